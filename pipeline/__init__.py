@@ -1,0 +1,1 @@
+"""The ground floor: orchestration, geometry, files and models. Never imports a stage."""

@@ -1,0 +1,1 @@
+"""One module per file format: images and depth, arrays, meshes, clips. Each convention lives in one place."""

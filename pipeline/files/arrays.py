@@ -1,0 +1,74 @@
+"""NPZ files: written with fixed timestamps so that equal arrays give equal bytes, read without pickle.
+
+`save` writes, `load` reads everything after checking each header, `open_lazily` maps big uncompressed members.
+"""
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import InputError
+
+MAX_BYTES = 64 << 30
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+def save(path: Path, *, compress: bool = False, **arrays: np.ndarray) -> None:
+    """Write named arrays; the same arrays always give the same bytes. Names may contain ``/``."""
+    method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+    with zipfile.ZipFile(path, "w", method, compresslevel=3) as archive:
+        for name, array in arrays.items():
+            array = np.asanyarray(array)
+            assert array.dtype != object, name
+            info = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
+            info.compress_type = method
+            with archive.open(info, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def load(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
+    """Read the named arrays (default: all). Raises InputError ART-010 for damaged files, missing names and object arrays."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = [name.removesuffix(".npy") for name in archive.namelist()]
+            missing = set(names or ()) - set(members)
+            if missing:
+                raise ValueError(f"missing {', '.join(sorted(missing))}; it holds {', '.join(members)}")
+            return {name: _read(archive, name) for name in (names or members)}
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
+        raise InputError("ART-010", what=f"cannot be read as NPZ: {error}", where=str(path), remedy="rebuild the stage that wrote it") from error
+
+
+def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """Read one member after checking its header's size and dtype."""
+    with archive.open(f"{name}.npy") as member:
+        head = io.BytesIO(member.read(4096))
+        major, _ = np.lib.format.read_magic(head)
+        reader = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}.get(major)
+        if reader is None:
+            raise ValueError(f"{name}: unknown array format")
+        shape, _, dtype = reader(head)
+        size = int(np.prod(shape, dtype=object)) * dtype.itemsize
+        if dtype.hasobject or size > MAX_BYTES:
+            raise ValueError(f"{name}: {dtype} of {size} bytes is refused")
+    with archive.open(f"{name}.npy") as member:
+        return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def open_lazily(path: Path, name: str) -> np.ndarray:
+    """Map one uncompressed member read-only, so that only what is indexed is read from disk."""
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo(f"{name}.npy")
+        if info.compress_type != zipfile.ZIP_STORED:
+            return _read(archive, name)
+        with archive.open(info) as member:
+            np.lib.format.read_magic(member)
+            shape, fortran, dtype = np.lib.format._read_array_header(member, version=(1, 0))
+            offset = member.tell()
+    with open(path, "rb") as file:
+        file.seek(info.header_offset + 26)
+        name_length, extra_length = np.frombuffer(file.read(4), "<u2")
+    start = info.header_offset + 30 + int(name_length) + int(extra_length) + offset
+    return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")

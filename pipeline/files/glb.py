@@ -1,0 +1,149 @@
+"""Write binary glTF 2.0: still surfaces and skinned, animated ones.
+
+A skinned file holds one root node that carries `world_from_agent`, the mesh, and every bone as a sibling joint under
+the root; the joint of bone b carries `agent_from_bone`. Bytes depend on the content alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pygltflib as gltf
+from jaxtyping import Float, Float32, UInt8
+
+from pipeline.space.meshes import Mesh
+from pipeline.space import rigid
+
+_FLOAT, _U8, _U32 = gltf.FLOAT, gltf.UNSIGNED_BYTE, gltf.UNSIGNED_INT
+_ROOT_NODE, _MESH_NODE, _FIRST_JOINT = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Four influences a vertex; `agent_from_bone_rest` are the bones in the pose of the surface."""
+
+    joints: UInt8[np.ndarray, "vertex 4"]
+    weights: Float32[np.ndarray, "vertex 4"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    bone_names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Action:
+    """One named animation: keys in seconds, root in the world, bones in the agent frame."""
+
+    name: str
+    time_s: Float[np.ndarray, " frame"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+
+
+def write_static(path: Path, mesh: Mesh, name: str) -> None:
+    """Write a still surface with vertex colour; metres, +y up."""
+    document = _Document()
+    document.add_mesh(mesh, name, None)
+    document.file.nodes = [gltf.Node(name=name, mesh=0)]
+    document.file.scenes = [gltf.Scene(nodes=[0])]
+    document.save(path)
+
+
+def write_skinned(path: Path, mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agent") -> None:
+    """Write a skinned surface (agent frame, metres) with one animation per action."""
+    document = _Document()
+    document.add_mesh(mesh, name, skin)
+    joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
+    document.file.nodes = [gltf.Node(name=name, children=[_MESH_NODE, *joints]), gltf.Node(name=f"{name}_surface", mesh=0, skin=0)]
+    translations, quaternions = _translation_quaternion(skin.agent_from_bone_rest)
+    for bone, translation, quaternion in zip(skin.bone_names, translations, quaternions, strict=True):
+        document.file.nodes.append(gltf.Node(name=bone, translation=_floats(translation), rotation=_floats(quaternion)))
+    inverse_bind = rigid.inverse(skin.agent_from_bone_rest).astype(np.float32)
+    columns = np.ascontiguousarray(inverse_bind.transpose(0, 2, 1)).reshape(-1, 16)  # glTF is column-major
+    document.file.skins = [gltf.Skin(name="skin", joints=joints, skeleton=_ROOT_NODE, inverseBindMatrices=document.add(columns, "MAT4", _FLOAT))]
+    document.file.animations = [document.animation(action) for action in actions]
+    document.file.scenes = [gltf.Scene(nodes=[_ROOT_NODE])]
+    document.save(path)
+
+
+class _Document:
+    """A growing glTF document and its one binary buffer."""
+
+    def __init__(self) -> None:
+        self.file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="agent-to-sim"), scene=0)
+        self.blob = bytearray()
+
+    def add(self, values: np.ndarray, kind: str, component: int, *, target: int | None = None, bounds: bool = False) -> int:
+        """Append an array and return its accessor."""
+        values = np.ascontiguousarray(values)
+        self.blob.extend(b"\0" * (-len(self.blob) % 4))
+        self.file.bufferViews.append(gltf.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=values.nbytes, target=target))
+        self.blob.extend(values.tobytes())
+        accessor = gltf.Accessor(bufferView=len(self.file.bufferViews) - 1, componentType=component, count=len(values), type=kind)
+        if bounds:
+            rows = values.reshape(len(values), -1)
+            accessor.min, accessor.max = rows.min(0).tolist(), rows.max(0).tolist()
+        self.file.accessors.append(accessor)
+        return len(self.file.accessors) - 1
+
+    def add_mesh(self, mesh: Mesh, name: str, skin: Skin | None) -> None:
+        vertex = {"target": gltf.ARRAY_BUFFER}
+        attributes = gltf.Attributes(
+            POSITION=self.add(mesh.vertices.astype(np.float32), "VEC3", _FLOAT, bounds=True, **vertex),
+            NORMAL=self.add(_unit_normals(mesh), "VEC3", _FLOAT, **vertex),
+        )
+        if mesh.color is not None:
+            attributes.COLOR_0 = self.add(_linear_rgba(mesh.color), "VEC4", _FLOAT, **vertex)
+        if skin is not None:
+            attributes.JOINTS_0 = self.add(skin.joints, "VEC4", _U8, **vertex)
+            attributes.WEIGHTS_0 = self.add(skin.weights, "VEC4", _FLOAT, **vertex)
+        indices = self.add(mesh.faces.astype(np.uint32).reshape(-1), "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER)
+        self.file.materials = [gltf.Material(name="surface", doubleSided=True, pbrMetallicRoughness=gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0))]
+        self.file.meshes = [gltf.Mesh(name=name, primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)])]
+
+    def animation(self, action: Action) -> gltf.Animation:
+        """Turn an action into channels: translation and rotation of the root and of every joint."""
+        animation = gltf.Animation(name=action.name)
+        keys = self.add(action.time_s.astype(np.float32), "SCALAR", _FLOAT, bounds=True)
+        tracks = [(_ROOT_NODE, action.world_from_agent)]
+        tracks += [(_FIRST_JOINT + bone, action.agent_from_bone[:, bone]) for bone in range(action.agent_from_bone.shape[1])]
+        for node, parent_from_node in tracks:
+            translation, quaternion = _translation_quaternion(parent_from_node)
+            for path, values, kind in (("translation", translation, "VEC3"), ("rotation", _without_flips(quaternion), "VEC4")):
+                animation.samplers.append(gltf.AnimationSampler(input=keys, output=self.add(values.astype(np.float32), kind, _FLOAT), interpolation="LINEAR"))
+                animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=gltf.AnimationChannelTarget(node=node, path=path)))
+        return animation
+
+    def save(self, path: Path) -> None:
+        self.file.buffers = [gltf.Buffer(byteLength=len(self.blob))]
+        self.file.set_binary_blob(bytes(self.blob))
+        self.file.save_binary(str(path))
+
+
+def _translation_quaternion(parent_from_node: Float[np.ndarray, "n 4 4"]) -> tuple[np.ndarray, np.ndarray]:
+    """Split rigid motions into translation and quaternion in glTF's order, xyzw."""
+    wxyz = rigid.quaternion_from_rotation(np.asarray(parent_from_node[:, :3, :3], np.float64))
+    return np.asarray(parent_from_node[:, :3, 3]), np.roll(wxyz, -1, axis=-1)
+
+
+def _without_flips(quaternion: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "frame 4"]:
+    """Choose signs so that neighbouring keys lie on one side: viewers interpolate the shorter arc either way."""
+    flips = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
+    return quaternion * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+
+
+def _unit_normals(mesh: Mesh) -> Float32[np.ndarray, "vertex 3"]:
+    """Vertex normals of unit length, +y where a vertex has no face: glTF forbids zero normals."""
+    normals = mesh.vertex_normals()
+    lost = np.linalg.norm(normals, axis=1, keepdims=True) < 0.5
+    return np.where(lost, [0.0, 1.0, 0.0], normals).astype(np.float32)
+
+
+def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "vertex 4"]:
+    """Undo the sRGB curve: glTF's vertex colours are linear."""
+    srgb = color.astype(np.float32) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([linear, np.ones_like(linear[:, :1])], 1).astype(np.float32)
+
+
+def _floats(values: np.ndarray) -> list[float]:
+    return [float(value) for value in values]

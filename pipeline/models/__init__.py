@@ -1,0 +1,1 @@
+"""The learned and fitted models that stages share; a checkpoint is meaningless without its class."""
