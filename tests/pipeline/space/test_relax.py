@@ -1,0 +1,68 @@
+"""Relaxing poses: contacts pull displaced cameras back, odometry bridges what contacts leave open."""
+
+import numpy as np
+
+from pipeline.space import relax, rigid
+
+FRAMES = 12
+
+
+def corridor(rng):
+    """Return true poses along a curve and points on three walls, so that planes fix all six directions."""
+    time = np.linspace(0, 1, FRAMES)
+    twist = np.stack([0.2 * np.sin(3 * time), 0.8 * time, 0.1 * np.cos(4 * time), time, 0.1 * time, 0.3 * np.sin(2 * time)], axis=-1)
+    points = rng.uniform(-2, 2, (300, 3))
+    normals = np.eye(3)[np.arange(300) % 3]
+    points[np.arange(300), np.arange(300) % 3] = 2.0
+    return time, rigid.exp(twist), points, normals
+
+
+def plane_contacts(truth, points, normals, frames):
+    """Return contacts of every point of the walls with the map, as the given frames saw them."""
+    first = np.repeat(frames, len(points))
+    seen = np.concatenate([rigid.apply(rigid.inverse(truth[frame]), points) for frame in frames])
+    tiled = np.tile(points, (len(frames), 1))
+    count = len(first)
+    return relax.Contacts(first, np.full(count, relax.MAP), seen, tiled, np.tile(normals, (len(frames), 1)), np.full(count, 0.01))
+
+
+def test_contacts_recover_displaced_cameras(rng=np.random.default_rng(0)):
+    time, truth, points, normals = corridor(rng)
+    start = truth @ rigid.exp(rng.normal(0, 0.05, (FRAMES, 6)))
+    contacts = plane_contacts(truth, points, normals, np.arange(FRAMES))
+    found = relax.relax(start, lambda *_: contacts, None, reach_m=(0.5,) * 6)
+    assert np.abs(found.world_from_camera - truth).max() < 1e-5
+    assert np.abs(found.residual_m).max() < 1e-5
+
+
+def test_odometry_carries_frames_without_contacts(rng=np.random.default_rng(1)):
+    time, truth, points, normals = corridor(rng)
+    moved = rigid.exp(np.array([0.1, -0.4, 0.2, 1.0, 2.0, 3.0])) @ truth
+    edges = relax.chain(time, moved, drift_rad_s=0.01, drift_m_s=0.01)
+    start = truth @ rigid.exp(rng.normal(0, 0.03, (FRAMES, 6)))
+    contacts = plane_contacts(truth, points, normals, np.array([0]))
+    found = relax.relax(start, lambda *_: contacts, edges, reach_m=(0.5,) * 8)
+    assert np.abs(found.world_from_camera - truth).max() < 1e-4
+
+
+def test_pairs_of_cameras_share_points_and_held_frames_stay(rng=np.random.default_rng(2)):
+    time, truth, points, _ = corridor(rng)
+    first, second = np.repeat(np.arange(FRAMES - 1), 60), np.repeat(np.arange(1, FRAMES), 60)
+    world = rng.uniform(-2, 2, (len(first), 3))
+    local = [np.einsum("cij,cj->ci", rigid.inverse(truth[index])[:, :3, :3], world) + rigid.inverse(truth[index])[:, :3, 3] for index in (first, second)]
+    contacts = relax.Contacts(first, second, *local, np.eye(3)[np.arange(len(first)) % 3], np.full(len(first), 0.01))
+    held = np.arange(FRAMES) == 0
+    start = truth @ rigid.exp(rng.normal(0, 0.03, (FRAMES, 6)) * ~held[:, None])
+    found = relax.relax(start, lambda *_: contacts, None, reach_m=(0.5,) * 8, held=held)
+    assert np.abs(found.world_from_camera - truth).max() < 1e-4
+    assert (found.world_from_camera[0] == truth[0]).all()
+
+
+def test_gross_outliers_do_not_move_the_answer(rng=np.random.default_rng(3)):
+    time, truth, points, normals = corridor(rng)
+    contacts = plane_contacts(truth, points, normals, np.arange(FRAMES))
+    wrong = rng.random(len(contacts.first)) < 0.2
+    contacts.points_second[wrong] += 1.0
+    start = truth @ rigid.exp(rng.normal(0, 0.02, (FRAMES, 6)))
+    found = relax.relax(start, lambda *_: contacts, None, reach_m=(0.2,) * 4 + (0.05,) * 4)
+    assert rigid.rotation_angle(found.world_from_camera[:, :3, :3], truth[:, :3, :3]).max() < np.deg2rad(0.3)
