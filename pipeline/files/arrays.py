@@ -3,9 +3,9 @@
 `save` writes, `load` reads everything after checking each header, `open_lazily` maps big uncompressed members.
 """
 
-import io
 import zipfile
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -44,17 +44,21 @@ def load(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarr
 def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     """Read one member after checking its header's size and dtype."""
     with archive.open(f"{name}.npy") as member:
-        head = io.BytesIO(member.read(4096))
-        major, _ = np.lib.format.read_magic(head)
-        reader = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}.get(major)
-        if reader is None:
-            raise ValueError(f"{name}: unknown array format")
-        shape, _, dtype = reader(head)
+        shape, _, dtype = _header(member, name)
         size = int(np.prod(shape, dtype=object)) * dtype.itemsize
         if dtype.hasobject or size > MAX_BYTES:
             raise ValueError(f"{name}: {dtype} of {size} bytes is refused")
     with archive.open(f"{name}.npy") as member:
         return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _header(member: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Read an array's shape, order and dtype and leave ``member`` at its first value."""
+    major, _ = np.lib.format.read_magic(member)
+    reader = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}.get(major)
+    if reader is None:
+        raise ValueError(f"{name}: unknown array format")
+    return reader(member)
 
 
 def open_lazily(path: Path, name: str) -> np.ndarray:
@@ -64,8 +68,7 @@ def open_lazily(path: Path, name: str) -> np.ndarray:
         if info.compress_type != zipfile.ZIP_STORED:
             return _read(archive, name)
         with archive.open(info) as member:
-            np.lib.format.read_magic(member)
-            shape, fortran, dtype = np.lib.format._read_array_header(member, version=(1, 0))
+            shape, fortran, dtype = _header(member, name)
             offset = member.tell()
     with open(path, "rb") as file:
         file.seek(info.header_offset + 26)
