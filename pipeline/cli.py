@@ -1,0 +1,172 @@
+"""The door every stage program enters through: command line -> `Task` -> `run(task)` -> exit code.
+
+A front declares what it reads; `enter` makes the options of that, checks the configuration strictly,
+and turns `InputError` into one message and exit code 2. `Task` is all that a front knows of the disk.
+"""
+
+import argparse
+import dataclasses
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline import artifact, config as configuration, dag, videos
+from pipeline.errors import InputError
+from pipeline.videos import Role, Split, Video
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One run of one stage: its inputs, its configuration and the artifact it is to make."""
+
+    stage: str
+    config: Any
+    """The stage's own `Config`."""
+    out: Path
+    """Where the artifact will stand."""
+    video: str | None
+    """Id of the recording, for stages that treat one at a time."""
+    videos: tuple[Video, ...]
+    """All recordings of the agent; empty when run by hand without `--videos`."""
+    resume: Path | None
+    """Folder for checkpoints; None: a killed run begins again."""
+    threads: int
+    key: str | None
+    paths: dict[str, Path]
+    """Inputs as given."""
+    requested_device: str
+    contents: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Hash of every artifact opened so far, for the manifest."""
+
+    @property
+    def device(self) -> str:
+        """`cpu` or `cuda`; `auto` takes CUDA where there is a usable one."""
+        if self.requested_device != "auto":
+            return self.requested_device
+        import torch  # late: it costs seconds, and many stages need none
+
+        return "cuda" if torch.cuda.is_available() else "cpu"
+
+    def has(self, name: str) -> bool:
+        """Tell whether the optional input `name` was given."""
+        return name in self.paths
+
+    def input(self, name: str) -> Path:
+        """Return the folder of the finished artifact `name`, or the plain file or folder where it is none."""
+        path = self.paths[name]
+        if name in dag.NODES:
+            return self._opened(path, name)
+        if not path.exists():
+            raise InputError("ART-003", f"{name} does not exist", str(path), "give an existing path")
+        return path
+
+    def per_video(
+        self, name: str, roles: tuple[Role, ...] | None = None, splits: tuple[Split, ...] | None = None
+    ) -> dict[str, Path]:
+        """Return the folder of `name` for every recording of `roles` and `splits`, by id, in id order.
+
+        By default: every recording for which the flow makes this artifact.
+        """
+        if not self.videos:
+            raise InputError("ART-004", f"which recordings of {name}?", self.stage, "give --videos build/<agent>/plan/videos.json")
+        wanted = dag.NODES[name].roles if roles is None else roles
+        chosen = sorted(v.id for v in self.videos if v.role in wanted and (splits is None or v.split in splits))
+        return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in chosen}
+
+    @contextmanager
+    def create(self) -> Iterator[Path]:
+        """Yield the folder to fill; it becomes the artifact if, and only if, the block ends well."""
+        settings = dataclasses.asdict(self.config)
+        with artifact.create(self.out, stage=self.stage, config=settings, inputs=self.contents, key=self.key) as folder:
+            yield folder
+
+    def _opened(self, path: Path, name: str) -> Path:
+        self.contents[name] = artifact.opened(path, name).content
+        return path
+
+
+def enter(
+    doc: str,
+    run: Callable[[Task], None],
+    *,
+    config: type,
+    reads: tuple[str, ...] = (),
+    optional: tuple[str, ...] = (),
+) -> None:
+    """Run a stage program: parse the command line, build its `Task`, run it, and exit.
+
+    `doc` is the front's docstring and becomes `--help`; `reads` and `optional` name its inputs.
+    """
+    given = _parser(doc, reads, optional).parse_args()
+    stage = Path(sys.argv[0]).parent.name
+    try:
+        run(_task(given, stage, config, reads + optional))
+    except InputError as error:
+        sys.exit(_told(error))
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        where = str(error.filename or given.out)
+        sys.exit(_told(InputError("SYS-001", "the disk is full", where, "free some space and run the same again")))
+
+
+def _told(error: InputError) -> int:
+    print(f"error: {error}", file=sys.stderr, flush=True)
+    return 2
+
+
+def _parser(doc: str, reads: tuple[str, ...], optional: tuple[str, ...]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in reads + optional:
+        option = f"--{name.replace('_', '-')}"
+        parser.add_argument(option, dest=name, type=Path, required=name in reads, metavar="PATH", help=_what(name))
+    parser.add_argument("--config", type=Path, metavar="FILE", help="this stage's table, JSON or TOML (default: all defaults)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="artifact to write; appears when complete")
+    parser.add_argument("--video", metavar="ID", help="the recording to treat, for example v002")
+    parser.add_argument("--videos", type=Path, metavar="FILE", help="the agent's recordings: build/<agent>/plan/videos.json")
+    parser.add_argument("--resume", type=Path, metavar="DIR", help="folder for checkpoints (default: none are kept)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute (default: auto)")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads to use (default: 1)")
+    parser.add_argument("--key", help=argparse.SUPPRESS)
+    return parser
+
+
+def _what(name: str) -> str:
+    if name not in dag.NODES:
+        return f"path of the {name}"
+    per_video = " (or the folder with one per recording)" if dag.NODES[name].roles else ""
+    return f"finished artifact `{name}`{per_video}"
+
+
+def _task(given: argparse.Namespace, stage: str, config: type, names: tuple[str, ...]) -> Task:
+    _limit_threads(given.threads)
+    return Task(
+        stage=stage,
+        config=configuration.load(config, given.config) if given.config else config(),
+        out=given.out,
+        video=given.video,
+        videos=videos.read(given.videos) if given.videos else (),
+        resume=given.resume,
+        threads=given.threads,
+        key=given.key,
+        paths={name: path for name in names if (path := getattr(given, name)) is not None},
+        requested_device=given.device,
+    )
+
+
+def _limit_threads(threads: int) -> None:
+    """Hold every library that is loaded, or will be, to `threads`."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(threads)
+    if "numba" in sys.modules:
+        sys.modules["numba"].set_num_threads(min(threads, sys.modules["numba"].config.NUMBA_NUM_THREADS))
+    else:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)

@@ -1,0 +1,87 @@
+"""Strict configuration: a table of plain values becomes a frozen dataclass, or an `InputError`.
+
+A stage's front declares `Config`; the recipe's table for that stage is checked against it:
+unknown keys and ill-typed values are refused with what is known. Standard library only.
+"""
+
+import dataclasses
+import json
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pipeline.errors import InputError
+
+C = TypeVar("C")
+
+
+def load(config: type[C], path: Path) -> C:
+    """Read one stage's table from a JSON or TOML file into `config`.
+
+    Raises `InputError` REC-001 (unknown key), REC-002 (wrong type), REC-003 (not readable).
+    """
+    return from_table(config, read_table(path), where=str(path))
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Read a JSON (`.json`) or TOML file that holds one table."""
+    try:
+        text = path.read_text()
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        raise InputError("REC-003", f"cannot be read: {error}", str(path), "repair the file") from error
+    if not isinstance(table, dict):
+        raise InputError("REC-003", "does not hold a table", str(path), "write `key = value` lines")
+    return table
+
+
+def from_table(config: type[C], table: Mapping[str, Any], *, where: str) -> C:
+    """Check `table` against the fields of the dataclass `config` and build it; nested tables likewise."""
+    known = [field.name for field in dataclasses.fields(config)]
+    refuse_unknown(table, known, where=where)
+    hints = typing.get_type_hints(config)
+    return config(**{key: _checked(hints[key], value, f"{where}: {key}") for key, value in table.items()})
+
+
+def refuse_unknown(table: Mapping[str, Any], known: typing.Collection[str], *, where: str, kind: str = "key") -> None:
+    """Raise REC-001 naming the known ones when `table` has a key outside `known`."""
+    for key in table:
+        if key not in known:
+            raise InputError("REC-001", f"unknown {kind} {key!r}", where, f"known: {', '.join(sorted(known)) or 'none'}")
+
+
+def _checked(hint: Any, value: Any, where: str) -> Any:
+    """Return `value` as `hint` wants it (lists become tuples, integers floats) or raise REC-002."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        return from_table(hint, value, where=where)
+    if origin is typing.Literal and value in arguments:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        return _first_fitting(arguments, value, hint, where)
+    if origin is tuple and isinstance(value, (list, tuple)):
+        each = [arguments[0]] * len(value) if arguments[1:] == (...,) else list(arguments)
+        if len(each) == len(value):
+            return tuple(_checked(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(each, value)))
+    if origin is dict and isinstance(value, Mapping):
+        return {key: _checked(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if origin is None and isinstance(hint, type) and type(value) is hint:
+        return value
+    if hint in (None, types.NoneType) and value is None:
+        return None
+    expected = hint.__name__ if isinstance(hint, type) and origin is None else str(hint).replace("typing.", "")
+    raise InputError("REC-002", f"{value!r} is not {expected}", where, f"give a value of type {expected}")
+
+
+def _first_fitting(kinds: tuple[Any, ...], value: Any, hint: Any, where: str) -> Any:
+    for kind in kinds:
+        try:
+            return _checked(kind, value, where)
+        except InputError:
+            continue
+    raise InputError("REC-002", f"{value!r} is not {hint}", where, f"give a value of type {hint}")

@@ -1,0 +1,125 @@
+"""The one declaration of the flow: which program makes which artifact, from what, for which recordings.
+
+`plan` expands it for an agent's recordings, `run` runs one job of it, and Make and Snakemake see
+only what `plan` wrote. Standard library only, no side effects.
+"""
+
+from dataclasses import dataclass, field
+
+from pipeline.videos import Role, Split
+
+VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
+"""Roles that models may see; the held-out phone is for `evaluate` alone."""
+AGENT: tuple[Role, ...] = ("turnaround", "session")
+"""Roles in which the animal is meant to be seen."""
+PLUMBING = ("errors", "config", "artifact", "cli", "progress", "videos", "dag")
+"""Files of `pipeline/` whose change cannot change what a stage computes."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """One input of a node; of an input that exists per recording, which recordings."""
+
+    artifact: str
+    roles: tuple[Role, ...] | None = None
+    """None: every recording that has it."""
+    splits: tuple[Split, ...] = ("train", "test", "none")
+    part: str | None = None
+    """Subfolder that is read, where it is not the whole artifact."""
+    option: str | None = None
+    """Command line option without dashes; the artifact's name if None."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """One artifact, or one per recording, and the program that makes it."""
+
+    artifact: str
+    stage: str
+    """Program: `python -m stages.<stage>`."""
+    needs: tuple[Need | str, ...] = ()
+    roles: tuple[Role, ...] = ()
+    """One job per recording of these roles; none: one job in all."""
+    sees: tuple[Role, ...] = ()
+    """Roles whose set and split decide the result although no per-recording input says so."""
+    fixed: dict[str, object] = field(default_factory=dict)
+    """Keys of the configuration that tell two nodes of one program apart."""
+    version: int = 1
+    """Raise it when results change although no code of the stage does."""
+    threads: int = 1
+    gpu: int = 0
+    memory_mb: int = 3000
+    """What a scheduler reserves; not a limit."""
+    resumable: bool = False
+    """Owns a folder for checkpoints that survives a kill."""
+
+
+def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Need, ...]:
+    """Return one need per artifact, over the recordings of `roles`."""
+    return tuple(Need(artifact, roles) for artifact in artifacts)
+
+
+FLOW: tuple[Node, ...] = (
+    Node("synthetic_capture", "synthesize_capture", threads=2),
+    Node("frames", "extract_frames", (Need("synthetic_capture", part="recordings", option="recording"),),
+         roles=("walkthrough", "turnaround", "session", "heldout")),
+    Node("flow", "estimate_flow", ("frames",), roles=AGENT),
+    Node("masks", "segment_agent", ("frames", "flow"), roles=AGENT),
+    Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, splits=("train", "none")),)),
+    Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
+    Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),
+    Node("agent_template", "build_agent_template", merging("frames", "masks", "features", roles=("turnaround",))),
+    Node("scene_localizer", "train_localizer",
+         ("scene_template", "feature_basis", *merging("frames", roles=("walkthrough",))),
+         fixed={"target": "scene"}, gpu=1, resumable=True),
+    Node("agent_localizer", "train_localizer", ("agent_template", "feature_basis"),
+         fixed={"target": "agent"}, gpu=1, resumable=True),
+    Node("video_poses", "register_videos",
+         ("frames", "masks", "features", "scene_template", "agent_template", "scene_localizer", "agent_localizer"),
+         roles=("session",), gpu=1),
+    Node("registration", "gather_registration", merging("video_poses")),
+    Node("reconstruction", "reconstruct",
+         ("registration", *merging("frames", roles=VIEWED), *merging("masks", "flow", "features"),
+          "scene_template", "agent_template"),
+         threads=2, gpu=1, memory_mb=6000, resumable=True),
+    Node("splats", "refine_gaussians",
+         ("reconstruction", *merging("frames", roles=VIEWED), *merging("masks", "flow")),
+         gpu=1, memory_mb=6000, resumable=True),
+    Node("behavior_data", "slice_behavior", ("reconstruction",), sees=("session",)),
+    Node("behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True),
+    Node("simulator", "export_simulator", ("reconstruction", "splats", "behavior", "behavior_data")),
+    Node("evaluation", "evaluate",
+         (*merging("frames", "masks", "flow"), "scene_template", "agent_template", "scene_localizer",
+          "agent_localizer", "registration", "reconstruction", "splats", "behavior_data", "behavior",
+          Need("synthetic_capture", part="truth", option="truth")),
+         sees=("session", "heldout"), gpu=1),
+    Node("report", "report",
+         (*merging("frames", "flow", "masks"), "feature_basis", *merging("features"),
+          "scene_template", "agent_template", "scene_localizer", "agent_localizer", *merging("video_poses"),
+          "registration", "reconstruction", "splats", "behavior_data", "behavior", "simulator", "evaluation")),
+)
+NODES = {node.artifact: node for node in FLOW}
+
+
+def table_of(node: Node) -> str:
+    """Return the name of the recipe's table that configures `node`: its program's, or its own where they share one."""
+    shared = sum(other.stage == node.stage for other in FLOW) > 1
+    return node.artifact if shared else node.stage
+
+
+def needs_of(node: Node) -> tuple[Need, ...]:
+    """Return the node's inputs, in declared order."""
+    return tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
+
+
+def check() -> None:
+    """Assert that every input is declared before it is used and exists for every recording that asks for it."""
+    declared: dict[str, Node] = {}
+    for node in FLOW:
+        for need in needs_of(node):
+            assert need.artifact in declared, f"{node.artifact} needs {need.artifact}, declared later or not at all"
+            source = declared[need.artifact]
+            if node.roles and source.roles:
+                assert set(node.roles) <= set(source.roles), f"{node.artifact}: no {need.artifact} for every role"
+        assert node.artifact not in declared, f"{node.artifact} is declared twice"
+        declared[node.artifact] = node

@@ -1,0 +1,1 @@
+"""The rooms. Each `__main__.py` is a program of its own; `pipeline/dag.py` tells their order."""
