@@ -1,0 +1,202 @@
+"""Check on the depth itself what a recording's device poses mean, and whether they mean anything.
+
+For a few pairs of frames, the depth of one is moved by the poses into the other and compared with what was measured
+there. The documented convention stays unless it is clearly refuted and another one clearly fits.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.space import cameras, rigid
+
+TOLERANCE_M = 0.015
+TOLERANCE_SHARE = 0.01
+UNUSABLE_FACTOR = 4.0
+MIN_OVERLAP = 0.25
+MIN_TURN_RAD = np.radians(3.0)
+MIN_SHIFT_M = 0.05
+GAP_S = (0.33, 1.5)
+STRIDE_PX = 3
+"""every third pixel of the first picture is enough"""
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How seven stored numbers become the pose of a camera with OpenCV axes."""
+
+    direction: Literal["camera_to_world", "world_to_camera"] = "camera_to_world"
+    axes: Literal["opengl", "opencv"] = "opengl"
+    quarter_turns: int = 0
+    """clockwise turns from the stored picture to the one that the poses refer to"""
+    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+
+
+RECORD3D = Convention()
+CONVENTIONS = tuple(
+    Convention(*choice)
+    for choice in product(("camera_to_world", "world_to_camera"), ("opengl", "opencv"), range(4), ("xyzw", "wxyz"))
+)
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """One frame's depth (metres, 0 = unknown) and its intrinsics."""
+
+    depth: Float[np.ndarray, "height width"]
+    intrinsics: Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
+class SelfCheck:
+    """What the depth said about the poses."""
+
+    verdict: Literal["documented", "other", "untested", "unusable"]
+    convention: Convention
+    pairs: int
+    """pairs of frames with enough motion between them"""
+    residual_m: float
+    """median over pairs of the median depth difference; NaN when nothing could be compared"""
+    overlap: float
+    reason: str
+
+
+def odometry_from_pose(pose: Float[np.ndarray, "frame 7"], convention: Convention) -> Float[np.ndarray, "frame 4 4"]:
+    """Turn stored poses into ``odometry_from_camera`` with OpenCV axes of the stored picture."""
+    quaternion = np.roll(pose[:, :4], 1, axis=1) if convention.quaternion == "xyzw" else pose[:, :4]
+    odometry_from_camera = rigid.make(rigid.rotation_from_quaternion(quaternion), pose[:, 4:])
+    if convention.direction == "world_to_camera":
+        odometry_from_camera = rigid.inverse(odometry_from_camera)
+    if convention.axes == "opengl":
+        odometry_from_camera = cameras.opencv_from_opengl(odometry_from_camera)
+    return cameras.turn_camera(odometry_from_camera, -convention.quarter_turns)
+
+
+def starts_at_identity(pose: Float[np.ndarray, "frame 7"], convention: Convention) -> bool:
+    """Tell whether the world is the first camera (old apps), so that its axes say nothing about gravity."""
+    identity = (0, 0, 0, 1, 0, 0, 0) if convention.quaternion == "xyzw" else (1, 0, 0, 0, 0, 0, 0)
+    return bool(np.allclose(pose[0], identity, atol=1e-6))
+
+
+def check_poses(
+    pose: Float[np.ndarray, "frame 7"] | None,
+    timestamp_s: Float[np.ndarray, "frame"],
+    depth_view: Callable[[int], DepthView],
+    pairs: int = 6,
+) -> SelfCheck:
+    """Decide which convention the poses follow; ``depth_view(i)`` gives the depth of frame i on demand."""
+    broken = _fault_of(pose)
+    if broken:
+        return _unusable(broken)
+    tried = {convention: odometry_from_pose(pose, convention) for convention in CONVENTIONS}
+    chosen = _moving_pairs(tried[RECORD3D], timestamp_s, pairs)
+    if len(chosen) == 0:
+        return SelfCheck("untested", RECORD3D, 0, np.nan, np.nan, "the phone moved too little to test its poses")
+    views = {frame: depth_view(frame) for frame in sorted(set(chosen.ravel().tolist()))}
+    scores = {
+        convention: _score(odometry_from_camera, chosen, views) for convention, odometry_from_camera in tried.items()
+    }
+    return _judge(scores, len(chosen))
+
+
+@dataclass(frozen=True)
+class _Score:
+    residual_m: float
+    overlap: float
+    accepted: bool
+
+    @property
+    def cost(self) -> float:
+        return self.residual_m / max(self.overlap, 1e-3)
+
+
+def _fault_of(pose: Float[np.ndarray, "frame 7"] | None) -> str | None:
+    """Name what makes poses meaningless without looking at depth."""
+    if pose is None:
+        return "the recording has no device poses"
+    if not np.isfinite(pose).all():
+        return "device poses are not finite"
+    if np.any(np.abs(np.linalg.norm(pose[:, :4], axis=1) - 1) > 0.05):
+        return "device poses hold quaternions that are not of unit length"
+    if len(pose) > 1 and np.ptp(pose, axis=0).max() < 1e-6:
+        return "all device poses are the same"
+    return None
+
+
+def _unusable(reason: str) -> SelfCheck:
+    return SelfCheck("unusable", RECORD3D, 0, np.nan, np.nan, reason)
+
+
+def _moving_pairs(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int
+) -> np.ndarray:
+    """Pick up to ``pairs`` (first, second) frames with time and motion between, spread over the recording."""
+    second = np.searchsorted(timestamp_s, timestamp_s + GAP_S[0])
+    first = np.flatnonzero(second < len(timestamp_s))
+    second = second[first]
+    relative = rigid.inverse(odometry_from_camera[first]) @ odometry_from_camera[second]
+    moved = (rigid.rotation_angle(np.eye(3), relative[:, :3, :3]) > MIN_TURN_RAD) | (
+        np.linalg.norm(relative[:, :3, 3], axis=1) > MIN_SHIFT_M
+    )
+    usable = np.stack([first, second], axis=1)[moved & (timestamp_s[second] - timestamp_s[first] <= GAP_S[1])]
+    return usable[np.unique(np.linspace(0, len(usable) - 1, pairs).round().astype(int))] if len(usable) else usable
+
+
+def _score(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarray, views: dict[int, DepthView]
+) -> _Score:
+    """Compare depth over all pairs under one convention."""
+    rows = []
+    for first, second in pairs:
+        second_from_first = rigid.inverse(odometry_from_camera[second]) @ odometry_from_camera[first]
+        rows.append(_compare(views[first], views[second], second_from_first))
+    residual_m, overlap, tolerance_m = np.array(rows).T
+    accepted = (residual_m < tolerance_m) & (overlap > MIN_OVERLAP)
+    return _Score(float(np.median(residual_m)), float(np.median(overlap)), bool(accepted.mean() >= 0.5))
+
+
+def _compare(
+    first: DepthView, second: DepthView, second_from_first: Float[np.ndarray, "4 4"]
+) -> tuple[float, float, float]:
+    """Return (median depth difference, share of points that can be compared, tolerance), metres."""
+    every = np.s_[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX]
+    points_first = cameras.back_project(first.depth, first.intrinsics)[every][first.depth[every] > 0]
+    pixel, depth = cameras.project(rigid.apply(second_from_first, points_first), second.intrinsics)
+    height, width = second.depth.shape
+    inside = (depth > 0.05) & (pixel >= 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+    column, row = np.floor(pixel[inside]).astype(int).T
+    measured = second.depth[row, column]
+    difference = np.abs(depth[inside] - measured)[measured > 0]
+    if len(difference) < 50:
+        return np.inf, 0.0, TOLERANCE_M
+    typical_m = float(np.median(measured[measured > 0]))
+    return (
+        float(np.median(difference)),
+        len(difference) / len(points_first),
+        max(TOLERANCE_M, TOLERANCE_SHARE * typical_m),
+    )
+
+
+def _judge(scores: dict[Convention, _Score], pairs: int) -> SelfCheck:
+    """Keep the documented convention unless it is refuted and another one is clearly right."""
+    documented = scores[RECORD3D]
+    best = min(scores, key=lambda convention: scores[convention].cost)
+    if documented.accepted:
+        return _checked("documented", RECORD3D, documented, pairs, "the documented convention explains the depth")
+    if scores[best].accepted and scores[best].cost < 0.5 * documented.cost:
+        return _checked(
+            "other", best, scores[best], pairs, f"the documented convention is refuted by the depth; {best} explains it"
+        )
+    if documented.residual_m < UNUSABLE_FACTOR * TOLERANCE_M and documented.overlap > MIN_OVERLAP:
+        return _checked("documented", RECORD3D, documented, pairs, "device poses explain the depth only roughly")
+    return _checked(
+        "unusable", RECORD3D, documented, pairs, "device poses do not explain the depth under any convention"
+    )
+
+
+def _checked(verdict, convention: Convention, score: _Score, pairs: int, reason: str) -> SelfCheck:
+    return SelfCheck(verdict, convention, pairs, score.residual_m, score.overlap, reason)

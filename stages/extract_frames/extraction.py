@@ -1,0 +1,147 @@
+"""From a recording to upright frames at a steady rate: first understand the whole, then read picture by picture.
+
+`understand` costs a second and reads a dozen depth pictures; `frames` then yields one `Frame` at a time.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.errors import InputError
+from pipeline.files import images
+from pipeline.space import cameras
+from stages.extract_frames import conventions
+from stages.extract_frames.conventions import SelfCheck
+from stages.extract_frames.record3d import Recording
+from stages.extract_frames.selection import choose_frames
+from stages.extract_frames.upright import quarter_turns_from_gravity
+
+SHARPNESS_WIDTH_PX = 240
+DARK = 0.15
+"""mean brightness (0..1) below which a picture loses quality"""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was understood of a recording; ``chosen`` indexes the recording's frames, everything else is upright."""
+
+    chosen: Int[np.ndarray, "frame"]
+    timestamp_s: Float[np.ndarray, "frame"]
+    intrinsics: Float[np.ndarray, "frame 3 3"]
+    """colour pixels"""
+    depth_intrinsics: Float[np.ndarray, "frame 3 3"]
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"] | None
+    gravity_known: bool
+    quarter_turns: int
+    """clockwise, stored to upright"""
+    self_check: SelfCheck
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One upright frame."""
+
+    color: UInt8[np.ndarray, "height width 3"]
+    jpeg: bytes
+    """the phone's own bytes where no turn was needed"""
+    depth: Float[np.ndarray, "height width"]
+    """metres, 0 = unknown"""
+    confidence: UInt8[np.ndarray, "height width"]
+    """0 low, 1 medium, 2 high"""
+    sharpness: float
+    """standard deviation of the Laplacian of the picture at a common width"""
+    brightness: float
+    """mean, 0..1"""
+    depth_valid: float
+    """share of known depth"""
+
+
+def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pairs: int) -> Plan:
+    """Choose frames, check the poses on the depth and find the upright turn."""
+    depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, recording.depth_size)
+
+    def view(frame: int) -> conventions.DepthView:
+        depth = known_depth(recording.read_depth(int(recording.index[frame])), max_depth_m)
+        return conventions.DepthView(depth, depth_intrinsics[frame])
+
+    check = conventions.check_poses(recording.pose, recording.timestamp_s, view, pairs)
+    odometry_from_camera, gravity_known, turns = None, False, 0
+    if check.verdict != "unusable":
+        odometry_from_camera = conventions.odometry_from_pose(recording.pose, check.convention)
+        gravity_known = not conventions.starts_at_identity(recording.pose, check.convention)
+        turns = quarter_turns_from_gravity(odometry_from_camera) if gravity_known else 0
+        odometry_from_camera = cameras.turn_camera(odometry_from_camera, turns)
+    chosen = choose_frames(recording.timestamp_s, rate_hz)
+    return Plan(
+        chosen=chosen,
+        timestamp_s=recording.timestamp_s[chosen],
+        intrinsics=cameras.turn_intrinsics(recording.intrinsics, recording.color_size, turns)[chosen],
+        depth_intrinsics=cameras.turn_intrinsics(depth_intrinsics, recording.depth_size, turns)[chosen],
+        odometry_from_camera=None if odometry_from_camera is None else odometry_from_camera[chosen],
+        gravity_known=gravity_known,
+        quarter_turns=turns,
+        self_check=check,
+    )
+
+
+def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality: int) -> Iterator[Frame]:
+    """Yield the plan's frames in order, upright. Raises InputError for pictures that cannot be decoded."""
+    for number in recording.index[plan.chosen]:
+        jpeg = recording.read_color(int(number))
+        color = images.decode_color(jpeg, f"{recording.where}, frame {number}")
+        if color.shape[:2] != recording.color_size:
+            have, want = color.shape, recording.color_size
+            what = f"the picture is {have[1]} x {have[0]}, the metadata say {want[1]} x {want[0]}"
+            raise InputError(
+                "CAP-004", what=what, where=f"{recording.where}, frame {number}", remedy="export the recording again"
+            )
+        depth = known_depth(recording.read_depth(int(number)), max_depth_m)
+        confidence = (
+            np.where(depth > 0, 2, 0).astype(np.uint8)
+            if recording.read_confidence is None
+            else np.minimum(recording.read_confidence(int(number)), 2)
+        )
+        if plan.quarter_turns:
+            color, depth, confidence = (
+                cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence)
+            )
+            jpeg = images.encode_jpeg(color, jpeg_quality)
+        sharpness, brightness = picture_statistics(color)
+        yield Frame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
+
+
+def known_depth(depth: Float[np.ndarray, "height width"], max_depth_m: float) -> Float[np.ndarray, "height width"]:
+    """Return depth in metres with 0 where it is not finite, not positive or beyond the sensor's range."""
+    return np.where(np.isfinite(depth) & (depth > 0) & (depth < max_depth_m), depth, np.float32(0))
+
+
+def picture_statistics(color: UInt8[np.ndarray, "height width 3"]) -> tuple[float, float]:
+    """Return (sharpness, brightness 0..1) of a picture; sharpness is measured at a common width."""
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    scale = SHARPNESS_WIDTH_PX / gray.shape[1]
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
+    return float(cv2.Laplacian(small, cv2.CV_32F).std()), float(gray.mean() / 255)
+
+
+def quality_of(
+    sharpness: Float[np.ndarray, "frame"],
+    brightness: Float[np.ndarray, "frame"],
+    depth_valid: Float[np.ndarray, "frame"],
+) -> Float[np.ndarray, "frame"]:
+    """Return 0..1 per frame: how sharp it is for its recording, whether it is lit, how much depth it has."""
+    sharp = np.minimum(sharpness / max(float(np.median(sharpness)), 1e-6), 1)
+    return sharp * np.minimum(brightness / DARK, 1) * depth_valid
+
+
+def sentence(recording: Recording, plan: Plan) -> str:
+    """Say in one line what was understood of a recording."""
+    seconds = recording.timestamp_s[-1] - recording.timestamp_s[0]
+    height, width = recording.color_size
+    turned = f"turned {90 * plan.quarter_turns} deg clockwise" if plan.quarter_turns else "upright as stored"
+    seen = f"{seconds:.1f} s, {len(recording.index)} frames {width} x {height}, {len(plan.chosen)} kept, {turned}"
+    check = plan.self_check
+    measured = f" ({1000 * check.residual_m:.1f} mm)" if np.isfinite(check.residual_m) else ""
+    return f"{recording.where}: {seen}; {check.reason}{measured}"

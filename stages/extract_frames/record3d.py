@@ -1,0 +1,302 @@
+"""Record3D recordings, both ways the app exports them: one ``.r3d`` archive, or a folder of EXR and JPEG files.
+
+`open_recording` reads the metadata and pairs the files; `Recording` then hands out one picture at a time. Poses and
+pictures are as stored: turning and checking them is the next files' work.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lzfse
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.errors import InputError
+from pipeline.files import images
+from stages.extract_frames import lzfse_blocks
+from stages.extract_frames.containers import Container, FolderContainer, ZipContainer, damaged
+
+MAX_METADATA_BYTES = 64 << 20
+MAX_PICTURE_BYTES = 64 << 20
+DEPTH_SIZES = {49_152: (256, 192), 307_200: (640, 480), 691_200: (960, 720)}
+"""floats per picture -> (height, width) of a portrait recording, where the metadata do not say"""
+FACE_ID_FLOATS = (307_200, 691_200)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording whose frames are known and whose pictures are read on demand, all as stored (not yet upright)."""
+
+    where: str
+    index: Int[np.ndarray, "frame"]
+    """the app's number of each frame that has both colour and depth"""
+    timestamp_s: Float[np.ndarray, "frame"]
+    intrinsics: Float[np.ndarray, "frame 3 3"]
+    """colour pixels"""
+    pose: Float[np.ndarray, "frame 7"] | None
+    """four quaternion and three translation (metres) numbers as the file has them; None where it has none"""
+    color_size: tuple[int, int]
+    """(height, width) in pixels"""
+    depth_size: tuple[int, int]
+    """(height, width) in pixels"""
+    read_color: Callable[[int], bytes]
+    """encoded picture of the app's frame number"""
+    read_depth: Callable[[int], Float[np.ndarray, "height width"]]
+    """metres as stored, of the app's frame number"""
+    read_confidence: Callable[[int], UInt8[np.ndarray, "height width"]] | None
+    """0 low, 1 medium, 2 high; None where the export has none"""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where one kind of export keeps its members; ``%d`` is the frame number."""
+
+    metadata: str
+    color: str
+    depth: str
+    confidence: str
+
+
+_ARCHIVE = _Layout("metadata", "rgbd/%d.jpg", "rgbd/%d.depth", "rgbd/%d.conf")
+_FOLDER = _Layout("metadata.json", "rgb/%d.jpg", "depth/%d.exr", "confidence/%d.png")
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a ``.r3d`` file, or a folder that is or holds Record3D's ``EXR_RGBD``.
+
+    Raises InputError CAP-001..006 for what cannot be a usable recording.
+    """
+    path = Path(path)
+    if path.is_dir():
+        inner = path / "EXR_RGBD"
+        return _open(FolderContainer(inner if inner.is_dir() else path), _FOLDER)
+    if not path.is_file():
+        raise InputError(
+            "CAP-003",
+            what="there is no such recording",
+            where=str(path),
+            remedy="give a .r3d file or a folder with Record3D's EXR + JPG export",
+        )
+    return _open(ZipContainer(path), _ARCHIVE)
+
+
+def _open(container: Container, layout: _Layout) -> Recording:
+    if layout.metadata not in container.names:
+        remedy = "export from Record3D as 'Shareable/Internal format (.r3d)' or 'EXR + JPG sequence'"
+        raise InputError(
+            "CAP-003",
+            what=f"not a Record3D recording: it has no {layout.metadata!r}",
+            where=container.where,
+            remedy=remedy,
+        )
+    metadata = _Metadata(container, layout.metadata)
+    stored = _numbers(container.names, layout.depth)
+    if not stored:
+        remedy = "record with Record3D's LiDAR camera; a plain video has no depth"
+        raise InputError("CAP-006", what="no depth in the recording", where=container.where, remedy=remedy)
+    index = np.array(sorted(stored & _numbers(container.names, layout.color)), int)
+    timestamp_s, intrinsics, pose = (
+        metadata.timestamp_s(max(stored) + 1),
+        metadata.intrinsics(max(stored) + 1),
+        metadata.pose(),
+    )
+    index = index[index < min(len(timestamp_s), len(intrinsics), len(timestamp_s) if pose is None else len(pose))]
+    if len(index) == 0:
+        raise InputError(
+            "CAP-007",
+            what="no frame has colour, depth and metadata",
+            where=container.where,
+            remedy="export it from the phone again",
+        )
+    depth_size = _depth_size(container, layout, metadata, int(index[0]))
+    _refuse_face_id(depth_size, pose, container.where)
+    return Recording(
+        where=container.where,
+        index=index,
+        timestamp_s=timestamp_s[index],
+        intrinsics=intrinsics[index],
+        pose=None if pose is None else pose[index],
+        color_size=metadata.color_size,
+        depth_size=depth_size,
+        read_color=lambda i: container.read(layout.color % i, MAX_PICTURE_BYTES),
+        read_depth=lambda i: _read_depth(container, layout.depth % i, depth_size),
+        read_confidence=_confidence_reader(container, layout, index, depth_size),
+    )
+
+
+class _Metadata:
+    """The recording's JSON, checked as it is asked for. Every complaint is CAP-004 and names the key."""
+
+    def __init__(self, container: Container, name: str) -> None:
+        self._where = f"{container.where}:{name}"
+        try:
+            self._table = json.loads(container.read(name, MAX_METADATA_BYTES))
+        except (ValueError, RecursionError) as error:
+            raise self._broken(f"not JSON ({error})") from error
+        if not isinstance(self._table, dict):
+            raise self._broken("not a table")
+        self.color_size = (self._pixels("h"), self._pixels("w"))
+
+    def depth_size(self) -> tuple[int, int] | None:
+        """Return (height, width) of the depth pictures where the app wrote it."""
+        return (self._pixels("dh"), self._pixels("dw")) if "dh" in self._table and "dw" in self._table else None
+
+    def timestamp_s(self, frames: int) -> Float[np.ndarray, "frame"]:
+        """Return seconds since the first frame; from the frame rate in recordings of old apps."""
+        if "frameTimestamps" not in self._table:
+            return np.arange(frames) / self._numbers("fps", (), positive=True)
+        timestamp_s = self._numbers("frameTimestamps", (None,))
+        if np.any(np.diff(timestamp_s) <= 0):
+            raise self._broken("'frameTimestamps' must increase")
+        return timestamp_s - timestamp_s[0] if len(timestamp_s) else timestamp_s
+
+    def intrinsics(self, frames: int) -> Float[np.ndarray, "frame 3 3"]:
+        """Return K in colour pixels: per frame where the app wrote it, else the first frame's (stored by columns)."""
+        if "perFrameIntrinsicCoeffs" in self._table:
+            focal_x, focal_y, center_x, center_y = self._numbers("perFrameIntrinsicCoeffs", (None, 4)).T
+            intrinsics = np.tile(np.eye(3), (len(focal_x), 1, 1))
+            intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (
+                focal_x,
+                focal_y,
+                center_x,
+                center_y,
+            )
+        else:
+            intrinsics = np.tile(self._numbers("K", (9,)).reshape(3, 3).T, (frames, 1, 1))
+        if np.any(intrinsics[:, [0, 1], [0, 1]] <= 0):
+            raise self._broken("the focal length must be positive")
+        return intrinsics
+
+    def pose(self) -> Float[np.ndarray, "frame 7"] | None:
+        """Return the device poses as stored; values that are no numbers come back as NaN."""
+        if not self._table.get("poses"):
+            return None
+        return self._numbers("poses", (None, 7), finite=False)
+
+    def _pixels(self, key: str) -> int:
+        value = float(self._numbers(key, (), positive=True))
+        if value != int(value) or value > 16384:
+            raise self._broken(f"{key!r} is no picture size: {value:g}")
+        return int(value)
+
+    def _numbers(
+        self, key: str, shape: tuple[int | None, ...], *, positive: bool = False, finite: bool = True
+    ) -> np.ndarray:
+        """Read an array of numbers whose axes have the given lengths (None: any)."""
+        if key not in self._table:
+            raise self._broken(f"{key!r} is missing")
+        array = _array_from_json(self._table[key])
+        if (
+            array is None
+            or array.ndim != len(shape)
+            or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True))
+        ):
+            raise self._broken(f"{key!r} has the wrong form")
+        if (finite and not np.isfinite(array).all()) or (positive and np.any(array <= 0)):
+            raise self._broken(f"{key!r} holds impossible values")
+        return array
+
+    def _broken(self, why: str) -> InputError:
+        return InputError(
+            "CAP-004",
+            what=f"the recording's metadata cannot be used: {why}",
+            where=self._where,
+            remedy="export it from the phone again",
+        )
+
+
+def _array_from_json(value: Any) -> np.ndarray | None:
+    try:
+        return np.array(value, float)
+    except (TypeError, ValueError):
+        return None
+
+
+def _numbers(names: frozenset[str], pattern: str) -> set[int]:
+    """Return the frame numbers of the members that follow a pattern such as ``rgbd/%d.jpg``."""
+    prefix, suffix = pattern.split("%d")
+    stems = (name[len(prefix) : -len(suffix)] for name in names if name.startswith(prefix) and name.endswith(suffix))
+    return {
+        int(stem) for stem in stems if stem.isascii() and stem.isdigit() and len(stem) < 10 and str(int(stem)) == stem
+    }
+
+
+def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, first: int) -> tuple[int, int]:
+    """Return (height, width) of the depth: as written, else from the first picture."""
+    size = metadata.depth_size()
+    if size is not None:
+        return size
+    if layout is _FOLDER:
+        return images.read_depth(container.path(layout.depth % first), channel="R").shape
+    floats = len(_decompress(container, layout.depth % first, 4 * max(DEPTH_SIZES))) // 4
+    if floats not in DEPTH_SIZES:
+        raise _wrong_depth(f"{container.where}:{layout.depth % first}", f"{floats} values fit no known depth camera")
+    portrait = DEPTH_SIZES[floats]
+    return portrait if metadata.color_size[0] >= metadata.color_size[1] else portrait[::-1]
+
+
+def _refuse_face_id(depth_size: tuple[int, int], pose: np.ndarray | None, where: str) -> None:
+    """Refuse the front camera: its recordings have depth of another size and no pose at all."""
+    no_pose = (
+        pose is not None and len(pose) > 1 and np.array_equal(pose, np.tile([0, 0, 0, 1, 0, 0, 0], (len(pose), 1)))
+    )
+    if no_pose or math.prod(depth_size) in FACE_ID_FLOATS:
+        remedy = "record with the LiDAR camera at the back of the phone"
+        raise InputError(
+            "CAP-005", what="recorded with the Face-ID camera: it has no device poses", where=where, remedy=remedy
+        )
+
+
+def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
+    if isinstance(container, FolderContainer):
+        depth = images.read_depth(container.path(name), channel="R")
+    else:
+        depth = np.frombuffer(_decompress_exactly(container, name, 4 * math.prod(size)), "<f4").reshape(size)
+    if depth.shape != size:
+        raise _wrong_depth(
+            f"{container.where}:{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}"
+        )
+    return depth
+
+
+def _confidence_reader(
+    container: Container, layout: _Layout, index: np.ndarray, size: tuple[int, int]
+) -> Callable[[int], np.ndarray] | None:
+    """Return a reader of confidence pictures where every frame has one."""
+    if isinstance(container, FolderContainer) or not set(index) <= _numbers(container.names, layout.confidence):
+        return None
+    return lambda i: np.frombuffer(
+        _decompress_exactly(container, layout.confidence % i, math.prod(size)), np.uint8
+    ).reshape(size)
+
+
+def _decompress_exactly(container: Container, name: str, expected: int) -> bytes:
+    data = _decompress(container, name, expected)
+    if len(data) != expected:
+        raise _wrong_depth(f"{container.where}:{name}", f"{len(data)} bytes instead of {expected}")
+    return data
+
+
+def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
+    """Unpack LZFSE after its block headers promised at most ``max_bytes``."""
+    where = f"{container.where}:{name}"
+    packed = container.read(name, max_bytes + max_bytes // 8 + 4096)
+    try:
+        if lzfse_blocks.unpacked_bytes(packed) > max_bytes:
+            raise _wrong_depth(where, f"more than {max_bytes} bytes")
+        return lzfse.decompress(packed)
+    except (lzfse_blocks.BrokenBlockError, lzfse.error) as error:
+        raise damaged(where, f"LZFSE: {error}") from error
+
+
+def _wrong_depth(where: str, why: str) -> InputError:
+    return InputError(
+        "CAP-008",
+        what=f"a depth picture has the wrong size: {why}",
+        where=where,
+        remedy="export it from the phone again",
+    )

@@ -1,0 +1,121 @@
+"""Write frames as the ``frames/<id>`` artifact and say how good they are."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline import qa
+from pipeline.errors import InputError
+from pipeline.files import arrays, images
+from stages.extract_frames.extraction import DARK, Frame, Plan, quality_of
+from stages.extract_frames.record3d import Recording
+
+SHEET_FRAMES = 12
+SHEET_HEIGHT_PX = 200
+
+
+@dataclass(frozen=True)
+class Written:
+    """What came out of a recording."""
+
+    kept: Bool[np.ndarray, "frame"]
+    """of the plan's frames, those with enough depth"""
+    sharpness: Float[np.ndarray, "kept"]
+    brightness: Float[np.ndarray, "kept"]
+    depth_valid: Float[np.ndarray, "kept"]
+    color_strip: UInt8[np.ndarray, "height width 3"]
+    depth_strip: UInt8[np.ndarray, "height width 3"]
+
+
+def write_frames(folder: Path, frames: Iterable[Frame], *, total: int, min_depth_valid: float, where: str) -> Written:
+    """Write the frames that have enough depth, numbered without gaps. Raises InputError CAP-007 when none has."""
+    for name in ("color", "depth", "confidence"):
+        (folder / name).mkdir()
+    kept, statistics, strip = np.zeros(total, bool), [], []
+    shown = set(np.linspace(0, total - 1, SHEET_FRAMES).astype(int).tolist())
+    for number, frame in enumerate(frames):
+        if number in shown:
+            strip.append((_thumbnail(frame.color), _thumbnail(_colored_depth(frame.depth))))
+        if frame.depth_valid < min_depth_valid:
+            continue
+        name = f"{len(statistics):06d}"
+        (folder / "color" / f"{name}.jpg").write_bytes(frame.jpeg)
+        images.write_depth(folder / "depth" / f"{name}.exr", frame.depth)
+        images.write_gray(folder / "confidence" / f"{name}.png", frame.confidence)
+        statistics.append((frame.sharpness, frame.brightness, frame.depth_valid))
+        kept[number] = True
+    if not statistics:
+        what = f"in no frame is {min_depth_valid:.0%} of the depth known"
+        raise InputError(
+            "CAP-007", what=what, where=where, remedy="record things within 5 m, in light, with the LiDAR camera"
+        )
+    color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))
+    return Written(kept, *np.array(statistics).T, color_strip, depth_strip)
+
+
+def write_table(folder: Path, recording: Recording, plan: Plan, written: Written) -> None:
+    """Write ``frames.npz`` for the kept frames."""
+    kept = written.kept
+    odometry = {} if plan.odometry_from_camera is None else {"odometry_from_camera": plan.odometry_from_camera[kept]}
+    arrays.save(
+        folder / "frames.npz",
+        timestamp_s=plan.timestamp_s[kept],
+        intrinsics=plan.intrinsics[kept],
+        depth_intrinsics=plan.depth_intrinsics[kept],
+        **odometry,
+        gravity_known=np.array(plan.gravity_known),
+        source_index=recording.index[plan.chosen][kept].astype(np.int64),
+        quarter_turns=np.array(plan.quarter_turns, np.int64),
+        sharpness=written.sharpness.astype(np.float32),
+        brightness=written.brightness.astype(np.float32),
+        depth_valid=written.depth_valid.astype(np.float32),
+        quality=quality_of(written.sharpness, written.brightness, written.depth_valid).astype(np.float32),
+    )
+
+
+def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float) -> None:
+    """Write the stage's own judgement: what was understood, how much of it is usable, a contact sheet."""
+    timestamp_s = plan.timestamp_s[written.kept]
+    duration_s = float(timestamp_s[-1] - timestamp_s[0])
+    median_sharpness = max(float(np.median(written.sharpness)), 1e-6)
+    missing = 1 - len(timestamp_s) / max(round(duration_s * rate_hz) + 1, 1)
+    check = plan.self_check
+    residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None
+    checks = [
+        qa.Check("duration", duration_s, "s", warn=5.0, better="higher"),
+        qa.Check("frames", float(len(timestamp_s)), "", warn=50, fail=2, better="higher"),
+        qa.Check("missing ticks", 100 * missing, "%", warn=20.0),
+        qa.Check("dark frames", 100 * float((written.brightness < DARK).mean()), "%", warn=20.0),
+        qa.Check("blurred frames", 100 * float((written.sharpness < 0.4 * median_sharpness).mean()), "%", warn=25.0),
+        qa.Check("known depth", 100 * float(written.depth_valid.mean()), "%", warn=50.0, better="higher"),
+        qa.Check("frames dropped for lack of depth", 100 * float((~written.kept).mean()), "%", warn=10.0),
+        qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
+        qa.Check("device poses usable", float(plan.odometry_from_camera is not None), "", warn=0.5, better="higher"),
+        qa.Check(f"device poses against depth ({check.reason})", residual_mm, "mm", warn=15.0),
+    ]
+    pictures = [
+        qa.Picture("contact_sheet", written.color_strip, "frames spread over the recording, as understood"),
+        qa.Picture("depth_strip", written.depth_strip, "their depth, near is bright, black is unknown"),
+    ]
+    qa.write(
+        folder,
+        good="upright pictures, depth that follows their edges, device poses within 15 mm of the depth",
+        bad="sideways or black pictures, mostly black depth, device poses missing",
+        checks=checks,
+        pictures=pictures,
+    )
+
+
+def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    scale = SHEET_HEIGHT_PX / image.shape[0]
+    return cv2.resize(image, (max(round(image.shape[1] * scale), 1), SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA)
+
+
+def _colored_depth(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:
+    nearness = np.clip(255 * (1 - depth / max(float(depth.max()), 1e-3)), 0, 255).astype(np.uint8)
+    colored = cv2.applyColorMap(nearness, cv2.COLORMAP_INFERNO)[..., ::-1]
+    return np.ascontiguousarray(np.where(depth[..., None] > 0, colored, 0).astype(np.uint8))

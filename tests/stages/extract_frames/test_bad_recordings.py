@@ -1,0 +1,111 @@
+"""Damaged, hostile and unsuitable recordings are refused with their code, and nothing is left on disk."""
+
+import struct
+import sys
+import zipfile
+
+import lzfse
+import numpy as np
+import pytest
+from made_recordings import walk, write_zip
+
+from pipeline import cli
+from stages.extract_frames import __main__ as front
+from stages.extract_frames import lzfse_blocks
+
+
+def _refused(recording, folder, monkeypatch, capsys):
+    """Run the stage, expect exit 2 and an unchanged disk, return the message."""
+    before = sorted(folder.rglob("*"))
+    monkeypatch.setattr(sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(folder / "out")])
+    with pytest.raises(SystemExit) as stop:
+        cli.enter(front.__doc__, front.run, config=front.Config, reads=("recording",))
+    assert stop.value.code == 2
+    assert sorted(folder.rglob("*")) == before
+    return capsys.readouterr().err
+
+
+DEPTH = "rgbd/3.depth"
+CASES = {
+    "CAP-003": [{"members": {"metadata": None}}],
+    "CAP-004": [
+        {"members": {"metadata": b"{"}},
+        {"members": {"metadata": b"[" * 60_000}},
+        {"metadata": {"K": None}},
+        {"metadata": {"K": [1, 2]}},
+        {"metadata": {"w": 1e9}},
+        {"metadata": {"w": float("nan")}},
+        {"metadata": {"frameTimestamps": [0.0] * 12}},
+        {"metadata": {"h": 60}},
+    ],
+    "CAP-005": [
+        {"metadata": {"poses": [[0, 0, 0, 1, 0, 0, 0]] * 12}},
+        {"metadata": {"dw": 480, "dh": 640}},
+    ],
+    "CAP-006": [{"members": {f"rgbd/{i}.depth": None for i in range(12)}}],
+    "CAP-007": [
+        {"members": {f"rgbd/{i}.jpg": None for i in range(12)}},
+        {"members": {f"rgbd/{i}.depth": lzfse.compress(np.full(768, np.nan, "<f4").tobytes()) for i in range(12)}},
+    ],
+    "CAP-008": [{"members": {DEPTH: lzfse.compress(b"\0" * 100)}}, {"members": {DEPTH: lzfse.compress(bytes(10**6))}}],
+    "CAP-001": [{"members": {DEPTH: b"bvx2garbage"}}, {"members": {DEPTH: lzfse.compress(bytes(3072))[:9]}}],
+    "CAP-020": [{"members": {"rgbd/3.jpg": b"\xff\xd8\xff nothing"}}],
+    "CAP-002": [
+        {"members": {"../escape": b"x"}},
+        {"members": {"/etc/x": b"x"}},
+        {"members": {"a\\b": b"x"}},
+        {"members": {"bomb": bytes(10**8)}},
+    ],
+}
+
+
+@pytest.mark.parametrize(("code", "change"), [(code, change) for code, changes in CASES.items() for change in changes])
+def test_faulty_recordings_are_refused(tmp_path, monkeypatch, capsys, code, change):
+    made = walk(12)
+    made.metadata |= change.get("metadata", {})
+    made.members |= change.get("members", {})
+    assert code in _refused(made.write(tmp_path / "a.r3d"), tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.98])
+def test_a_cut_file_is_refused(tmp_path, monkeypatch, capsys, share):
+    path = walk(12).write(tmp_path / "a.r3d")
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    assert "CAP-001" in _refused(path, tmp_path, monkeypatch, capsys)
+
+
+def test_flipped_bytes_are_refused(tmp_path, monkeypatch, capsys):
+    path = walk(12).write(tmp_path / "a.r3d")
+    data = bytearray(path.read_bytes())
+    at = data.find(b"rgbd/3.jpg") + 60
+    data[at : at + 8] = bytes(8)
+    path.write_bytes(data)
+    assert "CAP-001" in _refused(path, tmp_path, monkeypatch, capsys)
+
+
+def test_a_linked_member_is_refused(tmp_path, monkeypatch, capsys):
+    path = walk(12).write(tmp_path / "a.r3d")
+    with zipfile.ZipFile(path, "a") as archive:
+        link = zipfile.ZipInfo("rgbd/99.jpg")
+        link.external_attr = 0o120777 << 16
+        archive.writestr(link, "/etc/passwd")
+    assert "CAP-002" in _refused(path, tmp_path, monkeypatch, capsys)
+
+
+def test_something_else_is_refused(tmp_path, monkeypatch, capsys):
+    (tmp_path / "folder").mkdir()
+    assert "CAP-003" in _refused(tmp_path / "folder", tmp_path, monkeypatch, capsys)
+    write_zip(tmp_path / "b.r3d", {"hello": b"world"})
+    assert "CAP-003" in _refused(tmp_path / "b.r3d", tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize("size", [0, 3, 100, 50_000, 1_000_000])
+def test_lzfse_headers_promise_what_comes_out(size):
+    rng = np.random.default_rng(size)
+    for data in (bytes(size), rng.bytes(size), rng.integers(0, 4, size, dtype=np.uint8).tobytes()):
+        assert lzfse_blocks.unpacked_bytes(lzfse.compress(data)) == size
+
+
+def test_lzfse_blocks_that_stand_still_are_refused():
+    with pytest.raises(lzfse_blocks.BrokenBlockError):
+        lzfse_blocks.unpacked_bytes(b"bvx2" + struct.pack("<I3Q", 0, 0, 0, 0) + bytes(100))

@@ -1,0 +1,82 @@
+"""A recording becomes frames that agree with its truth, whichever way the phone was held."""
+
+import sys
+
+import numpy as np
+import pytest
+from made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
+
+from pipeline import cli
+from pipeline.files import arrays, images
+from pipeline.files.clips import Clip
+from pipeline.space import cameras, rigid
+from stages.extract_frames import __main__ as front
+
+
+def _extract(recording, out, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(out)])
+    cli.enter(front.__doc__, front.run, config=front.Config, reads=("recording",))
+    return Clip.open(out)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_frames_are_upright_and_agree_with_truth(tmp_path, monkeypatch, turns):
+    made = walk(36, quarter_turns=turns)
+    clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
+    source = arrays.load(tmp_path / "out" / "frames.npz")["source_index"]
+    assert len(clip) == 24
+    np.testing.assert_allclose(clip.timestamp_s, made.timestamp_s[source])
+    np.testing.assert_allclose(clip.odometry_from_camera, made.world_from_camera[source], atol=1e-6)
+    np.testing.assert_allclose(clip.intrinsics[0], walk().intrinsics, atol=1e-9)
+    assert clip.color_size == COLOR_SIZE
+    assert clip.depth_size == DEPTH_SIZE
+    assert np.array_equal(clip.confidence(0), np.ones(DEPTH_SIZE, np.uint8))
+    upright = walk(36)
+    np.testing.assert_allclose(clip.depth(5), upright.depth(source[5]), rtol=1e-3)
+    assert np.abs(clip.color(5).astype(int) - upright.color(source[5])).mean() < 3
+    np.testing.assert_allclose(
+        clip.depth_intrinsics[0], cameras.scale_intrinsics(clip.intrinsics[0], COLOR_SIZE, DEPTH_SIZE), atol=1e-9
+    )
+
+
+def test_colour_bytes_are_copied_untouched_when_upright(tmp_path, monkeypatch):
+    made = walk(12)
+    clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
+    assert (clip.folder / "color" / "000000.jpg").read_bytes() == images.encode_jpeg(made.color(0))
+
+
+def test_intrinsics_of_each_frame_win_over_the_first(tmp_path, monkeypatch):
+    made = walk(12)
+    made.metadata["perFrameIntrinsicCoeffs"] = [[50 + i, 52 + i, 25, 31] for i in range(12)]
+    clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
+    source = arrays.load(tmp_path / "out" / "frames.npz")["source_index"]
+    np.testing.assert_allclose(clip.intrinsics[:, 0, 0], 50 + source)
+
+
+def test_old_recordings_get_times_from_the_rate_and_no_gravity(tmp_path, monkeypatch):
+    made = walk(88)
+    made.timestamp_s = np.arange(88) / 60
+    first = made.world_from_camera[0] @ np.diag([1, -1, -1, 1])
+    made.metadata |= dict(frameTimestamps=None, initPose=None)
+    poses = rigid.inverse(first) @ made.world_from_camera @ np.diag([1, -1, -1, 1])
+    wxyz = rigid.quaternion_from_rotation(poses[:, :3, :3])
+    made.metadata["poses"] = np.concatenate([np.roll(wxyz, -1, 1), poses[:, :3, 3]], 1).tolist()
+    clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
+    assert not clip.gravity_known
+    np.testing.assert_allclose(np.diff(clip.timestamp_s), 0.1)
+
+
+def test_unusable_poses_are_left_out_and_said(tmp_path, monkeypatch):
+    made = walk(24)
+    made.metadata["poses"] = np.zeros((24, 7)).tolist()
+    clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
+    assert clip.odometry_from_camera is None
+    assert '"status": "warn"' in (tmp_path / "out" / "qa.json").read_text()
+
+
+def test_same_recording_same_bytes(tmp_path, monkeypatch):
+    recording = walk(12, quarter_turns=1).write(tmp_path / "a.r3d")
+    for out in ("one", "two"):
+        _extract(recording, tmp_path / out, monkeypatch)
+    files = [path.relative_to(tmp_path / "one") for path in sorted((tmp_path / "one").rglob("*")) if path.is_file()]
+    assert all((tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files)

@@ -1,0 +1,94 @@
+"""The depth tells what device poses mean: every wrong reading is found out, meaningless poses are refused."""
+
+import numpy as np
+import pytest
+from made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
+
+from pipeline.space import cameras, rigid
+from stages.extract_frames import conventions, upright
+
+
+def _check(made, pose):
+    intrinsics = cameras.scale_intrinsics(made.intrinsics, COLOR_SIZE, DEPTH_SIZE)
+    rng = np.random.default_rng(0)
+
+    def view(frame):
+        noisy = made.depth(frame) + rng.normal(0, 0.003, DEPTH_SIZE)
+        return conventions.DepthView(noisy, intrinsics)
+
+    return conventions.check_poses(pose, made.timestamp_s, view)
+
+
+def _stored(made, convention):
+    """Write the true poses the way another app would."""
+    camera = cameras.turn_camera(made.world_from_camera, convention.quarter_turns)
+    if convention.axes == "opengl":
+        camera = cameras.opencv_from_opengl(camera)
+    if convention.direction == "world_to_camera":
+        camera = rigid.inverse(camera)
+    wxyz = rigid.quaternion_from_rotation(camera[:, :3, :3])
+    order = -1 if convention.quaternion == "xyzw" else 0
+    return np.concatenate([np.roll(wxyz, order, axis=1), camera[:, :3, 3]], axis=1)
+
+
+@pytest.mark.parametrize("convention", conventions.CONVENTIONS)
+def test_reading_undoes_writing(convention):
+    made = walk()
+    read = conventions.odometry_from_pose(_stored(made, convention), convention)
+    np.testing.assert_allclose(read, made.world_from_camera, atol=1e-9)
+
+
+def test_documented_convention_is_kept():
+    made = walk(40)
+    check = _check(made, made.poses())
+    assert check.verdict == "documented"
+    assert check.residual_m < 0.025  # a 24 x 32 picture steps 30 mm per pixel along a wall
+
+
+@pytest.mark.parametrize("changes", [{"axes": "opencv"}, {"direction": "world_to_camera"}, {"quarter_turns": 1}])
+def test_another_convention_is_found(changes):
+    made = walk(60)
+    convention = conventions.Convention(**changes)
+    check = _check(made, _stored(made, convention))
+    assert check.verdict == "other"
+    relative = [
+        rigid.inverse(poses[0]) @ poses[-1] for poses in (made.world_from_camera, _read(made, convention, check))
+    ]
+    np.testing.assert_allclose(relative[0], relative[1], atol=1e-6)
+
+
+def _read(made, convention, check):
+    return conventions.odometry_from_pose(_stored(made, convention), check.convention)
+
+
+def test_meaningless_poses_are_unusable():
+    made = walk(40)
+    pose = made.poses()
+    rng = np.random.default_rng(0)
+    shuffled = pose[rng.permutation(len(pose))] + np.concatenate([np.zeros((40, 4)), rng.normal(0, 1, (40, 3))], 1)
+    for bad in (
+        None,
+        np.zeros_like(pose),
+        np.repeat(pose[:1], 40, 0),
+        np.where(pose == pose[3], np.nan, pose),
+        shuffled,
+    ):
+        assert _check(made, bad).verdict == "unusable"
+
+
+def test_a_still_phone_proves_nothing():
+    made = walk(40)
+    made.world_from_camera[:] = made.world_from_camera[0]
+    made.world_from_camera[:, 0, 3] += np.linspace(0, 0.01, 40)
+    assert _check(made, made.poses()).verdict == "untested"
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_gravity_gives_the_turn_that_makes_upright(turns):
+    stored = cameras.turn_camera(walk().world_from_camera, turns)
+    assert (turns + upright.quarter_turns_from_gravity(stored)) % 4 == 0
+
+
+def test_a_phone_that_looks_down_is_left_alone():
+    down = rigid.look_at(np.array([1.0, 2, 1]), np.array([1.0, 0, 1.001]), np.array([0.0, 0, 1]))
+    assert upright.quarter_turns_from_gravity(cameras.turn_camera(down[None], 1)) == 0
