@@ -4,11 +4,8 @@ The only file that decodes OpenEXR and OpenCV images. Sizes are checked before p
 a few hundred bytes can ask for gigabytes.
 """
 
-import os
 import struct
 from pathlib import Path
-
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(32 << 20))
 
 import cv2
 import numpy as np
@@ -23,7 +20,7 @@ MAX_DEPTH_M = 1000.0
 
 def decode_color(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Decode an image file's bytes to RGB. Raises InputError CAP-020 when the bytes are not a readable image."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data else None
+    image = _decoded(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise InputError("CAP-020", what="the picture cannot be decoded", where=where, remedy="export the recording again")
     return image
@@ -49,7 +46,7 @@ def write_color(path: Path, color: UInt8[np.ndarray, "height width 3"], quality:
 
 def read_gray(path: Path) -> UInt8[np.ndarray, "height width"]:
     """Read an 8-bit single-channel PNG (masks, confidence) with its values as they are."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image = _decoded(Path(path).read_bytes(), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
         raise InputError("CAP-021", what="not a readable 8-bit single-channel picture", where=str(path), remedy="rebuild the stage that wrote it")
     return image
@@ -80,6 +77,14 @@ def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float16)}) as file:
         file.write(str(path))
+
+
+def _decoded(data: bytes, flags: int) -> np.ndarray | None:
+    """Decode with OpenCV; None for what it cannot read or finds too large (``OPENCV_IO_MAX_IMAGE_PIXELS``)."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        return None
 
 
 def _check_exr_size(path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from made_recordings import walk, write_zip
 
 from pipeline import cli
+from pipeline.files import images
 from stages.extract_frames import __main__ as front
 from stages.extract_frames import lzfse_blocks
 
@@ -23,6 +24,14 @@ def _refused(recording, folder, monkeypatch, capsys):
     assert stop.value.code == 2
     assert sorted(folder.rglob("*")) == before
     return capsys.readouterr().err
+
+
+def huge_jpeg() -> bytes:
+    """A small JPEG whose header asks for 60,000 x 60,000 pixels."""
+    data = bytearray(images.encode_jpeg(np.zeros((8, 8, 3), np.uint8)))
+    at = data.find(b"\xff\xc0") + 5
+    data[at : at + 4] = struct.pack(">2H", 60_000, 60_000)
+    return bytes(data)
 
 
 DEPTH = "rgbd/3.depth"
@@ -49,7 +58,11 @@ CASES = {
     ],
     "CAP-008": [{"members": {DEPTH: lzfse.compress(b"\0" * 100)}}, {"members": {DEPTH: lzfse.compress(bytes(10**6))}}],
     "CAP-001": [{"members": {DEPTH: b"bvx2garbage"}}, {"members": {DEPTH: lzfse.compress(bytes(3072))[:9]}}],
-    "CAP-020": [{"members": {"rgbd/3.jpg": b"\xff\xd8\xff nothing"}}],
+    "CAP-020": [
+        {"members": {"rgbd/3.jpg": b"\xff\xd8\xff nothing"}},
+        {"members": {"rgbd/3.jpg": b""}},
+        {"members": {"rgbd/3.jpg": huge_jpeg()}},
+    ],
     "CAP-002": [
         {"members": {"../escape": b"x"}},
         {"members": {"/etc/x": b"x"}},
