@@ -1,0 +1,152 @@
+"""Structure from motion over keyframes of the walk-through with COLMAP, on one CPU thread and with fixed seeds.
+
+`choose_keyframes` thins the clip, `reconstruct` returns the largest model in its own scale, or None.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, Int
+
+from pipeline.files.clips import Clip
+from pipeline.space import rigid
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """How keyframes are chosen, matched and mapped."""
+
+    keyframe_m: float = 0.12
+    """A keyframe follows the last one after this much motion, metres (odometry)."""
+    keyframe_deg: float = 9.0
+    """... or after this much turning, degrees."""
+    keyframe_s: float = 0.4
+    """Time between keyframes where there is no odometry, seconds."""
+    most_keyframes: int = 90
+    """Upper bound; steps are widened until it holds."""
+    features: int = 1500
+    """SIFT features kept per keyframe."""
+    first_octave: int = -1
+    """-1 doubles the picture before SIFT (small pictures need it), 0 does not and costs a third."""
+    peak_threshold: float = 0.004
+    """SIFT's contrast threshold; plain walls need a low one."""
+    overlap: int = 6
+    """Keyframes matched with this many successors."""
+    loop_m: float = 1.0
+    """Loop closure: also match keyframes whose odometry is this close, metres ..."""
+    loop_deg: float = 35.0
+    """... and whose viewing directions differ by less than this, degrees."""
+    loops_per_keyframe: int = 4
+    """At most this many loop candidates a keyframe."""
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """The largest model: registered keyframes, points in the model's frame (arbitrary scale) and what sees them."""
+
+    frame: Int[np.ndarray, "key"]
+    model_from_camera: Float[np.ndarray, "key 4 4"]
+    points_model: Float[np.ndarray, "point 3"]
+    observed_point: Int[np.ndarray, "observation"]
+    observed_key: Int[np.ndarray, "observation"]
+    observed_pixel: Float[np.ndarray, "observation 2"]
+    reprojection_px: float
+    reconstruction: pycolmap.Reconstruction
+    """COLMAP's own model, for its text files."""
+
+
+def choose_keyframes(clip: Clip, options: SfmOptions) -> Int[np.ndarray, "key"]:
+    """Thin a clip by its odometry's motion, or by time where there is none; always fewer than the bound."""
+    if clip.odometry_from_camera is None:
+        progress = clip.timestamp_s / options.keyframe_s
+    else:
+        pose = clip.odometry_from_camera
+        moved = np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1) / options.keyframe_m
+        turned = np.rad2deg(rigid.rotation_angle(pose[:-1, :3, :3], pose[1:, :3, :3])) / options.keyframe_deg
+        progress = np.concatenate([[0.0], np.cumsum(np.maximum(moved, turned))])
+    progress = progress * min(1.0, (options.most_keyframes - 2) / max(progress[-1], 1e-6))
+    step = np.floor(progress).astype(int)
+    starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
+    bounds = np.append(starts, len(step))
+    return np.array([low + int(clip.quality[low:high].argmax()) for low, high in zip(bounds[:-1], bounds[1:])])
+
+
+def choose_pairs(clip: Clip, keyframes: Int[np.ndarray, "key"], options: SfmOptions) -> Int[np.ndarray, "pair 2"]:
+    """Pair each keyframe with its successors, and with those that odometry says look at the same place again."""
+    count = len(keyframes)
+    first, second = np.triu_indices(count, 1)
+    chosen = second - first <= options.overlap
+    if clip.odometry_from_camera is None:
+        chosen |= (first % 5 == 0) & (second % 3 == 0)
+    else:
+        pose = clip.odometry_from_camera[keyframes]
+        near = np.linalg.norm(pose[first, :3, 3] - pose[second, :3, 3], axis=1) / options.loop_m
+        near = np.maximum(near, np.arccos(np.clip((pose[first, :3, 2] * pose[second, :3, 2]).sum(1), -1, 1)) / np.deg2rad(options.loop_deg))
+        for key in range(count):
+            candidates = np.flatnonzero((first == key) & ~chosen & (near < 1))
+            chosen[candidates[np.argsort(near[candidates], kind="stable")[: options.loops_per_keyframe]]] = True
+    return np.stack([first[chosen], second[chosen]], axis=1)
+
+
+def reconstruct(clip: Clip, options: SfmOptions, workspace: Path, seed: int) -> Sparse | None:
+    """Run COLMAP on the keyframes in an empty workspace; None when no model has at least three of them."""
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.set_random_seed(seed)
+    keyframes = choose_keyframes(clip, options)
+    names = [f"{frame:06d}.jpg" for frame in keyframes]
+    database, pictures = workspace / "database.db", clip.folder / "color"
+    _extract(clip, names, database, pictures, options)
+    listing = workspace / "pairs.txt"
+    listing.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in choose_pairs(clip, keyframes, options)))
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listing)
+    pycolmap.match_image_pairs(database, matching, pairing, verification, device=pycolmap.Device.cpu)
+    mapping = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, ba_refine_focal_length=False, ba_refine_extra_params=False)
+    mapping.mapper.num_threads, mapping.mapper.random_seed, mapping.triangulation.random_seed = 1, seed, seed
+    mapping.mapper.abs_pose_refine_focal_length = False
+    mapping.mapper.init_min_tri_angle = 6.0
+    mapping.mapper.abs_pose_min_num_inliers = 20
+    mapping.ba_global_frames_ratio = mapping.ba_global_points_ratio = 1.3
+    models = pycolmap.incremental_mapping(database, pictures, workspace, mapping)
+    if not models:
+        return None
+    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    return _sparse(largest) if largest.num_reg_images() >= 3 else None
+
+
+def _extract(clip, names, database, pictures, options):
+    intrinsics = np.median(clip.intrinsics, axis=0)
+    parameters = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=",".join(f"{value:.6f}" for value in parameters))
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
+    extraction.sift.max_num_features = options.features
+    extraction.sift.first_octave = options.first_octave
+    extraction.sift.peak_threshold = options.peak_threshold
+    pycolmap.extract_features(database, pictures, names, pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu)
+
+
+def _sparse(model):
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    key_of = {image.image_id: key for key, image in enumerate(images)}
+    camera_from_model = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
+    identifiers = sorted(model.points3D)
+    rows = [
+        (point, key_of[element.image_id], *model.images[element.image_id].points2D[element.point2D_idx].xy)
+        for point, identifier in enumerate(identifiers)
+        for element in model.points3D[identifier].track.elements
+    ]
+    table = np.array(rows).reshape(-1, 4)
+    return Sparse(
+        frame=np.array([int(image.name[:6]) for image in images]),
+        model_from_camera=rigid.inverse(camera_from_model),
+        points_model=np.array([model.points3D[identifier].xyz for identifier in identifiers]).reshape(-1, 3),
+        observed_point=table[:, 0].astype(int),
+        observed_key=table[:, 1].astype(int),
+        observed_pixel=table[:, 2:],
+        reprojection_px=float(model.compute_mean_reprojection_error()),
+        reconstruction=model,
+    )
