@@ -1,0 +1,41 @@
+# The user's targets. The flow itself is declared in pipeline/dag.py and expanded by pipeline/plan.py into
+# build/<agent>/plan/rules.mk, which is included here for the agents named on the command line.
+SHELL := /bin/sh
+MAKEFLAGS += --no-builtin-rules --no-builtin-variables
+ifeq ($(filter -j%,$(MAKEFLAGS)),)
+MAKEFLAGS += -j$(shell nproc 2>/dev/null || echo 2)
+endif
+.SUFFIXES:
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+PYTHON := .venv/bin/python
+PLAN   := $(PYTHON) -SE -m pipeline.plan
+RUN    := $(PYTHON) -SE -m pipeline.run
+AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
+WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
+
+.PHONY: help new test doctor clean FORCE
+
+help:
+	@sed 's/make cat/make $(or $(AGENT),cat)/' pipeline/help.txt
+	@echo 'agents: $(AGENTS)'
+
+include $(WANTED:%=build/%$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
+build/%/plan/rules.mk: .venv/.ok FORCE
+	@$(PLAN) plan $*
+
+.venv/.ok: envs/cpu.txt envs/cuda.txt envs/setup
+	@envs/setup
+
+new: .venv/.ok
+	@$(PLAN) new '$(AGENT)'
+
+test: .venv/.ok
+	@$(PYTHON) -m pytest tests
+
+doctor: .venv/.ok
+	@$(PYTHON) -m pipeline.doctor
+
+clean:
+	rm -rf build .snakemake

@@ -1,0 +1,139 @@
+"""What lies in `captures/<agent>/`: from file names and the recipe's `[videos]` to recordings with roles and a split.
+
+`find` looks at the disk, `assign` decides roles and split; both raise `InputError` before anything is written.
+User file names go into `videos.json` and nowhere else. Standard library only.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline import config
+from pipeline.errors import InputError
+from pipeline.videos import ROLES, SPLITS, Role, Split, Video
+
+SIDECAR = ".toml"
+"""`<recording>.toml` beside a recording may hold the same keys as its table in the recipe's `[videos]`."""
+_NEEDED: tuple[tuple[Role, str], ...] = (
+    ("walkthrough", "one slow walk through the empty room, named walkthrough..."),
+    ("turnaround", "one circle around the resting animal, named turnaround..."),
+    ("session", "one or more clips of the animal, named anything else"),
+)
+
+
+@dataclass(frozen=True)
+class Remarks:
+    """What the user says about one recording, in the recipe's `[videos]` or in a sidecar; None where nothing."""
+
+    role: str | None = None
+    """`walkthrough`, `turnaround`, `session` or `heldout`; otherwise the name decides."""
+    split: str | None = None
+    """`train` or `test` for a session; otherwise the last session is the test."""
+    synchronized_with: str | None = None
+    """File name of the recording whose clock this one shares."""
+    offset_s: float | None = None
+    """Time in that recording = time in this one + offset, seconds."""
+
+
+def find(folder: Path) -> list[str]:
+    """Return the names of the recordings in `folder`: `.r3d` files and EXR + JPG export folders."""
+    if not folder.is_dir():
+        return []
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and _is_recording(path))
+
+
+def not_understood(folder: Path) -> list[str]:
+    """Return the names of whatever else lies there."""
+    known = set(find(folder)) | {f"{name}{SIDECAR}" for name in find(folder)}
+    return sorted(path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith("."))
+
+
+def remarks(folder: Path, names: Sequence[str], overrides: Mapping[str, Any], where: str) -> dict[str, Remarks]:
+    """Return what the user says about each recording; the recipe's word counts more than a sidecar's."""
+    config.refuse_unknown(overrides, names, where=f"{where}: [videos]", kind="recording")
+    said = {}
+    for name in names:
+        sidecar = folder / f"{name}{SIDECAR}"
+        table = config.read_table(sidecar) if sidecar.is_file() else {}
+        said[name] = config.from_table(Remarks, {**table, **overrides.get(name, {})}, where=f"{where}: [videos.{name!r}]")
+    return said
+
+
+def assign(
+    said: Mapping[str, Remarks], known_ids: Mapping[str, str], hashes: Mapping[str, str | None], where: str
+) -> tuple[Video, ...]:
+    """Give every recording its id, role, split and clock.
+
+    `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another file.
+    Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be).
+    """
+    roles = {name: _role(name, remark, where) for name, remark in said.items()}
+    for role, what in _NEEDED:
+        if role not in roles.values():
+            raise InputError("CAP-040", f"there is no {role} among the recordings", where, f"add {what}")
+    order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
+    splits = _splits([name for name in order if roles[name] == "session"], said, where)
+    ids = _ids(order, known_ids)
+    return tuple(
+        Video(
+            id=ids[name],
+            file=name,
+            role=roles[name],
+            split=splits.get(name, "none"),
+            sha256=hashes[name],
+            synchronized_with=_partner(name, said, ids, where),
+            offset_s=said[name].offset_s or 0.0,
+        )
+        for name in sorted(said, key=ids.__getitem__)
+    )
+
+
+def builtin(session_count: int, heldout_of: int) -> dict[str, Remarks]:
+    """Return the recordings that `synthesize_capture` writes; `heldout_of` counts sessions from 1."""
+    sessions = [f"session-{i}.r3d" for i in range(1, session_count + 1)]
+    heldout = Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)
+    plain = dict.fromkeys(("walkthrough.r3d", "turnaround.r3d", *sessions), Remarks())
+    return {**plain, "heldout.r3d": heldout}
+
+
+def _is_recording(path: Path) -> bool:
+    if path.is_dir():
+        return any((path / inner / "metadata.json").is_file() for inner in (".", "EXR_RGBD"))
+    return path.suffix.lower() == ".r3d"
+
+
+def _role(name: str, remark: Remarks, where: str) -> Role:
+    if remark.role is None:
+        return next((role for role in ROLES if name.lower().startswith(role)), "session")
+    if remark.role not in ROLES:
+        raise InputError("CAP-041", f"{name!r} cannot have the role {remark.role!r}", where, f"roles: {', '.join(ROLES)}")
+    return remark.role
+
+
+def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) -> dict[str, Split]:
+    for name, remark in said.items():
+        allowed = SPLITS if name in sessions else ("none", None)
+        if remark.split not in (*allowed, None):
+            raise InputError("CAP-041", f"{name!r} cannot be in the split {remark.split!r}", where, "sessions: train or test")
+    if any(said[name].split == "test" for name in sessions) or len(sessions) < 2:
+        return {name: said[name].split or "train" for name in sessions}
+    return {name: said[name].split or ("test" if name == sessions[-1] else "train") for name in sessions}
+
+
+def _ids(order: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:
+    following = 1 + max((int(id[1:]) for id in known.values()), default=-1)
+    ids = {}
+    for name in order:
+        ids[name] = known.get(name) or f"v{following:03d}"
+        following += name not in known
+    return ids
+
+
+def _partner(name: str, said: Mapping[str, Remarks], ids: Mapping[str, str], where: str) -> str | None:
+    partner = said[name].synchronized_with
+    if partner is None:
+        return None
+    if partner not in ids or partner == name:
+        raise InputError("CAP-041", f"{name!r} shares no clock with {partner!r}", where, f"recordings: {', '.join(sorted(ids))}")
+    return ids[partner]

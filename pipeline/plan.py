@@ -1,0 +1,383 @@
+"""The planner: recipe + recordings + declaration -> `build/<home>/plan/`, which Make, Snakemake and `run` read.
+
+    python -SE -m pipeline.plan plan HOME             HOME is an agent, or <agent>/variants/<name>
+    python -SE -m pipeline.plan redo HOME ARTIFACT    have one artifact made again
+    python -SE -m pipeline.plan new AGENT             a recipe and a capture folder for a new animal
+
+Every check of the user's input happens before anything is written; a file is rewritten only when its content
+changes, so that its age tells Make what is to be looked at. Standard library only: it runs at every `make`.
+"""
+
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline import artifact, captures, config, dag, sources
+from pipeline.dag import Need, Node
+from pipeline.errors import InputError
+from pipeline.videos import Video
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}\Z")
+NAME_RULE = "use a-z, 0-9, _ and -, beginning with a letter or digit, 63 at most"
+VIDEOS_TABLE = "videos"
+BUILTIN = "synthetic_capture"
+
+
+@dataclass(frozen=True)
+class Home:
+    """Where artifacts stand: an agent's own folder or one of its variants'."""
+
+    agent: str
+    variant: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> "Home":
+        """Read `agent` or `agent/variants/name`; raises REC-004 for names that are no plain names."""
+        agent, *rest = text.split("/variants/", 1)
+        for name in (agent, *rest):
+            if not NAME.match(name):
+                raise InputError("REC-004", f"{name!r} is no name for an agent or a variant", remedy=NAME_RULE)
+        return cls(agent, *rest)
+
+    def __str__(self) -> str:
+        return self.agent if self.variant is None else f"{self.agent}/variants/{self.variant}"
+
+    @property
+    def folder(self) -> Path:
+        """Return where its artifacts stand."""
+        return Path("build", str(self))
+
+    @property
+    def plan(self) -> Path:
+        """Return where its plan stands."""
+        return self.folder / "plan"
+
+    @property
+    def base(self) -> "Home":
+        """Return the agent's own home."""
+        return Home(self.agent)
+
+
+@dataclass(frozen=True)
+class Input:
+    """One artifact that a job reads."""
+
+    name: str
+    path: str
+    part: str | None
+    """Prefix of the files that count, where it is not the whole artifact."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One artifact to make, with all that `run` needs to know."""
+
+    id: str
+    artifact: str
+    stage: str
+    video: str | None
+    home: str
+    out: str
+    inputs: tuple[Input, ...]
+    keys: tuple[str, ...]
+    """Files that, with the inputs, decide the result."""
+    arguments: tuple[str, ...]
+    threads: int
+    gpu: int
+    memory_mb: int
+    resumable: bool
+
+    @property
+    def stamp(self) -> str:
+        """Return the file that Make looks at."""
+        return f"{self.out}/{artifact.STAMP}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that is known before the first stage runs."""
+
+    home: Home
+    videos: tuple[Video, ...]
+    builtin: bool
+    """Whether there are no recordings and the built-in capture stands in."""
+    tables: dict[str, dict[str, Any]]
+    """Per artifact: its stage's table, with the variant's changes."""
+    touched: frozenset[str]
+    """Artifacts that the variant makes anew; all of them for an agent itself."""
+
+    def home_of(self, name: str) -> Home:
+        """Return where the artifact `name` stands."""
+        return self.home if name in self.touched else self.home.base
+
+
+def read(home: Home, cache: sources.Cache) -> Plan:
+    """Check recipe and recordings and return the plan; changes nothing on disk."""
+    recipe, where = _recipe(Path("agents", f"{home.agent}.toml"), cache)
+    overlay = {}
+    if home.variant:
+        overlay, _ = _recipe(Path("agents", "variants", f"{home.variant}.toml"), cache)
+    tables = {n.artifact: {**recipe.get(dag.table_of(n), {}), **n.fixed} for n in dag.FLOW}
+    changed = {n.artifact: {**tables[n.artifact], **overlay.get(dag.table_of(n), {}), **n.fixed} for n in dag.FLOW}
+    folder = Path("captures", home.agent)
+    names = captures.find(folder)
+    if names:
+        said = captures.remarks(folder, names, recipe.get(VIDEOS_TABLE, {}), where)
+        hashes = {name: _digest_of_recording(folder / name, cache) for name in names}
+    else:
+        said = _builtin_remarks(recipe.get("synthesize_capture", {}), recipe.get(VIDEOS_TABLE, {}), cache, where)
+        hashes = dict.fromkeys(said)
+    videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where)
+    touched = _touched(tables, changed) if home.variant else frozenset(dag.NODES)
+    return Plan(home, videos, not names, changed, touched)
+
+
+def jobs(plan: Plan) -> list[Job]:
+    """Expand the declaration for the plan's recordings, in flow order."""
+    nodes = [node for node in dag.FLOW if plan.builtin or node.artifact != BUILTIN]
+    chosen = {n.artifact: [v for v in plan.videos if v.role in n.roles] if n.roles else [None] for n in nodes}
+    return [_job(plan, node, video) for node in nodes for video in chosen[node.artifact]]
+
+
+def write(plan: Plan, cache: sources.Cache) -> None:
+    """Write the plan's files, each only if it changed."""
+    all_jobs = jobs(plan)
+    base = plan.home.base.plan
+    ids = _known_ids(plan.home.base) | {video.file: video.id for video in plan.videos}
+    artifact.write_if_changed(base / "ids.json", _json(ids))
+    artifact.write_if_changed(base / "videos.json", _json([asdict(video) for video in plan.videos]))
+    for video in plan.videos:
+        artifact.write_if_changed(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
+    for name in {job.artifact for job in all_jobs if job.home == str(plan.home)}:
+        node, table = dag.NODES[name], plan.tables[name]
+        artifact.write_if_changed(plan.home.plan / f"configs/{name}.json", _json(table))
+        key = {
+            "stage": node.stage,
+            "version": node.version,
+            "code": sources.digest(node.stage, cache),
+            "table": table,
+            "videos": [[v.id, v.role, v.split, v.synchronized_with, v.offset_s] for v in _seen(plan, node)],
+        }
+        artifact.write_if_changed(plan.home.plan / f"keys/{name}.json", _json(key))
+    artifact.write_if_changed(plan.home.plan / "dag.json", _json([asdict(job) | {"stamp": job.stamp} for job in all_jobs]))
+    artifact.write_if_changed(plan.home.plan / "rules.mk", _rules(plan, all_jobs))
+
+
+def mark_redo(home: Home, name: str) -> None:
+    """Have the artifact `name` of `home` made again by the next build, although nothing changed."""
+    known = json.loads((home.plan / "dag.json").read_text())
+    marked = [job for job in known if job["artifact"] == name]
+    if not marked:
+        raise InputError("REC-007", f"no artifact {name!r}", str(home), f"artifacts: {', '.join(dag.NODES)}")
+    for job in marked:
+        artifact.write_if_changed(redo_mark(job["home"], job["id"]), "made again by the next build\n")
+        Path(job["stamp"]).unlink(missing_ok=True)
+
+
+def redo_mark(home: str, job_id: str) -> Path:
+    """Return the file whose presence has `run` do a job although its key is unchanged."""
+    return Path("build", home, "plan", "redo", job_id)
+
+
+def new_agent(name: str) -> None:
+    """Write the recipe and the capture folder of a new animal; an existing recipe stays as it is."""
+    home = Home.parse(name)
+    recipe = Path("agents", f"{home.agent}.toml")
+    if not recipe.exists():
+        template = Path("agents", "cat.toml").read_text()
+        artifact.write_if_changed(recipe, template.replace("captures/cat/", f"captures/{home.agent}/"))
+    Path("captures", home.agent).mkdir(parents=True, exist_ok=True)
+    print(f"recipe {recipe}; put recordings into captures/{home.agent}/, then: make {home.agent}")
+
+
+def _recipe(path: Path, cache: sources.Cache) -> tuple[dict[str, Any], str]:
+    """Read a recipe or an overlay and refuse tables and keys that no stage knows."""
+    if not path.is_file():
+        known = ", ".join(sorted(other.stem for other in path.parent.glob("*.toml"))) or "none"
+        raise InputError("REC-005", "there is no such recipe", str(path), f"known: {known}; a new animal: make new AGENT=...")
+    recipe = config.read_table(path)
+    stages = {dag.table_of(node): node for node in dag.FLOW}
+    config.refuse_unknown(recipe, {*stages, VIDEOS_TABLE}, where=str(path), kind="table")
+    for name, table in recipe.items():
+        if not isinstance(table, dict):
+            raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
+        known = sources.settings(stages[name].stage, cache) if name in stages else None
+        if known is not None:
+            config.refuse_unknown(table, set(known) - set(stages[name].fixed), where=f"{path}: [{name}]")
+    return recipe, str(path)
+
+
+def _builtin_remarks(
+    table: Mapping[str, Any], overrides: Mapping[str, Any], cache: sources.Cache, where: str
+) -> dict[str, captures.Remarks]:
+    """Return the built-in capture's recordings; an override may change them as it may a user's."""
+    settings = {**(sources.settings("synthesize_capture", cache) or {}), **table}
+    said = captures.builtin(settings["session_count"], settings["heldout_of"])
+    config.refuse_unknown(overrides, said, where=f"{where}: [videos]", kind="recording")
+    given = {name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()}
+    return {
+        name: config.from_table(captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]")
+        for name in said
+    }
+
+
+def _digest_of_recording(path: Path, cache: sources.Cache) -> str:
+    if path.is_file():
+        return cache.get(path, artifact.digest_of_file)
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    return artifact.digest_of({file.relative_to(path).as_posix(): cache.get(file, artifact.digest_of_file) for file in files})
+
+
+def _known_ids(base: Home) -> dict[str, str]:
+    try:
+        return json.loads((base.plan / "ids.json").read_text())
+    except (FileNotFoundError, ValueError):
+        return {}
+
+
+def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any]) -> frozenset[str]:
+    """Return what an overlay changes: the artifacts with another table, and all that is made from them."""
+    touched: set[str] = set()
+    for node in dag.FLOW:
+        from_touched = any(need.artifact in touched for need in dag.needs_of(node))
+        if tables[node.artifact] != changed[node.artifact] or from_touched:
+            touched.add(node.artifact)
+    return frozenset(touched)
+
+
+def _job(plan: Plan, node: Node, video: Video | None) -> Job:
+    home = plan.home_of(node.artifact)
+    out = home.folder / node.artifact / (video.id if video else "")
+    inputs: list[Input] = []
+    arguments: list[str] = []
+    for need in dag.needs_of(node):
+        if need.artifact == BUILTIN and not plan.builtin:
+            if video:
+                arguments += [f"--{need.option}", f"captures/{plan.home.agent}/{video.file}"]
+            continue
+        found = list(_inputs(plan, need, node, video))
+        inputs += found
+        together = plan.home_of(need.artifact).folder / need.artifact
+        path = together if dag.NODES[need.artifact].roles and not node.roles else Path(found[0].path, found[0].part or "")
+        arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
+    arguments += ["--config", str(home.plan / f"configs/{node.artifact}.json"), "--out", str(out)]
+    arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
+    keys = [str(home.plan / f"keys/{node.artifact}.json")]
+    keys += [str(home.base.plan / f"keys/video.{video.id}.json")] if video else []
+    return Job(
+        id=f"{node.artifact}.{video.id}" if video else node.artifact,
+        artifact=node.artifact,
+        stage=node.stage,
+        video=video.id if video else None,
+        home=str(home),
+        out=str(out),
+        inputs=tuple(inputs),
+        keys=tuple(keys),
+        arguments=tuple(arguments),
+        threads=node.threads,
+        gpu=node.gpu,
+        memory_mb=node.memory_mb,
+        resumable=node.resumable,
+    )
+
+
+def _inputs(plan: Plan, need: Need, node: Node, video: Video | None) -> Iterator[Input]:
+    """Yield the artifacts that one need of one job means."""
+    source = dag.NODES[need.artifact]
+    folder = plan.home_of(need.artifact).folder / need.artifact
+    if not source.roles:
+        part = f"{need.part}/{video.file}" if need.part and video else need.part
+        yield Input(need.artifact, str(folder), part)
+        return
+    for other in [video] if node.roles else plan.videos:
+        if node.roles or (other.role in (need.roles or source.roles) and other.role in source.roles and other.split in need.splits):
+            yield Input(f"{need.artifact}/{other.id}", str(folder / other.id), need.part)
+
+
+def _seen(plan: Plan, node: Node) -> list[Video]:
+    """Return the recordings whose set and split decide the result of a node that is one job for all."""
+    if node.roles:
+        return []
+    roles, splits = set(node.sees), {role: {"train", "test", "none"} for role in node.sees}
+    for need in dag.needs_of(node):
+        for role in need.roles or dag.NODES[need.artifact].roles:
+            roles.add(role)
+            splits.setdefault(role, set()).update(need.splits)
+    return [video for video in plan.videos if video.role in roles and video.split in splits[video.role]]
+
+
+def _rules(plan: Plan, all_jobs: list[Job]) -> str:
+    """Return the Make rules: one stamp per job, one target per artifact, and the agent's own."""
+    name, home = plan.home.agent, plan.home
+    lines = ["# written by pipeline/plan.py"]
+    stamps: dict[str, list[str]] = {}
+    for job in all_jobs:
+        stamps.setdefault(job.artifact, []).append(job.stamp)
+        needed = dict.fromkeys([*(f"{i.path}/{artifact.STAMP}" for i in job.inputs), *job.keys])
+        lines += [f"{job.stamp}: {' '.join(needed)}", f"\t@$(RUN) {home} {job.id}"]
+    for node, made in stamps.items():
+        lines += [f".PHONY: {name}.{node} {name}.{node}.redo", f"{name}.{node}: {' '.join(made)}"]
+        lines += [f"{name}.{node}.redo:", f"\t@$(PLAN) redo {home} {node}", f"\t@$(MAKE) --no-print-directory {name}.{node}"]
+    pages = [f"{plan.home_of(node).folder}/{node}/index.html" for node in ("report", "simulator")]
+    lines += [f".PHONY: {name}", f"{name}: {' '.join(stamp for made in stamps.values() for stamp in made)}"]
+    lines += [f"\t@echo '[{home}] done. Open:'", *(f"\t@echo '  {page}'" for page in pages)]
+    lines += [f"\t@echo 'Next: make {name}.<artifact>[.redo], make {name} VARIANT=no_scene, make new AGENT=<name>, make help'"]
+    return "\n".join(lines) + "\n"
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=1, sort_keys=True) + "\n"
+
+
+def _cache_file(home: Home) -> Path:
+    return home.plan / "cache.json"
+
+
+def _cache(home: Home) -> sources.Cache:
+    """Return what earlier runs of the planner read, by size and time of the files; lost, it only costs time."""
+    try:
+        return sources.Cache(json.loads(_cache_file(home).read_text()))
+    except (FileNotFoundError, ValueError):
+        return sources.Cache()
+
+
+def _plan(home: Home) -> None:
+    """Plan `home`; a variant stands on an up-to-date plan of its agent."""
+    cache = _cache(home)
+    planned = [read(each, cache) for each in dict.fromkeys((home.base, home))]
+    for plan in planned:
+        write(plan, cache)
+    artifact.write_if_changed(_cache_file(home), json.dumps(cache.fresh))
+    folder = Path("captures", home.agent)
+    if planned[0].builtin:
+        print(f"[{home}] nothing in {folder}/: building from the built-in synthetic capture")
+    else:
+        for name in captures.not_understood(folder):
+            print(f"[{home}] not a recording, left alone: {name!r}")
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line of the planner; returns its exit code."""
+    try:
+        match arguments:
+            case ["plan", home]:
+                _plan(Home.parse(home))
+            case ["redo", home, name]:
+                mark_redo(Home.parse(home), name)
+            case ["new", name]:
+                new_agent(name)
+            case _:
+                print(__doc__, file=sys.stderr)
+                return 2
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,246 @@
+"""The runner: do one job so that its artifact is complete or absent. What Make, Snakemake and schedulers call.
+
+    python -SE -m pipeline.run HOME JOB      for example `toy masks.v002`
+
+lock -> key -> unchanged? refresh the stamp -> clean up after the dead -> run the stage program, which publishes
+atomically -> record -> stamp. Exit codes: the stage's own (2 bad input, 75 stopped but resumable, 76 diverged),
+128 + n when signal n ended it. Standard library only.
+"""
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import json
+import os
+import platform
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from pipeline import artifact, plan
+from pipeline.errors import InputError
+
+LEAST_FREE_BYTES = 1 << 29
+"""A stage does not begin on a disk with less than this free."""
+LONGEST_S = 7 * 24 * 3600
+"""A stage that takes longer hangs."""
+GRACE_S = 30
+"""Time that a stage gets to save itself after SIGTERM."""
+EXPLAINED = {
+    75: "stopped after saving; run the same again to go on",
+    76: "training diverged; its diagnosis stands above",
+    128 + signal.SIGKILL: "killed; if nobody did it, the memory was full: close other programs, or build with -j1",
+}
+
+
+def run(home: str, job_id: str) -> int:
+    """Do the job if anything that decides its artifact has changed; return the exit code."""
+    job = _job(home, job_id)
+    out, stamp = Path(job["out"]), Path(job["stamp"])
+    resume = Path("build", job["home"], "resume", job_id)
+    redo = plan.redo_mark(job["home"], job_id)
+    with _lock(Path("build", job["home"], "locks", job_id), job_id):
+        artifact.clean(out)
+        key = _key(job)
+        made = artifact.read_manifest(out)
+        if made is None or made.key != key or redo.exists():
+            if redo.exists() or _other_key(resume, key):
+                shutil.rmtree(resume, ignore_errors=True)
+            code = _do(job, key, resume)
+            if code:
+                return code
+        stamp.touch()
+        shutil.rmtree(resume, ignore_errors=True)
+        redo.unlink(missing_ok=True)
+    return 0
+
+
+def _job(home: str, job_id: str) -> dict[str, Any]:
+    path = plan.Home.parse(home).plan / "dag.json"
+    if not path.is_file():
+        raise InputError("RUN-001", "is not planned yet", home, f"run `make {home}`")
+    for job in json.loads(path.read_text()):
+        if job["id"] == job_id:
+            return job
+    raise InputError("RUN-001", f"has no job {job_id!r}", home, f"see {path}")
+
+
+@contextlib.contextmanager
+def _lock(path: Path, job_id: str) -> Iterator[None]:
+    """Hold the job's kernel lock: it dies with its owner, and a second runner waits for the first."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            _say(job_id, "is being made by another build; waiting for it")
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _key(job: dict[str, Any]) -> str:
+    """Hash all that decides the artifact: stage, code, table, recordings, and the content of every input."""
+    contents = {}
+    for entry in job["inputs"]:
+        manifest = artifact.opened(Path(entry["path"]), entry["name"])
+        part = entry["part"]
+        chosen = {n: digest for n, digest in manifest.files.items() if part and (n == part or n.startswith(f"{part}/"))}
+        contents[entry["name"]] = artifact.content_of(chosen) if part else manifest.content
+    return artifact.digest_of([contents, [json.loads(Path(path).read_text()) for path in job["keys"]]])
+
+
+def _other_key(resume: Path, key: str) -> bool:
+    """Tell whether checkpoints, if any, belong to another key; they must never be gone on from."""
+    try:
+        return (resume / "key").read_text() != key
+    except FileNotFoundError:
+        return True
+
+
+def _do(job: dict[str, Any], key: str, resume: Path) -> int:
+    """Run the stage program and, if its artifact stands, record how it went."""
+    out = Path(job["out"])
+    if not Path("stages", job["stage"], "__main__.py").is_file():
+        raise InputError("RUN-002", f"there is no stage program {job['stage']!r}", "stages/", "this build is incomplete")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(out.parent).free
+    if free < LEAST_FREE_BYTES:
+        raise InputError("SYS-001", f"only {free >> 20} MB free on the disk", str(out), "free some space and run the same again")
+    arguments = [*job["arguments"], "--key", key, "--threads", str(job["threads"])]
+    if job["resumable"]:
+        resume.mkdir(parents=True, exist_ok=True)
+        artifact.write_if_changed(resume / "key", key)
+        arguments += ["--resume", str(resume)]
+    _say(job["id"], "begins")
+    start = time.time()
+    code, peak_mb = _spawn(job, [sys.executable, "-m", f"stages.{job['stage']}", *arguments])
+    seconds = time.time() - start
+    if code:
+        _say(job["id"], EXPLAINED.get(code, f"failed with exit code {code}"))
+        return code
+    made = artifact.read_manifest(out)
+    assert made is not None and made.key == key, f"{job['stage']} ended well without writing {out}"
+    record = {
+        "key": key,
+        "seconds": round(seconds, 2),
+        "peak_memory_mb": round(peak_mb),
+        "threads": job["threads"],
+        "host": platform.node(),
+        "commit": _commit(),
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    path = Path("build", job["home"], "records", f"{job['id']}.json")
+    artifact.write_if_changed(path, json.dumps(record, indent=1, sort_keys=True) + "\n")
+    _say(job["id"], f"done in {seconds:.1f} s, peak {peak_mb:.0f} MB{_quality(out)}")
+    return 0
+
+
+def _spawn(job: dict[str, Any], command: list[str]) -> tuple[int, float]:
+    """Run `command` with its output forwarded line by line; return exit code and peak memory in MB."""
+    child = subprocess.Popen(
+        command,
+        env=_environment(job["threads"]),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        preexec_fn=_bind_to_parent,
+    )
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        child.terminate()
+        threading.Timer(GRACE_S, child.kill).start()
+
+    old = signal.signal(signal.SIGTERM, stop)
+    reader = threading.Thread(target=_forward, args=(job["id"], child.stdout), daemon=True)
+    reader.start()
+    watchdog = threading.Timer(LONGEST_S, child.kill)
+    watchdog.daemon = True
+    watchdog.start()
+    try:
+        _, status, usage = os.wait4(child.pid, 0)
+    except KeyboardInterrupt:  # the child has had its own; what it saved is kept
+        _, status, usage = os.wait4(child.pid, 0)
+    finally:
+        watchdog.cancel()
+        signal.signal(signal.SIGTERM, old)
+    reader.join(timeout=2)
+    code = os.waitstatus_to_exitcode(status)
+    child.returncode = code
+    return (128 - code if code < 0 else code), usage.ru_maxrss / 1024
+
+
+def _bind_to_parent() -> None:
+    """In the child: die with the runner, leave no core dump."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """Return the environment of a stage: fixed hashing, as many threads as declared, no spinning, bounded decoders."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+    return {
+        **os.environ,
+        **dict.fromkeys(names, str(threads)),
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "GOMP_SPINCOUNT": "0",
+        "CUBLAS_WORKSPACE_CONFIG": ":4096:8",
+        "OPENCV_IO_MAX_IMAGE_PIXELS": str(32 << 20),
+        "PYTHONHASHSEED": "0",
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def _forward(job_id: str, lines: Any) -> None:
+    for line in lines:
+        _say(job_id, line.decode(errors="replace").rstrip())
+
+
+def _say(job_id: str, text: str) -> None:
+    print(f"[{job_id}] {text}", file=sys.stderr, flush=True)
+
+
+def _quality(out: Path) -> str:
+    """Return what the artifact says about itself, for the last line."""
+    try:
+        report = json.loads((out / "qa.json").read_text())
+    except (FileNotFoundError, ValueError):
+        return ""
+    worries = [f"{check['name']} {check['value']} {check['unit']}".strip() for check in report["checks"] if check["status"] != "ok"]
+    return f", quality {report['status']}" + (f": {'; '.join(worries)}" if worries else "")
+
+
+def _commit() -> str | None:
+    try:
+        return subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line of the runner; returns its exit code."""
+    if len(arguments) != 2:
+        print(__doc__, file=sys.stderr)
+        return 2
+    try:
+        return run(*arguments)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        print(f"error: {InputError('SYS-001', 'the disk is full', arguments[1], 'free some space and run the same again')}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

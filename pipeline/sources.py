@@ -1,0 +1,128 @@
+"""What the code of a stage is, read from its syntax trees without importing anything.
+
+`digest` changes when the meaning of a program or of a local module it imports can have changed, not with
+comments, docstrings or layout; `settings` are the fields of its `Config`. Standard library only.
+"""
+
+import ast
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline import artifact, dag
+
+
+@dataclass(frozen=True)
+class Source:
+    """One Python file, as far as the planner cares."""
+
+    digest: str
+    imports: tuple[str, ...]
+    """Local modules that it may import, dotted."""
+    settings: dict[str, dict[str, Any]]
+    """Per dataclass: its fields' defaults, None where they are no literals."""
+
+
+@dataclass
+class Cache:
+    """What was read before, by path, for as long as size and time of a file stay the same."""
+
+    known: dict[str, Any] = field(default_factory=dict)
+    fresh: dict[str, Any] = field(default_factory=dict)
+
+    def get(self, path: Path, read: Any) -> Any:
+        """Return `read(path)`, a value of plain JSON types, or what it was last time."""
+        stat = path.stat()
+        mark = [stat.st_size, stat.st_mtime_ns]
+        entry = self.fresh.get(str(path)) or self.known.get(str(path))
+        if entry is None or entry["mark"] != mark:
+            entry = {"mark": mark, "value": read(path)}
+        self.fresh[str(path)] = entry
+        return entry["value"]
+
+
+def digest(stage: str, cache: Cache) -> str:
+    """Hash the program `stage`, the local modules below it, and the other files of its room (pages, templates)."""
+    waiting, seen = [f"stages.{stage}.__main__"], {}
+    while waiting:
+        module = waiting.pop()
+        path = _path_of(module)
+        if module in seen or path is None or _is_plumbing(module):
+            continue
+        source = Source(**cache.get(path, _read))
+        seen[module] = source.digest
+        waiting += source.imports
+    return artifact.digest_of([seen, _assets(Path("stages") / stage, cache)])
+
+
+def settings(stage: str, cache: Cache) -> dict[str, Any] | None:
+    """Return the fields of the stage's `Config` and their literal defaults, or None if it cannot be told."""
+    modules = [f"stages.{stage}.__main__"]
+    while modules:
+        path = _path_of(modules.pop())
+        if path is None:
+            continue
+        source = Source(**cache.get(path, _read))
+        if "Config" in source.settings:
+            return source.settings["Config"]
+        modules += [name.removesuffix(".Config") for name in source.imports if name.endswith(".Config")]
+    return None
+
+
+def _path_of(module: str) -> Path | None:
+    path = Path(*module.split("."))
+    return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
+
+
+def _is_plumbing(module: str) -> bool:
+    return module.removeprefix("pipeline.") in dag.PLUMBING
+
+
+def _assets(room: Path, cache: Cache) -> dict[str, str]:
+    """Return the digests of the room's files that are not Python and that the stage may read."""
+    found = {}
+    for path in sorted(room.iterdir()) if room.is_dir() else ():
+        if path.name.startswith((".", "__pycache__", "node_modules")) or path.suffix == ".py":
+            continue
+        if path.is_dir():
+            found |= _assets(path, cache)
+        else:
+            found[path.as_posix()] = cache.get(path, artifact.digest_of_file)
+    return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    tree = ast.parse(path.read_bytes(), str(path))
+    imports = {name for node in ast.walk(tree) for name in _imported(node) if name.startswith(("pipeline", "stages"))}
+    classes = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    fields = {cls.name: {n.target.id: _literal(n.value) for n in cls.body if isinstance(n, ast.AnnAssign)} for cls in classes}
+    for node in ast.walk(tree):
+        _drop_docstrings(node)
+    return asdict(Source(artifact.digest_of(ast.dump(tree)), tuple(sorted(imports)), fields))
+
+
+def _imported(node: ast.AST) -> list[str]:
+    """Return the modules that a statement may import; `from a import b` may mean `a.b`, and imports package `a`."""
+    if isinstance(node, ast.Import):
+        names = [alias.name for alias in node.names]
+    elif isinstance(node, ast.ImportFrom) and node.module:
+        names = [f"{node.module}.{alias.name}" for alias in node.names]
+    else:
+        return []
+    return [".".join(name.split(".")[: i + 1]) for name in names for i in range(name.count(".") + 1)]
+
+
+def _drop_docstrings(node: ast.AST) -> None:
+    body = getattr(node, "body", None)
+    if isinstance(body, list):
+        kept = [n for n in body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
+        node.body = kept or [ast.Pass()]
+
+
+def _literal(value: ast.expr | None) -> Any:
+    try:
+        return None if value is None else ast.literal_eval(value)
+    except ValueError:
+        return None
+
