@@ -1,0 +1,90 @@
+"""The quality page of the flow: how often both directions agree, and flow wheels of a few frames."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline import qa
+from stages.estimate_flow.estimation import STRIDE_PX, Flow
+
+SHOWN_FRAMES = 6
+CERTAIN = 128
+"""stored confidence (of 255) that counts as agreement"""
+
+
+@dataclass(frozen=True)
+class Review:
+    """What one gap looks like."""
+
+    gap: int
+    agreement: float
+    """share of vectors on which both directions agree"""
+    speed_px: float
+    """mean length of the certain vectors, colour pixels"""
+    strip: UInt8[np.ndarray, "height width 3"] | None
+
+
+def review(gap: int, forward: Flow, color: Callable[[int], UInt8[np.ndarray, "height width 3"]]) -> Review:
+    """Summarise the forward flow of one gap; ``color(i)`` gives frame i."""
+    if len(forward.flow) == 0:
+        return Review(gap, float("nan"), float("nan"), None)
+    certain = forward.confidence >= CERTAIN
+    speed_px = [
+        float(np.linalg.norm(flow[keep].astype(np.float32), axis=-1).mean())
+        for flow, keep in zip(forward.flow, certain, strict=True)
+        if keep.any()
+    ]
+    shown = np.unique(np.linspace(0, len(forward.flow) - 1, SHOWN_FRAMES).astype(int))
+    strip = np.concatenate([_column(color(int(i)), forward.flow[i], forward.confidence[i]) for i in shown], axis=1)
+    return Review(gap, float(certain.mean()), float(np.mean(speed_px)) if speed_px else 0.0, strip)
+
+
+def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
+    """Write the stage's own judgement."""
+    limits = {1: 0.6, 2: 0.5, 4: 0.35, 8: 0.2}
+    checks = [
+        qa.Check(
+            f"both directions agree, {each.gap} apart",
+            100 * each.agreement,
+            "%",
+            warn=100 * limits[each.gap],
+            better="higher",
+        )
+        for each in reviews
+    ] + [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
+    pictures = [
+        qa.Picture(
+            f"gap_{each.gap}", each.strip, f"frames, flow to {each.gap} later (hue = direction), dark where uncertain"
+        )
+        for each in reviews
+        if each.strip is not None
+    ]
+    qa.write(
+        folder,
+        good="one smooth colour for the moving camera, another one inside the animal's outline, dark only at edges",
+        bad="speckles of all colours, large dark areas in the middle",
+        checks=checks,
+        pictures=pictures,
+    )
+
+
+def flow_wheel(flow: Float[np.ndarray, "height width 2"], full_px: float) -> UInt8[np.ndarray, "height width 3"]:
+    """Colour vectors: hue is direction, brightness is length up to ``full_px``."""
+    flow = flow.astype(np.float32)
+    hue = np.degrees(np.arctan2(flow[..., 1], flow[..., 0])) % 360 / 2
+    value = np.clip(np.linalg.norm(flow, axis=-1) / full_px, 0, 1) * 255
+    hsv = np.stack([hue, np.full_like(hue, 220), value], axis=-1).astype(np.uint8)
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
+
+
+def _column(color: np.ndarray, flow: np.ndarray, confidence: np.ndarray) -> UInt8[np.ndarray, "height width 3"]:
+    full_px = max(float(np.percentile(np.linalg.norm(flow.astype(np.float32), axis=-1), 95)), 1.0)
+    wheel = flow_wheel(flow, full_px) * (0.25 + 0.75 * confidence[..., None] / 255)
+    size = (2 * flow.shape[1], 2 * flow.shape[0])
+    big = cv2.resize(wheel.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    crop = color[: flow.shape[0] * STRIDE_PX, : flow.shape[1] * STRIDE_PX]
+    return np.concatenate([cv2.resize(crop, size, interpolation=cv2.INTER_AREA), big], axis=0)

@@ -1,0 +1,94 @@
+"""Flow of shifted and rotated textures is found on the stored grid, and uncertainty is told."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline import artifact, cli
+from pipeline.files import arrays, images
+from stages.estimate_flow import __main__ as front
+from stages.estimate_flow.estimation import Estimator, Search, flow_of_gap, grid_centers
+
+SEARCH = Search(working_side_px=320, finest_scale=1, patch_stride_px=3, iterations=25, refinements=0)
+
+
+def texture(height, width, seed=0):
+    """A smooth random RGB picture."""
+    rng = np.random.default_rng(seed)
+    noise = sum(
+        cv2.resize(rng.normal(size=(height // s, width // s)), (width, height), interpolation=cv2.INTER_CUBIC) * s
+        for s in (4, 8, 16)
+    )
+    scaled = (noise - noise.min()) / np.ptp(noise) * 255
+    return np.repeat(scaled.astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def moved(image, matrix):
+    """Warp so that a point at p (pixel centres at +0.5) goes to matrix @ (p, 1)."""
+    shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    indexed = np.linalg.inv(shift) @ np.vstack([matrix, [0, 0, 1]]) @ shift
+    return cv2.warpAffine(image, indexed[:2], image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.parametrize("size", [(160, 120), (120, 160), (400, 300), (162, 121)])
+@pytest.mark.parametrize("matrix", [[[1, 0, 5.0], [0, 1, -3.0]], [[0.999, -0.04, 4.0], [0.04, 0.999, -2.0]]])
+def test_known_motion_is_found_in_colour_pixels(size, matrix):
+    matrix = np.array(matrix)
+    estimator = Estimator(size, SEARCH, tolerance_px=1.5)
+    pair = [estimator.reduce(picture) for picture in (texture(*size), moved(texture(*size), matrix))]
+    forward, backward = estimator.between(*pair)
+    grid_px = grid_centers(size)
+    true_px = grid_px @ matrix[:, :2].T + matrix[:, 2] - grid_px
+    error_px = np.linalg.norm(forward.flow[0] - true_px, axis=-1)[4:-4, 4:-4]
+    assert np.median(error_px) < 0.3  # a quarter of a pixel is what the search reaches on smooth texture
+    assert np.median(forward.confidence[0][4:-4, 4:-4]) > 180
+    np.testing.assert_allclose(np.median(backward.flow[0] + forward.flow[0], axis=(0, 1)), 0, atol=0.3)
+
+
+def test_what_leaves_or_changes_is_uncertain():
+    size = (160, 120)
+    estimator = Estimator(size, SEARCH, tolerance_px=1.5)
+    first, second = texture(*size), moved(texture(*size), np.array([[1, 0, 30.0], [0, 1, 0]]))
+    second[60:100, 40:80] = texture(40, 40, seed=5)
+    confidence = estimator.between(*map(estimator.reduce, (first, second)))[0].confidence[0]
+    assert np.median(confidence[:, -6:]) == 0
+    assert np.median(confidence[16:24, 4:11]) < 100
+
+
+def test_a_clip_shorter_than_the_gap_gives_empty_flow():
+    estimator = Estimator((64, 48), SEARCH, tolerance_px=1.5)
+    gray = estimator.reduce(texture(64, 48))
+    forward, backward = flow_of_gap(lambda frame: gray, 3, 8, estimator)
+    assert forward.flow.shape == backward.flow.shape == (0, 16, 12, 2)
+
+
+def test_the_stage_writes_all_gaps_both_ways(tmp_path, monkeypatch):
+    frames = tmp_path / "frames"
+    with artifact.create(frames, stage="extract_frames", config={}, inputs={}, key=None) as folder:
+        for name in ("color", "depth"):
+            (folder / name).mkdir()
+        images.write_depth(folder / "depth" / "000000.exr", np.ones((8, 6)))
+        for i in range(10):
+            shifted = moved(texture(64, 48), np.array([[1, 0, i], [0, 1, 0.0]]))
+            images.write_color(folder / "color" / f"{i:06d}.jpg", shifted)
+        eye = np.tile(np.eye(3), (10, 1, 1))
+        arrays.save(
+            folder / "frames.npz",
+            timestamp_s=np.arange(10) / 10,
+            intrinsics=eye,
+            depth_intrinsics=eye,
+            gravity_known=np.array(True),
+            quality=np.ones(10, np.float32),
+        )
+    monkeypatch.setattr(sys, "argv", ["estimate_flow", "--frames", str(frames), "--out", str(tmp_path / "flow")])
+    cli.enter(front.__doc__, front.run, config=front.Config, reads=("frames",))
+    for gap in (1, 2, 4, 8):
+        for sign, way in ((1, "fw"), (-1, "bw")):
+            table = arrays.load(tmp_path / "flow" / f"flow_{gap}_{way}.npz")
+            assert table["flow"].shape == (10 - gap, 16, 12, 2)
+            assert table["flow"].dtype == np.float16
+            assert table["confidence"].dtype == np.uint8
+            median_px = np.median(table["flow"][:, 4:-4, 3:-3].astype(float), axis=(0, 1, 2))
+            np.testing.assert_allclose(median_px, [sign * gap, 0], atol=0.5)
