@@ -1,0 +1,55 @@
+"""Segment the animal in one recording: masks 255 agent, 0 not, 128 unknown, without any trained weights.
+
+Sessions: the animal is what lies in space that other frames saw through, tracked over the whole recording, so that it
+is kept while it rests. Turnaround: it is what stands on the ground where all cameras look. No map is used.
+`--prompt FILE` (TOML: `frame = 12` and `box = [x0, y0, x1, y1]` or `click = [x, y]`, colour pixels) points at it.
+
+    python -m stages.segment_agent --frames build/cat/frames/v002 --flow build/cat/flow/v002 --out build/cat/masks/v002
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline import cli, qa
+from pipeline.files.clips import Clip
+from pipeline.progress import log, track
+from stages.segment_agent import pictures, prompt, writing
+from stages.segment_agent.masks import Options, segment
+
+
+@dataclass(frozen=True)
+class Config(Options):
+    """Options of this stage."""
+
+    role: Literal["turnaround", "session"] = "session"
+    """Role of the recording where the list of recordings does not tell it."""
+    seed: int = 0
+    """Seed of the random numbers."""
+
+
+def run(task: cli.Task) -> None:
+    clip, flow = Clip.open(task.input("frames")), task.input("flow")
+    role = next((video.role for video in task.videos if video.id == task.video), task.config.role)
+    hint = prompt.parse(task.input("prompt"), clip) if task.has("prompt") else None
+    if clip.odometry_from_camera is None:
+        log("no usable odometry: the motion comes from depth and flow, which drifts more")
+    masks, path = segment(clip, flow, role, hint, task.config, np.random.default_rng(task.config.seed))
+    log(f"poses: {path.alignments} alignments of depth pictures agree within {1000 * path.residual_m:.0f} mm")
+    with task.create() as folder:
+        summary = writing.write(folder, track(masks, "masks", len(clip)), len(clip))
+        checks, shown = pictures.report(clip, summary.shown, np.array(summary.area), np.array(summary.visible), path.residual_m)
+        qa.write(
+            folder,
+            good="the green outline hugs the animal in every frame, resting frames too",
+            bad="the outline sits on furniture, flickers, or is missing while the animal is in view",
+            checks=checks,
+            pictures=shown,
+        )
+    if not any(summary.visible):
+        log("the animal was never seen: does it move in this recording? A hint (--prompt) helps")
+
+
+if __name__ == "__main__":
+    cli.enter(__doc__, run, config=Config, reads=("frames", "flow"), optional=("prompt",))

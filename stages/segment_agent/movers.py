@@ -1,0 +1,124 @@
+"""Track the one animal-sized mover of a recording through its candidates, frame by frame.
+
+`candidates` groups points that other frames saw through; `track` chooses at most one group a frame by dynamic
+programming over size, evidence and speed, looking at the whole recording at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from stages.segment_agent.free_space import Votes
+
+HINT_REWARD = 1000.0
+
+
+@dataclass(frozen=True)
+class Mover:
+    """What an animal may be like and how it may move."""
+
+    least_votes: int = 2
+    """references that must have seen through a point"""
+    least_share: float = 0.05
+    """the same as a share of the references that saw a surface there, added"""
+    least_area_m2: float = 0.003
+    """smallest visible area of a candidate"""
+    likely_area_m2: float = 0.03
+    """visible area from which on a candidate is fully convincing"""
+    largest_m: float = 1.3
+    """largest extent of an animal"""
+    speed_m_s: float = 2.5
+    """fastest motion that costs nothing much"""
+    candidates: int = 6
+    """groups kept per frame"""
+    appear_cost: float = 1.5
+    """cost of leaving or entering the view, in units of a convincing candidate"""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A connected group of points seen through by other frames."""
+
+    centre_world: Float[np.ndarray, "3"]
+    area_m2: float
+    radius_m: float
+    """distance from the centre that holds 95 % of the points"""
+    depth_m: float
+
+
+@dataclass(frozen=True)
+class Hint:
+    """Where a user says the animal is."""
+
+    frame: int
+    centre_world: Float[np.ndarray, "3"]
+
+
+def moving(votes: Votes, options: Mover) -> Bool[np.ndarray, "*shape"]:
+    """Tell which points lie in space that is free at other times."""
+    return votes.free >= options.least_votes + options.least_share * votes.occupied
+
+
+def candidates(
+    is_moving: Bool[np.ndarray, "height width"], points_world: Float[np.ndarray, "height width 3"], area_m2: Float[np.ndarray, "height width"], options: Mover
+) -> list[Candidate]:
+    """Group moving pixels that touch, largest area first; ``area_m2`` is what each pixel covers at its distance."""
+    closed = cv2.dilate(is_moving.astype(np.uint8), np.ones((3, 3), np.uint8))
+    count, label = cv2.connectedComponents(closed, connectivity=8)
+    found = []
+    for index in range(1, count):
+        own = (label == index) & is_moving
+        area = float(area_m2[own].sum())
+        if area < options.least_area_m2 or own.sum() < 6:
+            continue
+        points = points_world[own]
+        centre = np.median(points, axis=0)
+        radius = float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95))
+        if radius < options.largest_m:
+            found.append(Candidate(centre, area, radius, float(np.sqrt(np.median(area_m2[own])))))
+    return sorted(found, key=lambda candidate: -candidate.area_m2)[: options.candidates]
+
+
+def track(found: Sequence[Sequence[Candidate]], timestamp_s: Float[np.ndarray, "frame"], options: Mover, hint: Hint | None = None) -> Int[np.ndarray, "frame"]:
+    """Choose one candidate per frame (-1: none in view) by the Viterbi algorithm over scores and speeds.
+
+    A hint outweighs everything else in its frame.
+    """
+    best, back = [np.zeros(1)], []
+    for index, group in enumerate(found):
+        score = np.array([0.0] + [_score(candidate, options) for candidate in group])
+        if hint is not None and hint.frame == index:
+            score[1:] += [HINT_REWARD if np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + 0.2 else 0.0 for candidate in group]
+        if index == 0:
+            best = [score - options.appear_cost * (np.arange(len(score)) > 0)]
+            back.append(np.zeros(len(score), int))
+            continue
+        step = _transition(found[index - 1], group, timestamp_s[index] - timestamp_s[index - 1], options)
+        total = best[-1][:, None] + step
+        back.append(total.argmax(0))
+        best.append(total.max(0) + score)
+    choice = np.zeros(len(found), int)
+    choice[-1] = best[-1].argmax()
+    for index in range(len(found) - 1, 0, -1):
+        choice[index - 1] = back[index][choice[index]]
+    return choice - 1
+
+
+def _score(candidate: Candidate, options: Mover) -> float:
+    """Reward area up to a convincing one; halve what is larger than an animal."""
+    reward = min(candidate.area_m2 / options.likely_area_m2, 1.0) ** 0.5
+    return reward * (0.5 if candidate.radius_m > options.largest_m / 2 else 1.0)
+
+
+def _transition(before: Sequence[Candidate], after: Sequence[Candidate], seconds: float, options: Mover) -> Float[np.ndarray, "from to"]:
+    """Reward of going from each state to each; state 0 is absence."""
+    step = np.full((len(before) + 1, len(after) + 1), -options.appear_cost)
+    step[0, 0] = 0.0
+    if before and after:
+        apart = np.linalg.norm(np.stack([c.centre_world for c in before])[:, None] - np.stack([c.centre_world for c in after])[None], axis=-1)
+        excess = np.maximum(apart - 0.1 - options.speed_m_s * seconds, 0) / 0.3
+        step[1:, 1:] = -np.minimum(excess, 2.5 * options.appear_cost)
+    return step

@@ -1,0 +1,68 @@
+"""Where the phone was: its odometry without drift, or motion from depth and flow where a recording has none."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files import arrays
+from pipeline.files.clips import Clip
+from pipeline.space import cameras
+from pipeline.space.align import ransac_rigid
+from pipeline.space.depth_alignment import DepthView, depth_view
+from pipeline.space.straightening import Straightening, chain, level, straighten
+from stages.segment_agent.free_space import usable_depth
+
+DEPTH_STRIDE = 3
+FLOW_STRIDE = 4
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses in a world of the recording's own, +y up."""
+
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    from_odometry: bool
+    alignments: int
+    residual_m: float
+
+
+def steady(clip: Clip, flow: Path, options: Straightening, rng: np.random.Generator) -> Trajectory:
+    """Return poses without drift; a recording without odometry is chained from picture to picture first."""
+
+    def view(frame: int) -> DepthView:
+        depth = usable_depth(clip, frame)
+        return depth_view(depth, clip.depth_intrinsics[frame], depth > 0, DEPTH_STRIDE)
+
+    poses = clip.odometry_from_camera
+    if poses is None:
+        forward = arrays.open_lazily(flow / "flow_1_fw.npz", "flow")
+        poses = chain(view, lambda frame: motion_from_flow(clip, frame, forward[frame], rng), len(clip), options)
+    found = straighten(view, poses, options)
+    level_known = clip.odometry_from_camera is not None and clip.gravity_known
+    poses = found.world_from_camera if level_known else level(view, found.world_from_camera)
+    return Trajectory(poses, clip.odometry_from_camera is not None, found.edges, found.residual_m)
+
+
+def motion_from_flow(clip: Clip, frame: int, flow: Float[np.ndarray, "height width 2"], rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+    """Return ``first_from_second`` of a frame and the next from where the pixels went and how deep they were."""
+    height, width = flow.shape[:2]
+    pixel = cameras.pixel_grid(height, width) * FLOW_STRIDE
+    first = _lift(clip, frame, pixel.reshape(-1, 2))
+    second = _lift(clip, frame + 1, (pixel + flow).reshape(-1, 2))
+    known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
+    first_from_second, _ = ransac_rigid(second[known], first[known], threshold_m=0.03, iterations=200, rng=rng)
+    return first_from_second
+
+
+def _lift(clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
+    """Back-project colour pixels by the depth there; NaN where it is unknown or the pixel is out of view."""
+    depth = usable_depth(clip, frame)
+    at = np.floor(pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]).astype(int)
+    inside = ((at >= 0) & (at < [clip.depth_size[1], clip.depth_size[0]])).all(1)
+    at = np.where(inside[:, None], at, 0)
+    z = np.where(inside, depth[at[:, 1], at[:, 0]], 0)
+    points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
+    points[z == 0] = np.nan
+    return points

@@ -1,0 +1,156 @@
+"""Find an animal that keeps still while the phone circles it: what stands on the floor where all cameras look.
+
+The optical axes meet near the animal; the level surface beneath that point is its ground; the connected cluster of
+points above that ground nearest to the axes' meeting point is the animal.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Bool, Float, Int
+
+from pipeline.errors import InputError
+from pipeline.files.clips import Clip
+from pipeline.space import cameras, rigid
+from pipeline.space.depth_alignment import depth_view
+from stages.segment_agent.free_space import usable_depth
+from stages.segment_agent.segment import Evidence, Judge
+from stages.segment_agent.windows import Sphere, Window
+
+
+@dataclass(frozen=True)
+class Turnaround:
+    """How the standing animal is told from its ground and from furniture."""
+
+    pictures: int = 40
+    """frames that the cluster is made of"""
+    reach_m: float = 0.9
+    """farthest part of an animal from the point where the optical axes meet"""
+    voxel_m: float = 0.025
+    """size of the cluster's cells"""
+    clearance_m: float = 0.03
+    """height above the ground from which points surely do not belong to it"""
+    least_hits: int = 3
+    """pictures that must have seen a point in a cell"""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The level surface under the animal: ``height(x, z) = offset + slope . (x, z)`` in a world with +y up."""
+
+    offset_m: float
+    slope: Float[np.ndarray, "2"]
+
+    def above(self, points_world: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape"]:
+        """Return heights above the ground."""
+        return points_world[..., 1] - self.offset_m - points_world[..., [0, 2]] @ self.slope
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """The cells the animal fills, in the recording's world."""
+
+    cells: Bool[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    voxel_m: float
+
+    def holds(self, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
+        """Tell which points lie in the cells; NaN does not."""
+        at = np.floor(np.nan_to_num((points_world - self.origin) / self.voxel_m, nan=-1.0)).astype(int)
+        inside = ((at >= 0) & (at < self.cells.shape)).all(-1)
+        at = np.clip(at, 0, np.array(self.cells.shape) - 1)
+        return inside & self.cells[at[..., 0], at[..., 1], at[..., 2]]
+
+
+def find_standing(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"]) -> tuple[list[Sphere | None], Judge]:
+    """Locate what stands at the focus; return a ball per frame and the judge of its points. World: +y up.
+
+    Raises InputError MSK-003 when nothing stands there.
+    """
+    chosen = np.unique(np.linspace(0, len(clip) - 1, options.pictures).astype(int))
+    points, level = _points_near(clip, world_from_camera, focus, options, chosen)
+    ground = fit_ground(points[level], focus, options)
+    cluster = find_cluster(points[ground.above(points) > options.clearance_m], focus, options)
+    if not cluster.cells.any():
+        raise InputError("MSK-003", "nothing stands where the cameras look", str(clip.folder), "circle the resting animal with the phone pointed at it, or give a hint")
+    centres = cluster.origin + (np.argwhere(cluster.cells) + 0.5) * cluster.voxel_m
+    middle = (centres.min(0) + centres.max(0)) / 2
+    ball = Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + 0.05))
+    return [ball] * len(clip), _judge(cluster, ground, options)
+
+
+def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"]:
+    """Return the point nearest to all optical axes (robust least squares), metres."""
+    centre, forward = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    weight = np.ones(len(centre))
+    for _ in range(10):
+        point = np.linalg.solve((weight[:, None, None] * across).sum(0), np.einsum("f,fij,fj->i", weight, across, centre))
+        distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - centre), axis=1)
+        weight = 1 / (1 + (distance / 0.15) ** 2)
+    return point
+
+
+def fit_ground(points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], options: Turnaround) -> Ground:
+    """Fit the level surface below the focus that most upward-facing points near it lie on."""
+    aside = np.linalg.norm((points_world - focus)[:, [0, 2]], axis=1)
+    height = points_world[:, 1]
+    weight = np.exp(-((aside / 0.5) ** 2)) * (height < focus[1] + 0.05)
+    counts, edges = np.histogram(height, np.arange(height.min() - 0.02, height.max() + 0.04, 0.02), weights=weight)
+    offset, slope = edges[counts.argmax()] + 0.01, np.zeros(2)
+    for band in (0.05, 0.03, 0.02):
+        close = np.abs(height - offset - points_world[:, [0, 2]] @ slope) < band
+        design = np.column_stack([points_world[close][:, [0, 2]], np.ones(close.sum())]) * weight[close, None]
+        solution = np.linalg.lstsq(design, height[close] * weight[close], rcond=None)[0]
+        slope, offset = solution[:2], solution[2]
+    return Ground(float(offset), slope)
+
+
+def find_cluster(points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], options: Turnaround) -> Cluster:
+    """Gather points into cells and keep the connected group that is large and near the focus, grown by one cell."""
+    reach = options.reach_m + 2 * options.voxel_m
+    origin, count = focus - reach, int(np.ceil(2 * reach / options.voxel_m))
+    at = np.floor((points_world - origin) / options.voxel_m).astype(int)
+    at = at[((at >= 0) & (at < count)).all(1)]
+    hits = np.bincount(np.ravel_multi_index(at.T, (count,) * 3), minlength=count**3).reshape((count,) * 3)
+    filled = hits >= options.least_hits
+    around = np.ones((3, 3, 3), bool)
+    group, groups = scipy.ndimage.label(scipy.ndimage.binary_closing(filled, around) | filled, around)
+    centre = origin + (np.argwhere(filled) + 0.5) * options.voxel_m
+    nearness = np.exp(-((np.linalg.norm(centre - focus, axis=1) / 0.25) ** 2))
+    score = np.bincount(group[filled], nearness, minlength=groups + 1)
+    own = (group == score.argmax()) & filled
+    return Cluster(scipy.ndimage.binary_dilation(own, around), origin, options.voxel_m)
+
+
+def _points_near(clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, options: Turnaround, frames: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Read points within reach of the focus and whether they face upward."""
+    points, level = [], []
+    for frame in frames:
+        depth = usable_depth(clip, frame)
+        view = depth_view(depth, clip.depth_intrinsics[frame], depth > 0, 2)
+        world = rigid.apply(world_from_camera[frame], view.points.reshape(-1, 3).astype(float))
+        up = (view.normals.reshape(-1, 3) @ world_from_camera[frame, :3, :3].T)[:, 1]
+        near = (view.points.reshape(-1, 3)[:, 2] > 0) & (np.abs(world - focus).max(1) < options.reach_m)
+        points.append(world[near])
+        level.append(up[near] > 0.9)
+    return np.concatenate(points), np.concatenate(level)
+
+
+def _judge(cluster: Cluster, ground: Ground, options: Turnaround) -> Judge:
+    """Evidence for the turnaround: cells of the cluster well above the ground are animal, the rest is room."""
+
+    def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
+        known = np.isfinite(window.points_world[..., 0])
+        held, height = cluster.holds(window.points_world), ground.above(window.points_world)
+        beneath = window.points_world.copy()  # feet: cells begin at the clearance, look one up
+        beneath[..., 1] += options.clearance_m
+        held |= cluster.holds(beneath)
+        log_odds = np.where(held, np.clip((height - 0.015) / 0.004, -3, 3), -3.0)
+        log_odds[~known] = 0.0
+        certainty = np.where(known, 1.0, 0.05)
+        return Evidence(log_odds, certainty, known & (log_odds > 2), log_odds <= -2)
+
+    return judge

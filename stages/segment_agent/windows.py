@@ -1,0 +1,63 @@
+"""Cut the part of a frame that may show the animal, at working resolution, with its points in the recording's world."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.files.clips import Clip
+from pipeline.space import cameras, rigid
+from stages.segment_agent.free_space import usable_depth
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Where the animal is at one time: a ball in the recording's world, metres."""
+
+    centre_world: Float[np.ndarray, "3"]
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of a frame at working resolution."""
+
+    rows: slice
+    columns: slice
+    color: UInt8[np.ndarray, "height width 3"]
+    points_world: Float[np.ndarray, "height width 3"]
+    """NaN where depth is unknown"""
+
+
+def working_size(clip: Clip, height_px: int) -> tuple[int, int]:
+    """Return (height, width) of the pictures that masks are made at: no larger than ``height_px`` high."""
+    height, width = clip.color_size
+    scale = min(1.0, height_px / height)
+    return round(height * scale), round(width * scale)
+
+
+def cut(clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, height_px: int) -> Window | None:
+    """Read the rectangle around a ball with a rim of 8 px; None when it is out of view."""
+    size = working_size(clip, height_px)
+    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
+    centre = rigid.apply(rigid.inverse(world_from_camera), ball.centre_world[None])[0]
+    pixel, depth = cameras.project(centre, intrinsics)
+    if depth < 0.1:
+        return None
+    reach = intrinsics[[0, 1], [0, 1]] * ball.radius_m / max(depth - 0.5 * ball.radius_m, 0.2) + 8
+    low = np.clip(np.floor(pixel - reach), 0, [size[1], size[0]]).astype(int)
+    high = np.clip(np.ceil(pixel + reach), 0, [size[1], size[0]]).astype(int)
+    if (high - low).min() < 4:
+        return None
+    rows, columns = slice(low[1], high[1]), slice(low[0], high[0])
+    color = clip.color(frame)
+    if size != clip.color_size:
+        color = cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
+    grid = cameras.pixel_grid(*size)[rows, columns]
+    known = usable_depth(clip, frame)
+    at = np.floor(grid * [known.shape[1] / size[1], known.shape[0] / size[0]]).astype(int)
+    z = known[at[..., 1], at[..., 0]]
+    points = rigid.apply(world_from_camera, (cameras.unproject(grid, intrinsics) * z[..., None]).reshape(-1, 3)).reshape(*z.shape, 3)
+    points[z == 0] = np.nan
+    return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points)

@@ -1,0 +1,39 @@
+"""Write masks frame by frame and gather what the table and the report need."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.files import arrays, images
+from stages.segment_agent.segment import Mask
+
+
+@dataclass
+class Summary:
+    """Per-frame figures of masks, and a few whole masks for pictures."""
+
+    visible: list[bool] = field(default_factory=list)
+    confidence: list[float] = field(default_factory=list)
+    area: list[float] = field(default_factory=list)
+    shown: dict[int, np.ndarray] = field(default_factory=dict)
+
+
+def write(folder: Path, masks: Iterable[Mask], count: int, pictures: int = 12) -> Summary:
+    """Write ``%06d.png`` and ``masks.npz``; keep every so many masks for the report."""
+    summary, shown = Summary(), set(np.linspace(0, count - 1, pictures).astype(int).tolist())
+    for frame, mask in enumerate(masks):
+        images.write_gray(folder / f"{frame:06d}.png", mask.labels)
+        summary.visible.append(mask.visible)
+        summary.confidence.append(mask.confidence)
+        summary.area.append(float((mask.labels == 255).mean()))
+        if frame in shown:
+            summary.shown[frame] = mask.labels
+    arrays.save(
+        folder / "masks.npz",
+        visible=np.array(summary.visible),
+        confidence=np.array(summary.confidence, np.float32),
+        area=np.array(summary.area, np.float32),
+    )
+    return summary
