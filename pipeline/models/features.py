@@ -1,0 +1,102 @@
+"""Dense, weight-free picture features: DAISY descriptors (Tola et al. 2010) on a grid, then a shared linear basis.
+
+`describe` turns a picture into raw descriptors, `fit_basis` finds the basis on descriptors of many recordings, and
+`FeatureBasis.project` gives the 16 unit-length channels that fields, templates and losses use. Gradients normalised
+per patch make them blind to exposure and white balance. Measured on 60 pairs of an indoor RGB-D walk, 10-35 degrees
+apart, under changed light: 34 % of the cells find their true partner among 1,200 with 16 channels (radius 8 and
+partial normalisation: 17 %; all 104 raw channels: 39 %).
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.files import arrays
+
+CHANNELS = 16
+WORKING_SIDE_PX = 320
+"""pictures with a longer side are reduced to it, so that phones of any resolution are described alike"""
+RADIUS_PX = 16
+"""radius of a descriptor, reduced pixels"""
+
+
+def describe(color: UInt8[np.ndarray, "height width 3"], stride_px: int) -> Float[np.ndarray, "rows columns channel"]:
+    """Describe a picture at the cell centres (stride * (j + 1/2), stride * (i + 1/2)) of its own pixels.
+
+    Descriptors have unit length; cells without any texture are zero.
+    """
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, WORKING_SIDE_PX / max(gray.shape))
+    if scale < 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    rows, columns = color.shape[0] // stride_px, color.shape[1] // stride_px
+    raw = _daisy().compute(gray, _grid(rows, columns, stride_px, scale))[1].reshape(rows, columns, -1)
+    return _unit(np.nan_to_num(raw, nan=0.0, posinf=0.0, neginf=0.0))
+
+
+@dataclass(frozen=True)
+class FeatureBasis:
+    """Linear projection of raw descriptors, shared by all recordings of an agent."""
+
+    mean: Float[np.ndarray, "channel"]
+    components: Float[np.ndarray, "16 channel"]
+    """principal axes, already divided by the square root of their spread"""
+    scale: float
+    """median length of projections before they are normalised"""
+    explained: Float[np.ndarray, "16"]
+    """share of the variance along each axis"""
+
+    @classmethod
+    def load(cls, folder: Path) -> "FeatureBasis":
+        """Open a finished ``feature_basis`` artifact."""
+        table = arrays.load(folder / "basis.npz", ("mean", "components", "scale", "explained"))
+        return cls(table["mean"], table["components"], float(table["scale"]), table["explained"])
+
+    def save(self, folder: Path) -> None:
+        """Write ``basis.npz``."""
+        scale = np.array(self.scale, np.float32)
+        table = dict(mean=self.mean, components=self.components, scale=scale, explained=self.explained)
+        arrays.save(folder / "basis.npz", **table)
+
+    def project(self, raw: Float[np.ndarray, "*cell channel"]) -> Float[np.ndarray, "*cell 16"]:
+        """Return unit-length features of raw descriptors."""
+        return _unit((raw - self.mean) @ self.components.T)
+
+
+def fit_basis(raw: Float[np.ndarray, "sample channel"], *, channels: int = CHANNELS, whitening: float) -> FeatureBasis:
+    """Fit principal axes; ``whitening`` 0 keeps each axis's spread, 1 makes all equal.
+
+    Textureless samples (zero descriptors) are left out.
+    """
+    samples = raw[np.linalg.norm(raw, axis=1) > 0].astype(np.float64)
+    assert len(samples) > channels, len(samples)
+    mean = samples.mean(axis=0)
+    variance, axes = np.linalg.eigh(np.cov(samples - mean, rowvar=False))
+    variance, axes = variance[::-1][:channels], axes.T[::-1][:channels]
+    sign = np.sign(np.take_along_axis(axes, np.abs(axes).argmax(axis=1, keepdims=True), axis=1))
+    components = sign * axes / np.maximum(variance, 1e-12)[:, None] ** (whitening / 2)
+    length = np.linalg.norm((samples - mean) @ components.T, axis=1)
+    explained = variance / np.var(samples, axis=0, ddof=1).sum()
+    as_stored = (part.astype(np.float32) for part in (mean, components, explained))
+    mean, components, explained = as_stored
+    return FeatureBasis(mean, components, float(np.float32(np.median(length))), explained)
+
+
+def _unit(vectors: np.ndarray) -> Float[np.ndarray, "*cell channel"]:
+    return (vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)).astype(np.float32)
+
+
+@lru_cache(maxsize=1)
+def _daisy() -> cv2.xfeatures2d.DAISY:
+    return cv2.xfeatures2d.DAISY.create(RADIUS_PX, 2, 6, 8, cv2.xfeatures2d.DAISY_NRM_SIFT)
+
+
+@lru_cache(maxsize=8)
+def _grid(rows: int, columns: int, stride_px: int, scale: float) -> list[cv2.KeyPoint]:
+    """Cell centres as OpenCV key points, whose integer positions are pixel centres."""
+    y, x = (((np.arange(count) + 0.5) * stride_px * scale - 0.5) for count in (rows, columns))
+    return [cv2.KeyPoint(float(column), float(row), 2 * RADIUS_PX) for row in y for column in x]

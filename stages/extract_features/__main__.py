@@ -1,0 +1,36 @@
+"""Describe every frame of one video by 16 unit-length features at every eighth pixel, in the shared basis."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import cli, progress
+from pipeline.files import arrays
+from pipeline.files.clips import Clip
+from pipeline.models.features import FeatureBasis, describe
+from stages.extract_features import pictures
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of feature extraction."""
+
+    stride_px: int = 8
+    """Distance between features, colour pixels; readers expect 8."""
+
+
+def run(task: cli.Task) -> None:
+    """Extract one video's features."""
+    settings: Config = task.config
+    clip, basis = Clip.open(task.input("frames")), FeatureBasis.load(task.input("feature_basis"))
+    numbers = progress.track(range(len(clip)), "features: frames")
+    features = np.stack(
+        [basis.project(describe(clip.color(i), settings.stride_px)).astype(np.float16) for i in numbers]
+    )
+    with task.create() as folder:
+        arrays.save(folder / "features.npz", features=features)
+        pictures.report_quality(folder, clip, features)
+
+
+if __name__ == "__main__":
+    cli.enter(__doc__, run, config=Config, reads=("frames", "feature_basis"))

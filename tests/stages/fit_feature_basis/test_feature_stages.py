@@ -1,0 +1,85 @@
+"""The basis is fitted on training recordings only, and each video's features follow it."""
+
+import json
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline import artifact, cli
+from pipeline.files import arrays, images
+from pipeline.models.features import FeatureBasis, describe
+from stages.extract_features import __main__ as extract
+from stages.fit_feature_basis import __main__ as fit
+
+ROLES = ("walkthrough", "turnaround", "session", "session")
+
+
+def _write_clip(folder, seed):
+    rng = np.random.default_rng(seed)
+    with artifact.create(folder, stage="extract_frames", config={}, inputs={}, key=None) as inside:
+        (inside / "color").mkdir()
+        (inside / "depth").mkdir()
+        images.write_depth(inside / "depth" / "000000.exr", np.ones((8, 6)))
+        for i in range(3):
+            small = rng.integers(0, 255, (24, 18, 3), dtype=np.uint8)
+            images.write_color(inside / "color" / f"{i:06d}.jpg", cv2.resize(small, (72, 96)))
+        eye = np.tile(np.eye(3), (3, 1, 1))
+        table = dict(timestamp_s=np.arange(3) / 10, intrinsics=eye, depth_intrinsics=eye)
+        arrays.save(inside / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(3, np.float32))
+
+
+@pytest.fixture
+def world(tmp_path):
+    """Four recordings, the last of which is the test video."""
+    videos = []
+    for i, role in enumerate(ROLES):
+        _write_clip(tmp_path / "frames" / f"v{i:03d}", seed=i)
+        split = "test" if i == 3 else "train" if role == "session" else "none"
+        videos.append(
+            {
+                "id": f"v{i:03d}",
+                "file": f"{i}.r3d",
+                "role": role,
+                "split": split,
+                "sha256": "",
+                "synchronized_with": None,
+                "offset_s": 0.0,
+            }
+        )
+    (tmp_path / "videos.json").write_text(json.dumps(videos))
+    return tmp_path
+
+
+def _run(front, monkeypatch, reads, **options):
+    argv = [
+        front.__package__.split(".")[-1],
+        *(part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))),
+    ]
+    monkeypatch.setattr(sys, "argv", argv)
+    cli.enter(front.__doc__, front.run, config=front.Config, reads=reads)
+
+
+def test_basis_ignores_the_test_video_and_features_follow_it(world, monkeypatch):
+    common = dict(frames=world / "frames", videos=world / "videos.json")
+    _run(fit, monkeypatch, ("frames",), **common, out=world / "basis")
+    before = (world / "basis" / "basis.npz").read_bytes()
+    test_video = world / "frames" / "v003"
+    for i in range(3):
+        images.write_color(test_video / "color" / f"{i:06d}.jpg", np.zeros((96, 72, 3), np.uint8))
+    _run(fit, monkeypatch, ("frames",), **common, out=world / "again")
+    assert (world / "again" / "basis.npz").read_bytes() == before
+    _run(
+        extract,
+        monkeypatch,
+        ("frames", "feature_basis"),
+        frames=world / "frames" / "v002",
+        feature_basis=world / "basis",
+        out=world / "features",
+    )
+    features = arrays.load(world / "features" / "features.npz")["features"]
+    assert features.shape == (3, 12, 9, 16)
+    assert features.dtype == np.float16
+    color = images.read_color(world / "frames" / "v002" / "color" / "000001.jpg")
+    np.testing.assert_allclose(features[1], FeatureBasis.load(world / "basis").project(describe(color, 8)), atol=1e-3)
