@@ -1,0 +1,124 @@
+"""Film a script: render each frame, pass it through the sensor, and keep what is true beside what is recorded."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.space import cameras, rigid
+from stages.synthesize_capture import animal, light, raster, sensor, shade
+from stages.synthesize_capture.animal import INDEX, Animal
+from stages.synthesize_capture.script import Script
+
+SHADOW_BALLS = (
+    ("pelvis", (0, 0, -0.14), 0.075), ("spine", (0, 0, -0.06), 0.075), ("loin", (0, 0, 0.02), 0.075), ("chest", (0, 0, 0.1), 0.075),
+    ("head", (0, 0.08, 0.25), 0.055), ("left hand", (0.045, -0.21, 0.125), 0.03), ("right hand", (-0.045, -0.21, 0.125), 0.03),
+    ("left toes", (0.05, -0.21, -0.165), 0.03), ("right toes", (-0.05, -0.21, -0.165), 0.03),
+)  # fmt: skip
+"""Bone, rest point in the agent frame and radius of the balls that darken the ground near the animal."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One recorded frame and its truth, all on the stored canvas."""
+
+    color: UInt8[np.ndarray, "height width 3"]
+    depth: Float[np.ndarray, "rows columns"]
+    confidence: UInt8[np.ndarray, "rows columns"]
+    true_depth: Float[np.ndarray, "rows columns"]
+    mask: Bool[np.ndarray, "height width"]
+    vertices_world: Float[np.ndarray, "vertex 3"] | None
+
+
+class Stage:
+    """The lit set of one script: the room's mesh with its pictures, and the animal."""
+
+    def __init__(self, script: Script, creature: Animal):
+        self.script, self.creature = script, creature
+        self._rng = np.random.default_rng([script.seed, 7])
+        lit = light.lit_sheets(script.room, script.light, self._rng)
+        self.room = shade.backdrop(script.room.sheets(), lit)
+        self.empty = creature.faces[:0]
+
+    def animal_world(self, index: int) -> Float[np.ndarray, "vertex 3"] | None:
+        """Return the animal's surface in the world in a frame, or None without animal."""
+        motion = self.script.motion
+        if motion is None:
+            return None
+        return animal.surface(self.creature, motion.world_from_agent[index] @ motion.agent_from_bone[index])
+
+    def mesh(self, vertices_world: Float[np.ndarray, "vertex 3"] | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return vertices (world) and faces of room and animal together; the animal's faces come last."""
+        if vertices_world is None:
+            return self.room.vertices, self.room.faces
+        return np.concatenate([self.room.vertices, vertices_world]), np.concatenate([self.room.faces, self.creature.faces + len(self.room.vertices)])
+
+    def frames(self) -> Iterator[Frame]:
+        """Film every frame in order."""
+        script = self.script
+        blur = sensor.motion_blur_px(script.world_from_camera, script.timestamp_s, float(script.intrinsics[0, 0]), script.exposure.shutter_s)
+        for index in range(len(script.timestamp_s)):
+            yield self._frame(index, blur[index])
+
+    def _frame(self, index: int, blur_px: np.ndarray) -> Frame:
+        script = self.script
+        (height, width), (rows, columns) = script.color_size, script.depth_size
+        camera_from_world = rigid.inverse(script.world_from_camera[index])
+        body = self.animal_world(index)
+        vertices, faces = self.mesh(body)
+        fx, fy, cx, cy = script.intrinsics[index]
+        doubled = np.array([[2 * fx, 0, 2 * cx], [0, 2 * fy, 2 * cy], [0, 0, 1]])
+        view = raster.see(rigid.apply(camera_from_world, vertices), faces, doubled, 2 * height, 2 * width)
+        coat = self._coat(index, body, camera_from_world)
+        linear = shade.shade(view.face, view.inverse_corners, (fx, fy, cx, cy), self.room, coat, camera_from_world)
+        color = sensor.picture(linear, script.exposure, float(script.gain[index]), blur_px, self._rng)
+        scaled = np.array([fx * columns / width, fy * rows / height, cx * columns / width, cy * rows / height])
+        true_depth = raster.depth_through(view.face, view.inverse_corners, scaled, rows, columns)
+        depth, confidence = sensor.lidar(true_depth, self._rng)
+        samples = (view.face >= len(self.room.faces)).reshape(height, 2, width, 2).sum(axis=(1, 3))
+        return Frame(color, depth, confidence, true_depth, samples >= 2, body)
+
+    def _coat(self, index: int, body: np.ndarray | None, camera_from_world: np.ndarray) -> shade.Coat:
+        if body is None:
+            return shade.Coat(self.empty, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), np.zeros((0, 4)))
+        received = light.light_on_body(body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light)
+        motion = self.script.motion
+        camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
+        balls = np.zeros((len(SHADOW_BALLS), 4))
+        for row, (bone, rest, radius) in enumerate(SHADOW_BALLS):
+            local = np.asarray(rest) - animal.HEADS[INDEX[bone]]
+            balls[row] = *rigid.apply(camera_from_bone[INDEX[bone]], local[None])[0], radius
+        return shade.Coat(self.creature.faces, self.creature.vertices, received, self.creature.fur, balls)
+
+
+def true_flow(stage: Stage, first: int, second: int, *, stride: int = 4) -> Float[np.ndarray, "rows columns 2"]:
+    """Return flow from frame ``first`` to ``second`` of the upright picture at the centres of ``stride``-pixel cells; NaN where hidden or out of view."""
+    script = stage.script
+    upright = cameras.turn_camera(script.world_from_camera[[first, second]], script.quarter_turns)
+    lenses = cameras.turn_intrinsics(matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns)
+    height, width = script.color_size if script.quarter_turns % 2 == 0 else script.color_size[::-1]
+    here, there = (stage.mesh(stage.animal_world(index)) for index in (first, second))
+    cells = (height // stride, width // stride)
+    coarse = cameras.scale_intrinsics(lenses[0], (height, width), cells)
+    view = raster.see(rigid.apply(rigid.inverse(upright[0]), here[0]), here[1], coarse, *cells)
+    rays = cameras.ray_directions(coarse, *cells)
+    share = np.einsum("hwij,hwj->hwi", view.inverse_corners[np.maximum(view.face, 0)], rays)
+    share /= np.maximum(share.sum(-1, keepdims=True), 1e-9)
+    corners = there[0][there[1][np.maximum(view.face, 0)]]
+    moved = rigid.apply(rigid.inverse(upright[1]), np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3)).reshape(*cells, 3)
+    pixel, depth = cameras.project(moved, lenses[1])
+    flow = (pixel - (cameras.pixel_grid(*cells) * stride)).astype(np.float32)
+    inside = (depth > 0.05) & (pixel[..., 0] >= 0) & (pixel[..., 0] < width) & (pixel[..., 1] >= 0) & (pixel[..., 1] < height) & (view.face >= 0)
+    nearest = raster.see(rigid.apply(rigid.inverse(upright[1]), there[0]), there[1], lenses[1], height, width).inverse_depth
+    at = np.clip(np.nan_to_num(pixel), 0, [width - 1, height - 1]).astype(int)
+    hidden = depth > 1.0 / np.maximum(nearest[at[..., 1], at[..., 0]], 1e-3) + 0.02 + 0.01 * depth
+    flow[~inside | hidden] = np.nan
+    return flow
+
+
+def matrices(intrinsics: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "frame 3 3"]:
+    """Turn rows of fx, fy, cx, cy into matrices."""
+    out = np.zeros((len(intrinsics), 3, 3))
+    out[:, 0, 0], out[:, 1, 1], out[:, 0, 2], out[:, 1, 2], out[:, 2, 2] = *intrinsics.T, 1.0
+    return out

@@ -1,0 +1,126 @@
+"""Find ways around furniture: a grid of free floor, shortest paths on it, and walking along them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from skimage.graph import route_through_array
+
+from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Footprint
+
+CELL_M = 0.1
+Ground = Float[np.ndarray, "2"]
+"""A point (x, z) on the floor."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Which cells a walker of some breadth can stand on."""
+
+    free: Bool[np.ndarray, "x z"]
+
+    def cell(self, point: Ground) -> tuple[int, int]:
+        """Return the cell that holds a point, clipped to the room."""
+        i = int((point[0] + WIDTH_M / 2) / CELL_M)
+        k = int((point[1] + DEPTH_M / 2) / CELL_M)
+        return min(max(i, 0), self.free.shape[0] - 1), min(max(k, 0), self.free.shape[1] - 1)
+
+    def is_free(self, point: Ground) -> bool:
+        """Tell whether a walker may stand there."""
+        return bool(self.free[self.cell(point)])
+
+    def centers(self) -> Float[np.ndarray, "cell 2"]:
+        """Return the middle of every free cell."""
+        return (np.argwhere(self.free) + 0.5) * CELL_M - [WIDTH_M / 2, DEPTH_M / 2]
+
+    def nearest(self, point: Ground) -> Ground:
+        """Return the point itself if free, else the nearest free cell's middle."""
+        if self.is_free(point):
+            return np.asarray(point, float)
+        centers = self.centers()
+        return centers[np.argmin(((centers - point) ** 2).sum(-1))]
+
+    def route(self, start: Ground, goal: Ground, *, avoid: Ground | None = None, avoid_m: float = 1.0) -> Float[np.ndarray, "waypoint 2"]:
+        """Return a shortest way; blocked cells cost so much that they are crossed only when there is no other, a place to avoid costs extra."""
+        cost = np.where(self.free, 1.0, 60.0)
+        if avoid is not None:
+            x = (np.arange(self.free.shape[0]) + 0.5) * CELL_M - WIDTH_M / 2 - avoid[0]
+            z = (np.arange(self.free.shape[1]) + 0.5) * CELL_M - DEPTH_M / 2 - avoid[1]
+            cost = cost * (1 + 8 * np.exp(-(x[:, None] ** 2 + z[None, :] ** 2) / (0.5 * avoid_m) ** 2))
+        cells, _ = route_through_array(cost, self.cell(start), self.cell(goal), fully_connected=True, geometric=True)
+        way = (np.array(cells) + 0.5) * CELL_M - [WIDTH_M / 2, DEPTH_M / 2]
+        return np.concatenate([way[1:-1], np.asarray(goal, float)[None]]) if len(way) > 1 else np.asarray(goal, float)[None]
+
+
+def floor_for(footprints: list[Footprint], *, breadth_m: float, height_m: float) -> Floor:
+    """Return where a walker of some breadth and height can stand between the footprints and the walls."""
+    x = (np.arange(round(WIDTH_M / CELL_M)) + 0.5) * CELL_M - WIDTH_M / 2
+    z = (np.arange(round(DEPTH_M / CELL_M)) + 0.5) * CELL_M - DEPTH_M / 2
+    grid = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
+    reach = breadth_m / 2
+    free = (np.abs(grid[..., 0]) < WIDTH_M / 2 - reach) & (np.abs(grid[..., 1]) < DEPTH_M / 2 - reach)
+    for block in footprints:
+        if block.bottom >= height_m:
+            continue
+        cosine, sine = np.cos(block.yaw), np.sin(block.yaw)
+        away = grid - np.asarray(block.center)
+        local = np.abs(np.stack([cosine * away[..., 0] - sine * away[..., 1], sine * away[..., 0] + cosine * away[..., 1]], axis=-1))
+        outside = np.maximum(local - np.asarray(block.size) / 2, 0)
+        free &= np.linalg.norm(outside, axis=-1) >= reach
+    return Floor(free)
+
+
+class Walker:
+    """Walks a route: turns no faster and gains speed no faster than a body can."""
+
+    def __init__(self, floor: Floor, position: Ground, yaw: float, *, turn_rate: float, acceleration: float):
+        self.floor, self.position, self.yaw = floor, np.asarray(position, float), yaw
+        self.turn_rate, self.acceleration = turn_rate, acceleration
+        self.speed = 0.0
+        self.way: np.ndarray = np.zeros((0, 2))
+
+    def go(self, goal: Ground, *, avoid: Ground | None = None) -> None:
+        """Take the way to a goal."""
+        self.way = self.floor.route(self.position, self.floor.nearest(goal), avoid=avoid)
+
+    def stop(self) -> None:
+        """Forget the way."""
+        self.way = np.zeros((0, 2))
+
+    def arrived(self) -> bool:
+        """Tell whether nothing of the way is left."""
+        return len(self.way) == 0
+
+    def step(self, seconds: float, desired_speed: float, *, face: float | None = None) -> None:
+        """Move on; ``face`` keeps the walker's heading towards an angle while it walks (a person filming) instead of along the way."""
+        while len(self.way) and np.linalg.norm(self.way[0] - self.position) < (0.22 if len(self.way) > 1 else 0.05 + 0.06 * self.speed):
+            self.way = self.way[1:]
+        target_speed, heading = 0.0, self.yaw
+        if len(self.way):
+            toward = self.way[0] - self.position
+            heading = float(np.arctan2(toward[0], toward[1]))
+            left = np.linalg.norm(self.way[-1] - self.position)
+            target_speed = min(desired_speed, np.sqrt(2 * 0.8 * self.acceleration * max(left - 0.03, 0.0)) + 0.08)
+        error = _wrapped((heading if face is None else face) - self.yaw)
+        self.yaw += float(np.clip(error, -self.turn_rate * seconds, self.turn_rate * seconds))
+        if face is None:
+            target_speed *= max(np.cos(_wrapped(heading - self.yaw)), 0.0) ** 2
+            heading = self.yaw
+        change = self.acceleration * seconds
+        self.speed += float(np.clip(target_speed - self.speed, -1.6 * change, change))
+        ahead = self.position + self.speed * seconds * np.array([np.sin(heading), np.cos(heading)])
+        if self.floor.is_free(ahead) or not self.floor.is_free(self.position):
+            self.position = ahead
+        else:
+            self._slide(ahead)
+
+    def _slide(self, ahead: Ground) -> None:
+        for kept in (np.array([ahead[0], self.position[1]]), np.array([self.position[0], ahead[1]])):
+            if self.floor.is_free(kept):
+                self.position = kept
+                return
+        self.speed *= 0.5
+
+
+def _wrapped(angle: float) -> float:
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -1,0 +1,83 @@
+"""The person with the phone: follows the animal, walks up to it, stands, steps back, strolls.
+
+A small random state machine. Approaches come every 8 to 10 s so that what the animal does about
+people can be learnt from minutes of video. Positions (x, z) on the floor in metres, yaw about +y.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from stages.synthesize_capture.navigation import Floor, Ground, Walker
+
+REACTION_S = 0.28
+
+
+class Observer:
+    """A person who films; `step` moves it once, `looks_at` is what the phone points to."""
+
+    def __init__(self, floor: Floor, position: Ground, rng: np.random.Generator):
+        self.walker = Walker(floor, floor.nearest(position), 0.0, turn_rate=2.6, acceleration=2.2)
+        self.rng = rng
+        self.mode, self.left_s, self.pace, self.since_plan_s = "watch", rng.uniform(1.0, 2.0), 0.0, 0.0
+        self.velocity = np.zeros(2)
+        self.looks_at: Float[np.ndarray, "3"] | None = None
+        self._glance: tuple[float, np.ndarray] | None = None
+
+    def step(self, seconds: float, animal: Float[np.ndarray, "3"]) -> None:
+        """Move on, given where the animal is (x, y, z)."""
+        before = self.walker.position.copy()
+        ground = animal[[0, 2]]
+        self.left_s -= seconds
+        self.since_plan_s += seconds
+        if self.mode == "approach":
+            if np.linalg.norm(ground - self.walker.position) < 0.62:
+                self.left_s = 0.0
+            elif self.since_plan_s > 0.5:
+                self._plan_approach(ground)
+        if self.left_s <= 0:
+            self._choose(ground)
+        toward = ground - self.walker.position
+        self.walker.step(seconds, self.pace, face=float(np.arctan2(toward[0], toward[1])))
+        self.velocity = (self.walker.position - before) / seconds
+        self._look(seconds, animal)
+
+    def _choose(self, animal: Ground) -> None:
+        """Take up the next mode."""
+        self.walker.stop()
+        self.pace = 0.0
+        after = {"approach": ("watch", "retreat"), "watch": ("approach", "stroll"), "retreat": ("watch", "approach"), "stroll": ("approach", "watch")}
+        chance = {"approach": 0.6, "watch": 0.68, "retreat": 0.7, "stroll": 0.75}[self.mode]
+        self.mode = after[self.mode][0 if self.rng.random() < chance else 1]
+        match self.mode:
+            case "watch":
+                self.left_s = self.rng.uniform(2.4, 4.4)
+            case "approach":
+                self.left_s, self.pace = self.rng.uniform(2.0, 3.2), self.rng.uniform(0.95, 1.35)
+                self._plan_approach(animal)
+            case "retreat":
+                self.left_s, self.pace = self.rng.uniform(1.4, 2.2), self.rng.uniform(0.6, 0.85)
+                self._go_by(animal, lambda center: 0.9 * np.linalg.norm(center - animal, axis=-1) - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1))
+            case "stroll":
+                self.left_s, self.pace = self.rng.uniform(2.4, 3.8), self.rng.uniform(0.5, 0.8)
+                self._go_by(animal, lambda center: self.rng.random(len(center)) + 2.0 * (np.linalg.norm(center - animal, axis=-1) > 1.7))
+
+    def _plan_approach(self, animal: Ground) -> None:
+        self.since_plan_s = 0.0
+        self.walker.go(animal)
+
+    def _go_by(self, animal: Ground, score) -> None:
+        centers = self.walker.floor.centers()
+        self.walker.go(centers[np.argmax(score(centers))], avoid=animal)
+
+    def _look(self, seconds: float, animal: Float[np.ndarray, "3"]) -> None:
+        """Follow the animal with a lag; sometimes glance elsewhere for a moment."""
+        target = animal + np.array([0.0, 0.12, 0.0])
+        if self._glance is None and self.rng.random() < 0.02 * seconds * (3.0 if self.mode == "stroll" else 1.0):
+            self._glance = (self.rng.uniform(0.5, 1.0), target + np.array([self.rng.uniform(-1, 1), self.rng.uniform(0, 0.6), self.rng.uniform(-1, 1)]))
+        if self._glance is not None:
+            left, aside = self._glance
+            target = aside
+            self._glance = (left - seconds, aside) if left > seconds else None
+        if self.looks_at is None:
+            self.looks_at = target.copy()
+        self.looks_at = self.looks_at + (target - self.looks_at) * (1 - np.exp(-seconds / REACTION_S))

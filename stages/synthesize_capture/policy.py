@@ -1,0 +1,196 @@
+"""What the animal decides: a goal-driven cat that minds the person with the phone.
+
+It runs away when someone walks up to it, comes near when someone stands still or leaves, and
+otherwise visits its favourite places, sits, lies and looks. Someone far away changes nothing.
+Positions in metres, world axes; heights are those of what it stands on.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from stages.synthesize_capture.navigation import Floor, Ground, Walker
+from stages.synthesize_capture.room import Place
+
+DELAY_S = 0.25
+"""How long it takes to notice what the person does."""
+NOTICE_M = 3.0
+JUMP_S = 0.5
+Reason = Literal["own", "flee", "approach"]
+REASONS: tuple[Reason, ...] = ("own", "flee", "approach")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The person as the animal sees it: position and velocity on the floor."""
+
+    position: Ground
+    velocity: Ground
+
+
+@dataclass
+class Leap:
+    """A jump under way."""
+
+    start: Float[np.ndarray, "3"]
+    end: Float[np.ndarray, "3"]
+    elapsed_s: float = 0.0
+
+
+class Policy:
+    """The animal's mind and its body's course over the floor."""
+
+    def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
+        self.rng, self.places = rng, places
+        self.walker = Walker(floor, floor.nearest(position), rng.uniform(-np.pi, np.pi), turn_rate=4.0, acceleration=3.0)
+        self.height = 0.0
+        self.place: Place | None = None
+        self.perch: Place | None = None
+        self.reason: Reason = "own"
+        self.pace, self.rest_s, self.calm_s, self.fear_s = 0.0, 0.6, 0.0, 0.0
+        self.posture = np.zeros(3)
+        self.wanted = np.zeros(3)
+        self.leap: Leap | None = None
+        self.gaze = np.array([*self.walker.position, 0.3])[[0, 2, 1]]
+        self._gaze_goal, self._gaze_s = self.gaze.copy(), 0.0
+
+    @property
+    def position(self) -> Float[np.ndarray, "3"]:
+        """Where it stands: x, height of the ground under it, z."""
+        return np.array([self.walker.position[0], self.height, self.walker.position[1]])
+
+    def step(self, seconds: float, seen: Seen) -> None:
+        """Decide, then move on by one step."""
+        self._feel(seconds, seen)
+        if self.leap is not None:
+            self._fly(seconds)
+        else:
+            self._decide(seconds, seen)
+            moving = not self.walker.arrived()
+            if moving and self.perch is not None:
+                self._jump(np.array([self.perch.entry[0], 0.0, self.perch.entry[1]]))
+                self.perch = None
+            else:
+                face = None if moving or self.perch is None else self.perch.yaw
+                self.walker.turn_rate = 7.5 if self.reason == "flee" else 4.0
+                self.walker.step(seconds, self.pace, face=face if not moving else None)
+                if moving and self.walker.arrived():
+                    self._arrive()
+        rate = 1 - np.exp(-seconds / 0.22)
+        standing = self.walker.speed > 0.12 or self.leap is not None
+        self.posture += rate * (np.where(standing, np.array([0, 0, self.wanted[2]]), self.wanted) - self.posture)
+        self._look(seconds, seen)
+
+    def _feel(self, seconds: float, seen: Seen) -> None:
+        """Follow how long the person has been calm and how threatening it is."""
+        away = self.walker.position - seen.position
+        distance = float(np.linalg.norm(away))
+        closing = float(seen.velocity @ away) / max(distance, 1e-6)
+        self.closing, self.distance = closing, distance
+        self.calm_s = self.calm_s + seconds if np.linalg.norm(seen.velocity) < 0.2 or closing < -0.3 else 0.0
+        self.fear_s = max(self.fear_s - seconds, 0.0)
+
+    def _threatened(self) -> bool:
+        near = 0.95 if self.height > 0.1 else 1.25
+        return (self.distance < near and self.closing > 0.25) or self.distance < 0.55 or (self.distance < near + 0.75 and self.closing > 0.65)
+
+    def _decide(self, seconds: float, seen: Seen) -> None:
+        if self._threatened() and self.fear_s <= 0:
+            self._flee(seen)
+            return
+        if not self.walker.arrived():
+            return
+        self.rest_s -= seconds
+        willing = self.reason != "approach" and 1.35 < self.distance < NOTICE_M + 0.5 and self.calm_s > 0.9
+        if willing and self.rng.random() < 1.1 * seconds:
+            self._approach(seen)
+        elif self.rest_s <= 0:
+            self._visit()
+
+    def _flee(self, seen: Seen) -> None:
+        """Run to a free spot straight away from the person, about two metres off, not past it."""
+        centers = self.walker.floor.centers()
+        off = centers - self.walker.position
+        length = np.linalg.norm(off, axis=-1)
+        away = self.walker.position - seen.position
+        away = away / max(float(np.linalg.norm(away)), 1e-6)
+        straight = (off @ away) / np.maximum(length, 1e-6)
+        clear = np.minimum(np.linalg.norm(centers - seen.position, axis=-1), 3.0)
+        score = 1.3 * clear + 1.2 * straight - 0.7 * np.abs(length - 2.0) + self.rng.gumbel(0, 0.12, len(centers))
+        self.reason, self.fear_s, self.pace = "flee", 0.9, self.rng.uniform(1.7, 2.3)
+        self._leave()
+        self.walker.go(centers[np.argmax(score)], avoid=seen.position)
+        self.wanted = np.array([0.0, 0.0, 0.7])
+        self.rest_s = self.rng.uniform(2.0, 3.5)
+
+    def _approach(self, seen: Seen) -> None:
+        """Walk up to about a metre from the person, a little to one side."""
+        from_person = self.walker.position - seen.position
+        angle = np.arctan2(from_person[0], from_person[1]) + self.rng.normal(0, 0.3)
+        goal = seen.position + self.rng.uniform(0.85, 1.1) * np.array([np.sin(angle), np.cos(angle)])
+        self.reason, self.pace = "approach", self.rng.uniform(0.6, 0.9)
+        self._leave()
+        self.walker.go(goal)
+        self.wanted = np.zeros(3)
+        self.rest_s = self.rng.uniform(2.5, 4.5)
+
+    def _visit(self) -> None:
+        """Go to a favourite place, or just somewhere."""
+        weight = np.array([0.5 if self.perch is not None and place is self.perch else 1.0 for place in self.places])
+        weight *= np.exp(-0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places]))
+        self.reason, self.pace = "own", self.rng.choice([0.5, 0.7, 0.9, 1.3], p=[0.2, 0.4, 0.25, 0.15])
+        self._leave()
+        if self.rng.random() < 0.75:
+            self.place = self.places[self.rng.choice(len(self.places), p=weight / weight.sum())]
+            self.walker.go(np.asarray(self.place.entry))
+        else:
+            centers = self.walker.floor.centers()
+            self.walker.go(centers[self.rng.integers(len(centers))])
+        self.wanted = np.zeros(3)
+        self.rest_s = self.rng.uniform(1.0, 3.2)
+
+    def _leave(self) -> None:
+        self.place = None
+        self.wanted = np.zeros(3)
+
+    def _arrive(self) -> None:
+        """Jump up if the place is high, then settle: sit, lie or stand."""
+        if self.place is not None and self.place.position[1] > 0.1:
+            self.perch = self.place
+            self._jump(np.asarray(self.place.position, float))
+        sit, lie = {"flee": (0.15, 0.0), "approach": (0.65, 0.1), "own": (0.4, 0.25)}[self.reason]
+        draw = self.rng.random()
+        self.wanted = np.array([float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0])
+
+    def _jump(self, end: Float[np.ndarray, "3"]) -> None:
+        self.leap = Leap(self.position, end)
+        self.walker.speed = 0.0
+
+    def _fly(self, seconds: float) -> None:
+        leap = self.leap
+        leap.elapsed_s += seconds
+        share = min(leap.elapsed_s / JUMP_S, 1.0)
+        course = share * share * (3 - 2 * share)
+        self.walker.position = (leap.start + course * (leap.end - leap.start))[[0, 2]]
+        self.height = float(leap.start[1] + course * (leap.end[1] - leap.start[1]) + 4 * 0.16 * share * (1 - share))
+        toward = (leap.end - leap.start)[[0, 2]]
+        error = (np.arctan2(toward[0], toward[1]) - self.walker.yaw + np.pi) % (2 * np.pi) - np.pi
+        self.walker.yaw += float(np.clip(error, -9 * seconds, 9 * seconds))
+        if share >= 1.0:
+            self.height, self.leap = float(leap.end[1]), None
+
+    def _look(self, seconds: float, seen: Seen) -> None:
+        """Turn the gaze: at the person when it matters, else ahead or around."""
+        self._gaze_s -= seconds
+        ahead = self.position + np.array([np.sin(self.walker.yaw), 0.22, np.cos(self.walker.yaw)])
+        if self.walker.speed > 0.3:
+            self._gaze_goal = ahead
+        elif self._gaze_s <= 0:
+            self._gaze_s = self.rng.uniform(0.6, 2.2)
+            watch = self.distance < NOTICE_M and self.rng.random() < (0.8 if self.reason != "own" else 0.4)
+            person = np.array([seen.position[0], 1.2, seen.position[1]])
+            around = ahead + np.array([self.rng.uniform(-1, 1), self.rng.uniform(-0.2, 0.3), self.rng.uniform(-1, 1)])
+            self._gaze_goal = person if watch else around
+        self.gaze = self.gaze + (self._gaze_goal - self.gaze) * (1 - np.exp(-seconds / 0.18))

@@ -1,0 +1,90 @@
+"""Make recordings and truth of all scripts, several at once; each is a function of its script alone, so order and number of workers change nothing."""
+
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.files import meshes
+from pipeline.space.meshes import Mesh
+from stages.synthesize_capture import record3d, sheets
+from stages.synthesize_capture.animal import Animal
+from stages.synthesize_capture.film import Stage
+from stages.synthesize_capture.record3d import Header
+from stages.synthesize_capture.room import Room
+from stages.synthesize_capture.script import Script
+from stages.synthesize_capture.truth import Truth, write_flow
+
+FLOW_PAIRS = 40
+THUMBNAILS = 6
+
+
+@dataclass(frozen=True)
+class Made:
+    """What is worth knowing about a finished recording: some frames (colour, animal outlined, depth) and shares."""
+
+    name: str
+    frames: int
+    visible_share: float
+    thumbnails: UInt8[np.ndarray, "picture height width 3"]
+    outlines: UInt8[np.ndarray, "picture height width"]
+    depths: np.ndarray
+
+
+def produce(scripts: list[Script], creature: Animal, recordings: Path, truth: Path, *, workers: int) -> list[Made]:
+    """Make everything, longest recordings first; return in the order of the scripts."""
+    order = sorted(range(len(scripts)), key=lambda index: -len(scripts[index].timestamp_s))
+    jobs = [(scripts[index], creature, recordings, truth) for index in order]
+    if workers <= 1:
+        made = [record(*job) for job in jobs]
+    else:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            made = [future.result() for future in [pool.submit(record, *job) for job in jobs]]
+    return [made[order.index(index)] for index in range(len(scripts))]
+
+
+def record(script: Script, creature: Animal, recordings: Path, truth_folder: Path) -> Made:
+    """Film one script into a `.r3d` file and its truth."""
+    stage = Stage(script, creature)
+    truth = Truth(script, keep_depth=script.name == "heldout")
+    chosen = set(np.linspace(0, len(script.timestamp_s) - 1, THUMBNAILS).astype(int).tolist())
+    thumbnails, outlines, depths = [], [], []
+    with record3d.Writer(recordings / f"{script.name}.r3d") as writer:
+        for index, frame in enumerate(stage.frames()):
+            writer.add(frame.color, frame.depth, frame.confidence)
+            truth.add(frame, index)
+            if index in chosen:
+                thumbnails.append(frame.color)
+                outlines.append(frame.mask.astype(np.uint8) * 255)
+                depths.append(np.nan_to_num(frame.depth))
+        writer.finish(_header(script))
+    truth.write(truth_folder)
+    if script.session is not None:
+        write_flow(stage, truth_folder, pairs=FLOW_PAIRS)
+    return Made(script.name, len(script.timestamp_s), float(truth.visible().mean()), np.stack(thumbnails), np.stack(outlines), np.stack(depths))
+
+
+def write_surfaces(room: Room, creature: Animal, folder: Path) -> None:
+    """Write the true room (as in the walk-through, world of the truth) and the animal at rest (agent frame)."""
+    vertices, faces, coordinates, owner = sheets.triangles(room.sheets())
+    meshes.write_ply(folder / "scene.ply", Mesh(vertices, faces, _room_colors(room, coordinates)))
+    color = (np.clip(creature.fur[:, :3], 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
+    meshes.write_ply(folder / "agent.ply", Mesh(creature.vertices, creature.faces, color))
+
+
+def _room_colors(room: Room, coordinates: np.ndarray) -> UInt8[np.ndarray, "vertex 3"]:
+    colors, start = [], 0
+    for sheet in room.sheets():
+        count = sheet.points.shape[0] * sheet.points.shape[1]
+        height, width, _ = sheet.picture.shape
+        at = (coordinates[start : start + count] * [width - 1, height - 1]).astype(int)
+        colors.append(sheet.picture[at[:, 1], at[:, 0]])
+        start += count
+    return np.concatenate(colors)
+
+
+def _header(script: Script) -> Header:
+    return Header(script.timestamp_s, script.intrinsics, script.odometry_from_camera, script.color_size, script.depth_size, round(script.fps))

@@ -1,0 +1,98 @@
+"""Let animal and person live together for a while, without pictures.
+
+`simulate_session` steps both at `STEP_S` and returns plain time series; poses, cameras and pictures
+follow from them elsewhere, so this runs alone and fast.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from stages.synthesize_capture.navigation import floor_for
+from stages.synthesize_capture.observer import Observer
+from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, Seen
+from stages.synthesize_capture.room import Room
+
+STEP_S = 1.0 / 30.0
+ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M = 0.24, 0.34
+PERSON_BREADTH_M, PERSON_HEIGHT_M = 0.40, 1.7
+
+
+@dataclass(frozen=True)
+class AnimalCourse:
+    """Where the animal's body goes: ground point under it, heading about +y, posture, gaze, tail."""
+
+    timestamp_s: Float[np.ndarray, "sample"]
+    position: Float[np.ndarray, "sample 3"]
+    """x, height of what it stands on (or flies at), z."""
+    yaw: Float[np.ndarray, "sample"]
+    posture: Float[np.ndarray, "sample 3"]
+    """How much it sits, lies, crouches, each 0 to 1."""
+    airborne: Float[np.ndarray, "sample"]
+    gaze: Float[np.ndarray, "sample 3"]
+    """World point it looks at."""
+    tail: Float[np.ndarray, "sample"]
+    """-1 low and tense to 1 raised."""
+
+    def speed(self) -> Float[np.ndarray, "sample"]:
+        """Return the speed over ground in m/s."""
+        return np.linalg.norm(np.gradient(self.position, self.timestamp_s, axis=0), axis=-1)
+
+
+@dataclass(frozen=True)
+class SessionTrajectories:
+    """A session's truth before any camera: the animal's course, the person's, and why the animal moved."""
+
+    animal: AnimalCourse
+    observer_position: Float[np.ndarray, "sample 2"]
+    observer_looks_at: Float[np.ndarray, "sample 3"]
+    reason: Int[np.ndarray, "sample"]
+    """Index into `policy.REASONS`."""
+
+
+def simulate_session(room: Room, rng: np.random.Generator, duration_s: float) -> SessionTrajectories:
+    """Simulate one session in a room; the same generator state gives the same session."""
+    animal_floor = floor_for(room.footprints(), breadth_m=ANIMAL_BREADTH_M, height_m=ANIMAL_HEIGHT_M)
+    person_floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
+    start = person_floor.centers()[rng.integers(person_floor.free.sum())]
+    centers = animal_floor.centers()
+    begin = centers[np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))]
+    animal = Policy(animal_floor, room.places, begin, rng)
+    observer = Observer(person_floor, start, rng)
+    past: deque[Seen] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
+    count = int(np.ceil(duration_s / STEP_S)) + 2
+    rows: list[tuple] = []
+    for _ in range(count):
+        observer.step(STEP_S, animal.position)
+        past.append(Seen(observer.walker.position.copy(), observer.velocity.copy()))
+        animal.step(STEP_S, past[0])
+        mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (1.0 - 0.6 * animal.posture[:2].sum())
+        rows.append((
+            animal.position, animal.walker.yaw, animal.posture.copy(), float(animal.leap is not None), animal.gaze.copy(), mood,
+            observer.walker.position.copy(), observer.looks_at.copy(), REASONS.index(animal.reason),
+        ))  # fmt: skip
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    timestamp_s = np.arange(count) * STEP_S
+    course = AnimalCourse(timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5])
+    return SessionTrajectories(course, columns[6], columns[7], columns[8])
+
+
+def standing_course(room: Room, rng: np.random.Generator, duration_s: float) -> AnimalCourse:
+    """Return the course of an animal that stands calmly on the rug, looking about now and then."""
+    count = int(np.ceil(duration_s / STEP_S)) + 2
+    floor = floor_for(room.footprints(), breadth_m=1.0, height_m=PERSON_HEIGHT_M)
+    spot = floor.nearest(np.array([0.55, 0.15]) + rng.uniform(-0.1, 0.1, 2))
+    position = np.broadcast_to(np.array([spot[0], 0.008, spot[1]]), (count, 3)).copy()
+    yaw = np.full(count, rng.uniform(-np.pi, np.pi))
+    gaze = np.empty((count, 3))
+    goal, current = None, None
+    for index in range(count):
+        if goal is None or rng.random() < STEP_S / 2.2:
+            turn = yaw[0] + rng.normal(0, 0.35)
+            goal = position[0] + np.array([np.sin(turn), 0.27 + rng.normal(0, 0.08), np.cos(turn)])
+        current = goal if current is None else current + (goal - current) * (1 - np.exp(-STEP_S / 0.3))
+        gaze[index] = current
+    still = np.zeros(count)
+    return AnimalCourse(np.arange(count) * STEP_S, position, yaw, np.zeros((count, 3)), still, gaze, still + 0.1)

@@ -1,0 +1,71 @@
+"""Keep the truth of a recording, for `evaluate` alone: cameras, animal, masks, noiseless depth, flow. All on the upright picture."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.files import arrays
+from pipeline.space import cameras
+from stages.synthesize_capture.film import Frame, Stage, matrices, true_flow
+from stages.synthesize_capture.script import Script
+
+VISIBLE_SHARE = 0.001
+"""Share of the picture that must show the animal for it to count as visible."""
+FLOW_GAP_S = 0.1
+
+
+@dataclass
+class Truth:
+    """Collects one recording's truth frame by frame, then writes it."""
+
+    script: Script
+    keep_depth: bool
+    masks: list[np.ndarray] = field(default_factory=list)
+    depth: list[np.ndarray] = field(default_factory=list)
+    vertices: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, frame: Frame, index: int) -> None:
+        """Take over one frame."""
+        turns = self.script.quarter_turns
+        self.masks.append(cameras.turn_image(frame.mask, turns))
+        if self.keep_depth:
+            self.depth.append(cameras.turn_image(frame.true_depth, turns).astype(np.float16))
+        if frame.vertices_world is not None:
+            root = self.script.motion.world_from_agent[index, :3, 3]
+            self.vertices.append((frame.vertices_world - root).astype(np.float16))
+
+    def visible(self) -> np.ndarray:
+        """Return in which frames the animal can be seen."""
+        return np.array([mask.mean() > VISIBLE_SHARE for mask in self.masks])
+
+    def write(self, folder: Path) -> None:
+        """Write the recording's files into the truth folder."""
+        script, name = self.script, self.script.name
+        contents = {
+            "timestamp_s": script.timestamp_s,
+            "world_from_camera": cameras.turn_camera(script.world_from_camera, script.quarter_turns),
+            "intrinsics": cameras.turn_intrinsics(matrices(script.intrinsics), script.color_size, script.quarter_turns),
+            "agent_visible": self.visible(),
+            "moving": script.moving,
+        }
+        if script.motion is not None:
+            contents["world_from_agent"] = script.motion.world_from_agent
+            contents["agent_from_bone"] = script.motion.agent_from_bone.astype(np.float32)
+            contents["agent_vertices_world"] = np.stack(self.vertices)
+            masks = np.stack(self.masks)
+            arrays.save(folder / f"{name}.masks.npz", compress=True, packed=np.packbits(masks, axis=-1), shape=np.array(masks.shape, np.int64))
+        arrays.save(folder / f"{name}.npz", **contents)
+        if self.keep_depth:
+            stored = cameras.scale_intrinsics(matrices(script.intrinsics), script.color_size, script.depth_size)
+            depth_intrinsics = cameras.turn_intrinsics(stored, script.depth_size, script.quarter_turns)
+            arrays.save(folder / f"{name}.depth.npz", compress=True, depth=np.stack(self.depth), depth_intrinsics=depth_intrinsics)
+
+
+def write_flow(stage: Stage, folder: Path, *, pairs: int) -> None:
+    """Write the true flow of some pairs of frames about a tenth of a second apart."""
+    times = stage.script.timestamp_s
+    first = np.unique(np.linspace(0, np.searchsorted(times, times[-1] - FLOW_GAP_S) - 1, pairs).astype(np.int64))
+    second = [int(np.argmin(np.abs(times - times[index] - FLOW_GAP_S))) for index in first]
+    flow = np.stack([true_flow(stage, int(a), b) for a, b in zip(first, second, strict=True)])
+    arrays.save(folder / f"{stage.script.name}.flow.npz", compress=True, frame_index=first, second_index=np.array(second, np.int64), flow=flow.astype(np.float16))
