@@ -1,4 +1,4 @@
-"""Write binary glTF 2.0: still surfaces and skinned, animated ones.
+"""Make binary glTF 2.0: still surfaces and skinned, animated ones.
 
 A skinned file holds one root node that carries `world_from_agent`, the mesh, and every bone as a sibling joint under
 the root; the joint of bone b carries `agent_from_bone`. Bytes depend on the content alone.
@@ -6,14 +6,13 @@ the root; the joint of bone b carries `agent_from_bone`. Bytes depend on the con
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pygltflib as gltf
 from jaxtyping import Float, Float32, UInt8
 
-from pipeline.space.meshes import Mesh
 from pipeline.space import rigid
+from pipeline.space.meshes import Mesh
 
 _FLOAT, _U8, _U32 = gltf.FLOAT, gltf.UNSIGNED_BYTE, gltf.UNSIGNED_INT
 _ROOT_NODE, _MESH_NODE, _FIRST_JOINT = 0, 1, 2
@@ -39,30 +38,32 @@ class Action:
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
 
 
-def write_static(path: Path, mesh: Mesh, name: str) -> None:
-    """Write a still surface with vertex colour; metres, +y up."""
+def static(mesh: Mesh, name: str) -> bytes:
+    """Return a file of a still surface with vertex colour; metres, +y up."""
     document = _Document()
     document.add_mesh(mesh, name, None)
     document.file.nodes = [gltf.Node(name=name, mesh=0)]
     document.file.scenes = [gltf.Scene(nodes=[0])]
-    document.save(path)
+    return document.packed()
 
 
-def write_skinned(path: Path, mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agent") -> None:
-    """Write a skinned surface (agent frame, metres) with one animation per action."""
+def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agent") -> bytes:
+    """Return a file of a skinned surface (agent frame, metres) with one animation per action."""
     document = _Document()
     document.add_mesh(mesh, name, skin)
     joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
-    document.file.nodes = [gltf.Node(name=name, children=[_MESH_NODE, *joints]), gltf.Node(name=f"{name}_surface", mesh=0, skin=0)]
+    document.file.nodes = [gltf.Node(name=name, children=[_MESH_NODE, *joints])]
+    document.file.nodes.append(gltf.Node(name=f"{name}_surface", mesh=0, skin=0))
     translations, quaternions = _translation_quaternion(skin.agent_from_bone_rest)
     for bone, translation, quaternion in zip(skin.bone_names, translations, quaternions, strict=True):
         document.file.nodes.append(gltf.Node(name=bone, translation=_floats(translation), rotation=_floats(quaternion)))
     inverse_bind = rigid.inverse(skin.agent_from_bone_rest).astype(np.float32)
     columns = np.ascontiguousarray(inverse_bind.transpose(0, 2, 1)).reshape(-1, 16)  # glTF is column-major
-    document.file.skins = [gltf.Skin(name="skin", joints=joints, skeleton=_ROOT_NODE, inverseBindMatrices=document.add(columns, "MAT4", _FLOAT))]
+    matrices = document.add(columns, "MAT4", _FLOAT)
+    document.file.skins = [gltf.Skin(name="skin", joints=joints, skeleton=_ROOT_NODE, inverseBindMatrices=matrices)]
     document.file.animations = [document.animation(action) for action in actions]
     document.file.scenes = [gltf.Scene(nodes=[_ROOT_NODE])]
-    document.save(path)
+    return document.packed()
 
 
 class _Document:
@@ -97,7 +98,8 @@ class _Document:
             attributes.JOINTS_0 = self.add(skin.joints, "VEC4", _U8, **vertex)
             attributes.WEIGHTS_0 = self.add(skin.weights, "VEC4", _FLOAT, **vertex)
         indices = self.add(mesh.faces.astype(np.uint32).reshape(-1), "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER)
-        self.file.materials = [gltf.Material(name="surface", doubleSided=True, pbrMetallicRoughness=gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0))]
+        matte = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)
+        self.file.materials = [gltf.Material(name="surface", doubleSided=True, pbrMetallicRoughness=matte)]
         self.file.meshes = [gltf.Mesh(name=name, primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)])]
 
     def animation(self, action: Action) -> gltf.Animation:
@@ -109,14 +111,17 @@ class _Document:
         for node, parent_from_node in tracks:
             translation, quaternion = _translation_quaternion(parent_from_node)
             for path, values, kind in (("translation", translation, "VEC3"), ("rotation", _without_flips(quaternion), "VEC4")):
-                animation.samplers.append(gltf.AnimationSampler(input=keys, output=self.add(values.astype(np.float32), kind, _FLOAT), interpolation="LINEAR"))
-                animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=gltf.AnimationChannelTarget(node=node, path=path)))
+                output = self.add(values.astype(np.float32), kind, _FLOAT)
+                animation.samplers.append(gltf.AnimationSampler(input=keys, output=output, interpolation="LINEAR"))
+                target = gltf.AnimationChannelTarget(node=node, path=path)
+                animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
         return animation
 
-    def save(self, path: Path) -> None:
+    def packed(self) -> bytes:
+        """Return the whole file."""
         self.file.buffers = [gltf.Buffer(byteLength=len(self.blob))]
         self.file.set_binary_blob(bytes(self.blob))
-        self.file.save_binary(str(path))
+        return b"".join(self.file.save_to_bytes())
 
 
 def _translation_quaternion(parent_from_node: Float[np.ndarray, "n 4 4"]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,62 @@
+"""Say in one table what the page and every other player of the simulator must know: `simulator.json`."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from stages.export_simulator.actions import Motion
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The room as a place to move in: world frame, metres."""
+
+    floor_m: float
+    bounds_m: Float[np.ndarray, "2 3"]
+
+
+def contract(
+    *,
+    name: str,
+    behavior: dict[str, Any],
+    setting: Setting,
+    motions: list[Motion],
+    bone_names: tuple[str, ...],
+    skinning_residual_m: Float[np.ndarray, "frame vertex"],
+    volume: dict[str, Any],
+) -> dict[str, Any]:
+    """Assemble the table; `behavior` is the sampler's own contract, passed on unchanged."""
+    observers = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions])
+    starts = np.cumsum([0] + [len(motion.timestamp_s) for motion in motions])
+    residual_mm = skinning_residual_m * 1000
+    return {
+        "version": VERSION,
+        "name": name,
+        "units": {"length": "m", "time": "s", "angle": "rad"},
+        "up": "+y",
+        "quaternion": "wxyz",
+        "rows": "a row is a rigid motion: place x y z, quaternion w x y z; a clip's frame is world_from_agent, agent_from_bone of each bone, world_from_camera",
+        "scene": {"floor_m": round(setting.floor_m, 4), "bounds_m": np.round(setting.bounds_m, 4).tolist()},
+        "observer": {
+            "eye_height_m": round(float(np.median(observers[:, 1]) - setting.floor_m), 4),
+            "start_m": np.round(np.median(observers[:, [0, 2]], axis=0), 4).tolist(),
+        },
+        "agent": {
+            "bones": list(bone_names),
+            "skinning_residual_mm": {
+                "mean": round(float(residual_mm.mean()), 3),
+                "p99": round(float(np.percentile(residual_mm, 99)), 3),
+                "max": round(float(residual_mm.max()), 3),
+            },
+        },
+        "clips": [
+            {"name": motion.name, "start": int(start), "count": len(motion.timestamp_s)}
+            for motion, start in zip(motions, starts[:-1], strict=True)
+        ],
+        "volume": volume,
+        "behavior": behavior,
+    }

@@ -1,0 +1,108 @@
+"""Four linear-blend weights a vertex that imitate dual-quaternion blending with many.
+
+`blend_dual_quaternions` poses the surface as the reconstruction does; `refit_weights` finds, per vertex, the best four
+bones and convex weights for linear blending over a set of poses; `residual_m` says what is lost.
+"""
+
+from itertools import combinations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int, UInt8
+
+from pipeline.models import skinning
+
+_CANDIDATES = 8
+_DESCENT_STEPS = 150
+
+
+def blend_dual_quaternions(
+    vertices: Float[np.ndarray, "vertex 3"],
+    weights: Float[np.ndarray, "vertex bone"],
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"],
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
+) -> Float[np.ndarray, "frame vertex 3"]:
+    """Pose the surface as the reconstruction does: dual-quaternion blending with all weights; metres, agent frame."""
+    points, weight, rest = (torch.from_numpy(np.ascontiguousarray(values, np.float32)) for values in (vertices, weights, agent_from_bone_rest))
+    posed = [skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points) for bones in agent_from_bone]
+    return torch.stack(posed).numpy().astype(np.float64)
+
+
+def refit_weights(
+    vertices: Float[np.ndarray, "vertex 3"],
+    weights: Float[np.ndarray, "vertex bone"],
+    posed_from_rest: Float[np.ndarray, "frame bone 4 4"],
+    posed: Float[np.ndarray, "frame vertex 3"],
+) -> tuple[UInt8[np.ndarray, "vertex 4"], Float32[np.ndarray, "vertex 4"]]:
+    """Return bones and convex weights whose linear blend is nearest, in squares, to the posed surface."""
+    count = min(_CANDIDATES, weights.shape[1])
+    candidates = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+    gram = _gram(vertices, candidates, posed_from_rest, posed)
+    start = np.take_along_axis(weights, candidates, 1)
+    descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
+    kept = np.argsort(-descended, axis=1, kind="stable")[:, : min(4, count)]
+    gram = np.take_along_axis(np.take_along_axis(gram, kept[:, :, None], 1), kept[:, None, :], 2)
+    best = _best_on_simplex(gram)
+    order = np.argsort(-best, axis=1, kind="stable")
+    joints, best = np.take_along_axis(np.take_along_axis(candidates, kept, 1), order, 1), np.take_along_axis(best, order, 1)
+    padding = ((0, 0), (0, 4 - best.shape[1]))
+    joints, best = np.pad(np.where(best > 0, joints, 0), padding), np.pad(best, padding)
+    return joints.astype(np.uint8), best.astype(np.float32)
+
+
+def residual_m(
+    vertices: Float[np.ndarray, "vertex 3"],
+    joints: UInt8[np.ndarray, "vertex 4"],
+    weights: Float[np.ndarray, "vertex 4"],
+    posed_from_rest: Float[np.ndarray, "frame bone 4 4"],
+    posed: Float[np.ndarray, "frame vertex 3"],
+) -> Float[np.ndarray, "frame vertex"]:
+    """Return the distance between the linear blend and the posed surface."""
+    distance = np.empty(posed.shape[:2])
+    for frame, bones in enumerate(posed_from_rest):
+        each = np.einsum("vkij,vj->vki", bones[joints][..., :3, :3], vertices) + bones[joints][..., :3, 3]
+        distance[frame] = np.linalg.norm(np.einsum("vk,vki->vi", weights, each) - posed[frame], axis=1)
+    return distance
+
+
+def _gram(vertices: np.ndarray, candidates: Int[np.ndarray, "vertex k"], posed_from_rest: np.ndarray, posed: np.ndarray) -> Float[np.ndarray, "vertex k k"]:
+    """Sum over frames the products of each bone's error: for convex w the squared error is w' G w."""
+    gram = np.zeros((len(vertices), candidates.shape[1], candidates.shape[1]))
+    for bones, target in zip(posed_from_rest, posed, strict=True):
+        each = np.einsum("bij,vj->vbi", bones[:, :3, :3], vertices) + bones[None, :, :3, 3]
+        error = np.take_along_axis(each, candidates[:, :, None], 1) - target[:, None]
+        gram += error @ error.transpose(0, 2, 1)
+    return gram / len(posed)
+
+
+def _descend_on_simplex(gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]) -> Float[np.ndarray, "vertex k"]:
+    """Minimise w' G w over convex weights by projected gradient descent."""
+    rate = 1.0 / np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-20)[:, None]
+    for _ in range(_DESCENT_STEPS):
+        weights = _project_to_simplex(weights - rate * np.einsum("vij,vj->vi", gram, weights))
+    return weights
+
+
+def _project_to_simplex(values: Float[np.ndarray, "vertex k"]) -> Float[np.ndarray, "vertex k"]:
+    """Return the nearest convex weights (Duchi et al. 2008)."""
+    ordered = -np.sort(-values, axis=1)
+    excess = (np.cumsum(ordered, 1) - 1) / np.arange(1, values.shape[1] + 1)
+    last = (ordered > excess).sum(1) - 1
+    return np.maximum(values - np.take_along_axis(excess, last[:, None], 1), 0)
+
+
+def _best_on_simplex(gram: Float[np.ndarray, "vertex k k"]) -> Float[np.ndarray, "vertex k"]:
+    """Minimise w' G w over convex weights exactly: every support is tried."""
+    count = gram.shape[1]
+    ridge = 1e-9 * (np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(count)
+    best, best_cost = np.zeros(gram.shape[:2]), np.full(len(gram), np.inf)
+    for size in range(1, count + 1):
+        for support in map(list, combinations(range(count), size)):
+            solved = np.linalg.solve((gram + ridge)[:, support][:, :, support], np.ones((len(gram), size, 1)))[..., 0]
+            total = solved.sum(1, keepdims=True)
+            trial = np.zeros_like(best)
+            trial[:, support] = solved / np.where(total == 0, 1, total)
+            cost = np.einsum("vi,vij,vj->v", trial, gram, trial)
+            better = (trial >= 0).all(1) & (total[:, 0] > 0) & (cost < best_cost)
+            best[better], best_cost[better] = trial[better], cost[better]
+    return best

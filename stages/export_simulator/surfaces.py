@@ -1,0 +1,73 @@
+"""Make surfaces light enough for a page: thin them, keep their colour and weights, find the floor, shrink splats."""
+
+import fast_simplification
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import cKDTree
+
+from pipeline.space.meshes import Mesh
+
+_SPLAT_ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+_BAND_0 = 0.28209479177387814  # the constant spherical harmonic
+
+
+def thin(mesh: Mesh, max_faces: int) -> tuple[Mesh, Int[np.ndarray, " vertex"]]:
+    """Collapse edges until `max_faces` are left; also return, per new vertex, the nearest old one."""
+    if len(mesh.faces) <= max_faces:
+        return mesh, np.arange(len(mesh.vertices))
+    vertices, faces = fast_simplification.simplify(
+        np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.int32), target_count=max_faces
+    )
+    nearest = cKDTree(mesh.vertices).query(vertices)[1]
+    color = None if mesh.color is None else mesh.color[nearest]
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), color), nearest
+
+
+def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3"]) -> float:
+    """Find the height of the floor: the lowest level that holds a fair share of all upward-facing area below the agent."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    height = corners[..., 1].mean(1)
+    level = (normals[:, 1] > 0.9 * area) & (height < np.median(agent_positions_world[:, 1]))
+    if not level.any():
+        return float(np.percentile(mesh.vertices[:, 1], 2))
+    edges = np.arange(height[level].min() - 0.02, height[level].max() + 0.04, 0.02)
+    share, _ = np.histogram(height[level], edges, weights=area[level])
+    lowest = np.flatnonzero(share > 0.25 * share.max())[0]
+    near = level & (np.abs(height - edges[lowest] - 0.01) < 0.03)
+    return float(np.average(height[near], weights=area[near]))
+
+
+def bounds(mesh: Mesh) -> Float[np.ndarray, "2 3"]:
+    """Return the box that holds all but the stray 0.5 % of vertices at each end."""
+    return np.percentile(mesh.vertices, [0.5, 99.5], axis=0)
+
+
+def facing(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
+    """Orient all faces alike so that most of the area faces a point inside the room: walls then vanish from behind."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    towards = np.einsum("fi,fi->f", normals, inside - corners.mean(1))
+    if np.linalg.norm(normals, axis=1) @ np.sign(towards) >= 0:
+        return mesh
+    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.color)
+
+
+def splat_rows(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> bytes:
+    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation; the faintest go first."""
+    opacity = 1 / (1 + np.exp(-gaussians[:, 54].astype(np.float64)))
+    size = np.exp(gaussians[:, 55:58].astype(np.float64))
+    sound = np.isfinite(gaussians).all(1) & (opacity >= 1 / 255)
+    weight = np.where(sound, opacity * np.sort(size, axis=1)[:, 1:].prod(1), -1)
+    kept = np.argsort(-weight, kind="stable")[: min(max_points, int(sound.sum()))]
+    rows = np.zeros(len(kept), _SPLAT_ROW)
+    rows["position"], rows["scale"] = gaussians[kept, :3], size[kept]
+    rows["color"] = _bytes(np.concatenate([gaussians[kept, 6:9] * _BAND_0 + 0.5, opacity[kept, None]], 1) * 255)
+    rotation = gaussians[kept, 58:62] / np.linalg.norm(gaussians[kept, 58:62], axis=1, keepdims=True)
+    rows["rotation"] = _bytes(rotation * 128 + 128)
+    return rows.tobytes()
+
+
+def _bytes(values: np.ndarray) -> UInt8[np.ndarray, "*any"]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

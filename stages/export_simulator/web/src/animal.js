@@ -1,0 +1,76 @@
+// Skinned bodies: the animal itself, its ghost at the end of the plan, and a real animal beside it.
+
+import * as THREE from 'three';
+import { clone } from 'three/examples/jsm/utils/SkeletonUtils.js';
+import { ROW } from './rigid.js';
+import { parseModel } from './room.js';
+
+export class Animal {
+  constructor(root) {
+    this.root = root;
+    root.traverse((node) => { if (node.isSkinnedMesh) this.mesh = node; });
+    this.mesh.frustumCulled = false;
+    this.mesh.material = new THREE.MeshLambertMaterial({ vertexColors: true });
+    this.bones = this.mesh.skeleton.bones;
+    this.shadow = contactShadow();
+    this.root.parent?.add(this.shadow);
+  }
+
+  static async parse(bytes) {
+    const model = await parseModel(bytes);
+    return new Animal(model.scene.children[0]);
+  }
+
+  // A translucent copy that shares the surface.
+  ghost(color, opacity) {
+    const copy = new Animal(clone(this.root));
+    copy.mesh.material = new THREE.MeshBasicMaterial({ color, transparent: true, opacity, depthWrite: false });
+    copy.shadow.visible = false;
+    return copy;
+  }
+
+  addTo(scene) {
+    scene.add(this.root, this.shadow);
+    return this;
+  }
+
+  set visible(value) {
+    this.root.visible = value;
+    if (!value) this.shadow.visible = false;
+  }
+
+  get visible() {
+    return this.root.visible;
+  }
+
+  // Take the pose of a frame: the root's row, then one row per bone.
+  pose(frame, floor) {
+    setRow(this.root, frame, 0);
+    this.bones.forEach((bone, index) => setRow(bone, frame, (index + 1) * ROW));
+    const height = Math.max(0, frame[1] - floor);
+    this.shadow.position.set(frame[0], floor + 0.012, frame[2]);
+    this.shadow.scale.setScalar(1 + height);
+    this.shadow.material.opacity = 0.42 / (1 + 6 * Math.max(0, height - 0.2));
+  }
+}
+
+function setRow(node, frame, at) {
+  node.position.set(frame[at], frame[at + 1], frame[at + 2]);
+  node.quaternion.set(frame[at + 4], frame[at + 5], frame[at + 6], frame[at + 3]);
+}
+
+function contactShadow() {
+  const canvas = document.createElement('canvas');
+  canvas.width = canvas.height = 64;
+  const pen = canvas.getContext('2d');
+  const fade = pen.createRadialGradient(32, 32, 0, 32, 32, 32);
+  fade.addColorStop(0, 'rgba(30,22,14,1)');
+  fade.addColorStop(0.5, 'rgba(30,22,14,.45)');
+  fade.addColorStop(1, 'rgba(30,22,14,0)');
+  pen.fillStyle = fade;
+  pen.fillRect(0, 0, 64, 64);
+  const material = new THREE.MeshBasicMaterial({ map: new THREE.CanvasTexture(canvas), transparent: true, depthWrite: false });
+  const shadow = new THREE.Mesh(new THREE.PlaneGeometry(0.62, 0.62).rotateX(-Math.PI / 2), material);
+  shadow.renderOrder = 1;
+  return shadow;
+}

@@ -1,0 +1,87 @@
+// The controls: they read and write the state and call back; they know nothing of the room.
+
+const at = (id) => document.getElementById(id);
+
+export function buildPanel(state, clips, on) {
+  const sync = [];
+  const change = (key, value) => {
+    state[key] = value;
+    sync.forEach((update) => update());
+    on.change(key);
+  };
+
+  at('interactivity').addEventListener('input', (event) => change('interactivity', Number(event.target.value)));
+  sync.push(() => {
+    at('interactivity').value = state.interactivity;
+    at('interactivity-value').textContent = state.interactivity.toFixed(2);
+  });
+
+  for (const box of document.querySelectorAll('[data-sense]')) toggle(box, box.dataset.sense);
+  for (const box of document.querySelectorAll('[data-layer]')) toggle(box, box.dataset.layer);
+  function toggle(box, key) {
+    box.addEventListener('change', () => change(key, box.checked ? 1 : 0));
+    sync.push(() => { box.checked = Boolean(state[key]); });
+  }
+
+  choices('samples', [1, 4, 16]);
+  choices('steps', [10, 50]);
+  function choices(key, values) {
+    for (const value of values) {
+      const button = Object.assign(document.createElement('button'), { textContent: value, title: `${value} ${key}` });
+      button.addEventListener('click', () => change(key, value));
+      at(key).append(button);
+      sync.push(() => button.setAttribute('aria-pressed', state[key] === value));
+    }
+  }
+
+  at('seed').addEventListener('change', (event) => change('seed', Math.min(999999, Math.max(0, Math.round(Number(event.target.value) || 0)))));
+  at('seed-next').addEventListener('click', () => change('seed', (state.seed + 1) % 1000000));
+  sync.push(() => { at('seed').value = state.seed; });
+
+  for (const clip of clips) at('replay').append(Object.assign(document.createElement('option'), { value: clip.name, textContent: clip.name }));
+  at('replay').addEventListener('change', (event) => change('replay', event.target.value));
+  sync.push(() => { at('replay').value = state.replay; });
+
+  at('play').addEventListener('click', on.play);
+  at('reset').addEventListener('click', on.reset);
+  at('free').addEventListener('click', on.free);
+  at('slow').addEventListener('click', () => change('speed', state.speed === 1 ? 0.3 : 1));
+  sync.push(() => at('slow').setAttribute('aria-pressed', state.speed !== 1));
+
+  at('panel-toggle').addEventListener('click', () => {
+    const closed = at('panel').classList.toggle('closed');
+    at('panel-toggle').setAttribute('aria-expanded', !closed);
+  });
+  if (innerWidth < 720) at('panel').classList.add('closed');
+  sync.forEach((update) => update());
+  return { refresh: () => sync.forEach((update) => update()) };
+}
+
+export function showPlaying(playing) {
+  at('play').textContent = playing ? 'pause' : 'go on';
+}
+
+export function showFree(visible) {
+  at('free').hidden = !visible;
+}
+
+export function status(text) {
+  at('status').textContent = text;
+}
+
+export function progress(share, text) {
+  at('splash-bar').value = share;
+  at('splash-text').textContent = text;
+}
+
+export function ready() {
+  at('splash').classList.add('gone');
+  setTimeout(() => at('help').classList.add('gone'), 12000);
+}
+
+// Say plainly why there is nothing to see.
+export function sorry(text, remedy) {
+  const card = document.querySelector('#splash .card');
+  card.classList.add('sorry');
+  card.replaceChildren(...[['h1', 'Not here, sadly'], ['p', text], ['p', remedy]].map(([tag, content]) => Object.assign(document.createElement(tag), { textContent: content })));
+}

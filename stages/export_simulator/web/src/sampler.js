@@ -1,0 +1,146 @@
+// From what is perceived to a plan: goal, then path, then body. Counterpart of Sampler in pipeline/models/behavior.py.
+
+import { guided, sample } from './diffusion.js';
+import { normals } from './noise.js';
+import { apply, inverse } from './rigid.js';
+
+const FURTHEST = 2; // a clicked goal further away than this, in deviations of learned goals, is approached in legs
+
+export class Sampler {
+  // networks: name -> async (feeds: {name: [values, shape]}) -> Float32Array
+  constructor(contract, networks, senses) {
+    Object.assign(this, { contract: contract.behavior, networks, senses });
+    this.frames = this.contract.future_frames;
+    this.channels = this.contract.scaling.body_mean.length;
+  }
+
+  // The code with everything that is kept, and the one without the observer.
+  async codes(observation, keep, interactivity) {
+    const perceive = (observer) => this.networks.perception({
+      scene_grid: [observation.sceneGrid, [1, this.contract.architecture.scene_channels, ...this.contract.grid.shape]],
+      observer_past: [observation.observerPast, [1, observation.observerPast.length]],
+      past: [observation.past, [1, observation.past.length]],
+      keep: [Float32Array.of(keep.scene, observer, keep.past), [1, 3]],
+    });
+    const full = await perceive(keep.observer);
+    return { full, blind: interactivity === 1 ? full : await perceive(0) };
+  }
+
+  // Scaled goals, `count` of them, three numbers each.
+  goals(codes, count, { noise, steps, interactivity, method, draw }) {
+    const denoise = (code) => (x, t) => this.networks.goal({ x: [x, [count, 3]], ...this.step(count, t, code) });
+    return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity });
+  }
+
+  // A scaled path [3, frames] towards a scaled goal. The reference of the guidance sees neither observer nor goal,
+  // but a goal that the visitor has set is not taken away.
+  path(codes, goal, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
+    const denoise = (code, keep) => (x, t) => this.networks.path({
+      x: [x, [1, 3, this.frames]], ...this.step(1, t, code), control: [goal, [1, 3]], keep: [Float32Array.of(keep), [1, 1]],
+    });
+    return this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
+  }
+
+  // A scaled body [channels, frames] along a scaled path.
+  body(codes, path, { noise, steps, interactivity, method, draw }) {
+    const denoise = (code) => (x, t) => this.networks.body({
+      x: [x, [1, this.channels, this.frames]], ...this.step(1, t, code), control: [path, [1, 3, this.frames]], keep: [Float32Array.of(1), [1, 1]],
+    });
+    return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity });
+  }
+
+  step(count, t, code) {
+    const condition = new Float32Array(count * code.length);
+    for (let i = 0; i < count; i++) condition.set(code, i * code.length);
+    return { t: [new Float32Array(count).fill(t), [count]], condition: [condition, [count, code.length]] };
+  }
+
+  run(full, blind, noise, { interactivity, ...options }) {
+    return sample(guided(full, blind, interactivity), noise, this.contract.schedule, options);
+  }
+
+  // Goals alone, in the world.
+  async sampleGoals(question) {
+    const observation = this.senses.observe(question.past, question.observer);
+    const codes = await this.codes(observation, question.keep, question.interactivity);
+    const { scaled } = await this.think(codes, question);
+    return { goals: this.goalsInWorld(observation.frame, scaled) };
+  }
+
+  async think(codes, { seed, samples, steps, interactivity }) {
+    const draw = normals(seed);
+    const options = { method: this.contract.sampling.method, draw, interactivity };
+    const goalSteps = Math.max(steps, this.contract.sampling.goal_steps);
+    const scaled = await this.goals(codes, samples, { ...options, noise: draw(3 * samples), steps: goalSteps });
+    return { scaled, options: { ...options, steps } };
+  }
+
+  goalsInWorld(frame, scaled) {
+    const scale = this.contract.scaling.goal_std;
+    return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, [0, 1, 2].map((axis) => scaled[3 * i + axis] * scale[axis])));
+  }
+
+  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim}.
+  async plan(question) {
+    const observation = this.senses.observe(question.past, question.observer);
+    const { frame } = observation;
+    const codes = await this.codes(observation, question.keep, question.interactivity);
+    const { scaled: dreamt, options } = await this.think(codes, question);
+    const scaled = question.aim ? this.leg(frame, question.aim) : dreamt;
+    const goal = scaled.slice(0, 3);
+    const commanded = Boolean(question.aim);
+    const keepGoal = commanded ? 1 : question.keep.goal;
+    const path = await this.path(codes, goal, { ...options, keepGoal, commanded, noise: options.draw(3 * this.frames) });
+    const body = await this.body(codes, path, { ...options, noise: options.draw(this.channels * this.frames) });
+    const { positions, bodies } = this.unscaled(path, body);
+    const frames = positions.map((position, i) => this.senses.rows(frame, position, bodies[i]));
+    return {
+      goals: this.goalsInWorld(frame, scaled),
+      chosen: 0,
+      path: positions.map((position) => apply(frame, position)),
+      frames,
+    };
+  }
+
+  // The visitor's goal in scaled units, not further than the animal goes in one plan.
+  leg(frame, aim) {
+    const scale = this.contract.scaling.goal_std;
+    const [x, , z] = apply(inverse(frame), aim);
+    const share = Math.min(1, (FURTHEST * scale[0]) / Math.max(1e-6, Math.hypot(x, z)));
+    return Float32Array.of((x * share) / scale[0], 0, (z * share) / scale[2]);
+  }
+
+  // Metres and channels, frame by frame.
+  unscaled(path, body) {
+    const { path_std: spread, body_mean: mean, body_std: deviation } = this.contract.scaling;
+    const each = Array.from({ length: this.frames }, (_, i) => i);
+    return {
+      positions: each.map((i) => [0, 1, 2].map((axis) => path[axis * this.frames + i] * spread[axis][i])),
+      bodies: each.map((i) => mean.map((center, channel) => body[channel * this.frames + i] * deviation[channel] + center)),
+    };
+  }
+
+  // The fixed plan that Python wrote down, sampled again from the same input and noise.
+  async golden(golden) {
+    const { architecture, grid, past_frames: count } = this.contract;
+    const wave = (length, amplitude, frequency) => Float32Array.from({ length }, (_, i) => amplitude * Math.sin(frequency * i));
+    const observation = {
+      sceneGrid: wave(architecture.scene_channels * grid.shape.reduce((a, b) => a * b), 0.25, 0.01),
+      past: wave(count * (9 + 6 * architecture.bones), 0.1, 0.1),
+      observerPast: Float32Array.from(golden.input.observer_past),
+    };
+    const [scene, observer, past] = golden.input.keep;
+    const noise = (name) => Float32Array.from(golden.noise[name].flat());
+    const plans = {};
+    for (const name of Object.keys(golden.plans)) {
+      const options = { method: golden.sampling.method, interactivity: Number(name.split('_')[1]) };
+      const codes = await this.codes(observation, { scene, observer, past }, options.interactivity);
+      const goal = await this.goals(codes, 1, { ...options, steps: golden.sampling.goal_steps, noise: noise('goal') });
+      const path = await this.path(codes, goal, { ...options, steps: golden.sampling.sequence_steps, noise: noise('path') });
+      const body = await this.body(codes, path, { ...options, steps: golden.sampling.sequence_steps, noise: noise('body') });
+      const { positions, bodies } = this.unscaled(path, body);
+      plans[name] = { goal: Array.from(goal, (value, axis) => value * this.contract.scaling.goal_std[axis]), path: positions, body: bodies };
+    }
+    return plans;
+  }
+}

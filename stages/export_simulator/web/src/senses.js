@@ -1,0 +1,120 @@
+// What the animal perceives, in its ego frame: the scene on a grid, the observer's and its own last frames.
+// The counterpart of pipeline/models/perception.py and behavior.py; both are held together by a golden plan.
+
+import { ROW, apply, compose, conjugate, inverse, matrixFromTurn, multiply, place, rotate, turn, turnFromMatrix, turnFromVector } from './rigid.js';
+
+const UPRIGHT = 0.2;
+
+export class Senses {
+  // contract: simulator.json; volume: half-precision features, channel first.
+  constructor(contract, volume) {
+    const { behavior } = contract;
+    this.ego = behavior.architecture.ego;
+    this.grid = behavior.grid;
+    this.volume = { ...contract.volume, values: halfTable(volume) };
+    this.rest = behavior.agent_from_bone_rest.map(rowFromMatrix);
+  }
+
+  // past: frames of rows (root, bones); observer: rows of the phone. Oldest first.
+  observe(past, observer) {
+    const frame = this.frame(past.at(-1));
+    const egoFromWorld = inverse(frame);
+    return {
+      frame,
+      sceneGrid: this.around(frame),
+      observerPast: Float32Array.from(observer.flatMap((row) => apply(egoFromWorld, place(row)))),
+      past: Float32Array.from(past.flatMap((rows) => this.pastChannels(egoFromWorld, rows))),
+    };
+  }
+
+  // world_from_ego at a root pose.
+  frame(rows) {
+    const root = Array.from(rows.slice(0, ROW));
+    if (this.ego === 'full') return root;
+    const head = rotate(turn(root), [0, 0, 1]);
+    let forward = head;
+    if (Math.hypot(head[0], head[2]) < UPRIGHT) forward = rotate(turn(root), [0, 1, 0]).map((value) => -Math.sign(head[1]) * value);
+    const yaw = Math.atan2(forward[0], forward[2]);
+    return [...place(root), Math.cos(yaw / 2), 0, Math.sin(yaw / 2), 0];
+  }
+
+  // Nearest voxels on the ego grid; zero outside the volume.
+  around(frame) {
+    const [nx, ny, nz] = this.grid.shape;
+    const { shape: [channels, vx, vy, vz], origin, voxel_m: voxel, values } = this.volume;
+    const m = matrixFromTurn(turn(frame)).map((value) => value * (this.grid.cell_m / voxel));
+    const base = [0, 1, 2].map((axis) => (frame[axis] - origin[axis]) / voxel);
+    const out = new Float32Array(channels * nx * ny * nz);
+    let cell = 0;
+    for (let i = 0; i < nx; i++) for (let j = 0; j < ny; j++) for (let k = 0; k < nz; k++, cell++) {
+      const [x, y, z] = [i + 0.5 - nx / 2, j + 0.5 - ny / 2, k + 0.5 - nz / 2];
+      const a = Math.floor(base[0] + m[0] * x + m[1] * y + m[2] * z);
+      const b = Math.floor(base[1] + m[3] * x + m[4] * y + m[5] * z);
+      const c = Math.floor(base[2] + m[6] * x + m[7] * y + m[8] * z);
+      if (a < 0 || b < 0 || c < 0 || a >= vx || b >= vy || c >= vz) continue;
+      const at = (a * vy + b) * vz + c;
+      for (let channel = 0; channel < channels; channel++) out[channel * nx * ny * nz + cell] = values[channel * vx * vy * vz + at];
+    }
+    return out;
+  }
+
+  pastChannels(egoFromWorld, rows) {
+    const root = compose(egoFromWorld, Array.from(rows.slice(0, ROW)));
+    const channels = [...place(root), ...sixFromTurn(turn(root))];
+    this.rest.forEach((rest, bone) => {
+      const row = Array.from(rows.slice((bone + 1) * ROW, (bone + 2) * ROW));
+      channels.push(...vectorFromTurn(multiply(turn(row), conjugate(turn(rest)))), row[0] - rest[0], row[1] - rest[1], row[2] - rest[2]);
+    });
+    return channels;
+  }
+
+  // One planned frame as rows: root from the path and the body's first six channels, bones from the rest.
+  rows(frame, position, body) {
+    const out = new Float32Array((this.rest.length + 1) * ROW);
+    out.set(compose(frame, [...position, ...turnFromSix(body.slice(0, 6))]), 0);
+    this.rest.forEach((rest, bone) => {
+      const twist = body.slice(6 + 6 * bone, 12 + 6 * bone);
+      const turned = multiply(turnFromVector(twist.slice(0, 3)), turn(rest));
+      out.set([rest[0] + twist[3], rest[1] + twist[4], rest[2] + twist[5], ...turned], (bone + 1) * ROW);
+    });
+    return out;
+  }
+}
+
+function rowFromMatrix(m) {
+  return [m[0][3], m[1][3], m[2][3], ...turnFromMatrix([...m[0].slice(0, 3), ...m[1].slice(0, 3), ...m[2].slice(0, 3)])];
+}
+
+// First two columns of the rotation.
+function sixFromTurn(q) {
+  const m = matrixFromTurn(q);
+  return [m[0], m[3], m[6], m[1], m[4], m[7]];
+}
+
+// Gram-Schmidt on two columns.
+function turnFromSix(six) {
+  const length = Math.max(1e-6, Math.hypot(six[0], six[1], six[2]));
+  const a = [six[0] / length, six[1] / length, six[2] / length];
+  const dot = a[0] * six[3] + a[1] * six[4] + a[2] * six[5];
+  let b = [six[3] - dot * a[0], six[4] - dot * a[1], six[5] - dot * a[2]];
+  const other = Math.max(1e-6, Math.hypot(...b));
+  b = b.map((value) => value / other);
+  const c = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  return turnFromMatrix([a[0], b[0], c[0], a[1], b[1], c[1], a[2], b[2], c[2]]);
+}
+
+function vectorFromTurn([w, x, y, z]) {
+  const sign = w < 0 ? -1 : 1;
+  const length = Math.hypot(x, y, z);
+  const scale = length < 1e-12 ? 2 * sign : (2 * sign * Math.atan2(length, Math.abs(w))) / length;
+  return [x * scale, y * scale, z * scale];
+}
+
+function halfTable(bytes) {
+  const halves = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 2);
+  return Float32Array.from(halves, (half) => {
+    const sign = half & 0x8000 ? -1 : 1, exponent = (half >> 10) & 31, fraction = half & 1023;
+    if (exponent === 0) return sign * fraction * 2 ** -24;
+    return exponent === 31 ? 0 : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
+  });
+}

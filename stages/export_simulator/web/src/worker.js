@@ -1,0 +1,44 @@
+// The worker: holds the networks, answers the page's questions one at a time.
+
+import * as ort from 'onnxruntime-web/wasm';
+import { Sampler } from './sampler.js';
+import { Senses } from './senses.js';
+
+let sampler;
+let turn = Promise.resolve();
+
+const answers = {
+  async load({ contract, wasm, models, volume }, report) {
+    ort.env.wasm.numThreads = 1;
+    ort.env.wasm.wasmBinary = wasm.buffer;
+    ort.env.logLevel = 'error';
+    const networks = {};
+    const names = Object.keys(models);
+    for (const [i, name] of names.entries()) {
+      const session = await ort.InferenceSession.create(models[name], { executionProviders: ['wasm'], graphOptimizationLevel: 'all' });
+      networks[name] = async (feeds) => {
+        const tensors = Object.fromEntries(Object.entries(feeds).map(([key, [values, shape]]) => [key, new ort.Tensor('float32', values, shape)]));
+        return (await session.run(tensors))[session.outputNames[0]].data;
+      };
+      report((i + 1) / names.length);
+    }
+    sampler = new Sampler(contract, networks, new Senses(contract, volume));
+  },
+  async plan(question) {
+    const start = performance.now();
+    const plan = await sampler.plan(question);
+    return { ...plan, milliseconds: performance.now() - start };
+  },
+  goals: (question) => sampler.sampleGoals(question),
+  golden: (golden) => sampler.golden(golden),
+};
+
+onmessage = ({ data: { id, kind, content } }) => {
+  turn = turn.then(async () => {
+    try {
+      postMessage({ id, result: await answers[kind](content, (share) => postMessage({ id, share })) });
+    } catch (error) {
+      postMessage({ id, error: `${kind}: ${error.message ?? error}` });
+    }
+  });
+};

@@ -1,0 +1,58 @@
+"""Write the simulator's files and say how good they are."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.files import glb
+from pipeline.qa import Check
+from stages.export_simulator import page
+from stages.export_simulator.contract import contract
+from stages.export_simulator.export import Made
+from stages.export_simulator.reading import Minds
+
+
+def write_simulator(folder: Path, made: Made, minds: Minds, name: str) -> float:
+    """Write the page, the animated agent, the room and the contract; return the page's size in megabytes."""
+    about = contract(
+        name=name,
+        behavior=minds.behavior,
+        setting=made.setting,
+        motions=made.motions,
+        bone_names=made.skin.bone_names,
+        skinning_residual_m=made.residual_m,
+        volume=minds.volume,
+    )
+    room = glb.static(made.scene, "scene")
+    assets = {
+        "room": room,
+        "agent": glb.skinned(made.agent, made.skin, []),
+        "clips": page.clip_rows(made.motions),
+        "splats": made.splat_rows,
+        "volume": minds.features,
+        **minds.networks,
+    }
+    text = page.page(contract=about, assets=assets).encode()
+    (folder / "index.html").write_bytes(text)
+    (folder / "agent.glb").write_bytes(glb.skinned(made.agent, made.skin, made.actions))
+    (folder / "scene.glb").write_bytes(room)
+    (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
+    return len(text) / 1e6
+
+
+def quality(made: Made, size_mb: float, warn_page_mb: float) -> dict[str, Any]:
+    """Return what `qa.write` tells of the simulator."""
+    residual_mm = made.residual_m * 1000
+    return {
+        "good": "the page opens within seconds and the skin of `agent.glb` follows the reconstruction within 2 mm",
+        "bad": "limbs of `agent.glb` that thin out at the joints, or a page too big to send",
+        "checks": [
+            Check("size of the page", size_mb, "MB", warn=warn_page_mb, fail=2 * warn_page_mb),
+            Check("skinning loss, mean", float(residual_mm.mean()), "mm", warn=2.0, fail=10.0),
+            Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
+            Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),
+            Check("sessions to replay", len(made.motions), "", warn=1, better="higher"),
+        ],
+    }
