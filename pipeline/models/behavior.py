@@ -1,0 +1,395 @@
+"""The behaviour model as a whole: what its channels mean, its networks, and how a plan is sampled from them.
+
+`observe` turns a context into network inputs, `plan` samples goal, then path, then body (Fig. 3), `Plan.to_world`
+turns the result back into transforms. Networks are met through `Networks`, which torch and ONNX versions satisfy.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import nn
+
+from pipeline.models.denoisers import ControlUNet, GoalMLP
+from pipeline.models.diffusion import Schedule, guided, sample
+from pipeline.models.perception import (
+    GRID_CELL_M,
+    GRID_SHAPE,
+    Ego,
+    FeatureVolume,
+    Perception,
+    PerceptionSize,
+    world_from_ego,
+)
+from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, Context
+from pipeline.space import rigid
+
+Array = np.ndarray
+ROOT_CHANNELS = 6
+"""the body's leading channels: the root's rotation in the ego frame, its first two columns"""
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Everything that fixes the shape of the networks and the meaning of their channels."""
+
+    bones: int
+    ego: Ego = "yaw"
+    scene: Literal["pillars", "volume"] = "pillars"
+    scene_width: int = 32
+    scene_channels: int = 16
+    hidden: int = 128
+    code: int = 64
+    observer_radius_m: float = 4.0
+    unet_width: int = 32
+    unet_multipliers: tuple[int, ...] = (1, 2, 4)
+    goal_hidden: int = 128
+    goal_layers: int = 6
+
+    @property
+    def body_channels(self) -> int:
+        """Root rotation and 6 numbers per bone."""
+        return ROOT_CHANNELS + 6 * self.bones
+
+    @property
+    def condition(self) -> int:
+        """Length of the perception code."""
+        return 3 * self.code
+
+    @property
+    def perception(self) -> PerceptionSize:
+        """Return the sizes of the perception network."""
+        return PerceptionSize(
+            self.scene,
+            self.scene_width,
+            self.scene_channels,
+            self.hidden,
+            self.code,
+            PAST,
+            9 + 6 * self.bones,
+            self.observer_radius_m,
+            RATE_HZ,
+        )
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """What turns ego-frame metres and radians into the unit-variance numbers that are diffused, and back."""
+
+    goal_std: Float[np.ndarray, "3"]
+    path_std: Float[np.ndarray, "3 56"]
+    body_mean: Float[np.ndarray, "channel"]
+    body_std: Float[np.ndarray, "channel"]
+
+
+class BehaviorNets(nn.Module):
+    """Perception and the three denoisers."""
+
+    def __init__(self, architecture: Architecture):
+        super().__init__()
+        a = architecture
+        self.perception = Perception(a.perception)
+        self.goal = GoalMLP(a.condition, a.goal_hidden, a.goal_layers)
+        self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers)
+        self.body = ControlUNet(a.body_channels, 3, a.condition, a.unet_width, a.unet_multipliers)
+
+
+class Networks(Protocol):
+    """The four networks on NumPy arrays of float32, batch first."""
+
+    def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
+        """Return the perception code."""
+
+    def goal(self, x: Array, t: Array, condition: Array) -> Array:
+        """Return the noise in x."""
+
+    def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
+
+    def body(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
+
+
+class TorchNetworks:
+    """`Networks` by torch modules on any device."""
+
+    def __init__(self, nets: BehaviorNets, device: str = "cpu"):
+        self.nets, self.device = nets.eval().to(device), device
+
+    def _run(self, module: nn.Module, *arguments: Array) -> Array:
+        with torch.inference_mode():
+            return (
+                module(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device) for a in arguments))
+                .cpu()
+                .numpy()
+            )
+
+    def perceive(self, *arguments: Array) -> Array:
+        return self._run(self.nets.perception, *arguments)
+
+    def goal(self, *arguments: Array) -> Array:
+        return self._run(self.nets.goal, *arguments)
+
+    def path(self, *arguments: Array) -> Array:
+        return self._run(self.nets.path, *arguments)
+
+    def body(self, *arguments: Array) -> Array:
+        return self._run(self.nets.body, *arguments)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The inputs of perception, in metres and the ego frame."""
+
+    scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
+    observer_past: Float[np.ndarray, "batch frame*3"]
+    past: Float[np.ndarray, "batch frame*channel"]
+
+    def __getitem__(self, index: slice | np.ndarray) -> "Observation":
+        """Return some of the batch."""
+        return Observation(self.scene_grid[index], self.observer_past[index], self.past[index])
+
+    def __len__(self) -> int:
+        return len(self.past)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How plans are drawn."""
+
+    method: Literal["ddpm", "ddim"] = "ddim"
+    """DDPM adds fresh noise at every step; DDIM is a function of the first noise alone"""
+    goal_steps: int = 50
+    """denoising steps of the goal"""
+    sequence_steps: int = 10
+    """denoising steps of path and body"""
+    guidance: float = 1.0
+    """interactivity s: scales the observer and the goal condition"""
+    scene: bool = True
+    """perceive the scene"""
+    observer: bool = True
+    """perceive the observer"""
+    past: bool = True
+    """remember the past"""
+    goal: bool = True
+    """let the goal steer the path"""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Sampled futures in the ego frame."""
+
+    goal: Float[np.ndarray, "batch 3"]
+    path: Float[np.ndarray, "batch 56 3"]
+    body: Float[np.ndarray, "batch 56 channel"]
+
+    def world_from_agent(self, world_from_ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch 56 4 4"]:
+        """Return the root's poses."""
+        ego_from_agent = rigid.make(rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
+        return world_from_ego[:, None] @ ego_from_agent
+
+
+def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:
+    """Return the first two columns (x axis, then y axis)."""
+    return np.concatenate([rotation[..., 0], rotation[..., 1]], axis=-1)
+
+
+def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15)."""
+    first = columns[..., :3] / np.linalg.norm(columns[..., :3], axis=-1, keepdims=True).clip(1e-6)
+    second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
+    second = second / np.linalg.norm(second, axis=-1, keepdims=True).clip(1e-6)
+    return np.stack([first, second, np.cross(first, second)], axis=-1)
+
+
+def channels_from_bones(
+    agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
+) -> Float[np.ndarray, "*batch channel"]:
+    """Return per bone the rotation vector of ``agent_from_bone rest^-1`` and the shift of its origin from rest."""
+    turn = agent_from_bone[..., :3, :3] @ np.swapaxes(rest[..., :3, :3], -1, -2)
+    shift = agent_from_bone[..., :3, 3] - rest[..., :3, 3]
+    return np.concatenate([rigid.vector_from_rotation(turn), shift], axis=-1).reshape(*turn.shape[:-3], -1)
+
+
+def bones_from_channels(
+    channels: Float[np.ndarray, "*batch channel"], rest: Float[np.ndarray, "bone 4 4"]
+) -> Float[np.ndarray, "*batch bone 4 4"]:
+    """Undo `channels_from_bones`."""
+    twist = channels.reshape(*channels.shape[:-1], len(rest), 6)
+    return rigid.make(rigid.rotation_from_vector(twist[..., :3]) @ rest[..., :3, :3], rest[..., :3, 3] + twist[..., 3:])
+
+
+def past_channels(
+    ego_from_agent: Float[np.ndarray, "batch 8 4 4"], bones: Float[np.ndarray, "batch 8 channel"]
+) -> Float[np.ndarray, "batch 8*channel"]:
+    """Return per past frame: root position, root rotation (6), bones; oldest frame first."""
+    root = np.concatenate([ego_from_agent[..., :3, 3], rotation_to_6d(ego_from_agent[..., :3, :3])], axis=-1)
+    return np.concatenate([root, bones], axis=-1).reshape(len(root), -1).astype(np.float32)
+
+
+def observe(context: Context, volume: FeatureVolume, rest: Float[np.ndarray, "bone 4 4"], ego: Ego) -> Observation:
+    """Encode contexts as network inputs (Eq. 11, 12, 13)."""
+    frame = world_from_ego(context.world_from_agent[:, -1], ego)
+    ego_from_world = rigid.inverse(frame)
+    observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
+    past = past_channels(
+        ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
+    )
+    return Observation(volume.around(frame), observer, past)
+
+
+def contract(
+    architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: Float[np.ndarray, "bone 4 4"]
+) -> dict:
+    """Return the content of `behavior.json`: all that a sampler in another language must know."""
+    bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
+    root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]
+    return {
+        "units": "metres, radians, seconds",
+        "up": [0, 1, 0],
+        "rate_hz": RATE_HZ,
+        "past_frames": PAST,
+        "future_frames": FUTURE,
+        "architecture": asdict(architecture),
+        "bones": [f"bone_{number:02d}" for number in range(architecture.bones)],
+        "agent_from_bone_rest": np.asarray(rest, float).tolist(),
+        "channels": {
+            "observer_past": {"per_frame": ["x", "y", "z"], "order": "frame, channel; oldest first"},
+            "past": {
+                "per_frame": ["root_x", "root_y", "root_z", *root],
+                "per_bone": bone,
+                "order": "frame, (root, bones); oldest first",
+            },
+            "goal": ["x", "y", "z"],
+            "path": ["x", "y", "z"],
+            "body": {"root": root, "per_bone": bone},
+            "keep": ["scene", "observer", "past"],
+        },
+        "grid": {"shape": list(GRID_SHAPE), "cell_m": GRID_CELL_M, "sampling": "nearest", "order": "channel, x, y, z"},
+        "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
+        "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
+        "sampling": asdict(Sampling()),
+    }
+
+
+def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, Float[np.ndarray, "bone 4 4"]]:
+    """Read a trained model: its shape, networks, scaling, schedule, and the bones at rest."""
+    document = json.loads((folder / "behavior.json").read_text())
+    shape = document["architecture"]
+    architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
+    nets = BehaviorNets(architecture)
+    nets.load_state_dict(load_file(folder / "behavior.safetensors"))
+    scaling = Scaling(**{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()})
+    schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
+    return architecture, nets, scaling, schedule, np.asarray(document["agent_from_bone_rest"])
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """Draws plans: networks, schedule and scaling together."""
+
+    networks: Networks
+    schedule: Schedule
+    scaling: Scaling
+
+    def plan(
+        self,
+        observation: Observation,
+        sampling: Sampling,
+        rng: np.random.Generator,
+        *,
+        goal: Float[np.ndarray, "batch 3"] | None = None,
+        path: Float[np.ndarray, "batch 56 3"] | None = None,
+    ) -> Plan:
+        """Sample goal, path and body, one per row; a given goal or path (ego frame, metres) replaces its level."""
+        codes = self.codes(observation, sampling)
+        z = self.goals(codes, sampling, rng) if goal is None else (goal / self.scaling.goal_std).astype(np.float32)
+        p = (
+            self.paths(codes, z, sampling, rng)
+            if path is None
+            else (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
+        )
+        body = self.bodies(codes, p, sampling, rng)
+        return Plan(
+            z * self.scaling.goal_std,
+            np.swapaxes(p * self.scaling.path_std, 1, 2),
+            np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean,
+        )
+
+    def codes(self, observation: Observation, sampling: Sampling) -> tuple[Array, Array]:
+        """Return the perception code with everything that ``sampling`` keeps, and the one without the observer."""
+        keep = np.tile(np.array([sampling.scene, sampling.observer, sampling.past], np.float32), (len(observation), 1))
+        inputs = (observation.scene_grid, observation.observer_past, observation.past)
+        full = self.networks.perceive(*inputs, keep)
+        blind = (
+            self.networks.perceive(*inputs, keep * np.array([1, 0, 1], np.float32)) if sampling.guidance != 1 else full
+        )
+        return full, blind
+
+    def goals(
+        self, codes: tuple[Array, Array], sampling: Sampling, rng: np.random.Generator
+    ) -> Float[np.ndarray, "batch 3"]:
+        """Sample scaled goals."""
+
+        def denoise(code: Array) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
+
+        return _run(
+            denoise(codes[0]), denoise(codes[1]), (len(codes[0]), 3), self.schedule, sampling, sampling.goal_steps, rng
+        )
+
+    def paths(
+        self,
+        codes: tuple[Array, Array],
+        control: Float[np.ndarray, "batch 3"],
+        sampling: Sampling,
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "batch 3 56"]:
+        """Sample scaled paths under scaled goals; the reference of the guidance sees neither observer nor goal."""
+
+        def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.path(x, _filled(len(x), t), code, control, _filled((len(x), 1), keep))
+
+        pair = denoise(codes[0], float(sampling.goal)), denoise(codes[1], 0.0)
+        return _run(*pair, (len(control), 3, FUTURE), self.schedule, sampling, sampling.sequence_steps, rng)
+
+    def bodies(
+        self,
+        codes: tuple[Array, Array],
+        control: Float[np.ndarray, "batch 3 56"],
+        sampling: Sampling,
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "batch channel 56"]:
+        """Sample scaled bodies along scaled paths, which guidance never takes away."""
+
+        def denoise(code: Array) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.body(x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0))
+
+        shape = (len(control), len(self.scaling.body_mean), FUTURE)
+        return _run(denoise(codes[0]), denoise(codes[1]), shape, self.schedule, sampling, sampling.sequence_steps, rng)
+
+
+def _filled(shape: int | tuple[int, int], value: float) -> Array:
+    return np.full(shape, value, np.float32)
+
+
+def _run(
+    full: Callable,
+    blind: Callable,
+    shape: tuple[int, ...],
+    schedule: Schedule,
+    sampling: Sampling,
+    count: int,
+    rng: np.random.Generator,
+) -> Array:
+    def draw() -> Array:
+        return rng.standard_normal(shape, dtype=np.float32)
+
+    denoise = guided(full, blind, sampling.guidance)
+    return sample(denoise, draw(), schedule, method=sampling.method, count=count, draw=draw).astype(np.float32)

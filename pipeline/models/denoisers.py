@@ -1,0 +1,134 @@
+"""The denoising networks: goal MLP (Eq. 7), and 1-D ControlUNets for path and body (Eq. 9, 10).
+
+All predict the noise in x at step t, given the perception code. A ControlUNet is two identical UNets: the first
+denoises, the second reads the control (goal or path) and adds its features to every block of the first.
+"""
+
+import math
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+TIME_CHANNELS = 64
+
+
+def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
+    """Return sines and cosines of the step number at 32 frequencies from 1 down to 1e-4."""
+    frequency = torch.exp(
+        -math.log(1e4) / (TIME_CHANNELS // 2) * torch.arange(TIME_CHANNELS // 2, dtype=torch.float32, device=t.device)
+    )
+    angle = t[:, None] * frequency
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)
+
+
+class GoalMLP(nn.Module):
+    """Six layers of 128 (appendix A.2)."""
+
+    def __init__(self, condition: int, hidden: int = 128, layers: int = 6):
+        super().__init__()
+        sizes = [3 + TIME_CHANNELS + condition] + [hidden] * (layers - 1)
+        self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(sizes))
+        self.out = nn.Linear(hidden, 3)
+
+    def forward(
+        self, x: Float[Tensor, "batch 3"], t: Float[Tensor, "batch"], condition: Float[Tensor, "batch condition"]
+    ) -> Float[Tensor, "batch 3"]:
+        h = torch.cat([x, time_embedding(t), condition], dim=-1)
+        for layer in self.hidden:
+            h = nn.functional.silu(layer(h))
+        return self.out(h)
+
+
+class Block(nn.Module):
+    """Two convolutions over time with group norm; the embedding of step and condition enters between them."""
+
+    def __init__(self, inner: int, outer: int, embedding: int, kernel: int = 5):
+        super().__init__()
+        self.first = nn.Sequential(
+            nn.Conv1d(inner, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
+        )
+        self.second = nn.Sequential(
+            nn.Conv1d(outer, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
+        )
+        self.embedding = nn.Linear(embedding, outer)
+        self.shortcut = nn.Conv1d(inner, outer, 1) if inner != outer else nn.Identity()
+
+    def forward(
+        self, h: Float[Tensor, "batch channel frame"], embedding: Float[Tensor, "batch e"]
+    ) -> Float[Tensor, "batch outer frame"]:
+        return self.second(self.first(h) + self.embedding(embedding)[..., None]) + self.shortcut(h)
+
+
+class UNet(nn.Module):
+    """A 1-D UNet over 56 frames (14 at the bottom of three levels) that takes features to add to each block."""
+
+    def __init__(self, channels: int, widths: tuple[int, ...], embedding: int):
+        super().__init__()
+        inner = (widths[0], *widths[:-1])
+        self.enter = nn.Conv1d(channels, widths[0], 1)
+        self.down = nn.ModuleList(Block(i, o, embedding) for i, o in zip(inner, widths, strict=True))
+        self.halve = nn.ModuleList(nn.Conv1d(w, w, 3, 2, 1) for w in widths[:-1])
+        self.middle = Block(widths[-1], widths[-1], embedding)
+        self.up = nn.ModuleList(Block(2 * o, i, embedding) for i, o in zip(inner[::-1], widths[::-1], strict=True))
+        self.block_widths = (*widths, widths[-1], *inner[::-1])
+
+    def forward(
+        self,
+        h: Float[Tensor, "batch channel frame"],
+        embedding: Float[Tensor, "batch e"],
+        added: list[Tensor] | None = None,
+    ) -> list[Tensor]:
+        """Return the output of every block in order; ``added`` holds one tensor per block."""
+        outputs: list[Tensor] = []
+
+        def run(block: Block, h: Tensor) -> Tensor:
+            h = block(h, embedding)
+            outputs.append(h + added[len(outputs)] if added else h)
+            return outputs[-1]
+
+        h = self.enter(h)
+        skips = []
+        for level, block in enumerate(self.down):
+            h = run(block, h)
+            skips.append(h)
+            h = self.halve[level](h) if level < len(self.halve) else h
+        h = run(self.middle, h)
+        for level, block in enumerate(self.up):
+            h = h if level == 0 else h[..., None].expand(*h.shape, 2).flatten(-2)
+            h = run(block, torch.cat([h, skips[-1 - level]], dim=1))
+        return outputs
+
+
+class ControlUNet(nn.Module):
+    """Denoise a sequence under a control sequence (or one vector for all frames); ``keep`` 0 stands for no control."""
+
+    def __init__(
+        self, channels: int, control: int, condition: int, width: int = 32, multipliers: tuple[int, ...] = (1, 2, 4)
+    ):
+        super().__init__()
+        widths, embedding = tuple(width * m for m in multipliers), 128
+        self.time = nn.Sequential(nn.Linear(TIME_CHANNELS, embedding), nn.SiLU(), nn.Linear(embedding, embedding))
+        self.condition = nn.Linear(condition, embedding)
+        self.main = UNet(channels, widths, embedding)
+        self.side = UNet(control, widths, embedding)
+        self.inject = nn.ModuleList(nn.Conv1d(w, w, 1) for w in self.main.block_widths)
+        self.out = nn.Conv1d(widths[0], channels, 1)
+        for zero in self.inject:
+            nn.init.zeros_(zero.weight)
+            nn.init.zeros_(zero.bias)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch channel frame"]:
+        embedding = nn.functional.silu(self.time(time_embedding(t)) + self.condition(condition))
+        control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
+        side = self.side(control, embedding)
+        added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
+        return self.out(self.main(x, embedding, added)[-1])

@@ -1,0 +1,90 @@
+"""Diffusion in 50 steps: linear schedule, noising, DDPM and DDIM sampling, classifier-free guidance.
+
+Arithmetic only, on NumPy arrays and torch tensors alike: `sample` takes any function that predicts the noise, be it a
+torch module, an ONNX session, or a guided pair of calls.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+Array = TypeVar("Array")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """A linear variance schedule (Ho et al. 2020)."""
+
+    steps: int = 50
+    beta_first: float = 1e-4
+    beta_last: float = 0.2
+    clip: float = 5.0
+    """bound of the clean estimate, in standard deviations"""
+
+    @property
+    def beta(self) -> Float[np.ndarray, "step"]:
+        """Variance added at each step."""
+        return np.linspace(self.beta_first, self.beta_last, self.steps)
+
+    @property
+    def alpha_bar(self) -> Float[np.ndarray, "step"]:
+        """Share of the clean signal's variance left after each step."""
+        return np.cumprod(1.0 - self.beta)
+
+    def visited(self, count: int) -> list[int]:
+        """Return the steps that a sampler of ``count`` steps visits, noisiest first."""
+        return [int(np.floor(t + 0.5)) for t in np.linspace(self.steps - 1, 0, count)]
+
+
+def noised(clean: Array, noise: Array, alpha_bar: Array) -> Array:
+    """Return x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise; ``alpha_bar`` broadcasts against both."""
+    return alpha_bar**0.5 * clean + (1 - alpha_bar) ** 0.5 * noise
+
+
+def guided(
+    with_condition: Callable[[Array, float], Array], without: Callable[[Array, float], Array], scale: float
+) -> Callable[[Array, float], Array]:
+    """Return e = e_without + scale (e_with - e_without); only one network call where the scale is 0 or 1."""
+    if scale == 1.0:
+        return with_condition
+    if scale == 0.0:
+        return without
+
+    def both(x: Array, t: float) -> Array:
+        reference = without(x, t)
+        return reference + scale * (with_condition(x, t) - reference)
+
+    return both
+
+
+def sample(
+    denoise: Callable[[Array, float], Array],
+    noise: Array,
+    schedule: Schedule,
+    *,
+    method: Literal["ddpm", "ddim"],
+    count: int,
+    draw: Callable[[], Array] | None = None,
+) -> Array:
+    """Turn ``noise`` into a sample in ``count`` steps.
+
+    ``denoise(x, t)`` predicts the noise. DDIM is deterministic; DDPM adds fresh noise from ``draw`` at each step but
+    the last, with the posterior variance of the steps visited (exact ancestral sampling when all are).
+    """
+    x, steps, alpha_bar = noise, schedule.visited(count), schedule.alpha_bar
+    for position, t in enumerate(steps):
+        now = float(alpha_bar[t])
+        epsilon = denoise(x, float(t))
+        clean = ((x - (1 - now) ** 0.5 * epsilon) / now**0.5).clip(-schedule.clip, schedule.clip)
+        if position == len(steps) - 1:
+            return clean
+        later = float(alpha_bar[steps[position + 1]])
+        variance = (1 - later) / (1 - now) * (1 - now / later) if method == "ddpm" else 0.0
+        epsilon = (x - now**0.5 * clean) / (1 - now) ** 0.5
+        x = later**0.5 * clean + max(1 - later - variance, 0.0) ** 0.5 * epsilon
+        if method == "ddpm":
+            x = x + variance**0.5 * draw()
+    return x

@@ -1,0 +1,229 @@
+"""What the agent perceives (omega of the paper): scene, observer's and own last 0.8 s, as one code.
+
+`world_from_ego` gives the frame everything is told in, `FeatureVolume.around` samples the scene in it, and `Perception`
+turns the three raw inputs (metres, ego frame) into a code of 3 x 64 numbers. Normalisation happens inside the network.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, assert_never
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from pipeline.files import arrays
+from pipeline.space import rigid
+
+Ego = Literal["yaw", "full"]
+GRID_SHAPE = (64, 8, 64)
+GRID_CELL_M = 0.1
+UPRIGHT = 0.2
+"""shortest horizontal part of the head's direction that still tells the heading"""
+
+
+def world_from_ego(world_from_agent: Float[np.ndarray, "*batch 4 4"], ego: Ego) -> Float[np.ndarray, "*batch 4 4"]:
+    """Return the ego frame at the agent's root: its full rotation, or only its heading about world +y (``yaw``).
+
+    A head that points straight up or down has no heading: the belly's, or the back's, direction takes its place.
+    """
+    if ego == "full":
+        return np.asarray(world_from_agent, float)
+    rotation = np.asarray(world_from_agent, float)[..., :3, :3]
+    head, back = rotation[..., :, 2], rotation[..., :, 1]
+    lying = np.hypot(head[..., 0], head[..., 2]) < UPRIGHT
+    forward = np.where(lying[..., None], -np.sign(head[..., 1:2]) * back, head) * [1.0, 0.0, 1.0]
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    up = np.broadcast_to([0.0, 1.0, 0.0], forward.shape)
+    return rigid.make(np.stack([np.cross(up, forward), up, forward], axis=-1), np.asarray(world_from_agent)[..., :3, 3])
+
+
+@dataclass(frozen=True)
+class FeatureVolume:
+    """The scene's features and occupancy on voxels of the world (Psi of the paper)."""
+
+    features: Float[np.ndarray, "channel x y z"]
+    occupancy: Int[np.ndarray, "x y z"]
+    """0 free, 1 surface or inside, 2 unseen"""
+    origin: Float[np.ndarray, "3"]
+    """world position of the corner of voxel 0"""
+    voxel_m: float
+
+    @classmethod
+    def load(cls, path: Path) -> "FeatureVolume":
+        """Read `feature_volume.npz` or `volume.npz`. Raises InputError ART-010 when damaged."""
+        stored = arrays.load(path, ("features", "occupancy", "origin", "voxel_m"))
+        return cls(stored["features"], stored["occupancy"], stored["origin"], float(stored["voxel_m"]))
+
+    def voxel(
+        self, points_world: Float[np.ndarray, "*batch 3"]
+    ) -> tuple[Int[np.ndarray, "*batch 3"], Bool[np.ndarray, "*batch"]]:
+        """Return the voxel that holds each point (clamped to the volume) and whether it lies inside."""
+        index = np.floor((points_world - self.origin) / self.voxel_m).astype(np.int64)
+        last = np.array(self.occupancy.shape) - 1
+        clamped = np.clip(index, 0, last)
+        return clamped, (index == clamped).all(-1)
+
+    def around(self, ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch channel 64 8 64"]:
+        """Sample the nearest voxels on the ego grid (Eq. 11): centred at the root, axes x y z, zero outside."""
+        index, inside = self.voxel(rigid.apply(ego, grid_points_ego().reshape(-1, 3)))
+        features = self.features[:, index[..., 0], index[..., 1], index[..., 2]].astype(np.float32) * inside
+        return np.moveaxis(features, 0, 1).reshape(len(ego), -1, *GRID_SHAPE)
+
+
+def grid_points_ego(stride: int = 1) -> Float[np.ndarray, "width height length 3"]:
+    """Return the centres of the ego grid's cells, or of blocks of ``stride`` cells, in metres."""
+    axes = [(np.arange(n // stride) + 0.5 - n / stride / 2) * GRID_CELL_M * stride for n in GRID_SHAPE]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
+    """Return linear layers of these sizes with SiLU (and dropout) between them."""
+    layers: list[nn.Module] = []
+    for inner, outer in pairwise(sizes):
+        layers += [nn.Linear(inner, outer), nn.SiLU(), nn.Dropout(dropout)]
+    return nn.Sequential(*layers[:-2])
+
+
+class PillarScene(nn.Module):
+    """A 2.5-D encoder: blocks of 2 x 2 x 2 cells averaged, height folded into channels, then 2-D convolutions."""
+
+    stride = 2
+
+    def __init__(self, channels: int, width: int, code: int):
+        super().__init__()
+        self.pool = nn.AvgPool3d(2)
+        folded = channels * GRID_SHAPE[1] // 2
+        convolutions = [nn.Conv2d(folded, width, 1), nn.SiLU(), nn.Conv2d(width, width, 3, 2, 1), nn.SiLU()]
+        convolutions += [nn.Conv2d(width, width, 3, 2, 1), nn.SiLU(), nn.Conv2d(width, width, 3, 2, 1), nn.SiLU()]
+        self.convolutions = nn.Sequential(*convolutions)
+        self.out = nn.Linear(width * 16, code)
+
+    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Float[Tensor, "batch code"]:
+        return self.encode(self.pool(grid))
+
+    def encode(self, pooled: Float[Tensor, "batch channel 32 4 32"]) -> Float[Tensor, "batch code"]:
+        """Encode a grid that is already averaged over 2 x 2 x 2 cells."""
+        return self.out(self.convolutions(pooled.transpose(2, 3).flatten(1, 2).transpose(2, 3)).flatten(1))
+
+
+class VolumeScene(nn.Module):
+    """The paper's encoder: six 3-D convolutions of kernel 3 with residual connections."""
+
+    stride = 1
+
+    def __init__(self, channels: int, width: int, code: int):
+        super().__init__()
+        strides = [(1, 1, 1), (2, 1, 2), (2, 2, 2), (2, 2, 2), (2, 2, 2), (2, 1, 2)]
+        inputs = [channels] + [width] * 5
+        self.convolutions = nn.ModuleList(nn.Conv3d(i, width, 3, s, 1) for i, s in zip(inputs, strides, strict=True))
+        self.shortcuts = nn.ModuleList(nn.Conv3d(i, width, 1, s) for i, s in zip(inputs, strides, strict=True))
+        self.out = nn.Linear(width, code)
+
+    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Float[Tensor, "batch code"]:
+        for convolution, shortcut in zip(self.convolutions, self.shortcuts, strict=True):
+            grid = nn.functional.silu(convolution(grid)) + shortcut(grid)
+        return self.out(grid.mean((2, 3, 4)))
+
+    encode = forward
+
+
+class ObserverEncoder(nn.Module):
+    """Encode the observer's past positions (Eq. 12) through features that vanish towards ``radius_m``.
+
+    Beyond the radius all features are zero, so that a far observer and none at all are the same to the agent: the code
+    of zero features is also the learned null.
+    """
+
+    def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
+        super().__init__()
+        self.frames, self.radius_m, self.rate_hz = frames, radius_m, rate_hz
+        self.layers = mlp((frames * 3 + 3, hidden, hidden, code))
+
+    def forward(
+        self, observer_past: Float[Tensor, "batch frame*3"], keep: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch code"]:
+        position = observer_past.unflatten(1, (self.frames, 3))[:, :, ::2]
+        distance = (position.square().sum(-1) + 1e-6).sqrt()
+        nearness = (1 - distance / self.radius_m).clamp_min(0)
+        direction = position / (distance[..., None] + 0.1)
+        velocity = (position[:, -1] - position[:, 0]) * (self.rate_hz / (self.frames - 1))
+        closing = -(velocity * direction[:, -1]).sum(-1, keepdim=True)
+        seen = torch.cat([direction * nearness[..., None], nearness[..., None]], dim=-1).flatten(1)
+        moving = torch.cat([velocity, closing], dim=-1) * nearness[:, -1:]
+        return self.layers(torch.cat([seen, moving.clamp(-2, 2)], dim=-1) * keep[:, None])
+
+
+class PastEncoder(nn.Module):
+    """Encode the agent's own past: root poses in the ego frame and bones (Eq. 13), normalised inside."""
+
+    def __init__(self, frames: int, channels: int, hidden: int, code: int):
+        super().__init__()
+        self.frames = frames
+        self.register_buffer("mean", torch.zeros(channels))
+        self.register_buffer("std", torch.ones(channels))
+        self.bones = nn.Linear(frames * (channels - 9), 32)
+        self.layers = mlp((frames * 9 + 32, hidden, hidden, code))
+
+    def forward(
+        self, past: Float[Tensor, "batch frame*channel"], bones_keep: Float[Tensor, "batch"] | None = None
+    ) -> Float[Tensor, "batch code"]:
+        """``bones_keep`` is for training: 0 hides the bones of a sample (they take their mean)."""
+        past = (past.unflatten(1, (self.frames, -1)) - self.mean) / self.std
+        bones = past[:, :, 9:].flatten(1)
+        if bones_keep is not None:
+            bones = bones * bones_keep[:, None]
+        return self.layers(torch.cat([past[:, :, :9].flatten(1), self.bones(bones)], dim=-1))
+
+
+@dataclass(frozen=True)
+class PerceptionSize:
+    """Sizes of the perception network."""
+
+    scene: Literal["pillars", "volume"]
+    scene_width: int
+    scene_channels: int
+    hidden: int
+    code: int
+    past_frames: int
+    past_channels: int
+    observer_radius_m: float
+    rate_hz: float
+
+
+class Perception(nn.Module):
+    """The perception code: scene, observer and past, each of which ``keep`` can replace by its learned null."""
+
+    def __init__(self, size: PerceptionSize):
+        super().__init__()
+        match size.scene:
+            case "pillars":
+                self.scene = PillarScene(size.scene_channels, size.scene_width, size.code)
+            case "volume":
+                self.scene = VolumeScene(size.scene_channels, size.scene_width, size.code)
+            case _:
+                assert_never(size.scene)
+        self.observer = ObserverEncoder(size.past_frames, size.hidden, size.code, size.observer_radius_m, size.rate_hz)
+        self.past = PastEncoder(size.past_frames, size.past_channels, size.hidden, size.code)
+        self.scene_null = nn.Parameter(torch.zeros(size.code))
+        self.past_null = nn.Parameter(torch.zeros(size.code))
+
+    def forward(
+        self,
+        scene_grid: Float[Tensor, "batch channel 64 8 64"],
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch frame*channel"],
+        keep: Float[Tensor, "batch 3"],
+    ) -> Float[Tensor, "batch condition"]:
+        """``keep`` holds 1 or 0 for scene, observer and past."""
+        return self.join(self.scene(scene_grid), self.observer(observer_past, keep[:, 1]), self.past(past), keep)
+
+    def join(
+        self, scene: Tensor, observer: Tensor, past: Tensor, keep: Float[Tensor, "batch 3"]
+    ) -> Float[Tensor, "batch condition"]:
+        """Put the codes side by side, nulls where ``keep`` is 0 (the observer's code has seen it already)."""
+        scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
+        past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
+        return torch.cat([scene, observer, past], dim=-1)

@@ -1,0 +1,121 @@
+"""Trajectories of agent and observer on one time grid, and the windows that behaviour models learn from.
+
+`slice_behavior` writes them; `BehaviorData.load` reads them back; `BehaviorData.windows` gathers any set of windows
+as a `Context` (the past, all that a predictor may see) and a `Future` (what it must predict).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.files import arrays
+
+RATE_HZ = 10
+PAST = 8
+FUTURE = 56
+TRAIN, TEST = 0, 1
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One recording on the 10 Hz grid; transforms hold finite numbers wherever ``valid``."""
+
+    timestamp_s: Float[np.ndarray, "frame"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    valid: Bool[np.ndarray, "frame"]
+
+
+@dataclass(frozen=True)
+class Context:
+    """The 8 past frames of windows, the current one last, in the world frame."""
+
+    world_from_agent: Float[np.ndarray, "window 8 4 4"]
+    agent_from_bone: Float[np.ndarray, "window 8 bone 4 4"]
+    observer_world: Float[np.ndarray, "window 8 3"]
+
+    def __getitem__(self, index: slice | np.ndarray) -> "Context":
+        """Return some of the windows."""
+        return Context(self.world_from_agent[index], self.agent_from_bone[index], self.observer_world[index])
+
+    def __len__(self) -> int:
+        return len(self.world_from_agent)
+
+
+@dataclass(frozen=True)
+class Future:
+    """The 56 future frames of windows in the world frame; the goal is the root's last position."""
+
+    world_from_agent: Float[np.ndarray, "window 56 4 4"]
+    agent_from_bone: Float[np.ndarray, "window 56 bone 4 4"]
+
+    @property
+    def goal_world(self) -> Float[np.ndarray, "window 3"]:
+        """The root's position after 5.6 s (Z of the paper)."""
+        return self.world_from_agent[:, -1, :3, 3]
+
+    @property
+    def path_world(self) -> Float[np.ndarray, "window 56 3"]:
+        """The root's positions (P of the paper)."""
+        return self.world_from_agent[:, :, :3, 3]
+
+
+@dataclass(frozen=True)
+class BehaviorData:
+    """Everything in `behavior_data/`: trajectories per recording and the exact list of windows."""
+
+    trajectories: dict[str, Trajectory]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    video: Int[np.ndarray, "window"]
+    """index into ``videos``"""
+    start: Int[np.ndarray, "window"]
+    """first of the 64 frames"""
+    split: Int[np.ndarray, "window"]
+    """0 train, 1 test"""
+    videos: tuple[str, ...]
+
+    @classmethod
+    def load(cls, folder: Path) -> "BehaviorData":
+        """Read ``trajectories.npz`` and ``windows.npz``. Raises InputError ART-010 when damaged."""
+        tracks, windows = arrays.load(folder / "trajectories.npz"), arrays.load(folder / "windows.npz")
+        videos = tuple(str(video) for video in windows["videos"])
+        names = ("timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "valid")
+        trajectories = {video: Trajectory(*(tracks[f"{video}/{name}"] for name in names)) for video in videos}
+        return cls(
+            trajectories, tracks["agent_from_bone_rest"], windows["video"], windows["start"], windows["split"], videos
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write ``trajectories.npz`` and ``windows.npz``."""
+        tracks = {
+            f"{video}/{name}": value
+            for video, trajectory in self.trajectories.items()
+            for name, value in vars(trajectory).items()
+        }
+        arrays.save(folder / "trajectories.npz", agent_from_bone_rest=self.agent_from_bone_rest, **tracks)
+        arrays.save(
+            folder / "windows.npz",
+            video=self.video,
+            start=self.start,
+            split=self.split,
+            videos=np.array(self.videos, np.str_),
+        )
+
+    def indices(self, split: int) -> Int[np.ndarray, "window"]:
+        """Return the windows of one split."""
+        return np.flatnonzero(self.split == split)
+
+    def windows(self, index: Int[np.ndarray, "window"]) -> tuple[Context, Future]:
+        """Gather windows by their number in the list."""
+        frames = self.start[index][:, None] + np.arange(PAST + FUTURE)
+        gathered = {name: [] for name in ("world_from_agent", "agent_from_bone", "world_from_camera")}
+        for video, frame in zip(self.video[index], frames, strict=True):
+            for name, rows in gathered.items():
+                rows.append(getattr(self.trajectories[self.videos[video]], name)[frame])
+        agent, bone, camera = (np.stack(rows) for rows in gathered.values())
+        return Context(agent[:, :PAST], bone[:, :PAST], camera[:, :PAST, :3, 3]), Future(
+            agent[:, PAST:], bone[:, PAST:]
+        )

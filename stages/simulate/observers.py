@@ -1,0 +1,52 @@
+"""Scripted observers for rollouts without a person."""
+
+from collections.abc import Callable
+from typing import Literal, assert_never
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.models.trajectories import RATE_HZ
+
+Script = Literal["away", "still", "approach", "circle"]
+Observer = Callable[[float, Float[np.ndarray, "3"]], Float[np.ndarray, "3"]]
+"""From time in seconds and the animal's position to the observer's position, world metres"""
+
+
+def scripted(script: Script, *, center: Float[np.ndarray, "3"], speed_m_s: float = 1.0) -> Observer:
+    """Return an observer: far ``away``, ``still`` at the centre, walking up to the animal every 8 s, or circling.
+
+    ``center`` is a point at the height of the phone.
+    """
+    match script:
+        case "away":
+            return lambda time_s, animal: center + np.array([100.0, 0.0, 0.0])
+        case "still":
+            return lambda time_s, animal: center
+        case "circle":
+            return lambda time_s, animal: (
+                center + 1.2 * np.array([np.cos(time_s * speed_m_s / 1.2), 0.0, np.sin(time_s * speed_m_s / 1.2)])
+            )
+        case "approach":
+            return _Walker(center, speed_m_s)
+        case _:
+            assert_never(script)
+
+
+class _Walker:
+    """Walks up to the animal for 4 s, goes back to the centre for 4 s."""
+
+    def __init__(self, center: Float[np.ndarray, "3"], speed_m_s: float):
+        self.center, self.position, self.stride = (
+            np.asarray(center, float),
+            np.asarray(center, float),
+            speed_m_s / RATE_HZ,
+        )
+
+    def __call__(self, time_s: float, animal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        target = np.array([animal[0], self.center[1], animal[2]]) if time_s % 8.0 < 4.0 else self.center
+        away = target - self.position
+        distance = float(np.linalg.norm(away))
+        keep = 0.5 if time_s % 8.0 < 4.0 else 0.0
+        self.position = self.position + away / max(distance, 1e-6) * np.clip(distance - keep, 0.0, self.stride)
+        return self.position

@@ -1,0 +1,195 @@
+"""Training windows as tensors in the ego frame, and the augmented batches drawn from them.
+
+Augmentation rotates the ego frame about its up axis, mirrors left and right (bones are hidden then, since nobody knows
+which bone mirrors which), shifts the observer and blurs the remembered bones: five minutes of video must go a long way.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import convolve1d
+from torch import Tensor
+
+from pipeline.models.behavior import Architecture, Scaling, channels_from_bones
+from pipeline.models.perception import FeatureVolume, grid_points_ego, world_from_ego
+from pipeline.models.trajectories import PAST, BehaviorData
+from pipeline.space import rigid, rigid_torch
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How far training samples stray from the recorded ones."""
+
+    yaw_rad: float = 0.3
+    """largest rotation of the ego frame about its up axis, either way"""
+    mirror: float = 0.5
+    """probability of mirroring left and right"""
+    observer_m: float = 0.05
+    """standard deviation of a shift of the observer's whole past"""
+    bones: float = 0.2
+    """standard deviation of noise on remembered bones, in their own standard deviations"""
+    hide_bones: float = 0.5
+    """probability that a sample's remembered bones are hidden"""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """All training windows in their own ego frames."""
+
+    world_from_ego: Float[Tensor, "window 4 4"]
+    root: Float[Tensor, "window 64 3"]
+    rotation: Float[Tensor, "window 64 3 3"]
+    observer: Float[Tensor, "window 8 3"]
+    bones: Float[Tensor, "frame channel"]
+    frame: Int[Tensor, "window 64"]
+    """rows of ``bones``"""
+
+    def __len__(self) -> int:
+        return len(self.root)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One augmented batch: inputs of perception, and clean targets in scaled units."""
+
+    scene: Float[Tensor, "batch channel x y z"]
+    observer_past: Float[Tensor, "batch frame*3"]
+    past: Float[Tensor, "batch frame*channel"]
+    bones_keep: Float[Tensor, "batch"]
+    mirrored: Bool[Tensor, "batch"]
+    goal: Float[Tensor, "batch 3"]
+    path: Float[Tensor, "batch 3 56"]
+    body: Float[Tensor, "batch channel 56"]
+
+    def to(self, device: torch.device) -> "Batch":
+        """Return the batch on a device."""
+        return Batch(*(value.to(device) for value in vars(self).values()))
+
+
+class SceneSampler:
+    """Samples the ego grid at the resolution that the scene encoder works on, fast enough for every step.
+
+    The encoder averages blocks of 2 x 2 x 2 cells; here the volume is smoothed once as that averaging would, and read
+    at the blocks' centres.
+    """
+
+    def __init__(self, volume: FeatureVolume, stride: int, device: str):
+        features = volume.features.astype(np.float32)
+        kernel = np.array([0.125, 0.75, 0.125]) if stride > 1 else np.array([1.0])
+        for axis in (1, 2, 3):
+            features = convolve1d(features, kernel, axis=axis, mode="constant")
+        flat = np.concatenate(
+            [np.moveaxis(features, 0, -1).reshape(-1, len(features)), np.zeros((1, len(features)), np.float32)]
+        )
+        self.features = torch.from_numpy(flat).to(device)
+        self.points = torch.from_numpy(grid_points_ego(stride).astype(np.float32)).to(device)
+        self.origin = torch.from_numpy(volume.origin.astype(np.float32)).to(device)
+        self.shape, self.voxel_m = torch.tensor(volume.occupancy.shape, device=device), volume.voxel_m
+
+    def __call__(
+        self, world_from_ego: Float[Tensor, "batch 4 4"], side: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch channel x y z"]:
+        """Sample the grid; ``side`` is -1 where left and right are exchanged."""
+        points = (
+            self.points.flatten(0, 2)
+            * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
+        )
+        index = ((rigid_torch.apply(world_from_ego, points) - self.origin) / self.voxel_m).floor().long()
+        inside = ((index >= 0) & (index < self.shape)).all(-1)
+        row = (index[..., 0] * self.shape[1] + index[..., 1]) * self.shape[2] + index[..., 2]
+        features = self.features[torch.where(inside, row, len(self.features) - 1)]
+        return features.transpose(1, 2).unflatten(2, self.points.shape[:3])
+
+
+def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture) -> Windows:
+    """Express windows in the ego frame of their current time."""
+    context, future = data.windows(index)
+    frame = world_from_ego(context.world_from_agent[:, -1], architecture.ego)
+    ego_from_world = rigid.inverse(frame)
+    agent = ego_from_world[:, None] @ np.concatenate([context.world_from_agent, future.world_from_agent], axis=1)
+    lengths = [len(data.trajectories[video].timestamp_s) for video in data.videos]
+    first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    bones = np.concatenate(
+        [
+            channels_from_bones(data.trajectories[video].agent_from_bone, data.agent_from_bone_rest)
+            for video in data.videos
+        ]
+    )
+    rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(agent.shape[1])
+    observer = rigid.apply(ego_from_world, context.observer_world)
+    arrays = (frame, agent[..., :3, 3], agent[..., :3, :3], observer, bones)
+    return Windows(*(torch.from_numpy(array.astype(np.float32)) for array in arrays), torch.from_numpy(rows))
+
+
+def scaling_from_windows(windows: Windows) -> Scaling:
+    """Fit the scales of goal, path (per frame; both horizontal axes alike) and body (per channel, with floors)."""
+    future = windows.root[:, PAST:].double().numpy()
+    level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(0.02)
+    height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
+    path_std = np.stack([level, height, level])
+    body = body_channels(windows.rotation[:, PAST:], windows.bones[windows.frame[:, PAST:]]).double().numpy()
+    floor = np.concatenate([np.full(6, 0.05), np.tile([0.05] * 3 + [0.01] * 3, (body.shape[-1] - 6) // 6)])
+    return Scaling(path_std[:, -1], path_std, body.mean((0, 1)), np.maximum(body.std((0, 1)), floor))
+
+
+def past_statistics(windows: Windows) -> tuple[Float[Tensor, "channel"], Float[Tensor, "channel"]]:
+    """Return mean and standard deviation of the past's channels, with floors, for the inside of its encoder."""
+    past = torch.cat(
+        [windows.root[:, :PAST], body_channels(windows.rotation[:, :PAST], windows.bones[windows.frame[:, :PAST]])],
+        dim=-1,
+    ).flatten(0, 1)
+    floor = torch.tensor([0.05] * 9 + ([0.05] * 3 + [0.01] * 3) * ((past.shape[1] - 9) // 6))
+    return past.mean(0), torch.maximum(past.std(0), floor)
+
+
+def body_channels(
+    rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]
+) -> Float[Tensor, "*batch c"]:
+    """Put the root's rotation (6) before the bones."""
+    return torch.cat([rigid_torch.rotation_to_6d(rotation), bones], dim=-1)
+
+
+def draw_batch(
+    windows: Windows,
+    scene: SceneSampler,
+    scaling: Scaling,
+    augmentation: Augmentation,
+    size: int,
+    generator: torch.Generator,
+) -> Batch:
+    """Draw windows with replacement and augment each on its own, on the CPU; the batch lands where the scene lies."""
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    index = torch.randint(len(windows), (size,), generator=generator)
+    side = 1.0 - 2.0 * (uniform(size) < augmentation.mirror).float()
+    yaw = (uniform(size) * 2 - 1) * augmentation.yaw_rad
+    turn = rigid_torch.so3_exp(torch.stack([torch.zeros(size), yaw, torch.zeros(size)], dim=-1))
+    flip = torch.diag_embed(torch.stack([side, torch.ones(size), torch.ones(size)], dim=-1))
+    new_from_old = flip @ turn.mT
+    root = windows.root[index] @ new_from_old.mT
+    rotation = new_from_old[:, None] @ windows.rotation[index] @ flip[:, None]
+    shift = torch.randn(size, 1, 3, generator=generator) * augmentation.observer_m
+    observer = (windows.observer[index] + shift) @ new_from_old.mT
+    frames = windows.frame[index]
+    remembered = windows.bones[frames[:, :PAST]]
+    deviation = torch.from_numpy(scaling.body_std[6:]).float()
+    remembered = remembered + torch.randn(remembered.shape, generator=generator) * deviation * augmentation.bones
+    ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
+    body = (
+        body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
+    )
+    device = scene.points.device
+    return Batch(
+        scene(ego.to(device), side.to(device)),
+        observer.flatten(1),
+        torch.cat([root[:, :PAST], body_channels(rotation[:, :PAST], remembered)], dim=-1).flatten(1),
+        ((uniform(size) >= augmentation.hide_bones) & (side > 0)).float(),
+        side < 0,
+        root[:, -1] / torch.from_numpy(scaling.goal_std).float(),
+        root[:, PAST:].mT / torch.from_numpy(scaling.path_std).float(),
+        (body / torch.from_numpy(scaling.body_std).float()).mT,
+    ).to(device)

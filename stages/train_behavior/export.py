@@ -1,0 +1,153 @@
+"""The trained model as files: ONNX networks, weights, the sampler's contract, one golden plan to test samplers with."""
+
+import json
+import logging
+import warnings
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from safetensors.torch import save_file
+
+from pipeline.models.behavior import Architecture, BehaviorNets, Observation, Sampler, Sampling, Scaling, TorchNetworks
+from pipeline.models.behavior import contract as contract_of
+from pipeline.models.diffusion import Schedule
+from pipeline.models.perception import GRID_SHAPE
+from pipeline.models.trajectories import FUTURE, PAST
+
+NETWORKS = ("perception", "goal", "path", "body")
+
+
+def write_model(
+    folder: Path, nets: BehaviorNets, architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: np.ndarray
+) -> float:
+    """Write everything a sampler needs. Return the largest difference between ONNX and torch."""
+    save_file({name: value.contiguous() for name, value in nets.state_dict().items()}, folder / "behavior.safetensors")
+    document = contract_of(architecture, scaling, schedule, rest)
+    (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
+    for name in NETWORKS:
+        export_network(getattr(nets, name), folder / f"{name}.onnx", *_signature(name, architecture))
+    golden = golden_plan(Sampler(TorchNetworks(nets), schedule, scaling), architecture)
+    (folder / "golden.json").write_text(json.dumps(golden) + "\n")
+    return _largest_difference(folder, nets, architecture)
+
+
+def export_network(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]], output: str) -> None:
+    """Write one network as ONNX with a free batch dimension; the same weights always give the same bytes."""
+    batch = torch.export.Dim("batch", min=1, max=4096)
+    example = tuple(torch.zeros(2, *shape) for shape in inputs.values())
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(action="ignore"):
+        program = torch.onnx.export(
+            module.eval(),
+            example,
+            input_names=list(inputs),
+            output_names=[output],
+            dynamo=True,
+            dynamic_shapes=tuple({0: batch} for _ in example),
+            external_data=False,
+            verbose=False,
+        )
+    model = program.model_proto
+    for item in (
+        model,
+        model.graph,
+        *model.graph.node,
+        *model.graph.value_info,
+        *model.graph.input,
+        *model.graph.output,
+    ):
+        del item.metadata_props[:]
+        item.doc_string = ""
+    path.write_bytes(model.SerializeToString(deterministic=True))
+    onnx.checker.check_model(str(path))
+
+
+def _signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], str]:
+    """Return the inputs of a network (name and shape without batch) and the name of its output."""
+    step: dict[str, tuple[int, ...]] = {"t": (), "condition": (a.condition,)}
+    match name:
+        case "perception":
+            grid = {
+                "scene_grid": (a.scene_channels, *GRID_SHAPE),
+                "observer_past": (PAST * 3,),
+                "past": (PAST * (9 + 6 * a.bones),),
+            }
+            return grid | {"keep": (3,)}, "condition"
+        case "goal":
+            return {"x": (3,)} | step, "epsilon"
+        case "path":
+            return {"x": (3, FUTURE)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
+        case _:
+            return {"x": (a.body_channels, FUTURE)} | step | {"control": (3, FUTURE), "keep": (1,)}, "epsilon"
+
+
+def golden_observation(a: Architecture) -> Observation:
+    """Return the fixed input of the golden plan; every number follows from its index."""
+
+    def wave(*shape: int, amplitude: float, frequency: float) -> np.ndarray:
+        return (
+            (amplitude * np.sin(frequency * np.arange(np.prod(shape), dtype=np.float64)))
+            .reshape(1, *shape)
+            .astype(np.float32)
+        )
+
+    observer = np.stack(
+        [np.linspace(0.5, 0.2, PAST), np.full(PAST, 1.2), np.linspace(1.8, 1.1, PAST)], axis=-1
+    ).reshape(1, -1)
+    scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
+    return Observation(scene, observer.astype(np.float32), wave(PAST * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1))
+
+
+def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
+    """Sample one plan by DDIM and note its input, its noise and its result."""
+    observation = golden_observation(architecture)
+    sampling = Sampling(method="ddim", goal_steps=10, sequence_steps=10)
+    noise = np.random.default_rng(0)
+    shapes = {"goal": (1, 3), "path": (1, 3, FUTURE), "body": (1, architecture.body_channels, FUTURE)}
+    drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}
+    plans = {
+        f"guidance_{s:g}": sampler.plan(observation, Sampling("ddim", 10, 10, s), np.random.default_rng(0))
+        for s in (1.0, 0.5)
+    }
+    return {
+        "input": {
+            "scene_grid": "scene_grid.flat[i] = 0.25 sin(0.01 i)",
+            "past": "past.flat[i] = 0.1 sin(0.1 i)",
+            "observer_past": _plain(observation.observer_past),
+            "keep": [1, 1, 1],
+        },
+        "sampling": {
+            "method": sampling.method,
+            "goal_steps": sampling.goal_steps,
+            "sequence_steps": sampling.sequence_steps,
+        },
+        "noise": {name: _plain(value) for name, value in drawn.items()},
+        "plans": {name: {level: _plain(value) for level, value in vars(plan).items()} for name, plan in plans.items()},
+    }
+
+
+def _plain(array: np.ndarray) -> list:
+    return np.round(array[0].astype(np.float64), 7).tolist()
+
+
+def _largest_difference(folder: Path, nets: BehaviorNets, architecture: Architecture) -> float:
+    worst, rng = 0.0, np.random.default_rng(0)
+    for name in NETWORKS:
+        shapes, _ = _signature(name, architecture)
+        inputs = {key: rng.standard_normal((3, *shape), dtype=np.float32) for key, shape in shapes.items()}
+        session = onnxruntime.InferenceSession(
+            folder / f"{name}.onnx", _one_thread(), providers=["CPUExecutionProvider"]
+        )
+        with torch.inference_mode():
+            expected = getattr(nets, name)(*(torch.from_numpy(value) for value in inputs.values())).numpy()
+        worst = max(worst, float(np.abs(session.run(None, inputs)[0] - expected).max()))
+    return worst
+
+
+def _one_thread() -> onnxruntime.SessionOptions:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return options

@@ -1,0 +1,72 @@
+"""The denoising losses of goal, path and body (Eq. 8), with conditions dropped at random for guidance."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.models.behavior import BehaviorNets
+from pipeline.models.diffusion import Schedule, noised
+from stages.train_behavior.batches import Batch
+
+
+@dataclass(frozen=True)
+class Objective:
+    """How a batch becomes losses."""
+
+    drop: float = 0.1
+    """probability that a condition is replaced by its null, for each condition on its own"""
+    code_dropout: float = 0.1
+    """dropout on the perception code"""
+    goal_draws: int = 8
+    """noise levels drawn per window for the goal, whose network is small"""
+
+
+def losses(
+    nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Return the mean squared error of the predicted noise, per network."""
+    code = perceive(nets, batch, objective, generator)
+    draws = objective.goal_draws
+    goal = squared_error(
+        lambda x, t: nets.goal(x, t, code.repeat_interleave(draws, 0)),
+        batch.goal.repeat_interleave(draws, 0),
+        schedule,
+        generator,
+    )
+    controlled = kept(len(code), 1, objective.drop, generator).to(code.device)
+    path = squared_error(lambda x, t: nets.path(x, t, code, batch.goal, controlled), batch.path, schedule, generator)
+    known = ~batch.mirrored
+    controlled = controlled[known]
+    body = squared_error(
+        lambda x, t: nets.body(x, t, code[known], batch.path[known], controlled), batch.body[known], schedule, generator
+    )
+    return {"goal": goal.mean(), "path": path.mean(), "body": body.sum() / max(body.numel(), 1)}
+
+
+def perceive(
+    nets: BehaviorNets, batch: Batch, objective: Objective, generator: torch.Generator
+) -> Float[Tensor, "batch condition"]:
+    """Encode a batch, dropping scene, observer and past independently."""
+    keep = kept(len(batch.goal), 3, objective.drop, generator).to(batch.goal.device)
+    network = nets.perception
+    scene = network.scene.encode(batch.scene)
+    observer = network.observer(batch.observer_past, keep[:, 1])
+    code = network.join(scene, observer, network.past(batch.past, batch.bones_keep), keep)
+    return nn.functional.dropout(code, objective.code_dropout)
+
+
+def kept(size: int, count: int, drop: float, generator: torch.Generator) -> Float[Tensor, "batch count"]:
+    """Draw 1 with probability ``1 - drop``, else 0."""
+    return (torch.rand(size, count, generator=generator) >= drop).float()
+
+
+def squared_error(
+    denoise, clean: Float[Tensor, "batch ..."], schedule: Schedule, generator: torch.Generator
+) -> Float[Tensor, "batch ..."]:
+    """Noise ``clean`` to a random step and compare the noise with its prediction."""
+    t = torch.randint(schedule.steps, (len(clean),), generator=generator)
+    share = torch.from_numpy(schedule.alpha_bar).float()[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
+    noise = torch.randn(clean.shape, generator=generator).to(clean.device)
+    return (denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise) ** 2

@@ -1,0 +1,135 @@
+"""What the quality page of the behaviour model shows: goal fans, the effect of guidance, losses."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.figure import Figure
+
+from pipeline import figures
+from pipeline.fit import FitRecord
+from pipeline.models.behavior import Observation, Sampler, Sampling
+from pipeline.models.perception import FeatureVolume
+from pipeline.qa import Check, Picture
+from pipeline.space import rigid
+from stages.train_behavior.reactions import SIDES, Moments, Reactions, approach
+
+FAN = 64
+SHOWN = 4
+
+
+def pictures(
+    sampler: Sampler, moments: Moments, volume: FeatureVolume, record: FitRecord, *, seed: int
+) -> list[Picture]:
+    """Draw a few training windows, sampled under different conditions."""
+    chosen = np.linspace(0, len(moments.observation) - 1, SHOWN + 2).astype(int)[1:-1]
+    room, frame = _Room(volume), moments.world_from_ego[chosen]
+    some = moments.observation[chosen]
+    removed = {
+        "all": Sampling(),
+        "no observer": Sampling(observer=False),
+        "no scene": Sampling(scene=False),
+        "no past": Sampling(past=False),
+    }
+    strength = {f"interactivity {s:g}": Sampling(guidance=s) for s in (0.0, 0.5, 1.0)}
+    with_scene = {name: removed[name] for name in ("all", "no scene")}
+    close = replace(some, observer_past=np.tile(approach(SIDES[0], 0.8, 1.0), (len(chosen), 1)))
+    captions = {
+        "goals": "Sampled goals (orange) at training moments, with conditions removed; animal blue, observer green.",
+        "guidance": "The same moments with an observer who walks up from ahead; same noise at each interactivity.",
+        "paths": "Sampled paths with and without the scene.",
+        "losses": "Squared error of the predicted noise, smoothed.",
+    }
+    images = {
+        "goals": room.fans(sampler, some, frame, removed, seed),
+        "guidance": room.fans(sampler, close, frame, strength, seed),
+        "paths": room.fans(sampler, some, frame, with_scene, seed, paths=True),
+        "losses": losses(record),
+    }
+    return [Picture(name, image, captions[name]) for name, image in images.items()]
+
+
+def checks(record: FitRecord, reactions: Reactions, onnx_difference: float) -> list[Check]:
+    """Judge the training."""
+    last = {name: float(np.nanmean(values[-max(len(values) // 10, 1) :])) for name, values in record.terms.items()}
+    return [
+        *(Check(f"{name}: squared error of the noise, last tenth", value, "", 0.9) for name, value in last.items()),
+        Check("goals move away from an approaching observer", reactions.away_m, "m", 0.1, None, "higher"),
+        Check("share of approaches that drive goals away", reactions.away_share, "share", 0.6, None, "higher"),
+        Check(
+            "goals after an approach from one side against the other", reactions.reversal_m, "m", 0.2, None, "higher"
+        ),
+        Check("shift by a far observer against none", reactions.far_m, "m", 0.01, 0.1),
+        Check("shift by a far observer against a farther one", reactions.farther_m, "m", 0.01, 0.1),
+        Check("ONNX against torch, largest difference", onnx_difference, "", 1e-4, 1e-2),
+        Check("training fell back to a checkpoint", record.rolled_back, "times", 0),
+    ]
+
+
+def losses(record: FitRecord) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw the loss terms."""
+    figure = Figure(figsize=(7, 3), dpi=80, layout="constrained")
+    axis = figure.subplots()
+    for name, values in record.terms.items():
+        width = max(len(values) // 50, 1)
+        smooth = np.convolve(values, np.ones(width) / width, "valid")
+        axis.plot(np.arange(len(smooth)) + width, smooth, label=name)
+    axis.set(xlabel="step", ylabel="squared error", yscale="log")
+    axis.legend()
+    return figures.pixels(figure)
+
+
+class _Room:
+    """The room from above, to draw on."""
+
+    def __init__(self, volume: FeatureVolume):
+        self.solid = (volume.occupancy[:, 3:] == 1).mean(1)
+        self.low = volume.origin[[0, 2]]
+        self.high = self.low + np.array(self.solid.shape) * volume.voxel_m
+
+    def fans(
+        self,
+        sampler: Sampler,
+        observation: Observation,
+        frame: Float[np.ndarray, "window 4 4"],
+        samplings: dict[str, Sampling],
+        seed: int,
+        *,
+        paths: bool = False,
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Draw one row per way of sampling, one column per window."""
+        figure = Figure(figsize=(2.6 * len(frame), 2.3 * len(samplings)), dpi=80, layout="constrained")
+        grid = figure.subplots(len(samplings), len(frame), squeeze=False)
+        count = 12 if paths else FAN
+        repeated = observation[np.repeat(np.arange(len(frame)), count)]
+        for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
+            rng, codes = np.random.default_rng(seed), sampler.codes(repeated, sampling)
+            scaled = sampler.goals(codes, sampling, rng)
+            goals = (scaled * sampler.scaling.goal_std).reshape(len(frame), count, 3)
+            lines = sampler.paths(codes, scaled, sampling, rng) * sampler.scaling.path_std if paths else None
+            for column, axis in enumerate(row):
+                self._window(axis, frame[column], observation.observer_past[column].reshape(-1, 3), goals[column])
+                if lines is not None:
+                    self._lines(axis, frame[column], np.swapaxes(lines.reshape(len(frame), count, 3, -1)[column], 1, 2))
+            row[0].set_ylabel(name)
+        return figures.pixels(figure)
+
+    def _window(
+        self,
+        axis,
+        frame: Float[np.ndarray, "4 4"],
+        observer: Float[np.ndarray, "frame 3"],
+        goals: Float[np.ndarray, "sample 3"],
+    ) -> None:
+        extent = (self.low[0], self.high[0], self.high[1], self.low[1])
+        axis.imshow(self.solid.T, cmap="Greys", extent=extent, vmax=1.2)
+        goal, seen = rigid.apply(frame, goals), rigid.apply(frame, observer)
+        axis.scatter(goal[:, 0], goal[:, 2], s=5, color="#dd8452", alpha=0.7)
+        axis.plot(seen[:, 0], seen[:, 2], color="#55a868", linewidth=2)
+        axis.scatter(*seen[-1, [0, 2]], color="#55a868", s=25)
+        axis.quiver(*frame[[0, 2], 3], *(frame[[0, 2], 2] * [1, 1]), angles="xy", color="#3b6ea5", scale=8, width=0.02)
+        axis.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
+
+    def _lines(self, axis, frame: Float[np.ndarray, "4 4"], paths: Float[np.ndarray, "sample frame 3"]) -> None:
+        for path in rigid.apply(frame, paths):
+            axis.plot(path[:, 0], path[:, 2], color="#c44e52", linewidth=0.8, alpha=0.7)

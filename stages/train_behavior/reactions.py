@@ -1,0 +1,93 @@
+"""Does the animal mind the observer? The same sampled noise under observers that come close, are far, or absent.
+
+The observer walks up to the animal from one side, from the other side, stands beyond the radius of perception, and is
+dropped; everything else, scene, past and noise, is the same.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.models.behavior import Architecture, Observation, Sampler, Sampling, observe
+from pipeline.models.perception import FeatureVolume, world_from_ego
+from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData
+
+SAMPLES = 16
+SIDES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+"""where the observer comes from, ego frame: ahead, its left, behind, its right"""
+
+
+@dataclass(frozen=True)
+class Reactions:
+    """Mean shifts of sampled goals in metres, over windows and sides."""
+
+    away_m: float
+    """along the direction away from an approaching observer, against no observer"""
+    away_share: float
+    """share of sides and windows in which it is positive"""
+    reversal_m: float
+    """between approaches from opposite sides, along the first one's direction away"""
+    far_m: float
+    """largest, any direction, of a far observer against none"""
+    farther_m: float
+    """largest, any direction, of a far observer against one twice as far"""
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Some training windows, evenly spread, at which the model is looked at."""
+
+    observation: Observation
+    world_from_ego: Float[np.ndarray, "window 4 4"]
+
+
+def moments(data: BehaviorData, volume: FeatureVolume, architecture: Architecture, count: int = 24) -> Moments:
+    """Choose training windows and encode what the animal perceives in them."""
+    train = data.indices(TRAIN)
+    context, _ = data.windows(train[np.linspace(0, len(train) - 1, min(count, len(train))).astype(int)])
+    observation = observe(context, volume, data.agent_from_bone_rest, architecture.ego)
+    return Moments(observation, world_from_ego(context.world_from_agent[:, -1], architecture.ego))
+
+
+def approach(side: Float[np.ndarray, "3"], distance_m: float, speed_m_s: float) -> Float[np.ndarray, "frame*3"]:
+    """Return an observer's past in the ego frame: walking up from ``side``, now ``distance_m`` away."""
+    before_s = np.arange(PAST - 1, -1, -1)[:, None] / RATE_HZ
+    return ((distance_m + speed_m_s * before_s) * side + [0.0, 1.0, 0.0]).ravel().astype(np.float32)
+
+
+def measure(
+    sampler: Sampler,
+    observation: Observation,
+    *,
+    radius_m: float,
+    seed: int,
+    distance_m: float = 0.8,
+    speed_m_s: float = 1.0,
+) -> Reactions:
+    """Sample goals of some windows under scripted observers, always with the same noise."""
+    sampling = Sampling()
+    repeated = observation[np.repeat(np.arange(len(observation)), SAMPLES)]
+
+    def mean_goals(observer: Float[np.ndarray, "frame*3"], sampling: Sampling) -> Float[np.ndarray, "window 3"]:
+        seen = replace(repeated, observer_past=np.tile(observer, (len(repeated), 1)))
+        goals = (
+            sampler.goals(sampler.codes(seen, sampling), sampling, np.random.default_rng(seed))
+            * sampler.scaling.goal_std
+        )
+        return goals.reshape(len(observation), SAMPLES, 3).mean(1)
+
+    none = mean_goals(approach(SIDES[0], 1.0, 0.0), replace(sampling, observer=False))
+    shift = np.stack([mean_goals(approach(side, distance_m, speed_m_s), sampling) - none for side in SIDES])
+    away = -np.einsum("swc,sc->sw", shift, SIDES)
+    opposite = np.roll(shift, -2, axis=0)
+    reversal = -np.einsum("swc,sc->sw", shift - opposite, SIDES)
+    far = mean_goals(approach(SIDES[0], radius_m, 0.0), sampling)
+    farther = mean_goals(approach(SIDES[0], 2 * radius_m, 0.0), sampling)
+    return Reactions(
+        away_m=float(away.mean()),
+        away_share=float((away > 0).mean()),
+        reversal_m=float(reversal.mean()),
+        far_m=float(np.linalg.norm(far - none, axis=-1).max()),
+        farther_m=float(np.linalg.norm(far - farther, axis=-1).max()),
+    )

@@ -1,0 +1,122 @@
+"""Training of perception and the three denoisers together, with an average of the weights kept beside."""
+
+import copy
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from pipeline.fit import FitRecord, fit
+from pipeline.models.behavior import Architecture, BehaviorNets, Scaling
+from pipeline.models.diffusion import Schedule
+from pipeline.models.perception import FeatureVolume
+from pipeline.models.trajectories import TRAIN, BehaviorData
+from stages.train_behavior.batches import (
+    Augmentation,
+    SceneSampler,
+    Windows,
+    draw_batch,
+    past_statistics,
+    scaling_from_windows,
+    windows_from_data,
+)
+from stages.train_behavior.objective import Objective, losses
+
+
+@dataclass(frozen=True)
+class Optimization:
+    """How long and how fast."""
+
+    steps: int = 2000
+    batch: int = 64
+    """windows per step"""
+    rate: float = 1e-3
+    """peak learning rate of AdamW"""
+    weight_decay: float = 0.05
+    average: float = 0.995
+    """decay per step of the averaged weights"""
+    save_every: int = 200
+    """steps between checkpoints"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that a recipe may say about training."""
+
+    optimization: Optimization = field(default_factory=Optimization)
+    """length and speed"""
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    """how far samples stray from the recorded ones"""
+    objective: Objective = field(default_factory=Objective)
+    """dropping of conditions and the number of noise levels"""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A trained model."""
+
+    nets: BehaviorNets
+    """the average of the weights"""
+    scaling: Scaling
+    record: FitRecord
+
+
+def train(
+    data: BehaviorData,
+    volume: FeatureVolume,
+    architecture: Architecture,
+    schedule: Schedule,
+    settings: Settings,
+    *,
+    seed: int,
+    resume: Path | None = None,
+    device: str = "cpu",
+) -> Fitted:
+    """Fit the networks to the training windows of the data."""
+    windows = windows_from_data(data, data.indices(TRAIN), architecture)
+    scaling = scaling_from_windows(windows)
+    nets = initial_nets(architecture, windows, seed).to(device)
+    average = copy.deepcopy(nets).requires_grad_(False)
+    scene = SceneSampler(volume, nets.perception.scene.stride, device)
+    pace = settings.optimization
+    optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay)
+
+    def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        batch = draw_batch(windows, scene, scaling, settings.augmentation, pace.batch, generator)
+        return losses(nets, batch, schedule, settings.objective, generator)
+
+    def after_step(step: int) -> None:
+        decay = min(pace.average, (step + 1) / (step + 10))
+        with torch.no_grad():
+            for mean, parameter in zip(average.parameters(), nets.parameters(), strict=True):
+                mean.lerp_(parameter, 1 - decay)
+
+    record = fit(
+        modules={"nets": nets, "average": average},
+        optimizer=optimizer,
+        loss=loss,
+        steps=pace.steps,
+        seed=seed,
+        resume=resume,
+        save_every=pace.save_every,
+        schedule=warm_cosine,
+        label="behaviour",
+        clip_norm=1.0,
+        after_step=after_step,
+    )
+    return Fitted(average.eval(), scaling, record)
+
+
+def initial_nets(architecture: Architecture, windows: Windows, seed: int) -> BehaviorNets:
+    """Return freshly initialised networks that know the statistics of the past."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        nets = BehaviorNets(architecture)
+    nets.perception.past.mean[:], nets.perception.past.std[:] = past_statistics(windows)
+    return nets
+
+
+def warm_cosine(progress: float) -> float:
+    """Return the factor on the learning rate: a rise over 2 %, then half a cosine down to 2 %."""
+    return min(1.0, (progress + 1e-3) / 0.02) * (0.51 + 0.49 * math.cos(math.pi * progress))
