@@ -1,0 +1,82 @@
+"""Judge the figures of `metrics.json` against the bars that this project sets itself.
+
+A bar is a limit, or another figure that must be beaten. Figures that were not measured say why.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+Verdict = Literal["ok", "fail", "none"]
+Metrics = Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One promise."""
+
+    metric: str
+    words: str
+    better: Literal["lower", "higher"]
+    limit: float | str
+    """a number, or the name of the figure to beat or reach"""
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One promise and what was measured."""
+
+    bar: Bar
+    value: float | None
+    limit: float | None
+    verdict: Verdict
+    reason: str
+    """why there is no value"""
+
+
+BARS = (
+    Bar("registration/rotation_deg_median", "camera rotation error, median of all frames", "lower", 1.0, "deg"),
+    Bar("registration/translation_m_median", "camera position error, median of all frames", "lower", 0.04, "m"),
+    Bar("registration/videos_registered", "sessions placed on the map", "higher", "registration/videos_total"),
+    Bar("masks/iou_mean", "overlap of masks with the true animal", "higher", 0.75),
+    Bar("reconstruction/depth_acc_all", "depth within 0.1 m, seen by the held-out phone", "higher", 0.88),
+    Bar("reconstruction/agent_root_m_median", "position error of the animal, median", "lower", 0.08, "m"),
+    Bar("behavior/ats/goal_minde_m", "goal error, best of 16: less than the location prior's", "lower", "behavior/location_prior/goal_minde_m", "m"),
+    Bar("behavior/ats/goal_minde_m", "goal error, best of 16: less than standing still's", "lower", "behavior/stand_still/goal_minde_m", "m"),
+    Bar("behavior/ats/goal_minde_m", "goal error, best of 16: less than constant velocity's", "lower", "behavior/constant_velocity/goal_minde_m", "m"),
+    Bar("behavior/ats/goal_energy_score_m", "energy score: less than the location prior's", "lower", "behavior/location_prior/goal_energy_score_m", "m"),
+    Bar("behavior/ats/goal_energy_score_m", "energy score: less than standing still's", "lower", "behavior/stand_still/goal_energy_score_m", "m"),
+    Bar("behavior/ats/goal_energy_score_m", "energy score: less than constant velocity's", "lower", "behavior/constant_velocity/goal_energy_score_m", "m"),
+    Bar("simulator/plan_few_s", "time of a plan in few steps, one core", "lower", 1.5, "s"),
+)  # fmt: skip
+
+
+def judge(metrics: Metrics, reasons: Mapping[str, str]) -> list[Judged]:
+    """Compare every bar with its figure; a rival must be beaten, a limit and a total may be met."""
+    return [_judged(bar, metrics, reasons) for bar in BARS]
+
+
+def _judged(bar: Bar, metrics: Metrics, reasons: Mapping[str, str]) -> Judged:
+    value = _known(metrics.get(bar.metric))
+    limit = bar.limit if isinstance(bar.limit, float) else _known(metrics.get(bar.limit))
+    if value is None or limit is None:
+        missing = bar.metric if value is None else str(bar.limit)
+        return Judged(bar, value, limit, "none", reasons.get(missing, "not measured"))
+    rival = isinstance(bar.limit, str) and bar.better == "lower"
+    holds = value < limit if rival else value <= limit if bar.better == "lower" else value >= limit
+    return Judged(bar, value, limit, "ok" if holds else "fail", "")
+
+
+def grouped(metrics: Metrics) -> dict[str, dict[str, float | None]]:
+    """Sort figures by the first part of their names."""
+    groups: dict[str, dict[str, float | None]] = {}
+    for name, value in sorted(metrics.items()):
+        group, _, rest = name.partition("/")
+        groups.setdefault(group, {})[rest or name] = _known(value)
+    return groups
+
+
+def _known(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

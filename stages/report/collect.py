@@ -1,0 +1,108 @@
+"""Gather what the stages wrote about themselves: `qa.json`, its pictures, and the settings in the manifest."""
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from pipeline import artifact
+from pipeline.files import images
+from pipeline.videos import Video
+from stages.report.chapters import Chapter
+
+LIGHTS = ("none", "ok", "warn", "fail")
+_PICTURE_BYTES = 10_000_000
+_SMALLEST_PX = 160
+_STRIP = 2.4
+"""width over height of a picture that is a strip"""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture, ready to stand in a page."""
+
+    source: str
+    """data URI"""
+    caption: str
+    wide: bool
+    """a strip that wants the page's whole width"""
+
+
+@dataclass(frozen=True)
+class Note:
+    """What one artifact says about itself; per recording where there is one for each."""
+
+    video: str | None
+    about: str
+    """the recording's role"""
+    light: str
+    good: str
+    bad: str
+    checks: list[dict[str, Any]]
+    pictures: list[Picture]
+
+
+@dataclass(frozen=True)
+class Told:
+    """A chapter with all its notes."""
+
+    chapter: Chapter
+    notes: list[Note]
+    settings: dict[str, Any]
+
+    @property
+    def light(self) -> str:
+        """The worst light of all notes."""
+        return max((note.light for note in self.notes), key=LIGHTS.index, default="none")
+
+    @property
+    def worries(self) -> list[tuple[Note, dict[str, Any]]]:
+        """Checks that are not fine, worst first."""
+        found = [(note, check) for note in self.notes for check in note.checks if check["status"] in ("warn", "fail")]
+        return sorted(found, key=lambda pair: -LIGHTS.index(pair[1]["status"]))
+
+    @property
+    def cover(self) -> Picture | None:
+        """The first picture there is."""
+        return next((picture for note in self.notes for picture in note.pictures), None)
+
+
+def role(video: Video) -> str:
+    """Say what a recording is for."""
+    return f"{video.role}, {video.split}" if video.role == "session" else video.role
+
+
+def told(chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str]) -> Told:
+    """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all), `roles` name the recordings."""
+    raw = {video: _read(folder) for video, folder in folders.items()}
+    files = [folder / entry["file"] for folder, qa in zip(folders.values(), raw.values(), strict=True) for entry in qa["pictures"]]
+    total = sum(file.stat().st_size for file in files)
+    shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
+    notes = [_note(video, roles.get(video or "", ""), folders[video], qa, shrink) for video, qa in raw.items()]
+    manifests = [artifact.read_manifest(folder) for folder in folders.values()]
+    return Told(chapter, notes, manifests[0].config if manifests and manifests[0] else {})
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    path = folder / "qa.json"
+    return json.loads(path.read_bytes()) if path.exists() else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
+
+
+def _note(video: str | None, about: str, folder: Path, qa: dict[str, Any], shrink: float) -> Note:
+    pictures = [_picture(folder / entry["file"], entry["caption"], shrink) for entry in qa["pictures"]]
+    return Note(video, about, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures)
+
+
+def _picture(path: Path, caption: str, shrink: float) -> Picture:
+    """Embed a picture; where a page would grow too big to send, smaller."""
+    color = images.read_color(path)
+    kind, content = path.suffix[1:], path.read_bytes()
+    if shrink > 1:
+        size = [max(_SMALLEST_PX, round(length / shrink)) for length in color.shape[1::-1]]
+        kind, content = "jpeg", images.encode_jpeg(cv2.resize(color, size, interpolation=cv2.INTER_AREA), 85)
+    source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return Picture(source, caption, color.shape[1] > _STRIP * color.shape[0])

@@ -1,0 +1,44 @@
+"""Turn chapters and figures into pages: one index and one page per chapter, each a file of its own."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jinja2
+
+from stages.report.bars import Judged
+from stages.report.collect import Told
+
+WORDS = {"ok": "fine", "warn": "to look at", "fail": "not good", "none": "without a note"}
+MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
+
+
+def render(
+    *, name: str, chapters: Sequence[Told], judged: Sequence[Judged], figures: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the text of every page by file name."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("stages.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters["number"] = number
+    shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": MARKS}
+    index = environment.get_template("index.html").render(**shared, judged=judged, figures=figures, reasons=reasons)
+    pages = {"index.html": index}
+    chapter = environment.get_template("chapter.html")
+    for place, told in enumerate(chapters):
+        before = chapters[place - 1] if place else None
+        after = chapters[place + 1] if place + 1 < len(chapters) else None
+        pages[f"{told.chapter.artifact}.html"] = chapter.render(**shared, told=told, before=before, after=after)
+    return pages
+
+
+def number(value: Any) -> str:
+    """Write a number as a reader wants it: three significant digits, no exponent where it can be helped."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if value == round(value) and abs(value) < 1e7:
+        return f"{value:.0f}"
+    if abs(value) >= 100:
+        return f"{value:.0f}"
+    return f"{value:#.3g}".rstrip(".") if abs(value) >= 1e-3 else f"{value:.1e}"
