@@ -1,0 +1,216 @@
+"""The canonical structure T: what is where in the scene and on the agent (paper 001, Eqs. 1-2).
+
+`Field` maps points to signed distance, colour and feature: a multi-resolution dense grid and two small heads,
+with a learnable code per video for the scene. `density` turns signed distance into the density of volume
+rendering. `Body` skins the agent's field with Gaussian bones. `Reconstruction` holds all of it; `save` and `load`
+move it to and from a folder. Points and distances are in metres, inside and outside.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pipeline.models import skinning
+from pipeline.space import rigid_torch
+
+FEATURE_CHANNELS = 16
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """Everything that fixes the parameters' shapes of a field."""
+
+    low_m: tuple[float, float, float]
+    """lower corner of the box"""
+    high_m: tuple[float, float, float]
+    """upper corner of the box"""
+    voxel_m: tuple[float, ...]
+    """edge of the grid's cells, coarse to fine"""
+    grid_channels: int = 4
+    width: int = 64
+    """units of the hidden layer of each head"""
+    videos: int = 0
+    """number of codes; 0 = none"""
+    code_channels: int = 8
+    truncation_m: float | None = None
+    """signed distances saturate here; None = never"""
+
+
+@dataclass(frozen=True)
+class Values:
+    """What a field holds at points."""
+
+    signed_distance: Float[Tensor, "point"]
+    color: Float[Tensor, "point 3"]
+    feature: Float[Tensor, "point 16"]
+
+
+class DenseGrid(nn.Module):
+    """Trilinear interpolation in dense grids of several resolutions; their channels are concatenated."""
+
+    def __init__(self, low_m: Sequence[float], high_m: Sequence[float], voxel_m: Sequence[float], channels: int, initial: float = 0.01):
+        super().__init__()
+        low, high = torch.tensor(low_m, dtype=torch.float32), torch.tensor(high_m, dtype=torch.float32)
+        self.register_buffer("low", low, persistent=False)
+        self.levels, extents = nn.ParameterList(), []
+        for voxel in voxel_m:
+            nodes = ((high - low) / voxel).ceil().int() + 1
+            extents.append((nodes - 1) * voxel)
+            self.levels.append(nn.Parameter(torch.randn(1, channels, *nodes.flip(0).tolist()) * initial))
+        self.register_buffer("extents", torch.stack(extents), persistent=False)
+        self.channels = channels * len(voxel_m)
+
+    def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
+        """Interpolate at points; outside the box the border's values hold."""
+        found = []
+        for extent, level in zip(self.extents, self.levels, strict=True):
+            place = ((points - self.low) / extent * 2 - 1).view(1, 1, 1, -1, 3)
+            found.append(functional.grid_sample(level, place, padding_mode="border", align_corners=True).view(level.shape[1], -1))
+        return torch.cat(found).t()
+
+
+class Field(nn.Module):
+    """Signed distance, colour and feature at points (paper 001, Eqs. 1 and 2)."""
+
+    def __init__(self, shape: FieldShape, free_m: float):
+        """``free_m`` is the signed distance that an untrained field gives."""
+        super().__init__()
+        self.shape = shape
+        self.grid = DenseGrid(shape.low_m, shape.high_m, shape.voxel_m, shape.grid_channels)
+        self.codes = nn.Embedding(max(shape.videos, 1), shape.code_channels) if shape.videos else None
+        inputs = self.grid.channels + (shape.code_channels if shape.videos else 0)
+        self.geometry = nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 1))
+        self.appearance = nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 3 + FEATURE_CHANNELS))
+        self.log_beta = nn.Parameter(torch.tensor(-4.0))
+        if self.codes:
+            nn.init.normal_(self.codes.weight, std=0.1)
+        limit = shape.truncation_m
+        nn.init.constant_(self.geometry[-1].bias, torch.atanh(torch.tensor(min(free_m / limit, 0.9))).item() if limit else free_m)
+
+    def code(self, video: Int[Tensor, "point"]) -> Float[Tensor, "point channel"] | None:
+        """Return the codes of videos; -1 asks for the mean of all, the scene that the videos share."""
+        if self.codes is None:
+            return None
+        mean = self.codes.weight.mean(0)
+        return torch.where(video[:, None] < 0, mean, self.codes(video.clamp_min(0)))
+
+    def encode(self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point channel"] | None = None) -> Float[Tensor, "point channel"]:
+        """Read the grid and append the code: the input of both heads."""
+        read = self.grid(points)
+        return read if code is None else torch.cat([read, code], dim=-1)
+
+    def distance(self, encoded: Float[Tensor, "point channel"]) -> Float[Tensor, "point"]:
+        """Return signed distances in metres, positive in free space."""
+        raw, limit = self.geometry(encoded)[:, 0], self.shape.truncation_m
+        return limit * torch.tanh(raw) if limit else raw
+
+    def look(self, encoded: Float[Tensor, "point channel"]) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 16"]]:
+        """Return colour in 0..1 and unit-length features."""
+        color, feature = self.appearance(encoded).split([3, FEATURE_CHANNELS], dim=-1)
+        return color.sigmoid(), functional.normalize(feature, dim=-1, eps=1e-4)
+
+    def forward(self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point channel"] | None = None) -> Values:
+        """Return all values at points."""
+        encoded = self.encode(points, code)
+        return Values(self.distance(encoded), *self.look(encoded))
+
+    @property
+    def beta_m(self) -> Float[Tensor, ""]:
+        """The surface's softness in metres, kept between 4 mm and 2 cm."""
+        return self.log_beta.exp().clamp(0.004, 0.02)
+
+
+def density(signed_distance: Float[Tensor, "*point"], beta_m: Float[Tensor, ""]) -> Float[Tensor, "*point"]:
+    """Turn signed distance into volume density per metre: a Laplace CDF (Yariv et al., VolSDF, Eqs. 2-3)."""
+    tail = 0.5 * torch.exp(-signed_distance.abs() / beta_m)
+    return torch.where(signed_distance > 0, tail, 1 - tail) / beta_m
+
+
+class Body(nn.Module):
+    """The agent's 25 Gaussian bones at rest and the skinning weights they give (paper 001, Eq. 3)."""
+
+    def __init__(self, agent_from_bone_rest: Float[Tensor, "bone 4 4"], bone_scale_m: Float[Tensor, "bone 3"], shape: FieldShape, voxel_m: float = 0.1):
+        """The small learned correction of the weights lives on a grid of ``voxel_m`` in the box of ``shape``."""
+        super().__init__()
+        self.register_buffer("agent_from_bone_rest", agent_from_bone_rest)
+        self.log_scale = nn.Parameter(bone_scale_m.log())
+        self.delta = DenseGrid(shape.low_m, shape.high_m, (voxel_m,), len(bone_scale_m), initial=0.0)
+
+    @property
+    def bone_scale_m(self) -> Float[Tensor, "bone 3"]:
+        """Standard deviations of the Gaussian bones along their axes."""
+        return self.log_scale.exp()
+
+    def _delta(self, points_rest: Float[Tensor, "*batch point 3"]) -> Float[Tensor, "*batch point bone"]:
+        return self.delta(points_rest.reshape(-1, 3)).view(*points_rest.shape[:-1], -1)
+
+    def weights(self, points_rest: Float[Tensor, "*batch point 3"]) -> Float[Tensor, "*batch point bone"]:
+        """Return the skinning weights of points of the rest shape."""
+        return skinning.skinning_weights(points_rest, self.agent_from_bone_rest, self.bone_scale_m, delta=self._delta(points_rest))
+
+    def pose(self, points_rest: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]) -> Float[Tensor, "*batch point 3"]:
+        """Move points of the rest shape to where the posed bones take them (forward warp)."""
+        return skinning.move(skinning.blend(self.weights(points_rest), agent_from_bone, self.agent_from_bone_rest), points_rest)
+
+    def unpose(self, points_posed: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]) -> Float[Tensor, "*batch point 3"]:
+        """Move posed points back to the rest shape (backward warp).
+
+        The weights come from the posed bones; the learned correction is read where they alone would land.
+        """
+        scale = self.bone_scale_m
+        distance = -skinning.squared_mahalanobis(points_posed, agent_from_bone, scale)
+        with torch.no_grad():
+            landing = self._back(points_posed, agent_from_bone, distance.softmax(-1))
+        return self._back(points_posed, agent_from_bone, (distance + self._delta(landing)).softmax(-1))
+
+    def _back(self, points_posed: Tensor, agent_from_bone: Tensor, weights: Tensor) -> Tensor:
+        posed_from_rest = skinning.blend(weights, agent_from_bone, self.agent_from_bone_rest)
+        return skinning.move(rigid_torch.inverse(posed_from_rest), points_posed)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The canonical structure of one home and its animal, learned from all its videos."""
+
+    scene: Field
+    agent: Field
+    body: Body
+    videos: tuple[str, ...]
+    """ids, in the order of the scene's codes"""
+
+    def video_code(self, video: str | None) -> int:
+        """Return the index of a video's code, or -1, the shared scene, for None."""
+        return -1 if video is None else self.videos.index(video)
+
+
+def save(folder: Path, reconstruction: Reconstruction) -> None:
+    """Write ``scene_field.safetensors``, ``agent_field.safetensors`` (with the body) and ``fields.json``."""
+    agent = {f"field.{key}": value for key, value in reconstruction.agent.state_dict().items()}
+    agent |= {f"body.{key}": value for key, value in reconstruction.body.state_dict().items()}
+    for name, state in (("scene_field", reconstruction.scene.state_dict()), ("agent_field", agent)):
+        save_file({key: value.detach().cpu().contiguous() for key, value in state.items()}, folder / f"{name}.safetensors")
+    shapes = {"scene": asdict(reconstruction.scene.shape), "agent": asdict(reconstruction.agent.shape)}
+    table = {"unit": "metre", "videos": reconstruction.videos, "bones": len(reconstruction.body.log_scale), **shapes}
+    (folder / "fields.json").write_text(json.dumps(table, indent=1) + "\n")
+
+
+def load(folder: Path, device: str = "cpu") -> Reconstruction:
+    """Read what `save` wrote, ready to be asked (no gradients)."""
+    table = json.loads((folder / "fields.json").read_text())
+    shapes = {name: FieldShape(**{key: tuple(value) if isinstance(value, list) else value for key, value in table[name].items()}) for name in ("scene", "agent")}
+    scene, agent = Field(shapes["scene"], free_m=0.1), Field(shapes["agent"], free_m=0.1)
+    body = Body(torch.eye(4).repeat(table["bones"], 1, 1), torch.ones(table["bones"], 3), shapes["agent"])
+    scene.load_state_dict(load_file(folder / "scene_field.safetensors"))
+    state = load_file(folder / "agent_field.safetensors")
+    for prefix, module in (("field.", agent), ("body.", body)):
+        module.load_state_dict({key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)})
+    for module in (scene, agent, body):
+        module.to(device).requires_grad_(False).eval()
+    return Reconstruction(scene, agent, body, tuple(table["videos"]))

@@ -1,0 +1,110 @@
+"""The time-varying structure D: where camera, agent and bones are in every frame.
+
+`Motion` is one video's result as files hold it (`save`, `load`). `MotionTable` holds the same for all frames of
+all videos while it is being optimised: initial poses and small learned se(3) corrections on their right side.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from pipeline.files import arrays
+from pipeline.space import rigid, rigid_torch
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One video: poses of camera, agent and bones; NaN where the agent's pose is not known."""
+
+    timestamp_s: Float[np.ndarray, "frame"]
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+    confidence: Float[np.ndarray, "frame"]
+    agent_visible: Bool[np.ndarray, "frame"]
+
+    def at(self, query_s: float) -> tuple[Float[np.ndarray, "4 4"] | None, Float[np.ndarray, "bone 4 4"] | None]:
+        """Return the agent's root and bones at one time, interpolated; None where they are not known."""
+        after = int(np.clip(np.searchsorted(self.timestamp_s, query_s), 1, len(self.timestamp_s) - 1))
+        pair = slice(after - 1, after + 1)
+        if not np.isfinite(self.world_from_agent[pair]).all():
+            return None, None
+        when, query = self.timestamp_s[pair], np.clip([query_s], *self.timestamp_s[pair])
+        root = rigid.interpolate(when, self.world_from_agent[pair], query)[0]
+        bones = [rigid.interpolate(when, self.agent_from_bone[pair, bone], query)[0] for bone in range(self.agent_from_bone.shape[1])]
+        return root, np.stack(bones)
+
+
+def save(path: Path, motion: Motion) -> None:
+    """Write a ``motion.npz``."""
+    arrays.save(
+        path,
+        timestamp_s=motion.timestamp_s.astype("f8"),
+        world_from_camera=motion.world_from_camera.astype("f8"),
+        world_from_agent=motion.world_from_agent.astype("f8"),
+        agent_from_bone=motion.agent_from_bone.astype("f4"),
+        confidence=motion.confidence.astype("f4"),
+        agent_visible=motion.agent_visible.astype(bool),
+    )
+
+
+def load(path: Path) -> Motion:
+    """Read a ``motion.npz``."""
+    return Motion(**arrays.load(path, tuple(Motion.__dataclass_fields__)))
+
+
+class MotionTable(nn.Module):
+    """Poses of all frames of all videos, one after the other, with learned corrections.
+
+    A pose is ``initial @ exp(correction)``. Cameras are corrected at knots, linearly between them: registration
+    leaves slow drift, not jitter. Videos whose camera is held (templates) keep the initial poses.
+    """
+
+    def __init__(
+        self,
+        world_from_camera: Float[Tensor, "frame 4 4"],
+        world_from_agent: Float[Tensor, "frame 4 4"],
+        agent_from_bone_rest: Float[Tensor, "bone 4 4"],
+        frames_per_video: Sequence[int],
+        camera_free: Sequence[bool],
+        knot_frames: int = 10,
+    ):
+        super().__init__()
+        knots, before, share, free = 0, [], [], []
+        for frames, is_free in zip(frames_per_video, camera_free, strict=True):
+            place = torch.arange(frames) / knot_frames
+            before.append(place.floor().long() + knots)
+            share.append(place - place.floor())
+            free.append(torch.full((frames,), float(is_free)))
+            knots += (frames - 1) // knot_frames + 2
+        for name, value in (("knot", torch.cat(before)), ("knot_share", torch.cat(share)), ("camera_free", torch.cat(free))):
+            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("initial_camera", world_from_camera.float(), persistent=False)
+        self.register_buffer("initial_agent", world_from_agent.float(), persistent=False)
+        self.register_buffer("agent_from_bone_rest", agent_from_bone_rest.float(), persistent=False)
+        self.camera = nn.Parameter(torch.zeros(knots, 6))
+        self.root = nn.Parameter(torch.zeros(len(world_from_camera), 6))
+        self.bone = nn.Parameter(torch.zeros(len(world_from_camera), len(agent_from_bone_rest), 6))
+
+    def camera_correction(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 6"]:
+        """Return the corrections of cameras as twists (rotation vector, translation)."""
+        share = self.knot_share[frame][..., None]
+        mixed = (1 - share) * self.camera[self.knot[frame]] + share * self.camera[self.knot[frame] + 1]
+        return mixed * self.camera_free[frame][..., None]
+
+    def world_from_camera(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 4"]:
+        """Return camera poses."""
+        return self.initial_camera[frame] @ rigid_torch.se3_exp(self.camera_correction(frame))
+
+    def world_from_agent(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 4"]:
+        """Return the agent's root poses."""
+        return self.initial_agent[frame] @ rigid_torch.se3_exp(self.root[frame])
+
+    def agent_from_bone(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch bone 4 4"]:
+        """Return posed bones."""
+        return self.agent_from_bone_rest @ rigid_torch.se3_exp(self.bone[frame])

@@ -1,0 +1,77 @@
+"""Extract triangle meshes from fields by marching cubes, with colours read from the field."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from skimage import measure
+from torch import Tensor
+
+from pipeline.models.fields import Field
+from pipeline.space.meshes import Mesh
+
+CHUNK = 1 << 18
+
+
+@torch.no_grad()
+def sample_distance(distance: Callable[[Tensor], Tensor], low_m: Tensor, high_m: Tensor, step_m: float) -> Float[np.ndarray, "x y z"]:
+    """Evaluate a signed distance on a regular lattice that starts at ``low_m``."""
+    nodes = ((high_m - low_m) / step_m).ceil().int().tolist()
+    axes = [low_m[axis] + torch.arange(nodes[axis] + 1, device=low_m.device) * step_m for axis in range(3)]
+    values = []
+    for slab in axes[0].split(max(1, CHUNK // (len(axes[1]) * len(axes[2])))):
+        points = torch.stack(torch.meshgrid(slab, axes[1], axes[2], indexing="ij"), dim=-1)
+        values.append(distance(points.view(-1, 3)).view(points.shape[:-1]))
+    return torch.cat(values).cpu().numpy()
+
+
+def zero_level(volume: Float[np.ndarray, "x y z"], low_m: Float[np.ndarray, "3"], step_m: float) -> Mesh:
+    """Return the surface where the signed distance is 0, faces turned towards positive distance."""
+    if not volume.min() < 0 < volume.max():
+        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    vertices, faces, _, _ = measure.marching_cubes(volume, 0.0, spacing=(step_m,) * 3, gradient_direction="ascent")
+    return Mesh((vertices + low_m).astype(np.float32), faces.astype(np.int32))
+
+
+@torch.no_grad()
+def paint(field: Field, mesh: Mesh, code: int) -> Mesh:
+    """Return the mesh with the field's colour at its vertices."""
+    points = torch.from_numpy(mesh.vertices).to(field.log_beta.device)
+    codes = field.code(torch.full((len(points),), code, device=points.device))
+    color = field.look(field.encode(points, codes))[0]
+    return Mesh(mesh.vertices, mesh.faces, (color * 255 + 0.5).byte().cpu().numpy())
+
+
+def extract_scene(field: Field, code: int, step_m: float) -> Mesh:
+    """Return the scene's surface as one video's code (-1: all videos') shapes it, coloured."""
+
+    def distance(points: Tensor) -> Tensor:
+        return field.distance(field.encode(points, field.code(torch.full((len(points),), code, device=points.device))))
+
+    low, high = _box(field)
+    mesh = zero_level(sample_distance(distance, low, high, step_m), low.cpu().numpy(), step_m)
+    return paint(field, mesh, code)
+
+
+def extract_agent(field: Field, step_m: float) -> Mesh:
+    """Return the agent's surface at rest: closed, one piece (the largest), coloured."""
+    low, high = _box(field)
+    volume = sample_distance(lambda points: field.distance(field.encode(points)), low, high, step_m)
+    closed = np.pad(volume, 1, constant_values=step_m)
+    mesh = zero_level(closed, low.cpu().numpy() - step_m, step_m)
+    pieces = trimesh.graph.connected_components(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).edges_unique, nodes=np.arange(len(mesh.vertices)))
+    return paint(field, keep_vertices(mesh, np.isin(np.arange(len(mesh.vertices)), max(pieces, key=len))), -1)
+
+
+def keep_vertices(mesh: Mesh, keep: np.ndarray) -> Mesh:
+    """Return the mesh without the other vertices and the faces that need them."""
+    index = np.cumsum(keep) - 1
+    faces = index[mesh.faces[keep[mesh.faces].all(-1)]].astype(np.int32)
+    return Mesh(mesh.vertices[keep], faces, None if mesh.color is None else mesh.color[keep])
+
+
+def _box(field: Field) -> tuple[Tensor, Tensor]:
+    device = field.log_beta.device
+    return torch.tensor(field.shape.low_m, device=device), torch.tensor(field.shape.high_m, device=device)

@@ -1,0 +1,66 @@
+"""Reconstruct scene, agent and motion in 4D from registered recordings.
+
+Fits two neural fields (the scene with a code per video, the agent with 25 Gaussian bones), the phone's and the
+agent's poses to colour, depth, masks, flow and features of all registered sessions, the walk-through and the
+turnaround; then extracts surfaces, skin, motion per video and the scene's feature volume.
+"""
+
+from dataclasses import dataclass
+
+from pipeline import cli, progress
+from pipeline.models.fields import Reconstruction
+from stages.reconstruct import assemble, optimise, pictures, reading, results, writing
+from stages.reconstruct.assemble import Shapes
+from stages.reconstruct.rays import Sampling
+from stages.reconstruct.settings import Batches, Rates, Steps, Weights
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the reconstruction."""
+
+    seed: int = 0
+    """of all randomness"""
+    sampling: Sampling = Sampling(scene_per_frame=256, agent_per_frame=160)
+    """pixels kept of each frame"""
+    shapes: Shapes = Shapes()
+    """sizes of the fields"""
+    steps: Steps = Steps()
+    """length of each phase"""
+    batches: Batches = Batches()
+    """what a step looks at"""
+    weights: Weights = Weights()
+    """of the losses"""
+    rates: Rates = Rates()
+    """of learning"""
+    scene_step_m: float = 0.05
+    """resolution of the extracted scene, metres"""
+    agent_step_m: float = 0.015
+    """resolution of the extracted agent, metres"""
+    longest_gap_s: float = 1.0
+    """the agent's pose is interpolated over gaps up to this long, seconds"""
+
+
+def run(task: cli.Task) -> None:
+    """Reconstruct one agent's recordings."""
+    config: Config = task.config
+    names = ("frames", "masks", "flow", "features")
+    roles = {"frames": ("walkthrough", "turnaround", "session")}
+    per_video = {name: task.per_video(name, roles.get(name)) for name in names}
+    folders = reading.Folders(**per_video, **{name: task.input(name) for name in ("registration", "scene_template", "agent_template")})
+    by_role = {video.role: video.id for video in task.videos}
+    videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed)
+    problem = assemble.build(videos, reading.read_template(folders.agent_template), config.shapes, config.seed, task.device)
+    progress.log(f"reconstruct: {len(problem.video)} frames, {len(problem.store.scene)} scene rays, {len(problem.store.agent)} agent rays")
+    plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, task.resume)
+    records = optimise.optimise(problem, plan)
+    reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
+    motions = results.motions(problem, videos, config.longest_gap_s)
+    scene, agent = results.scene_surface(problem, config.scene_step_m), results.agent_surface(problem, config.agent_step_m)
+    with task.create() as folder:
+        writing.write(folder, problem, reconstruction, motions, scene, agent)
+        pictures.report_quality(folder, reconstruction, motions, per_video, records)
+
+
+if __name__ == "__main__":
+    cli.enter(__doc__, run, config=Config, reads=("frames", "masks", "flow", "features", "registration", "scene_template", "agent_template"))

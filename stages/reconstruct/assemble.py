@@ -1,0 +1,145 @@
+"""Set the problem up: join the videos' rays, place the boxes of the fields, start the motion at the registered poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from pipeline.models.fields import Body, Field, FieldShape
+from pipeline.models.motion import MotionTable
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh
+from stages.reconstruct.problem import Problem, RaysByFrame, Surface, frame_table
+from stages.reconstruct.rays import Store, join
+
+
+@dataclass(frozen=True)
+class Video:
+    """One video's poses from the templates or from registration, and its rays."""
+
+    id: str
+    timestamp_s: Float[np.ndarray, "frame"]
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    """NaN where unknown"""
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    """NaN where unknown"""
+    confidence: Float[np.ndarray, "frame"]
+    agent_visible: Bool[np.ndarray, "frame"]
+    camera_free: bool
+    """False holds the camera: templates"""
+    has_scene: bool
+    """False for the turnaround: its world is the agent"""
+    store: Store
+
+
+@dataclass(frozen=True)
+class Template:
+    """The agent template."""
+
+    mesh: Mesh
+    feature: Float[np.ndarray, "vertex 16"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    bone_scale_m: Float[np.ndarray, "bone 3"]
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Sizes of the fields."""
+
+    scene_voxel_m: tuple[float, ...] = (0.32, 0.16, 0.08)
+    """cells of the scene's grids"""
+    agent_voxel_m: tuple[float, ...] = (0.08, 0.04, 0.02)
+    """cells of the agent's grids"""
+    grid_channels: int = 4
+    """channels of each grid"""
+    width: int = 64
+    """units of each head's hidden layer"""
+    truncation_m: float = 0.12
+    """the scene's signed distance saturates here"""
+    scene_margin_m: float = 0.2
+    """space kept around all that was measured"""
+    agent_margin_m: float = 0.12
+    """space kept around the agent template"""
+    knot_frames: int = 10
+    """frames between the knots of camera corrections"""
+
+
+def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int, device: str) -> Problem:
+    """Make the problem; videos with a scene come first, so that codes count them."""
+    videos = scene_first(videos)
+    torch.manual_seed(seed)
+    store = join([usable(video) for video in videos])
+    lengths = [len(video.timestamp_s) for video in videos]
+    camera = np.concatenate([filled(video.timestamp_s, video.world_from_camera) for video in videos])
+    agent = np.concatenate([filled(video.timestamp_s, video.world_from_agent) for video in videos])
+    rooted = torch.from_numpy(np.concatenate([np.isfinite(video.world_from_agent).all((1, 2)) for video in videos]))
+    low, high = _measured_box(store, camera, shapes.scene_margin_m)
+    scene = Field(FieldShape(low, high, shapes.scene_voxel_m, shapes.grid_channels, shapes.width, sum(v.has_scene for v in videos), truncation_m=shapes.truncation_m), free_m=0.1)
+    vertices = template.mesh.vertices
+    low, high = (tuple(float(x) for x in corner) for corner in (vertices.min(0) - shapes.agent_margin_m, vertices.max(0) + shapes.agent_margin_m))
+    agent_shape = FieldShape(low, high, shapes.agent_voxel_m, shapes.grid_channels, shapes.width)
+    rest = torch.from_numpy(template.agent_from_bone_rest).float()
+    by_frame = RaysByFrame.of(store.agent, len(camera))
+    usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
+    has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
+    problem = Problem(
+        store=store,
+        scene=scene,
+        agent=Field(agent_shape, free_m=0.1),
+        body=Body(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape),
+        motion=MotionTable(torch.from_numpy(camera), torch.from_numpy(agent), rest, lengths, [v.camera_free for v in videos], shapes.knot_frames),
+        video=frame_table(lengths),
+        has_scene=has_scene,
+        surface=Surface.of(template.mesh, template.feature, np.random.default_rng(seed)),
+        agent_frames=usable_frames,
+        agent_rays=by_frame,
+    )
+    return problem if device == "cpu" else _moved(problem, device)
+
+
+def scene_first(videos: Sequence[Video]) -> list[Video]:
+    """Return the videos in the order of frames and codes: those with a scene first."""
+    return sorted(videos, key=lambda video: not video.has_scene)
+
+
+def scene_ids(videos: Sequence[Video]) -> tuple[str, ...]:
+    """Return the ids in the order of the scene's codes."""
+    return tuple(video.id for video in scene_first(videos) if video.has_scene)
+
+
+def usable(video: Video, least_confidence: float = 0.1) -> Store:
+    """Drop the rays of frames whose camera is unknown or doubtful."""
+    good = torch.from_numpy(np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= least_confidence))
+    store = video.store
+    return Store(*(rays.at(torch.nonzero(good[rays.frame])[:, 0]) for rays in (store.scene, store.agent)), store.views)
+
+
+def filled(timestamp_s: Float[np.ndarray, "frame"], a_from_b: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 4 4"]:
+    """Interpolate unknown poses between known ones; all unknown gives identities."""
+    known = np.isfinite(a_from_b).all((1, 2))
+    if not known.any():
+        return np.tile(np.eye(4), (len(a_from_b), 1, 1))
+    return rigid.interpolate(timestamp_s[known], a_from_b[known], timestamp_s)
+
+
+def _measured_box(store: Store, camera: Float[np.ndarray, "frame 4 4"], margin_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the box of nearly all measured points of the scene, and of the cameras that saw them."""
+    rays = store.scene.at(torch.nonzero(store.scene.depth > 0)[:, 0][::7])
+    pose = camera[rays.frame.numpy()]
+    points = rigid.apply(pose, (rays.direction * rays.depth[:, None]).numpy()[:, None])[:, 0]
+    eyes = pose[:, :3, 3]
+    low = np.minimum(np.quantile(points, 0.002, axis=0), eyes.min(0)) - margin_m
+    high = np.maximum(np.quantile(points, 0.998, axis=0), eyes.max(0)) + margin_m
+    return tuple(float(x) for x in low), tuple(float(x) for x in high)
+
+
+def _moved(problem: Problem, device: str) -> Problem:
+    """Return the problem on another device."""
+    for module in problem.modules().values():
+        module.to(device)
+    store = Store(problem.store.scene.to(device), problem.store.agent.to(device), problem.store.views.to(device))
+    by_frame = RaysByFrame(problem.agent_rays.start.to(device), problem.agent_rays.count.to(device))
+    moved = {name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "agent_frames")}
+    return Problem(store=store, **problem.modules(), agent_rays=by_frame, **moved)

@@ -1,0 +1,162 @@
+"""The agent's losses: masked depth against its field, its posed surface against picture and mask, and priors on motion.
+
+They serve twice: `pose_chunk` poses the template to the frames before the field learns, and the joint phase uses
+the same terms while everything learns.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Generator, Tensor
+from torch.nn import functional
+
+from pipeline.space import cameras, rigid_torch
+from stages.reconstruct import losses
+from stages.reconstruct.problem import Problem, neighbours
+from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
+from stages.reconstruct.scene import Terms
+from stages.reconstruct.settings import Weights
+
+DECIMETRE = 0.1
+REACH_M = 0.05
+"""signed distances on the agent are compared up to here"""
+OUTLIER_M = 0.06
+"""measured points this far from the agent count a quarter"""
+MARGIN_M = 0.03
+"""the posed surface may stand this much before the measured depth"""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where everything is in some frames."""
+
+    frame: Int[Tensor, "frame"]
+    world_from_camera: Float[Tensor, "frame 4 4"]
+    world_from_agent: Float[Tensor, "frame 4 4"]
+    agent_from_bone: Float[Tensor, "frame bone 4 4"]
+
+    @property
+    def agent_from_camera(self) -> Float[Tensor, "frame 4 4"]:
+        """Take points of the camera to the agent's root."""
+        return rigid_torch.inverse(self.world_from_agent) @ self.world_from_camera
+
+    @classmethod
+    def of(cls, problem: Problem, frame: Int[Tensor, "frame"]) -> "Pose":
+        """Read the motion table."""
+        motion = problem.motion
+        return cls(frame, motion.world_from_camera(frame), motion.world_from_agent(frame), motion.agent_from_bone(frame))
+
+
+def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, generator: Generator, near: int = 2) -> Terms:
+    """Fit the agent where the sensor measured it: masked rays ``[frame * ray]`` of known depth, mapped back to rest."""
+    frames, number = len(pose.frame), len(rays) // len(pose.frame)
+    offset = (torch.rand(len(rays), near, generator=generator).to(problem.device) * 2 - 1) * REACH_M
+    depth = torch.cat([rays.depth[:, None], rays.depth[:, None] + offset], dim=1)
+    points = rigid_torch.apply(pose.agent_from_camera, (rays.direction[:, None] * depth[..., None]).view(frames, -1, 3))
+    rest = problem.body.unpose(points, pose.agent_from_bone)
+    encoded = problem.agent.encode(rest.reshape(-1, 3))
+    distance = problem.agent.distance(encoded).view(len(rays), 1 + near)
+    target = (rays.depth[:, None] - depth) * rays.slope[:, None]
+    color, feature = problem.agent.look(encoded.view(len(rays), 1 + near, -1)[:, 0])
+    good = (rays.label == AGENT) & (rays.depth > 0)
+    trust = 1 / (1 + (distance[:, 0].detach() / OUTLIER_M).square()).square()
+    at_depth = points.view(frames, number, 1 + near, 3)[:, :, 0]
+    back = problem.body.pose(rest.view(frames, number, 1 + near, 3)[:, :, 0], pose.agent_from_bone)
+    cycle = (back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2
+    return {
+        "agent distance": (weights.distance, (trust[:, None] * losses.truncated_distance(distance, target, REACH_M))[good]),
+        "agent color": (weights.color, (trust * losses.color(color, rays.color / 255))[good]),
+        "agent feature": (weights.feature, (trust * losses.feature(feature, rays.feature / 127))[good]),
+        "cycle": (weights.cycle, cycle[good]),
+    }
+
+
+def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, generator: Generator) -> Terms:
+    """Keep the posed surface inside the mask, unless something stands before it, and out of space seen free."""
+    views, frames = problem.store.views, len(pose.frame)
+    index = torch.randint(len(problem.surface.points), (frames, number), generator=generator).to(problem.device)
+    posed = problem.body.pose(problem.surface.points[index], pose.agent_from_bone)
+    points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
+    pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
+    outside_px, inside_picture = _bilinear(views.outside_px[pose.frame].float(), pixel)
+    with torch.no_grad():
+        measured = _nearest(views.depth[pose.frame], pixel)
+        in_view = inside_picture & (depth > 0.1)
+        hidden = (measured > 0) & (measured < depth - MARGIN_M)
+    outside_m = outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None]
+    before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
+    on_mask = outside_px.detach() < THUMBNAIL
+    return {
+        "outside": (weights.outside, (outside_m / DECIMETRE)[in_view & ~hidden]),
+        "in front": (weights.in_front, (before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
+    }
+
+
+def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: Weights) -> Terms:
+    """Keep bones together, near rest, and moving smoothly within runs of consecutive frames."""
+    rest = problem.body.agent_from_bone_rest
+    first, second = neighbours(rest)
+    motion = pose.agent_from_bone @ rigid_torch.inverse(rest)
+    centre = rest[:, :3, 3]
+    carried = (motion[:, first, :3, :3] @ centre[second][..., None])[..., 0] + motion[:, first, :3, 3]
+    torn = (carried - pose.agent_from_bone[:, second, :3, 3]) / DECIMETRE
+    terms = {
+        "rigidity": (weights.rigidity, torn.square().sum(-1)),
+        "rest": (weights.rest, twist.square().sum(-1) + 20 * twist.mean(1, keepdim=True).square().sum(-1)),
+    }
+    if run >= 3:
+        bend = torch.diff(twist.view(-1, run, *twist.shape[1:]), n=2, dim=1)
+        path = torch.diff(pose.world_from_agent[:, :3].reshape(-1, run, 12), n=2, dim=1)
+        terms["smoothness"] = (weights.smoothness, bend.square().sum(-1))
+        terms["root smoothness"] = (4 * weights.smoothness, path.square().sum(-1))
+    return terms
+
+
+def _bilinear(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> tuple[Float[Tensor, "frame point"], Bool[Tensor, "frame point"]]:
+    """Read thumbnails between their pixels, with gradients towards the place; also tell what lies inside."""
+    place = _normalized(images, pixel)
+    values = functional.grid_sample(images[:, None], place[:, :, None], padding_mode="border", align_corners=False)
+    return values[:, 0, :, 0], (place.abs() <= 1).all(-1)
+
+
+def _nearest(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:
+    """Read thumbnails at the nearest pixel."""
+    place = _normalized(images, pixel)
+    return functional.grid_sample(images[:, None].float(), place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False)[:, 0, :, 0]
+
+
+def _normalized(images: Tensor, pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point 2"]:
+    size = torch.tensor([images.shape[2], images.shape[1]], device=pixel.device, dtype=torch.float32) * THUMBNAIL
+    return (pixel / size * 2 - 1).clamp(-4, 4)
+
+
+class ChunkLoss(torch.nn.Module):
+    """Poses the template in consecutive frames of one video: the field and the skin are held, root and bones move."""
+
+    def __init__(self, problem: Problem, frame: Int[Tensor, "frame"], weights: Weights, rays: int, points: int, root_share: float = 0.25):
+        """Bones start to move after ``root_share`` of the steps."""
+        super().__init__()
+        self.problem, self.frame, self.weights, self.rays, self.points, self.root_share = problem, frame, weights, rays, points, root_share
+        self.seen = torch.isin(frame, problem.agent_frames)
+        self.root = torch.nn.Parameter(problem.motion.root.detach()[frame].clone())
+        self.bone = torch.nn.Parameter(problem.motion.bone.detach()[frame].clone())
+
+    def pose(self, bones_move: bool = True) -> Pose:
+        """Return the current poses."""
+        motion = self.problem.motion
+        with torch.no_grad():
+            world_from_camera = motion.world_from_camera(self.frame)
+        bone = self.bone if bones_move else self.bone.detach()
+        root = motion.initial_agent[self.frame] @ rigid_torch.se3_exp(self.root)
+        return Pose(self.frame, world_from_camera, root, motion.agent_from_bone_rest @ rigid_torch.se3_exp(bone))
+
+    def loss(self, progress: float, generator: Generator) -> dict[str, Tensor]:
+        """Return the weighted terms over all frames of the chunk."""
+        problem, pose = self.problem, self.pose(progress >= self.root_share)
+        seen = Pose(self.frame[self.seen], pose.world_from_camera[self.seen], pose.world_from_agent[self.seen], pose.agent_from_bone[self.seen])
+        rays = problem.store.agent.at(problem.agent_rays.pick(seen.frame, self.rays, generator).flatten())
+        terms = measured_terms(problem, seen, rays, self.weights, generator, near=0)
+        terms |= surface_terms(problem, seen, self.points, self.weights, generator)
+        terms |= prior_terms(problem, pose, self.bone, len(self.frame), self.weights)
+        return losses.weighted(terms)

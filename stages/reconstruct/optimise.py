@@ -1,0 +1,132 @@
+"""Run the phases in order: copy the agent template, fit the scene, pose the template, fit everything.
+
+Each phase is one call of `pipeline.fit.fit` with its own checkpoints, so that a killed run goes on where it was.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from pipeline.fit import FitRecord, fit
+from stages.reconstruct.body import ChunkLoss
+from stages.reconstruct.joint import JointLoss, TemplateLoss
+from stages.reconstruct.problem import Problem
+from stages.reconstruct.scene import SceneLoss
+from stages.reconstruct.settings import Batches, Rates, Steps, Weights
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to optimise."""
+
+    steps: Steps
+    weights: Weights
+    batches: Batches
+    rates: Rates
+    seed: int
+    resume: Path | None
+    """folder for checkpoints"""
+
+
+def cosine(progress: float) -> float:
+    """Fall from 1 to a twentieth."""
+    return 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))
+
+
+def optimise(problem: Problem, plan: Plan) -> dict[str, FitRecord]:
+    """Run all phases; the modules of the problem change in place. Returns the losses of each phase."""
+    steps, rates = plan.steps, plan.rates
+    records = {}
+    records["template"] = _run(problem, plan, "template", TemplateLoss(problem), steps.template, _field_groups(problem.agent, rates))
+    scene = [*_field_groups(problem.scene, rates), _motion_group([problem.motion.camera], rates.camera, momentum=0.9)]
+    records["scene"] = _run(problem, plan, "scene", SceneLoss(problem, plan.weights, plan.batches, steps.scene), steps.scene, scene)
+    if len(problem.agent_frames):
+        for index, frame in enumerate(chunks(problem, steps.body_chunk_frames)):
+            _pose_chunk(problem, plan, frame, f"body_{index:04d}")
+        records["joint"] = _run(problem, plan, "joint", JointLoss(problem, plan.weights, plan.batches, steps.joint), steps.joint, _joint_groups(problem, rates))
+    return records
+
+
+def chunks(problem: Problem, length: int) -> Iterable[torch.Tensor]:
+    """Cut each video's frames into stretches that hold at least one usable frame."""
+    for video in range(int(problem.video.max()) + 1):
+        frames = torch.nonzero(problem.video == video)[:, 0]
+        for part in frames.split(length):
+            if torch.isin(part, problem.agent_frames).any():
+                yield part
+
+
+def _run(problem: Problem, plan: Plan, name: str, loss, steps: int, groups: list[dict]) -> FitRecord:
+    return fit(
+        modules=problem.modules(),
+        optimizer=torch.optim.AdamW(groups, lr=1.0),
+        loss=loss,
+        steps=steps,
+        seed=_seed(plan.seed, name),
+        resume=plan.resume / name if plan.resume else None,
+        save_every=min(plan.steps.save_every, max(steps, 1)),
+        schedule=cosine,
+        label=name,
+        clip_norm=10.0,
+    )
+
+
+def _pose_chunk(problem: Problem, plan: Plan, frame: torch.Tensor, name: str) -> None:
+    """Pose the template in one stretch of frames and write root and bones into the motion table."""
+    held = [problem.agent, problem.body, problem.scene]
+    for module in held:
+        module.requires_grad_(False)
+    chunk = ChunkLoss(problem, frame, plan.weights, plan.batches.agent_rays, plan.batches.surface_points)
+    steps = plan.steps.body
+    fit(
+        modules={"chunk": _Learned(chunk)},
+        optimizer=torch.optim.AdamW([{"params": [chunk.root, chunk.bone], "lr": plan.rates.body, "weight_decay": 0.0, "betas": (0.8, 0.99)}]),
+        loss=lambda step, generator: chunk.loss(step / steps, generator),
+        steps=steps,
+        seed=_seed(plan.seed, name),
+        resume=plan.resume / name if plan.resume else None,
+        save_every=steps,
+        schedule=cosine,
+        label=name,
+    )
+    with torch.no_grad():
+        problem.motion.root[frame] = chunk.root
+        problem.motion.bone[frame] = chunk.bone
+    for module in held:
+        module.requires_grad_(True)
+
+
+class _Learned(nn.Module):
+    """The two tables of a chunk, without the modules that it reads."""
+
+    def __init__(self, chunk: ChunkLoss):
+        super().__init__()
+        self.root, self.bone = chunk.root, chunk.bone
+
+
+def _field_groups(field: nn.Module, rates: Rates) -> list[dict]:
+    grid = list(field.grid.parameters())
+    heads = [parameter for name, parameter in field.named_parameters() if not name.startswith("grid.")]
+    return [{"params": grid, "lr": rates.grid, "weight_decay": 0.0, "betas": (0.9, 0.99)}, {"params": heads, "lr": rates.heads, "weight_decay": 1e-4}]
+
+
+def _motion_group(parameters: list[nn.Parameter], rate: float, momentum: float = 0.0) -> dict:
+    """By default without momentum: a frame that is not looked at must not move."""
+    return {"params": parameters, "lr": rate, "weight_decay": 0.0, "betas": (momentum, 0.99)}
+
+
+def _joint_groups(problem: Problem, rates: Rates) -> list[dict]:
+    motion = problem.motion
+    groups = [{**group, "lr": group["lr"] * 0.5} for field in (problem.scene, problem.agent) for group in _field_groups(field, rates)]
+    groups += [_motion_group([motion.camera], rates.camera * 0.3, momentum=0.9), _motion_group([motion.root, motion.bone], rates.motion)]
+    return [*groups, {"params": list(problem.body.parameters()), "lr": rates.skin, "weight_decay": 0.0}]
+
+
+def _seed(seed: int, name: str) -> int:
+    """Give each phase its own stream."""
+    return int(np.random.SeedSequence([seed, *name.encode()]).generate_state(1)[0])

@@ -1,0 +1,130 @@
+"""What is being reconstructed: measurements, fields, body, motion, and which frame belongs to which video."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Generator, Tensor, nn
+
+from pipeline.models.fields import Body, Field
+from pipeline.models.motion import MotionTable
+from pipeline.space.meshes import Mesh
+from stages.reconstruct.rays import Rays, Store
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that the phases read and change; tensors and modules live on one device."""
+
+    store: Store
+    scene: Field
+    agent: Field
+    body: Body
+    motion: MotionTable
+    video: Int[Tensor, "frame"]
+    """index of each frame's video"""
+    has_scene: Bool[Tensor, "frame"]
+    """False for the turnaround: its world is the agent"""
+    surface: "Surface"
+    agent_frames: Int[Tensor, "frame"]
+    """frames with a known root, a trusted mask and rays on the agent"""
+    agent_rays: "RaysByFrame"
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything lives."""
+        return self.scene.log_beta.device
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Return everything that learns, by name."""
+        return {"scene": self.scene, "agent": self.agent, "body": self.body, "motion": self.motion}
+
+    def runs(self, length: int) -> Int[Tensor, "run"]:
+        """Return first frames of stretches of usable frames of one video; single frames when there are none."""
+        usable = torch.zeros(len(self.video) + length, dtype=torch.bool)
+        usable[self.agent_frames.cpu()] = True
+        video = torch.cat([self.video.cpu(), torch.full((length,), -1)])
+        first = self.agent_frames.cpu()
+        good = torch.stack([usable[first + k] & (video[first + k] == video[first]) for k in range(length)]).all(0)
+        return first[good]
+
+
+@dataclass(frozen=True)
+class RaysByFrame:
+    """Where each frame's rays on the agent stand in the store."""
+
+    start: Int[Tensor, "frame"]
+    count: Int[Tensor, "frame"]
+
+    @classmethod
+    def of(cls, rays: Rays, frames: int) -> "RaysByFrame":
+        """Count rays, which are sorted by frame."""
+        count = torch.bincount(rays.frame, minlength=frames)
+        return cls(count.cumsum(0) - count, count)
+
+    def pick(self, frame: Int[Tensor, "frame"], number: int, generator: Generator) -> Int[Tensor, "frame ray"]:
+        """Choose rays of each frame at random, with repetition."""
+        share = torch.rand(len(frame), number, generator=generator).to(frame.device)
+        return self.start[frame][:, None] + (share * self.count[frame][:, None]).long()
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The agent template: samples of its surface and of the space around it."""
+
+    points: Float[Tensor, "point 3"]
+    """on the surface, agent frame"""
+    normal: Float[Tensor, "point 3"]
+    around: Float[Tensor, "sample 3"]
+    distance: Float[Tensor, "sample"]
+    """signed, metres, of ``around``"""
+    color: Float[Tensor, "sample 3"]
+    """of the nearest surface point"""
+    feature: Float[Tensor, "sample 16"]
+
+    @classmethod
+    def of(cls, mesh: Mesh, feature: Float[np.ndarray, "vertex 16"], rng: np.random.Generator, margin_m: float = 0.25, on: int = 4000, off: int = 40000) -> "Surface":
+        """Sample a template mesh; distances are to the nearest of many surface samples, signed by their normals."""
+        corner = mesh.vertices[mesh.faces].astype(np.float64)
+        area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1)
+        face = rng.choice(len(mesh.faces), 8 * on, p=area / area.sum())
+        bary = rng.dirichlet(np.ones(3), len(face))
+        points = np.einsum("pk,pkd->pd", bary, corner[face])
+        normal = mesh.face_normals()[face]
+        low, high = mesh.vertices.min(0) - margin_m, mesh.vertices.max(0) + margin_m
+        spread = rng.choice([0.01, 0.04], off // 2)[:, None]
+        around = np.concatenate([points[rng.integers(len(points), size=off // 2)] + rng.normal(size=(off // 2, 3)) * spread, rng.uniform(low, high, (off // 2, 3))])
+        near_m, near = cKDTree(points).query(around, 8)
+        side = ((around[:, None] - points[near]) * normal[near]).sum(-1).mean(-1)
+        distance = near_m[:, 0] * np.where(side < 0, -1, 1)
+        vertex = mesh.faces[face[near[:, 0]]]
+        mix = bary[near[:, 0]]
+        color = np.einsum("pk,pkc->pc", mix, (mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128))[vertex] / 255)
+        features = np.einsum("pk,pkc->pc", mix, feature[vertex].astype(np.float64))
+        features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-6)
+        return cls(*(torch.from_numpy(array).float() for array in (points[:on], normal[:on], around, distance, color, features)))
+
+    def to(self, device: str) -> "Surface":
+        """Move all to a device."""
+        return Surface(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+
+def pick(count: int, number: int, generator: Generator, device: torch.device) -> Int[Tensor, "sample"]:
+    """Choose indices below ``count`` at random, with repetition."""
+    return torch.randint(count, (number,), generator=generator).to(device)
+
+
+def neighbours(agent_from_bone_rest: Float[Tensor, "bone 4 4"], number: int = 4) -> tuple[Int[Tensor, "pair"], Int[Tensor, "pair"]]:
+    """Pair every bone with the bones nearest to it at rest."""
+    centre = agent_from_bone_rest[:, :3, 3]
+    order = torch.cdist(centre, centre).argsort(dim=-1)[:, 1 : number + 1]
+    first = torch.arange(len(centre), device=centre.device)[:, None].expand_as(order)
+    return first.flatten(), order.flatten()
+
+
+def frame_table(lengths: Sequence[int]) -> Int[Tensor, "frame"]:
+    """Return the video's index of each frame."""
+    return torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths))

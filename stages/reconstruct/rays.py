@@ -1,0 +1,218 @@
+"""Turn recordings into a compact store of rays, so that fitting never opens a picture again.
+
+`collect` reads each frame of one video once and keeps a few pixels of it: some anywhere, some on and around the
+agent. `Views` also keeps a thumbnail per frame (depth, distance from the agent's mask) to test the posed surface
+against. `join` strings the videos together on one frame axis.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, Int8, UInt8
+from numpy.random import Generator
+from torch import Tensor
+
+from pipeline.files.clips import Clip, Masks
+from pipeline.space import cameras
+
+AGENT, UNKNOWN, NOT_AGENT = 255, 128, 0
+THUMBNAIL = 4
+"""colour pixels along the edge of a thumbnail's pixel"""
+SEEN_M = (0.15, 5.0)
+"""depth outside this range is not trusted"""
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Pixels and what was measured there."""
+
+    frame: Int[Tensor, "ray"]
+    direction: Float[Tensor, "ray 3"]
+    """camera axes, z = 1"""
+    depth: Float[Tensor, "ray"]
+    """metres along z; 0 = unknown"""
+    slope: Float[Tensor, "ray"]
+    """|normal . direction|: metres towards the surface per metre of depth"""
+    color: UInt8[Tensor, "ray 3"]
+    feature: Int8[Tensor, "ray 16"]
+    """unit-length features times 127"""
+    label: UInt8[Tensor, "ray"]
+    """255 agent, 0 not, 128 unknown"""
+    flow_px: Float[Tensor, "ray 2"]
+    """where the pixel is ``flow_gap`` frames later, colour pixels, absolute"""
+    flow_confidence: UInt8[Tensor, "ray"]
+    flow_gap: Int8[Tensor, "ray"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def at(self, index: Int[Tensor, "ray"]) -> "Rays":
+        """Select rays."""
+        return Rays(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def to(self, device: str) -> "Rays":
+        """Move all to a device."""
+        return Rays(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Views:
+    """One entry per frame: intrinsics and thumbnails."""
+
+    intrinsics: Float[Tensor, "frame 3 3"]
+    """colour pixels"""
+    depth: Float[Tensor, "frame height width"]
+    """metres, half precision; 0 = unknown"""
+    outside_px: UInt8[Tensor, "frame height width"]
+    """colour pixels from the agent's mask, 255 = farther or no mask"""
+    agent_seen: Bool[Tensor, "frame"]
+    """the mask of this frame can be trusted"""
+
+    def to(self, device: str) -> "Views":
+        """Move all to a device."""
+        return Views(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Store:
+    """The rays of all videos, split by purpose, on one frame axis."""
+
+    scene: Rays
+    """anywhere in the picture but on the agent; empty of turnaround frames"""
+    agent: Rays
+    """on the agent's mask and in a ring around it"""
+    views: Views
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How many pixels of a frame are kept."""
+
+    scene_per_frame: int
+    agent_per_frame: int
+    ring_px: int = 10
+    """width of the ring around the mask, colour pixels"""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One video's inputs."""
+
+    clip: Clip
+    features: Float[np.ndarray, "frame height width 16"]
+    """at stride 8, memory-mapped"""
+    masks: Masks | None = None
+    flows: tuple[tuple[int, np.ndarray, np.ndarray], ...] = ()
+    """(gap, forward flow [frame height width 2] at stride 4, confidence), memory-mapped"""
+    has_scene: bool = True
+    """False for the turnaround, whose cameras are known relative to the agent only"""
+
+
+def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
+    """Read every frame of a video once; frames count from 0."""
+    scene, agent, depths, outsides = [], [], [], []
+    for frame in range(len(source.clip)):
+        depth, slope = _trusted_depth(source.clip, frame)
+        mask = source.masks[frame] if source.masks is not None else np.zeros(source.clip.color_size, np.uint8)
+        seen = source.masks is not None and source.masks.visible[frame]
+        near = _near_agent(mask, sampling.ring_px) if seen else np.zeros(mask.shape, bool)
+        reader = _Reader(source, frame, mask, depth, slope)
+        if source.has_scene:
+            scene.append(reader.read(_choose(mask == NOT_AGENT, sampling.scene_per_frame, rng), rng))
+        if seen:
+            agent.append(reader.read(_choose(near, sampling.agent_per_frame, rng), rng))
+        small = tuple(size // THUMBNAIL for size in mask.shape)
+        depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float16))
+        outsides.append(_distance_outside(mask, small) if seen else np.full(small, 255, np.uint8))
+    visible = source.masks.visible if source.masks is not None else np.zeros(len(source.clip), bool)
+    views = Views(torch.from_numpy(source.clip.intrinsics).float(), torch.from_numpy(np.stack(depths)), torch.from_numpy(np.stack(outsides)), torch.from_numpy(visible.astype(bool)))
+    return Store(_concatenate(scene), _concatenate(agent), views)
+
+
+def join(stores: Sequence[Store]) -> Store:
+    """String videos together; frame indices of later videos are shifted by the frames before them."""
+    starts = np.cumsum([0] + [len(store.views.intrinsics) for store in stores])
+    parts = [[_shift(getattr(store, name), int(start)) for store, start in zip(stores, starts)] for name in ("scene", "agent")]
+    views = Views(*(torch.cat([getattr(store.views, field.name) for store in stores]) for field in fields(Views)))
+    return Store(*(_concatenate(part) for part in parts), views)
+
+
+def _shift(rays: Rays, start: int) -> Rays:
+    return Rays(rays.frame + start, *(getattr(rays, field.name) for field in fields(rays)[1:]))
+
+
+def _concatenate(parts: Sequence[Rays]) -> Rays:
+    if not parts:
+        floats, bytes_ = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
+        features, signed = torch.zeros(0, 16, dtype=torch.int8), torch.zeros(0, dtype=torch.int8)
+        return Rays(torch.zeros(0, dtype=torch.int64), floats, floats[:, 0], floats[:, 0], bytes_, features, bytes_[:, 0], floats[:, :2], bytes_[:, 0], signed)
+    return Rays(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Rays)))
+
+
+def _trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Return depth (0 where the sensor doubts it) and each pixel's slope from the depth's own normals."""
+    depth = clip.depth(frame).astype(np.float32)
+    depth[(clip.confidence(frame) == 0) | (depth < SEEN_M[0]) | (depth > SEEN_M[1])] = 0
+    directions = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape).astype(np.float32)
+    smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(cv2.blur((depth > 0).astype(np.float32), (3, 3)), 1e-6)
+    points = directions * smooth[..., None]
+    across, down = np.zeros_like(points), np.zeros_like(points)
+    across[:, 1:-1], down[1:-1] = points[:, 2:] - points[:, :-2], points[2:] - points[:-2]
+    normal = np.cross(across, down)
+    slope = np.abs((normal * directions).sum(-1)) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
+    jump = cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3))) > 0.1 + 0.05 * depth
+    depth[jump] = 0
+    return depth, np.clip(slope, 0.15, None).astype(np.float32)
+
+
+def _near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np.ndarray, "height width"]:
+    kernel = np.ones((2 * ring_px + 1, 2 * ring_px + 1), np.uint8)
+    return cv2.dilate((mask == AGENT).astype(np.uint8), kernel) > 0
+
+
+def _distance_outside(mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
+    outside = cv2.resize((mask == NOT_AGENT).astype(np.uint8), small[::-1], interpolation=cv2.INTER_NEAREST)
+    distance = cv2.distanceTransform(outside, cv2.DIST_L2, 3) * THUMBNAIL
+    return np.minimum(distance, 255).astype(np.uint8)
+
+
+def _choose(allowed: Bool[np.ndarray, "height width"], count: int, rng: Generator) -> Int[np.ndarray, "ray 2"]:
+    """Choose up to ``count`` allowed pixels (row, column), without repetition."""
+    flat = np.flatnonzero(allowed)
+    picked = np.sort(rng.choice(flat, min(count, len(flat)), replace=False))
+    return np.stack(np.unravel_index(picked, allowed.shape), axis=-1)
+
+
+class _Reader:
+    """Reads what is known at chosen pixels of one frame."""
+
+    def __init__(self, source: Source, frame: int, mask: np.ndarray, depth: np.ndarray, slope: np.ndarray):
+        self.source, self.frame, self.mask, self.depth, self.slope = source, frame, mask, depth, slope
+        self.color = source.clip.color(frame)
+
+    def read(self, place: Int[np.ndarray, "ray 2"], rng: Generator) -> Rays:
+        """Collect the measurements at pixels (row, column)."""
+        clip, (row, column) = self.source.clip, place.T
+        pixel = np.stack([column, row], axis=-1) + 0.5
+        direction = cameras.unproject(pixel, clip.intrinsics[self.frame])
+        at_depth = cameras.project(direction, clip.depth_intrinsics[self.frame])[0].astype(int)
+        x, y = np.clip(at_depth[:, 0], 0, self.depth.shape[1] - 1), np.clip(at_depth[:, 1], 0, self.depth.shape[0] - 1)
+        features = self.source.features
+        feature = np.asarray(features[self.frame])[np.minimum(row // 8, features.shape[1] - 1), np.minimum(column // 8, features.shape[2] - 1)]
+        flow, confidence, gap = self._flow(place, rng)
+        arrays = (direction.astype(np.float32), self.depth[y, x], self.slope[y, x], self.color[row, column], np.rint(feature.astype(np.float32) * 127).astype(np.int8))
+        arrays += (self.mask[row, column], (pixel + flow).astype(np.float32), confidence, gap)
+        return Rays(torch.full((len(place),), self.frame), *(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+
+    def _flow(self, place: Int[np.ndarray, "ray 2"], rng: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return displacement, confidence and gap, one gap for all pixels of the frame."""
+        possible = [flow for flow in self.source.flows if self.frame < len(flow[1])]
+        if not possible:
+            return np.zeros((len(place), 2)), np.zeros(len(place), np.uint8), np.ones(len(place), np.int8)
+        gap, forward, confidence = possible[rng.integers(len(possible))]
+        row, column = np.minimum(place[:, 0] // 4, forward.shape[1] - 1), np.minimum(place[:, 1] // 4, forward.shape[2] - 1)
+        found = np.asarray(forward[self.frame])[row, column].astype(np.float64)
+        return found, np.asarray(confidence[self.frame])[row, column], np.full(len(place), gap, np.int8)

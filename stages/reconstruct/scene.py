@@ -1,0 +1,137 @@
+"""The scene's losses: signed distance around measured depth, colour and features at it, and rendered rays."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Generator, Tensor
+
+from pipeline.models.fields import density
+from pipeline.models.motion import MotionTable
+from pipeline.models.render import Layer, composite
+from pipeline.space import rigid_torch
+from stages.reconstruct import losses
+from stages.reconstruct.problem import Problem, pick
+from stages.reconstruct.rays import Rays
+from stages.reconstruct.settings import Batches, Weights
+
+Terms = dict[str, tuple[float, Tensor]]
+FREE_FROM_M = 0.1
+FARTHEST_M = 5.0
+EIKONAL_STEP_M = 0.04
+
+
+def swap_probability(progress: float, last: float = 0.05) -> float:
+    """Return how often codes are swapped: from 1 to ``last``, linearly (paper 001, scene annealing)."""
+    return 1 + (last - 1) * progress
+
+
+def swap(video: Int[Tensor, "ray"], videos: int, probability: float, generator: Generator) -> Int[Tensor, "ray"]:
+    """Replace the code's index by another video's with some probability (paper 001, scene annealing)."""
+    other = torch.randint(videos, video.shape, generator=generator).to(video.device)
+    return torch.where((torch.rand(video.shape, generator=generator) < probability).to(video.device), other, video)
+
+
+def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
+    """Return origins and directions (one metre of depth long) in the world."""
+    pose = motion.world_from_camera(rays.frame)
+    return pose[:, :3, 3], (pose[:, :3, :3] @ rays.direction[..., None])[..., 0]
+
+
+def sample_depths(rays: Rays, near: int, free: int, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
+    """Return the measured depth, samples within ``reach_m`` of it, and samples in the free space before it."""
+    device, depth = rays.depth.device, rays.depth[:, None]
+    around = (torch.rand(len(rays), near, generator=generator).to(device) * 2 - 1) * reach_m
+    step = (torch.arange(free, device=device) + torch.rand(len(rays), free, generator=generator).to(device)) / max(free, 1)
+    before = FREE_FROM_M + (depth - reach_m - FREE_FROM_M).clamp_min(0) * step
+    return torch.cat([depth, depth + around / rays.slope[:, None].clamp_min(0.3), before], dim=1)
+
+
+def measured_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, batches: Batches, generator: Generator) -> Terms:
+    """Fit the scene where the sensor measured: rays of known depth."""
+    field, limit = problem.scene, problem.scene.shape.truncation_m
+    origin, direction = world_rays(problem.motion, rays)
+    depth = sample_depths(rays, batches.near, batches.free, limit, generator)
+    points = origin[:, None] + direction[:, None] * depth[..., None]
+    code = field.code(code_of)
+    samples = depth.shape[1]
+    encoded = field.encode(points.view(-1, 3), code.repeat_interleave(samples, 0))
+    distance = field.distance(encoded).view(-1, samples)
+    target = (rays.depth[:, None] - depth) * rays.slope[:, None]
+    target[:, 1 + batches.near :] = target[:, 1 + batches.near :].clamp_min(limit)
+    color, feature = field.look(encoded.view(-1, samples, encoded.shape[-1])[:, 0])
+    few = slice(0, len(rays) // 8)
+    beside = points[few, 0].detach() + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
+    shifted = field.distance(field.encode(beside.reshape(-1, 3), code[few].repeat(3, 1))).view(3, -1)
+    return {
+        "distance": (weights.distance, losses.truncated_distance(distance, target, limit)),
+        "color": (weights.color, losses.color(color, rays.color / 255)),
+        "feature": (weights.feature, losses.feature(feature, rays.feature / 127)),
+        "eikonal": (weights.eikonal, losses.eikonal(distance[few, 0], shifted, EIKONAL_STEP_M)),
+    }
+
+
+def rendered_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, generator: Generator) -> Terms:
+    """Fit the scene by volume rendering: any rays, with or without depth."""
+    field = problem.scene
+    origin, direction = world_rays(problem.motion, rays)
+    depth = render_depths(rays, generator)
+    points = origin[:, None] + direction[:, None] * depth[..., None]
+    scene = scene_layer(problem, points, code_of)
+    empty = Layer(torch.zeros_like(scene.density), torch.zeros_like(scene.color), torch.zeros_like(scene.feature))
+    seen = composite(depth, direction.norm(dim=-1), scene, empty)
+    known = rays.depth > 0
+    return {
+        "rendered color": (weights.rendered_color, losses.color(seen.color, rays.color / 255)),
+        "rendered feature": (weights.rendered_feature, losses.feature(seen.feature, rays.feature / 127)),
+        "rendered depth": (weights.rendered_depth, losses.depth(seen.depth, rays.depth)[known]),
+    }
+
+
+def scene_layer(problem: Problem, points: Float[Tensor, "ray sample 3"], code_of: Int[Tensor, "ray"]) -> Layer:
+    """Ask the scene's field along rays."""
+    field, (rays, samples) = problem.scene, points.shape[:2]
+    values = field(points.reshape(-1, 3), field.code(code_of).repeat_interleave(samples, 0))
+    return Layer(
+        density(values.signed_distance, field.beta_m).view(rays, samples),
+        values.color.view(rays, samples, 3),
+        values.feature.view(rays, samples, -1),
+    )
+
+
+def render_depths(rays: Rays, generator: Generator, around: int = 12, along: int = 12, reach_m: float = 0.15) -> Float[Tensor, "ray sample"]:
+    """Place samples for rendering: half around the measured depth, half up to it (up to 5 m where it is unknown)."""
+    device = rays.depth.device
+    end = torch.where(rays.depth > 0, rays.depth, torch.full_like(rays.depth, FARTHEST_M))[:, None]
+
+    def strata(count: int) -> Tensor:
+        return (torch.arange(count, device=device) + torch.rand(len(rays), count, generator=generator).to(device)) / count
+
+    near = end + (strata(around) * 2 - 1) * reach_m
+    far = FREE_FROM_M + (end - reach_m - FREE_FROM_M).clamp_min(0.01) * strata(along)
+    return torch.cat([far, near], dim=1).sort(dim=1).values
+
+
+def drift_term(motion: MotionTable, weights: Weights) -> Terms:
+    """Keep the corrections of neighbouring camera knots alike (1 cm, half a degree) and small (10 cm, 6 degrees)."""
+    change = torch.diff(motion.camera, dim=0) / 0.01
+    return {"drift": (weights.drift * 1e-2, change.square()), "camera": (weights.drift * 1e-2, (motion.camera / 0.1).square())}
+
+
+class SceneLoss:
+    """The loss of the first phase: scene and cameras, feature-metric loss included."""
+
+    def __init__(self, problem: Problem, weights: Weights, batches: Batches, steps: int):
+        self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
+        self.measured = torch.nonzero(problem.store.scene.depth > 0)[:, 0]
+
+    def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
+        return losses.weighted(self.terms(self.batches.scene_rays, swap_probability(step / self.steps), generator) | drift_term(self.problem.motion, self.weights))
+
+    def terms(self, number: int, probability: float, generator: Generator) -> Terms:
+        """Return the scene's terms over random rays."""
+        problem, store = self.problem, self.problem.store.scene
+        rays = store.at(self.measured[pick(len(self.measured), number, generator, problem.device)])
+        others = store.at(pick(len(store), self.batches.rendered_rays // 2, generator, problem.device))
+        videos = problem.scene.shape.videos
+        code_of, other_code = (swap(problem.video[some.frame], videos, probability, generator) for some in (rays, others))
+        found = measured_terms(problem, rays, code_of, self.weights, self.batches, generator)
+        return found | rendered_terms(problem, others, other_code, self.weights, generator)

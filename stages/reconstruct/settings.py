@@ -1,0 +1,103 @@
+"""The numbers that steer the reconstruction, grouped as its modules use them."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much each loss counts, after averaging over its elements."""
+
+    distance: float = 1.0
+    """signed distance at and near measured depth"""
+    color: float = 4.0
+    """colour at measured surfaces"""
+    feature: float = 0.5
+    """features at measured surfaces (feature-metric loss)"""
+    rendered_color: float = 2.0
+    """colour of composite rendering"""
+    rendered_feature: float = 0.2
+    """features of composite rendering"""
+    rendered_depth: float = 0.1
+    """depth of composite rendering"""
+    silhouette: float = 0.2
+    """the agent's rendered opacity against its mask"""
+    flow: float = 0.1
+    """where rendered points are seen some frames later"""
+    eikonal: float = 0.05
+    """gradients of signed distance have length 1"""
+    cycle: float = 1.0
+    """backward then forward warp returns, per decimetre"""
+    outside: float = 1.0
+    """posed surface outside the mask, per decimetre"""
+    in_front: float = 0.5
+    """posed surface in space seen free, per decimetre"""
+    rigidity: float = 3.0
+    """neighbouring bones agree where they meet, per decimetre"""
+    smoothness: float = 1.0
+    """accelerations of root and bones"""
+    rest: float = 0.05
+    """bones stay near rest"""
+    drift: float = 3.0
+    """corrections of neighbouring camera knots agree (relative motion of registration)"""
+    template: float = 0.3
+    """the agent's field stays near its template where nothing is seen"""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How long each phase runs."""
+
+    template: int = 200
+    """steps that copy the agent template into the agent field"""
+    scene: int = 1200
+    """steps of the first phase: scene and cameras"""
+    body: int = 80
+    """steps per chunk that pose the template to the masked depth"""
+    joint: int = 1500
+    """steps of the second phase: everything"""
+    body_chunk_frames: int = 100
+    """frames posed together"""
+    save_every: int = 200
+    """steps between checkpoints"""
+
+
+@dataclass(frozen=True)
+class Batches:
+    """How much each step looks at."""
+
+    scene_rays: int = 1024
+    """rays a step in the first phase"""
+    joint_scene_rays: int = 512
+    """rays of the scene a step in the second phase"""
+    rendered_rays: int = 96
+    """rays of composite rendering a step"""
+    runs: int = 8
+    """stretches of consecutive frames a step in the second phase"""
+    run_frames: int = 4
+    """frames of each stretch"""
+    agent_rays: int = 32
+    """rays on the agent per frame and step"""
+    surface_points: int = 96
+    """points of the agent's surface per frame and step"""
+    near: int = 4
+    """samples of a ray near its measured depth"""
+    free: int = 3
+    """samples of a ray in the free space before it"""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Learning rates of AdamW; all fall to a twentieth along a cosine."""
+
+    grid: float = 2e-2
+    """grids of the fields"""
+    heads: float = 4e-3
+    """the fields' small networks and codes"""
+    camera: float = 1e-3
+    """corrections of cameras, metres and radians"""
+    body: float = 2e-2
+    """root and bones while the template is posed, metres and radians"""
+    motion: float = 5e-4
+    """root and bones in the second phase, metres and radians"""
+    skin: float = 2e-3
+    """bone sizes and the correction of skinning weights"""
