@@ -90,11 +90,12 @@ def assign(
 
 
 def builtin(session_count: int, heldout_of: int) -> dict[str, Remarks]:
-    """Return the recordings that `synthesize_capture` writes; `heldout_of` counts sessions from 1."""
+    """Return the recordings that `synthesize_capture` writes; `heldout_of` counts sessions from 1, 0 is none."""
     sessions = [f"session-{i}.r3d" for i in range(1, session_count + 1)]
-    heldout = Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)
     plain = dict.fromkeys(("walkthrough.r3d", "turnaround.r3d", *sessions), Remarks())
-    return {**plain, "heldout.r3d": heldout}
+    if not heldout_of:
+        return plain
+    return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}
 
 
 def _is_recording(path: Path) -> bool:
