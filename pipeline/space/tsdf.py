@@ -11,6 +11,9 @@ from skimage import measure
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 
+FREE_GAIN = 0.2
+"""Weight of a ray that passes far in front of what it met, against one that ends here: rims and thin legs would be carved away."""
+
 
 class Volume:
     """A dense grid of signed distance (positive in free space, in units of the truncation), weight and colour."""
@@ -31,14 +34,16 @@ class Volume:
         color: UInt8[np.ndarray, "color_height color_width 3"],
         intrinsics: Float[np.ndarray, "3 3"],
         world_from_camera: Float[np.ndarray, "4 4"],
+        trust: Float[np.ndarray, "height width"] | None = None,
     ) -> None:
-        """Add one frame; depth 0 is unknown and changes nothing. Near views weigh more (1 / depth squared)."""
+        """Add one frame; depth 0 is unknown and changes nothing. Near views weigh more (1 / depth squared), times the trust (0..1)."""
+        trust = np.ones(depth.shape, np.float32) if trust is None else np.ascontiguousarray(trust, np.float32)
         camera_from_world = rigid.inverse(world_from_camera)
         start = camera_from_world[:3, :3] @ self.origin + camera_from_world[:3, 3]
         steps = np.ascontiguousarray(camera_from_world[:3, :3].T * self.voxel_m)
         _integrate(
             self.distance, self.weight, self.color, self.color_weight, start, steps,
-            np.ascontiguousarray(depth, np.float32), _focal(depth_intrinsics), np.ascontiguousarray(color), _focal(intrinsics), self.truncation_m,
+            np.ascontiguousarray(depth, np.float32), trust, _focal(depth_intrinsics), np.ascontiguousarray(color), _focal(intrinsics), self.truncation_m,
         )  # fmt: skip
 
     def surface(self, least_weight: float) -> Mesh:
@@ -81,7 +86,7 @@ def _focal(intrinsics):
 
 
 @njit(cache=True, nogil=True)
-def _integrate(distance, weight, color, color_weight, start, steps, depth, depth_focal, image, focal, truncation_m):
+def _integrate(distance, weight, color, color_weight, start, steps, depth, trust, depth_focal, image, focal, truncation_m):
     for i in range(distance.shape[0]):
         for j in range(distance.shape[1]):
             x0 = start[0] + i * steps[0, 0] + j * steps[1, 0]
@@ -103,15 +108,17 @@ def _integrate(distance, weight, color, color_weight, start, steps, depth, depth
                 gap = measured - z
                 if gap < -truncation_m:
                     continue
-                gain = 1.0 / max(measured * measured, 0.25)
-                total = weight[i, j, k] + gain
+                gain = trust[row, column] / max(measured * measured, 0.25)
+                if gap > truncation_m:
+                    gain *= FREE_GAIN
+                total = weight[i, j, k] + gain + 1e-9
                 distance[i, j, k] += (min(1.0, gap / truncation_m) - distance[i, j, k]) * gain / total
                 weight[i, j, k] = total
                 if abs(gap) < 0.5 * truncation_m:
                     column = int(np.floor(x * focal[0] + focal[2]))
                     row = int(np.floor(y * focal[1] + focal[3]))
                     if row >= 0 and column >= 0 and row < image.shape[0] and column < image.shape[1]:
-                        total = color_weight[i, j, k] + gain
+                        total = color_weight[i, j, k] + gain + 1e-9
                         for channel in range(3):
                             color[i, j, k, channel] += (image[row, column, channel] - color[i, j, k, channel]) * gain / total
                         color_weight[i, j, k] = total

@@ -27,9 +27,9 @@ class FuseOptions:
     """Distances are clipped here, metres; about three times the depth noise at the far end."""
     furthest_m: float = 4.5
     """Depth beyond this is not fused, metres."""
-    least_confidence: int = 1
-    """Depth confidence a pixel needs: 0 low, 1 medium, 2 high."""
-    least_views: float = 0.7
+    trust: tuple[float, float, float] = (0.2, 0.6, 1.0)
+    """Weight of depth of low, medium and high confidence; rims and thin legs are seen with low confidence only."""
+    least_views: float = 0.15
     """A voxel needs this much weight, in views from one metre, to carry surface."""
     island_faces: int = 120
     """Smaller separate pieces of surface are dropped, faces."""
@@ -48,8 +48,9 @@ def fuse(clip: Clip, frames: Int[np.ndarray, "view"], world_from_camera: Float[n
     volume = tsdf.enclose(points, voxel_m=options.voxel_m, truncation_m=options.truncation_m)
     for frame in track(frames.tolist(), "fusing frames"):
         depth = clip.depth(frame)
-        depth = np.where((clip.confidence(frame) >= options.least_confidence) & (depth < options.furthest_m), depth, 0)
-        volume.integrate(depth, clip.depth_intrinsics[frame], clip.color(frame), clip.intrinsics[frame], world_from_camera[frame])
+        depth = np.where(depth < options.furthest_m, depth, 0)
+        trust = np.array(options.trust, np.float32)[clip.confidence(frame)]
+        volume.integrate(depth, clip.depth_intrinsics[frame], clip.color(frame), clip.intrinsics[frame], world_from_camera[frame], trust)
     return volume.surface(options.least_views)
 
 

@@ -1,0 +1,165 @@
+"""Align a whole recording to the template at once: odometry, frame votes, depth and pictures in one robust relaxation.
+
+Depth ties every frame to the surface along its normals (the agent masked out, moved furniture weighed
+down); votes tie points to points; in a second pass optical flow between the rendered template and the
+picture ties what depth leaves free to slide along walls.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.files.clips import Clip, Masks
+from pipeline.progress import track
+from pipeline.space import cameras, relax, rigid, surface
+from pipeline.space.meshes import Mesh, RayCaster, render_view
+from stages.register_videos.votes import Votes
+
+
+@dataclass(frozen=True)
+class AlignOptions:
+    """Weights, reach and rounds of the alignment."""
+
+    stride_px: int = 11
+    """One depth pixel in so many, each way, takes part."""
+    depth_inflation: float = 8.0
+    """Depth noise is multiplied by this, since neighbouring pixels err together and furniture moves."""
+    vote_sigma_m: float = 0.15
+    """Standard deviation of one matched patch of a vote, metres."""
+    drift_deg_s: float = 0.15
+    """Odometry's rotational drift, degrees a second."""
+    drift_m_s: float = 0.01
+    """Odometry's translational drift, metres a second."""
+    first_reach_m: float = 0.3
+    """Width of the robust weight in the first round, metres."""
+    last_reach_m: float = 0.04
+    """Width in the last round, metres."""
+    rounds: int = 8
+    """Gauss-Newton steps by depth and votes."""
+    picture_every_frames: int = 5
+    """One frame in so many is compared with the rendered template; 0: none."""
+    picture_rounds: int = 1
+    """Passes of rendering, flow and relaxation."""
+    picture_px: float = 8.0
+    """Standard deviation of the flow between rendering and picture, pixels at half size."""
+    picture_stride_px: int = 9
+    """One pixel of the half-size picture in so many, each way, takes part."""
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """The aligned cameras and how well each frame's depth fits."""
+
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    scans: list[surface.Scan]
+    gap_m: Float[np.ndarray, "frame"]
+    """Median distance of the static depth from the surface; NaN where nothing was in reach."""
+    fit: Float[np.ndarray, "frame"]
+    """Share of the static depth within 5 cm of the surface, of what lies within half a metre of it."""
+
+
+def align(
+    clip: Clip, masks: Masks, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], votes: Votes, supports: Bool[np.ndarray, "vote"], options: AlignOptions
+) -> Aligned:
+    """Relax all frames: first depth, votes and odometry from coarse to fine, then pictures as well."""
+    place, frames = surface.Surface(mesh), np.arange(len(clip))
+    scans = [_static_scan(clip, masks, int(frame), options) for frame in track(frames, "reading depth")]
+    voted = _vote_contacts(votes, supports, options)
+    odometry = clip.odometry_from_camera if clip.odometry_from_camera is not None else world_from_camera
+    looseness = 1.0 if clip.odometry_from_camera is not None else 20.0
+    edges = relax.chain(clip.timestamp_s, odometry, drift_rad_s=np.deg2rad(options.drift_deg_s) * looseness, drift_m_s=options.drift_m_s * looseness)
+
+    def find(poses, reach_m, *more):
+        depth = place.contacts(frames, scans, poses, reach_m)
+        sigma = depth.sigma_m * options.depth_inflation
+        depth = relax.Contacts(depth.first, depth.second, depth.points_first, depth.points_second, depth.direction_world, sigma)
+        return relax.Contacts.join(depth, *voted, *more)
+
+    reach = tuple(np.geomspace(options.first_reach_m, options.last_reach_m, options.rounds))
+    poses = relax.relax(world_from_camera, find, edges, reach_m=reach).world_from_camera
+    caster = RayCaster(mesh)
+    for _ in range(options.picture_rounds if options.picture_every_frames else 0):
+        chosen = frames[:: options.picture_every_frames]
+        seen = [tie for frame in track(chosen, "comparing pictures") if (tie := picture_contacts(clip, masks, caster, int(frame), poses[frame], options)) is not None]
+        poses = relax.relax(poses, lambda p, r: find(p, r, *seen), edges, reach_m=(options.last_reach_m,) * 3).world_from_camera
+    gap, fit = measure_fit(place, scans, poses)
+    return Aligned(poses, scans, gap, fit)
+
+
+def measure_fit(
+    place: surface.Surface, scans: list[surface.Scan], world_from_camera: Float[np.ndarray, "frame 4 4"]
+) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
+    """Return each frame's median gap (metres) and the share of its depth within 5 cm of the surface, of that within 50 cm."""
+    gap, fit = np.full(len(scans), np.nan), np.zeros(len(scans))
+    for frame, scan in enumerate(scans):
+        if len(scan.points_camera):
+            distance = np.abs(place.distance(rigid.apply(world_from_camera[frame], scan.points_camera)))
+            near = distance[distance < 0.5]
+            if len(near) >= 20:
+                gap[frame], fit[frame] = np.median(near), (near < 0.05).mean()
+    return gap, fit
+
+
+def _static_scan(clip, masks, frame, options):
+    ignore = cv2.resize((masks[frame] > 0).astype(np.uint8), clip.depth_size[::-1], interpolation=cv2.INTER_NEAREST)
+    ignore = cv2.dilate(ignore, np.ones((7, 7), np.uint8)) > 0
+    return surface.scan(clip.depth(frame), clip.depth_intrinsics[frame], stride=options.stride_px, confidence=clip.confidence(frame), ignore=ignore)
+
+
+def _vote_contacts(votes, supports, options):
+    contacts = []
+    for vote in np.flatnonzero(supports):
+        answer = votes.answers[vote]
+        count = len(answer.points_map)
+        first, second = np.full(count, votes.frame[vote]), np.full(count, relax.MAP)
+        for axis in np.eye(3):
+            direction = np.broadcast_to(axis, (count, 3))
+            contacts.append(relax.Contacts(first, second, answer.points_camera, answer.points_map, direction, np.full(count, options.vote_sigma_m)))
+    return contacts
+
+
+def picture_contacts(clip: Clip, masks: Masks, caster: RayCaster, frame: int, world_from_camera: Float[np.ndarray, "4 4"], options: AlignOptions) -> relax.Contacts | None:
+    """Tie one frame to the template by optical flow from its rendering to the picture, across the viewing rays."""
+    size = (clip.color_size[0] // 2, clip.color_size[1] // 2)
+    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
+    rendered, hits = render_view(caster, world_from_camera, intrinsics, *size)
+    color = hits.interpolate(caster.mesh, caster.mesh.color).reshape(*size, 3)
+    real = cv2.resize(clip.color(frame), size[::-1], interpolation=cv2.INTER_AREA)
+    hidden = cv2.resize((masks[frame] > 0).astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    known = (rendered > 0) & ~hidden
+    if known.mean() < 0.1:
+        return None
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(_even(color, known), _even(real, known), None)
+    rows, columns = np.mgrid[4 : size[0] - 4 : options.picture_stride_px, 4 : size[1] - 4 : options.picture_stride_px].reshape(2, -1)
+    start = np.stack([columns, rows], axis=-1) + 0.5
+    end = start + flow[rows, columns]
+    ray = cameras.unproject(end, intrinsics)
+    pixel, _ = cameras.project(ray, clip.depth_intrinsics[frame])
+    limit = np.array(clip.depth_size[::-1]) - 1
+    column, row = np.clip(pixel.astype(int), 0, limit).T
+    z = clip.depth(frame)[row, column]
+    good = known[rows, columns] & (pixel > 0).all(1) & (pixel < limit).all(1) & (np.abs(z - rendered[rows, columns]) < 0.12) & (np.abs(flow[rows, columns]).max(1) < 12)
+    if good.sum() < 20:
+        return None
+    mapped = rigid.apply(world_from_camera, (cameras.unproject(start, intrinsics) * rendered[rows, columns][:, None])[good])
+    return _sideways(frame, ray[good] * z[good, None], mapped, world_from_camera, options.picture_px / intrinsics[0, 0])
+
+
+def _sideways(frame, points_camera, points_map, world_from_camera, sigma_per_m):
+    count = len(points_camera)
+    first, second, sigma = np.full(count, frame), np.full(count, relax.MAP), sigma_per_m * points_camera[:, 2]
+    sides = [np.broadcast_to(world_from_camera[:3, axis], (count, 3)) for axis in (0, 1)]
+    return relax.Contacts.join(*(relax.Contacts(first, second, points_camera, points_map, side, sigma) for side in sides))
+
+
+def _even(color: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    """Remove differences of light: grey values minus their local mean over their local spread, unknown pixels flat."""
+    gray = cv2.cvtColor(color.astype(np.float32), cv2.COLOR_RGB2GRAY)
+    weight = known.astype(np.float32)
+    blur = lambda picture: cv2.GaussianBlur(picture, (0, 0), 9)
+    share = blur(weight) + 1e-3
+    mean = blur(gray * weight) / share
+    spread = np.sqrt(np.maximum(blur((gray - mean) ** 2 * weight) / share, 9.0))
+    return np.clip(128 + 48 * (gray - mean) / spread * weight, 0, 255).astype(np.uint8)
