@@ -1,0 +1,148 @@
+"""The planner: roles, split, ids, keys, and refusals that change nothing."""
+
+import json
+
+import pytest
+
+from pipeline.captures import Remarks, assign, builtin
+from pipeline.errors import InputError
+from tests.pipeline import checkout
+
+
+@pytest.fixture()
+def house(tmp_path):
+    return checkout.create(tmp_path)
+
+
+def assigned(names, ids=None, **said):
+    remarks = {name: said.get(name.split(".")[0], Remarks()) for name in names}
+    return {video.file: video for video in assign(remarks, ids or {}, dict.fromkeys(names), "captures/cat")}
+
+
+NAMES = ["walkthrough.r3d", "b.r3d", "a.r3d", "turnaround 1.r3d", "heldout.r3d"]
+
+
+def test_names_decide_roles_order_and_split():
+    videos = assigned(NAMES)
+    assert [(v.id, v.file, v.role, v.split) for v in sorted(videos.values(), key=lambda v: v.id)] == [
+        ("v000", "walkthrough.r3d", "walkthrough", "none"),
+        ("v001", "turnaround 1.r3d", "turnaround", "none"),
+        ("v002", "a.r3d", "session", "train"),
+        ("v003", "b.r3d", "session", "test"),
+        ("v004", "heldout.r3d", "heldout", "none"),
+    ]
+
+
+def test_the_recipe_decides_against_the_name():
+    videos = assigned(NAMES, a=Remarks(split="test"), heldout=Remarks(synchronized_with="a.r3d", offset_s=0.5))
+    assert (videos["a.r3d"].split, videos["b.r3d"].split) == ("test", "train")
+    assert (videos["heldout.r3d"].synchronized_with, videos["heldout.r3d"].offset_s) == (videos["a.r3d"].id, 0.5)
+
+
+def test_one_session_is_no_test():
+    assert assigned(["walkthrough.r3d", "turnaround.r3d", "x.r3d"])["x.r3d"].split == "train"
+
+
+def test_ids_stay_and_are_never_reused():
+    first = {name: video.id for name, video in assigned(NAMES).items()}
+    later = assigned([*[n for n in NAMES if n != "a.r3d"], "0.r3d"], ids=first)
+    assert all(later[name].id == first[name] for name in later if name in first)
+    assert later["0.r3d"].id == "v005"
+
+
+@pytest.mark.parametrize("missing", ["walkthrough", "turnaround", "session"])
+def test_a_partial_capture_is_refused(missing):
+    names = [name for name in ("walkthrough.r3d", "turnaround.r3d", "session.r3d") if not name.startswith(missing)]
+    with pytest.raises(InputError, match=f"CAP-040.*no {missing}"):
+        assigned(names)
+
+
+@pytest.mark.parametrize("remark", [Remarks(role="film"), Remarks(split="tset"), Remarks(synchronized_with="c.r3d")])
+def test_an_impossible_remark_is_refused(remark):
+    with pytest.raises(InputError, match="CAP-041"):
+        assigned(NAMES, a=remark)
+
+
+def test_the_builtin_capture_has_a_partner_for_its_second_phone():
+    said = builtin(3, heldout_of=2)
+    videos = {v.file: v for v in assign(said, {}, dict.fromkeys(said), "")}
+    assert videos["heldout.r3d"].synchronized_with == videos["session-2.r3d"].id
+    assert "heldout.r3d" not in builtin(3, heldout_of=0)
+
+
+HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", "-rf.r3d", "%.r3d", "#.r3d"]
+
+
+def test_file_names_are_never_executed(house):
+    for name in ["walkthrough.r3d", "turnaround.r3d", *HOSTILE]:
+        house.write(f"captures/toy/{name}", name)
+    made = house.make("-j2", "toy")
+    assert made.returncode == 0, made.stderr
+    assert not (house.folder / "hacked").exists()
+    videos = json.loads((house.folder / "build/toy/plan/videos.json").read_text())
+    assert {video["file"] for video in videos} >= set(HOSTILE)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "files", "code"),
+    [
+        (["plan", "../x"], {}, "REC-004"),
+        (["new", "../x"], {}, "REC-004"),
+        (["new", ""], {}, "REC-004"),
+        (["plan", "toy/variants/../.."], {}, "REC-004"),
+        (["plan", "dog"], {}, "REC-005"),
+        (["plan", "toy/variants/none"], {}, "REC-005"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agents]\nseed = 1\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agent]\nsead = 1\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "[scene_localizer]\ntarget = 'agent'\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "seed = 1\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "segment_agent = 1\n"}, "REC-002"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agent\n"}, "REC-003"),
+        (["plan", "toy"], {"agents/toy.toml": "[videos.'other.r3d']\nsplit = 'test'\n"}, "REC-001"),
+        (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
+    ],
+)
+def test_refusals_change_nothing(house, arguments, files, code):
+    for name, text in files.items():
+        house.write(name, text)
+    before = house.tree()
+    refused = house.python("pipeline.plan", *arguments)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith(f"error: {code} ")
+    assert "\n  -> " in refused.stderr
+    assert "Traceback" not in refused.stderr
+    assert house.tree() == before
+
+
+def key_files(house):
+    folder = house.folder / "build/toy/plan/keys"
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_only_what_matters_changes_a_key(house):
+    house.python("pipeline.plan", "plan", "toy")
+    before = key_files(house)
+    front = house.folder / "stages/segment_agent/__main__.py"
+    text = front.read_text()
+    front.write_text(text.replace('"""Hash the inputs."""', '"""Other words."""  # and a comment\n'))
+    house.python("pipeline.plan", "plan", "toy")
+    assert key_files(house) == before
+    front.write_text(text.replace("* 64", "* 65"))
+    house.write("stages/report/page.html", "<p>")
+    house.write("agents/toy.toml", "[estimate_flow]\nseed = 2\n")
+    house.python("pipeline.plan", "plan", "toy")
+    after = key_files(house)
+    assert {name for name in after if after[name] != before[name]} == {"masks.json", "report.json", "flow.json"}
+
+
+def test_a_new_session_does_not_touch_the_maps(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.plan", "plan", "toy")
+    before = key_files(house)
+    house.write("captures/toy/c.r3d", "c")
+    house.python("pipeline.plan", "plan", "toy")
+    after = key_files(house)
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed >= {"registration.json", "reconstruction.json", "behavior_data.json"}
+    assert not changed & {"scene_template.json", "agent_template.json", "frames.json", "video.v002.json", "masks.json"}

@@ -1,0 +1,188 @@
+"""The runner and its engines: cut-off, redo, variants, failure, kills; Make and Snakemake agree."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pipeline import artifact
+from tests.pipeline import checkout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    house = checkout.create(tmp_path_factory.mktemp("house"))
+    made = house.make("-j2", "toy")
+    assert made.returncode == 0, made.stderr
+    return house
+
+
+@pytest.fixture()
+def house(built, tmp_path):
+    """A copy of the built house, ages and all."""
+    shutil.copytree(built.folder, tmp_path / "house", symlinks=True)
+    return checkout.Checkout(tmp_path / "house")
+
+
+def begun(made):
+    assert made.returncode == 0, made.stderr
+    return {line.split("]")[0][1:] for line in made.stderr.splitlines() if line.endswith("] begins")}
+
+
+def contents(house):
+    """Return the content hash of every artifact, each checked against its files."""
+    found = {}
+    for path in (house.folder / "build").rglob(artifact.MANIFEST):
+        if path.parent.name.startswith("."):  # of one that died just before the rename: it does not count
+            continue
+        manifest = artifact.read_manifest(path.parent)
+        assert manifest is not None, path
+        assert manifest.files == artifact.digests(path.parent), path
+        found[path.parent.relative_to(house.folder).as_posix()] = (manifest.content, manifest.key)
+    return found
+
+
+def leftovers(house):
+    return [p for pattern in (".*.tmp.*", ".*.old.*") for p in (house.folder / "build").rglob(pattern)]
+
+
+def test_a_second_build_does_nothing(house):
+    assert begun(house.make("toy")) == set()
+
+
+def test_touching_reruns_nothing(house):
+    for path in (house.folder / "build/toy/plan/keys").iterdir():
+        path.touch()
+    assert begun(house.make("toy")) == set()
+
+
+def test_a_changed_table_reruns_that_stage_and_what_depends_on_it(house):
+    house.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
+    assert begun(house.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
+
+
+def test_equal_results_cut_the_work_off(house):
+    """`pause_s` changes the key of the flow but not its content."""
+    front = house.folder / "stages/estimate_flow/__main__.py"
+    front.write_text(front.read_text() + "\nNOTHING = 0\n")
+    assert begun(house.make("toy")) == {"flow.v001", "flow.v002", "flow.v003"}
+
+
+def test_redo(house):
+    assert begun(house.make("toy.masks.redo")) == {"masks.v001", "masks.v002", "masks.v003"}
+    assert begun(house.make("toy")) == set()
+
+
+def test_up_to_one_artifact(house):
+    shutil.rmtree(house.folder / "build")
+    assert begun(house.make("toy.flow")) == {
+        "synthetic_capture",
+        *(f"frames.v00{i}" for i in (1, 2, 3)),
+        *(f"flow.v00{i}" for i in (1, 2, 3)),
+    }
+
+
+def test_a_variant_shares_what_it_does_not_touch(house):
+    before = contents(house)
+    assert begun(house.make("toy", "VARIANT=other")) == {"behavior", "simulator", "evaluation", "report"}
+    assert contents(house).items() >= before.items()
+    assert begun(house.make("toy")) == set()
+
+
+def test_a_failing_stage_keeps_the_old_result_and_its_code(house):
+    before = contents(house)
+    house.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
+    house.python("pipeline.plan", "plan", "toy")
+    failed = house.python("pipeline.run", "toy", "behavior")
+    assert failed.returncode == 2
+    assert "TST-001" in failed.stderr
+    assert contents(house) == before
+    assert not leftovers(house)
+
+
+def test_an_unfinished_input_is_named(house):
+    (house.folder / "build/toy/reconstruction/manifest.json").unlink()
+    refused = house.python("pipeline.run", "toy", "splats")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("error: ART-001 build/toy/reconstruction")
+
+
+def test_an_unknown_job_is_named(house):
+    assert house.python("pipeline.run", "toy", "nothing").stderr.startswith("error: RUN-001 toy")
+
+
+def test_a_removed_recording_reruns_the_merge(tmp_path):
+    house = checkout.create(tmp_path)
+    for name in ("walkthrough", "turnaround", "a", "b", "c"):
+        house.write(f"captures/toy/{name}.r3d", name)
+    begun(house.make("-j2", "toy"))
+    (house.folder / "captures/toy/a.r3d").unlink()
+    again = begun(house.make("-j2", "toy"))
+    assert {"registration", "reconstruction", "feature_basis", "report"} <= again
+    assert not again & {"frames.v003", "flow.v003", "masks.v003", "scene_localizer.v003"}
+
+
+def test_two_builds_at_once_are_both_right(house):
+    reference = contents(house)
+    shutil.rmtree(house.folder / "build")
+    command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
+    both = [subprocess.Popen(command, cwd=house.folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for _ in range(2)]
+    assert [each.wait() for each in both] == [0, 0]
+    assert contents(house) == reference
+
+
+@pytest.mark.parametrize("victim", ["group", "make", "anyone"])
+def test_kills_leave_nothing_wrong(house, victim):
+    """SIGKILL at random times; whatever counts as complete is, and the next build ends as if nothing had been."""
+    reference = contents(house)
+    choice = random.Random(victim)
+    shutil.rmtree(house.folder / "build")
+    for _ in range(3):
+        command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
+        build = subprocess.Popen(
+            command, cwd=house.folder, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        time.sleep(choice.uniform(0.3, 1.5))
+        match victim:
+            case "group":
+                os.killpg(build.pid, signal.SIGKILL)
+            case "make":
+                build.kill()
+            case "anyone":
+                alive = [p for p in map(int, filter(str.isdigit, os.listdir("/proc"))) if _group(p) == build.pid]
+                os.kill(choice.choice(alive), signal.SIGKILL)
+        build.wait()
+        done = contents(house)
+        assert done.items() <= reference.items()
+    assert house.make("-j2", "toy").returncode == 0
+    assert contents(house) == reference
+    assert not leftovers(house)
+
+
+def _group(pid):
+    try:
+        return os.getpgid(pid)
+    except ProcessLookupError:
+        return None
+
+
+def test_snakemake_finds_makes_results_up_to_date(house):
+    command = [sys.executable, "-m", "snakemake", "--cores", "2", "--config", "agent=toy"]
+    told = subprocess.run(command, cwd=house.folder, capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+    assert "Nothing to be done" in told.stdout + told.stderr
+
+
+def test_snakemake_builds_the_same(house):
+    reference = contents(house)
+    shutil.rmtree(house.folder / "build")
+    command = [sys.executable, "-m", "snakemake", "--cores", "2", "--config", "agent=toy"]
+    told = subprocess.run(command, cwd=house.folder, capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+    assert contents(house) == reference
+    assert begun(house.make("toy")) == set()

@@ -1,0 +1,145 @@
+"""The rules of the house: floors, sizes, docstrings, doors, and a declaration that fits the programs."""
+
+import ast
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from pipeline import dag
+
+ROOT = Path(__file__).parent.parent
+FILES = sorted(path for top in ("pipeline", "stages") for path in (ROOT / top).rglob("*.py") if "node_modules" not in path.parts)
+FRONTS = sorted((ROOT / "stages").glob("*/__main__.py"))
+FLOORS = (
+    {"errors"},
+    {"space"},
+    {"files", "models", "videos", "progress"},
+    {"fit"},
+    {"artifact", "config", "dag", "qa"},
+    {"sources", "captures", "cli", "plan"},
+    {"run", "doctor"},
+)
+"""Parts of `pipeline/`, lowest first: each imports its own floor and those below."""
+FOR_FRONTS_ONLY = {"artifact", "cli", "config", "dag", "plan", "run", "captures", "sources", "doctor"}
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(), str(path))
+
+
+def imports(path: Path) -> set[str]:
+    """Return the absolute names that a file imports, wherever in the file."""
+    names: set[str] = set()
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name_of(path)}:{node.lineno}: imports are absolute"
+            assert all(alias.name != "*" for alias in node.names), f"{name_of(path)}:{node.lineno}: import *"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def floor_of(part: str) -> int:
+    return next(level for level, parts in enumerate(FLOORS) if part in parts)
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_imports_go_downstairs_only(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    for name in imports(path):
+        top, *rest = name.split(".")
+        if top == "stages":
+            assert parts[0] == "stages", f"the ground floor imports {name}"
+            assert rest[0] == parts[1], f"a room imports another: {name}"
+        if top == "pipeline" and parts[0] == "pipeline" and parts[1] != "__init__":
+            assert floor_of(rest[0]) <= floor_of(parts[1]), f"{parts[1]} stands below {rest[0]}"
+        if top == "pipeline" and parts[0] == "stages" and parts[-1] != "__main__":
+            assert rest[0] not in FOR_FRONTS_ONLY, f"science knows the disk: {name}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_sizes(path):
+    lines = path.read_text().count("\n")
+    assert lines <= (80 if path.name == "__main__.py" else 400), f"{lines} lines"
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            length = node.end_lineno - node.lineno + 1
+            assert length <= 60, f"{node.name} has {length} lines"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_docstrings(path):
+    tree = tree_of(path)
+    if tree.body:
+        assert ast.get_docstring(tree), "the module has no docstring"
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            assert ast.get_docstring(node), f"{node.name} has no docstring"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_names_and_marks(path):
+    assert path.name not in {"utils.py", "helpers.py", "common.py", "misc.py"}
+    assert not re.search(r"\b(TODO|FIXME|XXX)\b", path.read_text()), "no marks for later"
+    for node in ast.walk(tree_of(path)):
+        assert not (isinstance(node, ast.ExceptHandler) and node.type is None), f"line {node.lineno}: bare except"
+
+
+@pytest.mark.parametrize("path", FRONTS, ids=lambda path: path.parent.name)
+def test_settings_are_told(path):
+    """Every field of a front's Config is typed, defaulted and documented beneath; the dataclass is frozen."""
+    for cls in (node for node in tree_of(path).body if isinstance(node, ast.ClassDef) and node.name == "Config"):
+        assert "frozen=True" in ast.unparse(cls.decorator_list[0])
+        for field, following in zip(cls.body, [*cls.body[1:], None], strict=True):
+            if isinstance(field, ast.AnnAssign):
+                told = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+                assert field.value is not None, f"{field.target.id} has no default"
+                assert told, f"{field.target.id} is not documented"
+
+
+@cache
+def help_of(stage: str) -> str:
+    command = [sys.executable, "-m", f"stages.{stage}", "--help"]
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env={"COLUMNS": "1000", "OMP_NUM_THREADS": "1"})
+    assert told.returncode == 0, told.stderr
+    return told.stdout
+
+
+@pytest.mark.parametrize("path", FRONTS, ids=lambda path: path.parent.name)
+def test_every_door_opens(path):
+    """`--help` works and tells what the front's docstring tells."""
+    assert ast.get_docstring(tree_of(path)).splitlines()[0] in help_of(path.parent.name)
+
+
+@pytest.mark.parametrize("node", dag.FLOW, ids=lambda node: node.artifact)
+def test_the_declaration_fits_the_program(node):
+    """What the flow hands to a program is what the program asks for, and nothing that it must have is left out."""
+    usage = help_of(node.stage).split("\n\n")[0]
+    handed = {f"--{need.option or need.artifact.replace('_', '-')}" for need in dag.needs_of(node)}
+    known = set(re.findall(r"--[a-z-]+", usage))
+    required = set(re.findall(r"--[a-z-]+", re.sub(r"\[[^\]]*\]", "", usage)))
+    assert handed <= known, f"{node.stage} does not know {handed - known}"
+    assert required <= handed | {"--out"}, f"{node.stage} also needs {required - handed}"
+
+
+def test_every_room_is_in_the_flow():
+    """Every stage program has its place in the declaration; `simulate` stands behind it."""
+    assert {path.parent.name for path in FRONTS} == {node.stage for node in dag.FLOW} | {"simulate"}
+
+
+def test_truth_is_for_evaluate_alone():
+    """No source outside the room that makes truth and the one that judges by it speaks of a truth file."""
+    for path in FILES:
+        if path.parts[len(ROOT.parts)] == "stages" and path.parent.name not in {"synthesize_capture", "evaluate"}:
+            strings = [n.value for n in ast.walk(tree_of(path)) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+            assert not any("truth/" in text for text in strings), name_of(path)
