@@ -22,6 +22,8 @@ WORKING_SIDE_PX = 320
 """pictures with a longer side are reduced to it, so that phones of any resolution are described alike"""
 RADIUS_PX = 16
 """radius of a descriptor, reduced pixels"""
+MARGIN_PX = 24
+"""mirrored around a picture: a descriptor's radius and its smoothing, reduced pixels"""
 
 
 def describe(color: UInt8[np.ndarray, "height width 3"], stride_px: int) -> Float[np.ndarray, "rows columns channel"]:
@@ -33,6 +35,8 @@ def describe(color: UInt8[np.ndarray, "height width 3"], stride_px: int) -> Floa
     scale = min(1.0, WORKING_SIDE_PX / max(gray.shape))
     if scale < 1:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    # Beyond its edge a picture goes on as its mirror image: an edge at the border would be the strongest of all.
+    gray = cv2.copyMakeBorder(gray, *4 * (MARGIN_PX,), cv2.BORDER_REFLECT_101)
     rows, columns = color.shape[0] // stride_px, color.shape[1] // stride_px
     raw = _daisy().compute(gray, _grid(rows, columns, stride_px, scale))[1].reshape(rows, columns, -1)
     return _unit(np.nan_to_num(raw, nan=0.0, posinf=0.0, neginf=0.0))
@@ -97,6 +101,6 @@ def _daisy() -> cv2.xfeatures2d.DAISY:
 
 @lru_cache(maxsize=8)
 def _grid(rows: int, columns: int, stride_px: int, scale: float) -> list[cv2.KeyPoint]:
-    """Cell centres as OpenCV key points, whose integer positions are pixel centres."""
-    y, x = (((np.arange(count) + 0.5) * stride_px * scale - 0.5) for count in (rows, columns))
+    """Cell centres in the widened picture as OpenCV key points, whose integer positions are pixel centres."""
+    y, x = (((np.arange(count) + 0.5) * stride_px * scale - 0.5 + MARGIN_PX) for count in (rows, columns))
     return [cv2.KeyPoint(float(column), float(row), 2 * RADIUS_PX) for row in y for column in x]

@@ -1,9 +1,12 @@
-"""Dense inverse search (DIS, Kroeger et al. 2016) on a coarse grid, with forward-backward confidence.
+"""Optical flow by dense inverse search (DIS, Kroeger et al. 2016), chained over growing gaps.
 
-Make one `Estimator` per video; `between` estimates both directions of one pair of gray pictures.
+Coarse-to-fine search loses small things that move against the camera, so neighbouring frames are searched twice, from
+coarse levels and on the finest level only, and each place keeps what matches better. Search fails altogether when the
+picture moves far, so longer gaps chain two flows of half the gap and search again on the finest level from there.
+Make one `Estimator` per video; `flows` yields the gaps one after the other.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +15,16 @@ from jaxtyping import Float, UInt8
 
 STRIDE_PX = 4
 """colour pixels per stored flow vector"""
+MATCH_WINDOW_PX = 5
+"""side of the window over which two candidates are compared, pixels at half the reduced size"""
+MATCH_MARGIN = 2.0
+"""brightness difference (of 255) by which the second candidate must be better: on plain walls chance is not enough"""
+MATCH_CLIP = 40.0
+"""brightness difference (of 255) beyond which a mismatch is not worse"""
+
+Gray = UInt8[np.ndarray, "working_height working_width"]
+Dense = Float[np.ndarray, "dense_height dense_width 2"]
+"""flow at half the reduced size, where the search ends, in pixels of that size"""
 
 
 @dataclass(frozen=True)
@@ -20,14 +33,10 @@ class Search:
 
     working_side_px: int
     """longer side of the reduced pictures"""
-    finest_scale: int
-    """pyramid level at which the search ends, 0 = full size"""
     patch_stride_px: int
     """distance between patches"""
     iterations: int
     """descent steps per patch"""
-    refinements: int
-    """variational smoothing steps afterwards"""
 
 
 @dataclass(frozen=True)
@@ -43,81 +52,117 @@ class Estimator:
     """Flow between pictures of one size."""
 
     def __init__(self, color_size: tuple[int, int], search: Search, *, tolerance_px: float) -> None:
-        """Prepare for pictures of (height, width); the confidence falls to 1/e at ``tolerance_px`` reduced pixels."""
-        self._scale = min(1.0, search.working_side_px / max(color_size))
-        self._working = tuple(max(round(side * self._scale), 16) for side in color_size)
-        self._size = color_size
-        self._tolerance_px = tolerance_px / self._scale
+        """Prepare for pictures of (height, width); confidence falls to 1/e at ``tolerance_px`` reduced pixels."""
+        scale = min(1.0, search.working_side_px / max(color_size))
+        self.dense_size = tuple(max(round(side * scale / 2), 8) for side in color_size)
         self.grid_px = grid_centers(color_size)
-        self._search = _search(search)
+        self._color_size = color_size
+        self._color_per_dense = (np.array(color_size) / self.dense_size)[::-1].astype(np.float32)
+        self._tolerance_px = tolerance_px / scale
+        self._coarse, self._fine = _search(search, fine_only=False), _search(search, fine_only=True)
+        self._pixel = _index_grid(*self.dense_size)
 
-    def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "working_height working_width"]:
+    def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> Gray:
         """Turn a colour picture into the gray one that is searched."""
         gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-        return gray if self._scale == 1 else cv2.resize(gray, self._working[::-1], interpolation=cv2.INTER_AREA)
+        height, width = self.dense_size
+        return cv2.resize(gray, (2 * width, 2 * height), interpolation=cv2.INTER_AREA)
 
-    def between(
-        self,
-        first: UInt8[np.ndarray, "working_height working_width"],
-        second: UInt8[np.ndarray, "working_height working_width"],
-    ) -> tuple[Flow, Flow]:
-        """Return (first to second, second to first); each holds one pair."""
-        forward, backward = self._on_grid(first, second), self._on_grid(second, first)
-        return self._judged(forward, backward), self._judged(backward, forward)
+    def neighbours(self, first: Gray, second: Gray) -> Dense:
+        """Search from coarse to fine and on the finest level only; keep per place what matches better."""
+        candidates = [self._searched(search, first, second) for search in (self._coarse, self._fine)]
+        return self._better(first, second, candidates)
 
-    def _on_grid(self, first: np.ndarray, second: np.ndarray) -> Float[np.ndarray, "height width 2"]:
-        """Search at working size, then average to the stored grid in colour pixels."""
-        dense = self._search.calc(first, second, None)
-        per_working_px = np.array(self._size[::-1], np.float32) / np.array(self._working[::-1], np.float32)
-        at = (self.grid_px / per_working_px - 0.5).astype(np.float32)
-        blurred = cv2.blur(dense, (3, 3))
-        return (
-            cv2.remap(blurred, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            * per_working_px
-        )
+    def chained(self, first: Gray, last: Gray, first_to_middle: Dense, middle_to_last: Dense) -> Dense:
+        """Follow one flow, then the other; keep per place that or a search on the finest level from there."""
+        guess = first_to_middle + _sampled(middle_to_last, self._pixel + first_to_middle)
+        return self._better(first, last, [guess, self._searched(self._fine, first, last, guess)])
 
-    def _judged(self, flow: Float[np.ndarray, "height width 2"], back: Float[np.ndarray, "height width 2"]) -> Flow:
-        """Attach exp(-error / tolerance), where error is how far going there and back misses; 0 outside the picture."""
-        target_px = self.grid_px + flow
-        cell = (target_px / STRIDE_PX - 0.5).astype(np.float32)
-        there = cv2.remap(back, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        error_px = np.linalg.norm(flow + there, axis=-1)
-        inside = ((target_px >= 0) & (target_px <= np.array(self._size[::-1]))).all(-1)
+    def judged(self, flow: Dense, back: Dense) -> Flow:
+        """Bring one flow to the stored grid, with exp(-error / tolerance) as confidence.
+
+        The error is how far going there and back misses; what leaves the picture gets 0.
+        """
+        flow_px, back_px = self._on_grid(flow), self._on_grid(back)
+        target_px = self.grid_px + flow_px
+        error_px = np.linalg.norm(flow_px + _sampled(back_px, target_px / STRIDE_PX - 0.5), axis=-1)
+        inside = ((target_px >= 0) & (target_px <= np.array(self._color_size[::-1]))).all(-1)
         confidence = np.where(inside, np.exp(-error_px / self._tolerance_px), 0)
-        return Flow(flow[None].astype(np.float16), np.rint(255 * confidence)[None].astype(np.uint8))
+        return Flow(flow_px[None].astype(np.float16), np.rint(255 * confidence)[None].astype(np.uint8))
+
+    def _better(self, first: Gray, second: Gray, candidates: Sequence[Dense]) -> Dense:
+        """Keep the first candidate but where the second one clearly makes the pictures look more alike."""
+        first, second = (
+            cv2.resize(gray, self.dense_size[::-1], interpolation=cv2.INTER_AREA) for gray in (first, second)
+        )
+        mismatch = []
+        for candidate in candidates:
+            difference = cv2.absdiff(_sampled(second, self._pixel + candidate), first).astype(np.float32)
+            mismatch.append(cv2.blur(np.minimum(difference, MATCH_CLIP), (MATCH_WINDOW_PX, MATCH_WINDOW_PX)))
+        return np.where((mismatch[1] + MATCH_MARGIN < mismatch[0])[..., None], candidates[1], candidates[0])
+
+    def _searched(self, search: cv2.DISOpticalFlow, first: Gray, second: Gray, guess: Dense | None = None) -> Dense:
+        start = None if guess is None else 2 * cv2.resize(guess, first.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        return cv2.resize(search.calc(first, second, start), self.dense_size[::-1], interpolation=cv2.INTER_AREA) / 2
+
+    def _on_grid(self, dense: Dense) -> Float[np.ndarray, "height width 2"]:
+        return _sampled(dense, self.grid_px / self._color_per_dense - 0.5) * self._color_per_dense
+
+
+def flows(
+    gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimator: Estimator
+) -> Iterator[tuple[int, Flow, Flow]]:
+    """Yield (gap, forward, backward) for gaps that double from 1; ``gray(i)`` gives frame i reduced.
+
+    Entry i of both directions belongs to frames i and i + gap; both are empty when the clip is too short.
+    """
+    assert list(gaps) == [2**power for power in range(len(gaps))], gaps
+    before: list[tuple[Dense, Dense]] = []
+    for gap in gaps:
+        now, judged = [], []
+        for i in range(frames - gap):
+            first, last = gray(i), gray(i + gap)
+            if gap == 1:
+                there, back = estimator.neighbours(first, last), estimator.neighbours(last, first)
+            else:
+                (there_1, back_1), (there_2, back_2) = before[i], before[i + gap // 2]
+                there = estimator.chained(first, last, there_1, there_2)
+                back = estimator.chained(last, first, back_2, back_1)
+            now.append((there.astype(np.float16), back.astype(np.float16)))
+            judged.append((estimator.judged(there, back), estimator.judged(back, there)))
+        before = now
+        yield gap, *(_stacked([pair[way] for pair in judged], estimator) for way in (0, 1))
 
 
 def grid_centers(color_size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
     """Return the pixel positions (x, y) of the stored vectors for pictures of (height, width)."""
-    x, y = np.meshgrid(*(np.arange(side // STRIDE_PX) * STRIDE_PX + STRIDE_PX / 2 for side in color_size[::-1]))
-    return np.stack([x, y], axis=-1).astype(np.float32)
+    return (_index_grid(*(side // STRIDE_PX for side in color_size)) + 0.5) * STRIDE_PX
 
 
-def flow_of_gap(
-    gray: Callable[[int], UInt8[np.ndarray, "working_height working_width"]],
-    frames: int,
-    gap: int,
-    estimator: Estimator,
-) -> tuple[Flow, Flow]:
-    """Estimate flow between all frames ``gap`` apart; ``gray(i)`` gives frame i reduced.
-
-    Returns (forward, backward); entry i of both belongs to frames i and i + gap. Empty when the clip is too short.
-    """
-    pairs = [estimator.between(gray(i), gray(i + gap)) for i in range(frames - gap)]
-    return tuple(_stacked([pair[way] for pair in pairs], estimator) for way in (0, 1))
+def _index_grid(height: int, width: int) -> Float[np.ndarray, "height width 2"]:
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
 
 
-def _stacked(flows: list[Flow], estimator: Estimator) -> Flow:
+def _sampled(image: np.ndarray, index: Float[np.ndarray, "height width 2"]) -> np.ndarray:
+    """Read an image between its pixels at (x, y) indices; beyond the border it goes on as it ends."""
+    image = image.astype(np.float32) if image.dtype == np.float16 else image
+    index = index.astype(np.float32)
+    return cv2.remap(image, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _stacked(parts: list[Flow], estimator: Estimator) -> Flow:
     height, width = estimator.grid_px.shape[:2]
-    if not flows:
+    if not parts:
         return Flow(np.zeros((0, height, width, 2), np.float16), np.zeros((0, height, width), np.uint8))
-    return Flow(np.concatenate([flow.flow for flow in flows]), np.concatenate([flow.confidence for flow in flows]))
+    return Flow(np.concatenate([part.flow for part in parts]), np.concatenate([part.confidence for part in parts]))
 
 
-def _search(settings: Search) -> cv2.DISOpticalFlow:
+def _search(settings: Search, *, fine_only: bool) -> cv2.DISOpticalFlow:
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    search.setFinestScale(settings.finest_scale)
+    search.setFinestScale(1)
+    if fine_only:
+        search.setCoarsestScale(1)
     search.setPatchStride(settings.patch_stride_px)
     search.setGradientDescentIterations(settings.iterations)
-    search.setVariationalRefinementIterations(settings.refinements)
+    search.setVariationalRefinementIterations(0)
     return search

@@ -62,6 +62,8 @@ class SelfCheck:
     residual_m: float
     """median over pairs of the median depth difference; NaN when nothing could be compared"""
     overlap: float
+    tolerance_m: float
+    """residual that measured depth of this distance allows"""
     reason: str
 
 
@@ -95,7 +97,9 @@ def check_poses(
     tried = {convention: odometry_from_pose(pose, convention) for convention in CONVENTIONS}
     chosen = _moving_pairs(tried[RECORD3D], timestamp_s, pairs)
     if len(chosen) == 0:
-        return SelfCheck("untested", RECORD3D, 0, np.nan, np.nan, "the phone moved too little to test its poses")
+        return SelfCheck(
+            "untested", RECORD3D, 0, np.nan, np.nan, TOLERANCE_M, "the phone moved too little to test its poses"
+        )
     views = {frame: depth_view(frame) for frame in sorted(set(chosen.ravel().tolist()))}
     scores = {
         convention: _score(odometry_from_camera, chosen, views) for convention, odometry_from_camera in tried.items()
@@ -107,6 +111,7 @@ def check_poses(
 class _Score:
     residual_m: float
     overlap: float
+    tolerance_m: float
     accepted: bool
 
     @property
@@ -128,7 +133,7 @@ def _fault_of(pose: Float[np.ndarray, "frame 7"] | None) -> str | None:
 
 
 def _unusable(reason: str) -> SelfCheck:
-    return SelfCheck("unusable", RECORD3D, 0, np.nan, np.nan, reason)
+    return SelfCheck("unusable", RECORD3D, 0, np.nan, np.nan, TOLERANCE_M, reason)
 
 
 def _moving_pairs(
@@ -156,7 +161,12 @@ def _score(
         rows.append(_compare(views[first], views[second], second_from_first))
     residual_m, overlap, tolerance_m = np.array(rows).T
     accepted = (residual_m < tolerance_m) & (overlap > MIN_OVERLAP)
-    return _Score(float(np.median(residual_m)), float(np.median(overlap)), bool(accepted.mean() >= 0.5))
+    return _Score(
+        float(np.median(residual_m)),
+        float(np.median(overlap)),
+        float(np.median(tolerance_m)),
+        bool(accepted.mean() >= 0.5),
+    )
 
 
 def _compare(
@@ -199,4 +209,4 @@ def _judge(scores: dict[Convention, _Score], pairs: int) -> SelfCheck:
 
 
 def _checked(verdict, convention: Convention, score: _Score, pairs: int, reason: str) -> SelfCheck:
-    return SelfCheck(verdict, convention, pairs, score.residual_m, score.overlap, reason)
+    return SelfCheck(verdict, convention, pairs, score.residual_m, score.overlap, score.tolerance_m, reason)

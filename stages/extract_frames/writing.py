@@ -95,7 +95,7 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
         qa.Check("frames dropped for lack of depth", 100 * float((~written.kept).mean()), "%", warn=10.0),
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
         qa.Check("device poses usable", float(plan.odometry_from_camera is not None), "", warn=0.5, better="higher"),
-        qa.Check(f"device poses against depth ({check.reason})", residual_mm, "mm", warn=15.0),
+        qa.Check(f"device poses against depth ({check.reason})", residual_mm, "mm", warn=1000 * check.tolerance_m),
     ]
     pictures = [
         qa.Picture("contact_sheet", written.color_strip, "frames spread over the recording, as understood"),
