@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numba
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.files.clips import Clip
 from pipeline.space import rigid
@@ -37,6 +37,7 @@ class References:
     intrinsics: Float[np.ndarray, "reference 3 3"]
     depth: Float[np.ndarray, "reference height width"]
     nearest: Float[np.ndarray, "reference height width"]
+    color: UInt8[np.ndarray, "reference height width 3"]
     frame: Int[np.ndarray, "reference"]
 
 
@@ -48,6 +49,8 @@ class Votes:
     occupied: Int[np.ndarray, "*shape"]
     gap_m: Float[np.ndarray, "*shape"]
     """how far the references' surfaces lie behind the point, mean over those that agree within the margin"""
+    color: Float[np.ndarray, "*shape 3"]
+    """mean colour (0..255) of those surfaces"""
 
 
 def usable_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
@@ -63,7 +66,13 @@ def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], option
     frames = np.unique(np.linspace(0, len(clip) - 1, min(options.references, len(clip))).round().astype(int))
     depth = np.stack([usable_depth(clip, frame) for frame in frames])
     nearest = np.stack([_nearest(picture, clip.depth_intrinsics[frame, 0, 0], options) for picture, frame in zip(depth, frames, strict=True)])
-    return References(rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames], depth, nearest, frames)
+    color = np.stack([soft_color(clip.color(frame), clip.depth_size) for frame in frames])
+    return References(rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames], depth, nearest, color, frames)
+
+
+def soft_color(color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "new_height new_width 3"]:
+    """Resize to (height, width) and blur a little, so that colours compare in spite of small pose errors."""
+    return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), 1.2)
 
 
 def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], options: FreeSpace, frame: int) -> Votes:
@@ -77,10 +86,11 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], op
         pinhole[other],
         references.depth[other],
         references.nearest[other],
+        references.color[other],
         np.float32(options.margin_m),
         np.float32(options.margin_share),
     )
-    votes = [np.zeros(known.shape, values.dtype) for values in judged]
+    votes = [np.zeros(known.shape + values.shape[1:], values.dtype) for values in judged]
     for whole, values in zip(votes, judged, strict=True):
         whole[known] = values
     return Votes(*votes)
@@ -96,9 +106,10 @@ def _nearest(depth: Float[np.ndarray, "height width"], focal_px: float, options:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _vote(points, camera_from_world, pinhole, depth, nearest, margin_m, margin_share):
+def _vote(points, camera_from_world, pinhole, depth, nearest, color, margin_m, margin_share):
     count, (height, width) = len(points), depth.shape[1:]
     free, occupied, gap = np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros(count, np.float32)
+    mean = np.zeros((count, 3), np.float32)
     for r in range(len(depth)):
         m, k = camera_from_world[r], pinhole[r]
         for i in range(count):
@@ -117,7 +128,11 @@ def _vote(points, camera_from_world, pinhole, depth, nearest, margin_m, margin_s
             elif abs(difference) < margin:
                 occupied[i] += 1
                 gap[i] += difference
+                for channel in range(3):
+                    mean[i, channel] += color[r, v, u, channel]
     for i in range(count):
         if occupied[i] > 0:
             gap[i] /= occupied[i]
-    return free, occupied, gap
+            for channel in range(3):
+                mean[i, channel] /= occupied[i]
+    return free, occupied, gap, mean

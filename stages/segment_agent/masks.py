@@ -14,7 +14,7 @@ from stages.segment_agent.free_space import FreeSpace
 from stages.segment_agent.movers import Hint, Mover
 from stages.segment_agent.prompt import Prompt
 from stages.segment_agent.refine import Refinement
-from stages.segment_agent.segment import Mask, find_mover, judge_motion, learn_palette, paint
+from stages.segment_agent.segment import Mask, Weighing, find_mover, judge_motion, learn_palette, paint
 from stages.segment_agent.trajectory import Trajectory, steady
 from stages.segment_agent.turnaround import Turnaround, find_standing, meeting_point
 
@@ -29,6 +29,8 @@ class Options:
     """How other frames judge a point."""
     mover: Mover = field(default_factory=Mover)
     """What an animal may be like and how it moves."""
+    weighing: Weighing = field(default_factory=Weighing)
+    """What observations of a session are worth."""
     turnaround: Turnaround = field(default_factory=Turnaround)
     """How a standing animal is told from its ground."""
     refinement: Refinement = field(default_factory=Refinement)
@@ -48,7 +50,7 @@ def segment(
         case "session":
             references = free_space.gather(clip, poses, options.free_space)
             balls = find_mover(clip, poses, references, options.free_space, options.mover, None if place is None else Hint(hint.frame, place))
-            judge = judge_motion(references, options.free_space, options.mover)
+            judge = judge_motion(references, options.free_space, options.mover, options.weighing)
         case _:
             assert_never(role)
     palette = learn_palette(clip, poses, balls, judge, options.refinement)

@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float, UInt8
 class Refinement:
     """How evidence becomes a mask."""
 
-    color_weight: float = 1.4
+    color_weight: float = 0.7
     """log-odds per unit of the colours' log-ratio"""
     radius_px: int = 2
     """reach of the edge-preserving filter at working resolution"""
-    edge: float = 0.02
+    edge: float = 0.1
     """colour variance (0..1 squared) below which the filter smooths"""
     unsure: float = 0.4
     """log-odds below which a pixel at the boundary is unknown"""

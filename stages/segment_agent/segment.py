@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
 from stages.segment_agent import free_space, movers, refine
-from stages.segment_agent.free_space import FreeSpace, References
+from stages.segment_agent.free_space import FreeSpace, References, Votes
 from stages.segment_agent.movers import Hint, Mover
 from stages.segment_agent.refine import Palette, Refinement
 from stages.segment_agent.windows import Sphere, Window, cut, working_size
@@ -40,6 +40,24 @@ class Mask:
     confidence: float
 
 
+@dataclass(frozen=True)
+class Weighing:
+    """Log-odds that observations of a session are worth."""
+
+    moving: float = 3.0
+    """a point in space that is free at other times"""
+    room: float = 3.0
+    """a point on a surface that other frames saw"""
+    step_m: float = 0.022
+    """step in front of that surface that speaks neither way"""
+    step_spread_m: float = 0.008
+    """step that is worth one more"""
+    recolored: float = 1.0
+    """each time the noise by which such a surface's colour differs"""
+    distrusted: float = 0.5
+    """certainty of depth of low confidence or at a step; 1 is that of all other depth"""
+
+
 Judge = Callable[[int, Window, Sphere], Evidence]
 
 
@@ -59,12 +77,16 @@ def find_mover(
     choice = movers.track(found, clip.timestamp_s, mover, hint)
     chosen = [group[index] if index >= 0 else None for group, index in zip(found, choice, strict=True)]
     radii = [candidate.radius_m for candidate in chosen if candidate]
-    radius = float(np.clip(1.4 * np.quantile(radii, 0.9), 0.15, mover.largest_m)) if radii else 0.0
+    radius = float(np.clip(1.8 * np.quantile(radii, 0.9), 0.15, mover.largest_m)) if radii else 0.0
     return [Sphere(candidate.centre_world, radius) if candidate else None for candidate in chosen]
 
 
-def judge_motion(references: References, free: FreeSpace, mover: Mover) -> Judge:
-    """Evidence for sessions: free at other times is animal; on a surface that others saw is room, less so a step above it."""
+def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing: Weighing) -> Judge:
+    """Evidence for sessions: free at other times is animal; on a surface that others saw is room.
+
+    On such a surface a step towards the camera or another colour than the others saw there speaks for the animal: paws
+    and tails are too thin for the depth sensor.
+    """
 
     def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
         votes = free_space.vote(references, window.points_world, free, frame)
@@ -72,13 +94,28 @@ def judge_motion(references: References, free: FreeSpace, mover: Mover) -> Judge
         near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
         animal = movers.moving(votes, mover) & near
         settled = known & ~animal & (votes.occupied > 0)
-        log_odds = np.where(animal, 3.0, 0.0)
-        log_odds[settled] = np.clip((votes.gap_m[settled] - 0.016) / 0.005, -3, 1)
-        log_odds[known & ~near] = -3.0
-        certainty = np.where(animal | settled | (known & ~near), 1.0, 0.05)
-        return Evidence(log_odds, certainty, animal, log_odds <= -2)
+        step = np.clip((votes.gap_m - weighing.step_m) / weighing.step_spread_m, -weighing.room, 1)
+        log_odds = np.where(animal, weighing.moving, np.where(settled, step + weighing.recolored * recolored(window, votes, settled), 0.0))
+        log_odds[known & ~near] = -weighing.room
+        certainty = np.where(animal | settled | (known & ~near), np.where(window.trusted, 1.0, weighing.distrusted), 0.05)
+        return Evidence(log_odds, certainty, animal & window.trusted, log_odds <= -0.66 * weighing.room)
 
     return judge
+
+
+def recolored(window: Window, votes: Votes, settled: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Return by how many times the noise (0..6) a surface shows another colour than at other times, shadows taken out.
+
+    A shadow or a changed exposure scales all channels alike, and a shadow only darkens.
+    """
+    if settled.sum() < 50:
+        return np.zeros(settled.shape)
+    now = cv2.GaussianBlur(window.color, (5, 5), 1.2).astype(np.float32)
+    before = votes.color * np.median((now[settled] + 4) / (votes.color[settled] + 4), axis=0)
+    scale = np.clip((now * before).sum(-1) / np.maximum((before**2).sum(-1), 1), 0.5, 1.0)
+    difference = np.linalg.norm(now - scale[..., None] * before, axis=-1)
+    noise = max(float(np.median(difference[settled])), 3.0)
+    return np.where(settled, np.clip(difference / noise - 3, 0, 6), 0)
 
 
 def learn_palette(clip: Clip, world_from_camera: np.ndarray, balls: list[Sphere | None], judge: Judge, options: Refinement, pictures: int = 30) -> Palette:

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from pipeline.errors import InputError
 from pipeline.files.clips import Clip
-from pipeline.space import cameras, rigid
+from pipeline.space import rigid
 from pipeline.space.depth_alignment import depth_view
+from pipeline.space.ground import Ground, fit_ground
 from stages.segment_agent.free_space import usable_depth
 from stages.segment_agent.segment import Evidence, Judge
 from stages.segment_agent.windows import Sphere, Window
@@ -32,20 +33,10 @@ class Turnaround:
     """size of the cluster's cells"""
     clearance_m: float = 0.03
     """height above the ground from which points surely do not belong to it"""
+    foot_m: float = 0.008
+    """height above the ground from which a point under the body is rather a paw than ground"""
     least_hits: int = 3
     """pictures that must have seen a point in a cell"""
-
-
-@dataclass(frozen=True)
-class Ground:
-    """The level surface under the animal: ``height(x, z) = offset + slope . (x, z)`` in a world with +y up."""
-
-    offset_m: float
-    slope: Float[np.ndarray, "2"]
-
-    def above(self, points_world: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape"]:
-        """Return heights above the ground."""
-        return points_world[..., 1] - self.offset_m - points_world[..., [0, 2]] @ self.slope
 
 
 @dataclass(frozen=True)
@@ -71,7 +62,7 @@ def find_standing(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"],
     """
     chosen = np.unique(np.linspace(0, len(clip) - 1, options.pictures).astype(int))
     points, level = _points_near(clip, world_from_camera, focus, options, chosen)
-    ground = fit_ground(points[level], focus, options)
+    ground = fit_ground(points[level], focus)
     cluster = find_cluster(points[ground.above(points) > options.clearance_m], focus, options)
     if not cluster.cells.any():
         raise InputError("MSK-003", "nothing stands where the cameras look", str(clip.folder), "circle the resting animal with the phone pointed at it, or give a hint")
@@ -93,23 +84,8 @@ def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np
     return point
 
 
-def fit_ground(points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], options: Turnaround) -> Ground:
-    """Fit the level surface below the focus that most upward-facing points near it lie on."""
-    aside = np.linalg.norm((points_world - focus)[:, [0, 2]], axis=1)
-    height = points_world[:, 1]
-    weight = np.exp(-((aside / 0.5) ** 2)) * (height < focus[1] + 0.05)
-    counts, edges = np.histogram(height, np.arange(height.min() - 0.02, height.max() + 0.04, 0.02), weights=weight)
-    offset, slope = edges[counts.argmax()] + 0.01, np.zeros(2)
-    for band in (0.05, 0.03, 0.02):
-        close = np.abs(height - offset - points_world[:, [0, 2]] @ slope) < band
-        design = np.column_stack([points_world[close][:, [0, 2]], np.ones(close.sum())]) * weight[close, None]
-        solution = np.linalg.lstsq(design, height[close] * weight[close], rcond=None)[0]
-        slope, offset = solution[:2], solution[2]
-    return Ground(float(offset), slope)
-
-
 def find_cluster(points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], options: Turnaround) -> Cluster:
-    """Gather points into cells and keep the connected group that is large and near the focus, grown by one cell."""
+    """Gather points into cells and keep the connected group that is large and near the focus, grown by two cells."""
     reach = options.reach_m + 2 * options.voxel_m
     origin, count = focus - reach, int(np.ceil(2 * reach / options.voxel_m))
     at = np.floor((points_world - origin) / options.voxel_m).astype(int)
@@ -122,7 +98,7 @@ def find_cluster(points_world: Float[np.ndarray, "point 3"], focus: Float[np.nda
     nearness = np.exp(-((np.linalg.norm(centre - focus, axis=1) / 0.25) ** 2))
     score = np.bincount(group[filled], nearness, minlength=groups + 1)
     own = (group == score.argmax()) & filled
-    return Cluster(scipy.ndimage.binary_dilation(own, around), origin, options.voxel_m)
+    return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, options.voxel_m)
 
 
 def _points_near(clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, options: Turnaround, frames: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -148,9 +124,9 @@ def _judge(cluster: Cluster, ground: Ground, options: Turnaround) -> Judge:
         beneath = window.points_world.copy()  # feet: cells begin at the clearance, look one up
         beneath[..., 1] += options.clearance_m
         held |= cluster.holds(beneath)
-        log_odds = np.where(held, np.clip((height - 0.015) / 0.004, -3, 3), -3.0)
+        log_odds = np.where(held, np.clip((height - options.foot_m) / 0.004, -3, 3), -3.0)
         log_odds[~known] = 0.0
-        certainty = np.where(known, 1.0, 0.05)
-        return Evidence(log_odds, certainty, known & (log_odds > 2), log_odds <= -2)
+        certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), 0.05)
+        return Evidence(log_odds, certainty, window.trusted & (log_odds > 2), log_odds <= -2)
 
     return judge

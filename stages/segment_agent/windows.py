@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
@@ -28,6 +28,8 @@ class Window:
     color: UInt8[np.ndarray, "height width 3"]
     points_world: Float[np.ndarray, "height width 3"]
     """NaN where depth is unknown"""
+    trusted: Bool[np.ndarray, "height width"]
+    """where depth is neither of low confidence nor at a step"""
 
 
 def working_size(clip: Clip, height_px: int) -> tuple[int, int]:
@@ -55,9 +57,9 @@ def cut(clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], bal
     if size != clip.color_size:
         color = cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
     grid = cameras.pixel_grid(*size)[rows, columns]
-    known = usable_depth(clip, frame)
-    at = np.floor(grid * [known.shape[1] / size[1], known.shape[0] / size[0]]).astype(int)
-    z = known[at[..., 1], at[..., 0]]
+    at = np.floor(grid * [clip.depth_size[1] / size[1], clip.depth_size[0] / size[0]]).astype(int)
+    z = clip.depth(frame)[at[..., 1], at[..., 0]]
+    trusted = usable_depth(clip, frame)[at[..., 1], at[..., 0]] > 0
     points = rigid.apply(world_from_camera, (cameras.unproject(grid, intrinsics) * z[..., None]).reshape(-1, 3)).reshape(*z.shape, 3)
     points[z == 0] = np.nan
-    return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points)
+    return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points, trusted)
