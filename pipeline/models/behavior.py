@@ -201,11 +201,16 @@ def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
 
 
 def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15)."""
-    first = columns[..., :3] / np.linalg.norm(columns[..., :3], axis=-1, keepdims=True).clip(1e-6)
+    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15); parallel columns give one of many."""
+    first = _normalized(columns[..., :3])
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
-    second = second / np.linalg.norm(second, axis=-1, keepdims=True).clip(1e-6)
+    parallel = np.linalg.norm(second, axis=-1, keepdims=True) < 1e-4
+    second = _normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + [0.3, 0.2, 0.1]), second))
     return np.stack([first, second, np.cross(first, second)], axis=-1)
+
+
+def _normalized(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True).clip(1e-9)
 
 
 def channels_from_bones(

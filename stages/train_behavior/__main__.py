@@ -57,9 +57,8 @@ def run(task: cli.Task) -> None:
     reaction = reactions.measure(sampler, moments.observation, radius_m=c.observer_radius_m, seed=c.seed)
     progress.log(f"an approaching observer shifts goals {reaction.away_m:.2f} m away, a far one {reaction.far_m:.3f} m")
     with task.create() as folder:
-        difference = export.write_model(
-            folder, fitted.nets, architecture, fitted.scaling, Schedule(), data.agent_from_bone_rest
-        )
+        export.write_contract(folder, fitted.nets, architecture, fitted.scaling, Schedule(), data.agent_from_bone_rest)
+        difference = export.write_networks(folder, fitted.nets, architecture)
         qa.write(
             folder,
             good="goals that spread over where the animal could go and shift away from a close observer",

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import convolve1d
 from torch import Tensor
 
-from pipeline.models.behavior import Architecture, Scaling, channels_from_bones
+from pipeline.models.behavior import Architecture, Scaling, channels_from_bones, rotation_to_6d
 from pipeline.models.perception import FeatureVolume, grid_points_ego, world_from_ego
 from pipeline.models.trajectories import PAST, BehaviorData
 from pipeline.space import rigid, rigid_torch
@@ -123,15 +123,21 @@ def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], arch
     return Windows(*(torch.from_numpy(array.astype(np.float32)) for array in arrays), torch.from_numpy(rows))
 
 
-def scaling_from_windows(windows: Windows) -> Scaling:
-    """Fit the scales of goal, path (per frame; both horizontal axes alike) and body (per channel, with floors)."""
+def scaling_from_windows(windows: Windows, yaw_rad: float = 0.0) -> Scaling:
+    """Fit the scales of goal, path (per frame; both horizontal axes alike) and body (per channel, with floors).
+
+    The body's root rotation is scaled for ego frames that are turned by up to ``yaw_rad`` either way.
+    """
     future = windows.root[:, PAST:].double().numpy()
     level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(0.02)
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
-    body = body_channels(windows.rotation[:, PAST:], windows.bones[windows.frame[:, PAST:]]).double().numpy()
-    floor = np.concatenate([np.full(6, 0.05), np.tile([0.05] * 3 + [0.01] * 3, (body.shape[-1] - 6) // 6)])
-    return Scaling(path_std[:, -1], path_std, body.mean((0, 1)), np.maximum(body.std((0, 1)), floor))
+    turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, yaw_rad, 0])
+    root = rotation_to_6d(turns[:, None, None] @ windows.rotation[::4, PAST::4].double().numpy()).reshape(-1, 6)
+    bones = windows.bones[windows.frame[:, PAST:].unique()].double().numpy()
+    floor = np.concatenate([np.full(6, 0.05), np.tile([0.05] * 3 + [0.01] * 3, bones.shape[-1] // 6)])
+    mean, std = (np.concatenate([getattr(root, name)(0), getattr(bones, name)(0)]) for name in ("mean", "std"))
+    return Scaling(path_std[:, -1], path_std, mean, np.maximum(std, floor))
 
 
 def past_statistics(windows: Windows) -> tuple[Float[Tensor, "channel"], Float[Tensor, "channel"]]:

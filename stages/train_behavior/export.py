@@ -11,8 +11,16 @@ import onnxruntime
 import torch
 from safetensors.torch import save_file
 
-from pipeline.models.behavior import Architecture, BehaviorNets, Observation, Sampler, Sampling, Scaling, TorchNetworks
-from pipeline.models.behavior import contract as contract_of
+from pipeline.models.behavior import (
+    Architecture,
+    BehaviorNets,
+    Observation,
+    Sampler,
+    Sampling,
+    Scaling,
+    TorchNetworks,
+    contract,
+)
 from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.trajectories import FUTURE, PAST
@@ -20,18 +28,24 @@ from pipeline.models.trajectories import FUTURE, PAST
 NETWORKS = ("perception", "goal", "path", "body")
 
 
-def write_model(
+def write_contract(
     folder: Path, nets: BehaviorNets, architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: np.ndarray
-) -> float:
-    """Write everything a sampler needs. Return the largest difference between ONNX and torch."""
+) -> None:
+    """Write weights, `behavior.json` and `golden.json`."""
     save_file({name: value.contiguous() for name, value in nets.state_dict().items()}, folder / "behavior.safetensors")
-    document = contract_of(architecture, scaling, schedule, rest)
+    document = contract(architecture, scaling, schedule, rest)
     (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
-    for name in NETWORKS:
-        export_network(getattr(nets, name), folder / f"{name}.onnx", *_signature(name, architecture))
     golden = golden_plan(Sampler(TorchNetworks(nets), schedule, scaling), architecture)
     (folder / "golden.json").write_text(json.dumps(golden) + "\n")
-    return _largest_difference(folder, nets, architecture)
+
+
+def write_networks(folder: Path, nets: BehaviorNets, architecture: Architecture) -> float:
+    """Write the four ONNX files. Return the largest difference between ONNX and torch."""
+    for name in NETWORKS:
+        export_network(getattr(nets, name), folder / f"{name}.onnx", *signature(name, architecture))
+    return max(
+        difference(getattr(nets, name), folder / f"{name}.onnx", signature(name, architecture)[0]) for name in NETWORKS
+    )
 
 
 def export_network(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]], output: str) -> None:
@@ -65,7 +79,7 @@ def export_network(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[
     onnx.checker.check_model(str(path))
 
 
-def _signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], str]:
+def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], str]:
     """Return the inputs of a network (name and shape without batch) and the name of its output."""
     step: dict[str, tuple[int, ...]] = {"t": (), "condition": (a.condition,)}
     match name:
@@ -133,18 +147,14 @@ def _plain(array: np.ndarray) -> list:
     return np.round(array[0].astype(np.float64), 7).tolist()
 
 
-def _largest_difference(folder: Path, nets: BehaviorNets, architecture: Architecture) -> float:
-    worst, rng = 0.0, np.random.default_rng(0)
-    for name in NETWORKS:
-        shapes, _ = _signature(name, architecture)
-        inputs = {key: rng.standard_normal((3, *shape), dtype=np.float32) for key, shape in shapes.items()}
-        session = onnxruntime.InferenceSession(
-            folder / f"{name}.onnx", _one_thread(), providers=["CPUExecutionProvider"]
-        )
-        with torch.inference_mode():
-            expected = getattr(nets, name)(*(torch.from_numpy(value) for value in inputs.values())).numpy()
-        worst = max(worst, float(np.abs(session.run(None, inputs)[0] - expected).max()))
-    return worst
+def difference(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]]) -> float:
+    """Return how far an ONNX file is from its network on random inputs."""
+    rng = np.random.default_rng(0)
+    drawn = {name: rng.standard_normal((3, *shape), dtype=np.float32) for name, shape in inputs.items()}
+    session = onnxruntime.InferenceSession(path, _one_thread(), providers=["CPUExecutionProvider"])
+    with torch.inference_mode():
+        expected = module(*(torch.from_numpy(value) for value in drawn.values())).numpy()
+    return float(np.abs(session.run(None, drawn)[0] - expected).max())
 
 
 def _one_thread() -> onnxruntime.SessionOptions:

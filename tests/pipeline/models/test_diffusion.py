@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.models.denoisers import ControlUNet, GoalMLP
+from pipeline.models.diffusion import Schedule, guided, noised, sample
+
+SCHEDULE = Schedule()
+
+
+def perfect(mean: float, std: float):
+    """The noise that a perfect network predicts when the data are N(mean, std^2)."""
+
+    def denoise(x, t):
+        share = SCHEDULE.alpha_bar[int(t)]
+        clean = mean + np.sqrt(share) * std**2 / (share * std**2 + 1 - share) * (x - np.sqrt(share) * mean)
+        return (x - np.sqrt(share) * clean) / np.sqrt(1 - share)
+
+    return denoise
+
+
+@pytest.mark.parametrize(("method", "count", "tolerance"), [("ddpm", 50, 0.06), ("ddim", 50, 0.05), ("ddim", 10, 0.12)])
+def test_samplers_reproduce_a_gaussian(method, count, tolerance):
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal(20000)
+    x = sample(perfect(0.7, 0.5), noise, SCHEDULE, method=method, count=count, draw=lambda: rng.standard_normal(20000))
+    assert abs(x.mean() - 0.7) < tolerance  # 50 steps of the posterior's variance narrow, few large ones blur
+    assert abs(x.std() - 0.5) < tolerance
+
+
+def test_noising_keeps_unit_variance():
+    rng = np.random.default_rng(0)
+    clean, noise = rng.standard_normal((2, 100000))
+    assert noised(clean, noise, 0.3).std() == pytest.approx(1, abs=0.01)
+
+
+def test_schedule_ends_in_noise_and_every_sampler_visits_both_ends():
+    assert SCHEDULE.alpha_bar[0] > 0.999
+    assert SCHEDULE.alpha_bar[-1] < 0.01
+    for count in (4, 10, 50):
+        steps = SCHEDULE.visited(count)
+        assert (steps[0], steps[-1], len(set(steps))) == (49, 0, count)
+
+
+def test_guidance_is_linear_in_its_scale():
+    blend = guided(lambda x, t: x + 3, lambda x, t: x + 1, 0.5)
+    assert blend(0.0, 0) == 2.0
+    assert guided(lambda x, t: 3.0, lambda x, t: 1.0, 1.0)(0.0, 0) == 3.0
+    assert guided(lambda x, t: 3.0, lambda x, t: 1.0, 0.0)(0.0, 0) == 1.0
+
+
+def test_control_enters_every_block_and_can_be_dropped():
+    torch.manual_seed(0)
+    net = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
+    x, t, code = torch.randn(2, 4, 56), torch.tensor([3.0, 40.0]), torch.randn(2, 8)
+    keep, drop = torch.ones(2, 1), torch.zeros(2, 1)
+    first, second = torch.randn(2, 3), torch.randn(2, 3)
+    torch.testing.assert_close(net(x, t, code, first, keep), net(x, t, code, second, keep))  # begins without influence
+    assert len(net.inject) == 5
+    for zero in net.inject:
+        torch.nn.init.normal_(zero.weight)
+    assert (net(x, t, code, first, keep) - net(x, t, code, second, keep)).abs().max() > 1e-3
+    torch.testing.assert_close(net(x, t, code, first, drop), net(x, t, code, second, drop))
+    sequence = first[..., None].expand(2, 3, 56)
+    torch.testing.assert_close(net(x, t, code, first, keep), net(x, t, code, sequence, keep))
+
+
+def test_goal_network_learns_where_goals_are():
+    torch.manual_seed(0)
+    net, alpha_bar = GoalMLP(condition=2, hidden=32), torch.from_numpy(SCHEDULE.alpha_bar).float()
+    optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
+    for _ in range(400):
+        code = torch.sign(torch.randn(128, 2))
+        clean = torch.cat([code, code[:, :1]], dim=1) + 0.1 * torch.randn(128, 3)
+        t = torch.randint(50, (128,))
+        noise = torch.randn_like(clean)
+        loss = (net(noised(clean, noise, alpha_bar[t][:, None]), t.float(), code) - noise).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    code = torch.tensor([[1.0, -1.0]]).expand(200, 2)
+    with torch.inference_mode():
+        x = sample(
+            lambda x, t: net(x, torch.full((200,), t), code), torch.randn(200, 3), SCHEDULE, method="ddim", count=10
+        )
+    assert (x.mean(0) - torch.tensor([1.0, -1.0, 1.0])).abs().max() < 0.25

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from pipeline.models.behavior import BehaviorNets, Sampler, Sampling, Scaling, TorchNetworks
+from pipeline.models.diffusion import Schedule
+from pipeline.space import rigid
+from stages.simulate.observers import scripted
+from stages.simulate.rollout import rollout, write_take
+from stages.simulate.simulator import Chaining, Frames, Simulator, blocked_share, faded
+from tests.pipeline.models.wandering import ARCHITECTURE, room, wandering
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    channels = ARCHITECTURE.body_channels
+    mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
+    scaling = Scaling(
+        np.array([0.3, 0.01, 0.3]),
+        np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
+        mean,
+        np.full(channels, 0.05),
+    )
+    volume = room()
+    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)
+    sampling = Sampling(goal_steps=4, sequence_steps=2)
+    return Simulator(
+        sampler, wandering(), volume, volume.occupancy == 0, "yaw", sampling=sampling, chaining=Chaining(candidates=3)
+    )
+
+
+def test_same_seed_same_life_and_it_goes_on(simulator):
+    observer = np.array([0.5, 1.3, 0.5])
+    lives = []
+    for _ in range(2):
+        states = [simulator.reset(seed=4)] + [simulator.step(observer) for _ in range(25)]
+        lives.append(np.stack([state.world_from_agent for state in states]))
+    np.testing.assert_array_equal(*lives)
+    assert np.isfinite(lives[0]).all()
+    assert states[-1].time_s == pytest.approx(2.5)
+    np.testing.assert_allclose(np.linalg.det(lives[0][:, :3, :3]), 1, atol=1e-6)
+    assert states[-1].agent_from_bone.shape == (3, 4, 4)
+
+
+def test_paths_through_walls_count_as_blocked():
+    volume = room()
+    inside = np.tile([0.0, 0.3, 0.0], (56, 1))
+    across = np.linspace([0.0, 0.3, 0.0], [4.0, 0.3, 0.0], 56)
+    share = blocked_share(np.stack([inside, across]), volume, volume.occupancy == 0)
+    assert share[0] == 0
+    assert 0.4 < share[1] < 0.6
+
+
+def test_fading_leaves_the_old_plan_and_reaches_the_new_one():
+    old = Frames(np.tile(np.eye(4), (10, 1, 1)), np.zeros((10, 6)))
+    turned = rigid.make(rigid.rotation_from_vector(np.array([0, 1.0, 0])), np.array([1.0, 0, 0]))
+    new = Frames(np.tile(turned, (10, 1, 1)), np.ones((10, 6)))
+    blend = faded(old, new, 4)
+    np.testing.assert_allclose(blend.root[:5, 0, 3], [0.2, 0.4, 0.6, 0.8, 1.0])
+    angles = rigid.rotation_angle(np.eye(3), blend.root[:5, :3, :3])
+    np.testing.assert_allclose(angles, [0.2, 0.4, 0.6, 0.8, 1.0], atol=1e-9)
+    np.testing.assert_allclose(blend.bones[:, 0], [0.2, 0.4, 0.6, 0.8] + [1.0] * 6)
+    assert faded(Frames(old.root[:0], old.bones[:0]), new, 4) is new
+
+
+@pytest.mark.parametrize("script", ["away", "still", "approach", "circle"])
+def test_observers_move_at_a_walking_pace(script):
+    observer = scripted(script, center=np.array([0.0, 1.4, 0.0]), speed_m_s=1.0)
+    track = np.array([observer(step / 10, np.array([2.0, 0.2, 1.0])) for step in range(100)])
+    assert (np.abs(np.diff(track, axis=0)).max(0) <= 0.1 + 1e-9).all()
+    assert np.ptp(track[:, 1]) == 0
+    if script == "approach":
+        assert np.linalg.norm(track[39] - [2.0, 1.4, 1.0]) == pytest.approx(0.5, abs=0.05)
+
+
+def test_take_is_written_completely(simulator, tmp_path):
+    observer = scripted("circle", center=np.array([0.0, 1.4, 0.0]))
+    take = rollout(simulator, observer, seconds=1.0, seed=0)
+    write_take(tmp_path, take)
+    lines = (tmp_path / "take.csv").read_text().splitlines()
+    assert len(lines) == 1 + 11
+    assert lines[0].startswith("time_s,x,y,z,qw")
+    assert (tmp_path / "take.npz").stat().st_size > 1000

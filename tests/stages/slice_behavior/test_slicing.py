@@ -1,0 +1,98 @@
+import numpy as np
+
+from pipeline.models.trajectories import TEST, TRAIN
+from pipeline.space import rigid
+from stages.slice_behavior.gridding import Motion, smoothed, trajectory_from_motion
+from stages.slice_behavior.windows import allowed_voxels, slice_windows, window_starts
+from tests.pipeline.models.wandering import REST, room, wander
+
+OPTIONS = {"min_confidence": 0.5, "max_gap_s": 0.6, "smooth_s": 0.0}
+
+
+def jittered(rng: np.random.Generator, seconds: float = 20.0) -> Motion:
+    """A steady walk along x with a steady turn, seen at uneven times."""
+    time = np.arange(0, seconds, 0.1) + rng.uniform(-0.03, 0.03, round(seconds * 10))
+    time -= time[0]
+    turn = rigid.rotation_from_vector(np.stack([0 * time, 0.2 * time, 0 * time], axis=-1))
+    agent = rigid.make(turn, np.stack([0.1 * time, 0 * time + 0.2, 0 * time], axis=-1))
+    bones = np.broadcast_to(REST, (len(time), *REST.shape)).copy()
+    camera = rigid.make(
+        np.broadcast_to(np.eye(3), turn.shape), np.stack([0.05 * time, 0 * time + 1, 0 * time], axis=-1)
+    )
+    return Motion(time, camera, agent, bones, np.ones(len(time)))
+
+
+def test_uneven_times_become_even_without_error():
+    trajectory = trajectory_from_motion(jittered(np.random.default_rng(0)), **OPTIONS)
+    np.testing.assert_allclose(np.diff(trajectory.timestamp_s), 0.1, atol=1e-9)
+    assert trajectory.valid.all()
+    np.testing.assert_allclose(trajectory.world_from_agent[:-1, 0, 3], 0.1 * trajectory.timestamp_s[:-1], atol=1e-9)
+    np.testing.assert_allclose(trajectory.world_from_camera[:-1, 0, 3], 0.05 * trajectory.timestamp_s[:-1], atol=1e-9)
+
+
+def test_only_short_gaps_are_bridged_and_doubtful_frames_are_gaps():
+    motion = jittered(np.random.default_rng(0))
+    agent, confidence = motion.world_from_agent.copy(), motion.confidence.copy()
+    agent[50:53] = np.nan
+    confidence[100:120] = 0.1
+    holed = Motion(motion.timestamp_s, motion.world_from_camera, agent, motion.agent_from_bone, confidence)
+    trajectory = trajectory_from_motion(holed, **OPTIONS)
+    assert trajectory.valid[45:60].all()
+    np.testing.assert_allclose(trajectory.world_from_agent[45:60, 0, 3], 0.1 * trajectory.timestamp_s[45:60], atol=1e-9)
+    assert not trajectory.valid[101:119].any()
+    assert trajectory.valid[122:].all()
+    assert np.isfinite(trajectory.world_from_agent).all()
+
+
+def test_an_agent_never_seen_gives_no_valid_time():
+    motion = jittered(np.random.default_rng(0))
+    unseen = Motion(
+        motion.timestamp_s,
+        motion.world_from_camera,
+        motion.world_from_agent * np.nan,
+        motion.agent_from_bone,
+        motion.confidence,
+    )
+    trajectory = trajectory_from_motion(unseen, **OPTIONS)
+    assert not trajectory.valid.any()
+    assert np.isfinite(trajectory.world_from_agent).all()
+
+
+def test_smoothing_takes_jitter_and_keeps_rotations():
+    rng = np.random.default_rng(0)
+    clean = wander(rng).world_from_agent
+    noisy = clean @ rigid.exp(rng.standard_normal((len(clean), 6)) * 0.02)
+    smooth = smoothed(noisy, 1.0)
+    np.testing.assert_allclose(np.linalg.det(smooth[:, :3, :3]), 1, atol=1e-9)
+    error = [np.linalg.norm(track[5:-5, :3, 3] - clean[5:-5, :3, 3], axis=-1).mean() for track in (smooth, noisy)]
+    assert error[0] < 0.7 * error[1]
+
+
+def test_windows_hold_only_valid_frames_of_one_recording():
+    rng = np.random.default_rng(0)
+    trajectories = {name: wander(rng) for name in ("v002", "v003", "v004")}
+    trajectories["v003"].valid[70] = False
+    data = slice_windows(trajectories, frozenset({"v004"}), REST, stride=1)
+    assert len(window_starts(np.ones(120, bool), 1)) == 120 - 63
+    assert (data.video == 0).sum() == 120 - 63
+    assert (data.video == 1).sum() == 7
+    for video, start in zip(data.video, data.start, strict=True):
+        assert trajectories[data.videos[video]].valid[start : start + 64].all()
+    assert {data.videos[v] for v in data.video[data.indices(TEST)]} == {"v004"}
+    assert {data.videos[v] for v in data.video[data.indices(TRAIN)]} == {"v002", "v003"}
+
+
+def test_too_short_a_recording_gives_no_window():
+    assert len(window_starts(np.ones(63, bool), 1)) == 0
+
+
+def test_animal_may_be_where_it_is_free_or_where_it_has_been():
+    volume, trajectory = room(), wander(np.random.default_rng(0))
+    volume.occupancy[22, 4, 22] = 2
+    allowed = allowed_voxels(volume, {}, reach_voxels=2)
+    assert allowed[20, 4, 20] == 1
+    assert allowed[22, 4, 22] == 0
+    assert allowed[0, 4, 20] == 0
+    voxel, _ = volume.voxel(trajectory.world_from_agent[:, :3, 3])
+    volume.occupancy[tuple(voxel.T)] = 1
+    assert allowed_voxels(volume, {"v000": trajectory}, reach_voxels=0)[tuple(voxel.T)].all()

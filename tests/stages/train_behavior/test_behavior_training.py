@@ -1,0 +1,182 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline import fit
+from pipeline.models import behavior
+from pipeline.models.behavior import Sampler, Sampling, TorchNetworks
+from pipeline.models.diffusion import Schedule
+from pipeline.models.perception import GRID_SHAPE
+from pipeline.models.trajectories import TRAIN
+from stages.train_behavior.batches import (
+    Augmentation,
+    SceneSampler,
+    draw_batch,
+    scaling_from_windows,
+    windows_from_data,
+)
+from stages.train_behavior.export import (
+    difference,
+    export_network,
+    golden_observation,
+    golden_plan,
+    signature,
+    write_contract,
+)
+from stages.train_behavior.reactions import Reactions, measure, moments
+from stages.train_behavior.training import Optimization, Settings, initial_nets, train
+from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
+
+PLAIN = Augmentation(yaw_rad=0, mirror=0, observer_m=0, bones=0, hide_bones=0)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return wandering()
+
+
+@pytest.fixture(scope="module")
+def windows(data):
+    return windows_from_data(data, data.indices(TRAIN), ARCHITECTURE)
+
+
+def drawn(windows, augmentation, seed=0):
+    scaling = scaling_from_windows(windows, augmentation.yaw_rad)
+    batch = draw_batch(
+        windows, SceneSampler(room(), 2, "cpu"), scaling, augmentation, 16, torch.Generator().manual_seed(seed)
+    )
+    return batch, scaling
+
+
+def test_targets_have_unit_scale(windows):
+    index = torch.arange(len(windows))
+    scaling = scaling_from_windows(windows)
+    goal = windows.root[index, -1].numpy() / scaling.goal_std
+    assert np.sqrt((goal[:, [0, 2]] ** 2).mean()) == pytest.approx(1, abs=1e-3)
+    path = windows.root[:, 8:].numpy().swapaxes(1, 2) / scaling.path_std
+    np.testing.assert_allclose(np.sqrt((path[:, [0, 2]] ** 2).mean((0, 1)))[5:], 1, atol=1e-3)
+
+
+def test_windows_begin_at_the_origin_facing_forward(windows):
+    assert windows.root[:, 7].abs().max() < 1e-5
+    torch.testing.assert_close(windows.rotation[:, 7], torch.eye(3).expand(len(windows), 3, 3), atol=1e-5, rtol=0)
+
+
+def test_turning_and_mirroring_move_everything_together(windows):
+    plain, _ = drawn(windows, PLAIN)
+    for augmentation in (replace(PLAIN, yaw_rad=3.0), replace(PLAIN, mirror=1.0)):
+        moved, _ = drawn(windows, augmentation)
+        for ours, theirs in ((plain.goal, moved.goal), (plain.path[:, :, 20], moved.path[:, :, 20])):
+            torch.testing.assert_close(ours[:, [0, 2]].norm(dim=1), theirs[:, [0, 2]].norm(dim=1), atol=1e-4, rtol=1e-4)
+            torch.testing.assert_close(ours[:, 1], theirs[:, 1])
+        between = [
+            b.observer_past[:, -3:] - b.goal * torch.from_numpy(scaling_from_windows(windows).goal_std).float()
+            for b in (plain, moved)
+        ]
+        torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
+
+
+def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):
+    plain, _ = drawn(windows, PLAIN)
+    mirrored, _ = drawn(windows, replace(PLAIN, mirror=1.0))
+    assert mirrored.mirrored.all()
+    assert not mirrored.bones_keep.any()
+    torch.testing.assert_close(mirrored.goal[:, 0], -plain.goal[:, 0])
+    same = (mirrored.scene == plain.scene.flip(2)).all(1)
+    assert same.float().mean() > 0.99  # points on the border of two voxels may fall either way
+
+
+def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
+    volume = room()
+    exact = torch.nn.functional.avg_pool3d(torch.from_numpy(volume.around(windows.world_from_ego[:4].numpy())), 2)
+    fast = SceneSampler(volume, 2, "cpu")(windows.world_from_ego[:4], torch.ones(4))
+    assert fast.shape == exact.shape == (4, 16, *(n // 2 for n in GRID_SHAPE))
+    together = torch.stack([exact.flatten(), fast.flatten()])
+    assert torch.corrcoef(together)[0, 1] > 0.9  # one reads smoothed voxels, the other averages eight nearest ones
+
+
+def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
+    settings = Settings(Optimization(steps=8, batch=8, save_every=3))
+    whole = train(data, room(), ARCHITECTURE, Schedule(), settings, seed=3)
+    assert set(whole.record.terms) == {"goal", "path", "body"}
+    assert all(np.isfinite(values).all() for values in whole.record.terms.values())
+    restore = fit._Loop.advance
+
+    def interrupted(self, *arguments):
+        if self.step == 5:
+            raise KeyboardInterrupt
+        return restore(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit._Loop, "advance", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            train(data, room(), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
+    resumed = train(data, room(), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
+    for name, value in whole.nets.state_dict().items():
+        torch.testing.assert_close(resumed.nets.state_dict()[name], value, atol=0, rtol=0)
+
+
+def test_contract_is_whole_and_loads_back(windows, tmp_path):
+    nets, scaling = initial_nets(ARCHITECTURE, windows, 0).eval(), scaling_from_windows(windows)
+    write_contract(tmp_path, nets, ARCHITECTURE, scaling, Schedule(), REST)
+    contract, golden = (json.loads((tmp_path / name).read_text()) for name in ("behavior.json", "golden.json"))
+    assert contract["architecture"]["bones"] == len(contract["bones"]) == 3
+    assert len(golden["plans"]["guidance_1"]["path"]) == 56
+    architecture, loaded, rescaled, schedule, rest = behavior.load(tmp_path)
+    assert architecture == ARCHITECTURE
+    assert schedule == Schedule()
+    np.testing.assert_allclose(rest, REST)
+    assert golden_plan(Sampler(TorchNetworks(loaded), schedule, rescaled), architecture) == golden
+
+
+def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
+    goal = initial_nets(ARCHITECTURE, windows, 0).eval().goal
+    inputs, output = signature("goal", ARCHITECTURE)
+    for name in ("first", "second"):
+        export_network(goal, tmp_path / f"{name}.onnx", inputs, output)
+    assert difference(goal, tmp_path / "first.onnx", inputs) < 1e-5
+    assert (tmp_path / "first.onnx").read_bytes() == (tmp_path / "second.onnx").read_bytes()
+
+
+def test_golden_plan_uses_the_noise_it_names(windows):
+    nets, scaling = initial_nets(ARCHITECTURE, windows, 0).eval(), scaling_from_windows(windows)
+    sampler = Sampler(TorchNetworks(nets), Schedule(), scaling)
+    golden = golden_plan(sampler, ARCHITECTURE)
+
+    class Noted:
+        def __init__(self):
+            self.queue = [np.array([golden["noise"][level]], np.float32) for level in ("goal", "path", "body")]
+
+        def standard_normal(self, shape, dtype):
+            assert self.queue[0].shape == tuple(shape)
+            return self.queue.pop(0)
+
+    plan = sampler.plan(golden_observation(ARCHITECTURE), Sampling("ddim", 10, 10), Noted())
+    np.testing.assert_allclose(plan.path[0], golden["plans"]["guidance_1"]["path"], atol=1e-4)
+
+
+class Timid:
+    """Networks of an animal that goes one metre away from an observer who is nearer than 4 m, with 0.1 m of spread."""
+
+    def perceive(self, scene_grid, observer_past, past, keep):
+        position = observer_past[:, [-3, -1]] * keep[:, 1:2]
+        distance = np.linalg.norm(position, axis=1, keepdims=True)
+        return np.where((distance > 0) & (distance < 4), -position / np.maximum(distance, 1e-6), 0).astype(np.float32)
+
+    def goal(self, x, t, condition):
+        share = Schedule().alpha_bar[int(t[0])]
+        mean = np.stack([condition[:, 0], 0 * condition[:, 0], condition[:, 1]], axis=1)
+        clean = mean + np.sqrt(share) * 0.01 / (share * 0.01 + 1 - share) * (x - np.sqrt(share) * mean)
+        return (x - np.sqrt(share) * clean) / np.sqrt(1 - share)
+
+
+def test_reactions_measure_a_known_animal(data, windows):
+    seen = moments(data, room(), ARCHITECTURE, 3)
+    scaling = replace(scaling_from_windows(windows), goal_std=np.ones(3))
+    measured = measure(Sampler(Timid(), Schedule(), scaling), seen.observation, radius_m=4.0, seed=0)
+    expected = Reactions(away_m=1.0, away_share=1.0, reversal_m=2.0, far_m=0.0, farther_m=0.0)
+    for name, value in vars(expected).items():
+        assert getattr(measured, name) == pytest.approx(value, abs=0.05), name
