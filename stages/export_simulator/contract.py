@@ -31,6 +31,7 @@ def contract(
 ) -> dict[str, Any]:
     """Assemble the table; `behavior` is the sampler's own contract, passed on unchanged."""
     observers = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions])
+    heights = np.concatenate([motion.world_from_agent[:, 1, 3] for motion in motions])
     starts = np.cumsum([0] + [len(motion.timestamp_s) for motion in motions])
     residual_mm = skinning_residual_m * 1000
     return {
@@ -39,7 +40,8 @@ def contract(
         "units": {"length": "m", "time": "s", "angle": "rad"},
         "up": "+y",
         "quaternion": "wxyz",
-        "rows": "a row is a rigid motion: place x y z, quaternion w x y z; a clip's frame is world_from_agent, agent_from_bone of each bone, world_from_camera",
+        "rows": "a row is a rigid motion: place x y z, quaternion w x y z; "
+        "a clip's frame is world_from_agent, agent_from_bone of each bone, world_from_camera",
         "scene": {"floor_m": round(setting.floor_m, 4), "bounds_m": np.round(setting.bounds_m, 4).tolist()},
         "observer": {
             "eye_height_m": round(float(np.median(observers[:, 1]) - setting.floor_m), 4),
@@ -47,6 +49,7 @@ def contract(
         },
         "agent": {
             "bones": list(bone_names),
+            "root_height_m": [round(float(height), 4) for height in np.percentile(heights, [0.5, 99.5])],
             "skinning_residual_mm": {
                 "mean": round(float(residual_mm.mean()), 3),
                 "p99": round(float(np.percentile(residual_mm, 99)), 3),

@@ -26,7 +26,9 @@ def clip_rows(motions: list[Motion]) -> bytes:
     """Write all frames of all clips as float32 rows: root, bones, camera; place and quaternion wxyz each."""
     frames = []
     for motion in motions:
-        poses = np.concatenate([motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]], axis=1)
+        poses = np.concatenate(
+            [motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]], axis=1
+        )
         frames.append(pose_rows(poses))
     return np.concatenate(frames).astype("<f4").tobytes()
 
@@ -37,13 +39,15 @@ def pose_rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*
 
 
 def page(*, contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> str:
-    """Return the whole page; `assets` are the files that differ between builds, by the names that the script asks for."""
+    """Return the whole page; `assets` are what differs between builds, by the names that the script asks for."""
     bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
     texts = {name: packed(content) for name, content in assets.items()}
     texts["simulator"] = packed(json.dumps(contract).encode())
     for name, file in {"worker": "worker.js.gz", "ort.wasm": "ort.wasm.gz"}.items():
         texts[name] = base64.b64encode(bundle.joinpath(file).read_bytes()).decode()
-    tags = [f'<script type="application/octet-stream" id="asset-{name}">{text}</script>' for name, text in texts.items()]
+    tags = [
+        f'<script type="application/octet-stream" id="asset-{name}">{text}</script>' for name, text in texts.items()
+    ]
     script = gzip.decompress(bundle.joinpath("page.js.gz").read_bytes()).decode()
     name = html.escape(str(contract["name"]))
     pieces = {

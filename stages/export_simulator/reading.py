@@ -39,12 +39,18 @@ class Minds:
     """shape, origin and voxel size of `features`"""
     features: bytes
     """half precision, channel first"""
+    allowed: bytes
+    """one byte per voxel: where the animal may be"""
 
 
 def body(reconstruction: Path) -> Body:
     """Read the agent's surface and skin."""
     skin = arrays.load(reconstruction / "skin.npz", names=("weights", "agent_from_bone_rest"))
-    return Body(meshes.read_ply(reconstruction / "agent.ply"), skin["weights"].astype(np.float64), skin["agent_from_bone_rest"].astype(np.float64))
+    return Body(
+        meshes.read_ply(reconstruction / "agent.ply"),
+        skin["weights"].astype(np.float64),
+        skin["agent_from_bone_rest"].astype(np.float64),
+    )
 
 
 def scene(reconstruction: Path) -> Mesh:
@@ -56,12 +62,23 @@ def motions(behavior_data: Path) -> list[Motion]:
     """Read the longest unbroken stretch of every session. Raises InputError EXP-001 where none is long enough."""
     found = []
     for video, track in BehaviorData.load(behavior_data).trajectories.items():
-        whole = Motion(video, track.timestamp_s, track.world_from_agent, track.agent_from_bone.astype(np.float64), track.world_from_camera)
+        whole = Motion(
+            video,
+            track.timestamp_s,
+            track.world_from_agent,
+            track.agent_from_bone.astype(np.float64),
+            track.world_from_camera,
+        )
         frames = longest_run(track.valid)
         if frames.stop - frames.start >= _SHORTEST_CLIP_FRAMES:
             found.append(cut(whole, frames))
     if not found:
-        raise InputError("EXP-001", "no session shows the animal for 1.6 s without a break", str(behavior_data), "record longer sessions that keep the animal in view")
+        raise InputError(
+            "EXP-001",
+            "no session shows the animal for 1.6 s without a break",
+            str(behavior_data),
+            "record longer sessions that keep the animal in view",
+        )
     return found
 
 
@@ -70,17 +87,32 @@ def gaussians(path: Path) -> Float[np.ndarray, "point 62"]:
     data = path.read_bytes()
     head, mark, rows = data.partition(b"end_header\n")
     properties = head.count(b"property float ")
-    if not mark or b"binary_little_endian" not in head or properties != _GAUSSIAN_COLUMNS or len(rows) % (4 * _GAUSSIAN_COLUMNS):
-        raise InputError("ART-021", f"not a file of 3D Gaussians with {_GAUSSIAN_COLUMNS} floats a row", str(path), "rebuild `splats`")
+    if (
+        not mark
+        or b"binary_little_endian" not in head
+        or properties != _GAUSSIAN_COLUMNS
+        or len(rows) % (4 * _GAUSSIAN_COLUMNS)
+    ):
+        raise InputError(
+            "ART-021",
+            f"not a file of 3D Gaussians with {_GAUSSIAN_COLUMNS} floats a row",
+            str(path),
+            "rebuild `splats`",
+        )
     return np.frombuffer(rows, "<f4").reshape(-1, _GAUSSIAN_COLUMNS)
 
 
 def minds(behavior: Path, behavior_data: Path) -> Minds:
     """Read the sampler's contract, the four networks, and the scene's features that they perceive."""
-    table = arrays.load(behavior_data / "volume.npz", names=("features", "origin", "voxel_m"))
+    table = arrays.load(behavior_data / "volume.npz", names=("features", "allowed", "origin", "voxel_m"))
     return Minds(
         behavior=json.loads((behavior / "behavior.json").read_bytes()),
         networks={name: (behavior / f"{name}.onnx").read_bytes() for name in NETWORKS},
-        volume={"shape": list(table["features"].shape), "origin": table["origin"].tolist(), "voxel_m": float(table["voxel_m"])},
+        volume={
+            "shape": list(table["features"].shape),
+            "origin": table["origin"].tolist(),
+            "voxel_m": float(table["voxel_m"]),
+        },
+        allowed=table["allowed"].astype(np.uint8).tobytes(),
         features=table["features"].astype("<f2").tobytes(),
     )

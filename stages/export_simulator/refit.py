@@ -23,8 +23,14 @@ def blend_dual_quaternions(
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
 ) -> Float[np.ndarray, "frame vertex 3"]:
     """Pose the surface as the reconstruction does: dual-quaternion blending with all weights; metres, agent frame."""
-    points, weight, rest = (torch.from_numpy(np.ascontiguousarray(values, np.float32)) for values in (vertices, weights, agent_from_bone_rest))
-    posed = [skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points) for bones in agent_from_bone]
+    points, weight, rest = (
+        torch.from_numpy(np.ascontiguousarray(values, np.float32))
+        for values in (vertices, weights, agent_from_bone_rest)
+    )
+    posed = [
+        skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points)
+        for bones in agent_from_bone
+    ]
     return torch.stack(posed).numpy().astype(np.float64)
 
 
@@ -44,7 +50,10 @@ def refit_weights(
     gram = np.take_along_axis(np.take_along_axis(gram, kept[:, :, None], 1), kept[:, None, :], 2)
     best = _best_on_simplex(gram)
     order = np.argsort(-best, axis=1, kind="stable")
-    joints, best = np.take_along_axis(np.take_along_axis(candidates, kept, 1), order, 1), np.take_along_axis(best, order, 1)
+    joints, best = (
+        np.take_along_axis(np.take_along_axis(candidates, kept, 1), order, 1),
+        np.take_along_axis(best, order, 1),
+    )
     padding = ((0, 0), (0, 4 - best.shape[1]))
     joints, best = np.pad(np.where(best > 0, joints, 0), padding), np.pad(best, padding)
     return joints.astype(np.uint8), best.astype(np.float32)
@@ -65,7 +74,9 @@ def residual_m(
     return distance
 
 
-def _gram(vertices: np.ndarray, candidates: Int[np.ndarray, "vertex k"], posed_from_rest: np.ndarray, posed: np.ndarray) -> Float[np.ndarray, "vertex k k"]:
+def _gram(
+    vertices: np.ndarray, candidates: Int[np.ndarray, "vertex k"], posed_from_rest: np.ndarray, posed: np.ndarray
+) -> Float[np.ndarray, "vertex k k"]:
     """Sum over frames the products of each bone's error: for convex w the squared error is w' G w."""
     gram = np.zeros((len(vertices), candidates.shape[1], candidates.shape[1]))
     for bones, target in zip(posed_from_rest, posed, strict=True):
@@ -75,7 +86,9 @@ def _gram(vertices: np.ndarray, candidates: Int[np.ndarray, "vertex k"], posed_f
     return gram / len(posed)
 
 
-def _descend_on_simplex(gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]) -> Float[np.ndarray, "vertex k"]:
+def _descend_on_simplex(
+    gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]
+) -> Float[np.ndarray, "vertex k"]:
     """Minimise w' G w over convex weights by projected gradient descent."""
     rate = 1.0 / np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-20)[:, None]
     for _ in range(_DESCENT_STEPS):

@@ -16,7 +16,9 @@ def thin(mesh: Mesh, max_faces: int) -> tuple[Mesh, Int[np.ndarray, " vertex"]]:
     if len(mesh.faces) <= max_faces:
         return mesh, np.arange(len(mesh.vertices))
     vertices, faces = fast_simplification.simplify(
-        np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.int32), target_count=max_faces
+        np.ascontiguousarray(mesh.vertices, np.float32),
+        np.ascontiguousarray(mesh.faces, np.int32),
+        target_count=max_faces,
     )
     nearest = cKDTree(mesh.vertices).query(vertices)[1]
     color = None if mesh.color is None else mesh.color[nearest]
@@ -24,7 +26,7 @@ def thin(mesh: Mesh, max_faces: int) -> tuple[Mesh, Int[np.ndarray, " vertex"]]:
 
 
 def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3"]) -> float:
-    """Find the height of the floor: the lowest level that holds a fair share of all upward-facing area below the agent."""
+    """Find the height of the floor: the lowest level with a fair share of the upward area below the agent."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1)
@@ -55,7 +57,7 @@ def facing(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
 
 
 def splat_rows(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> bytes:
-    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation; the faintest go first."""
+    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation."""
     opacity = 1 / (1 + np.exp(-gaussians[:, 54].astype(np.float64)))
     size = np.exp(gaussians[:, 55:58].astype(np.float64))
     sound = np.isfinite(gaussians).all(1) & (opacity >= 1 / 255)

@@ -32,6 +32,7 @@ def write_simulator(folder: Path, made: Made, minds: Minds, name: str) -> float:
         "clips": page.clip_rows(made.motions),
         "splats": made.splat_rows,
         "volume": minds.features,
+        "allowed": minds.allowed,
         **minds.networks,
     }
     text = page.page(contract=about, assets=assets).encode()

@@ -13,11 +13,20 @@ MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
 
 
 def render(
-    *, name: str, chapters: Sequence[Told], judged: Sequence[Judged], figures: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str]
+    *,
+    name: str,
+    chapters: Sequence[Told],
+    judged: Sequence[Judged],
+    figures: Mapping[str, Mapping[str, Any]],
+    reasons: Mapping[str, str],
 ) -> dict[str, str]:
     """Return the text of every page by file name."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("stages.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+        loader=jinja2.PackageLoader("stages.report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
     )
     environment.filters["number"] = number
     shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": MARKS}

@@ -18,7 +18,9 @@ FLAGS = [
 
 
 @contextmanager
-def opened(file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60) -> Iterator[tuple[Page, list[str]]]:
+def opened(
+    file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60
+) -> Iterator[tuple[Page, list[str]]]:
     """Yield the page, once it is ready, and a growing list of everything it did wrong."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
@@ -26,7 +28,12 @@ def opened(file: Path, query: str = "", size: tuple[int, int] = (480, 320), time
         wrong: list[str] = []
         page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("request", lambda request: wrong.append(request.url[:200]) if request.url.split(":")[0] not in ("file", "data", "blob") else None)
+        page.on(
+            "request",
+            lambda request: (
+                wrong.append(request.url[:200]) if request.url.split(":")[0] not in ("file", "data", "blob") else None
+            ),
+        )
         page.goto(file.resolve().as_uri() + query)
         try:
             page.wait_for_function(READY, timeout=timeout_s * 1000)

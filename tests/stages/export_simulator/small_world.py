@@ -31,7 +31,9 @@ def tube(rings: int = 24, sides: int = 12) -> tuple[Mesh, np.ndarray]:
     vertices = np.stack([radius * np.cos(around), radius * np.sin(around), along], -1).reshape(-1, 3)
     corner = np.arange((rings - 1) * sides).reshape(rings - 1, sides)
     beside = np.roll(corner, -1, 1)
-    faces = np.concatenate([np.stack([corner, corner + sides, beside], -1), np.stack([beside, corner + sides, beside + sides], -1)]).reshape(-1, 3)
+    faces = np.concatenate(
+        [np.stack([corner, corner + sides, beside], -1), np.stack([beside, corner + sides, beside + sides], -1)]
+    ).reshape(-1, 3)
     squared = (vertices[:, None, 2] - rest()[None, :, 2, 3]) ** 2
     weights = np.exp(-squared / (2 * 0.06**2))
     color = np.where(np.sin(60 * vertices[:, 2:]) > 0, [214, 150, 92], [238, 214, 180]).astype(np.uint8)
@@ -41,12 +43,21 @@ def tube(rings: int = 24, sides: int = 12) -> tuple[Mesh, np.ndarray]:
 def room() -> Mesh:
     """Floor and four walls, seen from inside, chequered."""
     parts = [_sheet([0, 0, 0], [0, 0, 1], [1, 0, 0], (205, 180, 150), (188, 160, 130))]
-    for normal, along in (([1, 0, 0], [0, 0, -1]), ([-1, 0, 0], [0, 0, 1]), ([0, 0, 1], [1, 0, 0]), ([0, 0, -1], [-1, 0, 0])):
+    for normal, along in (
+        ([1, 0, 0], [0, 0, -1]),
+        ([-1, 0, 0], [0, 0, 1]),
+        ([0, 0, 1], [1, 0, 0]),
+        ([0, 0, -1], [-1, 0, 0]),
+    ):
         center = -HALF_ROOM_M * np.array(normal, float) + [0, HALF_ROOM_M, 0]
         parts.append(_sheet(center, along, [0, 1, 0], (222, 226, 220), (206, 214, 210)))
     start = np.cumsum([0] + [len(part.vertices) for part in parts])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, start[:-1], strict=True)])
-    return Mesh(np.concatenate([part.vertices for part in parts]), faces.astype(np.int32), np.concatenate([part.color for part in parts]))
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        faces.astype(np.int32),
+        np.concatenate([part.color for part in parts]),
+    )
 
 
 def _sheet(center, along, up, first, second, cells: int = 16) -> Mesh:
@@ -55,7 +66,9 @@ def _sheet(center, along, up, first, second, cells: int = 16) -> Mesh:
     row, column = np.meshgrid(np.arange(cells + 1), np.arange(cells + 1), indexing="ij")
     color = np.where(((row // 2 + column // 2) % 2 == 0)[..., None], first, second).reshape(-1, 3).astype(np.uint8)
     at = (row * (cells + 1) + column)[:-1, :-1].reshape(-1)
-    faces = np.concatenate([np.stack([at, at + cells + 1, at + 1], -1), np.stack([at + 1, at + cells + 1, at + cells + 2], -1)])
+    faces = np.concatenate(
+        [np.stack([at, at + cells + 1, at + 1], -1), np.stack([at + 1, at + cells + 1, at + cells + 2], -1)]
+    )
     return Mesh(vertices.reshape(-1, 3).astype(np.float32), faces.astype(np.int32), color)
 
 
@@ -68,8 +81,12 @@ def trajectory(frames: int, seed: int) -> Trajectory:
     world_from_agent = rigid.make(rigid.rotation_from_vector(heading), position)
     phase = 2 * np.pi * time_s[:, None] + np.arange(BONES)
     wag = np.stack([0 * phase, 0.25 * np.sin(phase), 0 * phase, 0.02 * np.sin(phase), 0 * phase, 0 * phase], -1)
-    camera = np.stack([rigid.look_at(np.array([0.2, 1.4, 0.1 * seed]), point, np.array([0.0, 1, 0])) for point in position])
-    return Trajectory(time_s, world_from_agent, (rest() @ rigid.exp(wag)).astype(np.float32), camera, np.ones(frames, bool))
+    camera = np.stack(
+        [rigid.look_at(np.array([0.2, 1.4, 0.1 * seed]), point, np.array([0.0, 1, 0])) for point in position]
+    )
+    return Trajectory(
+        time_s, world_from_agent, (rest() @ rigid.exp(wag)).astype(np.float32), camera, np.ones(frames, bool)
+    )
 
 
 def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[BehaviorNets, Scaling]:
@@ -88,7 +105,12 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         past = torch.zeros(128, 8 * (9 + 6 * BONES))
-        condition = nets.perception.join(still.detach().expand(128, -1), nets.perception.observer(observer.flatten(1), torch.ones(128)), nets.perception.past(past).detach(), torch.ones(128, 3))
+        condition = nets.perception.join(
+            still.detach().expand(128, -1),
+            nets.perception.observer(observer.flatten(1), torch.ones(128)),
+            nets.perception.past(past).detach(),
+            torch.ones(128, 3),
+        )
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
         loss = (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise).square().mean()
@@ -110,18 +132,31 @@ def write(build: Path) -> None:
     body, weights = tube()
     meshes.write_ply(build / "reconstruction/agent.ply", body)
     meshes.write_ply(build / "reconstruction/scene.ply", room())
-    arrays.save(build / "reconstruction/skin.npz", weights=weights.astype(np.float32), agent_from_bone_rest=rest().astype(np.float32), bone_scale_m=np.full((BONES, 3), 0.06, np.float32))
+    arrays.save(
+        build / "reconstruction/skin.npz",
+        weights=weights.astype(np.float32),
+        agent_from_bone_rest=rest().astype(np.float32),
+        bone_scale_m=np.full((BONES, 3), 0.06, np.float32),
+    )
     write_gaussians(build / "splats/scene.ply", room())
     tracks = {f"v{2 + k:03d}": trajectory(120, k) for k in range(2)}
     zeros = np.zeros(2, np.int32)
-    BehaviorData(tracks, rest(), np.arange(2, dtype=np.int32), zeros, np.array([0, 1], np.uint8), tuple(tracks)).save(build / "behavior_data")
+    BehaviorData(tracks, rest(), np.arange(2, dtype=np.int32), zeros, np.array([0, 1], np.uint8), tuple(tracks)).save(
+        build / "behavior_data"
+    )
     rng = np.random.default_rng(0)
     shape = (44, 24, 44)
     arrays.save(
         build / "behavior_data/volume.npz",
-        features=rng.normal(0, 0.1, (16, *shape)).astype(np.float16), occupancy=np.zeros(shape, np.uint8), origin=np.array([-2.2, -0.2, -2.2]), voxel_m=np.array(0.1),
-    )  # fmt: skip
-    architecture = Architecture(bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1, 2), goal_hidden=64)
+        features=rng.normal(0, 0.1, (16, *shape)).astype(np.float16),
+        occupancy=np.zeros(shape, np.uint8),
+        allowed=np.ones(shape, np.uint8),
+        origin=np.array([-2.2, -0.2, -2.2]),
+        voxel_m=np.array(0.1),
+    )
+    architecture = Architecture(
+        bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1, 2), goal_hidden=64
+    )
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
@@ -137,5 +172,12 @@ def write_gaussians(path: Path, mesh: Mesh) -> None:
     rows[:, 58] = 1.0
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *(f"property float {name}" for name in names), "end_header", ""]
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+        "",
+    ]
     path.write_bytes("\n".join(head).encode() + rows.tobytes())

@@ -1,4 +1,4 @@
-"""The page in headless Chromium, from a file: it lives, asks nobody, samples what Python samples, and minds the observer."""
+"""The page in headless Chromium, from a file: it lives, asks nobody, samples as Python does, minds the observer."""
 
 import json
 import shutil
@@ -69,9 +69,17 @@ def _check_reaction(page: browser.Page) -> None:
 
 
 def test_hash_keeps_a_setting(simulator: Path) -> None:
-    with browser.opened(simulator / "index.html", "#interactivity=0.25&samples=16&steps=50&scene=0&aim=0.5,0.5") as (page, wrong):
+    with browser.opened(simulator / "index.html", "#interactivity=0.25&samples=16&steps=50&scene=0&aim=0.5,0.5") as (
+        page,
+        wrong,
+    ):
         settings = page.evaluate("ats.state().settings")
-        assert (settings["interactivity"], settings["samples"], settings["steps"], settings["scene"]) == (0.25, 16, 50, 0)
+        assert (settings["interactivity"], settings["samples"], settings["steps"], settings["scene"]) == (
+            0.25,
+            16,
+            50,
+            0,
+        )
         assert page.evaluate("ats.state().aim") == [0.5, 0.5]
         assert page.input_value("#interactivity") == "0.25"
         assert wrong == []

@@ -33,7 +33,7 @@ class Simulator {
     this.recorded.visible = this.ghost.visible = false;
     this.observer = new Observer(this.contract);
     this.room.scene.add(this.observer.figure);
-    this.overlays = new Overlays(this.room.scene, this.contract.scene.floor_m);
+    this.overlays = new Overlays(this.room.scene, this.contract.scene.floor_m, this.contract.agent.root_height_m[0] - this.contract.scene.floor_m);
     this.map = new Minimap(document.getElementById('minimap'), this.room.picture(256));
     this.clips.each((frame, camera) => {
       this.map.visit('animal', frame[0], frame[2], 0.25);
@@ -122,7 +122,10 @@ class Simulator {
     const time = performance.now();
     const seconds = Math.min(0.25, (time - this.last) / 1000);
     this.last = time;
-    if (this.playing) this.advance(seconds * this.state.speed, seconds);
+    if (this.playing) {
+      this.advance(seconds * this.state.speed, seconds);
+      this.room.attend(this.observer.animal, seconds);
+    }
     this.draw();
   }
 
@@ -156,7 +159,12 @@ class Simulator {
     const epoch = this.epoch;
     const start = Math.floor(this.now);
     this.planStart = this.now;
-    const plan = await this.planner.plan(this.question({ seed: this.state.seed * 1009 + this.turnNumber++ }));
+    let plan;
+    try {
+      plan = await this.planner.plan(this.question({ seed: this.state.seed * 1009 + this.turnNumber++ }));
+    } catch (error) {
+      return panel.status(`cannot plan: ${error.message}`);
+    }
     if (epoch !== this.epoch) return;
     this.waiting = false;
     this.timeline.follow(start, plan.frames, this.now);

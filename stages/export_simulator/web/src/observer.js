@@ -60,18 +60,20 @@ export class Observer {
   }
 }
 
+// A pawn as tall as the person, with a phone held out: seen at a glance, in the way of nothing.
 function person(eye, color) {
   const group = new THREE.Group();
-  const cloth = new THREE.MeshLambertMaterial({ color, transparent: true, opacity: 0.82 });
-  const skin = new THREE.MeshLambertMaterial({ color: 0xf0dccb });
-  const shoulders = eye - 0.16;
-  const profile = [[0.02, 0], [0.13, 0.01], [0.15, 0.06], [0.12, 0.5 * shoulders], [0.17, 0.86 * shoulders], [0.12, 0.97 * shoulders], [0.03, shoulders]];
-  const body = new THREE.Mesh(new THREE.LatheGeometry(profile.map(([r, y]) => new THREE.Vector2(r, y)), 24), cloth);
-  const head = new THREE.Mesh(new THREE.SphereGeometry(0.105, 24, 16), skin);
-  head.position.y = eye + 0.01;
-  const phone = new THREE.Mesh(new THREE.BoxGeometry(0.08, 0.16, 0.012), new THREE.MeshLambertMaterial({ color: 0x2d2b28 }));
-  phone.position.set(0, eye - 0.12, 0.27);
-  const ring = new THREE.Mesh(new THREE.RingGeometry(0.24, 0.27, 40).rotateX(-Math.PI / 2), new THREE.MeshBasicMaterial({ color, transparent: true, opacity: 0.6 }));
+  const cloth = new THREE.MeshLambertMaterial({ color, transparent: true, opacity: 0.8 });
+  const tall = eye - 0.2;
+  const profile = [[0, 0], [0.19, 0], [0.195, 0.02], [0.16, 0.3 * tall], [0.115, 0.62 * tall], [0.1, 0.84 * tall], [0.115, 0.9 * tall], [0.1, 0.96 * tall], [0, tall]];
+  const curve = new THREE.SplineCurve(profile.slice(2).map(([r, y]) => new THREE.Vector2(r, y)));
+  const outline = [new THREE.Vector2(0.001, 0), new THREE.Vector2(0.19, 0), ...curve.getPoints(28)];
+  const body = new THREE.Mesh(new THREE.LatheGeometry(outline, 32), cloth);
+  const head = new THREE.Mesh(new THREE.SphereGeometry(0.115, 28, 20), cloth);
+  head.position.y = eye - 0.06;
+  const phone = new THREE.Mesh(new THREE.BoxGeometry(0.075, 0.15, 0.012), new THREE.MeshLambertMaterial({ color: 0x2d2b28 }));
+  phone.position.set(0, eye - 0.16, 0.24);
+  const ring = new THREE.Mesh(new THREE.RingGeometry(0.25, 0.275, 48).rotateX(-Math.PI / 2), new THREE.MeshBasicMaterial({ color, transparent: true, opacity: 0.55 }));
   ring.position.y = 0.015;
   group.add(body, head, phone, ring);
   return group;

@@ -6,8 +6,10 @@ const MAX_GOALS = 16;
 const LIFT_M = 0.025;
 
 export class Overlays {
-  constructor(scene, floor) {
+  // floor: its height; crouch: height of the root above what it stands on, at least. Metres.
+  constructor(scene, floor, crouch) {
     this.floor = floor;
+    this.ground = (point) => Math.max(floor, point[1] - crouch) + LIFT_M;
     this.goals = new THREE.InstancedMesh(
       new THREE.CircleGeometry(0.075, 24).rotateX(-Math.PI / 2),
       new THREE.MeshBasicMaterial({ color: 0xc8722b, transparent: true, opacity: 0.34, depthWrite: false }),
@@ -32,20 +34,19 @@ export class Overlays {
     this.layers = { goals: true, path: true };
   }
 
-  // goals: points in the world; chosen: index; path: points; all metres. Goals sit at the body's height: show them on what lies below.
+  // goals: points in the world; chosen: index; path: points; all metres.
   show(plan) {
     this.plan = plan;
     const count = Math.min(MAX_GOALS, plan.goals.length);
     const matrix = new THREE.Matrix4();
     for (let i = 0; i < count; i++) {
-      const [x, , z] = plan.goals[i];
-      this.goals.setMatrixAt(i, matrix.makeTranslation(x, this.floor + LIFT_M, z));
+      this.goals.setMatrixAt(i, matrix.makeTranslation(plan.goals[i][0], this.ground(plan.goals[i]), plan.goals[i][2]));
     }
     this.goals.count = count;
     this.goals.instanceMatrix.needsUpdate = true;
-    const [x, , z] = plan.goals[plan.chosen];
-    this.chosen.position.set(x, this.floor + LIFT_M + 0.004, z);
-    fillRibbon(this.ribbon, plan.path, this.floor + LIFT_M);
+    const goal = plan.goals[plan.chosen];
+    this.chosen.position.set(goal[0], this.ground(goal) + 0.004, goal[2]);
+    fillRibbon(this.ribbon, plan.path, this.ground);
     this.refresh();
   }
 
@@ -55,9 +56,9 @@ export class Overlays {
     const points = this.fan.geometry.attributes.position;
     const count = this.goals.count;
     for (let i = 0; i < count; i++) {
-      const [x, , z] = this.plan.goals[i];
-      points.setXYZ(2 * i, root[0], this.floor + LIFT_M, root[2]);
-      points.setXYZ(2 * i + 1, x, this.floor + LIFT_M, z);
+      const goal = this.plan.goals[i];
+      points.setXYZ(2 * i, root[0], this.ground(root), root[2]);
+      points.setXYZ(2 * i + 1, goal[0], this.ground(goal), goal[2]);
     }
     this.fan.geometry.setDrawRange(0, 2 * count);
     points.needsUpdate = true;
@@ -82,7 +83,7 @@ function ribbon() {
   return mesh;
 }
 
-function fillRibbon(mesh, path, height) {
+function fillRibbon(mesh, path, ground) {
   const { position, color } = mesh.geometry.attributes;
   const tint = new THREE.Color(0x4c8067);
   const count = Math.min(256, path.length);
@@ -92,6 +93,7 @@ function fillRibbon(mesh, path, height) {
     const [dx, dz] = [after[0] - before[0], after[2] - before[2]];
     const length = Math.hypot(dx, dz);
     if (length > 1e-3) [sideX, sideZ] = [(-dz / length) * 0.028, (dx / length) * 0.028];
+    const height = ground(path[i]);
     position.setXYZ(2 * i, path[i][0] + sideX, height, path[i][2] + sideZ);
     position.setXYZ(2 * i + 1, path[i][0] - sideX, height, path[i][2] - sideZ);
     const alpha = 0.85 * (1 - 0.7 * (i / count));

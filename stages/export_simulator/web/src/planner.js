@@ -19,8 +19,8 @@ export class Planner {
     onProgress(0.15);
     const models = Object.fromEntries(await Promise.all(MODELS.map(async (name) => [name, await assets.bytes(name)])));
     onProgress(0.3);
-    const volume = await assets.bytes('volume');
-    await planner.ask('load', { contract, wasm, models, volume }, [wasm.buffer, volume.buffer, ...Object.values(models).map((model) => model.buffer)]);
+    const [volume, allowed] = [await assets.bytes('volume'), await assets.bytes('allowed')];
+    await planner.ask('load', { contract, wasm, models, volume, allowed }, [wasm.buffer, volume.buffer, ...Object.values(models).map((model) => model.buffer)]);
     return planner;
   }
 

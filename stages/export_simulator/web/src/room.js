@@ -3,9 +3,11 @@
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
-import { SparkRenderer, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
+import { SparkRenderer, SplatEdit, SplatEditRgbaBlendMode, SplatEditSdf, SplatEditSdfType, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
 
 const HEADROOM_M = 1.9; // what hangs higher above the floor is cut away, so that one can look in
+const SOFTWARE_PIXELS = 0.75; // drawn per pixel of the screen, where a processor has to draw them
+const WALL_M = 0.35; // a wall's thickness, with what leans on it
 
 export const parseModel = (bytes) => new Promise((done, fail) => {
   new GLTFLoader().parse(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength), '', done, fail);
@@ -15,11 +17,11 @@ export class Room {
   constructor(canvas, contract) {
     this.canvas = canvas;
     this.contract = contract;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, powerPreference: 'high-performance' });
+    this.software = drawsInSoftware();
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.software, powerPreference: 'high-performance' });
     this.renderer.setClearColor(0xf5f2ec);
     this.renderer.localClippingEnabled = true;
-    this.software = isSoftware(this.renderer);
-    this.renderer.setPixelRatio(this.software ? 1 : Math.min(2, devicePixelRatio));
+    this.renderer.setPixelRatio(this.software ? SOFTWARE_PIXELS : Math.min(2, devicePixelRatio));
     this.scene = new THREE.Scene();
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0xd9cdbd, 2.4));
     const sun = new THREE.DirectionalLight(0xfff4e2, 1.3);
@@ -57,11 +59,45 @@ export class Room {
 
   async addSplats(bytes) {
     this.scene.add(new SparkRenderer({ renderer: this.renderer }));
-    const splats = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.SPLAT });
+    const splats = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.SPLAT, editable: true });
+    this.shell = new SplatEditSdf({ type: SplatEditSdfType.BOX, opacity: 0, invert: true });
+    const edit = new SplatEdit({ rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY, sdfs: [this.shell] });
+    splats.add(edit, this.shell);
     this.scene.add(splats);
     await splats.initialized;
     this.splats = splats;
     if (this.mesh) this.mesh.visible = false;
+  }
+
+  // Splats have no back: hide the walls between the camera and the room, and what hangs high.
+  openShell() {
+    const [low, high] = this.contract.scene.bounds_m.map((corner) => [...corner]);
+    high[1] = this.contract.scene.floor_m + HEADROOM_M;
+    low[1] -= 1;
+    for (const [axis, name] of [[0, 'x'], [2, 'z']]) {
+      const outside = this.camera.position[name];
+      low[axis] += outside < low[axis] ? WALL_M : -1;
+      high[axis] -= outside > high[axis] ? WALL_M : -1;
+    }
+    const key = [...low, ...high].join();
+    if (key === this.shellKey) return;
+    this.shellKey = key;
+    this.shell.position.set(...low.map((value, axis) => (value + high[axis]) / 2));
+    this.shell.scale.set(...low.map((value, axis) => (high[axis] - value) / 2));
+  }
+
+  // Drift gently with what matters, so that it stays in view.
+  attend(point, seconds) {
+    const { target } = this.orbit;
+    const [dx, dz] = [point[0] - target.x, point[2] - target.z];
+    const distance = Math.hypot(dx, dz);
+    const slack = 0.9;
+    if (distance < slack) return;
+    const share = ((distance - slack) / distance) * Math.min(1, 0.5 * seconds);
+    for (const spot of [target, this.camera.position]) {
+      spot.x += dx * share;
+      spot.z += dz * share;
+    }
   }
 
   // A picture of the room from above, for the map.
@@ -120,13 +156,16 @@ export class Room {
   }
 
   render() {
+    if (this.splats) this.openShell();
     this.orbit.update();
     this.renderer.render(this.scene, this.camera);
   }
 }
 
-function isSoftware(renderer) {
-  const gl = renderer.getContext();
+function drawsInSoftware() {
+  const gl = document.createElement('canvas').getContext('webgl2');
   const info = gl.getExtension('WEBGL_debug_renderer_info');
-  return /swiftshader|llvmpipe|software|basic render/i.test(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : '');
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : '';
+  gl.getExtension('WEBGL_lose_context')?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }

@@ -4,12 +4,13 @@ import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
 
+const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
 const FURTHEST = 2; // a clicked goal further away than this, in deviations of learned goals, is approached in legs
 
 export class Sampler {
   // networks: name -> async (feeds: {name: [values, shape]}) -> Float32Array
   constructor(contract, networks, senses) {
-    Object.assign(this, { contract: contract.behavior, networks, senses });
+    Object.assign(this, { contract: contract.behavior, heights: contract.agent.root_height_m, networks, senses });
     this.frames = this.contract.future_frames;
     this.channels = this.contract.scaling.body_mean.length;
   }
@@ -32,11 +33,13 @@ export class Sampler {
     return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity });
   }
 
-  // A scaled path [3, frames] towards a scaled goal. The reference of the guidance sees neither observer nor goal,
+  // Scaled paths [3, frames] towards scaled goals. The reference of the guidance sees neither observer nor goal,
   // but a goal that the visitor has set is not taken away.
-  path(codes, goal, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
+  paths(codes, goals, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
+    const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) => this.networks.path({
-      x: [x, [1, 3, this.frames]], ...this.step(1, t, code), control: [goal, [1, 3]], keep: [Float32Array.of(keep), [1, 1]],
+      x: [x, [count, 3, this.frames]], ...this.step(count, t, code),
+      control: [goals, [count, 3]], keep: [new Float32Array(count).fill(keep), [count, 1]],
     });
     return this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
   }
@@ -87,19 +90,39 @@ export class Sampler {
     const codes = await this.codes(observation, question.keep, question.interactivity);
     const { scaled: dreamt, options } = await this.think(codes, question);
     const scaled = question.aim ? this.leg(frame, question.aim) : dreamt;
-    const goal = scaled.slice(0, 3);
     const commanded = Boolean(question.aim);
     const keepGoal = commanded ? 1 : question.keep.goal;
-    const path = await this.path(codes, goal, { ...options, keepGoal, commanded, noise: options.draw(3 * this.frames) });
+    const tried = Math.min(CANDIDATES, question.samples);
+    const targets = commanded ? Float32Array.from({ length: 3 * tried }, (_, i) => scaled[i % 3]) : scaled.slice(0, 3 * tried);
+    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(3 * this.frames * tried) });
+    const best = this.firstInside(frame, paths);
+    const path = paths.slice(3 * this.frames * best, 3 * this.frames * (best + 1));
     const body = await this.body(codes, path, { ...options, noise: options.draw(this.channels * this.frames) });
     const { positions, bodies } = this.unscaled(path, body);
-    const frames = positions.map((position, i) => this.senses.rows(frame, position, bodies[i]));
+    const frames = positions.map((position, i) => this.grounded(this.senses.rows(frame, position, bodies[i])));
     return {
       goals: this.goalsInWorld(frame, scaled),
-      chosen: 0,
+      chosen: commanded ? 0 : best,
       path: positions.map((position) => apply(frame, position)),
       frames,
     };
+  }
+
+  // The first path of those that leave the allowed space least.
+  firstInside(frame, paths) {
+    const length = 3 * this.frames;
+    const scores = Array.from({ length: paths.length / length }, (_, i) => {
+      const places = this.positions(paths.subarray(i * length, (i + 1) * length));
+      return places.filter((place) => !this.senses.allows(apply(frame, place))).length;
+    });
+    return scores.indexOf(Math.min(...scores));
+  }
+
+  // Over many plans small errors of height add up: keep the root between the heights that recordings know.
+  grounded(rows) {
+    const [low, high] = this.heights;
+    rows[1] = Math.min(high, Math.max(low, rows[1]));
+    return rows;
   }
 
   // The visitor's goal in scaled units, not further than the animal goes in one plan.
@@ -112,12 +135,17 @@ export class Sampler {
 
   // Metres and channels, frame by frame.
   unscaled(path, body) {
-    const { path_std: spread, body_mean: mean, body_std: deviation } = this.contract.scaling;
+    const { body_mean: mean, body_std: deviation } = this.contract.scaling;
     const each = Array.from({ length: this.frames }, (_, i) => i);
     return {
-      positions: each.map((i) => [0, 1, 2].map((axis) => path[axis * this.frames + i] * spread[axis][i])),
+      positions: this.positions(path),
       bodies: each.map((i) => mean.map((center, channel) => body[channel * this.frames + i] * deviation[channel] + center)),
     };
+  }
+
+  positions(path) {
+    const spread = this.contract.scaling.path_std;
+    return Array.from({ length: this.frames }, (_, i) => [0, 1, 2].map((axis) => path[axis * this.frames + i] * spread[axis][i]));
   }
 
   // The fixed plan that Python wrote down, sampled again from the same input and noise.
@@ -136,7 +164,7 @@ export class Sampler {
       const options = { method: golden.sampling.method, interactivity: Number(name.split('_')[1]) };
       const codes = await this.codes(observation, { scene, observer, past }, options.interactivity);
       const goal = await this.goals(codes, 1, { ...options, steps: golden.sampling.goal_steps, noise: noise('goal') });
-      const path = await this.path(codes, goal, { ...options, steps: golden.sampling.sequence_steps, noise: noise('path') });
+      const path = await this.paths(codes, goal, { ...options, steps: golden.sampling.sequence_steps, noise: noise('path') });
       const body = await this.body(codes, path, { ...options, steps: golden.sampling.sequence_steps, noise: noise('body') });
       const { positions, bodies } = this.unscaled(path, body);
       plans[name] = { goal: Array.from(goal, (value, axis) => value * this.contract.scaling.goal_std[axis]), path: positions, body: bodies };

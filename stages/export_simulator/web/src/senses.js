@@ -6,12 +6,13 @@ import { ROW, apply, compose, conjugate, inverse, matrixFromTurn, multiply, plac
 const UPRIGHT = 0.2;
 
 export class Senses {
-  // contract: simulator.json; volume: half-precision features, channel first.
-  constructor(contract, volume) {
+  // contract: simulator.json; volume: half-precision features, channel first; allowed: bytes per voxel.
+  constructor(contract, volume, allowed) {
     const { behavior } = contract;
     this.ego = behavior.architecture.ego;
     this.grid = behavior.grid;
     this.volume = { ...contract.volume, values: halfTable(volume) };
+    this.allowed = allowed;
     this.rest = behavior.agent_from_bone_rest.map(rowFromMatrix);
   }
 
@@ -56,6 +57,13 @@ export class Senses {
       for (let channel = 0; channel < channels; channel++) out[channel * nx * ny * nz + cell] = values[channel * vx * vy * vz + at];
     }
     return out;
+  }
+
+  // Whether the root may be at a point of the world; nowhere outside the volume.
+  allows(point) {
+    const { shape: [, vx, vy, vz], origin, voxel_m: voxel } = this.volume;
+    const [a, b, c] = [0, 1, 2].map((axis) => Math.floor((point[axis] - origin[axis]) / voxel));
+    return a >= 0 && b >= 0 && c >= 0 && a < vx && b < vy && c < vz && this.allowed[(a * vy + b) * vz + c] > 0;
   }
 
   pastChannels(egoFromWorld, rows) {

@@ -14,6 +14,7 @@ export class Timeline {
   reset(past) {
     this.history = past.map((frame) => Float32Array.from(frame));
     this.lastTick = 0;
+    this.base = this.history.at(-1);
     this.plans = [];
   }
 
@@ -22,9 +23,10 @@ export class Timeline {
     return this.history.slice(-count);
   }
 
-  // Follow frames[0] at tick start + 1, and so on; the old plan fades out.
+  // Follow frames[0] at tick start + 1, and so on; what was followed until `now` fades out.
   follow(start, frames, now) {
-    this.plans = [...this.plans.slice(-1), { start, frames, since: now }];
+    const faded = this.plans.findLastIndex((plan) => share(plan, now) >= 1);
+    this.plans = [...this.plans.slice(Math.max(0, faded)), { start, frames, since: now }];
   }
 
   ticksLeft(now) {
@@ -32,11 +34,11 @@ export class Timeline {
     return plan ? plan.start + plan.frames.length - now : 0;
   }
 
+  // The pose at a time: each plan is blended over the one before it.
   at(now) {
-    if (!this.plans.length) return this.history.at(-1);
-    const [first, second] = this.plans;
-    if (!second) return this.fadeFrom(this.anchor(first), this.sample(first, now), first, now);
-    return this.fadeFrom(this.sample(first, now), this.sample(second, now), second, now);
+    let pose = this.base;
+    for (const plan of this.plans) pose = blend(pose, sample(plan, now), share(plan, now));
+    return pose;
   }
 
   // Write down every tick that has passed, so that the next plan knows its past.
@@ -47,28 +49,19 @@ export class Timeline {
       if (this.history.length > 64) this.history.shift();
     }
   }
+}
 
-  anchor(plan) {
-    plan.anchor ??= this.history.at(-1);
-    return plan.anchor;
-  }
+// How far a plan has faded in, 0 to 1, smoothly.
+function share(plan, now) {
+  const linear = Math.min(1, Math.max(0, (now - plan.since) / FADE_TICKS));
+  return linear * linear * (3 - 2 * linear);
+}
 
-  fadeFrom(old, next, plan, now) {
-    const share = Math.min(1, Math.max(0, (now - plan.since) / FADE_TICKS));
-    if (share >= 1) {
-      this.plans = [plan];
-      plan.anchor = next;
-      return next;
-    }
-    return blend(old, next, share * share * (3 - 2 * share));
-  }
-
-  sample(plan, now) {
-    const place = Math.min(plan.frames.length - 1, Math.max(0, now - plan.start - 1));
-    const index = Math.floor(place);
-    const next = Math.min(index + 1, plan.frames.length - 1);
-    return blend(plan.frames[index], plan.frames[next], place - index);
-  }
+function sample(plan, now) {
+  const place = Math.min(plan.frames.length - 1, Math.max(0, now - plan.start - 1));
+  const index = Math.floor(place);
+  const next = Math.min(index + 1, plan.frames.length - 1);
+  return blend(plan.frames[index], plan.frames[next], place - index);
 }
 
 export const rootOf = (frame) => Array.from(frame.subarray(0, ROW));

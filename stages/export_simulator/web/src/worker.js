@@ -8,7 +8,7 @@ let sampler;
 let turn = Promise.resolve();
 
 const answers = {
-  async load({ contract, wasm, models, volume }, report) {
+  async load({ contract, wasm, models, volume, allowed }, report) {
     ort.env.wasm.numThreads = 1;
     ort.env.wasm.wasmBinary = wasm.buffer;
     ort.env.logLevel = 'error';
@@ -22,7 +22,7 @@ const answers = {
       };
       report((i + 1) / names.length);
     }
-    sampler = new Sampler(contract, networks, new Senses(contract, volume));
+    sampler = new Sampler(contract, networks, new Senses(contract, volume, allowed));
   },
   async plan(question) {
     const start = performance.now();

@@ -1,0 +1,44 @@
+"""Four fitted weights: exact where four bones are enough, never worse than the four heaviest."""
+
+import numpy as np
+import pytest
+
+from pipeline.space import rigid
+from stages.export_simulator import refit
+
+RNG = np.random.default_rng(0)
+
+
+def world(bones: int, bend_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Random bones, points near them with soft weights, and poses in which every bone bends at random."""
+    centers = RNG.normal(0, 0.15, (bones, 3))
+    points = centers[RNG.integers(0, bones, 200)] + RNG.normal(0, 0.04, (200, 3))
+    weights = np.exp(-((points[:, None] - centers) ** 2).sum(-1) / (2 * 0.08**2))
+    rest = rigid.make(np.eye(3), centers)
+    twist = RNG.normal(size=(16, bones, 6)) * [bend_rad] * 6 * np.array([1, 1, 1, 0.1, 0.1, 0.1])
+    return points, weights / weights.sum(1, keepdims=True), rest, rest @ rigid.exp(twist)
+
+
+@pytest.mark.parametrize("bones", [2, 4, 12])
+def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
+    points, weights, rest, posed_bones = world(bones, 0.3)
+    motion = posed_bones @ rigid.inverse(rest)
+    posed = refit.blend_dual_quaternions(points, weights, posed_bones, rest)
+    joints, fitted = refit.refit_weights(points, weights, motion, posed)
+    assert (fitted >= 0).all()
+    np.testing.assert_allclose(fitted.sum(1), 1, atol=1e-6)
+    heaviest = np.argsort(-weights, axis=1)[:, :4]
+    plain = np.take_along_axis(weights, heaviest, 1)
+    plain /= plain.sum(1, keepdims=True)
+    error = refit.residual_m(points, joints, fitted, motion, posed)
+    before = refit.residual_m(points, heaviest.astype(np.uint8), plain, motion, posed)
+    assert (error**2).mean() <= (before**2).mean() + 1e-12
+
+
+def test_one_bone_a_point_is_exact() -> None:
+    points, weights, rest, posed_bones = world(6, 0.5)
+    alone = np.eye(6)[weights.argmax(1)]
+    motion = posed_bones @ rigid.inverse(rest)
+    posed = refit.blend_dual_quaternions(points, alone, posed_bones, rest)
+    joints, fitted = refit.refit_weights(points, alone, motion, posed)
+    assert refit.residual_m(points, joints, fitted, motion, posed).max() < 1e-4, "metres: float32 blending"
