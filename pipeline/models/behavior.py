@@ -1,36 +1,31 @@
-"""The behaviour model as a whole: what its channels mean, its networks, and how a plan is sampled from them.
+"""The behaviour model as a whole: what its channels mean, its networks, its files.
 
-`observe` turns a context into network inputs, `plan` samples goal, then path, then body (Fig. 3), `Plan.to_world`
-turns the result back into transforms. Networks are met through `Networks`, which torch and ONNX versions satisfy.
+`Architecture` fixes shapes, `BehaviorNets` holds the weights, `contract` and `load` write and read them as files; the
+functions between define the channels of body and past. Plans are drawn by `pipeline.models.planning`.
 """
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
 from pipeline.models.denoisers import ControlUNet, GoalMLP
-from pipeline.models.diffusion import Schedule, guided, sample
+from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import (
     GRID_CELL_M,
     GRID_SHAPE,
     Ego,
-    FeatureVolume,
     Perception,
     PerceptionSize,
-    world_from_ego,
 )
-from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, Context
+from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ
 from pipeline.space import rigid
 
-Array = np.ndarray
 ROOT_CHANNELS = 6
 """the body's leading channels: the root's rotation in the ego frame, its first two columns"""
 
@@ -88,77 +83,6 @@ class Scaling:
     body_std: Float[np.ndarray, "channel"]
 
 
-class BehaviorNets(nn.Module):
-    """Perception and the three denoisers."""
-
-    def __init__(self, architecture: Architecture):
-        super().__init__()
-        a = architecture
-        self.perception = Perception(a.perception)
-        self.goal = GoalMLP(a.condition, a.goal_hidden, a.goal_layers)
-        self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers)
-        self.body = ControlUNet(a.body_channels, 3, a.condition, a.unet_width, a.unet_multipliers)
-
-
-class Networks(Protocol):
-    """The four networks on NumPy arrays of float32, batch first."""
-
-    def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
-        """Return the perception code."""
-
-    def goal(self, x: Array, t: Array, condition: Array) -> Array:
-        """Return the noise in x."""
-
-    def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
-        """Return the noise in x."""
-
-    def body(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
-        """Return the noise in x."""
-
-
-class TorchNetworks:
-    """`Networks` by torch modules on any device."""
-
-    def __init__(self, nets: BehaviorNets, device: str = "cpu"):
-        self.nets, self.device = nets.eval().to(device), device
-
-    def _run(self, module: nn.Module, *arguments: Array) -> Array:
-        with torch.inference_mode():
-            return (
-                module(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device) for a in arguments))
-                .cpu()
-                .numpy()
-            )
-
-    def perceive(self, *arguments: Array) -> Array:
-        return self._run(self.nets.perception, *arguments)
-
-    def goal(self, *arguments: Array) -> Array:
-        return self._run(self.nets.goal, *arguments)
-
-    def path(self, *arguments: Array) -> Array:
-        return self._run(self.nets.path, *arguments)
-
-    def body(self, *arguments: Array) -> Array:
-        return self._run(self.nets.body, *arguments)
-
-
-@dataclass(frozen=True)
-class Observation:
-    """The inputs of perception, in metres and the ego frame."""
-
-    scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
-    observer_past: Float[np.ndarray, "batch frame*3"]
-    past: Float[np.ndarray, "batch frame*channel"]
-
-    def __getitem__(self, index: slice | np.ndarray) -> "Observation":
-        """Return some of the batch."""
-        return Observation(self.scene_grid[index], self.observer_past[index], self.past[index])
-
-    def __len__(self) -> int:
-        return len(self.past)
-
-
 @dataclass(frozen=True)
 class Sampling:
     """How plans are drawn."""
@@ -181,18 +105,16 @@ class Sampling:
     """let the goal steer the path"""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Sampled futures in the ego frame."""
+class BehaviorNets(nn.Module):
+    """Perception and the three denoisers."""
 
-    goal: Float[np.ndarray, "batch 3"]
-    path: Float[np.ndarray, "batch 56 3"]
-    body: Float[np.ndarray, "batch 56 channel"]
-
-    def world_from_agent(self, world_from_ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch 56 4 4"]:
-        """Return the root's poses."""
-        ego_from_agent = rigid.make(rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
-        return world_from_ego[:, None] @ ego_from_agent
+    def __init__(self, architecture: Architecture):
+        super().__init__()
+        a = architecture
+        self.perception = Perception(a.perception)
+        self.goal = GoalMLP(a.condition, a.goal_hidden, a.goal_layers)
+        self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers)
+        self.body = ControlUNet(a.body_channels, 3, a.condition, a.unet_width, a.unet_multipliers)
 
 
 def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:
@@ -205,7 +127,9 @@ def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray
     first = _normalized(columns[..., :3])
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
     parallel = np.linalg.norm(second, axis=-1, keepdims=True) < 1e-4
-    second = _normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + [0.3, 0.2, 0.1]), second))
+    second = _normalized(
+        np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + np.array([0.3, 0.2, 0.1])), second)
+    )
     return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 
@@ -236,17 +160,6 @@ def past_channels(
     """Return per past frame: root position, root rotation (6), bones; oldest frame first."""
     root = np.concatenate([ego_from_agent[..., :3, 3], rotation_to_6d(ego_from_agent[..., :3, :3])], axis=-1)
     return np.concatenate([root, bones], axis=-1).reshape(len(root), -1).astype(np.float32)
-
-
-def observe(context: Context, volume: FeatureVolume, rest: Float[np.ndarray, "bone 4 4"], ego: Ego) -> Observation:
-    """Encode contexts as network inputs (Eq. 11, 12, 13)."""
-    frame = world_from_ego(context.world_from_agent[:, -1], ego)
-    ego_from_world = rigid.inverse(frame)
-    observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
-    past = past_channels(
-        ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
-    )
-    return Observation(volume.around(frame), observer, past)
 
 
 def contract(
@@ -293,108 +206,3 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
     scaling = Scaling(**{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()})
     schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
     return architecture, nets, scaling, schedule, np.asarray(document["agent_from_bone_rest"])
-
-
-@dataclass(frozen=True)
-class Sampler:
-    """Draws plans: networks, schedule and scaling together."""
-
-    networks: Networks
-    schedule: Schedule
-    scaling: Scaling
-
-    def plan(
-        self,
-        observation: Observation,
-        sampling: Sampling,
-        rng: np.random.Generator,
-        *,
-        goal: Float[np.ndarray, "batch 3"] | None = None,
-        path: Float[np.ndarray, "batch 56 3"] | None = None,
-    ) -> Plan:
-        """Sample goal, path and body, one per row; a given goal or path (ego frame, metres) replaces its level."""
-        codes = self.codes(observation, sampling)
-        z = self.goals(codes, sampling, rng) if goal is None else (goal / self.scaling.goal_std).astype(np.float32)
-        p = (
-            self.paths(codes, z, sampling, rng)
-            if path is None
-            else (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
-        )
-        body = self.bodies(codes, p, sampling, rng)
-        return Plan(
-            z * self.scaling.goal_std,
-            np.swapaxes(p * self.scaling.path_std, 1, 2),
-            np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean,
-        )
-
-    def codes(self, observation: Observation, sampling: Sampling) -> tuple[Array, Array]:
-        """Return the perception code with everything that ``sampling`` keeps, and the one without the observer."""
-        keep = np.tile(np.array([sampling.scene, sampling.observer, sampling.past], np.float32), (len(observation), 1))
-        inputs = (observation.scene_grid, observation.observer_past, observation.past)
-        full = self.networks.perceive(*inputs, keep)
-        blind = (
-            self.networks.perceive(*inputs, keep * np.array([1, 0, 1], np.float32)) if sampling.guidance != 1 else full
-        )
-        return full, blind
-
-    def goals(
-        self, codes: tuple[Array, Array], sampling: Sampling, rng: np.random.Generator
-    ) -> Float[np.ndarray, "batch 3"]:
-        """Sample scaled goals."""
-
-        def denoise(code: Array) -> Callable[[Array, float], Array]:
-            return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
-
-        return _run(
-            denoise(codes[0]), denoise(codes[1]), (len(codes[0]), 3), self.schedule, sampling, sampling.goal_steps, rng
-        )
-
-    def paths(
-        self,
-        codes: tuple[Array, Array],
-        control: Float[np.ndarray, "batch 3"],
-        sampling: Sampling,
-        rng: np.random.Generator,
-    ) -> Float[np.ndarray, "batch 3 56"]:
-        """Sample scaled paths under scaled goals; the reference of the guidance sees neither observer nor goal."""
-
-        def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
-            return lambda x, t: self.networks.path(x, _filled(len(x), t), code, control, _filled((len(x), 1), keep))
-
-        pair = denoise(codes[0], float(sampling.goal)), denoise(codes[1], 0.0)
-        return _run(*pair, (len(control), 3, FUTURE), self.schedule, sampling, sampling.sequence_steps, rng)
-
-    def bodies(
-        self,
-        codes: tuple[Array, Array],
-        control: Float[np.ndarray, "batch 3 56"],
-        sampling: Sampling,
-        rng: np.random.Generator,
-    ) -> Float[np.ndarray, "batch channel 56"]:
-        """Sample scaled bodies along scaled paths, which guidance never takes away."""
-
-        def denoise(code: Array) -> Callable[[Array, float], Array]:
-            return lambda x, t: self.networks.body(x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0))
-
-        shape = (len(control), len(self.scaling.body_mean), FUTURE)
-        return _run(denoise(codes[0]), denoise(codes[1]), shape, self.schedule, sampling, sampling.sequence_steps, rng)
-
-
-def _filled(shape: int | tuple[int, int], value: float) -> Array:
-    return np.full(shape, value, np.float32)
-
-
-def _run(
-    full: Callable,
-    blind: Callable,
-    shape: tuple[int, ...],
-    schedule: Schedule,
-    sampling: Sampling,
-    count: int,
-    rng: np.random.Generator,
-) -> Array:
-    def draw() -> Array:
-        return rng.standard_normal(shape, dtype=np.float32)
-
-    denoise = guided(full, blind, sampling.guidance)
-    return sample(denoise, draw(), schedule, method=sampling.method, count=count, draw=draw).astype(np.float32)

@@ -5,17 +5,22 @@ fitted on the training windows.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.behavior import ROOT_CHANNELS, Sampler, Sampling, bones_from_channels, observe
+from pipeline.models import behavior
+from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
+from pipeline.models.planning import Sampler, TorchNetworks, observe
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, Context, Future
 from pipeline.space import rigid
 
 STEPS = np.arange(1, FUTURE + 1) / FUTURE
+WINDOWS_AT_ONCE = 32
+"""bounds the memory of scene grids and bones"""
 
 
 @dataclass(frozen=True)
@@ -132,10 +137,21 @@ class Ats:
     ego: Ego
     sampling: Sampling
 
+    @classmethod
+    def load(cls, model: Path, volume: FeatureVolume, sampling: Sampling, *, device: str = "cpu") -> "Ats":
+        """Read a trained model (`behavior/`)."""
+        architecture, nets, scaling, schedule, rest = behavior.load(model)
+        return cls(Sampler(TorchNetworks(nets, device), schedule, scaling), volume, rest, architecture.ego, sampling)
+
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        """Draw ``count`` plans for each window; goal and path are each as sampled."""
+        """Draw ``count`` plans for each window, a few windows at a time; goal and path are each as sampled."""
+        chunks = [context[start : start + WINDOWS_AT_ONCE] for start in range(0, len(context), WINDOWS_AT_ONCE)]
+        parts = [self._some(chunk, count, rng) for chunk in chunks]
+        return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+    def _some(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         observation = observe(context, self.volume, self.agent_from_bone_rest, self.ego)
-        plan = self.sampler.plan(observation[np.repeat(np.arange(len(context)), count)], self.sampling, rng)
+        plan = self.sampler.plan(observation, self.sampling, rng, count=count)
         frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
         root = plan.world_from_agent(frame)
         bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest).astype(np.float32)

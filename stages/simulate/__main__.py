@@ -12,6 +12,7 @@ from pipeline import cli, progress
 from pipeline.files import arrays
 from pipeline.models import behavior
 from pipeline.models.perception import FeatureVolume
+from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.trajectories import BehaviorData
 from stages.simulate.observers import Script, scripted
 from stages.simulate.rollout import rollout, write_take
@@ -43,7 +44,7 @@ def run(task: cli.Task) -> None:
     architecture, nets, scaling, schedule, _ = behavior.load(model)
     data, volume = BehaviorData.load(source), FeatureVolume.load(source / "volume.npz")
     allowed = arrays.load(source / "volume.npz", ("allowed",))["allowed"]
-    sampler = behavior.Sampler(behavior.TorchNetworks(nets, task.device), schedule, scaling)
+    sampler = Sampler(TorchNetworks(nets, task.device), schedule, scaling)
     simulator = Simulator(sampler, data, volume, allowed, architecture.ego, sampling=c.sampling, chaining=c.chaining)
     seen = np.concatenate([t.world_from_camera[t.valid, :3, 3] for t in data.trajectories.values()])
     observer = scripted(c.observer, center=np.median(seen, axis=0), speed_m_s=c.observer_speed_m_s)

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from pipeline.models.behavior import ROOT_CHANNELS, Sampler, Sampling, bones_from_channels, channels_from_bones, observe
+from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels, channels_from_bones
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
+from pipeline.models.planning import Sampler, observe
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Context
 from pipeline.space import rigid
 
@@ -102,14 +103,14 @@ class Simulator:
         observation = observe(
             Context(root[None], bones[None], np.array(self.observer)[None]), self.volume, self.rest, self.ego
         )
-        frame, scaling = world_from_ego(root[-1:], self.ego), self.sampler.scaling
-        codes = self.sampler.codes(observation[np.zeros(self.chaining.candidates, int)], self.sampling)
+        frame = world_from_ego(root[-1:], self.ego)
+        codes = self.sampler.codes(observation, self.sampling, self.chaining.candidates)
         goals = self.sampler.goals(codes, self.sampling, self.rng)
-        paths = np.swapaxes(self.sampler.paths(codes, goals, self.sampling, self.rng) * scaling.path_std, 1, 2)
+        paths = self.sampler.paths(codes, goals, self.sampling, self.rng)
         blocked = blocked_share(rigid.apply(frame, paths), self.volume, self.allowed)
         best = int(np.argmin(blocked))
-        goal = goals[best : best + 1] * scaling.goal_std
-        plan = self.sampler.plan(observation, self.sampling, self.rng, goal=goal, path=paths[best : best + 1])
+        given = {"goal": goals[best : best + 1], "path": paths[best : best + 1]}
+        plan = self.sampler.plan(observation, self.sampling, self.rng, **given)
         chosen = Frames(plan.world_from_agent(frame)[0], plan.body[0][:, ROOT_CHANNELS:])
         return chosen, rigid.apply(frame[0], plan.goal)[0], float(blocked[best])
 

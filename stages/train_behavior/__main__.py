@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pipeline import cli, progress, qa
-from pipeline.models.behavior import Architecture, Sampler, TorchNetworks
+from pipeline.models.behavior import Architecture
 from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import FeatureVolume
+from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.trajectories import TRAIN, BehaviorData
 from stages.train_behavior import export, pictures, reactions
 from stages.train_behavior.training import Settings, train
@@ -57,8 +58,8 @@ def run(task: cli.Task) -> None:
     reaction = reactions.measure(sampler, moments.observation, radius_m=c.observer_radius_m, seed=c.seed)
     progress.log(f"an approaching observer shifts goals {reaction.away_m:.2f} m away, a far one {reaction.far_m:.3f} m")
     with task.create() as folder:
-        export.write_contract(folder, fitted.nets, architecture, fitted.scaling, Schedule(), data.agent_from_bone_rest)
-        difference = export.write_networks(folder, fitted.nets, architecture)
+        rest = data.agent_from_bone_rest
+        difference = export.write_model(folder, fitted.nets, architecture, fitted.scaling, Schedule(), rest)
         qa.write(
             folder,
             good="goals that spread over where the animal could go and shift away from a close observer",

@@ -11,21 +11,21 @@ import onnxruntime
 import torch
 from safetensors.torch import save_file
 
-from pipeline.models.behavior import (
-    Architecture,
-    BehaviorNets,
-    Observation,
-    Sampler,
-    Sampling,
-    Scaling,
-    TorchNetworks,
-    contract,
-)
+from pipeline.models.behavior import Architecture, BehaviorNets, Sampling, Scaling, contract
 from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import GRID_SHAPE
+from pipeline.models.planning import Observation, Sampler, TorchNetworks
 from pipeline.models.trajectories import FUTURE, PAST
 
 NETWORKS = ("perception", "goal", "path", "body")
+
+
+def write_model(
+    folder: Path, nets: BehaviorNets, architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: np.ndarray
+) -> float:
+    """Write everything a sampler needs. Return the largest difference between ONNX and torch."""
+    write_contract(folder, nets, architecture, scaling, schedule, rest)
+    return write_networks(folder, nets, architecture)
 
 
 def write_contract(

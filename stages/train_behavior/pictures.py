@@ -8,8 +8,9 @@ from matplotlib.figure import Figure
 
 from pipeline import figures
 from pipeline.fit import FitRecord
-from pipeline.models.behavior import Observation, Sampler, Sampling
+from pipeline.models.behavior import Sampling
 from pipeline.models.perception import FeatureVolume
+from pipeline.models.planning import Observation, Sampler
 from pipeline.qa import Check, Picture
 from pipeline.space import rigid
 from stages.train_behavior.reactions import SIDES, Moments, Reactions, approach
@@ -101,16 +102,15 @@ class _Room:
         figure = Figure(figsize=(2.6 * len(frame), 2.3 * len(samplings)), dpi=80, layout="constrained")
         grid = figure.subplots(len(samplings), len(frame), squeeze=False)
         count = 12 if paths else FAN
-        repeated = observation[np.repeat(np.arange(len(frame)), count)]
         for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
-            rng, codes = np.random.default_rng(seed), sampler.codes(repeated, sampling)
-            scaled = sampler.goals(codes, sampling, rng)
-            goals = (scaled * sampler.scaling.goal_std).reshape(len(frame), count, 3)
-            lines = sampler.paths(codes, scaled, sampling, rng) * sampler.scaling.path_std if paths else None
+            rng, codes = np.random.default_rng(seed), sampler.codes(observation, sampling, count)
+            goals = sampler.goals(codes, sampling, rng)
+            lines = sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3) if paths else None
+            goals = goals.reshape(len(frame), count, 3)
             for column, axis in enumerate(row):
                 self._window(axis, frame[column], observation.observer_past[column].reshape(-1, 3), goals[column])
                 if lines is not None:
-                    self._lines(axis, frame[column], np.swapaxes(lines.reshape(len(frame), count, 3, -1)[column], 1, 2))
+                    self._lines(axis, frame[column], lines[column])
             row[0].set_ylabel(name)
         return figures.pixels(figure)
 

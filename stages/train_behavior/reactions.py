@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.models.behavior import Architecture, Observation, Sampler, Sampling, observe
+from pipeline.models.behavior import Architecture, Sampling
 from pipeline.models.perception import FeatureVolume, world_from_ego
+from pipeline.models.planning import Observation, Sampler, observe
 from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData
 
 SAMPLES = 16
@@ -67,14 +68,10 @@ def measure(
 ) -> Reactions:
     """Sample goals of some windows under scripted observers, always with the same noise."""
     sampling = Sampling()
-    repeated = observation[np.repeat(np.arange(len(observation)), SAMPLES)]
 
     def mean_goals(observer: Float[np.ndarray, "frame*3"], sampling: Sampling) -> Float[np.ndarray, "window 3"]:
-        seen = replace(repeated, observer_past=np.tile(observer, (len(repeated), 1)))
-        goals = (
-            sampler.goals(sampler.codes(seen, sampling), sampling, np.random.default_rng(seed))
-            * sampler.scaling.goal_std
-        )
+        seen = replace(observation, observer_past=np.tile(observer, (len(observation), 1)))
+        goals = sampler.goals(sampler.codes(seen, sampling, SAMPLES), sampling, np.random.default_rng(seed))
         return goals.reshape(len(observation), SAMPLES, 3).mean(1)
 
     none = mean_goals(approach(SIDES[0], 1.0, 0.0), replace(sampling, observer=False))

@@ -3,17 +3,14 @@ import pytest
 
 from pipeline.models.behavior import (
     BehaviorNets,
-    Plan,
-    Sampler,
     Sampling,
     Scaling,
-    TorchNetworks,
     bones_from_channels,
     channels_from_bones,
-    observe,
     rotation_to_6d,
 )
 from pipeline.models.diffusion import Schedule
+from pipeline.models.planning import Plan, Sampler, TorchNetworks, observe
 from pipeline.models.predictors import Ats, ConstantVelocity, LocationPrior, StandStill
 from pipeline.models.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.space import rigid

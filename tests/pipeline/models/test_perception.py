@@ -1,8 +1,9 @@
 import numpy as np
 import torch
 
-from pipeline.models.behavior import BehaviorNets, observe
+from pipeline.models.behavior import BehaviorNets
 from pipeline.models.perception import FeatureVolume, world_from_ego
+from pipeline.models.planning import observe
 from pipeline.models.trajectories import Context
 from pipeline.space import rigid
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from pipeline.models.behavior import BehaviorNets, Sampler, Sampling, Scaling, TorchNetworks
+from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
+from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.space import rigid
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take

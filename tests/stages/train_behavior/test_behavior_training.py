@@ -7,9 +7,10 @@ import torch
 
 from pipeline import fit
 from pipeline.models import behavior
-from pipeline.models.behavior import Sampler, Sampling, TorchNetworks
+from pipeline.models.behavior import Sampling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import GRID_SHAPE
+from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.trajectories import TRAIN
 from stages.train_behavior.batches import (
     Augmentation,

@@ -1,0 +1,214 @@
+"""Sampling plans: what the agent perceives goes in, goal, then path, then body come out (Fig. 3).
+
+`observe` turns a context into network inputs, `Sampler.plan` draws plans from them, `Plan.world_from_agent` puts them
+into the world. Networks are met through `Networks`, which torch modules and ONNX sessions can satisfy.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from pipeline.models.behavior import (
+    ROOT_CHANNELS,
+    BehaviorNets,
+    Sampling,
+    Scaling,
+    channels_from_bones,
+    past_channels,
+    rotation_from_6d,
+)
+from pipeline.models.diffusion import Schedule, guided, sample
+from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
+from pipeline.models.trajectories import FUTURE, Context
+from pipeline.space import rigid
+
+Array = np.ndarray
+
+
+class Networks(Protocol):
+    """The four networks on NumPy arrays of float32, batch first."""
+
+    def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
+        """Return the perception code."""
+
+    def goal(self, x: Array, t: Array, condition: Array) -> Array:
+        """Return the noise in x."""
+
+    def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
+
+    def body(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
+
+
+class TorchNetworks:
+    """`Networks` by torch modules on any device."""
+
+    def __init__(self, nets: BehaviorNets, device: str = "cpu"):
+        self.nets, self.device = nets.eval().to(device), device
+
+    def _run(self, module: nn.Module, *arguments: Array) -> Array:
+        with torch.inference_mode():
+            return (
+                module(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device) for a in arguments))
+                .cpu()
+                .numpy()
+            )
+
+    def perceive(self, *arguments: Array) -> Array:
+        return self._run(self.nets.perception, *arguments)
+
+    def goal(self, *arguments: Array) -> Array:
+        return self._run(self.nets.goal, *arguments)
+
+    def path(self, *arguments: Array) -> Array:
+        return self._run(self.nets.path, *arguments)
+
+    def body(self, *arguments: Array) -> Array:
+        return self._run(self.nets.body, *arguments)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The inputs of perception, in metres and the ego frame."""
+
+    scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
+    observer_past: Float[np.ndarray, "batch frame*3"]
+    past: Float[np.ndarray, "batch frame*channel"]
+
+    def __getitem__(self, index: slice | np.ndarray) -> "Observation":
+        """Return some of the batch."""
+        return Observation(self.scene_grid[index], self.observer_past[index], self.past[index])
+
+    def __len__(self) -> int:
+        return len(self.past)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Sampled futures in the ego frame."""
+
+    goal: Float[np.ndarray, "batch 3"]
+    path: Float[np.ndarray, "batch 56 3"]
+    body: Float[np.ndarray, "batch 56 channel"]
+
+    def world_from_agent(self, world_from_ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch 56 4 4"]:
+        """Return the root's poses."""
+        ego_from_agent = rigid.make(rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
+        return world_from_ego[:, None] @ ego_from_agent
+
+
+def observe(context: Context, volume: FeatureVolume, rest: Float[np.ndarray, "bone 4 4"], ego: Ego) -> Observation:
+    """Encode contexts as network inputs (Eq. 11, 12, 13)."""
+    frame = world_from_ego(context.world_from_agent[:, -1], ego)
+    ego_from_world = rigid.inverse(frame)
+    observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
+    past = past_channels(
+        ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
+    )
+    return Observation(volume.around(frame), observer, past)
+
+
+@dataclass(frozen=True)
+class Codes:
+    """Perception codes, one row per plan."""
+
+    full: Float[np.ndarray, "plan condition"]
+    """of everything that is kept"""
+    blind: Float[np.ndarray, "plan condition"]
+    """of the same without the observer"""
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """Draws plans: networks, schedule and scaling together."""
+
+    networks: Networks
+    schedule: Schedule
+    scaling: Scaling
+
+    def plan(
+        self,
+        observation: Observation,
+        sampling: Sampling,
+        rng: np.random.Generator,
+        *,
+        count: int = 1,
+        goal: Float[np.ndarray, "plan 3"] | None = None,
+        path: Float[np.ndarray, "plan 56 3"] | None = None,
+    ) -> Plan:
+        """Draw ``count`` plans for each row, those of a row together; a given goal or path replaces its level."""
+        codes = self.codes(observation, sampling, count)
+        goal = self.goals(codes, sampling, rng) if goal is None else goal
+        path = self.paths(codes, goal, sampling, rng) if path is None else path
+        return Plan(goal, path, self.bodies(codes, path, sampling, rng))
+
+    def codes(self, observation: Observation, sampling: Sampling, count: int = 1) -> Codes:
+        """Encode what is perceived, with all that ``sampling`` keeps and without the observer, ``count`` times."""
+        keep = np.tile(np.array([sampling.scene, sampling.observer, sampling.past], np.float32), (len(observation), 1))
+        inputs = (observation.scene_grid, observation.observer_past, observation.past)
+        full = blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
+        if sampling.guidance != 1:
+            keep[:, 1] = 0
+            blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
+        return Codes(full, blind)
+
+    def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
+        """Draw goals in the ego frame, metres."""
+
+        def denoise(code: Array) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
+
+        pair = denoise(codes.full), denoise(codes.blind)
+        return self._drawn(*pair, (len(codes.full), 3), sampling, sampling.goal_steps, rng) * self.scaling.goal_std
+
+    def paths(
+        self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
+    ) -> Float[np.ndarray, "plan 56 3"]:
+        """Draw paths to goals; the reference of the guidance sees neither observer nor goal."""
+        control = (goal / self.scaling.goal_std).astype(np.float32)
+
+        def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.path(x, _filled(len(x), t), code, control, _filled((len(x), 1), keep))
+
+        pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
+        path = self._drawn(*pair, (len(goal), 3, FUTURE), sampling, sampling.sequence_steps, rng)
+        return np.swapaxes(path * self.scaling.path_std, 1, 2)
+
+    def bodies(
+        self, codes: Codes, path: Float[np.ndarray, "plan 56 3"], sampling: Sampling, rng: np.random.Generator
+    ) -> Float[np.ndarray, "plan 56 channel"]:
+        """Draw bodies along paths, which guidance never takes away."""
+        control = (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
+
+        def denoise(code: Array) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.body(x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0))
+
+        shape = (len(path), len(self.scaling.body_mean), FUTURE)
+        body = self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng)
+        return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
+
+    def _drawn(
+        self,
+        full: Callable[[Array, float], Array],
+        blind: Callable[[Array, float], Array],
+        shape: tuple[int, ...],
+        sampling: Sampling,
+        count: int,
+        rng: np.random.Generator,
+    ) -> Array:
+        def draw() -> Array:
+            return rng.standard_normal(shape, dtype=np.float32)
+
+        denoise = guided(full, blind, sampling.guidance)
+        x = sample(denoise, draw(), self.schedule, method=sampling.method, count=count, draw=draw)
+        return x.astype(np.float32)
+
+
+def _filled(shape: int | tuple[int, int], value: float) -> Array:
+    return np.full(shape, value, np.float32)
