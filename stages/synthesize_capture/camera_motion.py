@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pipeline.space import rigid
 from stages.synthesize_capture.navigation import floor_for
-from stages.synthesize_capture.room import Room
+from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Room
 from stages.synthesize_capture.session import PERSON_BREADTH_M, PERSON_HEIGHT_M, STEP_S, AnimalCourse, SessionTrajectories
 
 Cameras = Float[np.ndarray, "sample 4 4"]
@@ -26,7 +26,7 @@ def walkthrough(room: Room, rng: np.random.Generator, duration_s: float) -> Came
     rounds = 2.0 + 0.5 * (duration_s > 30)
     angle = 2 * np.pi * rounds * share + rng.uniform(0, 2 * np.pi)
     # The person stands across the room from what is filmed, so that near walls do not fill the picture.
-    wanted = np.stack([-1.15 * np.sin(angle), -0.85 * np.cos(angle)], axis=-1) * (0.75 + 0.25 * np.sin(2 * np.pi * 1.3 * share))[:, None]
+    wanted = np.stack([-0.24 * WIDTH_M * np.sin(angle), -0.2 * DEPTH_M * np.cos(angle)], axis=-1) * (0.75 + 0.25 * np.sin(2 * np.pi * 1.3 * share))[:, None]
     position = np.array([floor.nearest(point) for point in wanted[::10]])
     position = np.stack([np.interp(timestamp_s, timestamp_s[::10], gaussian_filter1d(position[:, axis], 2.0)) for axis in range(2)], axis=-1)
     swing = angle + 0.45 * np.sin(2 * np.pi * 4.3 * share)
@@ -103,7 +103,7 @@ def _handheld(eye: np.ndarray, target: np.ndarray, rng: np.random.Generator, *, 
 
 def _inside(eye: np.ndarray) -> np.ndarray:
     """Keep the phone off the walls."""
-    from_wall = np.array([2.6 - 0.16, 9.0, 2.1 - 0.16])
+    from_wall = np.array([WIDTH_M / 2 - 0.16, 9.0, DEPTH_M / 2 - 0.16])
     return np.clip(eye, -from_wall, from_wall)
 
 

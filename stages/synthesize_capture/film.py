@@ -74,9 +74,9 @@ class Stage:
         linear = shade.shade(view.face, view.inverse_corners, (fx, fy, cx, cy), self.room, coat, camera_from_world)
         color = sensor.picture(linear, script.exposure, float(script.gain[index]), blur_px, self._rng)
         scaled = np.array([fx * columns / width, fy * rows / height, cx * columns / width, cy * rows / height])
-        true_depth = raster.depth_through(view.face, view.inverse_corners, scaled, rows, columns)
+        true_depth = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, scaled, rows, columns)
         depth, confidence = sensor.lidar(true_depth, self._rng)
-        samples = (view.face >= len(self.room.faces)).reshape(height, 2, width, 2).sum(axis=(1, 3))
+        samples = _four_sums(view.face >= len(self.room.faces))
         return Frame(color, depth, confidence, true_depth, samples >= 2, body)
 
     def _coat(self, index: int, body: np.ndarray | None, camera_from_world: np.ndarray) -> shade.Coat:
@@ -122,3 +122,9 @@ def matrices(intrinsics: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "fra
     out = np.zeros((len(intrinsics), 3, 3))
     out[:, 0, 0], out[:, 1, 1], out[:, 0, 2], out[:, 1, 2], out[:, 2, 2] = *intrinsics.T, 1.0
     return out
+
+
+def _four_sums(flags: Bool[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "height width"]:
+    """Count the flags in each two by two block."""
+    counts = flags.view(np.uint8)
+    return counts[::2, ::2] + counts[1::2, ::2] + counts[::2, 1::2] + counts[1::2, 1::2]

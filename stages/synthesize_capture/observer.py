@@ -21,17 +21,20 @@ class Observer:
         self.mode, self.left_s, self.pace, self.since_plan_s = "watch", rng.uniform(1.0, 2.0), 0.0, 0.0
         self.velocity = np.zeros(2)
         self.looks_at: Float[np.ndarray, "3"] | None = None
+        self._last: np.ndarray | None = None
         self._glance: tuple[float, np.ndarray] | None = None
 
     def step(self, seconds: float, animal: Float[np.ndarray, "3"]) -> None:
         """Move on, given where the animal is (x, y, z)."""
         before = self.walker.position.copy()
+        self._last = animal if self._last is None else self._last
         ground = animal[[0, 2]]
         self.left_s -= seconds
         self.since_plan_s += seconds
         if self.mode == "approach":
-            if np.linalg.norm(ground - self.walker.position) < 0.62:
-                self.left_s = 0.0
+            startled = np.linalg.norm(animal - self._last) > 1.2 * seconds
+            if np.linalg.norm(ground - self.walker.position) < 0.62 or startled:
+                self.left_s = min(self.left_s, 0.3)
             elif self.since_plan_s > 0.5:
                 self._plan_approach(ground)
         if self.left_s <= 0:
@@ -39,6 +42,7 @@ class Observer:
         toward = ground - self.walker.position
         self.walker.step(seconds, self.pace, face=float(np.arctan2(toward[0], toward[1])))
         self.velocity = (self.walker.position - before) / seconds
+        self._last = animal
         self._look(seconds, animal)
 
     def _choose(self, animal: Ground) -> None:
@@ -46,20 +50,23 @@ class Observer:
         self.walker.stop()
         self.pace = 0.0
         after = {"approach": ("watch", "retreat"), "watch": ("approach", "stroll"), "retreat": ("watch", "approach"), "stroll": ("approach", "watch")}
-        chance = {"approach": 0.6, "watch": 0.68, "retreat": 0.7, "stroll": 0.75}[self.mode]
-        self.mode = after[self.mode][0 if self.rng.random() < chance else 1]
+        chance = {"approach": 0.8, "watch": 0.88, "retreat": 1.0, "stroll": 0.2}[self.mode]
+        far = self.mode != "stroll" and np.linalg.norm(self.walker.position - animal) > 2.7
+        self.mode = "stroll" if far else after[self.mode][0 if self.rng.random() < chance else 1]
         match self.mode:
             case "watch":
-                self.left_s = self.rng.uniform(2.4, 4.4)
+                self.left_s = self.rng.uniform(7.0, 9.0)
             case "approach":
-                self.left_s, self.pace = self.rng.uniform(2.0, 3.2), self.rng.uniform(0.95, 1.35)
+                self.left_s, self.pace = self.rng.uniform(2.0, 3.0), self.rng.uniform(0.9, 1.2)
                 self._plan_approach(animal)
             case "retreat":
                 self.left_s, self.pace = self.rng.uniform(1.4, 2.2), self.rng.uniform(0.6, 0.85)
                 self._go_by(animal, lambda center: 0.9 * np.linalg.norm(center - animal, axis=-1) - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1))
             case "stroll":
                 self.left_s, self.pace = self.rng.uniform(2.4, 3.8), self.rng.uniform(0.5, 0.8)
-                self._go_by(animal, lambda center: self.rng.random(len(center)) + 2.0 * (np.linalg.norm(center - animal, axis=-1) > 1.7))
+                from_animal = self.walker.position - animal
+                angle = np.arctan2(from_animal[0], from_animal[1]) + self.rng.normal(0, 0.5)
+                self.walker.go(animal + 2.1 * np.array([np.sin(angle), np.cos(angle)]), avoid=animal)
 
     def _plan_approach(self, animal: Ground) -> None:
         self.since_plan_s = 0.0

@@ -17,6 +17,8 @@ from stages.synthesize_capture.room import Place
 DELAY_S = 0.25
 """How long it takes to notice what the person does."""
 NOTICE_M = 3.0
+FLIGHT_M = 2.2
+"""How far it runs when it can run straight away."""
 JUMP_S = 0.5
 Reason = Literal["own", "flee", "approach"]
 REASONS: tuple[Reason, ...] = ("own", "flee", "approach")
@@ -103,10 +105,11 @@ class Policy:
         if not self.walker.arrived():
             return
         self.rest_s -= seconds
-        willing = self.reason != "approach" and 1.35 < self.distance < NOTICE_M + 0.5 and self.calm_s > 0.9
-        if willing and self.rng.random() < 1.1 * seconds:
+        rested = self.reason == "own" or self.rest_s <= 0
+        willing = self.reason != "approach" and rested and 1.35 < self.distance < NOTICE_M + 0.5 and self.calm_s > 0.9
+        if willing and self.rng.random() < 1.8 * seconds:
             self._approach(seen)
-        elif self.rest_s <= 0:
+        elif self.rest_s <= -2.5 and self.rng.random() < 0.5 * seconds:
             self._visit()
 
     def _flee(self, seen: Seen) -> None:
@@ -118,23 +121,33 @@ class Policy:
         away = away / max(float(np.linalg.norm(away)), 1e-6)
         straight = (off @ away) / np.maximum(length, 1e-6)
         clear = np.minimum(np.linalg.norm(centers - seen.position, axis=-1), 3.0)
-        score = 1.3 * clear + 1.2 * straight - 0.7 * np.abs(length - 2.0) + self.rng.gumbel(0, 0.12, len(centers))
+        score = 0.5 * clear + 3.0 * straight - 1.6 * np.abs(length - FLIGHT_M) + self.rng.gumbel(0, 0.02, len(centers))
         self.reason, self.fear_s, self.pace = "flee", 0.9, self.rng.uniform(1.7, 2.3)
         self._leave()
-        self.walker.go(centers[np.argmax(score)], avoid=seen.position)
+        goal = centers[np.argmax(score)]
+        self.place = self._refuge(goal, seen)
+        self.walker.go(goal if self.place is None else np.asarray(self.place.entry), avoid=seen.position)
         self.wanted = np.array([0.0, 0.0, 0.7])
-        self.rest_s = self.rng.uniform(2.0, 3.5)
+        self.rest_s = self.rng.uniform(1.4, 2.0)
+
+    def _refuge(self, goal: Ground, seen: Seen) -> Place | None:
+        """Return a high place close to where it runs, not on the person's side."""
+        for place in self.places:
+            entry = np.asarray(place.entry)
+            if place.position[1] > 0.1 and np.linalg.norm(entry - goal) < 0.8 and np.linalg.norm(entry - seen.position) > 1.3:
+                return place
+        return None
 
     def _approach(self, seen: Seen) -> None:
         """Walk up to about a metre from the person, a little to one side."""
         from_person = self.walker.position - seen.position
-        angle = np.arctan2(from_person[0], from_person[1]) + self.rng.normal(0, 0.3)
-        goal = seen.position + self.rng.uniform(0.85, 1.1) * np.array([np.sin(angle), np.cos(angle)])
+        angle = np.arctan2(from_person[0], from_person[1]) + self.rng.normal(0, 0.15)
+        goal = seen.position + self.rng.uniform(0.9, 1.05) * np.array([np.sin(angle), np.cos(angle)])
         self.reason, self.pace = "approach", self.rng.uniform(0.6, 0.9)
         self._leave()
         self.walker.go(goal)
         self.wanted = np.zeros(3)
-        self.rest_s = self.rng.uniform(2.5, 4.5)
+        self.rest_s = self.rng.uniform(4.0, 7.0)
 
     def _visit(self) -> None:
         """Go to a favourite place, or just somewhere."""

@@ -90,18 +90,20 @@ def _invert(a, b, c, out):
 
 
 @njit(cache=True, error_model="numpy")
-def depth_through(face_of, inverse_corners, focal_center, height, width):
+def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height, width):
     """Return exact z-depth ``[height width]`` (0 = nothing) through the pixel centres of another size of the same view."""
     depth = np.zeros((height, width), np.float32)
     fx, fy, cx, cy = focal_center
     rows, columns = face_of.shape
     for i in range(height):
         for j in range(width):
-            face = face_of[int((i + 0.5) / height * rows), int((j + 0.5) / width * columns)]
+            row, column = int((i + 0.5) / height * rows), int((j + 0.5) / width * columns)
+            face = face_of[row, column]
             if face >= 0:
                 x, y = (j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy
                 total = 0.0
                 for k in range(3):
                     total += inverse_corners[face, k, 0] * x + inverse_corners[face, k, 1] * y + inverse_corners[face, k, 2]
-                depth[i, j] = 1.0 / max(total, 0.02)
+                near = inverse_depth[row, column]
+                depth[i, j] = 1.0 / min(max(total, 0.97 * near), 1.03 * near)
     return depth

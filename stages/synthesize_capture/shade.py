@@ -150,6 +150,9 @@ def _sample(face, a, b, c, x, y, z, fx, sheet, corners, atlas, levels, density, 
 @njit(cache=True, error_model="numpy")
 def _fur(corner, a, b, c, rest, light, pattern, footprint, pixel):
     """Blend base colour and light, and add the fine fur that the footprint (metres a pixel) can resolve."""
+    a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
+    total = a + b + c
+    a, b, c = a / total, b / total, c / total
     x = a * rest[corner[0], 0] + b * rest[corner[1], 0] + c * rest[corner[2], 0]
     y = a * rest[corner[0], 1] + b * rest[corner[1], 1] + c * rest[corner[2], 1]
     z = a * rest[corner[0], 2] + b * rest[corner[1], 2] + c * rest[corner[2], 2]

@@ -1,0 +1,83 @@
+"""Film the built-in world: a furnished room with a cat that minds people, as Record3D recordings.
+
+Writes `recordings/` (walk-through, turnaround, sessions, a second phone for one session) and, apart
+from them, `truth/`, which only `evaluate` may read. No real animal is needed to run the whole flow.
+"""
+
+import dataclasses
+import json
+
+import numpy as np
+
+from pipeline import cli, progress, qa
+from pipeline.qa import Check, Picture
+from stages.synthesize_capture import animal, produce, review, room, script
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to film."""
+
+    seed: int = 0
+    """Decides everything: room, coat, light, behaviour, noise."""
+    session_count: int = 6
+    """Recordings of the animal's life; the last is the test video."""
+    session_s: float = 60.0
+    """Length of a session, seconds."""
+    walkthrough_s: float = 45.0
+    """Length of the walk through the empty room, seconds."""
+    turnaround_s: float = 20.0
+    """Length of the circle around the standing animal, seconds."""
+    heldout_of: int = 2
+    """Session (from 1) that a second phone films from the other side; 0 = none."""
+    record_fps: float = 15.0
+    """Frames per second that the phone stores."""
+    dim_session: int = 3
+    """Session (from 1) filmed in the evening; 0 = none."""
+    sideways_session: int = 4
+    """Session (from 1) filmed with the phone held sideways; 0 = none."""
+    color_height: int = 320
+    """Pixels of the stored portrait canvas."""
+    color_width: int = 240
+    """Pixels of the stored portrait canvas."""
+    depth_height: int = 256
+    """Pixels of the stored depth."""
+    depth_width: int = 192
+    """Pixels of the stored depth."""
+
+
+def run(task: cli.Task) -> None:
+    """Build the world, write every recording's script, film them, and keep the truth apart."""
+    settings: Config = task.config
+    home = room.furnish(np.random.default_rng([settings.seed, 0]))
+    creature = animal.grow(np.random.default_rng([settings.seed, 2]))
+    scripts = script.scripts(script.Plan(**dataclasses.asdict(settings)), home)
+    manner = review.manner([part.session for part in scripts if part.session is not None])
+    progress.log(f"world: {len(scripts)} recordings, {sum(len(part.timestamp_s) for part in scripts)} frames")
+    with task.create() as folder:
+        recordings, truth = folder / "recordings", folder / "truth"
+        recordings.mkdir()
+        truth.mkdir()
+        made = produce.produce(scripts, creature, recordings, truth, workers=task.threads)
+        produce.write_surfaces(home, creature, truth)
+        about = {"seed": settings.seed, "up": [0, 1, 0], "recordings": [part.name for part in made], "bones": [bone.name for bone in animal.BONES]}
+        (truth / "world.json").write_text(json.dumps(about, indent=1) + "\n")
+        qa.write(
+            folder,
+            good="a lived-in room under changing light, and a cat that walks, sits, jumps and runs from whoever comes close",
+            bad="an animal that never moves or is never in the picture",
+            checks=[
+                Check("windows in which the animal moves", manner.moving_windows, "share", 0.5, 0.4, "higher"),
+                Check("quick approaches that it runs from", manner.flees_when_approached, "share", 0.6, None, "higher"),
+                Check("seconds left alone in which it runs", manner.flees_when_left_alone, "share", 0.1, None),
+                Check("frames that show the animal", float(np.mean([part.visible_share for part in made[1:]])), "share", 0.7, 0.5, "higher"),
+            ],
+            pictures=[
+                Picture("contact_sheet", review.contact_sheet(made), "Frames of every recording, the animal's true outline, and stored depth"),
+                Picture("birds_eye", review.birds_eye(scripts), "From above: the phone's way (blue), the animal's (orange) and its flights (red)"),
+            ],
+        )
+
+
+if __name__ == "__main__":
+    cli.enter(__doc__, run, config=Config)

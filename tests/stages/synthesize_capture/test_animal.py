@@ -1,0 +1,65 @@
+"""The animal is one closed surface, reaches for its feet exactly, and does not slide on them."""
+
+import numpy as np
+import trimesh
+
+from pipeline.space import rigid
+from stages.synthesize_capture import animal, gait
+from stages.synthesize_capture.session import AnimalCourse
+
+CREATURE = animal.grow(np.random.default_rng(0), cell_m=0.02)
+FEET = [animal.INDEX[name] for name in gait.FEET]
+
+
+def test_surface_is_closed_and_one():
+    surface = trimesh.Trimesh(animal.grow(np.random.default_rng(1)).vertices, animal.grow(np.random.default_rng(1)).faces, process=False)
+    assert surface.is_watertight and surface.body_count == 1 and surface.volume > 0
+    assert 2000 < len(surface.vertices) < 6000
+    assert len(animal.BONES) == 25
+
+
+def test_rest_bones_leave_the_surface_alone():
+    rest = rigid.make(np.eye(3), animal.HEADS)
+    np.testing.assert_allclose(animal.surface(CREATURE, rest), CREATURE.vertices, atol=1e-6)
+    np.testing.assert_allclose(CREATURE.weight.sum(1), 1, atol=1e-5)
+
+
+def test_planted_feet_do_not_slide():
+    for speed in (0.6, 1.2, 2.0):
+        course = _straight(speed)
+        times = np.linspace(1.0, 3.0, 400)
+        feet = _feet(gait.poses(course, times))
+        low = feet[..., 1] < gait.SOLE_M + 0.0005
+        drift = np.linalg.norm(np.diff(feet[..., [0, 2]], axis=0), axis=-1) / np.diff(times)[:, None]
+        planted = low[1:] & low[:-1]
+        assert planted.mean() > 0.3, "each foot carries weight for a good part of the stride"
+        assert np.quantile(drift[planted], 0.9) < 0.05, f"m/s at {speed} m/s"
+        assert (low.sum(1) >= 1).mean() > 0.6
+
+
+def test_bones_are_rigid_and_legs_keep_their_length():
+    motion = gait.poses(_straight(0.8, posture=(0.5, 0.0, 0.0)), np.linspace(0.5, 3.0, 60))
+    rotation = motion.agent_from_bone[..., :3, :3]
+    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-6)
+    for upper, lower in (("left upper arm", "left forearm"), ("right thigh", "right shank")):
+        gap = motion.agent_from_bone[:, animal.INDEX[upper], :3, 3] - motion.agent_from_bone[:, animal.INDEX[lower], :3, 3]
+        np.testing.assert_allclose(np.linalg.norm(gap, axis=-1), np.linalg.norm(animal.HEADS[animal.INDEX[upper]] - animal.HEADS[animal.INDEX[lower]]), atol=2e-3)
+
+
+def test_normals_point_outwards():
+    normals = animal.normals_of(CREATURE.vertices.astype(float), CREATURE.faces)
+    top = CREATURE.vertices[:, 1] > 0.06
+    belly = (np.abs(CREATURE.vertices[:, 2]) < 0.05) & (CREATURE.vertices[:, 1] < -0.06)
+    assert normals[top & (np.abs(CREATURE.vertices[:, 2]) < 0.05), 1].mean() > 0.5
+    assert normals[belly, 1].mean() < -0.5
+
+
+def _straight(speed: float, posture: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> AnimalCourse:
+    times = np.arange(130) / 30
+    position = np.stack([0 * times, 0 * times, speed * times], axis=-1)
+    still = np.zeros(len(times))
+    return AnimalCourse(times, position, still, np.tile(posture, (len(times), 1)), still, position + [0, 0.3, 2.0], still)
+
+
+def _feet(motion: gait.Motion) -> np.ndarray:
+    return rigid.apply(motion.world_from_agent, motion.agent_from_bone[:, FEET][..., :3, 3])

@@ -1,0 +1,46 @@
+"""The animal lives by its rules: it moves, stays on free floor, runs when pressed, and only then."""
+
+import numpy as np
+
+from stages.synthesize_capture import review, room
+from stages.synthesize_capture.navigation import floor_for
+from stages.synthesize_capture.policy import REASONS, Policy, Seen
+from stages.synthesize_capture.session import STEP_S, simulate_session
+
+HOME = room.furnish(np.random.default_rng(0))
+
+
+def test_same_seed_same_session():
+    first, second = (simulate_session(HOME, np.random.default_rng(5), 8.0) for _ in range(2))
+    np.testing.assert_array_equal(first.animal.position, second.animal.position)
+    np.testing.assert_array_equal(first.observer_looks_at, second.observer_looks_at)
+
+
+def test_manner_over_minutes():
+    sessions = [simulate_session(HOME.arranged(rng), rng, 60.0) for rng in np.random.default_rng(7).spawn(5)]
+    manner = review.manner(sessions)
+    assert manner.moving_windows >= 0.4
+    assert manner.flees_when_approached > 0.6
+    assert manner.flees_when_left_alone < 0.1
+    assert all(np.isfinite(lived.animal.position).all() and lived.animal.speed().max() < 4.0 for lived in sessions)
+    inside = np.concatenate([lived.animal.position for lived in sessions])
+    assert (np.abs(inside[:, 0]) < room.WIDTH_M / 2).all() and (np.abs(inside[:, 2]) < room.DEPTH_M / 2).all()
+
+
+def test_someone_far_away_or_still_never_makes_it_run():
+    floor = floor_for([], breadth_m=0.24, height_m=0.3)
+    for seen in (Seen(np.array([2.8, 2.2]), np.array([-0.9, -0.9])), Seen(np.array([-0.6, -1.0]), np.zeros(2))):
+        cat = Policy(floor, HOME.places, np.array([-2.0, -1.6]), np.random.default_rng(1))
+        for _ in range(20):
+            cat.step(STEP_S, seen)
+            assert cat.reason != REASONS[1]
+
+
+def test_it_runs_away_from_whoever_comes():
+    floor = floor_for([], breadth_m=0.24, height_m=0.3)
+    for angle in np.linspace(0, 2 * np.pi, 7):
+        toward = np.array([np.sin(angle), np.cos(angle)])
+        cat = Policy(floor, HOME.places, np.zeros(2), np.random.default_rng(2))
+        for _ in range(45):
+            cat.step(STEP_S, Seen(-1.2 * toward, 1.1 * toward))
+        assert cat.walker.position @ toward > 0.5, "metres along the way from the person to it"
