@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from pipeline.models import behavior
 from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
-from pipeline.models.planning import Sampler, TorchNetworks, observe
+from pipeline.models.planning import Observation, Sampler, TorchNetworks, observe
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, Context, Future
 from pipeline.space import rigid
 
@@ -144,17 +144,31 @@ class Ats:
         return cls(Sampler(TorchNetworks(nets, device), schedule, scaling), volume, rest, architecture.ego, sampling)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        """Draw ``count`` plans for each window, a few windows at a time; goal and path are each as sampled."""
-        chunks = [context[start : start + WINDOWS_AT_ONCE] for start in range(0, len(context), WINDOWS_AT_ONCE)]
-        parts = [self._some(chunk, count, rng) for chunk in chunks]
+        """Draw ``count`` plans for each window; goal and path are each as sampled."""
+        parts = [self._plans(chunk, count, rng) for chunk in _chunks(context)]
         return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
-    def _some(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        observation = observe(context, self.volume, self.agent_from_bone_rest, self.ego)
-        plan = self.sampler.plan(observation, self.sampling, rng, count=count)
+    def goals(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw goals only, which costs a hundredth of whole plans."""
+        goals = []
+        for chunk in _chunks(context):
+            codes = self.sampler.codes(self._observe(chunk), self.sampling, count)
+            goal = self.sampler.goals(codes, self.sampling, rng).reshape(len(chunk), count, 3)
+            goals.append(rigid.apply(world_from_ego(chunk.world_from_agent[:, -1], self.ego), goal))
+        return Samples(np.concatenate(goals))
+
+    def _plans(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        plan = self.sampler.plan(self._observe(context), self.sampling, rng, count=count)
         frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
         root = plan.world_from_agent(frame)
         bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest).astype(np.float32)
         goal = rigid.apply(frame, plan.goal[:, None])[:, 0]
         split = (len(context), count)
         return Samples(*(a.reshape(*split, *a.shape[1:]) for a in (goal, root[..., :3, 3], root[..., :3, :3], bones)))
+
+    def _observe(self, context: Context) -> Observation:
+        return observe(context, self.volume, self.agent_from_bone_rest, self.ego)
+
+
+def _chunks(context: Context) -> list[Context]:
+    return [context[start : start + WINDOWS_AT_ONCE] for start in range(0, len(context), WINDOWS_AT_ONCE)]

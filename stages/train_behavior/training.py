@@ -80,7 +80,7 @@ def train(
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(volume, nets.perception.scene.stride, device)
     pace = settings.optimization
-    optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay)
+    optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay, fused=True)
 
     def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
         batch = draw_batch(windows, scene, scaling, settings.augmentation, pace.batch, generator)

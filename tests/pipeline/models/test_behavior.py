@@ -88,6 +88,12 @@ def test_predictors_share_one_call(ats, data):
             np.testing.assert_allclose(np.linalg.det(first.rotation), 1, atol=1e-4)
 
 
+def test_goals_alone_are_those_of_whole_plans(ats, data):
+    context, _ = data.windows(data.indices(TEST)[:3])
+    whole, alone = (draw(context, 4, np.random.default_rng(0)).goal for draw in (ats.sample, ats.goals))
+    np.testing.assert_allclose(alone, whole, atol=1e-6)
+
+
 def test_baseline_noise_is_that_of_training(data):
     train = data.windows(data.indices(TRAIN))
     still = StandStill.fit(*train)
