@@ -22,8 +22,10 @@ from pipeline.space import rigid, rigid_torch
 class Augmentation:
     """How far training samples stray from the recorded ones."""
 
+    turn: float = 0.5
+    """probability of turning the ego frame about its up axis by any angle"""
     yaw_rad: float = 0.3
-    """largest rotation of the ego frame about its up axis, either way"""
+    """largest turn of the other samples, either way"""
     mirror: float = 0.5
     """probability of mirroring left and right"""
     observer_m: float = 0.05
@@ -32,6 +34,11 @@ class Augmentation:
     """standard deviation of noise on remembered bones, in their own standard deviations"""
     hide_bones: float = 0.5
     """probability that a sample's remembered bones are hidden"""
+
+    @property
+    def largest_turn_rad(self) -> float:
+        """Return how far the ego frame may be turned, either way."""
+        return torch.pi if self.turn > 0 else self.yaw_rad
 
 
 @dataclass(frozen=True)
@@ -123,7 +130,7 @@ def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], arch
     return Windows(*(torch.from_numpy(array.astype(np.float32)) for array in arrays), torch.from_numpy(rows))
 
 
-def scaling_from_windows(windows: Windows, yaw_rad: float = 0.0) -> Scaling:
+def scaling_from_windows(windows: Windows, yaw_rad: float) -> Scaling:
     """Fit the scales of goal, path (per frame; both horizontal axes alike) and body (per channel, with floors).
 
     The body's root rotation is scaled for ego frames that are turned by up to ``yaw_rad`` either way.
@@ -172,7 +179,8 @@ def draw_batch(
 
     index = torch.randint(len(windows), (size,), generator=generator)
     side = 1.0 - 2.0 * (uniform(size) < augmentation.mirror).float()
-    yaw = (uniform(size) * 2 - 1) * augmentation.yaw_rad
+    reach = torch.where(uniform(size) < augmentation.turn, torch.pi, augmentation.yaw_rad)
+    yaw = (uniform(size) * 2 - 1) * reach
     turn = rigid_torch.so3_exp(torch.stack([torch.zeros(size), yaw, torch.zeros(size)], dim=-1))
     flip = torch.diag_embed(torch.stack([side, torch.ones(size), torch.ones(size)], dim=-1))
     new_from_old = flip @ turn.mT

@@ -75,7 +75,7 @@ def train(
 ) -> Fitted:
     """Fit the networks to the training windows of the data."""
     windows = windows_from_data(data, data.indices(TRAIN), architecture)
-    scaling = scaling_from_windows(windows, settings.augmentation.yaw_rad)
+    scaling = scaling_from_windows(windows, settings.augmentation.largest_turn_rad)
     nets = initial_nets(architecture, windows, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(volume, nets.perception.scene.stride, device)
