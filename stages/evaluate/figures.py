@@ -1,0 +1,42 @@
+"""Named figures, each a number or nothing with its reason."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What `metrics.json` and `reasons.json` will hold."""
+
+    values: dict[str, float | None] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    def put(self, name: str, value: float, why_unknown: str = "too few frames could be measured") -> None:
+        """Record a figure; what is not finite becomes nothing with the reason given."""
+        if math.isfinite(value):
+            self.values[name] = float(value)
+        else:
+            self.skip([name], why_unknown)
+
+    def skip(self, names: Iterable[str], reason: str) -> None:
+        """Record figures that do not apply."""
+        for name in names:
+            self.values[name], self.reasons[name] = None, reason
+
+    def add(self, other: "Figures") -> None:
+        """Take over another room's figures."""
+        self.values.update(other.values)
+        self.reasons.update(other.reasons)
+
+
+def median(errors: np.ndarray) -> float:
+    """Return the median where failures count as infinite; NaN when nothing was measured."""
+    return float(np.median(errors)) if len(errors) else math.nan
+
+
+def percentile(errors: np.ndarray, share: float) -> float:
+    """Return a percentile (0..100) without interpolation, so that infinite failures stay what they are."""
+    return float(np.percentile(errors, share, method="higher")) if len(errors) else math.nan

@@ -1,0 +1,116 @@
+"""Single frames of real sessions placed on the map without odometry: our localizer and two simple rivals.
+
+The rivals show that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only), and the
+pose of the most similar walk-through picture.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files.clips import Clip
+from pipeline.models.features import describe
+from pipeline.models.localizer import Localizer
+from pipeline.space import cameras, rigid
+from stages.evaluate.alignment import PoseErrors
+from stages.evaluate.figures import Figures, median
+
+RETRIEVAL_STRIDE_PX = 40
+REPROJECTION_PX = 4.0
+FAILED = "more than half of the frames were not placed"
+
+
+@dataclass(frozen=True)
+class SiftMap:
+    """SIFT descriptors of the walk-through and the points under them."""
+
+    descriptors: Float[np.ndarray, "point 128"]
+    points_world: Float[np.ndarray, "point 3"]
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Walk-through pictures described as a whole, with their cameras."""
+
+    descriptors: Float[np.ndarray, "picture channel"]
+    world_from_camera: Float[np.ndarray, "picture 4 4"]
+
+
+def figures_of(name: str, errors: PoseErrors) -> Figures:
+    """Summarise errors of single frames under a name's beginning; frames that were not placed count as failures."""
+    figures = Figures()
+    figures.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
+    figures.put(f"{name}translation_m_median", median(errors.meters), FAILED)
+    within = (errors.degrees <= 5) & (errors.meters <= 0.2)
+    figures.put(f"{name}within_5deg_20cm_share", float(within.mean()) if len(within) else np.nan)
+    return figures
+
+
+def placed_by_localizer(
+    localizer: Localizer, clip: Clip, frames: Sequence[int], hide: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return ``world_from_camera [frame 4 4]``, NaN where not placed; ``hide`` marks the agent's pixels."""
+    found = []
+    for frame, hidden in zip(frames, hide, strict=True):
+        camera = (clip.depth_intrinsics[frame], clip.intrinsics[frame])
+        answers = localizer.localize(clip.color(frame), clip.depth(frame), *camera, ~hidden)
+        found.append(answers[0].world_from_camera if answers else np.full((4, 4), np.nan))
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def sift_map(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> SiftMap:
+    """Lift the SIFT points of walk-through frames by their depth."""
+    descriptors, points = [], []
+    for frame in frames:
+        pixel, described = _sift(clip.color(frame))
+        ray = cameras.unproject(pixel, clip.intrinsics[frame])
+        in_depth, _ = cameras.project(ray, clip.depth_intrinsics[frame])
+        depth = clip.depth(frame)
+        column, row = np.clip(np.floor(in_depth).astype(int), 0, np.array(depth.shape[::-1]) - 1).T
+        z = depth[row, column]
+        points.append(rigid.apply(world_from_camera[frame], ray * z[:, None])[z > 0])
+        descriptors.append(described[z > 0])
+    return SiftMap(np.concatenate(descriptors), np.concatenate(points))
+
+
+def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> np.ndarray:
+    """Match each frame's SIFT points to the map and solve PnP with RANSAC; NaN where that fails."""
+    matcher, found = cv2.BFMatcher(cv2.NORM_L2), []
+    for frame in frames:
+        pixel, described = _sift(clip.color(frame))
+        found.append(np.full((4, 4), np.nan))
+        if len(described) < 8:
+            continue
+        points = known.points_world[[match.trainIdx for match in matcher.match(described, known.descriptors)]]
+        cv2.setRNGSeed(0)
+        ok, turn, shift, inliers = cv2.solvePnPRansac(
+            points, pixel, clip.intrinsics[frame], None, iterationsCount=2000, reprojectionError=REPROJECTION_PX
+        )
+        if ok and inliers is not None and len(inliers) >= 8:
+            found[-1] = rigid.inverse(rigid.make(rigid.rotation_from_vector(turn[:, 0]), shift[:, 0]))
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def gallery(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> Gallery:
+    """Describe walk-through frames as a whole."""
+    return Gallery(np.stack([_whole(clip.color(frame)) for frame in frames]), world_from_camera[np.array(frames)])
+
+
+def placed_by_retrieval(known: Gallery, clip: Clip, frames: Sequence[int]) -> np.ndarray:
+    """Give each frame the camera of the most similar walk-through frame."""
+    nearest = [int(np.argmax(known.descriptors @ _whole(clip.color(frame)))) for frame in frames]
+    return known.world_from_camera[nearest]
+
+
+def _whole(color: np.ndarray) -> Float[np.ndarray, "channel"]:
+    raw = describe(color, RETRIEVAL_STRIDE_PX).ravel()
+    return raw / max(float(np.linalg.norm(raw)), 1e-6)
+
+
+def _sift(color: np.ndarray) -> tuple[Float[np.ndarray, "point 2"], Float[np.ndarray, "point 128"]]:
+    keypoints, described = cv2.SIFT.create().detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
+    pixel = np.array([keypoint.pt for keypoint in keypoints], float).reshape(-1, 2) + 0.5
+    return pixel, np.zeros((0, 128), np.float32) if described is None else described

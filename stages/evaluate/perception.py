@@ -1,0 +1,85 @@
+"""Masks and flow against truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.files.clips import Masks
+from stages.evaluate.figures import Figures
+from stages.evaluate.truth import TrueFlow, Truth
+
+SEEN_SHARE = 0.001
+"""share of the picture that must be agent, in truth or in ours, for a frame to count"""
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """Overlap per counted frame of one video."""
+
+    iou: Float[np.ndarray, "frame"]
+    resting: Bool[np.ndarray, "frame"]
+
+
+def overlaps(masks: Masks, truth: Truth) -> Overlaps:
+    """Compare every frame in which the agent is visible, in truth or according to us; unknown pixels do not count."""
+    iou, resting = [], []
+    for frame in range(len(masks)):
+        label, true = masks[frame], truth.masks[frame]
+        ours, counts = label == 255, label != 128
+        if max(true.mean(), ours.mean()) < SEEN_SHARE:
+            continue
+        union = ((ours | true) & counts).sum()
+        iou.append((ours & true & counts).sum() / union if union else 0.0)
+        resting.append(not truth.moving[frame])
+    return Overlaps(np.array(iou, float), np.array(resting, bool))
+
+
+def mask_figures(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Figures:
+    """Summarise overlaps of all sessions; the turnaround stands apart, it is the easy one."""
+    figures = Figures()
+    iou = np.concatenate([each.iou for each in sessions]) if sessions else np.zeros(0)
+    resting = np.concatenate([each.resting for each in sessions]) if sessions else np.zeros(0, bool)
+    figures.put("masks/iou_mean", _mean(iou), "the animal is never visible")
+    figures.put("masks/iou_resting", _mean(iou[resting]), "the animal never rests in view")
+    figures.put("masks/iou_turnaround", _mean(turnaround.iou) if turnaround else np.nan, "no turnaround")
+    return figures
+
+
+@dataclass(frozen=True)
+class FlowPair:
+    """Ours and true flow of the same pair of frames, colour pixels."""
+
+    ours: Float[np.ndarray, "height width 2"]
+    true: Float[np.ndarray, "height width 2"]
+    agent: Bool[np.ndarray, "height width"]
+
+
+def flow_pairs(ours: Float[np.ndarray, "frame height width 2"], true: TrueFlow, masks: np.ndarray) -> list[FlowPair]:
+    """Pair up flow of gap 1; the agent's cells are those whose centre it covers."""
+    stride = masks.shape[1] // ours.shape[1]
+    agent = masks[:, stride // 2 :: stride, stride // 2 :: stride][:, : ours.shape[1], : ours.shape[2]]
+    return [
+        FlowPair(ours[first].astype(np.float32), flow, agent[first])
+        for first, flow in zip(true.first, true.flow, strict=True)
+    ]
+
+
+def flow_figures(pairs: Sequence[FlowPair]) -> Figures:
+    """Return end-point errors, of ours and of predicting no motion at all."""
+    figures, why = Figures(), "no truth for neighbouring frames"
+    ours, zero, agent = [], [], []
+    for pair in pairs:
+        known = np.isfinite(pair.true).all(-1)
+        error = np.linalg.norm(pair.ours - pair.true, axis=-1)
+        ours.append(error[known])
+        agent.append(error[known & pair.agent])
+        zero.append(np.linalg.norm(pair.true, axis=-1)[known])
+    for name, parts in (("epe_px_mean", ours), ("epe_px_agent_mean", agent), ("zero_flow_epe_px_mean", zero)):
+        figures.put(f"flow/{name}", _mean(np.concatenate(parts) if parts else np.zeros(0)), why)
+    return figures
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else float("nan")

@@ -1,0 +1,154 @@
+"""The 4D reconstruction against truth: held-out views, agent roots, followed points, surfaces."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.files import arrays, meshes
+from pipeline.models import fields
+from pipeline.models.motion import Motion
+from pipeline.models.render import Renderer
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh, RayCaster
+from stages.evaluate import heldout, reading, surfaces
+from stages.evaluate.alignment import PoseErrors, pose_errors
+from stages.evaluate.figures import Figures
+from stages.evaluate.heldout import View
+from stages.evaluate.reading import Folders, Frames, Recorded
+from stages.evaluate.registration import root_figures
+from stages.evaluate.surfaces import Skin
+from stages.evaluate.truth import read_depth
+
+CAMERAS_FOR_SEEN = 40
+SURFACE_NAMES = (
+    "reconstruction/agent_root_m_median", "reconstruction/agent_root_deg_median", "reconstruction/agent_track_m_median",
+    "reconstruction/agent_track_m_p90", "reconstruction/scene_chamfer_m", "reconstruction/agent_chamfer_m",
+)  # fmt: skip
+NAMES = heldout.NAMES + SURFACE_NAMES
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is looked at."""
+
+    heldout_frames: int
+    surface_frames: int
+    """per session, for the agent's surface"""
+
+
+def reconstruction_figures(
+    folders: Folders, known: Sequence[Recorded], frames: Frames, effort: Effort, rng: np.random.Generator, device: str
+) -> Figures:
+    """Return everything about the reconstruction."""
+    figures = Figures()
+    sessions = [each for each in known if each.video.role == "session"]
+    motions = {each.video.id: reading.read_motion(folders.reconstruction, each.video.id) for each in sessions}
+    roots = [_root_errors(motions[each.video.id], each, frames) for each in sessions]
+    figures.add(root_figures("reconstruction", roots))
+    turnaround = next(each for each in known if each.video.role == "turnaround")
+    figures.add(_tracks(folders, sessions, motions, turnaround, frames))
+    figures.add(_agent_chamfer(folders, sessions, motions, frames, effort))
+    walkthrough = next(each for each in known if each.video.role == "walkthrough")
+    figures.add(_scene_chamfer(folders, walkthrough, frames, rng))
+    phones = [each for each in known if each.video.role == "heldout" and motions.get(each.video.synchronized_with)]
+    if phones:
+        views = [view for each in phones for view in _views(folders, each, motions, frames, effort, device)]
+        figures.add(heldout.view_figures(views))
+    else:
+        figures.skip(heldout.NAMES, "no held-out phone, or the session that it is synchronized with was not registered")
+    return figures
+
+
+def _root_errors(motion: Motion | None, each: Recorded, frames: Frames) -> PoseErrors:
+    ours = np.full((len(each.clip), 4, 4), np.nan) if motion is None else motion.world_from_agent
+    return pose_errors(ours, frames.roots(each.truth))[each.truth.agent_visible]
+
+
+def _views(
+    folders: Folders, phone: Recorded, motions: dict[str, Motion | None], frames: Frames, effort: Effort, device: str
+) -> list[View]:
+    """Draw the reconstruction from the held-out phone's true cameras, at its depth's resolution."""
+    session = phone.video.synchronized_with
+    renderer = Renderer(fields.load(folders.reconstruction, device), session)
+    true, cameras = read_depth(folders.truth, phone.name, phone.source_index), frames.cameras(phone.truth)
+    views = []
+    for frame in np.unique(np.linspace(0, len(phone.clip) - 1, effort.heldout_frames).astype(int)).tolist():
+        height, width = true.depth[frame].shape
+        root, bones = motions[session].at(phone.clip.timestamp_s[frame] + phone.video.offset_s)
+        picture = renderer.draw(cameras[frame], true.intrinsics[frame], height, width, root, bones)
+        color = cv2.resize(phone.clip.color(frame), (width, height), interpolation=cv2.INTER_AREA)
+        agent = cv2.resize(phone.truth.masks[frame].astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        views.append(View(picture.color, picture.depth, color, true.depth[frame], agent > 0))
+    return views
+
+
+def _skin(folders: Folders) -> tuple[Mesh, Skin]:
+    mesh, table = (
+        meshes.read_ply(folders.reconstruction / "agent.ply"),
+        arrays.load(folders.reconstruction / "skin.npz"),
+    )
+    return mesh, Skin(mesh.vertices, table["weights"], table["agent_from_bone_rest"])
+
+
+def _tracks(
+    folders: Folders, sessions: Sequence[Recorded], motions: dict, turnaround: Recorded, frames: Frames
+) -> Figures:
+    """Follow surface points that are matched to truth once, in the turnaround's middle frame."""
+    skin = _skin(folders)[1].only(arrays.load(folders.reconstruction / "tracks.npz")["vertex_index"])
+    middle = len(turnaround.clip) // 2
+    true_agent_from_world = rigid.inverse(turnaround.truth.world_from_agent[middle])
+    true_vertices = rigid.apply(true_agent_from_world, turnaround.truth.vertices_world(middle))
+    partner = surfaces.matched_once(skin.points_agent, rigid.apply(frames.agent_from_true_agent, true_vertices))
+    distances = []
+    for each in sessions:
+        motion = motions[each.video.id]
+        for frame in np.flatnonzero(each.truth.agent_visible):
+            true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame)[partner])
+            ours = _posed(skin, motion, frame)
+            distances.append(np.full(len(partner), np.inf) if ours is None else np.linalg.norm(ours - true, axis=1))
+    return surfaces.track_figures(distances)
+
+
+def _posed(skin: Skin, motion: Motion | None, frame: int) -> np.ndarray | None:
+    if motion is None or not np.isfinite(motion.world_from_agent[frame]).all():
+        return None
+    return skin.posed(motion.world_from_agent[frame], motion.agent_from_bone[frame])
+
+
+def _agent_chamfer(
+    folders: Folders, sessions: Sequence[Recorded], motions: dict, frames: Frames, effort: Effort
+) -> Figures:
+    figures, skin, distances = Figures(), _skin(folders)[1], []
+    for each in sessions:
+        visible = np.flatnonzero(each.truth.agent_visible)
+        chosen = (
+            visible[np.unique(np.linspace(0, len(visible) - 1, effort.surface_frames).astype(int))]
+            if len(visible)
+            else []
+        )
+        for frame in chosen:
+            ours = _posed(skin, motions[each.video.id], frame)
+            if ours is not None:
+                true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))
+                distances.append(surfaces.chamfer(ours, true))
+    value = float(np.mean(distances)) if distances else np.nan
+    figures.put("reconstruction/agent_chamfer_m", value, "the agent's pose is known in no visible frame")
+    return figures
+
+
+def _scene_chamfer(folders: Folders, walkthrough: Recorded, frames: Frames, rng: np.random.Generator) -> Figures:
+    """Compare the scene's surface with the true room, on what the walk-through saw of it."""
+    figures = Figures()
+    ours, true = meshes.read_ply(folders.reconstruction / "scene.ply"), meshes.read_ply(folders.truth / "scene.ply")
+    true = Mesh(rigid.apply(frames.world_from_true_world, true.vertices.astype(float)).astype(np.float32), true.faces)
+    cameras, caster = frames.cameras(walkthrough.truth), RayCaster(true)
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, CAMERAS_FOR_SEEN).astype(int))
+    camera = (cameras[chosen], walkthrough.truth.intrinsics[chosen], walkthrough.clip.color_size)
+    points = surfaces.sample_surface(true, surfaces.SAMPLES, rng)
+    seen = points[surfaces.seen_by(caster, points, *camera)]
+    figures.put(
+        "reconstruction/scene_chamfer_m", surfaces.chamfer(surfaces.sample_surface(ours, surfaces.SAMPLES, rng), seen)
+    )
+    return figures

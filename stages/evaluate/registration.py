@@ -1,0 +1,49 @@
+"""Cameras and agent roots of all sessions against truth: every frame counts, refused recordings as failures."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from stages.evaluate.alignment import PoseErrors, joined
+from stages.evaluate.figures import Figures, median, percentile
+
+REFUSED = "more than half of the frames have no pose"
+GOOD = (2.0, 0.05)
+"""degrees and metres within which a pose counts as right"""
+COVERAGES = (0.5, 0.8)
+
+
+def camera_figures(
+    errors: Mapping[str, PoseErrors], confidence: Mapping[str, Float[np.ndarray, "frame"]], registered: int
+) -> Figures:
+    """Summarise camera errors of all sessions, and of the frames that were most certain."""
+    figures, all_errors = Figures(), joined(list(errors.values()))
+    _summarise(figures, "registration", all_errors)
+    figures.put("registration/videos_registered", registered)
+    figures.put("registration/videos_total", len(errors))
+    right = (all_errors.degrees <= GOOD[0]) & (all_errors.meters <= GOOD[1])
+    figures.put("registration/within_2deg_5cm_share", float(right.mean()) if len(right) else np.nan)
+    certain = np.concatenate([confidence[id] for id in errors]) if errors else np.zeros(0)
+    order = np.argsort(-certain, kind="stable")
+    for coverage in COVERAGES:
+        kept = order[: round(coverage * len(order))]
+        name = f"registration/at_coverage_{round(100 * coverage)}"
+        figures.put(f"{name}_rotation_deg_median", median(all_errors.degrees[kept]), REFUSED)
+        figures.put(f"{name}_translation_m_median", median(all_errors.meters[kept]), REFUSED)
+    return figures
+
+
+def root_figures(name: str, errors: Sequence[PoseErrors]) -> Figures:
+    """Summarise the agent's root over the frames in which it is truly visible."""
+    figures, all_errors = Figures(), joined(list(errors))
+    figures.put(f"{name}/agent_root_m_median", median(all_errors.meters), REFUSED)
+    figures.put(f"{name}/agent_root_deg_median", median(all_errors.degrees), REFUSED)
+    figures.put(f"{name}/agent_root_m_p90", percentile(all_errors.meters, 90), "a tenth of the frames has no pose")
+    return figures
+
+
+def _summarise(figures: Figures, name: str, errors: PoseErrors) -> None:
+    for unit, values in (("rotation_deg", errors.degrees), ("translation_m", errors.meters)):
+        figures.put(f"{name}/{unit}_median", median(values), REFUSED)
+        figures.put(f"{name}/{unit}_p95", percentile(values, 95), "a twentieth of the frames has no pose")

@@ -1,0 +1,92 @@
+"""Surfaces against truth: points followed on the animal, chamfer distances of scene and animal."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.models import skinning
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh, RayCaster
+from stages.evaluate.figures import Figures, median, percentile
+
+RANGE_M = 5.0
+SAMPLES = 20_000
+
+
+@dataclass(frozen=True)
+class Skin:
+    """The agent's surface points and how bones move them."""
+
+    points_agent: Float[np.ndarray, "point 3"]
+    """at rest"""
+    weights: Float[np.ndarray, "point bone"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+
+    def posed(
+        self, world_from_agent: Float[np.ndarray, "4 4"], agent_from_bone: Float[np.ndarray, "bone 4 4"]
+    ) -> Float[np.ndarray, "point 3"]:
+        """Return the points in the world."""
+        weights, bones, rest, points = (
+            torch.as_tensor(np.asarray(part, np.float32))
+            for part in (self.weights, agent_from_bone, self.agent_from_bone_rest, self.points_agent)
+        )
+        moved = skinning.move(skinning.blend(weights, bones, rest), points).numpy().astype(np.float64)
+        return rigid.apply(world_from_agent, moved)
+
+    def only(self, index: Int[np.ndarray, "chosen"]) -> "Skin":
+        """Return some of the points."""
+        return Skin(self.points_agent[index], self.weights[index], self.agent_from_bone_rest)
+
+
+def matched_once(
+    points_agent: Float[np.ndarray, "point 3"], true_vertices_agent: Float[np.ndarray, "vertex 3"]
+) -> Int[np.ndarray, "point"]:
+    """Match our points to true vertices of one turnaround frame; both in our agent frame. Never matched again."""
+    return KDTree(true_vertices_agent).query(points_agent)[1]
+
+
+def track_figures(distances: Sequence[Float[np.ndarray, "point"]]) -> Figures:
+    """Summarise distances of followed points over all frames of all sessions; unknown poses count as failures."""
+    figures = Figures()
+    every = np.concatenate(distances) if len(distances) else np.zeros(0)
+    figures.put("reconstruction/agent_track_m_median", median(every), "more than half of the frames have no pose")
+    figures.put("reconstruction/agent_track_m_p90", percentile(every, 90), "a tenth of the frames has no pose")
+    return figures
+
+
+def chamfer(ours: Float[np.ndarray, "point 3"], true: Float[np.ndarray, "vertex 3"]) -> float:
+    """Return the mean of both directions' mean distances, metres."""
+    return float((KDTree(true).query(ours)[0].mean() + KDTree(ours).query(true)[0].mean()) / 2)
+
+
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:
+    """Draw points evenly over a surface."""
+    corner = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    return (rng.dirichlet((1, 1, 1), count)[..., None] * corner[face]).sum(1)
+
+
+def seen_by(
+    caster: RayCaster,
+    points_world: Float[np.ndarray, "point 3"],
+    world_from_camera: Float[np.ndarray, "camera 4 4"],
+    intrinsics: Float[np.ndarray, "camera 3 3"],
+    size: tuple[int, int],
+) -> Bool[np.ndarray, "point"]:
+    """Tell which surface points some camera sees within 5 m: in its picture and not behind anything."""
+    seen = np.zeros(len(points_world), bool)
+    for camera, lens in zip(world_from_camera, intrinsics, strict=True):
+        points_camera = rigid.apply(rigid.inverse(camera), points_world)
+        pixel = points_camera @ lens.T
+        inside = (points_camera[:, 2] > 0.05) & (points_camera[:, 2] < RANGE_M)
+        pixel = pixel[:, :2] / np.where(inside, points_camera[:, 2], 1)[:, None]
+        inside &= ((pixel >= 0) & (pixel < size[::-1])).all(1) & ~seen
+        direction = points_world[inside] - camera[:3, 3]
+        hit = caster.cast(camera[:3, 3], direction).distance
+        seen[np.flatnonzero(inside)[hit > 0.99]] = True
+    return seen

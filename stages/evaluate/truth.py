@@ -1,0 +1,85 @@
+"""The truth of one recording, at the frames that were extracted from it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.files import arrays
+
+CAMERA = ("world_from_camera", "intrinsics", "agent_visible", "moving")
+AGENT = ("world_from_agent", "agent_vertices_world")
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Everything known of a recording, in the truth's own frames; the agent's parts are None without an agent."""
+
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    intrinsics: Float[np.ndarray, "frame 3 3"]
+    agent_visible: Bool[np.ndarray, "frame"]
+    moving: Bool[np.ndarray, "frame"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"] | None
+    vertices: Float[np.ndarray, "frame vertex 3"] | None
+    """world positions less the agent's"""
+    masks: Bool[np.ndarray, "frame height width"] | None
+
+    @classmethod
+    def open(cls, folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> "Truth":
+        """Read ``<name>.npz`` and ``<name>.masks.npz`` for the extracted frames."""
+        table = arrays.load(folder / f"{name}.npz")
+        camera = [table[key][source_index] for key in CAMERA]
+        agent = [table[key][source_index] if key in table else None for key in AGENT]
+        masks = folder / f"{name}.masks.npz"
+        return cls(*camera, *agent, _masks(masks)[source_index] if masks.exists() else None)
+
+    def vertices_world(self, frame: int) -> Float[np.ndarray, "vertex 3"]:
+        """Return the true surface's vertices of one frame, metres, in the truth's world."""
+        return self.vertices[frame].astype(np.float64) + self.world_from_agent[frame, :3, 3]
+
+
+@dataclass(frozen=True)
+class TrueDepth:
+    """Noiseless depth of the held-out phone."""
+
+    depth: Float[np.ndarray, "frame height width"]
+    intrinsics: Float[np.ndarray, "frame 3 3"]
+
+
+def read_depth(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> TrueDepth:
+    """Read ``<name>.depth.npz`` for the extracted frames."""
+    table = arrays.load(folder / f"{name}.depth.npz")
+    intrinsics = table["depth_intrinsics"]
+    if intrinsics.ndim == 2:
+        intrinsics = np.broadcast_to(intrinsics, (len(table["depth"]), 3, 3))
+    return TrueDepth(table["depth"][source_index].astype(np.float32), intrinsics[source_index])
+
+
+@dataclass(frozen=True)
+class TrueFlow:
+    """True flow of neighbouring extracted frames, at the stored grid."""
+
+    first: Int[np.ndarray, "pair"]
+    """extracted frame; the flow leads to the next one"""
+    flow: Float[np.ndarray, "pair height width 2"]
+    """colour pixels, NaN where the point is not seen in both"""
+
+
+def read_flow(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> TrueFlow | None:
+    """Read ``<name>.flow.npz`` and keep the pairs that extraction made neighbours; None without a file."""
+    path = folder / f"{name}.flow.npz"
+    if not path.exists():
+        return None
+    table = arrays.load(path)
+    position = {int(source): frame for frame, source in enumerate(source_index)}
+    sources = zip(table["frame_index"].tolist(), table["second_index"].tolist(), strict=True)
+    pairs = [(position.get(first, -1), position.get(second, -9), row) for row, (first, second) in enumerate(sources)]
+    kept = [(first, row) for first, second, row in pairs if first >= 0 and second == first + 1]
+    first, row = np.array(kept, int).reshape(-1, 2).T
+    return TrueFlow(first, table["flow"][row].astype(np.float32))
+
+
+def _masks(path: Path) -> Bool[np.ndarray, "frame height width"]:
+    table = arrays.load(path)
+    return np.unpackbits(table["packed"], axis=-1)[..., : table["shape"][2]].astype(bool)
