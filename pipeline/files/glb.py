@@ -1,7 +1,7 @@
 """Make binary glTF 2.0: still surfaces and skinned, animated ones.
 
-A skinned file holds one root node that carries `world_from_agent`, the mesh, and every bone as a sibling joint under
-the root; the joint of bone b carries `agent_from_bone`. Bytes depend on the content alone.
+A skinned file holds one root node that carries `world_from_agent`, every bone as a sibling joint under it (bone b
+carries `agent_from_bone`), and beside the root the mesh, which follows its joints alone. Same content, same bytes.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agen
     document = _Document()
     document.add_mesh(mesh, name, skin)
     joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
-    document.file.nodes = [gltf.Node(name=name, children=[_MESH_NODE, *joints])]
+    document.file.nodes = [gltf.Node(name=name, children=joints)]
     document.file.nodes.append(gltf.Node(name=f"{name}_surface", mesh=0, skin=0))
     translations, quaternions = _translation_quaternion(skin.agent_from_bone_rest)
     for bone, translation, quaternion in zip(skin.bone_names, translations, quaternions, strict=True):
@@ -62,7 +62,7 @@ def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agen
     matrices = document.add(columns, "MAT4", _FLOAT)
     document.file.skins = [gltf.Skin(name="skin", joints=joints, skeleton=_ROOT_NODE, inverseBindMatrices=matrices)]
     document.file.animations = [document.animation(action) for action in actions]
-    document.file.scenes = [gltf.Scene(nodes=[_ROOT_NODE])]
+    document.file.scenes = [gltf.Scene(nodes=[_ROOT_NODE, _MESH_NODE])]
     return document.packed()
 
 

@@ -53,6 +53,7 @@ def page(*, contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> str:
     pieces = {
         "@@TITLE@@": f"{name}: a behaviour simulator",
         "@@NAME@@": name,
+        "@@NOTICES@@": bundle.joinpath("NOTICES.txt").read_text(),
         "@@STYLE@@": bundle.joinpath("style.css").read_text(),
         "@@ASSETS@@": "\n".join(tags),
         "@@SCRIPT@@": script.replace("</script", "<\\/script").replace("<!--", "<\\!--"),

@@ -9,7 +9,6 @@ import torch
 from pipeline.files import arrays, meshes
 from pipeline.models.behavior import Architecture, BehaviorNets, Scaling
 from pipeline.models.diffusion import Schedule, noised
-from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.trajectories import FUTURE, BehaviorData, Trajectory
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
@@ -94,9 +93,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
     torch.manual_seed(0)
     nets, schedule = BehaviorNets(architecture), Schedule()
     optimizer = torch.optim.Adam([*nets.perception.observer.parameters(), *nets.goal.parameters()], 3e-3)
-    alpha_bar, blank = torch.from_numpy(schedule.alpha_bar).float(), torch.zeros(1, 16, *GRID_SHAPE)
-    with torch.no_grad():
-        still = nets.perception.scene(blank)
+    alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
         place = (torch.rand(128, 1, 3) * 2 - 1) * torch.tensor([3.0, 0.3, 3.0]) + torch.tensor([0.0, 1.2, 0.0])
         observer = place.expand(-1, 8, 3)
@@ -104,13 +101,9 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
         distance = level.norm(dim=-1, keepdim=True)
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
-        past = torch.zeros(128, 8 * (9 + 6 * BONES))
-        condition = nets.perception.join(
-            still.detach().expand(128, -1),
-            nets.perception.observer(observer.flatten(1), torch.ones(128)),
-            nets.perception.past(past).detach(),
-            torch.ones(128, 3),
-        )
+        elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
+        noticed = nets.perception.observer(observer.flatten(1), torch.ones(128))
+        condition = nets.perception.join(elsewhere[0], noticed, elsewhere[1], torch.ones(128, 3))
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
         loss = (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise).square().mean()
@@ -155,7 +148,7 @@ def write(build: Path) -> None:
         voxel_m=np.array(0.1),
     )
     architecture = Architecture(
-        bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1, 2), goal_hidden=64
+        bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1,), goal_hidden=64
     )
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())

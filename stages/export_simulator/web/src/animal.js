@@ -6,41 +6,40 @@ import { ROW } from './rigid.js';
 import { parseModel } from './room.js';
 
 export class Animal {
-  constructor(root) {
-    this.root = root;
-    root.traverse((node) => { if (node.isSkinnedMesh) this.mesh = node; });
+  constructor(group) {
+    this.group = group;
+    group.traverse((node) => { if (node.isSkinnedMesh) this.mesh = node; });
     this.mesh.frustumCulled = false;
     this.mesh.material = new THREE.MeshLambertMaterial({ vertexColors: true });
     this.bones = this.mesh.skeleton.bones;
+    this.root = this.bones[0].parent;
     this.shadow = contactShadow();
-    this.root.parent?.add(this.shadow);
   }
 
   static async parse(bytes) {
-    const model = await parseModel(bytes);
-    return new Animal(model.scene.children[0]);
+    return new Animal((await parseModel(bytes)).scene);
   }
 
   // A translucent copy that shares the surface.
   ghost(color, opacity) {
-    const copy = new Animal(clone(this.root));
+    const copy = new Animal(clone(this.group));
     copy.mesh.material = new THREE.MeshBasicMaterial({ color, transparent: true, opacity, depthWrite: false });
     copy.shadow.visible = false;
     return copy;
   }
 
   addTo(scene) {
-    scene.add(this.root, this.shadow);
+    scene.add(this.group, this.shadow);
     return this;
   }
 
   set visible(value) {
-    this.root.visible = value;
+    this.group.visible = value;
     if (!value) this.shadow.visible = false;
   }
 
   get visible() {
-    return this.root.visible;
+    return this.group.visible;
   }
 
   // Take the pose of a frame: the root's row, then one row per bone.
