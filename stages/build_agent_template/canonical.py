@@ -8,6 +8,9 @@ from jaxtyping import Float
 from pipeline.space import rigid
 from pipeline.space.ground import Ground
 
+END_SHARE = 0.18
+"""Share of the body's length that counts as an end."""
+
 
 @dataclass(frozen=True)
 class Heading:
@@ -15,25 +18,24 @@ class Heading:
 
     world_from_agent: Float[np.ndarray, "4 4"]
     head_share: float
-    """share of the two ends' volume that lies at the head's end (0.5 = cannot be told)"""
+    """share of the two ends' volume times height that lies at the head's end (0.5 = cannot be told)"""
 
 
 def find_heading(inside_world: Float[np.ndarray, "cell 3"], ground: Ground, flip: bool) -> Heading:
-    """Lay +z along the longest level axis of the body, towards the end with more volume above the legs.
+    """Lay +z along the longest level axis of the body, towards the end that holds more volume, higher up.
 
-    The head is thick and high where the tail is thin; ``flip`` turns the answer round when it is wrong.
+    The head is thick and high where the tail is thin or, curled up, the rump is low; ``flip`` turns the answer round
+    when it is wrong.
     """
     centre = np.median(inside_world, axis=0)
     level = (inside_world - inside_world.mean(0))[:, [0, 2]]
     axis = np.linalg.eigh(level.T @ level)[1][:, -1]
     axis = axis if axis[np.abs(axis).argmax()] > 0 else -axis
-    height = ground.above(inside_world)
     along = (inside_world - centre)[:, [0, 2]] @ axis
-    upper = height > 0.4 * np.quantile(height, 0.98)
-    low, high = np.quantile(along, [0.005, 0.995])
-    quarter = 0.25 * (high - low)
-    ahead, behind = (upper & (along > high - quarter)).sum(), (upper & (along < low + quarter)).sum()
-    share = max(ahead, behind) / max(ahead + behind, 1)
+    end = END_SHARE * np.ptp(along)
+    height = np.maximum(ground.above(inside_world), 0)
+    ahead, behind = height[along > along.max() - end].sum(), height[along < along.min() + end].sum()
+    share = max(ahead, behind) / max(ahead + behind, 1e-9)
     if (behind > ahead) != flip:
         axis = -axis
     forward, up = np.array([axis[0], 0, axis[1]]), np.array([0.0, 1.0, 0.0])

@@ -1,7 +1,7 @@
 """Fuse masked depth into one closed surface.
 
-A pixel on the animal says where its surface is; a pixel beside it says that its whole ray is free, which carves the
-floor away. What no ray ever reached is inside the body; below the ground is outside.
+A pixel on the animal says where its surface is; a pixel beside it says that its ray is free up to the depth there.
+What hardly any frame sees through is inside the body; below the ground is outside.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ import fast_simplification
 import numpy as np
 import scipy.ndimage
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from skimage import measure
 
 from pipeline.files.clips import Clip, Masks
-from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from pipeline.space.tsdf import Volume, enclose
+from stages.build_agent_template.carve import Silhouettes
 from stages.build_agent_template.poses import Circle, depth_labels
 
 
@@ -29,6 +29,10 @@ class Fusion:
     """size of the volume's cells"""
     truncation_m: float = 0.03
     """depth error that averages out"""
+    see_through: float = 0.08
+    """share of the frames that must see through a cell without depth to carve it"""
+    see_through_fused: float = 0.4
+    """the same for a cell whose distance was fused"""
     smooth_voxels: float = 0.8
     """standard deviation of the smoothing of the signed distance"""
     vertices: int = 3000
@@ -45,22 +49,27 @@ class Body:
 
 
 def fuse(clip: Clip, masks: Masks, circle: Circle, options: Fusion) -> Body:
-    """Carve and fuse all frames that show the animal, then extract the largest closed surface."""
+    """Fuse and carve all frames that show the animal, then extract the largest closed surface."""
     volume = enclose(circle.points_world, voxel_m=options.voxel_m, truncation_m=options.truncation_m)
-    middle = circle.points_world.mean(0)
+    silhouettes = Silhouettes(volume.origin, volume.weight.shape, volume.voxel_m)
     for frame in np.flatnonzero(masks.visible):
-        pose = circle.world_from_camera[frame]
-        beyond = float(rigid.apply(rigid.inverse(pose), middle[None])[0, 2]) + 1.0
-        label = depth_labels(masks[frame], clip.depth_size)
-        depth = np.where(label == 255, _trusted(clip, frame), np.where(label == 0, beyond, 0))
-        volume.integrate(depth, clip.depth_intrinsics[frame], clip.color(frame), clip.intrinsics[frame], pose)
-    return extract(volume, _below(volume, circle), options)
+        pose, intrinsics = circle.world_from_camera[frame], clip.depth_intrinsics[frame]
+        labels, depth = depth_labels(masks[frame], clip.depth_size), clip.depth(frame)
+        silhouettes.add(labels, depth, intrinsics, pose)
+        on_animal = np.where(labels == 255, _trusted(depth, clip.confidence(frame)), 0)
+        volume.integrate(on_animal, intrinsics, clip.color(frame), clip.intrinsics[frame], pose)
+    return extract(volume, silhouettes.share_beside(), _below(volume, circle), options)
 
 
-def extract(volume: Volume, below_ground: Bool[np.ndarray, "x y z"], options: Fusion) -> Body:
-    """Close the fused volume and return its largest body, smoothed and thinned."""
-    distance = np.where(volume.weight > 0, volume.distance, -1.0).astype(np.float32)
-    distance[below_ground] = 1.0
+def extract(volume: Volume, share_beside: Float[np.ndarray, "x y z"], below_ground: Bool[np.ndarray, "x y z"], options: Fusion) -> Body:
+    """Close the fused volume and return its largest body, smoothed and thinned.
+
+    Where depth was fused it decides unless most frames see through; elsewhere a cell is inside that hardly any frame
+    sees through.
+    """
+    fused = volume.weight > 0
+    outside = below_ground | (share_beside > np.where(fused, options.see_through_fused, options.see_through))
+    distance = np.where(outside, 1.0, np.where(fused, volume.distance, -1.0)).astype(np.float32)
     distance = np.pad(distance, 1, constant_values=1.0)
     group, count = scipy.ndimage.label(distance < 0)
     own = group == (np.bincount(group.ravel())[1:].argmax() + 1 if count else -1)
@@ -89,12 +98,11 @@ def thin(mesh: trimesh.Trimesh, vertices: int) -> tuple[Float[np.ndarray, "verte
     return np.asarray(result.vertices), np.asarray(result.faces)
 
 
-def _trusted(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Depth without low confidence and without flying pixels at steps."""
-    depth = clip.depth(frame)
+def _trusted(depth: Float[np.ndarray, "height width"], confidence: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Drop depth (0 = unknown) of low confidence and flying pixels at steps."""
     around = np.ones((3, 3), np.uint8)
     step = cv2.dilate(depth, around) - cv2.erode(depth, around)
-    return np.where((clip.confidence(frame) > 0) & (step < 0.06 + 0.02 * depth), depth, 0)
+    return np.where((confidence > 0) & (step < 0.06 + 0.02 * depth), depth, 0)
 
 
 def _below(volume: Volume, circle: Circle) -> Bool[np.ndarray, "x y z"]:
