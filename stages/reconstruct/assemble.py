@@ -56,7 +56,7 @@ class Shapes:
     """channels of each grid"""
     width: int = 64
     """units of each head's hidden layer"""
-    truncation_m: float = 0.12
+    truncation_m: float = 0.08
     """the scene's signed distance saturates here"""
     scene_margin_m: float = 0.2
     """space kept around all that was measured"""
@@ -76,7 +76,7 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     agent = np.concatenate([filled(video.timestamp_s, video.world_from_agent) for video in videos])
     rooted = torch.from_numpy(np.concatenate([np.isfinite(video.world_from_agent).all((1, 2)) for video in videos]))
     low, high = _measured_box(store, camera, shapes.scene_margin_m)
-    scene = Field(FieldShape(low, high, shapes.scene_voxel_m, shapes.grid_channels, shapes.width, sum(v.has_scene for v in videos), truncation_m=shapes.truncation_m), free_m=0.1)
+    scene = Field(FieldShape(low, high, shapes.scene_voxel_m, shapes.grid_channels, shapes.width, sum(v.has_scene for v in videos), truncation_m=shapes.truncation_m), free_m=-0.03)
     vertices = template.mesh.vertices
     low, high = (tuple(float(x) for x in corner) for corner in (vertices.min(0) - shapes.agent_margin_m, vertices.max(0) + shapes.agent_margin_m))
     agent_shape = FieldShape(low, high, shapes.agent_voxel_m, shapes.grid_channels, shapes.width)

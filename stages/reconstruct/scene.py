@@ -16,6 +16,8 @@ from stages.reconstruct.settings import Batches, Weights
 Terms = dict[str, tuple[float, Tensor]]
 FREE_FROM_M = 0.1
 FARTHEST_M = 5.0
+BEHIND_M = 0.08
+"""samples behind a measured surface; deeper ones would fill thin things and what lies behind edges"""
 EIKONAL_STEP_M = 0.04
 
 
@@ -37,12 +39,13 @@ def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"],
 
 
 def sample_depths(rays: Rays, near: int, free: int, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
-    """Return the measured depth, samples within ``reach_m`` of it, and samples in the free space before it."""
+    """Return the measured depth, samples from ``reach_m`` before the surface to just behind it, and samples in the free space before it."""
     device, depth = rays.depth.device, rays.depth[:, None]
-    around = (torch.rand(len(rays), near, generator=generator).to(device) * 2 - 1) * reach_m
+    place = torch.rand(len(rays), near, generator=generator).to(device)
+    around = place * (reach_m / rays.slope[:, None].clamp_min(0.3) + BEHIND_M) - BEHIND_M
     step = (torch.arange(free, device=device) + torch.rand(len(rays), free, generator=generator).to(device)) / max(free, 1)
     before = FREE_FROM_M + (depth - reach_m - FREE_FROM_M).clamp_min(0) * step
-    return torch.cat([depth, depth + around / rays.slope[:, None].clamp_min(0.3), before], dim=1)
+    return torch.cat([depth, depth - around, before], dim=1)
 
 
 def measured_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, batches: Batches, generator: Generator) -> Terms:

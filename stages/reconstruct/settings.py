@@ -37,7 +37,7 @@ class Weights:
     """accelerations of root and bones"""
     rest: float = 0.05
     """bones stay near rest"""
-    drift: float = 3.0
+    drift: float = 0.5
     """corrections of neighbouring camera knots agree (relative motion of registration)"""
     template: float = 0.3
     """the agent's field stays near its template where nothing is seen"""
