@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline import cli, qa
+from pipeline import artifact, cli, qa
 from pipeline.cli import Task
 from stages.report import bars, collect, pages
 from stages.report.chapters import CHAPTERS, Chapter
@@ -29,7 +29,7 @@ def run(task: Task) -> None:
     evaluation = task.input("evaluation")
     metrics, reasons = (json.loads((evaluation / file).read_bytes()) for file in ("metrics.json", "reasons.json"))
     roles = {video.id: collect.role(video) for video in task.videos}
-    chapters = [collect.told(chapter, folders(task, chapter), roles) for chapter in CHAPTERS]
+    chapters = [told(task, chapter, roles) for chapter in CHAPTERS]
     judged, figures = bars.judge(metrics, reasons), bars.grouped(metrics)
     texts = pages.render(name=task.config.name, chapters=chapters, judged=judged, figures=figures, reasons=reasons)
     with task.create() as folder:
@@ -40,9 +40,13 @@ def run(task: Task) -> None:
         qa.write(folder, good="every page opens and can be sent", bad="pages too big to send", checks=[size])
 
 
-def folders(task: Task, chapter: Chapter) -> dict[str | None, Path]:
-    """Return the chapter's artifacts, by recording where there is one for each."""
-    return {**task.per_video(chapter.artifact)} if chapter.per_video else {None: task.input(chapter.artifact)}
+def told(task: Task, chapter: Chapter, roles: dict[str, str]) -> collect.Told:
+    """Open the chapter's artifacts, by recording where there is one for each, and read their notes."""
+    folders: dict[str | None, Path] = (
+        {**task.per_video(chapter.artifact)} if chapter.per_video else {None: task.input(chapter.artifact)}
+    )
+    manifest = artifact.read_manifest(next(iter(folders.values())))
+    return collect.told(chapter, folders, roles, manifest.config if manifest else {})
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 
-from pipeline import artifact
 from pipeline.files import images
 from pipeline.videos import Video
 from stages.report.chapters import Chapter
@@ -76,7 +75,9 @@ def role(video: Video) -> str:
     return f"{video.role}, {video.split}" if video.role == "session" else video.role
 
 
-def told(chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str]) -> Told:
+def told(
+    chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str], settings: Mapping[str, Any]
+) -> Told:
     """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all)."""
     raw = {video: _read(folder) for video, folder in folders.items()}
     files = [
@@ -87,8 +88,7 @@ def told(chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[st
     total = sum(file.stat().st_size for file in files)
     shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
     notes = [_note(video, roles.get(video or "", ""), folders[video], qa, shrink) for video, qa in raw.items()]
-    manifests = [artifact.read_manifest(folder) for folder in folders.values()]
-    return Told(chapter, notes, manifests[0].config if manifests and manifests[0] else {})
+    return Told(chapter, notes, dict(settings))
 
 
 def _read(folder: Path) -> dict[str, Any]:
