@@ -1,0 +1,225 @@
+"""Scores: exact on constructed cases, blind to what they must be blind to, and honest about failures."""
+
+import numpy as np
+import pytest
+
+from pipeline.models.predictors import Samples
+from pipeline.models.trajectories import TEST, TRAIN, BehaviorData, Future, Trajectory
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh, RayCaster
+from stages.evaluate import behavior, heldout, registration, surfaces
+from stages.evaluate.alignment import constant_between, pose_errors
+from stages.evaluate.figures import Figures, median, percentile
+from stages.evaluate.heldout import View
+from stages.evaluate.statistics import bootstrapped, episodes
+
+
+def poses(count, seed=0, size_m=2.0):
+    """Random rigid motions."""
+    rng = np.random.default_rng(seed)
+    return rigid.exp(np.concatenate([rng.normal(0, 1, (count, 3)), rng.normal(0, size_m, (count, 3))], axis=1))
+
+
+def test_a_constant_motion_is_found_and_then_nothing_is_left():
+    truth, constant = poses(30), poses(1, seed=5)[0]
+    ours = constant @ truth
+    ours[3] = np.nan
+    ours[7] = ours[7] @ poses(1, seed=9)[0]
+    found = constant_between(ours, truth)
+    np.testing.assert_allclose(found, constant, atol=1e-3)
+    errors = pose_errors(ours, found @ truth)
+    assert np.isinf(errors.degrees[3])
+    assert errors.meters[7] > 0.1
+    assert np.median(errors.degrees) < 0.05
+
+
+def test_no_scale_is_hidden_by_the_fit():
+    truth = poses(50)
+    ours = truth.copy()
+    ours[:, :3, 3] *= 1.1
+    errors = pose_errors(ours, constant_between(ours, truth) @ truth)
+    assert median(errors.meters) > 0.1
+
+
+def test_refused_recordings_count_as_failures():
+    truth = poses(10)
+    good = pose_errors(truth, truth)
+    refused = pose_errors(np.full_like(truth, np.nan), truth)
+    figures = registration.camera_figures({"a": good, "b": refused}, {"a": np.ones(10), "b": np.zeros(10)}, 1)
+    assert figures.values["registration/videos_registered"] == 1
+    assert figures.values["registration/videos_total"] == 2
+    assert figures.values["registration/rotation_deg_p95"] is None
+    assert "registration/rotation_deg_p95" in figures.reasons
+    assert figures.values["registration/at_coverage_50_translation_m_median"] == pytest.approx(0, abs=1e-9)
+    assert figures.values["registration/within_2deg_5cm_share"] == 0.5
+
+
+def test_rotation_error_has_no_floor():
+    truth = poses(5)
+    turned = truth @ rigid.exp(np.array([1e-4, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(pose_errors(turned, truth).degrees, np.degrees(1e-4), rtol=1e-6)
+
+
+def test_infinite_failures_stay_infinite_in_percentiles():
+    errors = np.array([0.0] * 18 + [np.inf] * 2)
+    assert percentile(errors, 90) == np.inf or percentile(errors, 90) == 0.0
+    assert percentile(errors, 95) == np.inf
+    figures = Figures()
+    figures.put("x", percentile(errors, 95), "why")
+    assert figures.values["x"] is None
+    assert figures.reasons["x"] == "why"
+
+
+def view(color, depth, true_color, true_depth, agent):
+    return View(color, depth.astype(np.float32), true_color, true_depth.astype(np.float32), agent)
+
+
+def test_held_out_views_count_holes_as_wrong_and_forgive_exposure():
+    rng = np.random.default_rng(0)
+    true_color = rng.integers(40, 200, (32, 24, 3), dtype=np.uint8)
+    true_depth, agent = np.full((32, 24), 2.0), np.zeros((32, 24), bool)
+    agent[:8] = True
+    true_depth[-4:] = 7.0
+    depth = true_depth + 0.05
+    depth[:8, :12] = 0
+    darker = (0.5 * true_color + 10).astype(np.uint8)
+    values = heldout.view_figures([view(darker, depth, true_color, true_depth, agent)]).values
+    assert values["reconstruction/depth_acc_agent"] == 0.5
+    assert values["reconstruction/depth_acc_scene"] == 1.0
+    assert values["reconstruction/depth_acc_all"] == pytest.approx(1 - 8 * 12 / (28 * 24))
+    assert values["reconstruction/psnr_all"] > 40
+    assert values["reconstruction/lpips_all"] is None
+
+
+def test_worse_pictures_score_worse():
+    rng = np.random.default_rng(0)
+    true_color = rng.integers(0, 255, (40, 40, 3), dtype=np.uint8)
+    depth, agent = np.ones((40, 40)), np.zeros((40, 40), bool)
+    qualities = []
+    for noise in (2, 20, 80):
+        ours = np.clip(true_color + rng.normal(0, noise, true_color.shape), 0, 255).astype(np.uint8)
+        qualities.append(heldout.picture_quality(view(ours, depth, true_color, depth, agent)))
+    psnr, ssim = np.array(qualities)[:, [0, 3]].T
+    assert np.all(np.diff(psnr) < 0)
+    assert np.all(np.diff(ssim) < 0)
+
+
+def test_chamfer_measures_the_distance_of_surfaces():
+    plane = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
+    assert surfaces.chamfer(plane, plane + np.array([0, 0, 0.3])) == pytest.approx(0.3)
+
+
+def test_only_what_cameras_see_is_seen():
+    corner = np.array(
+        [[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]]
+    )
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    mesh = Mesh(corner.astype(np.float32), faces)
+    points = surfaces.sample_surface(mesh, 2000, np.random.default_rng(0))
+    lens = np.array([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]])
+    seen = surfaces.seen_by(RayCaster(mesh), points, np.eye(4)[None], lens, (100, 100))
+    assert seen[points[:, 2] < 2.5].all()
+    assert not seen[points[:, 2] > 2.5].any()
+
+
+def test_tracks_follow_the_skin():
+    rng = np.random.default_rng(0)
+    rest = poses(2, 1).astype(np.float32)
+    skin = surfaces.Skin(rng.normal(size=(50, 3)), np.eye(2)[rng.integers(0, 2, 50)], rest)
+    root, turn = poses(1, 3)[0], poses(1, 4)[0]
+    np.testing.assert_allclose(skin.posed(root, rest), rigid.apply(root, skin.points_agent), atol=1e-4)
+    moved = skin.posed(np.eye(4), turn @ rest)
+    np.testing.assert_allclose(moved, rigid.apply(turn, skin.points_agent), atol=1e-4)
+    assert np.array_equal(surfaces.matched_once(skin.points_agent, skin.points_agent[::-1]), np.arange(50)[::-1])
+
+
+def wandering(frames, seed):
+    """An animal that walks in a straight line at a random heading."""
+    rng = np.random.default_rng(seed)
+    heading = rng.uniform(0, 2 * np.pi)
+    position = np.arange(frames)[:, None] * 0.05 * np.array([np.sin(heading), 0, np.cos(heading)])
+    root = rigid.make(rigid.rotation_from_vector(np.tile([0, heading, 0.0], (frames, 1))), position)
+    bones = np.tile(np.eye(4), (frames, 3, 1, 1))
+    camera = rigid.make(np.eye(3), np.tile([0, 1.5, -2.0], (frames, 1)))
+    return Trajectory(np.arange(frames) / 10, root, bones, camera, np.ones(frames, bool))
+
+
+@pytest.fixture(scope="module")
+def data():
+    trajectories = {"a": wandering(200, 0), "b": wandering(160, 1)}
+    starts = {"a": np.arange(0, 136, 4), "b": np.arange(97)}
+    video = np.concatenate([np.full(len(start), i) for i, start in enumerate(starts.values())])
+    split = np.where(video == 0, TRAIN, TEST)
+    return BehaviorData(
+        trajectories, np.tile(np.eye(4), (3, 1, 1)), video, np.concatenate(list(starts.values())), split, ("a", "b")
+    )
+
+
+class Oracle:
+    """Knows the future up to a little noise."""
+
+    def __init__(self, data):
+        self.future = data.windows(data.indices(TEST))[1]
+
+    def sample(self, context, count, rng):
+        keep = slice(None) if len(context) == len(self.future.world_from_agent) else slice(None, None, 16)
+        root, bones = self.future.world_from_agent[keep], self.future.agent_from_bone[keep]
+        path = root[:, None, :, :3, 3] + rng.normal(0, 0.01, (len(root), count, 1, 3))
+        shape = (len(root), count, *root.shape[1:2])
+        rotation = np.broadcast_to(root[:, None, :, :3, :3], (*shape, 3, 3))
+        return Samples(path[:, :, -1], path, rotation, np.broadcast_to(bones[:, None], (*shape, *bones.shape[2:])))
+
+
+PROTOCOL = behavior.Protocol(samples=8, trials=2, plan_trials=1, plan_stride=16, draws=200, seed=0)
+
+
+def test_who_knows_the_future_beats_blind_rivals_and_the_interval_says_so(data):
+    values = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
+    assert values["behavior/ats/goal_minde_m"] < 0.02
+    assert values["behavior/ats/orientation_minade_rad"] == pytest.approx(0, abs=1e-6)
+    assert values["behavior/moving_windows_share"] == 1.0
+    for rival in ("location_prior", "stand_still"):
+        for score in behavior.GOAL_SCORES:
+            assert values[f"behavior/ats_minus_{rival}/{score}_ci95_high"] < 0
+    assert values["behavior/location_prior/path_minade_m"] is None
+
+
+def test_constant_velocity_is_right_about_straight_walks(data):
+    values = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
+    assert values["behavior/constant_velocity/goal_minde_m"] < 0.01 < values["behavior/stand_still/goal_minde_m"]
+
+
+def test_without_a_test_video_behaviour_is_skipped_and_says_so(data):
+    alone = BehaviorData(
+        data.trajectories,
+        data.agent_from_bone_rest,
+        data.video,
+        data.start,
+        np.full(len(data.start), TRAIN),
+        data.videos,
+    )
+    figures = behavior.behavior_figures(alone, Oracle(data), PROTOCOL)
+    assert figures.values["behavior/ats/goal_minde_m"] is None
+    assert "test video" in figures.reasons["behavior/ats/goal_minde_m"]
+
+
+def test_the_energy_score_is_smallest_for_the_right_distribution():
+    rng = np.random.default_rng(0)
+    truth = rng.normal(0, 1, (4000, 3))
+    future = Future(np.tile(np.eye(4), (4000, 1, 1, 1)), np.zeros((4000, 1, 1, 4, 4)))
+    future.world_from_agent[:, 0, :3, 3] = truth
+    scores = [
+        behavior.goal_energy_score(Samples(rng.normal(0, std, (4000, 16, 3))), future).mean() for std in (0.01, 1, 3)
+    ]
+    assert scores[1] == min(scores)
+
+
+def test_intervals_widen_when_windows_repeat_each_other():
+    rng = np.random.default_rng(0)
+    start = np.arange(600)
+    values = np.repeat(rng.normal(size=10), 60)
+    blocks = episodes(start, np.zeros(600, int), 60)
+    wide = bootstrapped(values, blocks, 500, np.random.default_rng(0))
+    narrow = bootstrapped(values, start, 500, np.random.default_rng(0))
+    assert wide.high - wide.low > 3 * (narrow.high - narrow.low)
+    assert wide.low <= wide.mean <= wide.high
