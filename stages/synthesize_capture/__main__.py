@@ -5,12 +5,10 @@ from them, `truth/`, which only `evaluate` may read. No real animal is needed to
 """
 
 import dataclasses
-import json
 
 import numpy as np
 
-from pipeline import cli, progress, qa
-from pipeline.qa import Check, Picture
+from pipeline import cli, progress
 from stages.synthesize_capture import animal, produce, review, room, script
 
 
@@ -52,31 +50,14 @@ def run(task: cli.Task) -> None:
     home = room.furnish(np.random.default_rng([settings.seed, 0]))
     creature = animal.grow(np.random.default_rng([settings.seed, 2]))
     scripts = script.scripts(script.Plan(**dataclasses.asdict(settings)), home)
-    manner = review.manner([part.session for part in scripts if part.session is not None])
     progress.log(f"world: {len(scripts)} recordings, {sum(len(part.timestamp_s) for part in scripts)} frames")
     with task.create() as folder:
         recordings, truth = folder / "recordings", folder / "truth"
         recordings.mkdir()
         truth.mkdir()
         made = produce.produce(scripts, creature, recordings, truth, workers=task.threads)
-        produce.write_surfaces(home, creature, truth)
-        about = {"seed": settings.seed, "up": [0, 1, 0], "recordings": [part.name for part in made], "bones": [bone.name for bone in animal.BONES]}
-        (truth / "world.json").write_text(json.dumps(about, indent=1) + "\n")
-        qa.write(
-            folder,
-            good="a lived-in room under changing light, and a cat that walks, sits, jumps and runs from whoever comes close",
-            bad="an animal that never moves or is never in the picture",
-            checks=[
-                Check("windows in which the animal moves", manner.moving_windows, "share", 0.5, 0.4, "higher"),
-                Check("quick approaches that it runs from", manner.flees_when_approached, "share", 0.6, None, "higher"),
-                Check("seconds left alone in which it runs", manner.flees_when_left_alone, "share", 0.1, None),
-                Check("frames that show the animal", float(np.mean([part.visible_share for part in made[1:]])), "share", 0.7, 0.5, "higher"),
-            ],
-            pictures=[
-                Picture("contact_sheet", review.contact_sheet(made), "Frames of every recording, the animal's true outline, and stored depth"),
-                Picture("birds_eye", review.birds_eye(scripts), "From above: the phone's way (blue), the animal's (orange) and its flights (red)"),
-            ],
-        )
+        produce.write_world(home, creature, settings.seed, truth)
+        review.report_quality(folder, scripts, made)
 
 
 if __name__ == "__main__":

@@ -53,11 +53,22 @@ def _skeleton() -> tuple[Bone, ...]:
     start = (0.0, 0.022, -0.20)
     for index in range(5):
         end = (0.0, start[1] - 0.006 * index, start[2] - 0.056)
-        rows.append((f"tail {index + 1}", "pelvis" if index == 0 else f"tail {index}", start, end, (0.021 - 0.0016 * index, 0.0195 - 0.0016 * index)))
+        rows.append(
+            (
+                f"tail {index + 1}",
+                "pelvis" if index == 0 else f"tail {index}",
+                start,
+                end,
+                (0.021 - 0.0016 * index, 0.0195 - 0.0016 * index),
+            )
+        )
         start = end
     rows += [*_limbs(1), *_limbs(-1)]
     names = [row[0] for row in rows]
-    return tuple(Bone(name, names.index(parent) if parent else -1, head, tail, radius) for name, parent, head, tail, radius in rows)
+    return tuple(
+        Bone(name, names.index(parent) if parent else -1, head, tail, radius)
+        for name, parent, head, tail, radius in rows
+    )
 
 
 BONES = _skeleton()
@@ -94,8 +105,12 @@ def _body_distance(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "p
     parts = [_cone(points, HEADS[k], TAILS[k], *BONES[k].radius) for k in range(len(BONES))]
     sharpness = [0.03] * 6 + [0.012] * 5 + [0.024, 0.012, 0.008, 0.03, 0.014, 0.008, 0.008] * 2
     for side in (-1, 1):
-        ear = _cone(points, np.array([side * 0.030, 0.125, 0.225]), np.array([side * 0.040, 0.168, 0.216]), 0.020, 0.0065)
-        cheek = _cone(points, np.array([side * 0.022, 0.068, 0.262]), np.array([side * 0.014, 0.064, 0.283]), 0.026, 0.018)
+        ear = _cone(
+            points, np.array([side * 0.030, 0.125, 0.225]), np.array([side * 0.040, 0.168, 0.216]), 0.020, 0.0065
+        )
+        cheek = _cone(
+            points, np.array([side * 0.022, 0.068, 0.262]), np.array([side * 0.014, 0.064, 0.283]), 0.026, 0.018
+        )
         parts += [ear, cheek]
         sharpness += [0.008, 0.012]
     parts.append(_cone(points, np.array([0, -0.025, -0.08]), np.array([0, -0.022, 0.07]), 0.06, 0.064))
@@ -110,7 +125,9 @@ def _body_distance(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "p
 def _cone(points: np.ndarray, head: np.ndarray, tail: np.ndarray, head_radius: float, tail_radius: float) -> np.ndarray:
     axis = tail - head
     along = np.clip((points - head) @ axis / (axis @ axis), 0, 1)
-    return np.linalg.norm(points - head - along[:, None] * axis, axis=-1) - (head_radius + along * (tail_radius - head_radius))
+    return np.linalg.norm(points - head - along[:, None] * axis, axis=-1) - (
+        head_radius + along * (tail_radius - head_radius)
+    )
 
 
 def _skin(vertices: Float[np.ndarray, "vertex 3"]) -> tuple[Int[np.ndarray, "vertex 4"], Float[np.ndarray, "vertex 4"]]:
@@ -119,7 +136,7 @@ def _skin(vertices: Float[np.ndarray, "vertex 3"]) -> tuple[Int[np.ndarray, "ver
     score = np.exp(-np.maximum(distance - distance.min(1, keepdims=True), 0) / 0.009)
     for name, sign in (("left", 1), ("right", -1)):
         limb = [index for index, bone in enumerate(BONES) if bone.name.startswith(name)]
-        score[:, limb] *= (1 / (1 + np.exp(-np.clip(sign * vertices[:, :1] / 0.006, -30, 30))))
+        score[:, limb] *= 1 / (1 + np.exp(-np.clip(sign * vertices[:, :1] / 0.006, -30, 30)))
     bone = np.argsort(-score, axis=1, kind="stable")[:, :4]
     weight = np.take_along_axis(score, bone, axis=1)
     weight[weight < 0.01 * weight[:, :1]] = 0
@@ -127,12 +144,14 @@ def _skin(vertices: Float[np.ndarray, "vertex 3"]) -> tuple[Int[np.ndarray, "ver
 
 
 def _coat(vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator) -> Float[np.ndarray, "vertex 4"]:
-    """Draw a mackerel tabby: dark stripes across back, legs and tail over a warm ground, pale belly, muzzle and paws."""
+    """Draw a mackerel tabby: dark stripes across back, legs and tail, pale belly, muzzle and paws."""
     x, y, z = vertices.T
     ground = np.array([0.36, 0.22, 0.115]) * rng.uniform(0.8, 1.15)
     dark, pale = np.array([0.045, 0.032, 0.026]), np.array([0.72, 0.66, 0.56])
     phase = rng.uniform(0, 2 * np.pi, 6)
-    wobble = 0.9 * np.sin(9 * y / 0.1 + phase[0]) + 0.8 * np.sin(x / 0.022 + phase[1]) + 0.6 * np.sin(z / 0.05 + phase[2])
+    wobble = (
+        0.9 * np.sin(9 * y / 0.1 + phase[0]) + 0.8 * np.sin(x / 0.022 + phase[1]) + 0.6 * np.sin(z / 0.05 + phase[2])
+    )
     body = np.sin(2 * np.pi * z / 0.052 + wobble)
     tail = np.sin(2 * np.pi * z / 0.045 + phase[3])
     leg = np.sin(2 * np.pi * y / 0.042 + 0.5 * np.sin(z / 0.02 + phase[4]))
@@ -152,7 +171,7 @@ def _coat(vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator) -> 
 
 
 def surface(animal: Animal, a_from_bone: Float[np.ndarray, "bone 4 4"]) -> Float[np.ndarray, "vertex 3"]:
-    """Blend the bones' motions linearly and return the vertices in frame a (bone frames at rest sit at the bones' heads)."""
+    """Blend the bones' motions linearly and return the vertices in frame a (at rest, bones sit at their heads)."""
     a_from_rest = a_from_bone.copy()
     a_from_rest[:, :3, 3] -= np.einsum("bij,bj->bi", a_from_bone[:, :3, :3], HEADS)
     return _blend(animal.vertices, animal.bone, animal.weight, a_from_rest)

@@ -11,7 +11,13 @@ from scipy.ndimage import gaussian_filter1d
 from pipeline.space import rigid
 from stages.synthesize_capture.navigation import floor_for
 from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Room
-from stages.synthesize_capture.session import PERSON_BREADTH_M, PERSON_HEIGHT_M, STEP_S, AnimalCourse, SessionTrajectories
+from stages.synthesize_capture.session import (
+    PERSON_BREADTH_M,
+    PERSON_HEIGHT_M,
+    STEP_S,
+    AnimalCourse,
+    SessionTrajectories,
+)
 
 Cameras = Float[np.ndarray, "sample 4 4"]
 ARM_M = 0.3
@@ -19,19 +25,27 @@ ARM_M = 0.3
 
 
 def walkthrough(room: Room, rng: np.random.Generator, duration_s: float) -> Cameras:
-    """Sweep an empty room from several standpoints: outwards all round, then along the floor, into corners and down on furniture."""
+    """Sweep an empty room all round, from across it: along the floor, into corners, over furniture."""
     timestamp_s = _times(duration_s)
     share = timestamp_s / timestamp_s[-1]
     floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
     rounds = 2.0 + 0.5 * (duration_s > 30)
     angle = 2 * np.pi * rounds * share + rng.uniform(0, 2 * np.pi)
     # The person stands across the room from what is filmed, so that near walls do not fill the picture.
-    wanted = np.stack([-0.24 * WIDTH_M * np.sin(angle), -0.2 * DEPTH_M * np.cos(angle)], axis=-1) * (0.75 + 0.25 * np.sin(2 * np.pi * 1.3 * share))[:, None]
+    wanted = (
+        np.stack([-0.24 * WIDTH_M * np.sin(angle), -0.2 * DEPTH_M * np.cos(angle)], axis=-1)
+        * (0.75 + 0.25 * np.sin(2 * np.pi * 1.3 * share))[:, None]
+    )
     position = np.array([floor.nearest(point) for point in wanted[::10]])
-    position = np.stack([np.interp(timestamp_s, timestamp_s[::10], gaussian_filter1d(position[:, axis], 2.0)) for axis in range(2)], axis=-1)
+    position = np.stack(
+        [np.interp(timestamp_s, timestamp_s[::10], gaussian_filter1d(position[:, axis], 2.0)) for axis in range(2)],
+        axis=-1,
+    )
     swing = angle + 0.45 * np.sin(2 * np.pi * 4.3 * share)
     down = 0.28 + 0.42 * np.sin(2 * np.pi * (3.2 * rounds) * share)
-    eye = np.stack([position[:, 0], np.full(len(share), 1.42) + 0.12 * np.sin(2 * np.pi * 2.1 * share), position[:, 1]], axis=-1)
+    eye = np.stack(
+        [position[:, 0], np.full(len(share), 1.42) + 0.12 * np.sin(2 * np.pi * 2.1 * share), position[:, 1]], axis=-1
+    )
     forward = np.stack([np.sin(swing) * np.cos(down), -np.sin(down), np.cos(swing) * np.cos(down)], axis=-1)
     return _handheld(eye, eye + forward, rng, calm=0.8)
 
@@ -70,14 +84,20 @@ def bystanding(session: SessionTrajectories, room: Room, rng: np.random.Generato
     every = round(1.0 / STEP_S)
     stands = []
     for at, target in zip(animal[::every], opposite[::every], strict=True):
-        cost = np.linalg.norm(centers - target, axis=-1) + 3 * np.maximum(1.3 - np.linalg.norm(centers - at, axis=-1), 0)
+        cost = np.linalg.norm(centers - target, axis=-1) + 3 * np.maximum(
+            1.3 - np.linalg.norm(centers - at, axis=-1), 0
+        )
         cost += 0.6 * np.linalg.norm(centers - stands[-1], axis=-1) if stands else 0
         stands.append(centers[np.argmin(cost)])
     slow = gaussian_filter1d(np.array(stands), 1.6, axis=0)
     count = len(animal)
-    ground = np.stack([np.interp(np.arange(count), np.arange(len(slow)) * every, slow[:, axis]) for axis in range(2)], axis=-1)
+    ground = np.stack(
+        [np.interp(np.arange(count), np.arange(len(slow)) * every, slow[:, axis]) for axis in range(2)], axis=-1
+    )
     eye = np.stack([ground[:, 0], 1.36 + 0.06 * _wander(rng, count, 2.0)[:, 0], ground[:, 1]], axis=-1)
-    target = gaussian_filter1d(session.animal.position + [0, 0.25, 0], 0.35 / STEP_S, axis=0) + 0.08 * _wander(rng, count, 0.9)
+    target = gaussian_filter1d([*session.animal.position, 0, 0.25, 0], 0.35 / STEP_S, axis=0) + 0.08 * _wander(
+        rng, count, 0.9
+    )
     return _handheld(_inside(eye), target, rng, calm=0.7)
 
 

@@ -12,10 +12,16 @@ from stages.synthesize_capture.animal import INDEX, Animal
 from stages.synthesize_capture.script import Script
 
 SHADOW_BALLS = (
-    ("pelvis", (0, 0, -0.14), 0.075), ("spine", (0, 0, -0.06), 0.075), ("loin", (0, 0, 0.02), 0.075), ("chest", (0, 0, 0.1), 0.075),
-    ("head", (0, 0.08, 0.25), 0.055), ("left hand", (0.045, -0.21, 0.125), 0.03), ("right hand", (-0.045, -0.21, 0.125), 0.03),
-    ("left toes", (0.05, -0.21, -0.165), 0.03), ("right toes", (-0.05, -0.21, -0.165), 0.03),
-)  # fmt: skip
+    ("pelvis", (0, 0, -0.14), 0.075),
+    ("spine", (0, 0, -0.06), 0.075),
+    ("loin", (0, 0, 0.02), 0.075),
+    ("chest", (0, 0, 0.1), 0.075),
+    ("head", (0, 0.08, 0.25), 0.055),
+    ("left hand", (0.045, -0.21, 0.125), 0.03),
+    ("right hand", (-0.045, -0.21, 0.125), 0.03),
+    ("left toes", (0.05, -0.21, -0.165), 0.03),
+    ("right toes", (-0.05, -0.21, -0.165), 0.03),
+)
 """Bone, rest point in the agent frame and radius of the balls that darken the ground near the animal."""
 
 
@@ -52,12 +58,16 @@ class Stage:
         """Return vertices (world) and faces of room and animal together; the animal's faces come last."""
         if vertices_world is None:
             return self.room.vertices, self.room.faces
-        return np.concatenate([self.room.vertices, vertices_world]), np.concatenate([self.room.faces, self.creature.faces + len(self.room.vertices)])
+        return np.concatenate([self.room.vertices, vertices_world]), np.concatenate(
+            [self.room.faces, self.creature.faces + len(self.room.vertices)]
+        )
 
     def frames(self) -> Iterator[Frame]:
         """Film every frame in order."""
         script = self.script
-        blur = sensor.motion_blur_px(script.world_from_camera, script.timestamp_s, float(script.intrinsics[0, 0]), script.exposure.shutter_s)
+        blur = sensor.motion_blur_px(
+            script.world_from_camera, script.timestamp_s, float(script.intrinsics[0, 0]), script.exposure.shutter_s
+        )
         for index in range(len(script.timestamp_s)):
             yield self._frame(index, blur[index])
 
@@ -81,8 +91,16 @@ class Stage:
 
     def _coat(self, index: int, body: np.ndarray | None, camera_from_world: np.ndarray) -> shade.Coat:
         if body is None:
-            return shade.Coat(self.empty, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), np.zeros((0, 4)))
-        received = light.light_on_body(body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light)
+            return shade.Coat(
+                self.empty,
+                np.zeros((0, 3), np.float32),
+                np.zeros((0, 3), np.float32),
+                np.zeros((0, 4), np.float32),
+                np.zeros((0, 4)),
+            )
+        received = light.light_on_body(
+            body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light
+        )
         motion = self.script.motion
         camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
         balls = np.zeros((len(SHADOW_BALLS), 4))
@@ -93,10 +111,15 @@ class Stage:
 
 
 def true_flow(stage: Stage, first: int, second: int, *, stride: int = 4) -> Float[np.ndarray, "rows columns 2"]:
-    """Return flow from frame ``first`` to ``second`` of the upright picture at the centres of ``stride``-pixel cells; NaN where hidden or out of view."""
+    """Return flow between two frames of the upright picture, pixels, at the centres of ``stride``-pixel cells.
+
+    NaN where the surface is hidden or out of view in frame ``second``.
+    """
     script = stage.script
     upright = cameras.turn_camera(script.world_from_camera[[first, second]], script.quarter_turns)
-    lenses = cameras.turn_intrinsics(matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns)
+    lenses = cameras.turn_intrinsics(
+        matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns
+    )
     height, width = script.color_size if script.quarter_turns % 2 == 0 else script.color_size[::-1]
     here, there = (stage.mesh(stage.animal_world(index)) for index in (first, second))
     cells = (height // stride, width // stride)
@@ -106,11 +129,22 @@ def true_flow(stage: Stage, first: int, second: int, *, stride: int = 4) -> Floa
     share = np.einsum("hwij,hwj->hwi", view.inverse_corners[np.maximum(view.face, 0)], rays)
     share /= np.maximum(share.sum(-1, keepdims=True), 1e-9)
     corners = there[0][there[1][np.maximum(view.face, 0)]]
-    moved = rigid.apply(rigid.inverse(upright[1]), np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3)).reshape(*cells, 3)
+    moved = rigid.apply(rigid.inverse(upright[1]), np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3)).reshape(
+        *cells, 3
+    )
     pixel, depth = cameras.project(moved, lenses[1])
     flow = (pixel - (cameras.pixel_grid(*cells) * stride)).astype(np.float32)
-    inside = (depth > 0.05) & (pixel[..., 0] >= 0) & (pixel[..., 0] < width) & (pixel[..., 1] >= 0) & (pixel[..., 1] < height) & (view.face >= 0)
-    nearest = raster.see(rigid.apply(rigid.inverse(upright[1]), there[0]), there[1], lenses[1], height, width).inverse_depth
+    inside = (
+        (depth > 0.05)
+        & (pixel[..., 0] >= 0)
+        & (pixel[..., 0] < width)
+        & (pixel[..., 1] >= 0)
+        & (pixel[..., 1] < height)
+        & (view.face >= 0)
+    )
+    nearest = raster.see(
+        rigid.apply(rigid.inverse(upright[1]), there[0]), there[1], lenses[1], height, width
+    ).inverse_depth
     at = np.clip(np.nan_to_num(pixel), 0, [width - 1, height - 1]).astype(int)
     hidden = depth > 1.0 / np.maximum(nearest[at[..., 1], at[..., 0]], 1e-3) + 0.02 + 0.01 * depth
     flow[~inside | hidden] = np.nan

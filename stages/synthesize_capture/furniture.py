@@ -24,12 +24,17 @@ class Piece:
 def sofa(rng: np.random.Generator) -> Piece:
     """Make a two-seat sofa with a pillow."""
     cloth = texture.fabric(rng, tuple(np.array([92.0, 104, 116]) + rng.uniform(-12, 12, 3)), grain=7)
-    parts = [*sheets.box((0, 0.18, 0.02), (1.86, 0.24, 0.84), cloth), *sheets.box((0, 0.55, -0.33), (1.86, 0.5, 0.16), cloth, skip="-y")]
+    parts = [
+        *sheets.box((0, 0.18, 0.02), (1.86, 0.24, 0.84), cloth),
+        *sheets.box((0, 0.55, -0.33), (1.86, 0.5, 0.16), cloth, skip="-y"),
+    ]
     for side in (-1, 1):
         parts += sheets.cushion((side * 0.86, 0.4, 0.02), (0.16, 0.5, 0.84), cloth, bulge=0.015)
         parts += sheets.cushion((side * 0.39, 0.36, 0.1), (0.77, 0.14, 0.68), cloth, bulge=0.022)
         parts += sheets.cushion((side * 0.39, 0.62, -0.2), (0.76, 0.38, 0.14), cloth, bulge=0.03)
-    pillow = sheets.cushion((0, 0, 0), (0.38, 0.36, 0.08), texture.fabric(rng, (196, 150, 70), grain=6, stripes_m=0.07), bulge=0.05, skip="")
+    pillow = sheets.cushion(
+        (0, 0, 0), (0.38, 0.36, 0.08), texture.fabric(rng, (196, 150, 70), grain=6, stripes_m=0.07), bulge=0.05, skip=""
+    )
     parts += [sheet.moved(sheets.upright(-0.62, -0.07, 0.3, 0.6)) for sheet in pillow]
     return Piece(parts, (1.9, 0.88), 0.8)
 
@@ -38,7 +43,11 @@ def shelf(rng: np.random.Generator) -> Piece:
     """Make a shelf with five rows of books and a few things between them."""
     timber = texture.wood(rng, (168, 128, 84))
     wide, deep = 1.16, 0.32
-    parts = [sheet for side in (-1, 1) for sheet in sheets.box((side * wide / 2, 0.95, 0), (0.025, 1.9, deep), timber, skip="-y")]
+    parts = [
+        sheet
+        for side in (-1, 1)
+        for sheet in sheets.box((side * wide / 2, 0.95, 0), (0.025, 1.9, deep), timber, skip="-y")
+    ]
     parts += sheets.box((0, 0.95, -deep / 2 + 0.01), (wide, 1.88, 0.012), timber, skip="-z -y +y +x -x")
     for level in range(6):
         parts += sheets.box((0, 0.06 + 0.365 * level, 0), (wide, 0.025, deep), timber, skip="-z +x -x")
@@ -48,8 +57,17 @@ def shelf(rng: np.random.Generator) -> Piece:
         right = min(max(right, left + 0.3), 0.55)
         tall = rng.uniform(0.22, 0.28)
         spines = {"+z": texture.books(rng), "": texture.plain(rng, (190, 180, 160))}
-        parts += sheets.box(((left + right) / 2, bottom + tall / 2, -0.02), (right - left, tall, 0.22), spines, skip="-y -z")
-    parts += sheets.cylinder((0.5, 0.0725 + 0.365 + 0.08, 0), 0.05, 0.16, texture.plain(rng, (70, 110, 140)), texture.plain(rng, (40, 60, 80)), flare=0.7)
+        parts += sheets.box(
+            ((left + right) / 2, bottom + tall / 2, -0.02), (right - left, tall, 0.22), spines, skip="-y -z"
+        )
+    parts += sheets.cylinder(
+        (0.5, 0.0725 + 0.365 + 0.08, 0),
+        0.05,
+        0.16,
+        texture.plain(rng, (70, 110, 140)),
+        texture.plain(rng, (40, 60, 80)),
+        flare=0.7,
+    )
     parts += [sheets.ball((-0.5, 0.0725 + 0.365 * 3 + 0.06, 0.02), 0.06, texture.fabric(rng, (190, 70, 60), grain=10))]
     return Piece(parts, (1.2, 0.34), 1.9)
 
@@ -59,7 +77,13 @@ def media(rng: np.random.Generator) -> Piece:
     timber = texture.wood(rng, (120, 92, 68))
     black = texture.plain(rng, (24, 25, 28), grain=1, clouds=1)
     parts = sheets.box((0, 0.24, 0), (1.46, 0.44, 0.4), timber, skip="-z -y")
-    parts += [sheet for k in range(3) for sheet in sheets.box((-0.48 + 0.48 * k, 0.24, 0.208), (0.45, 0.38, 0.016), texture.wood(rng, (140, 108, 80)), skip="-z")]
+    parts += [
+        sheet
+        for k in range(3)
+        for sheet in sheets.box(
+            (-0.48 + 0.48 * k, 0.24, 0.208), (0.45, 0.38, 0.016), texture.wood(rng, (140, 108, 80)), skip="-z"
+        )
+    ]
     parts += sheets.box((0, 0.82, -0.08), (1.1, 0.64, 0.05), black, skip="-z")
     parts += sheets.box((0, 0.475, -0.05), (0.4, 0.03, 0.2), black, skip="-z -y")
     parts += sheets.box((0.6, 0.5, 0.04), (0.12, 0.08, 0.18), texture.carton(rng), skip="-y")
@@ -87,9 +111,18 @@ def coffee_table(rng: np.random.Generator) -> Piece:
     parts = sheets.box((0, 0.4, 0), (0.86, 0.035, 0.46), oak)
     for sx, sz in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         parts += sheets.box((sx * 0.38, 0.19, sz * 0.18), (0.04, 0.38, 0.04), oak, skip="+y -y")
-    parts += sheets.box((-0.15, 0.425, 0.02), (0.24, 0.015, 0.17), {"+y": texture.poster(rng), "": texture.plain(rng, (230, 230, 226))}, skip="-y")
-    parts += sheets.box((-0.13, 0.445, 0.0), (0.2, 0.022, 0.14), {"+y": texture.poster(rng), "": texture.books(rng)}, skip="-y")
-    parts += sheets.cylinder((0.23, 0.46, 0.08), 0.038, 0.09, texture.plain(rng, (60, 96, 120)), texture.plain(rng, (70, 44, 26)))
+    parts += sheets.box(
+        (-0.15, 0.425, 0.02),
+        (0.24, 0.015, 0.17),
+        {"+y": texture.poster(rng), "": texture.plain(rng, (230, 230, 226))},
+        skip="-y",
+    )
+    parts += sheets.box(
+        (-0.13, 0.445, 0.0), (0.2, 0.022, 0.14), {"+y": texture.poster(rng), "": texture.books(rng)}, skip="-y"
+    )
+    parts += sheets.cylinder(
+        (0.23, 0.46, 0.08), 0.038, 0.09, texture.plain(rng, (60, 96, 120)), texture.plain(rng, (70, 44, 26))
+    )
     return Piece(parts, (0.86, 0.46), 0.42, 0.36)
 
 
@@ -99,11 +132,29 @@ def dining_table(rng: np.random.Generator) -> Piece:
     parts = sheets.box((0, 0.72, 0), (1.0, 0.03, 0.9), birch)
     for sx, sz in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         parts += sheets.box((sx * 0.45, 0.35, sz * 0.4), (0.05, 0.7, 0.05), birch, skip="+y -y")
-    parts += sheets.cylinder((0.05, 0.765, -0.05), 0.11, 0.06, texture.plain(rng, (214, 208, 196)), texture.plain(rng, (120, 112, 100)), flare=1.3)
+    parts += sheets.cylinder(
+        (0.05, 0.765, -0.05),
+        0.11,
+        0.06,
+        texture.plain(rng, (214, 208, 196)),
+        texture.plain(rng, (120, 112, 100)),
+        flare=1.3,
+    )
     for angle in np.linspace(0, 2 * np.pi, 5, endpoint=False):
         color = ((206, 120, 40), (190, 60, 44), (150, 170, 60))[int(rng.integers(3))]
-        parts.append(sheets.ball((0.05 + 0.06 * np.sin(angle), 0.81, -0.05 + 0.06 * np.cos(angle)), 0.04, texture.plain(rng, color, grain=5, clouds=10)))
-    parts += sheets.box((-0.3, 0.738, 0.2), (0.3, 0.006, 0.21), {"+y": texture.poster(rng), "": texture.plain(rng, (230, 230, 226))}, skip="-y")
+        parts.append(
+            sheets.ball(
+                (0.05 + 0.06 * np.sin(angle), 0.81, -0.05 + 0.06 * np.cos(angle)),
+                0.04,
+                texture.plain(rng, color, grain=5, clouds=10),
+            )
+        )
+    parts += sheets.box(
+        (-0.3, 0.738, 0.2),
+        (0.3, 0.006, 0.21),
+        {"+y": texture.poster(rng), "": texture.plain(rng, (230, 230, 226))},
+        skip="-y",
+    )
     return Piece(parts, (1.0, 0.9), 0.74, 0.66)
 
 
@@ -115,7 +166,9 @@ def plant(rng: np.random.Generator) -> Piece:
         yaw, reach, rise = rng.uniform(0, 2 * np.pi), rng.uniform(0.12, 0.3), rng.uniform(0.35, 0.95)
         t = np.linspace(0, 1, 5)
         out, across = np.array([np.sin(yaw), 0, np.cos(yaw)]), np.array([np.cos(yaw), 0, -np.sin(yaw)])
-        spine = np.array([0, 0.34, 0]) + t[:, None] * reach * out + (rise * (1.7 * t - 0.75 * t**2))[:, None] * [0, 1, 0]
+        spine = (
+            np.array([0, 0.34, 0]) + t[:, None] * reach * out + (rise * (1.7 * t - 0.75 * t**2))[:, None] * [0, 1, 0]
+        )
         half = (0.045 * np.sin(np.pi * np.clip(t * 0.9 + 0.08, 0, 1)))[:, None] * across
         points = np.stack([spine - half, spine + half], axis=1)[::-1]
         green = np.array([62.0, 110, 52]) + rng.uniform(-18, 26, 3)
@@ -128,14 +181,23 @@ def lamp(rng: np.random.Generator) -> Piece:
     metal = texture.plain(rng, (70, 66, 62))
     parts = sheets.cylinder((0, 0.015, 0), 0.13, 0.03, metal, metal)
     parts += sheets.cylinder((0, 0.75, 0), 0.012, 1.45, metal, metal, segments=6)
-    shade = sheets.cylinder((0, 1.58, 0), 0.17, 0.26, texture.fabric(rng, (232, 214, 176), grain=4), texture.plain(rng, (250, 240, 214)), flare=0.7)
+    shade = sheets.cylinder(
+        (0, 1.58, 0),
+        0.17,
+        0.26,
+        texture.fabric(rng, (232, 214, 176), grain=4),
+        texture.plain(rng, (250, 240, 214)),
+        flare=0.7,
+    )
     return Piece([*parts, *(replace(sheet, glow=0.55) for sheet in shade)], (0.3, 0.3), 1.6)
 
 
 def bowls(rng: np.random.Generator) -> Piece:
     """Make a food and a water bowl, too low to be in anyone's way."""
     blue = texture.plain(rng, (60, 120, 170))
-    parts = sheets.cylinder((-0.11, 0.025, 0), 0.075, 0.05, blue, texture.fabric(rng, (110, 76, 46), grain=14), flare=0.8)
+    parts = sheets.cylinder(
+        (-0.11, 0.025, 0), 0.075, 0.05, blue, texture.fabric(rng, (110, 76, 46), grain=14), flare=0.8
+    )
     parts += sheets.cylinder((0.11, 0.025, 0.02), 0.075, 0.05, blue, texture.plain(rng, (170, 190, 200)), flare=0.8)
     return Piece(parts, (0.36, 0.15), 0.05)
 

@@ -61,7 +61,9 @@ def lit_sheets(room: Room, light: Light, rng: np.random.Generator) -> list[UInt8
     return lit
 
 
-def _lit_picture(sheet: Sheet, cells: Float[np.ndarray, "row column 3"], light: Light) -> UInt8[np.ndarray, "height width 3"]:
+def _lit_picture(
+    sheet: Sheet, cells: Float[np.ndarray, "row column 3"], light: Light
+) -> UInt8[np.ndarray, "height width 3"]:
     height, width, _ = sheet.picture.shape
     albedo = (np.arange(256, dtype=np.float32) / 255) ** 2.2
     if sheet.glow > 0:
@@ -88,10 +90,14 @@ def _light_grid(sheet: Sheet) -> tuple[np.ndarray, np.ndarray]:
 def _bilinear(grid: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     i, j = np.clip(row.astype(int), 0, grid.shape[0] - 2), np.clip(column.astype(int), 0, grid.shape[1] - 2)
     s, t = (row - i)[..., None], (column - j)[..., None]
-    return (1 - s) * ((1 - t) * grid[i, j] + t * grid[i, j + 1]) + s * ((1 - t) * grid[i + 1, j] + t * grid[i + 1, j + 1])
+    return (1 - s) * ((1 - t) * grid[i, j] + t * grid[i, j + 1]) + s * (
+        (1 - t) * grid[i + 1, j] + t * grid[i + 1, j + 1]
+    )
 
 
-def _irradiance(points: np.ndarray, normals: np.ndarray, room: Room, light: Light, caster: RayCaster, rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:
+def _irradiance(
+    points: np.ndarray, normals: np.ndarray, room: Room, light: Light, caster: RayCaster, rng: np.random.Generator
+) -> Float[np.ndarray, "point 3"]:
     total = np.zeros((len(points), 3))
     openness = np.zeros(len(points))
     spread = _hemisphere(rng, 12)
@@ -104,9 +110,17 @@ def _irradiance(points: np.ndarray, normals: np.ndarray, room: Room, light: Ligh
     for i in range(2):
         for j in range(3):
             jitter = rng.uniform(-0.12, 0.12, 2)
-            sample = corner + (j + 0.5 + jitter[0]) / 3 * right + (i + 0.5 + jitter[1]) / 2 * down - np.array([0.06, 0, 0])
+            sample = (
+                corner + (j + 0.5 + jitter[0]) / 3 * right + (i + 0.5 + jitter[1]) / 2 * down - np.array([0.06, 0, 0])
+            )
             area = np.linalg.norm(right) * np.linalg.norm(down) / 6
-            total += _from_source(points, normals, sample, caster, facing=np.array([-1.0, 0, 0]), toward=light.toward_sun)[:, None] * light.window * area
+            total += (
+                _from_source(points, normals, sample, caster, facing=np.array([-1.0, 0, 0]), toward=light.toward_sun)[
+                    :, None
+                ]
+                * light.window
+                * area
+            )
     for shift in ((0.0, 0.22, 0.0), (0.0, -0.2, 0.0)):
         total += _from_source(points, normals, np.asarray(room.lamp) + shift, caster)[:, None] * light.lamp * 0.6
     return total
@@ -140,12 +154,17 @@ def _around(normals: np.ndarray, sine_cosine: np.ndarray, turn: np.ndarray) -> n
     return sine_cosine[0] * (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second) + sine_cosine[1] * normals
 
 
-def light_on_body(points: Float[np.ndarray, "vertex 3"], normals: Float[np.ndarray, "vertex 3"], room: Room, light: Light) -> Float[np.ndarray, "vertex 3"]:
+def light_on_body(
+    points: Float[np.ndarray, "vertex 3"], normals: Float[np.ndarray, "vertex 3"], room: Room, light: Light
+) -> Float[np.ndarray, "vertex 3"]:
     """Return the light that reaches a small body's surface, without cast shadows; undersides get less."""
     up = 0.5 + 0.5 * normals[:, 1:2]
     total = (0.35 + 0.6 * up) * light.ambient
     corner, right, down = room.window
-    sources = ((corner + 0.5 * right + 0.5 * down, light.window * np.linalg.norm(right) * np.linalg.norm(down) / np.pi), (np.asarray(room.lamp), light.lamp * 1.2))
+    sources = (
+        (corner + 0.5 * right + 0.5 * down, light.window * np.linalg.norm(right) * np.linalg.norm(down) / np.pi),
+        (np.asarray(room.lamp), light.lamp * 1.2),
+    )
     for source, strength in sources:
         away = source - points.mean(0)
         distance = max(float(np.linalg.norm(away)), 0.4)

@@ -20,7 +20,7 @@ class Observer:
         self.rng = rng
         self.mode, self.left_s, self.pace, self.since_plan_s = "watch", rng.uniform(1.0, 2.0), 0.0, 0.0
         self.velocity = np.zeros(2)
-        self.looks_at: Float[np.ndarray, "3"] | None = None
+        self.looks_at: Float[np.ndarray, 3] | None = None
         self._last: np.ndarray | None = None
         self._glance: tuple[float, np.ndarray] | None = None
 
@@ -49,7 +49,12 @@ class Observer:
         """Take up the next mode."""
         self.walker.stop()
         self.pace = 0.0
-        after = {"approach": ("watch", "retreat"), "watch": ("approach", "stroll"), "retreat": ("watch", "approach"), "stroll": ("approach", "watch")}
+        after = {
+            "approach": ("watch", "retreat"),
+            "watch": ("approach", "stroll"),
+            "retreat": ("watch", "approach"),
+            "stroll": ("approach", "watch"),
+        }
         chance = {"approach": 0.8, "watch": 0.88, "retreat": 1.0, "stroll": 0.2}[self.mode]
         far = self.mode != "stroll" and np.linalg.norm(self.walker.position - animal) > 2.7
         self.mode = "stroll" if far else after[self.mode][0 if self.rng.random() < chance else 1]
@@ -61,7 +66,13 @@ class Observer:
                 self._plan_approach(animal)
             case "retreat":
                 self.left_s, self.pace = self.rng.uniform(1.4, 2.2), self.rng.uniform(0.6, 0.85)
-                self._go_by(animal, lambda center: 0.9 * np.linalg.norm(center - animal, axis=-1) - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1))
+                self._go_by(
+                    animal,
+                    lambda center: (
+                        0.9 * np.linalg.norm(center - animal, axis=-1)
+                        - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1)
+                    ),
+                )
             case "stroll":
                 self.left_s, self.pace = self.rng.uniform(2.4, 3.8), self.rng.uniform(0.5, 0.8)
                 from_animal = self.walker.position - animal
@@ -80,7 +91,10 @@ class Observer:
         """Follow the animal with a lag; sometimes glance elsewhere for a moment."""
         target = animal + np.array([0.0, 0.12, 0.0])
         if self._glance is None and self.rng.random() < 0.02 * seconds * (3.0 if self.mode == "stroll" else 1.0):
-            self._glance = (self.rng.uniform(0.5, 1.0), target + np.array([self.rng.uniform(-1, 1), self.rng.uniform(0, 0.6), self.rng.uniform(-1, 1)]))
+            self._glance = (
+                self.rng.uniform(0.5, 1.0),
+                target + np.array([self.rng.uniform(-1, 1), self.rng.uniform(0, 0.6), self.rng.uniform(-1, 1)]),
+            )
         if self._glance is not None:
             left, aside = self._glance
             target = aside

@@ -46,7 +46,9 @@ class Policy:
 
     def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
         self.rng, self.places = rng, places
-        self.walker = Walker(floor, floor.nearest(position), rng.uniform(-np.pi, np.pi), turn_rate=4.0, acceleration=3.0)
+        self.walker = Walker(
+            floor, floor.nearest(position), rng.uniform(-np.pi, np.pi), turn_rate=4.0, acceleration=3.0
+        )
         self.height = 0.0
         self.place: Place | None = None
         self.perch: Place | None = None
@@ -96,7 +98,11 @@ class Policy:
 
     def _threatened(self) -> bool:
         near = 0.95 if self.height > 0.1 else 1.25
-        return (self.distance < near and self.closing > 0.25) or self.distance < 0.55 or (self.distance < near + 0.75 and self.closing > 0.65)
+        return (
+            (self.distance < near and self.closing > 0.25)
+            or self.distance < 0.55
+            or (self.distance < near + 0.75 and self.closing > 0.65)
+        )
 
     def _decide(self, seconds: float, seen: Seen) -> None:
         if self._threatened() and self.fear_s <= 0:
@@ -134,7 +140,11 @@ class Policy:
         """Return a high place close to where it runs, not on the person's side."""
         for place in self.places:
             entry = np.asarray(place.entry)
-            if place.position[1] > 0.1 and np.linalg.norm(entry - goal) < 0.8 and np.linalg.norm(entry - seen.position) > 1.3:
+            if (
+                place.position[1] > 0.1
+                and np.linalg.norm(entry - goal) < 0.8
+                and np.linalg.norm(entry - seen.position) > 1.3
+            ):
                 return place
         return None
 
@@ -152,7 +162,9 @@ class Policy:
     def _visit(self) -> None:
         """Go to a favourite place, or just somewhere."""
         weight = np.array([0.5 if self.perch is not None and place is self.perch else 1.0 for place in self.places])
-        weight *= np.exp(-0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places]))
+        weight *= np.exp(
+            -0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places])
+        )
         self.reason, self.pace = "own", self.rng.choice([0.5, 0.7, 0.9, 1.3], p=[0.2, 0.4, 0.25, 0.15])
         self._leave()
         if self.rng.random() < 0.75:
@@ -175,7 +187,9 @@ class Policy:
             self._jump(np.asarray(self.place.position, float))
         sit, lie = {"flee": (0.15, 0.0), "approach": (0.65, 0.1), "own": (0.4, 0.25)}[self.reason]
         draw = self.rng.random()
-        self.wanted = np.array([float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0])
+        self.wanted = np.array(
+            [float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0]
+        )
 
     def _jump(self, end: Float[np.ndarray, "3"]) -> None:
         self.leap = Leap(self.position, end)

@@ -1,5 +1,9 @@
-"""Make recordings and truth of all scripts, several at once; each is a function of its script alone, so order and number of workers change nothing."""
+"""Make recordings and truth of all scripts, several at once.
 
+Each is a function of its script alone, so order and number of workers change nothing.
+"""
+
+import json
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -11,7 +15,7 @@ from jaxtyping import UInt8
 from pipeline.files import meshes
 from pipeline.space.meshes import Mesh
 from stages.synthesize_capture import record3d, sheets
-from stages.synthesize_capture.animal import Animal
+from stages.synthesize_capture.animal import BONES, Animal
 from stages.synthesize_capture.film import Stage
 from stages.synthesize_capture.record3d import Header
 from stages.synthesize_capture.room import Room
@@ -64,12 +68,21 @@ def record(script: Script, creature: Animal, recordings: Path, truth_folder: Pat
     truth.write(truth_folder)
     if script.session is not None:
         write_flow(stage, truth_folder, pairs=FLOW_PAIRS)
-    return Made(script.name, len(script.timestamp_s), float(truth.visible().mean()), np.stack(thumbnails), np.stack(outlines), np.stack(depths))
+    return Made(
+        script.name,
+        len(script.timestamp_s),
+        float(truth.visible().mean()),
+        np.stack(thumbnails),
+        np.stack(outlines),
+        np.stack(depths),
+    )
 
 
-def write_surfaces(room: Room, creature: Animal, folder: Path) -> None:
-    """Write the true room (as in the walk-through, world of the truth) and the animal at rest (agent frame)."""
-    vertices, faces, coordinates, owner = sheets.triangles(room.sheets())
+def write_world(room: Room, creature: Animal, seed: int, folder: Path) -> None:
+    """Write the true room (as in the walk-through, world of the truth), the animal at rest (agent frame), and names."""
+    about = {"seed": seed, "up": [0, 1, 0], "bones": [bone.name for bone in BONES]}
+    (folder / "world.json").write_text(json.dumps(about, indent=1) + "\n")
+    vertices, faces, coordinates, _owner = sheets.triangles(room.sheets())
     meshes.write_ply(folder / "scene.ply", Mesh(vertices, faces, _room_colors(room, coordinates)))
     color = (np.clip(creature.fur[:, :3], 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
     meshes.write_ply(folder / "agent.ply", Mesh(creature.vertices, creature.faces, color))
@@ -87,4 +100,11 @@ def _room_colors(room: Room, coordinates: np.ndarray) -> UInt8[np.ndarray, "vert
 
 
 def _header(script: Script) -> Header:
-    return Header(script.timestamp_s, script.intrinsics, script.odometry_from_camera, script.color_size, script.depth_size, round(script.fps))
+    return Header(
+        script.timestamp_s,
+        script.intrinsics,
+        script.odometry_from_camera,
+        script.color_size,
+        script.depth_size,
+        round(script.fps),
+    )

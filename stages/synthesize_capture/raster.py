@@ -23,7 +23,13 @@ class View:
     inverse_corners: Float[np.ndarray, "face 3 3"]
 
 
-def see(points_camera: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"], intrinsics: Float[np.ndarray, "3 3"], height: int, width: int) -> View:
+def see(
+    points_camera: Float[np.ndarray, "vertex 3"],
+    faces: Int[np.ndarray, "face 3"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    height: int,
+    width: int,
+) -> View:
     """Find the nearest face through each pixel centre; both sides of a face are seen."""
     face = np.full((height, width), -1, np.int32)
     inverse_depth = np.zeros((height, width), np.float32)
@@ -91,7 +97,7 @@ def _invert(a, b, c, out):
 
 @njit(cache=True, error_model="numpy")
 def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height, width):
-    """Return exact z-depth ``[height width]`` (0 = nothing) through the pixel centres of another size of the same view."""
+    """Return exact z-depth ``[height width]`` (0 = nothing) at the pixel centres of the view in another size."""
     depth = np.zeros((height, width), np.float32)
     fx, fy, cx, cy = focal_center
     rows, columns = face_of.shape
@@ -103,7 +109,9 @@ def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height,
                 x, y = (j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy
                 total = 0.0
                 for k in range(3):
-                    total += inverse_corners[face, k, 0] * x + inverse_corners[face, k, 1] * y + inverse_corners[face, k, 2]
+                    total += (
+                        inverse_corners[face, k, 0] * x + inverse_corners[face, k, 1] * y + inverse_corners[face, k, 2]
+                    )
                 near = inverse_depth[row, column]
                 depth[i, j] = 1.0 / min(max(total, 0.97 * near), 1.03 * near)
     return depth

@@ -67,7 +67,12 @@ class Writer:
     def __exit__(self, *error) -> None:
         self._zip.close()
 
-    def add(self, color: UInt8[np.ndarray, "height width 3"], depth: Float[np.ndarray, "rows columns"], confidence: UInt8[np.ndarray, "rows columns"]) -> None:
+    def add(
+        self,
+        color: UInt8[np.ndarray, "height width 3"],
+        depth: Float[np.ndarray, "rows columns"],
+        confidence: UInt8[np.ndarray, "rows columns"],
+    ) -> None:
         """Append one frame: RGB, depth in metres (float32), confidence 0 to 2."""
         done, jpeg = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
         assert done, "JPEG encoding failed"

@@ -1,11 +1,14 @@
 """Judge the made world: does the animal move, does it answer people, is it seen; and draw it for the report."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from pipeline import qa
+from pipeline.qa import Check, Picture
 from stages.synthesize_capture.policy import REASONS
 from stages.synthesize_capture.produce import Made
 from stages.synthesize_capture.room import DEPTH_M, WIDTH_M
@@ -35,18 +38,47 @@ def manner(sessions: list[SessionTrajectories]) -> Manner:
     for lived in sessions:
         speed = lived.animal.speed()
         reach = round(WINDOW_S / STEP_S)
-        moving += [float(speed[start : start + reach].mean() > MOVING_M_S) for start in range(0, max(len(speed) - reach, 1), 6)]
+        moving += [
+            float(speed[start : start + reach].mean() > MOVING_M_S) for start in range(0, max(len(speed) - reach, 1), 6)
+        ]
         flee = _begins(lived.reason == REASONS.index("flee"))
         ran += [bool(flee[max(start - 15, 0) : start + 30].any()) for start in np.flatnonzero(_begins(_pressed(lived)))]
         away = ~_pressed(lived) & (_distance(lived) > 1.6)
-        alone += [bool(flee[start : start + 30].any()) for start in range(0, len(flee), 30) if away[max(start - 20, 0) : start + 30].all()]
+        alone += [
+            bool(flee[start : start + 30].any())
+            for start in range(0, len(flee), 30)
+            if away[max(start - 20, 0) : start + 30].all()
+        ]
         came += int(_begins(lived.reason == REASONS.index("approach")).sum())
         seconds += lived.animal.timestamp_s[-1]
     return Manner(_mean(moving), _mean(ran), _mean(alone), 60 * came / max(seconds, 1e-6))
 
 
+def report_quality(folder: Path, scripts: list[Script], made: list[Made]) -> None:
+    """Write the stage's checks and pictures into the artifact in the making."""
+    shown = manner([part.session for part in scripts if part.session is not None])
+    visible = _mean([part.visible_share for part in made if part.outlines.any()])
+    qa.write(
+        folder,
+        good="a lived-in room under changing light, and a cat that walks, sits and runs from whoever comes close",
+        bad="an animal that never moves or is never in the picture",
+        checks=[
+            Check("windows in which the animal moves", shown.moving_windows, "share", 0.5, 0.4, "higher"),
+            Check("quick approaches that it runs from", shown.flees_when_approached, "share", 0.6, None, "higher"),
+            Check("seconds left alone in which it runs", shown.flees_when_left_alone, "share", 0.1, None),
+            Check("frames that show the animal", visible, "share", 0.7, 0.5, "higher"),
+        ],
+        pictures=[
+            Picture("contact_sheet", contact_sheet(made), "Every recording, the animal's true outline, stored depth"),
+            Picture(
+                "birds_eye", birds_eye(scripts), "From above: the phone (blue), the animal (orange), its flights (red)"
+            ),
+        ],
+    )
+
+
 def contact_sheet(made: list[Made]) -> UInt8[np.ndarray, "height width 3"]:
-    """Show some frames of every recording, one recording a row, the true outline of the animal in magenta, then two depth pictures."""
+    """Show frames of every recording, one a row: the animal's true outline in magenta, then stored depth."""
     rows = []
     for recording in made:
         pictures = []
@@ -64,7 +96,7 @@ def contact_sheet(made: list[Made]) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def birds_eye(scripts: list[Script]) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw each recording from above: furniture grey, the phone's way blue, the animal's way orange, its flights red."""
+    """Draw each recording from above: furniture grey, the phone blue, the animal orange, its flights red."""
     return np.hstack([_from_above(script) for script in scripts])
 
 
@@ -74,25 +106,38 @@ def _from_above(script: Script) -> UInt8[np.ndarray, "height width 3"]:
         corners = cv2.boxPoints(((0, 0), block.size, 0.0))
         cosine, sine = np.cos(block.yaw), np.sin(block.yaw)
         turned = corners @ np.array([[cosine, -sine], [sine, cosine]]) + np.asarray(block.center)
-        cv2.fillConvexPoly(canvas, _pixels(turned), (205, 205, 200) if block.bottom == 0 else (228, 226, 220), cv2.LINE_AA)
+        cv2.fillConvexPoly(
+            canvas, _pixels(turned), (205, 205, 200) if block.bottom == 0 else (228, 226, 220), cv2.LINE_AA
+        )
     cv2.polylines(canvas, [_pixels(script.world_from_camera[:, [0, 2], 3])], False, (60, 110, 220), 2, cv2.LINE_AA)
     for pose in script.world_from_camera[::15]:
         start = pose[[0, 2], 3]
-        cv2.arrowedLine(canvas, *map(tuple, _pixels(np.stack([start, start + 0.22 * pose[[0, 2], 2]])).tolist()), (120, 160, 240), 1, cv2.LINE_AA, tipLength=0.3)
+        cv2.arrowedLine(
+            canvas,
+            *map(tuple, _pixels(np.stack([start, start + 0.22 * pose[[0, 2], 2]])).tolist()),
+            (120, 160, 240),
+            1,
+            cv2.LINE_AA,
+            tipLength=0.3,
+        )
     if script.motion is not None:
         way = script.motion.world_from_agent[:, [0, 2], 3]
         cv2.polylines(canvas, [_pixels(way)], False, (240, 150, 40), 2, cv2.LINE_AA)
     if script.session is not None:
         course = script.session.animal.position[:, [0, 2]]
         flights = script.session.reason == REASONS.index("flee")
-        for start, end in zip(np.flatnonzero(_begins(flights)), np.flatnonzero(_begins(~flights) & (np.arange(len(flights)) > 0)), strict=False):
+        for start, end in zip(
+            np.flatnonzero(_begins(flights)),
+            np.flatnonzero(_begins(~flights) & (np.arange(len(flights)) > 0)),
+            strict=False,
+        ):
             cv2.polylines(canvas, [_pixels(course[start:end])], False, (220, 40, 40), 2, cv2.LINE_AA)
     cv2.putText(canvas, script.name, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
     return canvas
 
 
 def _pixels(ground: np.ndarray) -> np.ndarray:
-    return np.round((ground + [WIDTH_M / 2, DEPTH_M / 2]) * PIXELS_PER_M).astype(np.int32)
+    return np.round(([*ground, WIDTH_M / 2, DEPTH_M / 2]) * PIXELS_PER_M).astype(np.int32)
 
 
 def _distance(lived: SessionTrajectories) -> np.ndarray:

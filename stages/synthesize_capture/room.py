@@ -19,7 +19,7 @@ WIDTH_M, DEPTH_M, HEIGHT_M = 6.0, 4.8, 2.5
 
 @dataclass(frozen=True)
 class Footprint:
-    """An upright block that stands in the way: centre (x, z), size (x, z) before the turn, turn about +y, height span."""
+    """A block that stands in the way: centre (x, z), size (x, z) before the turn about +y, height span."""
 
     center: tuple[float, float]
     size: tuple[float, float]
@@ -30,7 +30,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Place:
-    """A place the animal likes: where it stands, which way it looks, and the spot on the floor from which it jumps up."""
+    """A place the animal likes: where it stands, which way it looks, the spot on the floor from which it jumps up."""
 
     name: str
     position: tuple[float, float, float]
@@ -65,13 +65,18 @@ class Room:
 
     def sheets(self) -> list[Sheet]:
         """Return every sheet in world axes."""
-        moved = [sheet.moved(sheets.upright(x, z, yaw)) for thing, (x, z, yaw) in zip(self.movables, self.arrangement, strict=True) for sheet in thing.sheets]
+        moved = [
+            sheet.moved(sheets.upright(x, z, yaw))
+            for thing, (x, z, yaw) in zip(self.movables, self.arrangement, strict=True)
+            for sheet in thing.sheets
+        ]
         return [*self.fixed, *moved]
 
     def footprints(self) -> list[Footprint]:
         """Return everything that stands in the way."""
         moved = [
-            Footprint((x, z), thing.size, yaw, 0.0, thing.height) for thing, (x, z, yaw) in zip(self.movables, self.arrangement, strict=True)
+            Footprint((x, z), thing.size, yaw, 0.0, thing.height)
+            for thing, (x, z, yaw) in zip(self.movables, self.arrangement, strict=True)
         ]
         return [*self.standing, *moved]
 
@@ -101,22 +106,35 @@ def furnish(rng: np.random.Generator) -> Room:
         "lamp": (0.85, -z + 0.26, 0.0),
         "bowls": (1.45, z - 0.22, 0.0),
     }
-    stands = {name: (px + rng.uniform(-0.06, 0.06) * (yaw == 0), pz + rng.uniform(-0.06, 0.06) * (yaw != 0), yaw) for name, (px, pz, yaw) in stands.items()}
+    stands = {
+        name: (px + rng.uniform(-0.06, 0.06) * (yaw == 0), pz + rng.uniform(-0.06, 0.06) * (yaw != 0), yaw)
+        for name, (px, pz, yaw) in stands.items()
+    }
     pieces = {name: furniture.MAKERS[name](rng) for name in stands}
     fixed = [*_shell(rng), *_window(rng), *_prints(rng)]
     fixed += [sheet.moved(sheets.upright(*stands[name])) for name, piece in pieces.items() for sheet in piece.sheets]
     standing = tuple(
-        Footprint((px, pz), pieces[name].size, yaw, pieces[name].bottom, pieces[name].top) for name, (px, pz, yaw) in stands.items() if pieces[name].top > 0.1
+        Footprint((px, pz), pieces[name].size, yaw, pieces[name].bottom, pieces[name].top)
+        for name, (px, pz, yaw) in stands.items()
+        if pieces[name].top > 0.1
     )
     movables = tuple(
-        Movable(tuple(piece.sheets), piece.size, piece.top, home) for piece, home in zip(furniture.loose_things(rng), _HOMES, strict=True)
+        Movable(tuple(piece.sheets), piece.size, piece.top, home)
+        for piece, home in zip(furniture.loose_things(rng), _HOMES, strict=True)
     )
     window = np.array([[x - 0.02, 2.1, -0.75], [0, 0, 1.5], [0, -1.2, 0]], float)
     lamp = (stands["lamp"][0], 1.62, stands["lamp"][1])
     return Room(tuple(fixed), movables, np.array(_HOMES, float), standing, _places(stands), window, lamp)
 
 
-_HOMES = ((1.5, 1.5, 0.9), (2.45, 0.62, 0.3), (-2.55, 1.95, -0.4), (1.1, -1.0, 0.0), (-0.3, 1.1, 0.7), (0.5, -1.75, 0.0))
+_HOMES = (
+    (1.5, 1.5, 0.9),
+    (2.45, 0.62, 0.3),
+    (-2.55, 1.95, -0.4),
+    (1.1, -1.0, 0.0),
+    (-0.3, 1.1, 0.7),
+    (0.5, -1.75, 0.0),
+)
 """Usual x, z, yaw of chair, crate, parcel, two balls and stool."""
 
 
@@ -157,10 +175,17 @@ def _shell(rng: np.random.Generator) -> list[Sheet]:
     door = texture.wood(rng, (196, 184, 164), contrast=3)
     frame = texture.plain(rng, (228, 226, 220))
     leaf = sheets.box((1.0, 1.0, z - 0.02), (0.8, 2.0, 0.03), door, skip="+z -y")
-    around = [*sheets.box((0.56, 1.02, z - 0.03), (0.07, 2.04, 0.06), frame, skip="+z -y"), *sheets.box((1.44, 1.02, z - 0.03), (0.07, 2.04, 0.06), frame, skip="+z -y")]
+    around = [
+        *sheets.box((0.56, 1.02, z - 0.03), (0.07, 2.04, 0.06), frame, skip="+z -y"),
+        *sheets.box((1.44, 1.02, z - 0.03), (0.07, 2.04, 0.06), frame, skip="+z -y"),
+    ]
     handle = sheets.box((0.71, 1.0, z - 0.06), (0.12, 0.02, 0.05), texture.plain(rng, (90, 88, 84)))
     panels = [
-        sheet for y0 in (0.55, 1.45) for sheet in sheets.box((1.0, y0, z - 0.042), (0.56, 0.7, 0.014), texture.wood(rng, (186, 172, 150), contrast=3), skip="+z")
+        sheet
+        for y0 in (0.55, 1.45)
+        for sheet in sheets.box(
+            (1.0, y0, z - 0.042), (0.56, 0.7, 0.014), texture.wood(rng, (186, 172, 150), contrast=3), skip="+z"
+        )
     ]
     return [*walls, *board, *leaf, *around, *handle, *panels]
 
@@ -174,8 +199,21 @@ def _window(rng: np.random.Generator) -> list[Sheet]:
         sheets.curtain((x - 0.1, 2.28, -1.18), (0, 0, 0.5), 2.2, cloth, depth=0.035, folds=5),
         sheets.curtain((x - 0.1, 2.28, 0.68), (0, 0, 0.5), 2.2, cloth, depth=0.035, folds=5),
     ]
-    radiator = [sheet for k in range(12) for sheet in sheets.box((x - 0.07, 0.42, -0.55 + 0.1 * k), (0.09, 0.6, 0.07), texture.plain(rng, (220, 220, 214)), skip="+x -y")]
-    pot = sheets.cylinder((x - 0.1, 0.97, 0.45), 0.06, 0.13, texture.plain(rng, (176, 92, 60)), texture.plain(rng, (60, 46, 36)), flare=1.25)
+    radiator = [
+        sheet
+        for k in range(12)
+        for sheet in sheets.box(
+            (x - 0.07, 0.42, -0.55 + 0.1 * k), (0.09, 0.6, 0.07), texture.plain(rng, (220, 220, 214)), skip="+x -y"
+        )
+    ]
+    pot = sheets.cylinder(
+        (x - 0.1, 0.97, 0.45),
+        0.06,
+        0.13,
+        texture.plain(rng, (176, 92, 60)),
+        texture.plain(rng, (60, 46, 36)),
+        flare=1.25,
+    )
     return [pane, *sill, *drapes, *radiator, *pot]
 
 

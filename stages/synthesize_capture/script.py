@@ -1,6 +1,6 @@
 """Write the script of every recording: who is where, under which light, filmed by which phone.
 
-`scripts` decides everything that is random apart from sensor noise, so that recordings can be filmed one by one, in any order.
+`scripts` decides everything random apart from sensor noise, so that recordings can be filmed in any order.
 """
 
 from dataclasses import dataclass
@@ -72,10 +72,24 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
     streams = iter(np.random.default_rng([plan.seed, 1]).spawn(4 * plan.session_count + 16))
     day = light.light_of_session(next(streams), dim=False)
     rng = next(streams)
-    out = [_script(plan, rng, "walkthrough", room, day, camera_motion.walkthrough(room, rng, plan.walkthrough_s), plan.walkthrough_s)]
+    out = [
+        _script(
+            plan,
+            rng,
+            "walkthrough",
+            room,
+            day,
+            camera_motion.walkthrough(room, rng, plan.walkthrough_s),
+            plan.walkthrough_s,
+        )
+    ]
     rng = next(streams)
     course = session.standing_course(room, rng, plan.turnaround_s)
-    out.append(_script(plan, rng, "turnaround", room, day, camera_motion.turnaround(course, rng), plan.turnaround_s, course=course))
+    out.append(
+        _script(
+            plan, rng, "turnaround", room, day, camera_motion.turnaround(course, rng), plan.turnaround_s, course=course
+        )
+    )
     for number in range(1, plan.session_count + 1):
         rng = next(streams)
         arranged = room.arranged(rng)
@@ -84,7 +98,21 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
         lived = session.simulate_session(arranged, rng, plan.session_s)
         path = camera_motion.filming(lived, rng)
         turns = 1 if number == plan.sideways_session else 0
-        out.append(_script(plan, rng, f"session-{number}", arranged, lit, path, plan.session_s, course=lived.animal, lived=lived, dim=dim, turns=turns))
+        out.append(
+            _script(
+                plan,
+                rng,
+                f"session-{number}",
+                arranged,
+                lit,
+                path,
+                plan.session_s,
+                course=lived.animal,
+                lived=lived,
+                dim=dim,
+                turns=turns,
+            )
+        )
         rng = next(streams)
         if number == plan.heldout_of:
             path = camera_motion.bystanding(lived, arranged, rng)
@@ -93,9 +121,19 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
 
 
 def _script(
-    plan: Plan, rng: np.random.Generator, name: str, room: Room, lit: Light, path: camera_motion.Cameras, duration_s: float, *,
-    course: AnimalCourse | None = None, lived: SessionTrajectories | None = None, dim: bool = False, turns: int = 0,
-) -> Script:  # fmt: skip
+    plan: Plan,
+    rng: np.random.Generator,
+    name: str,
+    room: Room,
+    lit: Light,
+    path: camera_motion.Cameras,
+    duration_s: float,
+    *,
+    course: AnimalCourse | None = None,
+    lived: SessionTrajectories | None = None,
+    dim: bool = False,
+    turns: int = 0,
+) -> Script:
     timestamp_s = sensor.timestamps(rng, duration_s, plan.record_fps)
     upright = rigid.interpolate(np.arange(len(path)) * session.STEP_S, path, timestamp_s)
     stored = cameras.turn_camera(upright, -turns)
@@ -104,9 +142,21 @@ def _script(
     if course is not None:
         moving = np.interp(timestamp_s, course.timestamp_s, course.speed()) > MOVING_M_S
     return Script(
-        name=name, seed=int(rng.integers(2**31)), room=room, light=lit, exposure=exposure, timestamp_s=timestamp_s, world_from_camera=stored,
-        intrinsics=sensor.lens(rng, timestamp_s, plan.color_width, plan.color_height), odometry_from_camera=sensor.odometry(rng, timestamp_s, stored),
-        gain=sensor.gains(rng, timestamp_s, exposure), motion=None if course is None else gait.poses(course, timestamp_s), moving=moving,
-        quarter_turns=turns, color_size=(plan.color_height, plan.color_width), depth_size=(plan.depth_height, plan.depth_width),
-        fps=plan.record_fps, session=lived,
-    )  # fmt: skip
+        name=name,
+        seed=int(rng.integers(2**31)),
+        room=room,
+        light=lit,
+        exposure=exposure,
+        timestamp_s=timestamp_s,
+        world_from_camera=stored,
+        intrinsics=sensor.lens(rng, timestamp_s, plan.color_width, plan.color_height),
+        odometry_from_camera=sensor.odometry(rng, timestamp_s, stored),
+        gain=sensor.gains(rng, timestamp_s, exposure),
+        motion=None if course is None else gait.poses(course, timestamp_s),
+        moving=moving,
+        quarter_turns=turns,
+        color_size=(plan.color_height, plan.color_width),
+        depth_size=(plan.depth_height, plan.depth_width),
+        fps=plan.record_fps,
+        session=lived,
+    )

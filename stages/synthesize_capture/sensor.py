@@ -33,11 +33,11 @@ def exposure_of_recording(rng: np.random.Generator, *, dim: bool) -> Exposure:
     balance[1] = 1.0
     if dim:
         return Exposure(rng.uniform(0.95, 1.15), 0.06, balance, 0.03, 1 / 45)
-    return Exposure(rng.uniform(0.72, 1.0), 0.10, balance, 0.012, 1 / 110)
+    return Exposure(rng.uniform(0.85, 1.12), 0.10, balance, 0.012, 1 / 110)
 
 
 def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float[np.ndarray, "frame"]:
-    """Return recorded times: nominal rate, jitter of about a millisecond, now and then one to three frames lost; the first is 0."""
+    """Return recorded times from 0: nominal rate, a millisecond of jitter, now and then one to three frames lost."""
     times = np.arange(int(duration_s * fps + 1e-6) + 1) / fps
     times[1:] += np.clip(rng.normal(0, 0.0012, len(times) - 1), -0.004, 0.004)
     keep = np.ones(len(times), bool)
@@ -47,8 +47,10 @@ def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float
     return times[keep]
 
 
-def lens(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], width: int, height: int) -> Float[np.ndarray, "frame 4"]:
-    """Return fx, fy, cx, cy per frame: a main camera of about 54 by 68 degrees whose stabiliser and focus wander a little."""
+def lens(
+    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], width: int, height: int
+) -> Float[np.ndarray, "frame 4"]:
+    """Return fx, fy, cx, cy per frame: about 54 by 68 degrees, with a stabiliser and a focus that wander."""
     focal = 235.0 / 240.0 * width * rng.uniform(0.985, 1.015)
     center = np.array([width, height]) / 2 + rng.normal(0, 0.004 * width, 2)
     wander = [_slow(rng, timestamp_s, 1.2) for _ in range(3)]
@@ -56,10 +58,13 @@ def lens(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], widt
     return np.stack([fx, fx, center[0] + 0.0022 * width * wander[1], center[1] + 0.0022 * width * wander[2]], axis=-1)
 
 
-def odometry(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 4 4"]:
-    """Return the phone's own poses: gravity-aligned, a new origin and heading, with drift in heading, scale and position.
+def odometry(
+    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], world_from_camera: Float[np.ndarray, "frame 4 4"]
+) -> Float[np.ndarray, "frame 4 4"]:
+    """Return the phone's own poses: gravity-aligned, a new origin and heading, drifting.
 
-    Steps between frames are chained with a slowly wrong heading (about a degree a minute), half a per cent of scale and a small tilt.
+    Steps between frames are chained with a slowly wrong heading (about a degree a minute), half a per cent
+    of scale and a small tilt.
     """
     count = len(timestamp_s)
     start = rigid.rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
@@ -72,14 +77,20 @@ def odometry(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], 
     position = world_from_camera[:, :3, 3]
     step = np.diff(position, axis=0)
     moved = scale * np.einsum("fij,fj->fi", turn[1:], step)
-    moved = moved + 0.004 * np.linalg.norm(step, axis=-1, keepdims=True) * np.stack([_slow(rng, timestamp_s, 2.0)[1:] for _ in range(3)], axis=-1)
+    moved = moved + 0.004 * np.linalg.norm(step, axis=-1, keepdims=True) * np.stack(
+        [_slow(rng, timestamp_s, 2.0)[1:] for _ in range(3)], axis=-1
+    )
     track = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)]) + rng.normal(0, 0.02, 3)
     jitter = rigid.rotation_from_vector(rng.normal(0, np.deg2rad(0.03), (count, 3)))
     return rigid.make(turn @ world_from_camera[:, :3, :3] @ jitter, track + rng.normal(0, 0.0006, (count, 3)))
 
 
 def picture(
-    linear: Float[np.ndarray, "height width 3"], exposure: Exposure, gain: float, blur_px: Float[np.ndarray, "2"], rng: np.random.Generator
+    linear: Float[np.ndarray, "height width 3"],
+    exposure: Exposure,
+    gain: float,
+    blur_px: Float[np.ndarray, "2"],
+    rng: np.random.Generator,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Expose linear light: motion blur along ``blur_px``, vignette, photon and read noise, tone curve."""
     image = _smeared(linear, blur_px)
@@ -99,15 +110,23 @@ def lidar(
     mixed pixels, holes along some edges, nothing past 5 m.
     """
     height, width = depth.shape
-    bend = cv2.resize(rng.standard_normal((height // 6 + 1, width // 6 + 1, 2), dtype=np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    bend = cv2.resize(
+        rng.standard_normal((height // 6 + 1, width // 6 + 1, 2), dtype=np.float32),
+        (width, height),
+        interpolation=cv2.INTER_LINEAR,
+    )
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    seen = cv2.remap(depth, x + 0.7 * bend[..., 0], y + 0.7 * bend[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.remap(
+        depth, x + 0.7 * bend[..., 0], y + 0.7 * bend[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    )
     mixed = cv2.blur(seen, (3, 3))
     jump = cv2.morphologyEx(seen, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     edge = jump > 0.05 + 0.03 * seen
     seen = np.where(edge & (bend[..., 0] > 0.1), mixed, seen)
     grain = cv2.GaussianBlur(rng.standard_normal((height, width), dtype=np.float32), (0, 0), 1.6) * 5.6
-    measured = seen + (0.005 * seen + 0.004) * (0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)).astype(np.float32)
+    measured = seen + (0.005 * seen + 0.004) * (
+        0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)
+    ).astype(np.float32)
     slope = jump / np.maximum(seen, 0.3)
     confidence = np.where(slope > 0.09, 0, np.where((slope > 0.035) | (seen > 3.8), 1, 2)).astype(np.uint8)
     confidence = cv2.erode(confidence, np.ones((3, 3), np.uint8))
@@ -119,15 +138,24 @@ def lidar(
     return measured, confidence
 
 
-def motion_blur_px(world_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], focal_px: float, shutter_s: float) -> Float[np.ndarray, "frame 2"]:
+def motion_blur_px(
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    timestamp_s: Float[np.ndarray, "frame"],
+    focal_px: float,
+    shutter_s: float,
+) -> Float[np.ndarray, "frame 2"]:
     """Return how far (x, y) the picture's centre moves while the shutter is open, from the camera's turning."""
-    turn = rigid.vector_from_rotation(np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3])
+    turn = rigid.vector_from_rotation(
+        np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
+    )
     rate = turn / np.diff(timestamp_s)[:, None]
     rate = np.concatenate([rate, rate[-1:]])
     return np.stack([-rate[:, 1], rate[:, 0]], axis=-1) * focal_px * shutter_s
 
 
-def gains(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], exposure: Exposure) -> Float[np.ndarray, "frame"]:
+def gains(
+    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], exposure: Exposure
+) -> Float[np.ndarray, "frame"]:
     """Return the automatic exposure's slow wander, around 1."""
     return np.exp(exposure.gain_wander * _slow(rng, timestamp_s, 2.5))
 

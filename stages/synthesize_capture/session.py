@@ -58,7 +58,9 @@ def simulate_session(room: Room, rng: np.random.Generator, duration_s: float) ->
     person_floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
     start = person_floor.centers()[rng.integers(person_floor.free.sum())]
     centers = animal_floor.centers()
-    begin = centers[np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))]
+    begin = centers[
+        np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))
+    ]
     animal = Policy(animal_floor, room.places, begin, rng)
     observer = Observer(person_floor, start, rng)
     past: deque[Seen] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
@@ -69,13 +71,24 @@ def simulate_session(room: Room, rng: np.random.Generator, duration_s: float) ->
         past.append(Seen(observer.walker.position.copy(), observer.velocity.copy()))
         animal.step(STEP_S, past[0])
         mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (1.0 - 0.6 * animal.posture[:2].sum())
-        rows.append((
-            animal.position, animal.walker.yaw, animal.posture.copy(), float(animal.leap is not None), animal.gaze.copy(), mood,
-            observer.walker.position.copy(), observer.looks_at.copy(), REASONS.index(animal.reason),
-        ))  # fmt: skip
+        rows.append(
+            (
+                animal.position,
+                animal.walker.yaw,
+                animal.posture.copy(),
+                float(animal.leap is not None),
+                animal.gaze.copy(),
+                mood,
+                observer.walker.position.copy(),
+                observer.looks_at.copy(),
+                REASONS.index(animal.reason),
+            )
+        )
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     timestamp_s = np.arange(count) * STEP_S
-    course = AnimalCourse(timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5])
+    course = AnimalCourse(
+        timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5]
+    )
     return SessionTrajectories(course, columns[6], columns[7], columns[8])
 
 

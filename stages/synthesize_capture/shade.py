@@ -1,4 +1,4 @@
-"""Turn what the camera sees into light: sample lit pictures through mip maps, fur on the animal, a soft shadow under it.
+"""Turn what the camera sees into light: lit pictures through mip maps, fur on the animal, a soft shadow under it.
 
 `Backdrop` holds a recording's lit room as one mesh with an atlas of mip maps; `shade` makes a linear RGB
 image from a view at twice the image's size: pixels whose four samples agree are shaded once, edges four times.
@@ -18,7 +18,10 @@ RADIANCE_RANGE = 2.0
 
 @dataclass(frozen=True)
 class Backdrop:
-    """The lit room: mesh, picture coordinates per face corner, and the atlas (flat bytes; per sheet and level: start, height, width)."""
+    """The lit room: mesh, picture coordinates per face corner, and the atlas of mip maps.
+
+    ``levels`` holds start, height and width of each sheet's maps in the flat atlas.
+    """
 
     vertices: Float[np.ndarray, "vertex 3"]
     faces: Int[np.ndarray, "face 3"]
@@ -42,16 +45,21 @@ def backdrop(sheets: list[Sheet], lit: list[UInt8[np.ndarray, "height width 3"]]
             parts.append(picture.reshape(-1))
             start += picture.size
             picture = cv2.resize(picture, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
-    density = np.array([picture.shape[1] / max(sheet.size_m()[1], 1e-3) for sheet, picture in zip(sheets, lit, strict=True)], np.float32)
+    density = np.array(
+        [picture.shape[1] / max(sheet.size_m()[1], 1e-3) for sheet, picture in zip(sheets, lit, strict=True)],
+        np.float32,
+    )
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    return Backdrop(vertices, faces, coordinates[faces], owner, normal.astype(np.float32), np.concatenate(parts), levels, density)
+    return Backdrop(
+        vertices, faces, coordinates[faces], owner, normal.astype(np.float32), np.concatenate(parts), levels, density
+    )
 
 
 @dataclass(frozen=True)
 class Coat:
-    """The animal as seen in one frame: faces, rest points, lit colour factor per vertex, and balls that shade the ground."""
+    """The animal in one frame: faces, rest points, light per vertex, and balls that shade the ground."""
 
     faces: Int[np.ndarray, "face 3"]
     rest: Float[np.ndarray, "vertex 3"]
@@ -63,8 +71,10 @@ class Coat:
     """Camera-frame centre and radius."""
 
 
-def shade(view_face, inverse_corners, focal_center, room: Backdrop, coat: Coat, camera_from_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "height width 3"]:
-    """Return linear RGB ``[height width 3]`` of a view whose samples are twice as dense; ``focal_center`` = fx fy cx cy of the image.
+def shade(
+    view_face, inverse_corners, focal_center, room: Backdrop, coat: Coat, camera_from_world: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "height width 3"]:
+    """Return linear RGB of a view whose samples are twice as dense; ``focal_center`` = fx fy cx cy of the image.
 
     Faces from ``len(room.faces)`` on are the animal's.
     """
@@ -73,14 +83,43 @@ def shade(view_face, inverse_corners, focal_center, room: Backdrop, coat: Coat, 
     normals_camera = (room.normals @ camera_from_world[:3, :3].T).astype(np.float32)
     surface = np.concatenate([room.owner, np.full(len(coat.faces), len(room.levels), np.int32)])
     _shade(
-        view_face, inverse_corners, np.asarray(focal_center, float), surface, room.corners, room.atlas, room.levels, room.texels_per_m,
-        normals_camera, coat.faces, coat.rest, coat.light, coat.pattern, coat.shadow, out,
-    )  # fmt: skip
+        view_face,
+        inverse_corners,
+        np.asarray(focal_center, float),
+        surface,
+        room.corners,
+        room.atlas,
+        room.levels,
+        room.texels_per_m,
+        normals_camera,
+        coat.faces,
+        coat.rest,
+        coat.light,
+        coat.pattern,
+        coat.shadow,
+        out,
+    )
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def _shade(view_face, inverse_corners, focal_center, surface, corners, atlas, levels, density, normals, coat_faces, rest, light, pattern, shadow, out):
+def _shade(
+    view_face,
+    inverse_corners,
+    focal_center,
+    surface,
+    corners,
+    atlas,
+    levels,
+    density,
+    normals,
+    coat_faces,
+    rest,
+    light,
+    pattern,
+    shadow,
+    out,
+):
     height, width, _ = out.shape
     fx, fy, cx, cy = focal_center
     pixel = np.empty(3, np.float32)
@@ -139,8 +178,12 @@ def _sample(face, a, b, c, x, y, z, fx, sheet, corners, atlas, levels, density, 
         j1, i1 = min(j0 + 1, columns - 1), min(i0 + 1, rows - 1)
         s, t = p - j0, q - i0
         for channel in range(3):
-            upper = (1 - s) * atlas[start + (i0 * columns + j0) * 3 + channel] + s * atlas[start + (i0 * columns + j1) * 3 + channel]
-            lower = (1 - s) * atlas[start + (i1 * columns + j0) * 3 + channel] + s * atlas[start + (i1 * columns + j1) * 3 + channel]
+            upper = (1 - s) * atlas[start + (i0 * columns + j0) * 3 + channel] + s * atlas[
+                start + (i0 * columns + j1) * 3 + channel
+            ]
+            lower = (1 - s) * atlas[start + (i1 * columns + j0) * 3 + channel] + s * atlas[
+                start + (i1 * columns + j1) * 3 + channel
+            ]
             pixel[channel] += weight * ((1 - t) * upper + t * lower)
     for channel in range(3):
         root = pixel[channel] / 255.0
@@ -157,7 +200,9 @@ def _fur(corner, a, b, c, rest, light, pattern, footprint, pixel):
     y = a * rest[corner[0], 1] + b * rest[corner[1], 1] + c * rest[corner[2], 1]
     z = a * rest[corner[0], 2] + b * rest[corner[1], 2] + c * rest[corner[2], 2]
     strength = a * pattern[corner[0], 3] + b * pattern[corner[1], 3] + c * pattern[corner[2], 3]
-    fine = strength * min(1.0, 0.004 / max(footprint, 1e-4)) * (_grain(x, y, z, 90.0) * 0.8 + _grain(x, y, z, 230.0) * 0.5)
+    fine = (
+        strength * min(1.0, 0.004 / max(footprint, 1e-4)) * (_grain(x, y, z, 90.0) * 0.8 + _grain(x, y, z, 230.0) * 0.5)
+    )
     for channel in range(3):
         base = a * pattern[corner[0], channel] + b * pattern[corner[1], channel] + c * pattern[corner[2], channel]
         shine = a * light[corner[0], channel] + b * light[corner[1], channel] + c * light[corner[2], channel]
@@ -191,7 +236,7 @@ def _shadow(x, y, z, normal, shadow):
         facing = sign * (normal[0] * dx + normal[1] * dy + normal[2] * dz) / np.sqrt(squared)
         if facing > 0:
             lost += facing * min(shadow[ball, 3] * shadow[ball, 3] / squared, 0.9)
-    return max(1.0 - 0.75 * lost, 0.3)
+    return max(1.0 - 1.15 * lost, 0.25)
 
 
 @njit(cache=True, error_model="numpy")

@@ -56,10 +56,17 @@ def flat(corner, right, down, paint: Paint, *, glow: float = 0.0, cells: tuple[i
 
 
 def box(center, size, paint: Paint | dict[str, Paint], *, skip: str = "") -> list[Sheet]:
-    """Make an upright box; ``paint`` may name faces ``+x -x +y -y +z -z`` apart, "" being the rest; ``skip`` leaves faces out."""
+    """Make an upright box; ``paint`` may name faces (``+x`` ... ``-z``) apart ("" = the rest); ``skip`` omits faces."""
     center, half = np.asarray(center, float), np.asarray(size, float) / 2
     sheets = []
-    for name, normal in (("+x", (1, 0, 0)), ("-x", (-1, 0, 0)), ("+y", (0, 1, 0)), ("-y", (0, -1, 0)), ("+z", (0, 0, 1)), ("-z", (0, 0, -1))):
+    for name, normal in (
+        ("+x", (1, 0, 0)),
+        ("-x", (-1, 0, 0)),
+        ("+y", (0, 1, 0)),
+        ("-y", (0, -1, 0)),
+        ("+z", (0, 0, 1)),
+        ("-z", (0, 0, -1)),
+    ):
         if name in skip.split():
             continue
         normal = np.array(normal, float)
@@ -75,7 +82,11 @@ def cushion(center, size, paint: Paint, *, bulge: float, skip: str = "-y") -> li
     """Make a box whose faces bulge softly outwards by ``bulge`` metres."""
     soft = []
     for sheet in box(center, size, paint, skip=skip):
-        corner, right, down = sheet.points[0, 0], sheet.points[0, 1] - sheet.points[0, 0], sheet.points[1, 0] - sheet.points[0, 0]
+        corner, right, down = (
+            sheet.points[0, 0],
+            sheet.points[0, 1] - sheet.points[0, 0],
+            sheet.points[1, 0] - sheet.points[0, 0],
+        )
         v, u = np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7), indexing="ij")
         rise = bulge * (np.sin(np.pi * u) * np.sin(np.pi * v)) ** 0.6
         points = corner + v[..., None] * down + u[..., None] * right + rise[..., None] * sheet.normals()[0, 0]
@@ -83,12 +94,17 @@ def cushion(center, size, paint: Paint, *, bulge: float, skip: str = "-y") -> li
     return soft
 
 
-def cylinder(center, radius: float, height: float, side: Paint, top: Paint, *, flare: float = 1.0, segments: int = 16) -> list[Sheet]:
+def cylinder(
+    center, radius: float, height: float, side: Paint, top: Paint, *, flare: float = 1.0, segments: int = 16
+) -> list[Sheet]:
     """Make a standing cylinder whose top radius is ``flare`` times the bottom one, with a lid."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
-    low, high = np.asarray(center, float) - [0, height / 2, 0], np.asarray(center, float) + [0, height / 2, 0]
-    wall = Sheet(np.stack([high + ring * radius * flare, low + ring * radius]).astype(np.float32), side(2 * np.pi * radius, height))
+    low, high = np.asarray(center, float) - [0, height / 2, 0], [*np.asarray(center, float), 0, height / 2, 0]
+    wall = Sheet(
+        np.stack([high + ring * radius * flare, low + ring * radius]).astype(np.float32),
+        side(2 * np.pi * radius, height),
+    )
     disc = np.stack([np.broadcast_to(high, ring.shape), high + ring * radius * flare]).astype(np.float32)
     return [wall, Sheet(disc, top(2 * np.pi * radius, radius))]
 
@@ -105,13 +121,22 @@ def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: 
 
 def ball(center, radius: float, paint: Paint, *, squash: float = 1.0, rings: int = 7) -> Sheet:
     """Make a ball, its height scaled by ``squash``."""
-    polar, angle = np.meshgrid(np.linspace(0.02, np.pi - 0.02, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij")
+    polar, angle = np.meshgrid(
+        np.linspace(0.02, np.pi - 0.02, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij"
+    )
     unit = np.stack([np.sin(polar) * np.sin(angle), squash * np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1)
-    return Sheet((np.asarray(center, float) + radius * unit).astype(np.float32), paint(2 * np.pi * radius, np.pi * radius))
+    return Sheet(
+        (np.asarray(center, float) + radius * unit).astype(np.float32), paint(2 * np.pi * radius, np.pi * radius)
+    )
 
 
-def triangles(sheets: Sequence[Sheet]) -> tuple[Float[np.ndarray, "vertex 3"], np.ndarray, Float[np.ndarray, "vertex 2"], np.ndarray]:
-    """Join sheets to one mesh: vertices, faces (counter-clockwise from the front), picture coordinates in [0, 1], sheet of each face."""
+def triangles(
+    sheets: Sequence[Sheet],
+) -> tuple[Float[np.ndarray, "vertex 3"], np.ndarray, Float[np.ndarray, "vertex 2"], np.ndarray]:
+    """Join sheets to one mesh.
+
+    Returns vertices, faces (counter-clockwise from the front), picture coordinates in [0, 1], and each face's sheet.
+    """
     vertices, faces, coordinates, owner, start = [], [], [], [], 0
     for index, sheet in enumerate(sheets):
         rows, columns, _ = sheet.points.shape

@@ -1,4 +1,7 @@
-"""Keep the truth of a recording, for `evaluate` alone: cameras, animal, masks, noiseless depth, flow. All on the upright picture."""
+"""Keep the truth of a recording, for `evaluate` alone: cameras, animal, masks, noiseless depth, flow.
+
+Everything refers to the upright picture.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,12 +57,22 @@ class Truth:
             contents["agent_from_bone"] = script.motion.agent_from_bone.astype(np.float32)
             contents["agent_vertices_world"] = np.stack(self.vertices)
             masks = np.stack(self.masks)
-            arrays.save(folder / f"{name}.masks.npz", compress=True, packed=np.packbits(masks, axis=-1), shape=np.array(masks.shape, np.int64))
+            arrays.save(
+                folder / f"{name}.masks.npz",
+                compress=True,
+                packed=np.packbits(masks, axis=-1),
+                shape=np.array(masks.shape, np.int64),
+            )
         arrays.save(folder / f"{name}.npz", **contents)
         if self.keep_depth:
             stored = cameras.scale_intrinsics(matrices(script.intrinsics), script.color_size, script.depth_size)
             depth_intrinsics = cameras.turn_intrinsics(stored, script.depth_size, script.quarter_turns)
-            arrays.save(folder / f"{name}.depth.npz", compress=True, depth=np.stack(self.depth), depth_intrinsics=depth_intrinsics)
+            arrays.save(
+                folder / f"{name}.depth.npz",
+                compress=True,
+                depth=np.stack(self.depth),
+                depth_intrinsics=depth_intrinsics,
+            )
 
 
 def write_flow(stage: Stage, folder: Path, *, pairs: int) -> None:
@@ -68,4 +81,10 @@ def write_flow(stage: Stage, folder: Path, *, pairs: int) -> None:
     first = np.unique(np.linspace(0, np.searchsorted(times, times[-1] - FLOW_GAP_S) - 1, pairs).astype(np.int64))
     second = [int(np.argmin(np.abs(times - times[index] - FLOW_GAP_S))) for index in first]
     flow = np.stack([true_flow(stage, int(a), b) for a, b in zip(first, second, strict=True)])
-    arrays.save(folder / f"{stage.script.name}.flow.npz", compress=True, frame_index=first, second_index=np.array(second, np.int64), flow=flow.astype(np.float16))
+    arrays.save(
+        folder / f"{stage.script.name}.flow.npz",
+        compress=True,
+        frame_index=first,
+        second_index=np.array(second, np.int64),
+        flow=flow.astype(np.float16),
+    )

@@ -13,9 +13,20 @@ from stages.synthesize_capture import animal, film, produce, room, script
 
 CREATURE = animal.grow(np.random.default_rng(0), cell_m=0.016)
 PLAN = script.Plan(
-    seed=4, session_count=2, session_s=0.8, walkthrough_s=0.5, turnaround_s=0.5, heldout_of=1, record_fps=15.0, dim_session=0, sideways_session=2,
-    color_height=160, color_width=120, depth_height=128, depth_width=96,
-)  # fmt: skip
+    seed=4,
+    session_count=2,
+    session_s=0.8,
+    walkthrough_s=0.5,
+    turnaround_s=0.5,
+    heldout_of=1,
+    record_fps=15.0,
+    dim_session=0,
+    sideways_session=2,
+    color_height=160,
+    color_width=120,
+    depth_height=128,
+    depth_width=96,
+)
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +53,17 @@ def test_container_follows_the_format(scripts, made):
         depth = np.frombuffer(lzfse.decompress(archive.read("rgbd/0.depth")), "<f4").reshape(about["dh"], about["dw"])
         confidence = np.frombuffer(lzfse.decompress(archive.read("rgbd/0.conf")), np.uint8)
         color = cv2.imdecode(np.frombuffer(archive.read("rgbd/0.jpg"), np.uint8), cv2.IMREAD_COLOR)
-    assert color.shape == (about["h"], about["w"], 3) and about["h"] > about["w"]
-    assert set(np.unique(confidence)) <= {0, 1, 2} and 0.2 < np.nanmedian(depth) < 5
+    assert color.shape == (about["h"], about["w"], 3)
+    assert about["h"] > about["w"]
+    assert set(np.unique(confidence)) <= {0, 1, 2}
+    assert 0.2 < np.nanmedian(depth) < 5
     assert about["K"][0] == pytest.approx(about["perFrameIntrinsicCoeffs"][0][0], abs=1e-3)
-    assert len(about["poses"]) == len(about["frameTimestamps"]) == len(scripts[2].timestamp_s) and about["frameTimestamps"][0] == 0
+    assert len(about["poses"]) == len(about["frameTimestamps"]) == len(scripts[2].timestamp_s)
+    assert about["frameTimestamps"][0] == 0
     x, y, z, w = about["poses"][3][:4]
-    up = cameras.opencv_from_opengl(rigid.make(rigid.rotation_from_quaternion(np.array([w, x, y, z])), np.array(about["poses"][3][4:])))
+    up = cameras.opencv_from_opengl(
+        rigid.make(rigid.rotation_from_quaternion(np.array([w, x, y, z])), np.array(about["poses"][3][4:]))
+    )
     np.testing.assert_allclose(up, scripts[2].odometry_from_camera[3], atol=1e-6)
 
 
@@ -59,7 +75,9 @@ def test_truth_is_upright_and_the_animal_fills_its_mask(scripts, made):
         assert (truth["world_from_camera"][:, 1, 1] < -0.3).all(), "the picture's y axis points down"
         frame = int(np.argmax(masks.mean((1, 2))))
         points = truth["agent_vertices_world"][frame].astype(float) + truth["world_from_agent"][frame, :3, 3]
-        pixel, depth = cameras.project(rigid.apply(rigid.inverse(truth["world_from_camera"][frame]), points), truth["intrinsics"][frame])
+        pixel, depth = cameras.project(
+            rigid.apply(rigid.inverse(truth["world_from_camera"][frame]), points), truth["intrinsics"][frame]
+        )
         height, width = masks.shape[1:]
         inside = (depth > 0) & (pixel >= 0).all(-1) & (pixel < [width, height]).all(-1)
         at = pixel[inside].astype(int)

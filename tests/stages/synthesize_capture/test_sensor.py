@@ -11,10 +11,13 @@ def test_lidar_noise_reach_and_confidence():
     truth[:, 96:] = 1.5
     truth[:40] = 5.5
     depth, confidence = sensor.lidar(truth, np.random.default_rng(0))
-    assert np.isnan(depth[:36]).all() and (confidence[:36] == 0).all(), "nothing past 5 m"
+    assert np.isnan(depth[:36]).all(), "nothing past 5 m"
+    assert (confidence[:36] == 0).all()
     plain = depth[60:, 10:80] - 3.0
-    assert 0.004 < plain.std() < 0.03 and abs(plain.mean()) < 0.004
-    assert confidence[60:, 10:80].min() == 2 and confidence[60:, 95:97].max() == 0
+    assert 0.004 < plain.std() < 0.03
+    assert abs(plain.mean()) < 0.004
+    assert confidence[60:, 10:80].min() == 2
+    assert confidence[60:, 95:97].max() == 0
 
 
 def test_odometry_is_gravity_aligned_with_small_drift():
@@ -37,4 +40,7 @@ def test_odometry_is_gravity_aligned_with_small_drift():
 def test_timestamps_begin_at_zero_and_have_gaps():
     times = sensor.timestamps(np.random.default_rng(1), 60.0, 15.0)
     step = np.diff(times)
-    assert times[0] == 0 and (step > 0.05).all() and step.max() > 0.12 and abs(times[-1] - 60) < 0.01
+    assert times[0] == 0
+    assert (step > 0.05).all()
+    assert step.max() > 0.12
+    assert abs(times[-1] - 60) < 0.01
