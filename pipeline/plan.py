@@ -163,6 +163,9 @@ def write(plan: Plan, cache: sources.Cache) -> None:
             "videos": [[v.id, v.role, v.split, v.synchronized_with, v.offset_s] for v in _seen(plan, node)],
         }
         artifact.write_if_changed(plan.home.plan / f"keys/{name}.json", _json(key))
+    for job in all_jobs:  # there from the start, so that a job that fails leaves no trace
+        lock_file(job.home, job.id).parent.mkdir(parents=True, exist_ok=True)
+        lock_file(job.home, job.id).touch()
     artifact.write_if_changed(plan.home.plan / "dag.json", _json([asdict(job) | {"stamp": job.stamp} for job in all_jobs]))
     artifact.write_if_changed(plan.home.plan / "rules.mk", _rules(plan, all_jobs))
 
@@ -181,6 +184,11 @@ def mark_redo(home: Home, name: str) -> None:
 def redo_mark(home: str, job_id: str) -> Path:
     """Return the file whose presence has `run` do a job although its key is unchanged."""
     return Path("build", home, "plan", "redo", job_id)
+
+
+def lock_file(home: str, job_id: str) -> Path:
+    """Return the file whose kernel lock a runner holds while it does a job."""
+    return Path("build", home, "plan", "locks", job_id)
 
 
 def new_agent(name: str) -> None:

@@ -48,7 +48,7 @@ def run(home: str, job_id: str) -> int:
     out, stamp = Path(job["out"]), Path(job["stamp"])
     resume = Path("build", job["home"], "resume", job_id)
     redo = plan.redo_mark(job["home"], job_id)
-    with _lock(Path("build", job["home"], "locks", job_id), job_id):
+    with _lock(plan.lock_file(job["home"], job_id), job_id):
         artifact.clean(out)
         key = _key(job)
         made = artifact.read_manifest(out)
@@ -77,8 +77,7 @@ def _job(home: str, job_id: str) -> dict[str, Any]:
 @contextlib.contextmanager
 def _lock(path: Path, job_id: str) -> Iterator[None]:
     """Hold the job's kernel lock: it dies with its owner, and a second runner waits for the first."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+") as file:
+    with path.open("a") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -111,8 +110,7 @@ def _do(job: dict[str, Any], key: str, resume: Path) -> int:
     out = Path(job["out"])
     if not Path("stages", job["stage"], "__main__.py").is_file():
         raise InputError("RUN-002", f"there is no stage program {job['stage']!r}", "stages/", "this build is incomplete")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    free = shutil.disk_usage(out.parent).free
+    free = shutil.disk_usage("build").free
     if free < LEAST_FREE_BYTES:
         raise InputError("SYS-001", f"only {free >> 20} MB free on the disk", str(out), "free some space and run the same again")
     arguments = [*job["arguments"], "--key", key, "--threads", str(job["threads"])]

@@ -7,12 +7,12 @@ import zipfile
 import lzfse
 import numpy as np
 import pytest
-from made_recordings import walk, write_zip
 
 from pipeline import cli
 from pipeline.files import images
 from stages.extract_frames import __main__ as front
 from stages.extract_frames import lzfse_blocks
+from tests.stages.extract_frames.made_recordings import walk, write_zip
 
 
 def _refused(recording, folder, monkeypatch, capsys):

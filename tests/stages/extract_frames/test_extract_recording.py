@@ -4,17 +4,17 @@ import sys
 
 import numpy as np
 import pytest
-from made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 from pipeline import cli
 from pipeline.files import arrays, images
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
 from stages.extract_frames import __main__ as front
+from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 
-def _extract(recording, out, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(out)])
+def _extract(recording, out, monkeypatch, *options):
+    monkeypatch.setattr(sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(out), *options])
     cli.enter(front.__doc__, front.run, config=front.Config, reads=("recording",))
     return Clip.open(out)
 
@@ -80,3 +80,14 @@ def test_same_recording_same_bytes(tmp_path, monkeypatch):
         _extract(recording, tmp_path / out, monkeypatch)
     files = [path.relative_to(tmp_path / "one") for path in sorted((tmp_path / "one").rglob("*")) if path.is_file()]
     assert all((tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files)
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_large_pictures_are_reduced_with_their_intrinsics(tmp_path, monkeypatch, turns):
+    made = walk(12, quarter_turns=turns)
+    (tmp_path / "config.toml").write_text("max_side_px = 32")
+    options = ("--config", str(tmp_path / "config.toml"))
+    clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch, *options)
+    assert clip.color_size == (32, 24)
+    np.testing.assert_allclose(clip.intrinsics[0], np.diag([0.5, 0.5, 1]) @ walk().intrinsics)
+    np.testing.assert_allclose(clip.odometry_from_camera[0], made.world_from_camera[0], atol=1e-6)

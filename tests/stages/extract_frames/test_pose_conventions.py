@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 from pipeline.space import cameras, rigid
 from stages.extract_frames import conventions, upright
+from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 
 def _check(made, pose):

@@ -1,0 +1,24 @@
+"""What tests share: the long ones come last, and the toy is built once."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def pytest_collection_modifyitems(items):
+    """Run unit and house tests first, then the builds of the toy."""
+    items.sort(key=lambda item: item.get_closest_marker("toy") is not None)
+
+
+@pytest.fixture(scope="session")
+def toy(pytestconfig) -> Path:
+    """Build the toy in the repository's own `build/` and return its folder; its progress is shown."""
+    capture = pytestconfig.pluginmanager.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled():
+        print("\nmake toy", flush=True)
+        made = subprocess.run(["make", "-j2", "toy"], cwd=ROOT)
+    assert made.returncode == 0, "the toy does not build"
+    return ROOT / "build" / "toy"
