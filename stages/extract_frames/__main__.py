@@ -16,6 +16,8 @@ class Config:
 
     rate_hz: float = 10.0
     """Frames per second to keep; gaps in the recording stay gaps."""
+    max_side_px: int = 640
+    """Larger pictures are divided by a whole number until their longer side fits, pixels."""
     max_depth_m: float = 6.0
     """Depth beyond this is unknown, metres; phone LiDAR reaches about 5."""
     min_depth_valid: float = 0.2
@@ -23,7 +25,7 @@ class Config:
     check_pairs: int = 6
     """Pairs of frames on which device poses are checked against depth."""
     jpeg_quality: int = 95
-    """JPEG quality 1..100 of pictures that had to be turned; the others keep the phone's bytes."""
+    """JPEG quality 1..100 of pictures that were turned or reduced; the others keep the phone's bytes."""
 
 
 def run(task: cli.Task) -> None:
@@ -31,7 +33,11 @@ def run(task: cli.Task) -> None:
     settings: Config = task.config
     recording = open_recording(task.input("recording"))
     plan = extraction.understand(
-        recording, rate_hz=settings.rate_hz, max_depth_m=settings.max_depth_m, pairs=settings.check_pairs
+        recording,
+        rate_hz=settings.rate_hz,
+        max_depth_m=settings.max_depth_m,
+        pairs=settings.check_pairs,
+        max_side_px=settings.max_side_px,
     )
     progress.log(extraction.sentence(recording, plan))
     frames = extraction.frames(recording, plan, max_depth_m=settings.max_depth_m, jpeg_quality=settings.jpeg_quality)

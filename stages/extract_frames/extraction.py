@@ -30,6 +30,8 @@ class Plan:
 
     chosen: Int[np.ndarray, "frame"]
     timestamp_s: Float[np.ndarray, "frame"]
+    stored_size: tuple[int, int]
+    """(height, width) of the colour pictures before the turn"""
     intrinsics: Float[np.ndarray, "frame 3 3"]
     """colour pixels"""
     depth_intrinsics: Float[np.ndarray, "frame 3 3"]
@@ -46,7 +48,7 @@ class Frame:
 
     color: UInt8[np.ndarray, "height width 3"]
     jpeg: bytes
-    """the phone's own bytes where no turn was needed"""
+    """the phone's own bytes where the picture is kept as it is"""
     depth: Float[np.ndarray, "height width"]
     """metres, 0 = unknown"""
     confidence: UInt8[np.ndarray, "height width"]
@@ -59,8 +61,8 @@ class Frame:
     """share of known depth"""
 
 
-def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pairs: int) -> Plan:
-    """Choose frames, check the poses on the depth and find the upright turn."""
+def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pairs: int, max_side_px: int) -> Plan:
+    """Choose frames, check the poses on the depth, find the upright turn and the size of the pictures."""
     depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, recording.depth_size)
 
     def view(frame: int) -> conventions.DepthView:
@@ -74,11 +76,14 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
         gravity_known = not conventions.starts_at_identity(recording.pose, check.convention)
         turns = quarter_turns_from_gravity(odometry_from_camera) if gravity_known else 0
         odometry_from_camera = cameras.turn_camera(odometry_from_camera, turns)
+    size = reduced_size(recording.color_size, max_side_px)
+    intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
     chosen = choose_frames(recording.timestamp_s, rate_hz)
     return Plan(
         chosen=chosen,
         timestamp_s=recording.timestamp_s[chosen],
-        intrinsics=cameras.turn_intrinsics(recording.intrinsics, recording.color_size, turns)[chosen],
+        stored_size=size,
+        intrinsics=cameras.turn_intrinsics(intrinsics, size, turns)[chosen],
         depth_intrinsics=cameras.turn_intrinsics(depth_intrinsics, recording.depth_size, turns)[chosen],
         odometry_from_camera=None if odometry_from_camera is None else odometry_from_camera[chosen],
         gravity_known=gravity_known,
@@ -104,6 +109,8 @@ def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality
             if recording.read_confidence is None
             else np.minimum(recording.read_confidence(int(number)), 2)
         )
+        if color.shape[:2] != plan.stored_size:
+            color = cv2.resize(color, plan.stored_size[::-1], interpolation=cv2.INTER_AREA)
         if plan.quarter_turns:
             color, depth, confidence = (
                 cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence)
@@ -111,6 +118,12 @@ def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality
             jpeg = images.encode_jpeg(color, jpeg_quality)
         sharpness, brightness = picture_statistics(color)
         yield Frame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
+
+
+def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
+    """Divide a (height, width) by the smallest whole number that brings the longer side to ``max_side_px``."""
+    factor = -(-max(size) // max_side_px)
+    return (round(size[0] / factor), round(size[1] / factor))
 
 
 def known_depth(depth: Float[np.ndarray, "height width"], max_depth_m: float) -> Float[np.ndarray, "height width"]:

@@ -24,14 +24,15 @@ def _sample(name: str) -> Path:
 
 def test_exr_export_passes_the_self_check():
     recording = open_recording(_sample("record3d_exr12"))
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6)
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
     assert plan.self_check.verdict == "documented"
     assert plan.self_check.residual_m < LIMIT_M
     assert plan.gravity_known
     assert plan.quarter_turns == 0
     frames = list(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=95))
     assert len(frames) == 12
-    assert frames[0].color.shape == (1920, 1440, 3)
+    assert frames[0].color.shape == (640, 480, 3)
+    np.testing.assert_allclose(plan.intrinsics[0], np.diag([1 / 3, 1 / 3, 1]) @ recording.intrinsics[0])
     assert min(frame.depth_valid for frame in frames) > 0.9
 
 
