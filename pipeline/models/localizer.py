@@ -221,6 +221,20 @@ def project(descriptors: Float[np.ndarray, "patch channel"], bank: Bank) -> Floa
     return low / np.maximum(np.linalg.norm(low, axis=1, keepdims=True), 1e-6)
 
 
+def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample"]) -> Calibration:
+    """Fit P(good) as a logistic curve of a score in 0..1 by Newton steps; one pseudo-observation at each end and a ridge keep separable data finite."""
+    x = np.concatenate([score, [0.0, 1.0]])
+    y = np.concatenate([good.astype(float), [0.0, 1.0]])
+    design = np.stack([np.ones_like(x), x], axis=1)
+    weights = np.zeros(2)
+    penalty = np.diag([1e-3, 5e-3])
+    for _ in range(50):
+        p = 1 / (1 + np.exp(-np.clip(design @ weights, -30, 30)))
+        curvature = design.T @ (design * (p * (1 - p))[:, None]) + penalty
+        weights = weights + np.linalg.solve(curvature, design.T @ (y - p) - penalty @ weights)
+    return Calibration(float(weights[0]), float(weights[1]))
+
+
 def errors(map_from_camera: Float[np.ndarray, "*batch 4 4"], truth: Float[np.ndarray, "*batch 4 4"]) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     """Return rotation error (degrees) and the distance of the camera centres (metres)."""
     rotation = np.rad2deg(rigid.rotation_angle(map_from_camera[..., :3, :3], truth[..., :3, :3]))

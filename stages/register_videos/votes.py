@@ -44,6 +44,8 @@ class Votes:
     answers: list[Hypothesis]
     asked: int
     """Frames that were localised, with or without an answer."""
+    nearest: Hypothesis | None
+    """The best answer of all, believed or not: it tells the nearest view of the template."""
 
     @property
     def world_from_camera(self) -> Float[np.ndarray, "vote 4 4"]:
@@ -67,13 +69,15 @@ class Agreement:
 def collect(clip: Clip, masks: Masks, localizer: Localizer, options: VoteOptions) -> Votes:
     """Localise every so many frames, with the agent masked out."""
     asked = np.arange(options.every_frames // 2, len(clip), options.every_frames)
-    frames, answers = [], []
+    frames, answers, nearest = [], [], None
     for frame in track(asked.tolist(), "localising frames"):
         found = localizer.localize(clip.color(frame), clip.depth(frame), clip.depth_intrinsics[frame], clip.intrinsics[frame], masks[frame] == 0)
+        if found and (nearest is None or found[0].inlier_ratio > nearest.inlier_ratio):
+            nearest = found[0]
         if found and found[0].probability >= options.least_probability:
             frames.append(frame)
             answers.append(found[0])
-    return Votes(np.array(frames, int), answers, len(asked))
+    return Votes(np.array(frames, int), answers, len(asked), nearest)
 
 
 def agree(votes: Votes, odometry_from_camera: Float[np.ndarray, "frame 4 4"], gravity_known: bool, options: VoteOptions) -> Agreement | None:

@@ -17,7 +17,7 @@ from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip
 from pipeline.models import localizer as model
 from stages.train_localizer import pictures, training
-from stages.train_localizer.training import Options
+from stages.train_localizer.training import AgentOptions, Options
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,10 @@ class Config:
     """What is localised against: the room or the animal."""
     kind: Literal["bank"] = "bank"
     """bank: nearest neighbours among patches of rendered views."""
-    options: Options = field(default_factory=Options)
-    """Size of the bank, scale of the pictures, and how queries are answered."""
+    scene: Options = field(default_factory=Options)
+    """The scene's localizer: size of the bank, scale of the pictures, how queries are answered."""
+    agent: AgentOptions = field(default_factory=AgentOptions)
+    """The same for the agent's."""
     seed: int = 0
     """Seed of views, noise and RANSAC."""
 
@@ -42,10 +44,10 @@ def run(task: cli.Task) -> None:
         clip = Clip.open(next(iter(task.per_video("frames", roles=("walkthrough",)).values())))
         walk = arrays.load(template / "cameras.npz", ("world_from_camera",))["world_from_camera"]
         floor_m = json.loads((template / "world.json").read_text())["floor"]
-        found, held = training.train_scene(meshes.read_ply(template / "mesh.ply"), walk, floor_m, clip, task.config.options, rng)
+        found, held = training.train_scene(meshes.read_ply(template / "mesh.ply"), walk, floor_m, clip, task.config.scene, rng)
     else:
         mesh = meshes.read_ply(task.input("agent_template") / "agent.ply")
-        found, held = training.train_agent(mesh, task.config.options, rng)
+        found, held = training.train_agent(mesh, task.config.agent, rng)
     with task.create() as folder:
         model.save(folder, found, pictures.report(held, task.config.target))
         qa.write(

@@ -65,17 +65,3 @@ def hold_out(localizer: model.Localizer, draw: Callable[[], Photograph], count: 
             ratio[index] = answers[0].inlier_ratio
     limits = GOOD[localizer.sight.target]
     return HeldOut(rotation, translation, ratio, (rotation <= limits[0]) & (translation <= limits[1]), views)
-
-
-def calibrate(inlier_ratio: Float[np.ndarray, "view"], good: Bool[np.ndarray, "view"], ridge: float = 0.5) -> model.Calibration:
-    """Fit a logistic curve by Newton steps; one pseudo-observation at each end and a ridge keep separable data finite."""
-    x = np.concatenate([inlier_ratio, [0.0, 1.0]])
-    y = np.concatenate([good.astype(float), [0.0, 1.0]])
-    design = np.stack([np.ones_like(x), x], axis=1)
-    weights = np.zeros(2)
-    penalty = np.diag([1e-3, ridge * 1e-2])
-    for _ in range(50):
-        p = 1 / (1 + np.exp(-np.clip(design @ weights, -30, 30)))
-        curvature = design.T @ (design * (p * (1 - p))[:, None]) + penalty
-        weights = weights + np.linalg.solve(curvature, design.T @ (y - p) - penalty @ weights)
-    return model.Calibration(float(weights[0]), float(weights[1]))

@@ -48,6 +48,26 @@ class Options:
     """Where cameras stand and how pictures are disturbed."""
 
 
+@dataclass(frozen=True)
+class AgentOptions(Options):
+    """The same for the agent, which is small, near and seen from all around."""
+
+    views: int = 250
+    """Rendered views in the bank."""
+    held_out: int = 60
+    """Further views that measure the error and calibrate the uncertainty."""
+    focal_px: float = 110.0
+    """Pixels a metre of the crops."""
+    stride_px: int = 4
+    """Distance between patches, pixels of the crop."""
+    radii_px: tuple[int, ...] = (6, 14)
+    """Radii of the concatenated DAISY descriptors, pixels of the crop."""
+    threshold_m: float = 0.04
+    """RANSAC: matches within this agree, metres."""
+    spread_m: float = 0.06
+    """RANSAC: least side of a triplet, metres."""
+
+
 def train_scene(mesh: Mesh, walk: Float[np.ndarray, "frame 4 4"], floor_m: float, clip: Clip, options: Options, rng: np.random.Generator) -> tuple[model.Localizer, bank.HeldOut]:
     """Train on random views of the scene and on frames of the walk-through with their template cameras."""
     caster = RayCaster(mesh)
@@ -96,7 +116,7 @@ def _finish(pictures, draw_query, options, target, rng):
         sight, made, model.Calibration(0.0, 0.0), options.threshold_m, options.spread_m, options.iterations, options.sectors
     )
     held = bank.hold_out(unsure, draw_query, options.held_out)
-    return replace(unsure, calibration=bank.calibrate(held.inlier_ratio, held.good)), held
+    return replace(unsure, calibration=model.calibrate(held.inlier_ratio, held.good)), held
 
 
 def _frame(clip, frame, world_from_camera, intrinsics, size):

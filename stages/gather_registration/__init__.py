@@ -1,0 +1,1 @@
+"""Gather the registrations of all sessions into one artifact with a summary."""

@@ -1,0 +1,113 @@
+"""What the quality page of a registered recording shows, its checks, and its status file."""
+
+import cv2
+import numpy as np
+
+from pipeline.files.clips import Clip
+from pipeline.qa import Check, Picture
+from pipeline.space import overview, rigid
+from pipeline.space.meshes import RayCaster, render_view
+from pipeline.space.surface import Surface
+from stages.register_videos.registration import Maps, Refused, Registered
+
+EDGE, PHONE, ANIMAL, HEAD = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
+
+
+def status(found: Registered | Refused) -> dict:
+    """Describe the outcome for ``status.json``."""
+    votes = found.votes
+    figures = {"frames_localized": votes.asked, "votes": len(votes.frame)}
+    nearest = None if votes.nearest is None else {"inlier_ratio": votes.nearest.inlier_ratio, "world_from_camera": votes.nearest.map_from_camera.round(6).tolist()}
+    if isinstance(found, Refused):
+        return {"registered": False, "reason": found.reason, "nearest_view": nearest, "figures": figures}
+    figures |= {
+        "votes_agreeing": int(found.supports.sum()),
+        "depth_gap_m": float(np.nanmedian(found.aligned.gap_m)),
+        "depth_fit": float(np.median(found.aligned.fit)),
+        "confidence": float(found.confidence.mean()),
+        "agent_frames": int(found.roots.visible.sum()),
+        "agent_confidence": float(found.agent_confidence[found.roots.visible].mean()) if found.roots.visible.any() else 0.0,
+    }
+    return {"registered": True, "reason": None, "nearest_view": nearest, "figures": figures}
+
+
+def checks(found: Registered | Refused) -> list[Check]:
+    """Judge the outcome."""
+    if isinstance(found, Refused):
+        return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
+    return [
+        Check("registered", 1.0, "", 0.5, 0.5, "higher"),
+        Check("frame votes that agree", float(found.supports.mean()), "share", 0.5, 0.25, "higher"),
+        Check("depth against the template", float(np.nanmedian(found.aligned.gap_m) * 100), "cm, median", 2.5, 6.0),
+        Check("static depth within 5 cm", float(np.median(found.aligned.fit)), "share", 0.6, 0.35, "higher"),
+        Check("camera confidence", float(found.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
+        Check("animal placed", float(found.roots.visible.mean()), "share of frames", 0.4, None, "higher"),
+    ]
+
+
+def pictures(found: Registered | Refused, clip: Clip, maps: Maps) -> list[Picture]:
+    """Draw the outcome for people."""
+    if isinstance(found, Refused):
+        return _refused(found, clip, maps)
+    scene, agent = RayCaster(maps.scene), RayCaster(maps.agent)
+    chosen = np.linspace(0, len(clip) - 1, 9).astype(int)[1:-1]
+    return [
+        Picture("edges", overview.tile([outlined(found, clip, scene, agent, int(frame)) for frame in chosen], len(chosen)), "Template edges (magenta) and the placed animal (orange) over frames."),
+        Picture("bird", paths(found, maps), "From above: the phone's path (blue), the animal's (orange, yellow towards its head)."),
+        Picture("depth", depth_on_map(found, maps), "Static depth on the map from above: green within 5 cm of the surface, red further away."),
+    ]
+
+
+def outlined(found: Registered, clip: Clip, scene: RayCaster, agent: RayCaster, frame: int) -> np.ndarray:
+    """Draw the depth edges of the rendered template and the animal's outline over one frame."""
+    height, width = clip.color_size
+    camera = found.aligned.world_from_camera[frame]
+    picture = clip.color(frame).copy()
+    depth, _ = render_view(scene, camera, clip.intrinsics[frame], height, width)
+    picture[_edges(depth, 0.08)] = EDGE
+    root = found.roots.world_from_agent[frame]
+    if np.isfinite(root).all():
+        body, _ = render_view(agent, rigid.inverse(root) @ camera, clip.intrinsics[frame], height, width)
+        picture[_edges((body > 0).astype(np.float32) * 9, 1.0)] = ANIMAL
+    return picture
+
+
+def _edges(depth, jump_m):
+    window = np.ones((3, 3), np.uint8)
+    return cv2.dilate(depth, window) - cv2.erode(depth, window) > jump_m * (1 + depth / 3)
+
+
+def paths(found: Registered, maps: Maps) -> np.ndarray:
+    """Draw both paths over the room."""
+    picture = overview.bird_view(maps.scene, floor_m=_floor(maps))
+    root = found.roots.world_from_agent
+    picture.draw(found.aligned.world_from_camera[:, :3, 3], PHONE)
+    picture.draw(root[:, :3, 3], ANIMAL)
+    for frame in np.flatnonzero(found.roots.visible)[::10]:
+        picture.draw(np.stack([root[frame, :3, 3], root[frame, :3, 3] + 0.2 * root[frame, :3, 2]]), HEAD)
+    return picture.image
+
+
+def depth_on_map(found: Registered, maps: Maps) -> np.ndarray:
+    """Draw the static depth of some frames over the room, coloured by its distance from the surface."""
+    picture = overview.bird_view(maps.scene, floor_m=_floor(maps))
+    place = Surface(maps.scene)
+    for frame in range(0, len(found.aligned.scans), 10):
+        points = rigid.apply(found.aligned.world_from_camera[frame], found.aligned.scans[frame].points_camera[::3])
+        distance = np.abs(place.distance(points))
+        for pixel, far in zip(np.round(picture.pixel(points)).astype(int), distance, strict=True):
+            cv2.circle(picture.image, tuple(int(value) for value in pixel), 1, (210, 50, 40) if far > 0.05 else (50, 170, 80), -1)
+    return picture.image
+
+
+def _floor(maps):
+    return float(np.quantile(maps.scene.vertices[:, 1], 0.02))
+
+
+def _refused(found, clip, maps):
+    middle = clip.color(len(clip) // 2)
+    if found.votes.nearest is None:
+        return [Picture("frame", middle, "A frame of the recording; no view of the template is like it.")]
+    frame = len(clip) // 2
+    near = overview.view(RayCaster(maps.scene), found.votes.nearest.map_from_camera, clip.intrinsics[frame], *clip.color_size)
+    return [Picture("nearest", overview.tile([middle, near], 2), "A frame of the recording, and the nearest view of the template.")]

@@ -1,0 +1,110 @@
+"""Register one recording: votes, agreement, alignment, confidence, agent roots, or the reason why it does not fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.files.clips import Clip, Masks
+from pipeline.models.localizer import Localizer, calibrate
+from pipeline.progress import log
+from pipeline.space import rigid, surface
+from pipeline.space.meshes import Mesh
+from stages.register_videos import alignment, votes as voting
+from stages.register_videos.agent_roots import RootOptions, Roots, find_roots
+from stages.register_videos.alignment import Aligned, AlignOptions
+from stages.register_videos.votes import VoteOptions, Votes
+
+
+@dataclass(frozen=True)
+class GateOptions:
+    """When an aligned recording is believed, and how confidence is calibrated."""
+
+    least_fit: float = 0.35
+    """Median share of a frame's static depth that must lie within 5 cm of the template."""
+    probes: int = 240
+    """Disturbed poses that calibrate the confidence."""
+    bridge_s: float = 0.25
+    """Time constant with which confidence is averaged over neighbouring frames, seconds."""
+
+
+@dataclass(frozen=True)
+class Maps:
+    """What a recording is registered to."""
+
+    scene: Mesh
+    agent: Mesh
+    scene_localizer: Localizer
+    agent_localizer: Localizer
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A recording in the world."""
+
+    aligned: Aligned
+    confidence: Float[np.ndarray, "frame"]
+    """P(camera within 2 deg and 5 cm)"""
+    roots: Roots
+    agent_confidence: Float[np.ndarray, "frame"]
+    votes: Votes
+    supports: Bool[np.ndarray, "vote"]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A recording that does not fit, and why."""
+
+    reason: str
+    votes: Votes
+
+
+def register(
+    clip: Clip, masks: Masks, maps: Maps, *, vote: VoteOptions, align: AlignOptions, gate: GateOptions, root: RootOptions, rng: np.random.Generator
+) -> Registered | Refused:
+    """Register one recording, or refuse it with a reason."""
+    votes = voting.collect(clip, masks, maps.scene_localizer, vote)
+    if clip.odometry_from_camera is None:
+        start, supports = voting.without_odometry(votes, clip.timestamp_s, vote)
+    else:
+        agreement = voting.agree(votes, clip.odometry_from_camera, clip.gravity_known, vote)
+        supports = agreement.supports if agreement else None
+        start = agreement.world_from_odometry @ clip.odometry_from_camera if agreement else None
+    reason = voting.refusal(votes, supports, vote)
+    if reason is not None:
+        return Refused(reason, votes)
+    log(f"{int(supports.sum())} of {votes.asked} localised frames agree")
+    aligned = alignment.align(clip, masks, maps.scene, start, votes, supports, align)
+    fit = float(np.median(aligned.fit))
+    log(f"static depth: {np.nanmedian(aligned.gap_m) * 100:.1f} cm from the template, {fit:.0%} within 5 cm")
+    if fit < gate.least_fit:
+        return Refused(f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken", votes)
+    confidence = camera_confidence(clip.timestamp_s, surface.Surface(maps.scene), aligned, gate, rng)
+    roots = find_roots(clip, masks, maps.agent, maps.agent_localizer, aligned.world_from_camera, root, rng)
+    log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
+    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, supports)
+
+
+def camera_confidence(
+    timestamp_s: Float[np.ndarray, "frame"], place: surface.Surface, aligned: Aligned, gate: GateOptions, rng: np.random.Generator
+) -> Float[np.ndarray, "frame"]:
+    """Calibrate P(within 2 deg and 5 cm) on how much worse depth fits when poses are disturbed on purpose, then average in time."""
+    frames = rng.integers(0, len(aligned.scans), gate.probes)
+    size = np.exp(rng.uniform(np.log(0.1), np.log(8.0), gate.probes))[:, None]
+    direction = rng.normal(size=(gate.probes, 6)) / np.sqrt(3)
+    twist = direction * size * np.array([np.deg2rad(2.0)] * 3 + [0.05] * 3)
+    disturbed = aligned.world_from_camera[frames] @ rigid.exp(twist)
+    good = (np.linalg.norm(twist[:, :3], axis=1) < np.deg2rad(2.0)) & (np.linalg.norm(twist[:, 3:], axis=1) < 0.05)
+    _, fit = alignment.measure_fit(place, [aligned.scans[frame] for frame in frames], disturbed)
+    raw = calibrate(fit, good).probability(aligned.fit)
+    near = np.exp(-0.5 * ((timestamp_s[:, None] - timestamp_s[None]) / gate.bridge_s) ** 2)
+    return (near @ raw) / near.sum(1)
+
+
+def agent_confidence(roots: Roots, scale_m: float = 0.012, enough: float = 0.15) -> Float[np.ndarray, "frame"]:
+    """Score each root 0..1: full for the video's usual fit in good view, less where it fits worse or little is seen; 0 unseen."""
+    if not roots.visible.any():
+        return np.zeros(len(roots.visible))
+    usual = np.nanquantile(roots.cost_m, 0.3)
+    worse = np.maximum(np.nan_to_num(roots.cost_m, nan=1.0) - usual, 0) / scale_m
+    return np.where(roots.visible, np.exp(-0.5 * worse**2) * np.minimum(roots.share / enough, 1.0), 0.0)
