@@ -96,28 +96,34 @@ def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality
     """Yield the plan's frames in order, upright. Raises InputError for pictures that cannot be decoded."""
     for number in recording.index[plan.chosen]:
         jpeg = recording.read_color(int(number))
-        color = images.decode_color(jpeg, f"{recording.where}, frame {number}")
-        if color.shape[:2] != recording.color_size:
-            have, want = color.shape, recording.color_size
-            what = f"the picture is {have[1]} x {have[0]}, the metadata say {want[1]} x {want[0]}"
-            raise InputError(
-                "CAP-004", what=what, where=f"{recording.where}, frame {number}", remedy="export the recording again"
-            )
+        color = _decoded(jpeg, recording.color_size, f"{recording.where}, frame {number}")
         depth = known_depth(recording.read_depth(int(number)), max_depth_m)
-        confidence = (
-            np.where(depth > 0, 2, 0).astype(np.uint8)
-            if recording.read_confidence is None
-            else np.minimum(recording.read_confidence(int(number)), 2)
-        )
+        confidence = _confidence(recording, int(number), depth)
         if color.shape[:2] != plan.stored_size:
             color = cv2.resize(color, plan.stored_size[::-1], interpolation=cv2.INTER_AREA)
         if plan.quarter_turns:
             color, depth, confidence = (
                 cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence)
             )
+        if plan.quarter_turns or plan.stored_size != recording.color_size:
             jpeg = images.encode_jpeg(color, jpeg_quality)
         sharpness, brightness = picture_statistics(color)
         yield Frame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
+
+
+def _decoded(jpeg: bytes, size: tuple[int, int], where: str) -> UInt8[np.ndarray, "height width 3"]:
+    color = images.decode_color(jpeg, where)
+    if color.shape[:2] != size:
+        what = f"the picture is {color.shape[1]} x {color.shape[0]}, the metadata say {size[1]} x {size[0]}"
+        raise InputError("CAP-004", what=what, where=where, remedy="export the recording again")
+    return color
+
+
+def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[np.ndarray, "height width"]:
+    """Return the phone's confidence; an export without it trusts all depth that there is."""
+    if recording.read_confidence is None:
+        return np.where(depth > 0, 2, 0).astype(np.uint8)
+    return np.minimum(recording.read_confidence(number), 2)
 
 
 def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
