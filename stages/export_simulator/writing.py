@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.files import glb
-from pipeline.qa import Check
-from stages.export_simulator import page
+from pipeline.qa import Check, Picture
+from stages.export_simulator import page, pictures
 from stages.export_simulator.contract import contract
 from stages.export_simulator.export import Made
 from stages.export_simulator.reading import Minds
@@ -55,5 +55,12 @@ def quality(made: Made, size_mb: float, warn_page_mb: float) -> dict[str, Any]:
             Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
             Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),
             Check("sessions to replay", len(made.motions), "", warn=1, better="higher"),
+        ],
+        "pictures": [
+            Picture(
+                "visits",
+                pictures.visits(made.scene, made.setting, made.motions),
+                "the room from above: where the animal (amber) and the person (blue) have been",
+            )
         ],
     }

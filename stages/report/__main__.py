@@ -45,7 +45,7 @@ def told(task: Task, chapter: Chapter, roles: dict[str, str]) -> collect.Told:
     folders: dict[str | None, Path] = (
         {**task.per_video(chapter.artifact)} if chapter.per_video else {None: task.input(chapter.artifact)}
     )
-    manifest = artifact.read_manifest(next(iter(folders.values())))
+    manifest = artifact.read_manifest(next(iter(folders.values()), task.out))
     return collect.told(chapter, folders, roles, manifest.config if manifest else {})
 
 
