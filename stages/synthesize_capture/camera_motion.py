@@ -95,9 +95,9 @@ def bystanding(session: SessionTrajectories, room: Room, rng: np.random.Generato
         [np.interp(np.arange(count), np.arange(len(slow)) * every, slow[:, axis]) for axis in range(2)], axis=-1
     )
     eye = np.stack([ground[:, 0], 1.36 + 0.06 * _wander(rng, count, 2.0)[:, 0], ground[:, 1]], axis=-1)
-    target = gaussian_filter1d([*session.animal.position, 0, 0.25, 0], 0.35 / STEP_S, axis=0) + 0.08 * _wander(
-        rng, count, 0.9
-    )
+    target = gaussian_filter1d(
+        session.animal.position + np.array([0, 0.25, 0]), 0.35 / STEP_S, axis=0
+    ) + 0.08 * _wander(rng, count, 0.9)
     return _handheld(_inside(eye), target, rng, calm=0.7)
 
 

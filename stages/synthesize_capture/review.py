@@ -137,7 +137,7 @@ def _from_above(script: Script) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def _pixels(ground: np.ndarray) -> np.ndarray:
-    return np.round(([*ground, WIDTH_M / 2, DEPTH_M / 2]) * PIXELS_PER_M).astype(np.int32)
+    return np.round((ground + np.array([WIDTH_M, DEPTH_M]) / 2) * PIXELS_PER_M).astype(np.int32)
 
 
 def _distance(lived: SessionTrajectories) -> np.ndarray:

@@ -100,7 +100,8 @@ def cylinder(
     """Make a standing cylinder whose top radius is ``flare`` times the bottom one, with a lid."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
-    low, high = np.asarray(center, float) - [0, height / 2, 0], [*np.asarray(center, float), 0, height / 2, 0]
+    half = np.array([0, height / 2, 0])
+    low, high = np.asarray(center, float) - half, np.asarray(center, float) + half
     wall = Sheet(
         np.stack([high + ring * radius * flare, low + ring * radius]).astype(np.float32),
         side(2 * np.pi * radius, height),

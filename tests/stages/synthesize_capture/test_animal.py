@@ -72,7 +72,7 @@ def _straight(speed: float, posture: tuple[float, float, float] = (0.0, 0.0, 0.0
     position = np.stack([0 * times, 0 * times, speed * times], axis=-1)
     still = np.zeros(len(times))
     return AnimalCourse(
-        times, position, still, np.tile(posture, (len(times), 1)), still, [*position, 0, 0.3, 2.0], still
+        times, position, still, np.tile(posture, (len(times), 1)), still, position + np.array([0, 0.3, 2.0]), still
     )
 
 

@@ -11,7 +11,7 @@ INTRINSICS = np.array([[90.0, 0, 40.3], [0, 88.0, 31.1], [0, 0, 1]])
 
 def test_depth_agrees_with_embree():
     rng = np.random.default_rng(3)
-    center = [*rng.uniform(-1.5, 1.5, (80, 1, 3)), 0, 0, 2.0]
+    center = rng.uniform(-1.5, 1.5, (80, 1, 3)) + np.array([0, 0, 2.0])
     vertices = (center + rng.normal(0, 0.6, (80, 3, 3))).reshape(-1, 3).astype(np.float32)
     faces = np.arange(240).reshape(-1, 3).astype(np.int32)
     world_from_camera = rigid.exp(np.array([0.1, -0.2, 0.05, 0.1, 0.0, 0.3]))
