@@ -12,51 +12,72 @@ from stages.evaluate.figures import Figures
 TOLERANCE_M = 0.1
 RANGE_M = 5.0
 PARTS = ("all", "agent", "scene")
-NAMES = tuple(f"reconstruction/{kind}_{part}" for kind in ("depth_acc", "psnr", "ssim", "lpips") for part in PARTS)
+NAMES = (
+    *(f"reconstruction/{kind}_{part}" for kind in ("depth_acc", "psnr", "ssim", "lpips") for part in PARTS),
+    *(f"splats/{kind}_{part}" for kind in ("psnr", "ssim") for part in PARTS),
+)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What the held-out phone truly saw at one time."""
+
+    world_from_camera: Float[np.ndarray, "4 4"]
+    """in our world"""
+    intrinsics: Float[np.ndarray, "3 3"]
+    time_s: float
+    """on the clock of the session that it is synchronized with"""
+    color: UInt8[np.ndarray, "height width 3"]
+    depth: Float[np.ndarray, "height width"]
+    agent: Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
 class View:
-    """One true picture and ours of the same camera and time, at one size."""
+    """A true picture and ours of the same camera and time."""
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
     """metres, 0 = nothing"""
-    true_color: UInt8[np.ndarray, "height width 3"]
-    true_depth: Float[np.ndarray, "height width"]
-    true_agent: Bool[np.ndarray, "height width"]
+    true: Shot
 
 
 def view_figures(views: Sequence[View]) -> Figures:
     """Average over all pixels (depth) and over pictures (PSNR, SSIM)."""
     figures = Figures()
-    known = np.stack([(view.true_depth > 0) & (view.true_depth <= RANGE_M) for view in views])
+    known = np.stack([(view.true.depth > 0) & (view.true.depth <= RANGE_M) for view in views])
     right = np.stack([depth_is_right(view) for view in views])
-    agent = np.stack([view.true_agent for view in views])
+    agent = np.stack([view.true.agent for view in views])
     for part, chosen in (("all", known), ("agent", known & agent), ("scene", known & ~agent)):
         value = float(right[chosen].mean()) if chosen.any() else np.nan
         figures.put(f"reconstruction/depth_acc_{part}", value, "not in view of the held-out phone")
-    rows = np.array([picture_quality(view) for view in views])
+    figures.add(picture_figures("reconstruction", views))
+    figures.skip((f"reconstruction/lpips_{part}" for part in PARTS), "LPIPS needs learned weights, none are shipped")
+    return figures
+
+
+def picture_figures(name: str, views: Sequence[View]) -> Figures:
+    """Average PSNR and SSIM over pictures."""
+    figures, rows = Figures(), np.array([picture_quality(view) for view in views])
     for column, (kind, part) in enumerate((kind, part) for kind in ("psnr", "ssim") for part in PARTS):
         values = rows[:, column][np.isfinite(rows[:, column])]
         value = float(values.mean()) if len(values) else np.nan
-        figures.put(f"reconstruction/{kind}_{part}", value, "not in view of the held-out phone")
-    figures.skip((f"reconstruction/lpips_{part}" for part in PARTS), "LPIPS needs learned weights, none are shipped")
+        figures.put(f"{name}/{kind}_{part}", value, "not in view of the held-out phone")
     return figures
 
 
 def depth_is_right(view: View) -> Bool[np.ndarray, "height width"]:
     """Tell which pixels are within 0.1 m of truth; holes are wrong."""
-    return (view.depth > 0) & (np.abs(view.depth - view.true_depth) <= TOLERANCE_M)
+    return (view.depth > 0) & (np.abs(view.depth - view.true.depth) <= TOLERANCE_M)
 
 
 def picture_quality(view: View) -> list[float]:
     """Return PSNR (all, agent, scene) in dB, then SSIM; NaN for a part that is not in the picture."""
-    true = view.true_color.astype(np.float64) / 255
+    true = view.true.color.astype(np.float64) / 255
     ours = exposed(view.color.astype(np.float64) / 255, true, view.depth > 0)
     squared = ((ours - true) ** 2).mean(-1)
     similar = structural_similarity(true, ours, channel_axis=-1, data_range=1.0, full=True)[1].mean(-1)
-    parts = (np.ones_like(view.true_agent), view.true_agent, ~view.true_agent)
+    parts = (np.ones_like(view.true.agent), view.true.agent, ~view.true.agent)
     psnr = [-10 * np.log10(max(float(squared[part].mean()), 1e-10)) if part.any() else np.nan for part in parts]
     return psnr + [float(similar[part].mean()) if part.any() else np.nan for part in parts]
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 
 from pipeline.files import arrays, meshes
-from pipeline.models import fields
+from pipeline.models import fields, gaussians
 from pipeline.models.motion import Motion
 from pipeline.models.render import Renderer
 from pipeline.space import rigid
@@ -15,7 +16,7 @@ from pipeline.space.meshes import Mesh, RayCaster
 from stages.evaluate import heldout, reading, surfaces
 from stages.evaluate.alignment import PoseErrors, pose_errors
 from stages.evaluate.figures import Figures
-from stages.evaluate.heldout import View
+from stages.evaluate.heldout import Shot, View
 from stages.evaluate.reading import Folders, Frames, Recorded
 from stages.evaluate.registration import root_figures
 from stages.evaluate.surfaces import Skin
@@ -52,12 +53,27 @@ def reconstruction_figures(
     figures.add(_agent_chamfer(folders, sessions, motions, frames, effort))
     walkthrough = next(each for each in known if each.video.role == "walkthrough")
     figures.add(_scene_chamfer(folders, walkthrough, frames, rng))
-    phones = [each for each in known if each.video.role == "heldout" and motions.get(each.video.synchronized_with)]
-    if phones:
-        views = [view for each in phones for view in _views(folders, each, motions, frames, effort, device)]
-        figures.add(heldout.view_figures(views))
+    figures.add(_held_out(folders, [each for each in known if each.video.role == "heldout"], frames, effort, device))
+    return figures
+
+
+def _held_out(folders: Folders, phones: Sequence[Recorded], frames: Frames, effort: Effort, device: str) -> Figures:
+    """Compare with what the held-out phones saw, drawn by the fields and by the 3D Gaussians."""
+    figures, by_fields, by_splats = Figures(), [], []
+    for phone in phones:
+        session = phone.video.synchronized_with
+        motion = reading.read_motion(folders.reconstruction, session)
+        if motion is None:
+            continue
+        shots = _shots(folders, phone, frames, effort.heldout_frames)
+        by_fields += _drawn_by_fields(folders, session, motion, shots, device)
+        by_splats += _drawn_by_splats(folders, reading.read_motion(folders.splats, session) or motion, shots)
+    if by_fields:
+        figures.add(heldout.view_figures(by_fields))
+        figures.add(heldout.picture_figures("splats", by_splats))
     else:
-        figures.skip(heldout.NAMES, "no held-out phone, or the session that it is synchronized with was not registered")
+        reason = "no held-out phone, or the session that it is synchronized with was not registered"
+        figures.skip(heldout.NAMES, reason)
     return figures
 
 
@@ -66,21 +82,45 @@ def _root_errors(motion: Motion | None, each: Recorded, frames: Frames) -> PoseE
     return pose_errors(ours, frames.roots(each.truth))[each.truth.agent_visible]
 
 
-def _views(
-    folders: Folders, phone: Recorded, motions: dict[str, Motion | None], frames: Frames, effort: Effort, device: str
-) -> list[View]:
-    """Draw the reconstruction from the held-out phone's true cameras, at its depth's resolution."""
-    session = phone.video.synchronized_with
-    renderer = Renderer(fields.load(folders.reconstruction, device), session)
-    true, cameras = read_depth(folders.truth, phone.name, phone.source_index), frames.cameras(phone.truth)
-    views = []
-    for frame in np.unique(np.linspace(0, len(phone.clip) - 1, effort.heldout_frames).astype(int)).tolist():
-        height, width = true.depth[frame].shape
-        root, bones = motions[session].at(phone.clip.timestamp_s[frame] + phone.video.offset_s)
-        picture = renderer.draw(cameras[frame], true.intrinsics[frame], height, width, root, bones)
-        color = cv2.resize(phone.clip.color(frame), (width, height), interpolation=cv2.INTER_AREA)
-        agent = cv2.resize(phone.truth.masks[frame].astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        views.append(View(picture.color, picture.depth, color, true.depth[frame], agent > 0))
+def _shots(folders: Folders, phone: Recorded, frames: Frames, count: int) -> list[Shot]:
+    """Return what the held-out phone saw, at its depth's resolution."""
+    true, cameras, shots = read_depth(folders.truth, phone.name, phone.source_index), frames.cameras(phone.truth), []
+    for frame in np.unique(np.linspace(0, len(phone.clip) - 1, count).astype(int)).tolist():
+        size = true.depth[frame].shape[::-1]
+        color = cv2.resize(phone.clip.color(frame), size, interpolation=cv2.INTER_AREA)
+        agent = cv2.resize(phone.truth.masks[frame].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        time_s = float(phone.clip.timestamp_s[frame] + phone.video.offset_s)
+        shots.append(Shot(cameras[frame], true.intrinsics[frame], time_s, color, true.depth[frame], agent))
+    return shots
+
+
+def _drawn_by_fields(folders: Folders, session: str, motion: Motion, shots: Sequence[Shot], device: str) -> list[View]:
+    """Draw the reconstruction as the synchronized session saw it."""
+    renderer, views = Renderer(fields.load(folders.reconstruction, device), session), []
+    for shot in shots:
+        picture = renderer.draw(shot.world_from_camera, shot.intrinsics, *shot.depth.shape, *motion.at(shot.time_s))
+        views.append(View(picture.color, picture.depth, shot))
+    return views
+
+
+def _drawn_by_splats(folders: Folders, motion: Motion, shots: Sequence[Shot]) -> list[View]:
+    """Draw the 3D Gaussians; where the animal's pose is not known, the room alone."""
+    scene, agent = (gaussians.load_ply(folders.splats / f"{part}.ply") for part in ("scene", "agent"))
+    weights = torch.from_numpy(arrays.load(folders.splats / "splats.npz", ("agent_weights",))["agent_weights"])
+    rest = torch.from_numpy(arrays.load(folders.reconstruction / "skin.npz")["agent_from_bone_rest"])
+    splats, views = gaussians.Splats(scene, agent, weights, rest, videos=0), []
+    for shot in shots:
+        cloud, (root, bones) = splats.place_scene(None), motion.at(shot.time_s)
+        if root is not None:
+            posed = (torch.as_tensor(part, dtype=torch.float32) for part in (root, bones))
+            cloud = gaussians.together(cloud, splats.place_agent(*posed, None))
+        camera = (rigid.inverse(shot.world_from_camera), shot.intrinsics)
+        with torch.no_grad():
+            seen = gaussians.see(
+                cloud, *(torch.as_tensor(part, dtype=torch.float32) for part in camera), *shot.depth.shape
+            )
+        color = (seen.color.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+        views.append(View(color, seen.depth.numpy(), shot))
     return views
 
 

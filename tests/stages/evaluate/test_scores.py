@@ -10,7 +10,7 @@ from pipeline.space.meshes import Mesh, RayCaster
 from stages.evaluate import behavior, heldout, registration, surfaces
 from stages.evaluate.alignment import constant_between, pose_errors
 from stages.evaluate.figures import Figures, median, percentile
-from stages.evaluate.heldout import View
+from stages.evaluate.heldout import Shot, View
 from stages.evaluate.statistics import bootstrapped, episodes
 
 
@@ -71,7 +71,8 @@ def test_infinite_failures_stay_infinite_in_percentiles():
 
 
 def view(color, depth, true_color, true_depth, agent):
-    return View(color, depth.astype(np.float32), true_color, true_depth.astype(np.float32), agent)
+    true = Shot(np.eye(4), np.eye(3), 0.0, true_color, true_depth.astype(np.float32), agent)
+    return View(color, depth.astype(np.float32), true)
 
 
 def test_held_out_views_count_holes_as_wrong_and_forgive_exposure():
