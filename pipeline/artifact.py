@@ -63,9 +63,7 @@ def opened(folder: Path, name: str) -> Manifest:
 
 
 @contextlib.contextmanager
-def create(
-    out: Path, *, stage: str, config: Mapping[str, Any], inputs: Mapping[str, str], key: str | None = None
-) -> Iterator[Path]:
+def create(out: Path, *, stage: str, config: Mapping[str, Any], inputs: Mapping[str, str], key: str | None = None) -> Iterator[Path]:
     """Yield a folder to fill and publish it as `out` if, and only if, the block ends well.
 
     Whatever happens, an artifact that stood at `out` before stays until the new one is complete.

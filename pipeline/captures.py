@@ -60,9 +60,7 @@ def remarks(folder: Path, names: Sequence[str], overrides: Mapping[str, Any], wh
     return said
 
 
-def assign(
-    said: Mapping[str, Remarks], known_ids: Mapping[str, str], hashes: Mapping[str, str | None], where: str
-) -> tuple[Video, ...]:
+def assign(said: Mapping[str, Remarks], known_ids: Mapping[str, str], hashes: Mapping[str, str | None], where: str) -> tuple[Video, ...]:
     """Give every recording its id, role, split and clock.
 
     `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another file.

@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline import artifact, config as configuration, dag, videos
+from pipeline import artifact, dag, videos
+from pipeline import config as configuration
 from pipeline.errors import InputError
 from pipeline.videos import Role, Split, Video
 
@@ -64,9 +65,7 @@ class Task:
             raise InputError("ART-003", f"{name} does not exist", str(path), "give an existing path")
         return path
 
-    def per_video(
-        self, name: str, roles: tuple[Role, ...] | None = None, splits: tuple[Split, ...] | None = None
-    ) -> dict[str, Path]:
+    def per_video(self, name: str, roles: tuple[Role, ...] | None = None, splits: tuple[Split, ...] | None = None) -> dict[str, Path]:
         """Return the folder of `name` for every recording of `roles` and `splits`, by id, in id order.
 
         By default: every recording for which the flow makes this artifact.

@@ -65,7 +65,7 @@ def _checked(hint: Any, value: Any, where: str) -> Any:
     if origin is tuple and isinstance(value, (list, tuple)):
         each = [arguments[0]] * len(value) if arguments[1:] == (...,) else list(arguments)
         if len(each) == len(value):
-            return tuple(_checked(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(each, value)))
+            return tuple(_checked(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(each, value, strict=True)))
     if origin is dict and isinstance(value, Mapping):
         return {key: _checked(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
     if hint is float and isinstance(value, int) and not isinstance(value, bool):

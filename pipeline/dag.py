@@ -59,6 +59,7 @@ def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Nee
     return tuple(Need(artifact, roles) for artifact in artifacts)
 
 
+# fmt: off
 FLOW: tuple[Node, ...] = (
     Node("synthetic_capture", "synthesize_capture", threads=2),
     Node("frames", "extract_frames", (Need("synthetic_capture", part="recordings", option="recording"),),
@@ -96,6 +97,7 @@ FLOW: tuple[Node, ...] = (
           "scene_template", "agent_template", "scene_localizer", "agent_localizer", *merging("video_poses"),
           "registration", "reconstruction", "splats", "behavior_data", "behavior", "simulator", "evaluation")),
 )
+# fmt: on
 NODES = {node.artifact: node for node in FLOW}
 
 

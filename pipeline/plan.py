@@ -228,8 +228,7 @@ def _builtin_remarks(
     config.refuse_unknown(overrides, said, where=f"{where}: [videos]", kind="recording")
     given = {name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()}
     return {
-        name: config.from_table(captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]")
-        for name in said
+        name: config.from_table(captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]") for name in said
     }
 
 

@@ -51,9 +51,7 @@ class Picture:
     caption: str
 
 
-def write(
-    folder: Path, *, good: str, bad: str, checks: Sequence[Check] = (), pictures: Sequence[Picture] = ()
-) -> None:
+def write(folder: Path, *, good: str, bad: str, checks: Sequence[Check] = (), pictures: Sequence[Picture] = ()) -> None:
     """Write `qa.json` and its pictures into `folder`, an artifact in the making.
 
     `good` and `bad` each complete the sentence "good (bad) looks like ...".

@@ -236,7 +236,9 @@ def main(arguments: list[str]) -> int:
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        print(f"error: {InputError('SYS-001', 'the disk is full', arguments[1], 'free some space and run the same again')}", file=sys.stderr)
+        print(
+            f"error: {InputError('SYS-001', 'the disk is full', arguments[1], 'free some space and run the same again')}", file=sys.stderr
+        )
         return 2
 
 

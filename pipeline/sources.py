@@ -5,7 +5,6 @@ comments, docstrings or layout; `settings` are the fields of its `Config`. Stand
 """
 
 import ast
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -128,4 +127,3 @@ def _literal(value: ast.expr | None) -> Any:
         return None if value is None else ast.literal_eval(value)
     except ValueError:
         return None
-

@@ -67,9 +67,7 @@ def no_recording(good: Path, bad: Path) -> None:
     bad.write_bytes(zlib.compress(good.read_bytes()))
 
 
-@pytest.mark.parametrize(
-    ("spoil", "code"), [(truncated, "CAP-001"), (no_recording, "CAP-001"), (bomb, "CAP-002"), (face_id, "CAP-005")]
-)
+@pytest.mark.parametrize(("spoil", "code"), [(truncated, "CAP-001"), (no_recording, "CAP-001"), (bomb, "CAP-002"), (face_id, "CAP-005")])
 def test_a_bad_recording(house, spoil, code):
     captures = house / "captures" / "luna"
     spoil(captures / "walkthrough.r3d", captures / "session.r3d")

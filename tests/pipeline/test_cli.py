@@ -45,7 +45,7 @@ if __name__ == "__main__":
 '''
 
 
-@pytest.fixture()
+@pytest.fixture
 def stage(tmp_path):
     (tmp_path / "pipeline").symlink_to(ROOT / "pipeline")
     front = tmp_path / "stages" / "example" / "__main__.py"
@@ -87,7 +87,10 @@ def test_help_is_the_docstring(stage):
 
 
 def test_an_input_must_be_finished(stage, tmp_path):
-    videos = [dict(id="v002", file="x", role="session", split="train", sha256=None), dict(id="v003", file="y", role="session", split="test", sha256=None)]
+    videos = [
+        dict(id="v002", file="x", role="session", split="train", sha256=None),
+        dict(id="v003", file="y", role="session", split="test", sha256=None),
+    ]
     (tmp_path / "videos.json").write_text(json.dumps(videos))
     (tmp_path / "frames" / "v002").mkdir(parents=True)
     call = ("--out", "out", "--frames", "frames", "--videos", "videos.json")

@@ -9,7 +9,7 @@ from pipeline.errors import InputError
 from tests.pipeline import checkout
 
 
-@pytest.fixture()
+@pytest.fixture
 def house(tmp_path):
     return checkout.create(tmp_path)
 

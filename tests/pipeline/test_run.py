@@ -22,7 +22,7 @@ def built(tmp_path_factory):
     return house
 
 
-@pytest.fixture()
+@pytest.fixture
 def house(built, tmp_path):
     """A copy of the built house, ages and all."""
     shutil.copytree(built.folder, tmp_path / "house", symlinks=True)
@@ -144,9 +144,7 @@ def test_kills_leave_nothing_wrong(house, victim):
     shutil.rmtree(house.folder / "build")
     for _ in range(2):
         command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
-        build = subprocess.Popen(
-            command, cwd=house.folder, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        build = subprocess.Popen(command, cwd=house.folder, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(choice.uniform(0.3, 1.5))
         match victim:
             case "group":

@@ -1,0 +1,109 @@
+"""`data_layout.md` promises what the stages write: every artifact, every file, every array's key, axes and dtype."""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import dag
+
+ROOT = Path(__file__).parent.parent
+OF_EVERY_ARTIFACT = re.compile(r"manifest\.json|\.ok|qa\.json|qa/.*")
+KEY = re.compile(r"`(\w+) \[([^\]]*)\] (f2|f4|f8|u1|u2|i4|i8|bool|U)`( \(absent)?")
+OPTIONAL = ("absent when", "only where", "held-out phone only", "sessions:")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of an artifact's table."""
+
+    patterns: tuple[re.Pattern[str], ...]
+    """Paths inside the artifact."""
+    text: str
+    """What the row says of them."""
+
+    @property
+    def arrays(self) -> list[tuple[str, int, str, bool]]:
+        """Name, number of axes, dtype and whether it may be absent, of every array told."""
+        if "packed" in self.text:
+            return []
+        return [(name, len(axes.split()), dtype, bool(absent)) for name, axes, dtype, absent in KEY.findall(self.text)]
+
+
+def pattern_of(text: str) -> re.Pattern[str]:
+    text = re.escape(text).replace(r"%06d", r"\d{6}").replace("%06d", r"\d{6}")
+    text = re.sub(r"<\w+>", "[^/]+", text.replace(r"\<", "<").replace(r"\>", ">"))
+    text = re.sub(r"\\\{(\w+),(\w+)\\\}", r"(\1|\2)", text).replace(r"\*", "[^/]*")
+    return re.compile(text + ".*" if text.endswith("/") else text)
+
+
+@cache
+def promised() -> dict[str, list[Row]]:
+    """Return the rows per artifact, in the page's order."""
+    found: dict[str, list[Row]] = {}
+    for section in (ROOT / "data_layout.md").read_text().split("\n### ")[1:]:
+        heading, *lines = section.splitlines()
+        names = re.findall(r"`(\w+)/(?:<id>/)?`", heading)
+        found |= {name: [] for name in names}
+        cells = [line.strip("|").split(" | ", 1) for line in lines if line.startswith("| `")]
+        if not cells:  # the heading says it all
+            cells = [[heading.split(" — ", 1)[1].split(":", 1)[1], heading]]
+        for files, text in cells:
+            for name in names:
+                told = [t for t in re.findall(r"`([^`]+)`", files) if "." in t or t.endswith("/")]
+                mine = [t.removeprefix(f"{name}/").removeprefix("<id>/" if dag.NODES[name].roles else "") for t in told
+                        if not (t.split("/")[0] in names and t.split("/")[0] != name)]  # fmt: skip
+                if mine:
+                    found[name].append(Row(tuple(map(pattern_of, mine)), text))
+    return found
+
+
+def test_every_artifact_is_told():
+    assert list(promised()) == sorted(dag.NODES, key=list(promised()).index)
+    text = (ROOT / "data_layout.md").read_text()
+    assert [node.stage for node in dag.FLOW if f"`{node.stage}`" not in text] == []
+
+
+def folders(build: Path, name: str) -> list[Path]:
+    folder = build / name
+    return sorted(folder.iterdir()) if dag.NODES[name].roles else [folder]
+
+
+def files(folder: Path) -> list[str]:
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return [name for name in names if not OF_EVERY_ARTIFACT.fullmatch(name)]
+
+
+@pytest.mark.toy
+@pytest.mark.parametrize("name", dag.NODES)
+def test_files_are_as_promised(toy, name):
+    written = {file for folder in folders(toy, name) for file in files(folder)}
+    patterns = [pattern for row in promised()[name] for pattern in row.patterns]
+    assert [file for file in sorted(written) if not any(p.fullmatch(file) for p in patterns)] == [], "written, not promised"
+    needed = [p for row in promised()[name] for p in row.patterns if not any(word in row.text for word in OPTIONAL)]
+    assert [p.pattern for p in needed if not any(map(p.fullmatch, written))] == [], "promised, not written"
+
+
+@pytest.mark.toy
+@pytest.mark.parametrize("name", dag.NODES)
+def test_arrays_are_as_promised(toy, name):
+    for row in promised()[name]:
+        for folder in folders(toy, name):
+            for file in files(folder):
+                if file.endswith(".npz") and any(pattern.fullmatch(file) for pattern in row.patterns):
+                    check_arrays(folder / file, row)
+
+
+def check_arrays(path: Path, row: Row) -> None:
+    with np.load(path, allow_pickle=False) as arrays:
+        for name, axes, dtype, may_be_absent in row.arrays:
+            found = [key for key in arrays.files if key == name or key.endswith(f"/{name}")]
+            assert found or may_be_absent, f"{path}: no {name}"
+            for key in found:
+                array = arrays[key]
+                assert array.ndim == axes, f"{path}: {key} has {array.ndim} axes, promised {axes}"
+                fits = array.dtype.kind == "U" if dtype == "U" else array.dtype == np.dtype(dtype)
+                assert fits, f"{path}: {key} is {array.dtype}, promised {dtype}"

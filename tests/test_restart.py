@@ -1,0 +1,126 @@
+"""Kill the toy's build twenty times while stages write, without the truth on disk: the artifacts are the same bytes."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline import artifact, dag
+
+ROOT = Path(__file__).parent.parent
+pytestmark = pytest.mark.toy
+
+KILLS = {
+    "frames": 4, "flow": 3, "masks": 3, "feature_basis": 1, "features": 3, "behavior_data": 1,
+    "reconstruction": 2, "splats": 1, "behavior": 2,
+}  # fmt: skip
+"""How often a build is killed while an artifact is written, or while its training writes checkpoints."""
+TRAININGS = ("reconstruction", "splats", "behavior")
+LIMIT_S = 1200
+"""For the next artifact to begin to be written; a hang ends the test."""
+
+
+@pytest.fixture(scope="module")
+def copy(toy, tmp_path_factory) -> Path:
+    """A working copy that has the toy's recordings, and no truth."""
+    folder = tmp_path_factory.mktemp("restart")
+    for name in ("pipeline", "stages", "agents", "envs"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
+    shutil.copy(ROOT / "Makefile", folder)
+    (folder / ".venv").symlink_to(ROOT / ".venv")
+    shutil.copytree(toy / "synthetic_capture", folder / "build/toy/synthetic_capture")
+    shutil.rmtree(folder / "build/toy/synthetic_capture/truth")
+    return folder
+
+
+def begin(folder: Path) -> subprocess.Popen[bytes]:
+    """Build what stands before `evaluation`, in a process group of its own."""
+    goals = [f"toy.{node.artifact}" for node in dag.FLOW if node.artifact not in ("evaluation", "report")]
+    with (folder / "build.log").open("ab") as log:
+        return subprocess.Popen(["make", "-j2", *goals], cwd=folder, start_new_session=True, stdout=log, stderr=log)
+
+
+def being_written(folder: Path, name: str) -> Iterator[Path]:
+    """Yield the temporary folders of artifact `name`, or the checkpoints of its training."""
+    build = folder / "build" / "toy"
+    if name in TRAININGS:
+        yield from (build / "resume" / name).rglob("step*[1-9]*.pt")
+    elif dag.NODES[name].roles:
+        yield from (build / name).glob(".*.tmp.*")
+    else:
+        yield from build.glob(f".{name}.tmp.*")
+
+
+def kill_while_writing(folder: Path, names: list[str], choice: random.Random) -> tuple[str, str]:
+    """Build until one of `names` is being written, then SIGKILL the group; return which, and what was there."""
+    build = begin(folder)
+    end = time.monotonic() + LIMIT_S
+    while build.poll() is None and time.monotonic() < end:
+        for name in names:
+            seen = next(being_written(folder, name), None)
+            if seen is not None:
+                time.sleep(choice.uniform(0, 2.0 if name in TRAININGS else 0.02))
+                os.killpg(build.pid, signal.SIGKILL)
+                build.wait()
+                return name, str(seen.relative_to(folder))
+        time.sleep(0.002)
+    raise AssertionError(f"none of {names} was ever written; make ended with {build.poll()}")
+
+
+def complete(folder: Path) -> dict[str, artifact.Manifest]:
+    """Return every artifact that counts as complete, each checked against its files."""
+    found = {}
+    for path in (folder / "build" / "toy").rglob(artifact.MANIFEST):
+        inside = path.parent.relative_to(folder / "build" / "toy")
+        if inside.parts[0] == "synthetic_capture" or any(part.startswith(".") for part in inside.parts):
+            continue
+        manifest = artifact.read_manifest(path.parent)
+        assert manifest is not None, path
+        assert manifest.files == artifact.digests(path.parent), f"{inside} is taken as complete and is not"
+        found[inside.as_posix()] = manifest
+    return found
+
+
+@pytest.fixture(scope="module")
+def rebuilt(copy, toy, pytestconfig) -> Path:
+    """Rebuild the copy under kills, telling each; finish it undisturbed."""
+    choice = random.Random(20)
+    left = dict(KILLS)
+    shown = pytestconfig.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled
+    while any(left.values()):
+        name, there = kill_while_writing(copy, [name for name in left if left[name]], choice)
+        left[name] -= 1
+        count = sum(KILLS.values()) - sum(left.values())
+        with shown():
+            print(f"kill {count:2} during {name}, beside {there}; {len(complete(copy))} artifacts complete", flush=True)
+    assert begin(copy).wait() == 0, (copy / "build.log").read_text()[-3000:]
+    return copy
+
+
+def test_trainings_went_on_from_their_checkpoints(rebuilt):
+    log = (rebuilt / "build.log").read_text()
+    for name in TRAININGS:
+        steps = [int(line.rsplit(" ", 1)[1]) for line in log.splitlines() if line.startswith(f"[{name}] resumed at step")]
+        assert any(step > 0 for step in steps), f"{name} began again"
+
+
+def test_the_artifacts_are_those_of_an_undisturbed_build_with_truth(rebuilt, toy):
+    """Byte for byte, manifests too; what stands before `evaluation` has never seen the truth."""
+    assert not (rebuilt / "build/toy/synthetic_capture/truth").exists()
+    done = complete(rebuilt)
+    assert {name.split("/")[0] for name in done} == set(dag.NODES) - {"synthetic_capture", "evaluation", "report"}
+    assert [name for name, manifest in done.items() if manifest.files != artifact.opened(toy / name, name).files] == []
+    for name in done:
+        assert (rebuilt / "build/toy" / name / artifact.MANIFEST).read_bytes() == (toy / name / artifact.MANIFEST).read_bytes()
+
+
+def test_nothing_is_left_over(rebuilt):
+    build = rebuilt / "build" / "toy"
+    assert [path for pattern in (".*.tmp.*", ".*.old.*") for path in build.rglob(pattern)] == []
+    assert list((build / "resume").iterdir()) == []
