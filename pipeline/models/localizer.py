@@ -38,7 +38,9 @@ class Sight:
 
 @dataclass(frozen=True)
 class Calibration:
-    """P(within 2 deg and 5 cm; agent: 15 deg and 8 cm) = logistic(bias + slope * inlier ratio), fitted on held-out renders."""
+    """P(within 2 deg and 5 cm; agent: 15 deg and 8 cm) = logistic(bias + slope * inlier ratio), fitted on held-out
+    renders.
+    """
 
     bias: float
     slope: float
@@ -86,14 +88,19 @@ class Hypothesis:
         return self.map_from_camera
 
 
-def describe(picture: UInt8[np.ndarray, "height width 3"], sight: Sight) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
+def describe(
+    picture: UInt8[np.ndarray, "height width 3"], sight: Sight
+) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
     """Return DAISY descriptors on the grid of a resized picture and the pixels of their centres (Tola et al. 2010)."""
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     offset = sight.stride_px // 2
     y, x = np.mgrid[offset : gray.shape[0] : sight.stride_px, offset : gray.shape[1] : sight.stride_px]
     pixel = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float32)
     keypoints = [cv2.KeyPoint(float(column), float(row), 8) for column, row in pixel]
-    parts = [cv2.xfeatures2d.DAISY_create(radius, 2, 6, 8, cv2.xfeatures2d.DAISY_NRM_PARTIAL).compute(gray, keypoints)[1] for radius in sight.radii_px]
+    parts = [
+        cv2.xfeatures2d.DAISY_create(radius, 2, 6, 8, cv2.xfeatures2d.DAISY_NRM_PARTIAL).compute(gray, keypoints)[1]
+        for radius in sight.radii_px
+    ]
     return np.concatenate(parts, axis=1), pixel + 0.5
 
 
@@ -105,7 +112,9 @@ def see(
     mask: Bool[np.ndarray, "height width"] | None,
     sight: Sight,
 ) -> Patches | None:
-    """Describe one picture at the bank's scale. The mask says where the target is; None means everywhere. None: too little is seen."""
+    """Describe one picture at the bank's scale. The mask says where the target is; None means everywhere. None: too
+    little is seen.
+    """
     match sight.target:
         case "scene":
             scale = sight.focal_px / intrinsics[0, 0]
@@ -142,7 +151,11 @@ def _crop(color, depth, depth_intrinsics, intrinsics, mask, sight):
     origin = np.array([(column.min() + column.max() + 1) / 2, (row.min() + row.max() + 1) / 2]) - half
     warp = np.array([[scale, 0, -origin[0] * scale], [0, scale, -origin[1] * scale]])
     filled = np.where(mask[..., None], color, np.uint8(128))
-    return cv2.warpAffine(filled, warp, (sight.window_px, sight.window_px), flags=cv2.INTER_LINEAR, borderValue=(128, 128, 128)), origin, scale
+    return (
+        cv2.warpAffine(filled, warp, (sight.window_px, sight.window_px), flags=cv2.INTER_LINEAR, borderValue=(128, 128, 128)),
+        origin,
+        scale,
+    )
 
 
 def _lift(pixel, depth, depth_intrinsics, intrinsics):
@@ -205,14 +218,27 @@ class Localizer:
         weight = np.clip(similarity[np.arange(len(query)), nearest], 0.05, 1).astype(float)
         matched = points[nearest].astype(float)
         map_from_camera, inlier = align.ransac_rigid(
-            patches.points_camera, matched, threshold_m=self.threshold_m, iterations=self.iterations, rng=np.random.default_rng(0), weights=weight**2, spread_m=self.spread_m
+            patches.points_camera,
+            matched,
+            threshold_m=self.threshold_m,
+            iterations=self.iterations,
+            rng=np.random.default_rng(0),
+            weights=weight**2,
+            spread_m=self.spread_m,
         )
         if inlier.sum() < 4:
             return None
         ratio = float(inlier.mean())
         views, votes = np.unique(view[nearest[inlier]], return_counts=True)
         probability = float(self.calibration.probability(ratio))
-        return Hypothesis(map_from_camera, ratio, probability, int(views[votes.argmax()]), matched[inlier], patches.points_camera[inlier])
+        return Hypothesis(
+            map_from_camera,
+            ratio,
+            probability,
+            int(views[votes.argmax()]),
+            matched[inlier],
+            patches.points_camera[inlier],
+        )
 
 
 def project(descriptors: Float[np.ndarray, "patch channel"], bank: Bank) -> Float[np.ndarray, "patch 64"]:
@@ -222,7 +248,9 @@ def project(descriptors: Float[np.ndarray, "patch channel"], bank: Bank) -> Floa
 
 
 def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample"]) -> Calibration:
-    """Fit P(good) as a logistic curve of a score in 0..1 by Newton steps; one pseudo-observation at each end and a ridge keep separable data finite."""
+    """Fit P(good) as a logistic curve of a score in 0..1 by Newton steps; one pseudo-observation at each end and a
+    ridge keep separable data finite.
+    """
     x = np.concatenate([score, [0.0, 1.0]])
     y = np.concatenate([good.astype(float), [0.0, 1.0]])
     design = np.stack([np.ones_like(x), x], axis=1)
@@ -235,7 +263,9 @@ def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample
     return Calibration(float(weights[0]), float(weights[1]))
 
 
-def errors(map_from_camera: Float[np.ndarray, "*batch 4 4"], truth: Float[np.ndarray, "*batch 4 4"]) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+def errors(
+    map_from_camera: Float[np.ndarray, "*batch 4 4"], truth: Float[np.ndarray, "*batch 4 4"]
+) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
     """Return rotation error (degrees) and the distance of the camera centres (metres)."""
     rotation = np.rad2deg(rigid.rotation_angle(map_from_camera[..., :3, :3], truth[..., :3, :3]))
     return rotation, np.linalg.norm(map_from_camera[..., :3, 3] - truth[..., :3, 3], axis=-1)
@@ -247,7 +277,12 @@ def save(folder: Path, localizer: Localizer, report: dict) -> None:
     bank["descriptors"] = bank["descriptors"].astype(np.float16)
     save_file(bank, folder / "localizer.safetensors")
     table = {name: value for name, value in vars(localizer).items() if name not in ("bank", "sight", "calibration")}
-    table |= {"kind": "bank", "sight": asdict(localizer.sight), "calibration": asdict(localizer.calibration), "held_out": report}
+    table |= {
+        "kind": "bank",
+        "sight": asdict(localizer.sight),
+        "calibration": asdict(localizer.calibration),
+        "held_out": report,
+    }
     (folder / "localizer.json").write_text(json.dumps(table, indent=1) + "\n")
 
 

@@ -47,7 +47,13 @@ def bird_view(mesh: Mesh, *, floor_m: float, height_m: float = 1.7, width_px: in
     return Overview(shade(mesh, hits).reshape(height_px, width_px, 3), low, meter_px)
 
 
-def view(caster: RayCaster, world_from_camera: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "3 3"], height: int, width: int) -> UInt8[np.ndarray, "height width 3"]:
+def view(
+    caster: RayCaster,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    height: int,
+    width: int,
+) -> UInt8[np.ndarray, "height width 3"]:
     """Draw a mesh with its vertex colours as a camera sees it."""
     _, hits = render_view(caster, world_from_camera, intrinsics, height, width)
     return shade(caster.mesh, hits).reshape(height, width, 3)

@@ -21,7 +21,9 @@ MAP = -1
 
 @dataclass(frozen=True)
 class Contacts:
-    """Pairs of points that should touch along ``direction``; ``points_*`` in the camera (or map) they belong to, metres."""
+    """Pairs of points that should touch along ``direction``; ``points_*`` in the camera (or map) they belong to,
+    metres.
+    """
 
     first: Int[np.ndarray, "contact"]
     second: Int[np.ndarray, "contact"]
@@ -57,7 +59,12 @@ class Relaxed:
 
 
 def chain(
-    timestamp_s: Float[np.ndarray, "frame"], odometry_from_camera: Float[np.ndarray, "frame 4 4"], *, drift_rad_s: float, drift_m_s: float, floor_m: float = 0.001
+    timestamp_s: Float[np.ndarray, "frame"],
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    *,
+    drift_rad_s: float,
+    drift_m_s: float,
+    floor_m: float = 0.001,
 ) -> Relatives:
     """Turn odometry into one relative motion per neighbouring pair; the drift grows with the time between."""
     first = np.arange(len(timestamp_s) - 1)
@@ -99,7 +106,9 @@ def relax(
 
 def residuals(world_from_camera: Float[np.ndarray, "frame 4 4"], contacts: Contacts) -> Float[np.ndarray, "contact"]:
     """Return the signed gap of each contact along its direction in metres."""
-    gap = _world(world_from_camera, contacts.first, contacts.points_first) - _world(world_from_camera, contacts.second, contacts.points_second)
+    gap = _world(world_from_camera, contacts.first, contacts.points_first) - _world(
+        world_from_camera, contacts.second, contacts.points_second
+    )
     return np.einsum("ci,ci->c", gap, contacts.direction_world)
 
 
@@ -111,7 +120,10 @@ def _world(world_from_camera, index, points):
 def _contact_rows(poses, contacts):
     residual = residuals(poses, contacts)
     blocks, columns, rows = [], [], []
-    for index, points, sign in ((contacts.first, contacts.points_first, 1.0), (contacts.second, contacts.points_second, -1.0)):
+    for index, points, sign in (
+        (contacts.first, contacts.points_first, 1.0),
+        (contacts.second, contacts.points_second, -1.0),
+    ):
         row = np.flatnonzero(index != MAP)
         direction = np.einsum("cij,ci->cj", poses[index[row], :3, :3], contacts.direction_world[row])
         blocks.append(sign * np.concatenate([np.cross(points[row], direction), direction], axis=1))
@@ -127,7 +139,10 @@ def _edge_rows(poses, relatives):
     whiten = 1.0 / np.stack([relatives.sigma_rad] * 3 + [relatives.sigma_m] * 3, axis=-1)
     count = len(relatives.first)
     row = np.broadcast_to(np.arange(6 * count).reshape(count, 6, 1), (count, 6, 6))
-    values = [-_adjoint(second_from_first) * whiten[..., None], np.broadcast_to(np.eye(6), (count, 6, 6)) * whiten[..., None]]
+    values = [
+        -_adjoint(second_from_first) * whiten[..., None],
+        np.broadcast_to(np.eye(6), (count, 6, 6)) * whiten[..., None],
+    ]
     columns = [np.broadcast_to(index[:, None, None] * 6 + np.arange(6), (count, 6, 6)) for index in (relatives.first, relatives.second)]
     entries = (np.stack(values).ravel(), (np.stack([row, row]).ravel(), np.stack(columns).ravel()))
     return sparse.csr_array(entries, shape=(6 * count, 6 * len(poses))), (rigid.log(error) * whiten).ravel()

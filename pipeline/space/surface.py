@@ -62,12 +62,20 @@ class Surface:
         self.normals_world = mesh.vertex_normals()
         self._tree = cKDTree(self.points_world)
 
-    def contacts(self, frames: Int[np.ndarray, "scan"], scans: list[Scan], world_from_camera: Float[np.ndarray, "frame 4 4"], reach_m: float) -> Contacts:
-        """Pair every scanned point with the nearest place within reach whose normal faces the camera, point to plane."""
+    def contacts(
+        self,
+        frames: Int[np.ndarray, "scan"],
+        scans: list[Scan],
+        world_from_camera: Float[np.ndarray, "frame 4 4"],
+        reach_m: float,
+    ) -> Contacts:
+        """Pair every scanned point with the nearest place in reach whose normal faces the camera, point to plane."""
         first = np.repeat(frames, [len(scan.points_camera) for scan in scans])
         points = np.concatenate([scan.points_camera for scan in scans])
         sigma = np.concatenate([scan.sigma_m for scan in scans])
-        world = np.concatenate([rigid.apply(world_from_camera[frame], scan.points_camera) for frame, scan in zip(frames, scans, strict=True)])
+        world = np.concatenate(
+            [rigid.apply(world_from_camera[frame], scan.points_camera) for frame, scan in zip(frames, scans, strict=True)]
+        )
         distance, nearest = self._tree.query(world, distance_upper_bound=reach_m * 1.5)
         found = np.flatnonzero(np.isfinite(distance))
         nearest, first, world = nearest[found], first[found], world[found]

@@ -1,4 +1,5 @@
-"""Truncated signed distance volumes: fuse posed depth and colour, then extract the seen surface (Curless and Levoy 1996).
+"""Truncated signed distance volumes: fuse posed depth and colour, then extract the seen surface (Curless and Levoy
+1996).
 
 `enclose` makes an empty volume around points, `Volume.integrate` adds one frame, `Volume.surface` returns the mesh.
 """
@@ -12,7 +13,9 @@ from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 
 FREE_GAIN = 0.2
-"""Weight of a ray that passes far in front of what it met, against one that ends here: rims and thin legs would be carved away."""
+"""Weight of a ray that passes far in front of what it met, against one that ends here: rims and thin legs would be
+carved away.
+"""
 
 
 class Volume:
@@ -36,15 +39,27 @@ class Volume:
         world_from_camera: Float[np.ndarray, "4 4"],
         trust: Float[np.ndarray, "height width"] | None = None,
     ) -> None:
-        """Add one frame; depth 0 is unknown and changes nothing. Near views weigh more (1 / depth squared), times the trust (0..1)."""
+        """Add one frame; depth 0 is unknown and changes nothing. Near views weigh more (1 / depth squared), times the
+        trust (0..1).
+        """
         trust = np.ones(depth.shape, np.float32) if trust is None else np.ascontiguousarray(trust, np.float32)
         camera_from_world = rigid.inverse(world_from_camera)
         start = camera_from_world[:3, :3] @ self.origin + camera_from_world[:3, 3]
         steps = np.ascontiguousarray(camera_from_world[:3, :3].T * self.voxel_m)
         _integrate(
-            self.distance, self.weight, self.color, self.color_weight, start, steps,
-            np.ascontiguousarray(depth, np.float32), trust, _focal(depth_intrinsics), np.ascontiguousarray(color), _focal(intrinsics), self.truncation_m,
-        )  # fmt: skip
+            self.distance,
+            self.weight,
+            self.color,
+            self.color_weight,
+            start,
+            steps,
+            np.ascontiguousarray(depth, np.float32),
+            trust,
+            _focal(depth_intrinsics),
+            np.ascontiguousarray(color),
+            _focal(intrinsics),
+            self.truncation_m,
+        )
 
     def surface(self, least_weight: float) -> Mesh:
         """Extract the zero crossing between voxels that were seen often enough; what was never seen stays open."""

@@ -61,7 +61,8 @@ def run(task: cli.Task) -> None:
         (folder / "world.json").write_text(json.dumps(pictures.world(made), indent=1) + "\n")
         template.write_model(sparse, made.world_from_camera, folder / "colmap")
         qa.write(
-            folder, good="walls are straight, furniture is whole, frames and renderings agree", bad="walls are doubled or bent, the path jumps, large parts are missing",
+            folder, good="walls are straight, furniture is whole, frames and renderings agree",
+            bad="walls are doubled or bent, the path jumps, large parts are missing",
             checks=pictures.checks(made), pictures=pictures.pictures(made, clip),
         )  # fmt: skip
 

@@ -24,7 +24,9 @@ class AnchorOptions:
     most_scale_spread: float = 0.06
     """Robust relative spread of depth over SfM depth beyond which the model is refuted."""
     most_gap_m: float = 0.05
-    """Median gap between overlapping depth images beyond which the model is refuted, metres (and twice the odometry's)."""
+    """Median gap between overlapping depth images beyond which the model is refuted, metres (and twice the
+    odometry's).
+    """
 
 
 @dataclass(frozen=True)
@@ -61,11 +63,16 @@ def metric_scale(sparse: Sparse, clip: Clip) -> tuple[float, float]:
 
 
 def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "key 4 4"]) -> float:
-    """Return the median absolute difference in metres between depth images of keyframes 1, 3 and 8 apart, pose against pose."""
+    """Return the median absolute difference in metres between depth images of keyframes 1, 3 and 8 apart, pose
+    against pose.
+    """
     gaps = []
     for hop in (1, 3, 8):
         for first in range(len(keyframes) - hop):
-            moved = rigid.apply(rigid.inverse(world_from_camera[first + hop]) @ world_from_camera[first], keyframes[first].scan.points_camera)
+            moved = rigid.apply(
+                rigid.inverse(world_from_camera[first + hop]) @ world_from_camera[first],
+                keyframes[first].scan.points_camera,
+            )
             target = keyframes[first + hop]
             pixel, z = cameras.project(moved, target.intrinsics)
             column, row = np.floor(pixel).astype(int).T
@@ -77,13 +84,19 @@ def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "k
 
 
 def bridge(clip: Clip, frames: Int[np.ndarray, "key"], world_from_camera: Float[np.ndarray, "key 4 4"]) -> Float[np.ndarray, "frame 4 4"]:
-    """Carry known frames to all frames: along the odometry from both known neighbours, blended; without odometry, in time."""
+    """Carry known frames to all frames: along the odometry from both known neighbours, blended; without odometry, in
+    time.
+    """
     time = clip.timestamp_s
     if clip.odometry_from_camera is None:
         return rigid.interpolate(time[frames], world_from_camera, time)
     odometry = clip.odometry_from_camera
     world_from_odometry = world_from_camera @ rigid.inverse(odometry[frames])
-    after = np.clip(np.searchsorted(frames, np.arange(len(time)), side="right"), 1, len(frames) - 1) if len(frames) > 1 else np.zeros(len(time), int)
+    after = (
+        np.clip(np.searchsorted(frames, np.arange(len(time)), side="right"), 1, len(frames) - 1)
+        if len(frames) > 1
+        else np.zeros(len(time), int)
+    )
     before = np.maximum(after - 1, 0)
     share = np.clip((time - time[frames[before]]) / np.maximum(time[frames[after]] - time[frames[before]], 1e-9), 0, 1)
     ends = [world_from_odometry[index] @ odometry for index in (before, after)]
@@ -91,7 +104,9 @@ def bridge(clip: Clip, frames: Int[np.ndarray, "key"], world_from_camera: Float[
     return ends[0] @ rigid.exp(step * share[:, None])
 
 
-def choose_start(clip: Clip, frames: Int[np.ndarray, "key"], keyframes: list[Keyframe], sparse: Sparse | None, options: AnchorOptions) -> Trajectory:
+def choose_start(
+    clip: Clip, frames: Int[np.ndarray, "key"], keyframes: list[Keyframe], sparse: Sparse | None, options: AnchorOptions
+) -> Trajectory:
     """Believe SfM if enough keyframes are in it, its scale is steady and depth agrees; otherwise take the odometry."""
     odometry = clip.odometry_from_camera
     gap = {} if odometry is None else {"odometry": depth_gap(keyframes, odometry[frames])}
@@ -125,9 +140,14 @@ def _refutation(registered, spread, gap, options):
 
 
 def upright(
-    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], points_world: Float[np.ndarray, "point 3"], normals_world: Float[np.ndarray, "point 3"]
+    clip: Clip,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    points_world: Float[np.ndarray, "point 3"],
+    normals_world: Float[np.ndarray, "point 3"],
 ) -> tuple[Float[np.ndarray, "4 4"], str]:
-    """Return ``upright_from_world`` that turns +y up, and how up was found: the phone's gravity, or the dominant planes."""
+    """Return ``upright_from_world`` that turns +y up, and how up was found: the phone's gravity, or the dominant
+    planes.
+    """
     if clip.odometry_from_camera is not None and clip.gravity_known:
         up = (world_from_camera[:, :3, :3] @ np.swapaxes(clip.odometry_from_camera[:, :3, :3], 1, 2))[:, :, 1].mean(0)
         how = "gravity of the phone"
@@ -138,7 +158,9 @@ def upright(
     return rigid.make(rotation, -rotation @ points_world.mean(0)), how
 
 
-def floor_direction(normals_world: Float[np.ndarray, "point 3"], guess: Float[np.ndarray, "3"], within_deg: float = 40.0) -> Float[np.ndarray, "3"]:
+def floor_direction(
+    normals_world: Float[np.ndarray, "point 3"], guess: Float[np.ndarray, "3"], within_deg: float = 40.0
+) -> Float[np.ndarray, "3"]:
     """Sharpen a guess of up: the direction near it that most surface normals lie along or across (Manhattan)."""
     up = guess
     for limit_deg in (within_deg, 15.0, 8.0, 5.0):

@@ -1,4 +1,5 @@
-"""Clean a mesh with MeshLab's filters; run as a program of its own with one thread: ``clean_mesh.py IN.ply OUT.ply LEAST_FACES``.
+"""Clean a mesh with MeshLab's filters; run as a program of its own with one thread: ``clean_mesh.py IN.ply OUT.ply
+LEAST_FACES``.
 
 MeshLab's library is GPL-3 and is only ever talked to through files. Islands with fewer faces than
 LEAST_FACES, duplicates, slivers and non-manifold edges go; colours and the outline of holes stay.

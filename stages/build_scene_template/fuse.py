@@ -50,17 +50,34 @@ def fuse(clip: Clip, frames: Int[np.ndarray, "view"], world_from_camera: Float[n
         depth = clip.depth(frame)
         depth = np.where(depth < options.furthest_m, depth, 0)
         trust = np.array(options.trust, np.float32)[clip.confidence(frame)]
-        volume.integrate(depth, clip.depth_intrinsics[frame], clip.color(frame), clip.intrinsics[frame], world_from_camera[frame], trust)
+        volume.integrate(
+            depth,
+            clip.depth_intrinsics[frame],
+            clip.color(frame),
+            clip.intrinsics[frame],
+            world_from_camera[frame],
+            trust,
+        )
     return volume.surface(options.least_views)
 
 
 def align_frames(
-    clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], options: FuseOptions, weights: RefineOptions
+    clip: Clip,
+    mesh: Mesh,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    options: FuseOptions,
+    weights: RefineOptions,
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
     """Relax every frame against the surface and the odometry; also return each frame's median gap in metres."""
     place, frames = surface.Surface(mesh), np.arange(len(clip))
     scans = [
-        surface.scan(clip.depth(f), clip.depth_intrinsics[f], stride=options.align_stride_px, confidence=clip.confidence(f), furthest_m=options.furthest_m)
+        surface.scan(
+            clip.depth(f),
+            clip.depth_intrinsics[f],
+            stride=options.align_stride_px,
+            confidence=clip.confidence(f),
+            furthest_m=options.furthest_m,
+        )
         for f in frames
     ]
 
@@ -84,17 +101,33 @@ def clean(mesh: Mesh, workspace: Path, island_faces: int) -> Mesh:
     mesh_files.write_ply(source, mesh)
     program = Path(__file__).with_name("clean_mesh.py")
     environment = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "PATH": "/usr/bin:/bin"}
-    done = subprocess.run([sys.executable, str(program), str(source), str(target), str(island_faces)], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, str(program), str(source), str(target), str(island_faces)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     if done.returncode or not target.exists():
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise InputError("MAP-003", what=f"pymeshlab failed: {last}", where=program.name, remedy="install its libraries: apt-get install libgl1 libopengl0")
+        raise InputError(
+            "MAP-003",
+            what=f"pymeshlab failed: {last}",
+            where=program.name,
+            remedy="install its libraries: apt-get install libgl1 libopengl0",
+        )
     return mesh_files.read_ply(target)
 
 
 def vertex_features(
-    clip: Clip, features: Float[np.ndarray, "frame height width channel"], mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: int
+    clip: Clip,
+    features: Float[np.ndarray, "frame height width channel"],
+    mesh: Mesh,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    frames: int,
 ) -> Float[np.ndarray, "vertex channel"]:
-    """Average the features of the frames that see each vertex (depth within 6 cm), L2-normalised; zero where none does."""
+    """Average the features of the frames that see each vertex (depth within 6 cm), L2-normalised; zero where none
+    does.
+    """
     total = np.zeros((len(mesh.vertices), features.shape[-1]))
     for frame in np.unique(np.linspace(0, len(clip) - 1, frames).astype(int)):
         local = rigid.apply(rigid.inverse(world_from_camera[frame]), mesh.vertices.astype(float))
@@ -105,6 +138,8 @@ def vertex_features(
         scale = np.array(depth.shape[::-1]) / (width, height)
         column, row = np.minimum((pixel[inside] * scale).astype(int), np.array(depth.shape[::-1]) - 1).T
         inside = inside[np.abs(depth[row, column] - z[inside]) < 0.06]
-        cell = np.minimum(pixel[inside] * np.array(features.shape[2:0:-1]) / (width, height), np.array(features.shape[2:0:-1]) - 1).astype(int)
+        cell = np.minimum(pixel[inside] * np.array(features.shape[2:0:-1]) / (width, height), np.array(features.shape[2:0:-1]) - 1).astype(
+            int
+        )
         total[inside] += np.asarray(features[frame][cell[:, 1], cell[:, 0]], float) / z[inside, None]
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)

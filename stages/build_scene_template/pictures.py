@@ -1,4 +1,6 @@
-"""What the quality page of the scene template shows: a turntable, the bird's-eye coverage, real against rendered frames."""
+"""What the quality page of the scene template shows: a turntable, the bird's-eye coverage, real against rendered
+frames.
+"""
 
 import numpy as np
 
@@ -17,7 +19,11 @@ def pictures(template: Template, clip: Clip) -> list[Picture]:
     return [
         Picture("turntable", turntable(template, caster), "The fused mesh from four sides, seen through its walls' backs."),
         Picture("coverage", coverage(template), "From above: the seen surface and the walk-through's path."),
-        Picture("frames", frames(template, clip, caster), "Upper row: frames of the walk-through; lower row: the mesh from the same cameras."),
+        Picture(
+            "frames",
+            frames(template, clip, caster),
+            "Upper row: frames of the walk-through; lower row: the mesh from the same cameras.",
+        ),
     ]
 
 
@@ -56,7 +62,12 @@ def checks(template: Template) -> list[Check]:
         Check("keyframes registered by COLMAP", len(start.registered) / template.keyframes, "share", 0.8, 0.0, "higher"),
         Check("reprojection error", template.reprojection_px, "px", 1.5),
         Check("scale against depth, relative spread", start.scale_spread, "", 0.05),
-        Check("scale against odometry", None if start.odometry_scale is None else abs(start.odometry_scale - 1), "relative difference", 0.05),
+        Check(
+            "scale against odometry",
+            None if start.odometry_scale is None else abs(start.odometry_scale - 1),
+            "relative difference",
+            0.05,
+        ),
         Check("depth against the surface", float(np.nanmedian(template.gap_m) * 100), "cm, median", 2.0, 5.0),
         Check("frames that fit the surface", float(template.registered.mean()), "share", 0.95, 0.5, "higher"),
     ]

@@ -51,8 +51,12 @@ def load_keyframe(clip: Clip, frame: int, stride_px: int) -> Keyframe:
     return Keyframe(surface.scan(depth, intrinsics, stride=stride_px), depth, image_normals(depth, intrinsics), intrinsics)
 
 
-def image_normals(depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4) -> Float[np.ndarray, "height width 3"]:
-    """Return unit normals towards the camera from central differences over ``span_px``; zero at edges and unknown depth."""
+def image_normals(
+    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4
+) -> Float[np.ndarray, "height width 3"]:
+    """Return unit normals towards the camera from central differences over ``span_px``; zero at edges and unknown
+    depth.
+    """
     points = cameras.back_project(depth, intrinsics)
     normals = np.zeros_like(points)
     inner = slice(span_px, -span_px)
@@ -63,14 +67,23 @@ def image_normals(depth: Float[np.ndarray, "height width"], intrinsics: Float[np
     centre = depth[inner, inner]
     limit = 0.05 + 0.06 * centre
     known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
-    for shifted in (depth[inner, 2 * span_px :], depth[inner, : -2 * span_px], depth[2 * span_px :, inner], depth[: -2 * span_px, inner]):
+    for shifted in (
+        depth[inner, 2 * span_px :],
+        depth[inner, : -2 * span_px],
+        depth[2 * span_px :, inner],
+        depth[: -2 * span_px, inner],
+    ):
         known &= shifted > 0
     normals[inner, inner] = np.where(known[..., None], cross / np.maximum(length, 1e-9)[..., None], 0)
     return normals
 
 
 def depth_contacts(
-    keyframes: list[Keyframe], pairs: Int[np.ndarray, "pair 2"], world_from_camera: Float[np.ndarray, "key 4 4"], reach_m: float, inflation: float
+    keyframes: list[Keyframe],
+    pairs: Int[np.ndarray, "pair 2"],
+    world_from_camera: Float[np.ndarray, "key 4 4"],
+    reach_m: float,
+    inflation: float,
 ) -> relax.Contacts:
     """Project each pair's thinned points into the other's depth image and tie them to the plane seen there."""
     parts = [_pair_contacts(keyframes, int(a), int(b), world_from_camera, reach_m, inflation) for a, b in pairs]
@@ -94,7 +107,12 @@ def _pair_contacts(keyframes, first, second, world_from_camera, reach_m, inflati
     count = len(inside)
     sigma = inflation * np.hypot(source.sigma_m[inside], surface.depth_noise(met[:, 2]))
     return relax.Contacts(
-        np.full(count, first), np.full(count, second), source.points_camera[inside], met, normal @ world_from_camera[second, :3, :3].T, sigma
+        np.full(count, first),
+        np.full(count, second),
+        source.points_camera[inside],
+        met,
+        normal @ world_from_camera[second, :3, :3].T,
+        sigma,
     )
 
 
@@ -146,9 +164,7 @@ def points_under(clip: Clip, frame: int, pixel: Float[np.ndarray, "sample 2"]) -
     return np.where((z > 0.1)[:, None], points, np.nan)
 
 
-def overlapping(
-    world_from_camera: Float[np.ndarray, "key 4 4"], keyframes: list[Keyframe], neighbours: int
-) -> Int[np.ndarray, "pair 2"]:
+def overlapping(world_from_camera: Float[np.ndarray, "key 4 4"], keyframes: list[Keyframe], neighbours: int) -> Int[np.ndarray, "pair 2"]:
     """Pick for each keyframe its successor and the others that see most of its points."""
     pairs = []
     for first, keyframe in enumerate(keyframes):
@@ -162,7 +178,9 @@ def overlapping(
         seen[first] = 0
         spread = np.argsort(-seen, kind="stable")
         best = spread[seen[spread] > 0.3]
-        chosen = set(best[:: max(1, len(best) // neighbours)][:neighbours].tolist()) | ({first + 1} if first + 1 < len(keyframes) else set())
+        chosen = set(best[:: max(1, len(best) // neighbours)][:neighbours].tolist()) | (
+            {first + 1} if first + 1 < len(keyframes) else set()
+        )
         pairs += [(first, second) for second in sorted(chosen)]
     return np.array(pairs).reshape(-1, 2)
 

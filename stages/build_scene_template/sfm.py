@@ -3,6 +3,7 @@
 `choose_keyframes` thins the clip, `reconstruct` returns the largest model in its own scale, or None.
 """
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,7 +71,7 @@ def choose_keyframes(clip: Clip, options: SfmOptions) -> Int[np.ndarray, "key"]:
     step = np.floor(progress).astype(int)
     starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
     bounds = np.append(starts, len(step))
-    return np.array([low + int(clip.quality[low:high].argmax()) for low, high in zip(bounds[:-1], bounds[1:])])
+    return np.array([low + int(clip.quality[low:high].argmax()) for low, high in itertools.pairwise(bounds)])
 
 
 def choose_pairs(clip: Clip, keyframes: Int[np.ndarray, "key"], options: SfmOptions) -> Int[np.ndarray, "pair 2"]:
@@ -83,7 +84,10 @@ def choose_pairs(clip: Clip, keyframes: Int[np.ndarray, "key"], options: SfmOpti
     else:
         pose = clip.odometry_from_camera[keyframes]
         near = np.linalg.norm(pose[first, :3, 3] - pose[second, :3, 3], axis=1) / options.loop_m
-        near = np.maximum(near, np.arccos(np.clip((pose[first, :3, 2] * pose[second, :3, 2]).sum(1), -1, 1)) / np.deg2rad(options.loop_deg))
+        near = np.maximum(
+            near,
+            np.arccos(np.clip((pose[first, :3, 2] * pose[second, :3, 2]).sum(1), -1, 1)) / np.deg2rad(options.loop_deg),
+        )
         for key in range(count):
             candidates = np.flatnonzero((first == key) & ~chosen & (near < 1))
             chosen[candidates[np.argsort(near[candidates], kind="stable")[: options.loops_per_keyframe]]] = True
@@ -105,7 +109,9 @@ def reconstruct(clip: Clip, options: SfmOptions, workspace: Path, seed: int) -> 
     verification.ransac.random_seed = seed
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listing)
     pycolmap.match_image_pairs(database, matching, pairing, verification, device=pycolmap.Device.cpu)
-    mapping = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, ba_refine_focal_length=False, ba_refine_extra_params=False)
+    mapping = pycolmap.IncrementalPipelineOptions(
+        num_threads=1, random_seed=seed, ba_refine_focal_length=False, ba_refine_extra_params=False
+    )
     mapping.mapper.num_threads, mapping.mapper.random_seed, mapping.triangulation.random_seed = 1, seed, seed
     mapping.mapper.abs_pose_refine_focal_length = False
     mapping.mapper.init_min_tri_angle = 6.0

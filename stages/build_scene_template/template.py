@@ -44,14 +44,24 @@ def build(
     workspace: Path,
     seed: int,
 ) -> tuple[Template, sfm.Sparse | None]:
-    """Build the template; the sparse model comes back in the world, ready to be written. Raises InputError MAP-001 and MAP-002."""
+    """Build the template; the sparse model comes back in the world, ready to be written. Raises InputError MAP-001
+    and MAP-002.
+    """
     sparse = sfm.reconstruct(clip, structure, workspace, seed)
     frames = sfm.choose_keyframes(clip, structure)
     keyframes = [refine.load_keyframe(clip, int(frame), weights.stride_px) for frame in frames]
     if sparse is None and clip.odometry_from_camera is None:
-        raise InputError("MAP-001", "the walk-through has neither odometry nor enough texture for COLMAP", str(clip.folder), "record a slower walk-through in better light")
+        raise InputError(
+            "MAP-001",
+            "the walk-through has neither odometry nor enough texture for COLMAP",
+            str(clip.folder),
+            "record a slower walk-through in better light",
+        )
     start = anchor.choose_start(clip, frames, keyframes, sparse, believe)
-    log(f"start from {start.source}{': ' + start.reason if start.reason else ''}; {len(start.registered)} of {len(frames)} keyframes in the model")
+    log(
+        f"start from {start.source}{': ' + start.reason if start.reason else ''}; "
+        f"{len(start.registered)} of {len(frames)} keyframes in the model"
+    )
     trusted = sparse if start.source == "colmap" else None
     keys = refine.refine_keyframes(clip, frames, keyframes, start.world_from_camera[frames], trusted, weights)
     poses = anchor.bridge(clip, frames, keys)
@@ -61,7 +71,12 @@ def build(
     upright_from_world, gravity = anchor.upright(clip, poses, points[known], normals[known])
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, fusion)
     if len(mesh.faces) < 100:
-        raise InputError("MAP-002", "depth fused to no surface", str(clip.folder), "check that the recording has LiDAR depth within 4 m")
+        raise InputError(
+            "MAP-002",
+            "depth fused to no surface",
+            str(clip.folder),
+            "check that the recording has LiDAR depth within 4 m",
+        )
     poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, fusion, weights)
     mesh = fuse.clean(fuse.fuse(clip, np.arange(len(clip)), poses, fusion), workspace, fusion.island_faces)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")

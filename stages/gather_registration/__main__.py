@@ -1,4 +1,6 @@
-"""Gather the registrations of all sessions: their poses, and a summary of what was registered and what was refused, and why."""
+"""Gather the registrations of all sessions: their poses, and a summary of what was registered and what was refused,
+and why.
+"""
 
 import json
 from dataclasses import dataclass
@@ -18,7 +20,9 @@ class Config:
 
 
 def run(task: cli.Task) -> None:
-    """Copy the poses of registered recordings and write the summary. Raises InputError REG-001 when too few are registered."""
+    """Copy the poses of registered recordings and write the summary. Raises InputError REG-001 when too few are
+    registered.
+    """
     outcomes = []
     for video, folder in task.per_video("video_poses").items():
         status = json.loads((folder / "status.json").read_text())
@@ -26,7 +30,12 @@ def run(task: cli.Task) -> None:
     summary = gather.summarise(outcomes)
     if summary["registered"] < task.config.least_registered:
         reasons = "; ".join(f"{outcome.video}: {outcome.status['reason']}" for outcome in outcomes)
-        raise InputError("REG-001", f"{summary['registered']} of {summary['total']} sessions fit the walk-through ({reasons})", str(task.out), "record a walk-through that shows the whole room, or sessions in that room")
+        raise InputError(
+            "REG-001",
+            f"{summary['registered']} of {summary['total']} sessions fit the walk-through ({reasons})",
+            str(task.out),
+            "record a walk-through that shows the whole room, or sessions in that room",
+        )
     with task.create() as folder:
         for outcome in outcomes:
             if outcome.poses is not None:
@@ -34,8 +43,10 @@ def run(task: cli.Task) -> None:
                 arrays.save(folder / outcome.video / "poses.npz", **outcome.poses)
         (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
         qa.write(
-            folder, good="all recordings are registered and their paths share one room", bad="recordings are refused, or a path lies apart from the others",
-            checks=gather.checks(outcomes), pictures=[qa.Picture("paths", gather.paths(outcomes), "From above: phones thin, animals thick, one colour a recording.")],
+            folder, good="all recordings are registered and their paths share one room",
+            bad="recordings are refused, or a path lies apart from the others",
+            checks=gather.checks(outcomes),
+            pictures=[qa.Picture("paths", gather.paths(outcomes), "From above: phones thin, animals thick.")],
         )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Summarise what was registered and what was refused, and draw all paths into one picture."""
 
+import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -56,8 +57,15 @@ def paths(outcomes: list[Outcome], edge_px: int = 560) -> UInt8[np.ndarray, "hei
         color = COLORS[index % len(COLORS)]
         for points, thickness in zip(pair, (1, 3), strict=True):
             pixel = (points - low) * scale + 20
-            for start, end in zip(pixel[:-1], pixel[1:], strict=True):
+            for start, end in itertools.pairwise(pixel):
                 if np.isfinite(start).all() and np.isfinite(end).all():
-                    cv2.line(image, tuple(np.round(start).astype(int).tolist()), tuple(np.round(end).astype(int).tolist()), color, thickness, cv2.LINE_AA)
+                    cv2.line(
+                        image,
+                        tuple(np.round(start).astype(int).tolist()),
+                        tuple(np.round(end).astype(int).tolist()),
+                        color,
+                        thickness,
+                        cv2.LINE_AA,
+                    )
         cv2.putText(image, video, (10, 18 + 16 * index), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, 1, cv2.LINE_AA)
     return image

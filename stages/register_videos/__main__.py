@@ -6,7 +6,7 @@ status.json; a recording that does not fit has no poses.npz, and status.json say
 """
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,24 +15,13 @@ from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip, Masks
 from pipeline.models import localizer
 from stages.register_videos import pictures, registration
-from stages.register_videos.agent_roots import RootOptions
-from stages.register_videos.alignment import AlignOptions
-from stages.register_videos.registration import GateOptions, Maps, Registered
-from stages.register_videos.votes import VoteOptions
+from stages.register_videos.registration import Maps, Registered
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(registration.Options):
     """How a recording is registered."""
 
-    vote: VoteOptions = field(default_factory=VoteOptions)
-    """Which frames vote, and when votes agree."""
-    align: AlignOptions = field(default_factory=AlignOptions)
-    """Weights, reach and rounds of the alignment."""
-    gate: GateOptions = field(default_factory=GateOptions)
-    """When a recording is believed, and its confidence."""
-    root: RootOptions = field(default_factory=RootOptions)
-    """How the animal is placed."""
     seed: int = 0
     """Seed of thinning and calibration."""
 
@@ -46,17 +35,10 @@ def run(task: cli.Task) -> None:
         scene_localizer=localizer.load(task.input("scene_localizer")),
         agent_localizer=localizer.load(task.input("agent_localizer")),
     )
-    config = task.config
-    found = registration.register(
-        clip, masks, maps, vote=config.vote, align=config.align, gate=config.gate, root=config.root, rng=np.random.default_rng(config.seed)
-    )
+    found = registration.register(clip, masks, maps, task.config, np.random.default_rng(task.config.seed))
     with task.create() as folder:
         if isinstance(found, Registered):
-            arrays.save(
-                folder / "poses.npz", timestamp_s=clip.timestamp_s, world_from_camera=found.aligned.world_from_camera,
-                world_from_agent=found.roots.world_from_agent, confidence=found.confidence.astype(np.float32),
-                agent_confidence=found.agent_confidence.astype(np.float32), agent_visible=found.roots.visible,
-            )  # fmt: skip
+            arrays.save(folder / "poses.npz", timestamp_s=clip.timestamp_s, **found.tables())
         (folder / "status.json").write_text(json.dumps(pictures.status(found), indent=1) + "\n")
         qa.write(
             folder, good="template edges lie on the frames' edges, the animal's outline fits, paths stay in free space",
@@ -66,4 +48,10 @@ def run(task: cli.Task) -> None:
 
 
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, reads=("frames", "masks", "scene_template", "agent_template", "scene_localizer", "agent_localizer"), optional=("features",))
+    cli.enter(
+        __doc__,
+        run,
+        config=Config,
+        reads=("frames", "masks", "scene_template", "agent_template", "scene_localizer", "agent_localizer"),
+        optional=("features",),
+    )

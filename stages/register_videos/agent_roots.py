@@ -69,7 +69,13 @@ class Candidates:
 
 
 def find_roots(
-    clip: Clip, masks: Masks, mesh: Mesh, localizer: Localizer, world_from_camera: Float[np.ndarray, "frame 4 4"], options: RootOptions, rng: np.random.Generator
+    clip: Clip,
+    masks: Masks,
+    mesh: Mesh,
+    localizer: Localizer,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    options: RootOptions,
+    rng: np.random.Generator,
 ) -> Roots:
     """Find the animal's root in every frame that shows it."""
     body = bodies.make_body(mesh, options.fit, rng)
@@ -83,7 +89,9 @@ def find_roots(
     cost, share, visible = np.full(count, np.nan), np.zeros(count), np.zeros(count, bool)
     if not glimpses:
         return Roots(roots, visible, cost, share)
-    candidates = [_candidates(clip, glimpse, body, localizer, index, options) for index, glimpse in enumerate(track(glimpses, "placing the animal"))]
+    candidates = [
+        _candidates(clip, glimpse, body, localizer, index, options) for index, glimpse in enumerate(track(glimpses, "placing the animal"))
+    ]
     path = best_path(clip.timestamp_s, candidates, pace(clip.timestamp_s, glimpses, options.still_weight), options)
     for glimpse, candidate, chosen in zip(glimpses, candidates, path, strict=True):
         placed = bodies.fit(glimpse, body, candidate.world_from_agent[chosen][None], options.fit, tilt=True)
@@ -186,9 +194,15 @@ def _link_cost(before, after, velocity, elapsed, options):
 
 
 def smooth(
-    timestamp_s: Float[np.ndarray, "frame"], world_from_agent: Float[np.ndarray, "frame 4 4"], cost_m: Float[np.ndarray, "frame"], share: Float[np.ndarray, "frame"], options: RootOptions
+    timestamp_s: Float[np.ndarray, "frame"],
+    world_from_agent: Float[np.ndarray, "frame 4 4"],
+    cost_m: Float[np.ndarray, "frame"],
+    share: Float[np.ndarray, "frame"],
+    options: RootOptions,
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Replace each visible root by a local line through its neighbours, weighted by closeness in time, fit and visibility; twice, robustly."""
+    """Replace each visible root by a local line through its neighbours, weighted by closeness in time, fit and
+    visibility; twice, robustly.
+    """
     known = np.flatnonzero(np.isfinite(cost_m))
     result = world_from_agent.copy()
     for _ in range(2):
@@ -199,7 +213,12 @@ def smooth(
             index, gap = known[near], gap[near]
             offset = rigid.log(rigid.inverse(before[frame]) @ world_from_agent[index])
             strange = np.linalg.norm(offset / ([0.35] * 3 + [0.1] * 3), axis=1)
-            weight = np.exp(-0.5 * (gap / options.smooth_s) ** 2) * (0.05 + share[index]) / (1 + strange**2) * np.exp(-(cost_m[index] - np.nanmin(cost_m)) / 0.02)
+            weight = (
+                np.exp(-0.5 * (gap / options.smooth_s) ** 2)
+                * (0.05 + share[index])
+                / (1 + strange**2)
+                * np.exp(-(cost_m[index] - np.nanmin(cost_m)) / 0.02)
+            )
             moment = np.array([weight.sum(), (weight * gap).sum(), (weight * gap**2).sum() + 1e-4 * weight.sum()])
             slope = moment[2] - moment[1] * gap
             share_of = weight * slope / max(moment[0] * moment[2] - moment[1] ** 2, 1e-12)

@@ -61,7 +61,13 @@ class Aligned:
 
 
 def align(
-    clip: Clip, masks: Masks, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], votes: Votes, supports: Bool[np.ndarray, "vote"], options: AlignOptions
+    clip: Clip,
+    masks: Masks,
+    mesh: Mesh,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    votes: Votes,
+    supports: Bool[np.ndarray, "vote"],
+    options: AlignOptions,
 ) -> Aligned:
     """Relax all frames: first depth, votes and odometry from coarse to fine, then pictures as well."""
     place, frames = surface.Surface(mesh), np.arange(len(clip))
@@ -69,21 +75,32 @@ def align(
     voted = _vote_contacts(votes, supports, options)
     odometry = clip.odometry_from_camera if clip.odometry_from_camera is not None else world_from_camera
     looseness = 1.0 if clip.odometry_from_camera is not None else 20.0
-    edges = relax.chain(clip.timestamp_s, odometry, drift_rad_s=np.deg2rad(options.drift_deg_s) * looseness, drift_m_s=options.drift_m_s * looseness)
+    edges = relax.chain(
+        clip.timestamp_s,
+        odometry,
+        drift_rad_s=np.deg2rad(options.drift_deg_s) * looseness,
+        drift_m_s=options.drift_m_s * looseness,
+    )
 
-    def find(poses, reach_m, *more):
+    seen: list[relax.Contacts] = []
+
+    def find(poses, reach_m):
         depth = place.contacts(frames, scans, poses, reach_m)
         sigma = depth.sigma_m * options.depth_inflation
         depth = relax.Contacts(depth.first, depth.second, depth.points_first, depth.points_second, depth.direction_world, sigma)
-        return relax.Contacts.join(depth, *voted, *more)
+        return relax.Contacts.join(depth, *voted, *seen)
 
     reach = tuple(np.geomspace(options.first_reach_m, options.last_reach_m, options.rounds))
     poses = relax.relax(world_from_camera, find, edges, reach_m=reach).world_from_camera
     caster = RayCaster(mesh)
     for _ in range(options.picture_rounds if options.picture_every_frames else 0):
         chosen = frames[:: options.picture_every_frames]
-        seen = [tie for frame in track(chosen, "comparing pictures") if (tie := picture_contacts(clip, masks, caster, int(frame), poses[frame], options)) is not None]
-        poses = relax.relax(poses, lambda p, r: find(p, r, *seen), edges, reach_m=(options.last_reach_m,) * 3).world_from_camera
+        seen[:] = [
+            tie
+            for frame in track(chosen, "comparing pictures")
+            if (tie := picture_contacts(clip, masks, caster, int(frame), poses[frame], options)) is not None
+        ]
+        poses = relax.relax(poses, find, edges, reach_m=(options.last_reach_m,) * 3).world_from_camera
     gap, fit = measure_fit(place, scans, poses)
     return Aligned(poses, scans, gap, fit)
 
@@ -91,7 +108,9 @@ def align(
 def measure_fit(
     place: surface.Surface, scans: list[surface.Scan], world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
-    """Return each frame's median gap (metres) and the share of its depth within 5 cm of the surface, of that within 50 cm."""
+    """Return each frame's median gap (metres) and the share of its depth within 5 cm of the surface, of that within
+    50 cm.
+    """
     gap, fit = np.full(len(scans), np.nan), np.zeros(len(scans))
     for frame, scan in enumerate(scans):
         if len(scan.points_camera):
@@ -105,7 +124,13 @@ def measure_fit(
 def _static_scan(clip, masks, frame, options):
     ignore = cv2.resize((masks[frame] > 0).astype(np.uint8), clip.depth_size[::-1], interpolation=cv2.INTER_NEAREST)
     ignore = cv2.dilate(ignore, np.ones((7, 7), np.uint8)) > 0
-    return surface.scan(clip.depth(frame), clip.depth_intrinsics[frame], stride=options.stride_px, confidence=clip.confidence(frame), ignore=ignore)
+    return surface.scan(
+        clip.depth(frame),
+        clip.depth_intrinsics[frame],
+        stride=options.stride_px,
+        confidence=clip.confidence(frame),
+        ignore=ignore,
+    )
 
 
 def _vote_contacts(votes, supports, options):
@@ -116,11 +141,27 @@ def _vote_contacts(votes, supports, options):
         first, second = np.full(count, votes.frame[vote]), np.full(count, relax.MAP)
         for axis in np.eye(3):
             direction = np.broadcast_to(axis, (count, 3))
-            contacts.append(relax.Contacts(first, second, answer.points_camera, answer.points_map, direction, np.full(count, options.vote_sigma_m)))
+            contacts.append(
+                relax.Contacts(
+                    first,
+                    second,
+                    answer.points_camera,
+                    answer.points_map,
+                    direction,
+                    np.full(count, options.vote_sigma_m),
+                )
+            )
     return contacts
 
 
-def picture_contacts(clip: Clip, masks: Masks, caster: RayCaster, frame: int, world_from_camera: Float[np.ndarray, "4 4"], options: AlignOptions) -> relax.Contacts | None:
+def picture_contacts(
+    clip: Clip,
+    masks: Masks,
+    caster: RayCaster,
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    options: AlignOptions,
+) -> relax.Contacts | None:
     """Tie one frame to the template by optical flow from its rendering to the picture, across the viewing rays."""
     size = (clip.color_size[0] // 2, clip.color_size[1] // 2)
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
@@ -140,7 +181,13 @@ def picture_contacts(clip: Clip, masks: Masks, caster: RayCaster, frame: int, wo
     limit = np.array(clip.depth_size[::-1]) - 1
     column, row = np.clip(pixel.astype(int), 0, limit).T
     z = clip.depth(frame)[row, column]
-    good = known[rows, columns] & (pixel > 0).all(1) & (pixel < limit).all(1) & (np.abs(z - rendered[rows, columns]) < 0.12) & (np.abs(flow[rows, columns]).max(1) < 12)
+    good = (
+        known[rows, columns]
+        & (pixel > 0).all(1)
+        & (pixel < limit).all(1)
+        & (np.abs(z - rendered[rows, columns]) < 0.12)
+        & (np.abs(flow[rows, columns]).max(1) < 12)
+    )
     if good.sum() < 20:
         return None
     mapped = rigid.apply(world_from_camera, (cameras.unproject(start, intrinsics) * rendered[rows, columns][:, None])[good])
@@ -158,8 +205,11 @@ def _even(color: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "h
     """Remove differences of light: grey values minus their local mean over their local spread, unknown pixels flat."""
     gray = cv2.cvtColor(color.astype(np.float32), cv2.COLOR_RGB2GRAY)
     weight = known.astype(np.float32)
-    blur = lambda picture: cv2.GaussianBlur(picture, (0, 0), 9)
-    share = blur(weight) + 1e-3
-    mean = blur(gray * weight) / share
-    spread = np.sqrt(np.maximum(blur((gray - mean) ** 2 * weight) / share, 9.0))
+    share = _blur(weight) + 1e-3
+    mean = _blur(gray * weight) / share
+    spread = np.sqrt(np.maximum(_blur((gray - mean) ** 2 * weight) / share, 9.0))
     return np.clip(128 + 48 * (gray - mean) / spread * weight, 0, 255).astype(np.uint8)
+
+
+def _blur(picture, sigma_px=9):
+    return cv2.GaussianBlur(picture, (0, 0), sigma_px)

@@ -82,9 +82,16 @@ def make_body(mesh: Mesh, options: FitOptions, rng: np.random.Generator) -> Body
 
 
 def observe(
-    clip: Clip, mask: UInt8[np.ndarray, "height width"], frame: int, world_from_camera: Float[np.ndarray, "4 4"], body: Body, options: FitOptions
+    clip: Clip,
+    mask: UInt8[np.ndarray, "height width"],
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    body: Body,
+    options: FitOptions,
 ) -> Glimpse | None:
-    """Lift the masked depth to the world, without the mask's rim and without what lies far from the rest; None if too little is left."""
+    """Lift the masked depth to the world, without the mask's rim and without what lies far from the rest; None if too
+    little is left.
+    """
     inside = mask == 255
     depth = clip.depth(frame)
     small = cv2.resize(inside.astype(np.uint8), depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -103,9 +110,15 @@ def observe(
     column, row = np.clip(pixel.astype(int), 0, limit).T
     full_px = 0.3 * body.length_m**2 * (clip.intrinsics[frame, 0, 0] / np.median(z)) ** 2
     return Glimpse(
-        frame, rigid.apply(world_from_camera, points), clip.color(frame)[row, column] / 255.0, inside, depth, world_from_camera, clip.intrinsics[frame],
-        float(min(1.0, inside.sum() / full_px)),
-    )  # fmt: skip
+        frame=frame,
+        points_world=rigid.apply(world_from_camera, points),
+        color=clip.color(frame)[row, column] / 255.0,
+        mask=inside,
+        depth=depth,
+        world_from_camera=world_from_camera,
+        intrinsics=clip.intrinsics[frame],
+        share=float(min(1.0, inside.sum() / full_px)),
+    )
 
 
 def starts(glimpse: Glimpse, body: Body, headings: int) -> Float[np.ndarray, "start 4 4"]:
@@ -120,7 +133,9 @@ def starts(glimpse: Glimpse, body: Body, headings: int) -> Float[np.ndarray, "st
     return rigid.make(rotation, behind - rotation @ centre)
 
 
-def fit(glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "start 4 4"], options: FitOptions, *, tilt: bool) -> Float[np.ndarray, "start 4 4"]:
+def fit(
+    glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "start 4 4"], options: FitOptions, *, tilt: bool
+) -> Float[np.ndarray, "start 4 4"]:
     """Fit from every start: robust point to plane, with a little point to point so that nothing slides away."""
     placed = np.array(world_from_agent, float)
     prior = np.deg2rad(options.tilt_sigma_deg) if tilt else 1e-4
@@ -162,7 +177,9 @@ def _keep_upright(placed, curvature, gradient, prior_rad, point_sigma_m=0.03):
 
 
 def cost(glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "start 4 4"], options: FitOptions) -> Float[np.ndarray, "start"]:
-    """Return metres: truncated distance of the seen points, difference of colour there, and template outside the mask."""
+    """Return metres: truncated distance of the seen points, difference of colour there, and template outside the
+    mask.
+    """
     local = rigid.apply(rigid.inverse(world_from_agent), glimpse.points_world[None])
     distance, nearest = body.tree.query(local)
     seen, model = glimpse.color - glimpse.color.mean(0), body.color[nearest]
@@ -172,7 +189,9 @@ def cost(glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "star
 
 
 def _outside(glimpse, body, world_from_agent):
-    """Return the share of the camera-facing template that should be seen, but where the mask has no animal and depth looks past it."""
+    """Return the share of the camera-facing template that should be seen, but where the mask has no animal and depth
+    looks past it.
+    """
     camera_from_agent = rigid.inverse(glimpse.world_from_camera) @ world_from_agent
     points = rigid.apply(camera_from_agent, body.points_agent[None])
     normals = body.normals_agent @ np.swapaxes(camera_from_agent[:, :3, :3], 1, 2)

@@ -17,7 +17,14 @@ def status(found: Registered | Refused) -> dict:
     """Describe the outcome for ``status.json``."""
     votes = found.votes
     figures = {"frames_localized": votes.asked, "votes": len(votes.frame)}
-    nearest = None if votes.nearest is None else {"inlier_ratio": votes.nearest.inlier_ratio, "world_from_camera": votes.nearest.map_from_camera.round(6).tolist()}
+    nearest = (
+        None
+        if votes.nearest is None
+        else {
+            "inlier_ratio": votes.nearest.inlier_ratio,
+            "world_from_camera": votes.nearest.map_from_camera.round(6).tolist(),
+        }
+    )
     if isinstance(found, Refused):
         return {"registered": False, "reason": found.reason, "nearest_view": nearest, "figures": figures}
     figures |= {
@@ -52,9 +59,21 @@ def pictures(found: Registered | Refused, clip: Clip, maps: Maps) -> list[Pictur
     scene, agent = RayCaster(maps.scene), RayCaster(maps.agent)
     chosen = np.linspace(0, len(clip) - 1, 9).astype(int)[1:-1]
     return [
-        Picture("edges", overview.tile([outlined(found, clip, scene, agent, int(frame)) for frame in chosen], len(chosen)), "Template edges (magenta) and the placed animal (orange) over frames."),
-        Picture("bird", paths(found, maps), "From above: the phone's path (blue), the animal's (orange, yellow towards its head)."),
-        Picture("depth", depth_on_map(found, maps), "Static depth on the map from above: green within 5 cm of the surface, red further away."),
+        Picture(
+            "edges",
+            overview.tile([outlined(found, clip, scene, agent, int(frame)) for frame in chosen], len(chosen)),
+            "Template edges (magenta) and the placed animal (orange) over frames.",
+        ),
+        Picture(
+            "bird",
+            paths(found, maps),
+            "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
+        ),
+        Picture(
+            "depth",
+            depth_on_map(found, maps),
+            "Static depth on the map from above: green within 5 cm of the surface, red further away.",
+        ),
     ]
 
 
@@ -96,7 +115,13 @@ def depth_on_map(found: Registered, maps: Maps) -> np.ndarray:
         points = rigid.apply(found.aligned.world_from_camera[frame], found.aligned.scans[frame].points_camera[::3])
         distance = np.abs(place.distance(points))
         for pixel, far in zip(np.round(picture.pixel(points)).astype(int), distance, strict=True):
-            cv2.circle(picture.image, tuple(int(value) for value in pixel), 1, (210, 50, 40) if far > 0.05 else (50, 170, 80), -1)
+            cv2.circle(
+                picture.image,
+                tuple(int(value) for value in pixel),
+                1,
+                (210, 50, 40) if far > 0.05 else (50, 170, 80),
+                -1,
+            )
     return picture.image
 
 
@@ -110,4 +135,10 @@ def _refused(found, clip, maps):
         return [Picture("frame", middle, "A frame of the recording; no view of the template is like it.")]
     frame = len(clip) // 2
     near = overview.view(RayCaster(maps.scene), found.votes.nearest.map_from_camera, clip.intrinsics[frame], *clip.color_size)
-    return [Picture("nearest", overview.tile([middle, near], 2), "A frame of the recording, and the nearest view of the template.")]
+    return [
+        Picture(
+            "nearest",
+            overview.tile([middle, near], 2),
+            "A frame of the recording, and the nearest view of the template.",
+        )
+    ]

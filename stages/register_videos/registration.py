@@ -1,6 +1,6 @@
 """Register one recording: votes, agreement, alignment, confidence, agent roots, or the reason why it does not fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,7 +10,8 @@ from pipeline.models.localizer import Localizer, calibrate
 from pipeline.progress import log
 from pipeline.space import rigid, surface
 from pipeline.space.meshes import Mesh
-from stages.register_videos import alignment, votes as voting
+from stages.register_videos import alignment
+from stages.register_videos import votes as voting
 from stages.register_videos.agent_roots import RootOptions, Roots, find_roots
 from stages.register_videos.alignment import Aligned, AlignOptions
 from stages.register_videos.votes import VoteOptions, Votes
@@ -26,6 +27,20 @@ class GateOptions:
     """Disturbed poses that calibrate the confidence."""
     bridge_s: float = 0.25
     """Time constant with which confidence is averaged over neighbouring frames, seconds."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a recording is registered."""
+
+    vote: VoteOptions = field(default_factory=VoteOptions)
+    """Which frames vote, and when votes agree."""
+    align: AlignOptions = field(default_factory=AlignOptions)
+    """Weights, reach and rounds of the alignment."""
+    gate: GateOptions = field(default_factory=GateOptions)
+    """When a recording is believed, and its confidence."""
+    root: RootOptions = field(default_factory=RootOptions)
+    """How the animal is placed."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +65,16 @@ class Registered:
     votes: Votes
     supports: Bool[np.ndarray, "vote"]
 
+    def tables(self) -> dict[str, np.ndarray]:
+        """Return the arrays of ``poses.npz`` but the time."""
+        return {
+            "world_from_camera": self.aligned.world_from_camera,
+            "world_from_agent": self.roots.world_from_agent,
+            "confidence": self.confidence.astype(np.float32),
+            "agent_confidence": self.agent_confidence.astype(np.float32),
+            "agent_visible": self.roots.visible,
+        }
+
 
 @dataclass(frozen=True)
 class Refused:
@@ -59,36 +84,43 @@ class Refused:
     votes: Votes
 
 
-def register(
-    clip: Clip, masks: Masks, maps: Maps, *, vote: VoteOptions, align: AlignOptions, gate: GateOptions, root: RootOptions, rng: np.random.Generator
-) -> Registered | Refused:
+def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.random.Generator) -> Registered | Refused:
     """Register one recording, or refuse it with a reason."""
-    votes = voting.collect(clip, masks, maps.scene_localizer, vote)
+    votes = voting.collect(clip, masks, maps.scene_localizer, options.vote)
     if clip.odometry_from_camera is None:
-        start, supports = voting.without_odometry(votes, clip.timestamp_s, vote)
+        start, supports = voting.without_odometry(votes, clip.timestamp_s, options.vote)
     else:
-        agreement = voting.agree(votes, clip.odometry_from_camera, clip.gravity_known, vote)
+        agreement = voting.agree(votes, clip.odometry_from_camera, clip.gravity_known, options.vote)
         supports = agreement.supports if agreement else None
         start = agreement.world_from_odometry @ clip.odometry_from_camera if agreement else None
-    reason = voting.refusal(votes, supports, vote)
+    reason = voting.refusal(votes, supports, options.vote)
     if reason is not None:
         return Refused(reason, votes)
     log(f"{int(supports.sum())} of {votes.asked} localised frames agree")
-    aligned = alignment.align(clip, masks, maps.scene, start, votes, supports, align)
+    aligned = alignment.align(clip, masks, maps.scene, start, votes, supports, options.align)
     fit = float(np.median(aligned.fit))
     log(f"static depth: {np.nanmedian(aligned.gap_m) * 100:.1f} cm from the template, {fit:.0%} within 5 cm")
-    if fit < gate.least_fit:
-        return Refused(f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken", votes)
-    confidence = camera_confidence(clip.timestamp_s, surface.Surface(maps.scene), aligned, gate, rng)
-    roots = find_roots(clip, masks, maps.agent, maps.agent_localizer, aligned.world_from_camera, root, rng)
+    if fit < options.gate.least_fit:
+        return Refused(
+            f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken",
+            votes,
+        )
+    confidence = camera_confidence(clip.timestamp_s, surface.Surface(maps.scene), aligned, options.gate, rng)
+    roots = find_roots(clip, masks, maps.agent, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
     log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
     return Registered(aligned, confidence, roots, agent_confidence(roots), votes, supports)
 
 
 def camera_confidence(
-    timestamp_s: Float[np.ndarray, "frame"], place: surface.Surface, aligned: Aligned, gate: GateOptions, rng: np.random.Generator
+    timestamp_s: Float[np.ndarray, "frame"],
+    place: surface.Surface,
+    aligned: Aligned,
+    gate: GateOptions,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "frame"]:
-    """Calibrate P(within 2 deg and 5 cm) on how much worse depth fits when poses are disturbed on purpose, then average in time."""
+    """Calibrate P(within 2 deg and 5 cm) on how much worse depth fits when poses are disturbed on purpose, then
+    average in time.
+    """
     frames = rng.integers(0, len(aligned.scans), gate.probes)
     size = np.exp(rng.uniform(np.log(0.1), np.log(8.0), gate.probes))[:, None]
     direction = rng.normal(size=(gate.probes, 6)) / np.sqrt(3)
@@ -102,7 +134,9 @@ def camera_confidence(
 
 
 def agent_confidence(roots: Roots, scale_m: float = 0.012, enough: float = 0.15) -> Float[np.ndarray, "frame"]:
-    """Score each root 0..1: full for the video's usual fit in good view, less where it fits worse or little is seen; 0 unseen."""
+    """Score each root 0..1: full for the video's usual fit in good view, less where it fits worse or little is seen;
+    0 unseen.
+    """
     if not roots.visible.any():
         return np.zeros(len(roots.visible))
     usual = np.nanquantile(roots.cost_m, 0.3)

@@ -71,7 +71,13 @@ def collect(clip: Clip, masks: Masks, localizer: Localizer, options: VoteOptions
     asked = np.arange(options.every_frames // 2, len(clip), options.every_frames)
     frames, answers, nearest = [], [], None
     for frame in track(asked.tolist(), "localising frames"):
-        found = localizer.localize(clip.color(frame), clip.depth(frame), clip.depth_intrinsics[frame], clip.intrinsics[frame], masks[frame] == 0)
+        found = localizer.localize(
+            clip.color(frame),
+            clip.depth(frame),
+            clip.depth_intrinsics[frame],
+            clip.intrinsics[frame],
+            masks[frame] == 0,
+        )
         if found and (nearest is None or found[0].inlier_ratio > nearest.inlier_ratio):
             nearest = found[0]
         if found and found[0].probability >= options.least_probability:
@@ -80,8 +86,12 @@ def collect(clip: Clip, masks: Masks, localizer: Localizer, options: VoteOptions
     return Votes(np.array(frames, int), answers, len(asked), nearest)
 
 
-def agree(votes: Votes, odometry_from_camera: Float[np.ndarray, "frame 4 4"], gravity_known: bool, options: VoteOptions) -> Agreement | None:
-    """Find ``world_from_odometry`` by letting each vote propose one and weighing who supports it (4 DoF where gravity is known)."""
+def agree(
+    votes: Votes, odometry_from_camera: Float[np.ndarray, "frame 4 4"], gravity_known: bool, options: VoteOptions
+) -> Agreement | None:
+    """Find ``world_from_odometry`` by letting each vote propose one and weighing who supports it (4 DoF where gravity
+    is known).
+    """
     if not len(votes.frame):
         return None
     odometry, voted = odometry_from_camera[votes.frame], votes.world_from_camera
@@ -105,7 +115,9 @@ def agree(votes: Votes, odometry_from_camera: Float[np.ndarray, "frame 4 4"], gr
 
 
 def keep_upright(
-    proposals: Float[np.ndarray, "vote 4 4"], from_points: Float[np.ndarray, "vote 3"], to_points: Float[np.ndarray, "vote 3"]
+    proposals: Float[np.ndarray, "vote 4 4"],
+    from_points: Float[np.ndarray, "vote 3"],
+    to_points: Float[np.ndarray, "vote 3"],
 ) -> Float[np.ndarray, "vote 4 4"]:
     """Reduce motions to a turn about +y that still takes each point where it was taken."""
     yaw = np.arctan2(proposals[:, 0, 2] - proposals[:, 2, 0], proposals[:, 0, 0] + proposals[:, 2, 2])
@@ -122,15 +134,20 @@ def _supports(world_from_odometry, odometry, voted, options):
 def refusal(votes: Votes, supports: Bool[np.ndarray, "vote"] | None, options: VoteOptions) -> str | None:
     """Say why the votes are not enough, None when they are."""
     if len(votes.frame) < options.least_votes:
-        return f"only {len(votes.frame)} of {votes.asked} frames were recognised: the recording shows little of the room of the walk-through"
+        recognised = f"only {len(votes.frame)} of {votes.asked} frames were recognised"
+        return f"{recognised}: the recording shows little of the walk-through's room"
     count = 0 if supports is None else int(supports.sum())
     if count < options.least_votes or count < options.least_share * len(votes.frame):
         return f"only {count} of {len(votes.frame)} recognised frames agree on where the recording lies"
     return None
 
 
-def without_odometry(votes: Votes, timestamp_s: Float[np.ndarray, "frame"], options: VoteOptions, speed_m_s: float = 1.5) -> tuple[Float[np.ndarray, "frame 4 4"], Bool[np.ndarray, "vote"]]:
-    """Interpolate between votes that most of their neighbours in time can be reached from; for recordings without odometry."""
+def without_odometry(
+    votes: Votes, timestamp_s: Float[np.ndarray, "frame"], options: VoteOptions, speed_m_s: float = 1.5
+) -> tuple[Float[np.ndarray, "frame 4 4"], Bool[np.ndarray, "vote"]]:
+    """Interpolate between votes that most of their neighbours in time can be reached from; for recordings without
+    odometry.
+    """
     voted, time = votes.world_from_camera, timestamp_s[votes.frame]
     supports = np.zeros(len(voted), bool)
     for vote in range(len(voted)):

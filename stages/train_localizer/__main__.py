@@ -51,7 +51,8 @@ def run(task: cli.Task) -> None:
     with task.create() as folder:
         model.save(folder, found, pictures.report(held, task.config.target))
         qa.write(
-            folder, good="held-out renders are answered within a degree or two, and wrong answers get low probabilities",
+            folder,
+            good="held-out renders are answered within a degree or two, wrong answers get low probabilities",
             bad="the histogram has its weight on the right, or confident answers are wrong",
             checks=pictures.checks(held, task.config.target), pictures=pictures.pictures(held, found),
         )  # fmt: skip

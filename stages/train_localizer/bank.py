@@ -35,14 +35,18 @@ def look(view: Photograph, sight: model.Sight) -> model.Patches | None:
 
 def make_bank(views: list[Photograph], sight: model.Sight, channels: int, rng: np.random.Generator) -> model.Bank:
     """Describe all views, fit the principal axes of their descriptors and keep the projections."""
-    seen = [(index, view, patches) for index, view in enumerate(track(views, "describing views")) if (patches := look(view, sight)) is not None]
+    seen = [
+        (index, view, patches) for index, view in enumerate(track(views, "describing views")) if (patches := look(view, sight)) is not None
+    ]
     descriptors = np.concatenate([patches.descriptors for _, _, patches in seen])
     sample = descriptors[rng.choice(len(descriptors), min(len(descriptors), 20000), replace=False)].astype(np.float64)
     mean = sample.mean(0)
     _, axes = np.linalg.eigh((sample - mean).T @ (sample - mean))
     bank = model.Bank(
         descriptors=np.zeros((0, channels), np.float32),
-        points_map=np.concatenate([rigid.apply(view.map_from_camera, patches.points_camera) for _, view, patches in seen]).astype(np.float32),
+        points_map=np.concatenate([rigid.apply(view.map_from_camera, patches.points_camera) for _, view, patches in seen]).astype(
+            np.float32
+        ),
         view=np.repeat([index for index, _, _ in seen], [len(patches.points_camera) for _, _, patches in seen]).astype(np.int32),
         map_from_camera=np.stack([view.map_from_camera for view in views]),
         mean=mean.astype(np.float32),

@@ -29,8 +29,21 @@ def checks(held: HeldOut, target: Target) -> list[Check]:
     rotation, translation = (2.0, 0.05) if target == "scene" else (20.0, 0.08)
     return [
         Check("rotation, median of held-out renders", figures["rotation_deg_median"], "deg", rotation, 10 * rotation),
-        Check("translation, median of held-out renders", figures["translation_m_median"], "m", translation, 10 * translation),
-        Check("right answers (within %g deg, %g m)" % GOOD[target], figures["good_share"], "share", 0.6, 0.1, "higher"),
+        Check(
+            "translation, median of held-out renders",
+            figures["translation_m_median"],
+            "m",
+            translation,
+            10 * translation,
+        ),
+        Check(
+            "right answers (within {:g} deg, {:g} m)".format(*GOOD[target]),
+            figures["good_share"],
+            "share",
+            0.6,
+            0.1,
+            "higher",
+        ),
     ]
 
 
@@ -39,10 +52,24 @@ def pictures(held: HeldOut, localizer: Localizer) -> list[Picture]:
     rotation = np.nan_to_num(held.rotation_deg, nan=180.0)
     worst = np.argsort(-rotation, kind="stable")[:8]
     edge = max(max(view.color.shape[:2]) for view in held.views)
-    tiles = [_label(_square(held.views[index].color, edge), f"{rotation[index]:.1f} deg, p {float(localizer.calibration.probability(held.inlier_ratio[index])):.2f}") for index in worst]
+    tiles = [
+        _label(
+            _square(held.views[index].color, edge),
+            f"{rotation[index]:.1f} deg, p {float(localizer.calibration.probability(held.inlier_ratio[index])):.2f}",
+        )
+        for index in worst
+    ]
     return [
-        Picture("errors", histogram(rotation), "Rotation error of held-out renders in degrees (log scale from 0.1 to 180); green: counted as right."),
-        Picture("worst", overview.tile(tiles, 4), "The eight held-out renders with the largest error, and the probability they were given."),
+        Picture(
+            "errors",
+            histogram(rotation),
+            "Rotation error of held-out renders in degrees (log scale from 0.1 to 180); green: counted as right.",
+        ),
+        Picture(
+            "worst",
+            overview.tile(tiles, 4),
+            "The eight held-out renders with the largest error, and the probability they were given.",
+        ),
     ]
 
 

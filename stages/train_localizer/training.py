@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 
-
 import cv2
 import numpy as np
 from jaxtyping import Float
@@ -68,7 +67,14 @@ class AgentOptions(Options):
     """RANSAC: least side of a triplet, metres."""
 
 
-def train_scene(mesh: Mesh, walk: Float[np.ndarray, "frame 4 4"], floor_m: float, clip: Clip, options: Options, rng: np.random.Generator) -> tuple[model.Localizer, bank.HeldOut]:
+def train_scene(
+    mesh: Mesh,
+    walk: Float[np.ndarray, "frame 4 4"],
+    floor_m: float,
+    clip: Clip,
+    options: Options,
+    rng: np.random.Generator,
+) -> tuple[model.Localizer, bank.HeldOut]:
     """Train on random views of the scene and on frames of the walk-through with their template cameras."""
     caster = RayCaster(mesh)
     scale = options.focal_px / float(np.median(clip.intrinsics[:, 0, 0]))
@@ -113,7 +119,13 @@ def _finish(pictures, draw_query, options, target, rng):
     sight = model.Sight(target, options.focal_px, options.window_px, options.stride_px, options.radii_px)
     made = bank.make_bank(pictures, sight, options.channels, rng)
     unsure = model.Localizer(
-        sight, made, model.Calibration(0.0, 0.0), options.threshold_m, options.spread_m, options.iterations, options.sectors
+        sight,
+        made,
+        model.Calibration(0.0, 0.0),
+        options.threshold_m,
+        options.spread_m,
+        options.iterations,
+        options.sectors,
     )
     held = bank.hold_out(unsure, draw_query, options.held_out)
     return replace(unsure, calibration=model.calibrate(held.inlier_ratio, held.good)), held

@@ -86,7 +86,12 @@ def agent_camera(centre: Float[np.ndarray, "3"], options: ViewOptions, rng: np.r
 
 
 def photograph(
-    caster: RayCaster, map_from_camera: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "3 3"], size: tuple[int, int], options: ViewOptions, rng: np.random.Generator
+    caster: RayCaster,
+    map_from_camera: Float[np.ndarray, "4 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    size: tuple[int, int],
+    options: ViewOptions,
+    rng: np.random.Generator,
 ) -> Photograph:
     """Render a view and disturb its colour; depth stays exact (see `with_depth_noise`)."""
     depth, hits = render_view(caster, map_from_camera, intrinsics, *size)
@@ -96,7 +101,9 @@ def photograph(
     return Photograph(map_from_camera, intrinsics, disturb(color, options, rng), depth, seen)
 
 
-def disturb(color: Float[np.ndarray, "height width 3"], options: ViewOptions, rng: np.random.Generator) -> UInt8[np.ndarray, "height width 3"]:
+def disturb(
+    color: Float[np.ndarray, "height width 3"], options: ViewOptions, rng: np.random.Generator
+) -> UInt8[np.ndarray, "height width 3"]:
     """Change exposure, white balance and gamma, blur a little, add noise."""
     picture = cv2.GaussianBlur(color.astype(np.float32) / 255, (0, 0), max(0.3, rng.uniform(0, options.blur_px)))
     gain = 1 + rng.uniform(-options.gain, options.gain) + rng.normal(0, 0.04, 3)

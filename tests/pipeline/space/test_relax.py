@@ -26,8 +26,9 @@ def plane_contacts(truth, points, normals, frames):
     return relax.Contacts(first, np.full(count, relax.MAP), seen, tiled, np.tile(normals, (len(frames), 1)), np.full(count, 0.01))
 
 
-def test_contacts_recover_displaced_cameras(rng=np.random.default_rng(0)):
-    time, truth, points, normals = corridor(rng)
+def test_contacts_recover_displaced_cameras():
+    rng = np.random.default_rng(0)
+    _, truth, points, normals = corridor(rng)
     start = truth @ rigid.exp(rng.normal(0, 0.05, (FRAMES, 6)))
     contacts = plane_contacts(truth, points, normals, np.arange(FRAMES))
     found = relax.relax(start, lambda *_: contacts, None, reach_m=(0.5,) * 6)
@@ -35,7 +36,8 @@ def test_contacts_recover_displaced_cameras(rng=np.random.default_rng(0)):
     assert np.abs(found.residual_m).max() < 1e-5
 
 
-def test_odometry_carries_frames_without_contacts(rng=np.random.default_rng(1)):
+def test_odometry_carries_frames_without_contacts():
+    rng = np.random.default_rng(1)
     time, truth, points, normals = corridor(rng)
     moved = rigid.exp(np.array([0.1, -0.4, 0.2, 1.0, 2.0, 3.0])) @ truth
     edges = relax.chain(time, moved, drift_rad_s=0.01, drift_m_s=0.01)
@@ -45,11 +47,15 @@ def test_odometry_carries_frames_without_contacts(rng=np.random.default_rng(1)):
     assert np.abs(found.world_from_camera - truth).max() < 1e-4
 
 
-def test_pairs_of_cameras_share_points_and_held_frames_stay(rng=np.random.default_rng(2)):
-    time, truth, points, _ = corridor(rng)
+def test_pairs_of_cameras_share_points_and_held_frames_stay():
+    rng = np.random.default_rng(2)
+    _, truth, _, _ = corridor(rng)
     first, second = np.repeat(np.arange(FRAMES - 1), 60), np.repeat(np.arange(1, FRAMES), 60)
     world = rng.uniform(-2, 2, (len(first), 3))
-    local = [np.einsum("cij,cj->ci", rigid.inverse(truth[index])[:, :3, :3], world) + rigid.inverse(truth[index])[:, :3, 3] for index in (first, second)]
+    local = [
+        np.einsum("cij,cj->ci", rigid.inverse(truth[index])[:, :3, :3], world) + rigid.inverse(truth[index])[:, :3, 3]
+        for index in (first, second)
+    ]
     contacts = relax.Contacts(first, second, *local, np.eye(3)[np.arange(len(first)) % 3], np.full(len(first), 0.01))
     held = np.arange(FRAMES) == 0
     start = truth @ rigid.exp(rng.normal(0, 0.03, (FRAMES, 6)) * ~held[:, None])
@@ -58,8 +64,9 @@ def test_pairs_of_cameras_share_points_and_held_frames_stay(rng=np.random.defaul
     assert (found.world_from_camera[0] == truth[0]).all()
 
 
-def test_gross_outliers_do_not_move_the_answer(rng=np.random.default_rng(3)):
-    time, truth, points, normals = corridor(rng)
+def test_gross_outliers_do_not_move_the_answer():
+    rng = np.random.default_rng(3)
+    _, truth, points, normals = corridor(rng)
     contacts = plane_contacts(truth, points, normals, np.arange(FRAMES))
     wrong = rng.random(len(contacts.first)) < 0.2
     contacts.points_second[wrong] += 1.0
