@@ -35,7 +35,9 @@ class Alignment:
     """root mean square distance to the planes of those"""
 
 
-def depth_view(depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], usable: Bool[np.ndarray, "height width"], stride: int) -> DepthView:
+def depth_view(
+    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], usable: Bool[np.ndarray, "height width"], stride: int
+) -> DepthView:
     """Prepare a depth picture (metres, 0 = unknown) at every ``stride``-th pixel; normals by central differences."""
     points = cameras.back_project(depth, intrinsics)[stride // 2 :: stride, stride // 2 :: stride].astype(np.float32)
     valid = (usable & (depth > 0))[stride // 2 :: stride, stride // 2 :: stride]

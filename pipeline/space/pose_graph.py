@@ -52,7 +52,9 @@ def optimise(
     return poses
 
 
-def _solve(count: int, first: np.ndarray, second: np.ndarray, relative: np.ndarray, residual: np.ndarray, information: np.ndarray) -> Float[np.ndarray, "frame 6"]:
+def _solve(
+    count: int, first: np.ndarray, second: np.ndarray, relative: np.ndarray, residual: np.ndarray, information: np.ndarray
+) -> Float[np.ndarray, "frame 6"]:
     """Solve one Gauss-Newton step for the poses' twists, each on its camera's side."""
     rotation, translation = relative[:, :3, :3], relative[:, :3, 3]
     j_first = -np.broadcast_to(np.eye(6), information.shape)

@@ -70,14 +70,21 @@ def straighten(
 
 
 def chain(
-    view: Callable[[int], DepthView], guess: Callable[[int], Float[np.ndarray, "4 4"]], count: int, options: Straightening
+    view: Callable[[int], DepthView],
+    guess: Callable[[int, Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]],
+    count: int,
+    options: Straightening,
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Make odometry by aligning each depth picture to the one before; ``guess(i)`` begins frame i+1's motion in frame i."""
-    poses = [np.eye(4)]
+    """Make odometry by aligning each depth picture to the one before.
+
+    ``guess(i, last)`` begins the search for frame i+1 in frame i's axes; ``last`` is the motion of the frame before.
+    """
+    poses, last = [np.eye(4)], np.eye(4)
     for index in range(count - 1):
-        start = guess(index)
+        start = guess(index, last)
         found = align_views(view(index), view(index + 1), start, reach_m=options.reach_m, iterations=options.alignment_iterations)
-        poses.append(poses[-1] @ (found.target_from_source if _credible(found, options) else start))
+        last = found.target_from_source if _credible(found, options) else start
+        poses.append(poses[-1] @ last)
     return np.stack(poses)
 
 
@@ -103,7 +110,9 @@ def _pairs(poses: Float[np.ndarray, "frame 4 4"], options: Straightening) -> lis
     return pairs
 
 
-def level(view: Callable[[int], DepthView], world_from_camera: Float[np.ndarray, "frame 4 4"], pictures: int = 20) -> Float[np.ndarray, "frame 4 4"]:
+def level(
+    view: Callable[[int], DepthView], world_from_camera: Float[np.ndarray, "frame 4 4"], pictures: int = 20
+) -> Float[np.ndarray, "frame 4 4"]:
     """Turn a world of unknown gravity so that +y is up: the direction near the cameras' own up that most surfaces face."""
     up = -world_from_camera[:, :3, 1].mean(0)
     up /= np.linalg.norm(up)

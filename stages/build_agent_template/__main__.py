@@ -29,6 +29,7 @@ class Config(Options):
 
 
 def run(task: cli.Task) -> None:
+    """Build the template from the turnaround and write it."""
     folders = {name: task.per_video(name, roles=("turnaround",)) for name in ("frames", "masks", "features")}
     video = next(iter(folders["frames"]))
     if len(folders["frames"]) > 1:
@@ -36,7 +37,8 @@ def run(task: cli.Task) -> None:
     clip, masks = Clip.open(folders["frames"][video]), Masks.open(folders["masks"][video])
     features = arrays.open_lazily(folders["features"][video] / "features.npz", "features")
     template = build(clip, masks, features, task.config, np.random.default_rng(task.config.seed))
-    log(f"surface: {len(template.mesh.vertices)} vertices, {template.around_deg:.0f} deg around, depth agrees within {1000 * template.residual_m:.0f} mm")
+    log(f"surface: {len(template.mesh.vertices)} vertices from {template.around_deg:.0f} deg around")
+    log(f"depth pictures agree within {1000 * template.residual_m:.0f} mm")
     checks, shown = pictures.report(template)
     with task.create() as folder:
         writing.write(folder, template, clip)

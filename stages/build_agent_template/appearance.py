@@ -11,7 +11,11 @@ from pipeline.space.meshes import Mesh, RayCaster, render_view
 
 
 def visibility(
-    mesh_agent: Mesh, agent_from_camera: Float[np.ndarray, "view 4 4"], intrinsics: Float[np.ndarray, "view 3 3"], size: tuple[int, int], tolerance_m: float = 0.01
+    mesh_agent: Mesh,
+    agent_from_camera: Float[np.ndarray, "view 4 4"],
+    intrinsics: Float[np.ndarray, "view 3 3"],
+    size: tuple[int, int],
+    tolerance_m: float = 0.01,
 ) -> tuple[Float[np.ndarray, "view vertex"], Float[np.ndarray, "view vertex 2"]]:
     """Return how squarely each view sees each vertex (0: hidden, 1: face to face) and at which colour pixel.
 
@@ -50,7 +54,9 @@ def gather(
     return mean
 
 
-def _sample(picture: Float[np.ndarray, "height width channel"], position: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point channel"]:
+def _sample(
+    picture: Float[np.ndarray, "height width channel"], position: Float[np.ndarray, "point 2"]
+) -> Float[np.ndarray, "point channel"]:
     """Blend bilinearly at positions in cells; a cell's centre lies in the middle of its square."""
     height, width = picture.shape[:2]
     grid = np.clip(position - 0.5, 0, [width - 1.001, height - 1.001])

@@ -70,7 +70,9 @@ def body_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sp
     return graph
 
 
-def group_cells(graph: scipy.sparse.csr_matrix, cells: Float[np.ndarray, "cell 3"], weight: Float[np.ndarray, "cell"], options: Skeleton) -> Int[np.ndarray, "cell"]:
+def group_cells(
+    graph: scipy.sparse.csr_matrix, cells: Float[np.ndarray, "cell 3"], weight: Float[np.ndarray, "cell"], options: Skeleton
+) -> Int[np.ndarray, "cell"]:
     """Return each cell's bone: farthest-point seeds, then k-medoids by distance through the body."""
     first = int(np.linalg.norm(cells - cells.mean(0), axis=1).argmin())
     seeds, distance = [], dijkstra(graph, directed=False, indices=first)

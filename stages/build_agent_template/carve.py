@@ -16,7 +16,11 @@ class Silhouettes:
         self.within: Int[np.ndarray, "x y z"] = np.zeros(shape, np.int32)
 
     def add(
-        self, labels: UInt8[np.ndarray, "height width"], depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], world_from_camera: Float[np.ndarray, "4 4"]
+        self,
+        labels: UInt8[np.ndarray, "height width"],
+        depth: Float[np.ndarray, "height width"],
+        intrinsics: Float[np.ndarray, "3 3"],
+        world_from_camera: Float[np.ndarray, "4 4"],
     ) -> None:
         """Count one frame; labels 255 animal, 0 not, 128 unknown. A ray beside the animal tells only of cells before its depth."""
         camera_from_world = rigid.inverse(world_from_camera)

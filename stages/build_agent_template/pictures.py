@@ -48,7 +48,9 @@ def report(template: Template) -> tuple[list[Check], list[Picture]]:
         Check("height", float(np.ptp(mesh.vertices[:, 1])), "m"),
         Check("volume", 1000 * float(abs(solid.volume)), "l"),
         Check("head against tail (50 = cannot be told)", 100 * template.head_share, "%", warn=55, better="higher"),
-        Check("bones that move less than 1 % of the surface", float((influence < 0.01 * influence.mean() * len(influence)).sum()), "", warn=8),
+        Check(
+            "bones that move less than 1 % of the surface", float((influence < 0.01 * influence.mean() * len(influence)).sum()), "", warn=8
+        ),
     ]
     bones = Mesh(mesh.vertices, mesh.faces, bone_colors(template.weights))
     pictures = [

@@ -32,7 +32,7 @@ def walk_around(clip: Clip, masks: Masks, options: Straightening) -> Circle:
 
     odometry = clip.odometry_from_camera
     if odometry is None:
-        odometry = chain(view, lambda frame: np.eye(4), len(clip), options)
+        odometry = chain(view, lambda _, last: last, len(clip), options)
     straightened = straighten(view, odometry, options)
     poses = straightened.world_from_camera
     if clip.odometry_from_camera is None or not clip.gravity_known:
@@ -61,5 +61,5 @@ def depth_labels(labels: UInt8[np.ndarray, "height width"], size: tuple[int, int
 def _without_strays(points: Float[np.ndarray, "point 3"], middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "point 3"]:
     """Leave out points much farther from the middle than nearly all others."""
     distance = np.linalg.norm(points - middle, axis=1)
-    near: Bool[np.ndarray, "point"] = distance < 1.3 * np.quantile(distance, 0.98)
+    near: Bool[np.ndarray, point] = distance < 1.3 * np.quantile(distance, 0.98)
     return points[near]

@@ -55,17 +55,26 @@ class Template:
     """how much of the circle the cameras cover"""
 
 
-def build(clip: Clip, masks: Masks, features: Float[np.ndarray, "frame height width 16"], options: Options, rng: np.random.Generator) -> Template:
+def build(
+    clip: Clip, masks: Masks, features: Float[np.ndarray, "frame height width 16"], options: Options, rng: np.random.Generator
+) -> Template:
     """Build the template from one turnaround. Raises InputError AGT-001 when the animal is seen in too few frames."""
     if masks.visible.sum() < LEAST_FRAMES:
-        raise InputError("AGT-001", f"the animal is seen in {int(masks.visible.sum())} frames", str(masks.folder), "circle the resting animal once, the whole of it in view")
+        raise InputError(
+            "AGT-001",
+            f"the animal is seen in {int(masks.visible.sum())} frames",
+            str(masks.folder),
+            "circle the resting animal once, the whole of it in view",
+        )
     circle = walk_around(clip, masks, options.straightening)
     body = fuse(clip, masks, circle, options.fusion)
     heading = find_heading(body.inside_world, circle.ground, options.flip)
     agent_from_world = rigid.inverse(heading.world_from_agent)
     mesh = Mesh(rigid.apply(agent_from_world, body.mesh.vertices.astype(float)).astype(np.float32), body.mesh.faces)
     bones = lay_bones(rigid.apply(agent_from_world, body.inside_world), body.voxel_m, options.skeleton, rng)
-    weights = skinning_weights(*(torch.from_numpy(np.asarray(part, np.float32)) for part in (mesh.vertices, bones.agent_from_bone_rest, bones.bone_scale_m)))
+    weights = skinning_weights(
+        *(torch.from_numpy(np.asarray(part, np.float32)) for part in (mesh.vertices, bones.agent_from_bone_rest, bones.bone_scale_m))
+    )
     cameras = agent_from_world @ circle.world_from_camera
     seen = np.flatnonzero(masks.visible)
     views = seen[np.unique(np.linspace(0, len(seen) - 1, options.views).astype(int))]
@@ -75,7 +84,16 @@ def build(clip: Clip, masks: Masks, features: Float[np.ndarray, "frame height wi
     vertex_features /= np.maximum(np.linalg.norm(vertex_features, axis=1, keepdims=True), 1e-9)
     mesh = Mesh(mesh.vertices, mesh.faces, np.round(color).astype(np.uint8))
     cameras[~masks.visible] = np.nan
-    return Template(mesh, vertex_features, bones, weights.numpy(), cameras, heading.head_share, circle.straightened.residual_m, covered_deg(cameras[seen]))
+    return Template(
+        mesh,
+        vertex_features,
+        bones,
+        weights.numpy(),
+        cameras,
+        heading.head_share,
+        circle.straightened.residual_m,
+        covered_deg(cameras[seen]),
+    )
 
 
 def covered_deg(agent_from_camera: Float[np.ndarray, "frame 4 4"]) -> float:

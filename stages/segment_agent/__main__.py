@@ -30,6 +30,7 @@ class Config(Options):
 
 
 def run(task: cli.Task) -> None:
+    """Segment one recording and write its masks."""
     clip, flow = Clip.open(task.input("frames")), task.input("flow")
     role = next((video.role for video in task.videos if video.id == task.video), task.config.role)
     hint = prompt.parse(task.input("prompt"), clip) if task.has("prompt") else None

@@ -65,7 +65,9 @@ def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], option
     """Read the depth pictures that vote."""
     frames = np.unique(np.linspace(0, len(clip) - 1, min(options.references, len(clip))).round().astype(int))
     depth = np.stack([usable_depth(clip, frame) for frame in frames])
-    nearest = np.stack([_nearest(picture, clip.depth_intrinsics[frame, 0, 0], options) for picture, frame in zip(depth, frames, strict=True)])
+    nearest = np.stack(
+        [_nearest(picture, clip.depth_intrinsics[frame, 0, 0], options) for picture, frame in zip(depth, frames, strict=True)]
+    )
     color = np.stack([soft_color(clip.color(frame), clip.depth_size) for frame in frames])
     return References(rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames], depth, nearest, color, frames)
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeline.files.clips import Clip
 from pipeline.space.straightening import Straightening
-from stages.segment_agent import free_space, prompt as prompts
+from stages.segment_agent import free_space
+from stages.segment_agent import prompt as prompts
 from stages.segment_agent.free_space import FreeSpace
 from stages.segment_agent.movers import Hint, Mover
 from stages.segment_agent.prompt import Prompt
@@ -49,7 +50,9 @@ def segment(
             balls, judge = find_standing(clip, poses, options.turnaround, meeting_point(poses) if place is None else place)
         case "session":
             references = free_space.gather(clip, poses, options.free_space)
-            balls = find_mover(clip, poses, references, options.free_space, options.mover, None if place is None else Hint(hint.frame, place))
+            balls = find_mover(
+                clip, poses, references, options.free_space, options.mover, None if place is None else Hint(hint.frame, place)
+            )
             judge = judge_motion(references, options.free_space, options.mover, options.weighing)
         case _:
             assert_never(role)

@@ -63,7 +63,10 @@ def moving(votes: Votes, options: Mover) -> Bool[np.ndarray, "*shape"]:
 
 
 def candidates(
-    is_moving: Bool[np.ndarray, "height width"], points_world: Float[np.ndarray, "height width 3"], area_m2: Float[np.ndarray, "height width"], options: Mover
+    is_moving: Bool[np.ndarray, "height width"],
+    points_world: Float[np.ndarray, "height width 3"],
+    area_m2: Float[np.ndarray, "height width"],
+    options: Mover,
 ) -> list[Candidate]:
     """Group moving pixels that touch, largest area first; ``area_m2`` is what each pixel covers at its distance."""
     closed = cv2.dilate(is_moving.astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -82,7 +85,9 @@ def candidates(
     return sorted(found, key=lambda candidate: -candidate.area_m2)[: options.candidates]
 
 
-def track(found: Sequence[Sequence[Candidate]], timestamp_s: Float[np.ndarray, "frame"], options: Mover, hint: Hint | None = None) -> Int[np.ndarray, "frame"]:
+def track(
+    found: Sequence[Sequence[Candidate]], timestamp_s: Float[np.ndarray, "frame"], options: Mover, hint: Hint | None = None
+) -> Int[np.ndarray, "frame"]:
     """Choose one candidate per frame (-1: none in view) by the Viterbi algorithm over scores and speeds.
 
     A hint outweighs everything else in its frame.
@@ -91,7 +96,10 @@ def track(found: Sequence[Sequence[Candidate]], timestamp_s: Float[np.ndarray, "
     for index, group in enumerate(found):
         score = np.array([0.0] + [_score(candidate, options) for candidate in group])
         if hint is not None and hint.frame == index:
-            score[1:] += [HINT_REWARD if np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + 0.2 else 0.0 for candidate in group]
+            score[1:] += [
+                HINT_REWARD if np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + 0.2 else 0.0
+                for candidate in group
+            ]
         if index == 0:
             best = [score - options.appear_cost * (np.arange(len(score)) > 0)]
             back.append(np.zeros(len(score), int))
@@ -118,7 +126,9 @@ def _transition(before: Sequence[Candidate], after: Sequence[Candidate], seconds
     step = np.full((len(before) + 1, len(after) + 1), -options.appear_cost)
     step[0, 0] = 0.0
     if before and after:
-        apart = np.linalg.norm(np.stack([c.centre_world for c in before])[:, None] - np.stack([c.centre_world for c in after])[None], axis=-1)
+        apart = np.linalg.norm(
+            np.stack([c.centre_world for c in before])[:, None] - np.stack([c.centre_world for c in after])[None], axis=-1
+        )
         excess = np.maximum(apart - 0.1 - options.speed_m_s * seconds, 0) / 0.3
         step[1:, 1:] = -np.minimum(excess, 2.5 * options.appear_cost)
     return step

@@ -19,15 +19,21 @@ def overlay(color: UInt8[np.ndarray, "height width 3"], labels: UInt8[np.ndarray
     return picture.astype(np.uint8)
 
 
-def contact_sheet(clip: Clip, labels: dict[int, UInt8[np.ndarray, "height width"]], columns: int = 6, width_px: int = 200) -> UInt8[np.ndarray, "height width 3"]:
+def contact_sheet(
+    clip: Clip, labels: dict[int, UInt8[np.ndarray, "height width"]], columns: int = 6, width_px: int = 200
+) -> UInt8[np.ndarray, "height width 3"]:
     """Lay overlays of some frames out in a grid."""
     height_px = round(width_px * clip.color_size[0] / clip.color_size[1])
-    tiles = [cv2.resize(overlay(clip.color(frame), mask), (width_px, height_px), interpolation=cv2.INTER_AREA) for frame, mask in labels.items()]
+    tiles = [
+        cv2.resize(overlay(clip.color(frame), mask), (width_px, height_px), interpolation=cv2.INTER_AREA) for frame, mask in labels.items()
+    ]
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
     return np.vstack([np.hstack(tiles[start : start + columns]) for start in range(0, len(tiles), columns)])
 
 
-def area_strip(area: Float[np.ndarray, "frame"], visible: Bool[np.ndarray, "frame"], height_px: int = 80) -> UInt8[np.ndarray, "height width 3"]:
+def area_strip(
+    area: Float[np.ndarray, "frame"], visible: Bool[np.ndarray, "frame"], height_px: int = 80
+) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the mask's share of the picture over time; frames without the agent are dark red."""
     step = max(1, 720 // max(len(area), 1))
     strip = np.full((height_px, len(area) * step, 3), 24, np.uint8)
@@ -35,7 +41,7 @@ def area_strip(area: Float[np.ndarray, "frame"], visible: Bool[np.ndarray, "fram
         columns = slice(frame * step, (frame + 1) * step)
         if not visible[frame]:
             strip[:, columns] = (70, 20, 20)
-        top = height_px - int(round(height_px * share / max(area.max(), 1e-6)))
+        top = height_px - round(height_px * float(share / max(area.max(), 1e-6)))
         strip[top:, columns] = GREEN
     return strip
 
@@ -48,7 +54,9 @@ def flicker(area: Float[np.ndarray, "frame"], visible: Bool[np.ndarray, "frame"]
     return float(np.median(np.abs(np.diff(area))[both] / np.maximum(area[1:], area[:-1])[both]))
 
 
-def report(clip: Clip, labels: dict[int, np.ndarray], area: np.ndarray, visible: np.ndarray, residual_m: float) -> tuple[list[Check], list[Picture]]:
+def report(
+    clip: Clip, labels: dict[int, np.ndarray], area: np.ndarray, visible: np.ndarray, residual_m: float
+) -> tuple[list[Check], list[Picture]]:
     """Return the stage's figures and pictures."""
     checks = [
         Check("agent visible", 100 * float(visible.mean()), "%", warn=30, fail=2, better="higher"),

@@ -31,7 +31,12 @@ def parse(path: Path, clip: Clip) -> Prompt:
         if not (0 <= frame < len(clip) and 0 <= x0 <= x1 <= clip.color_size[1] and 0 <= y0 <= y1 <= clip.color_size[0]):
             raise ValueError(f"frame {frame}, box {box} is not inside the recording")
     except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError("MSK-001", f"not a usable hint: {error}", str(path), "give `frame = 12` and `box = [x0, y0, x1, y1]` or `click = [x, y]` in colour pixels") from error
+        raise InputError(
+            "MSK-001",
+            f"not a usable hint: {error}",
+            str(path),
+            "give `frame = 12` and `box = [x0, y0, x1, y1]` or `click = [x, y]` in colour pixels",
+        ) from error
     return Prompt(frame, (x0, y0, x1, y1))
 
 
@@ -43,7 +48,12 @@ def position(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "f
     low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)
     depth = usable_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():
-        raise InputError("MSK-002", "the hint lies where depth is unknown", f"frame {prompt.frame}", "point at another part of the animal or another frame")
+        raise InputError(
+            "MSK-002",
+            "the hint lies where depth is unknown",
+            f"frame {prompt.frame}",
+            "point at another part of the animal or another frame",
+        )
     z = float(np.quantile(depth[depth > 0], 0.3))
     point_camera = cameras.unproject(centre / scale, clip.intrinsics[prompt.frame]) * z
     return rigid.apply(world_from_camera[prompt.frame], point_camera[None])[0]

@@ -40,7 +40,9 @@ class Palette:
         """Add the colours of pixels that surely show the animal."""
         np.add.at(self._counts, _bin(color), 1.0)
 
-    def ratio(self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    def ratio(
+        self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
+    ) -> Float[np.ndarray, "height width"]:
         """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks pixels that surely show the room."""
         if self._counts.sum() < 50 or room.sum() < 50:
             return np.zeros(color.shape[:2], np.float32)
@@ -52,7 +54,10 @@ class Palette:
 
 
 def sharpen(
-    evidence: Float[np.ndarray, "height width"], certainty: Float[np.ndarray, "height width"], color: UInt8[np.ndarray, "height width 3"], options: Refinement
+    evidence: Float[np.ndarray, "height width"],
+    certainty: Float[np.ndarray, "height width"],
+    color: UInt8[np.ndarray, "height width 3"],
+    options: Refinement,
 ) -> Float[np.ndarray, "height width"]:
     """Spread log-odds along the picture: where certainty is low the neighbours of like colour decide."""
     guide = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32) / 255
@@ -61,7 +66,9 @@ def sharpen(
     return filtered[..., 0] / np.maximum(filtered[..., 1], 0.05)
 
 
-def label(log_odds: Float[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"], options: Refinement) -> UInt8[np.ndarray, "height width"]:
+def label(
+    log_odds: Float[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"], options: Refinement
+) -> UInt8[np.ndarray, "height width"]:
     """Decide 255 / 0 / 128: parts that hold sure pixels stay, holes close, a weak boundary is unknown."""
     inside = (log_odds > 0).astype(np.uint8)
     count, parts, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)
@@ -78,7 +85,7 @@ def label(log_odds: Float[np.ndarray, "height width"], sure: Bool[np.ndarray, "h
 
 def _fill_holes(inside: UInt8[np.ndarray, "height width"], limit: float) -> UInt8[np.ndarray, "height width"]:
     """Close holes smaller than a share of the whole."""
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(1 - inside, connectivity=4)
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(1 - inside, connectivity=4)
     small = stats[:, cv2.CC_STAT_AREA] < limit * max(int(inside.sum()), 1)
     small[0] = False
     return np.where(small[parts], 1, inside).astype(np.uint8)

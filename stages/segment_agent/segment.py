@@ -118,7 +118,9 @@ def recolored(window: Window, votes: Votes, settled: Bool[np.ndarray, "height wi
     return np.where(settled, np.clip(difference / noise - 3, 0, 6), 0)
 
 
-def learn_palette(clip: Clip, world_from_camera: np.ndarray, balls: list[Sphere | None], judge: Judge, options: Refinement, pictures: int = 30) -> Palette:
+def learn_palette(
+    clip: Clip, world_from_camera: np.ndarray, balls: list[Sphere | None], judge: Judge, options: Refinement, pictures: int = 30
+) -> Palette:
     """Learn the animal's colours from frames spread over the recording."""
     palette = Palette()
     seen = [frame for frame, ball in enumerate(balls) if ball is not None]
@@ -131,7 +133,12 @@ def learn_palette(clip: Clip, world_from_camera: np.ndarray, balls: list[Sphere 
 
 
 def paint(
-    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], balls: list[Sphere | None], judge: Judge, palette: Palette, options: Refinement
+    clip: Clip,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    balls: list[Sphere | None],
+    judge: Judge,
+    palette: Palette,
+    options: Refinement,
 ) -> Iterator[Mask]:
     """Make one mask per frame, in order."""
     for frame, ball in enumerate(balls):
@@ -139,7 +146,9 @@ def paint(
         yield _paint_one(clip, frame, window, ball, judge, palette, options)
 
 
-def _paint_one(clip: Clip, frame: int, window: Window | None, ball: Sphere | None, judge: Judge, palette: Palette, options: Refinement) -> Mask:
+def _paint_one(
+    clip: Clip, frame: int, window: Window | None, ball: Sphere | None, judge: Judge, palette: Palette, options: Refinement
+) -> Mask:
     empty = np.zeros(clip.color_size, np.uint8)
     if window is None:
         return Mask(empty, False, 1.0)

@@ -38,14 +38,16 @@ def steady(clip: Clip, flow: Path, options: Straightening, rng: np.random.Genera
     poses = clip.odometry_from_camera
     if poses is None:
         forward = arrays.open_lazily(flow / "flow_1_fw.npz", "flow")
-        poses = chain(view, lambda frame: motion_from_flow(clip, frame, forward[frame], rng), len(clip), options)
+        poses = chain(view, lambda frame, _: motion_from_flow(clip, frame, forward[frame], rng), len(clip), options)
     found = straighten(view, poses, options)
     level_known = clip.odometry_from_camera is not None and clip.gravity_known
     poses = found.world_from_camera if level_known else level(view, found.world_from_camera)
     return Trajectory(poses, clip.odometry_from_camera is not None, found.edges, found.residual_m)
 
 
-def motion_from_flow(clip: Clip, frame: int, flow: Float[np.ndarray, "height width 2"], rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+def motion_from_flow(
+    clip: Clip, frame: int, flow: Float[np.ndarray, "height width 2"], rng: np.random.Generator
+) -> Float[np.ndarray, "4 4"]:
     """Return ``first_from_second`` of a frame and the next from where the pixels went and how deep they were."""
     height, width = flow.shape[:2]
     pixel = cameras.pixel_grid(height, width) * FLOW_STRIDE

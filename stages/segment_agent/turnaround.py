@@ -55,7 +55,9 @@ class Cluster:
         return inside & self.cells[at[..., 0], at[..., 1], at[..., 2]]
 
 
-def find_standing(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"]) -> tuple[list[Sphere | None], Judge]:
+def find_standing(
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"]
+) -> tuple[list[Sphere | None], Judge]:
     """Locate what stands at the focus; return a ball per frame and the judge of its points. World: +y up.
 
     Raises InputError MSK-003 when nothing stands there.
@@ -65,7 +67,12 @@ def find_standing(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"],
     ground = fit_ground(points[level], focus)
     cluster = find_cluster(points[ground.above(points) > options.clearance_m], focus, options)
     if not cluster.cells.any():
-        raise InputError("MSK-003", "nothing stands where the cameras look", str(clip.folder), "circle the resting animal with the phone pointed at it, or give a hint")
+        raise InputError(
+            "MSK-003",
+            "nothing stands where the cameras look",
+            str(clip.folder),
+            "circle the resting animal with the phone pointed at it, or give a hint",
+        )
     centres = cluster.origin + (np.argwhere(cluster.cells) + 0.5) * cluster.voxel_m
     middle = (centres.min(0) + centres.max(0)) / 2
     ball = Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + 0.05))
@@ -101,7 +108,9 @@ def find_cluster(points_world: Float[np.ndarray, "point 3"], focus: Float[np.nda
     return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, options.voxel_m)
 
 
-def _points_near(clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, options: Turnaround, frames: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+def _points_near(
+    clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, options: Turnaround, frames: Iterable[int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Read points within reach of the focus and whether they face upward."""
     points, level = [], []
     for frame in frames:

@@ -1,0 +1,129 @@
+"""The template of a rendered blocky animal: its surface, its axes, its bones, and where the cameras were."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from pipeline.errors import InputError
+from pipeline.files.clips import Clip
+from pipeline.space import rigid
+from stages.build_agent_template.bones import Skeleton, lay_bones
+from stages.build_agent_template.carve import Silhouettes
+from stages.build_agent_template.template import Options, build
+
+_spec = importlib.util.spec_from_file_location("room_with_animal", Path(__file__).parent.parent / "room_with_animal.py")
+scenery = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scenery)
+
+
+class TrueMasks:
+    """The recording's true masks, as `pipeline.files.clips.Masks` gives them."""
+
+    def __init__(self, masks, folder):
+        self.masks, self.folder, self.visible = masks, folder, masks.any((1, 2))
+
+    def __len__(self):
+        return len(self.masks)
+
+    def __getitem__(self, frame):
+        return np.where(self.masks[frame], 255, 0).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def turnaround(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("turnaround") / "frames"
+    poses, agent = scenery.turnaround(36)
+    truth = scenery.record(folder, poses, agent, scenery.drifted(poses))
+    features = np.random.default_rng(0).normal(size=(36, 15, 11, 16)).astype(np.float16)
+    return Clip.open(folder), TrueMasks(truth.masks, folder), features, rigid.inverse(agent) @ poses
+
+
+@pytest.fixture(scope="module")
+def template(turnaround):
+    clip, masks, features, _ = turnaround
+    return build(clip, masks, features, Options(), np.random.default_rng(0))
+
+
+def true_from_ours(template, turnaround):
+    """Agent frame of the truth from ours, by the cameras."""
+    return rigid.make(
+        rigid.mean_rotation((turnaround[3] @ rigid.inverse(template.agent_from_camera))[:, :3, :3]),
+        np.median((turnaround[3] @ rigid.inverse(template.agent_from_camera))[:, :3, 3], axis=0),
+    )
+
+
+def test_the_surface_is_closed_and_near_the_truth(template, turnaround):
+    mesh = trimesh.Trimesh(template.mesh.vertices, template.mesh.faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.volume > 0, "faces look outward"
+    assert 1000 < len(mesh.vertices) < 4000
+    ours = rigid.apply(true_from_ours(template, turnaround), mesh.sample(4000, seed=0))
+    true = scenery.animal().sample(20000, seed=0)
+    assert cKDTree(true).query(ours)[0].mean() < 0.012, "metres; cells of 8 mm, depth noise of 5 mm, pixels of 11 mm"
+
+
+def test_the_axes_point_up_and_to_the_head(template, turnaround):
+    turn = true_from_ours(template, turnaround)[:3, :3]
+    assert np.degrees(rigid.rotation_angle(turn, np.eye(3))) < 6
+    assert template.head_share > 0.6
+
+
+def test_flip_turns_the_animal_round(turnaround, template):
+    clip, masks, features, _ = turnaround
+    flipped = build(clip, masks, features, replace(Options(), flip=True), np.random.default_rng(0))
+    between = flipped.agent_from_camera[0, :3, :3] @ template.agent_from_camera[0, :3, :3].T
+    assert np.allclose(between, np.diag([-1, 1, -1]), atol=1e-6)
+
+
+def test_cameras_stand_where_they_stood(template, turnaround):
+    placed = true_from_ours(template, turnaround) @ template.agent_from_camera
+    error = np.linalg.norm(placed[:, :3, 3] - turnaround[3][:, :3, 3], axis=1)
+    assert np.median(error) < 0.015, "metres; odometry drifts by some centimetres on the circle"
+    assert template.around_deg > 340
+
+
+def test_skin_and_features_are_normalised(template):
+    assert template.weights.shape == (len(template.mesh.vertices), 25)
+    assert np.allclose(template.weights.sum(1), 1, atol=1e-5)
+    assert np.allclose(np.linalg.norm(template.features, axis=1), 1, atol=1e-3)
+    assert np.allclose(np.linalg.det(template.bones.agent_from_bone_rest[:, :3, :3]), 1)
+
+
+def test_limbs_have_bones_of_their_own():
+    """Cells of the true animal: every paw, the head and the tail's tip belong to different bones."""
+    grid = np.stack(np.meshgrid(*[np.arange(-0.4, 0.4, 0.012)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    parts = scenery.animal().split()
+    inside = grid[np.any([np.all((grid > part.bounds[0]) & (grid < part.bounds[1]), axis=1) for part in parts], axis=0)]
+    bones = lay_bones(inside, 0.012, Skeleton(), np.random.default_rng(0))
+    tips = np.array([[x, -0.21, z] for x in (-0.05, 0.05) for z in (-0.16, 0.16)] + [[0, 0.12, 0.28], [0, 0.06, -0.36]])
+    nearest = np.linalg.norm(bones.agent_from_bone_rest[None, :, :3, 3] - tips[:, None], axis=-1)
+    assert len(set(nearest.argmin(1))) == len(tips)
+    assert nearest.min(1).max() < 0.07, "metres from a tip to its bone's centre"
+    assert (bones.bone_scale_m > 0.01).all()
+
+
+def test_the_same_seed_gives_the_same_template(turnaround, template):
+    clip, masks, features, _ = turnaround
+    again = build(clip, masks, features, Options(), np.random.default_rng(0))
+    assert np.array_equal(again.mesh.vertices, template.mesh.vertices)
+    assert np.array_equal(again.weights, template.weights)
+
+
+def test_silhouettes_count_only_what_a_ray_passes():
+    grid = Silhouettes(np.array([0.0, 0.0, 1.0]), (1, 1, 3), 0.5)
+    intrinsics = np.array([[10.0, 0, 2], [0, 10.0, 2], [0, 0, 1]])
+    grid.add(np.zeros((4, 4), np.uint8), np.full((4, 4), 1.7, np.float32), intrinsics, np.eye(4))
+    grid.add(np.full((4, 4), 255, np.uint8), np.full((4, 4), 1.2, np.float32), intrinsics, np.eye(4))
+    assert grid.share_beside().reshape(-1).tolist() == [0.5, 0.5, 0.0], "the third cell lies behind what the ray met"
+
+
+def test_too_few_frames_are_refused(turnaround):
+    clip, masks, features, _ = turnaround
+    few = TrueMasks(np.where(np.arange(36)[:, None, None] < 5, masks.masks, False), masks.folder)
+    with pytest.raises(InputError, match="AGT-001"):
+        build(clip, few, features, Options(), np.random.default_rng(0))

@@ -1,0 +1,116 @@
+"""A small rendered recording with truth: a furnished box room and a blocky animal, written as a frames artifact."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from pipeline.files import arrays, images
+from pipeline.space import cameras, rigid
+from pipeline.space.meshes import Mesh, RayCaster
+
+COLOR_SIZE, DEPTH_SIZE = (120, 90), (120, 90)
+INTRINSICS = np.array([[84.0, 0, 45], [0, 84.0, 60], [0, 0, 1]])
+UP = np.array([0.0, 1.0, 0.0])
+ROOM_COLOR, ANIMAL_COLOR = np.array([120, 130, 150]), np.array([190, 120, 50])
+
+
+def box(size, at) -> trimesh.Trimesh:
+    return trimesh.creation.box(size, rigid.make(np.eye(3), np.array(at, float)))
+
+
+def room() -> trimesh.Trimesh:
+    """4 x 2.4 x 3.4 m, floor at 0, three pieces of furniture."""
+    walls = box((4, 2.4, 3.4), (0, 1.2, 0))
+    walls.invert()
+    furniture = [
+        box((0.6, 0.5, 0.9), (1.5, 0.25, 0.9)),
+        box((0.4, 1.1, 0.4), (-1.5, 0.55, -1.1)),
+        box((0.8, 0.35, 0.4), (-1.2, 0.175, 1.2)),
+    ]
+    return trimesh.util.concatenate([walls, *furniture])
+
+
+def animal() -> trimesh.Trimesh:
+    """Body, head, tail and four legs as overlapping boxes; root in the body, +y up, head towards +z, paws at -0.22."""
+    parts = [box((0.14, 0.15, 0.4), (0, 0, 0)), box((0.12, 0.13, 0.14), (0, 0.12, 0.24)), box((0.03, 0.03, 0.2), (0, 0.06, -0.28))]
+    parts += [box((0.05, 0.2, 0.05), (x, -0.12, z)) for x in (-0.05, 0.05) for z in (-0.16, 0.16)]
+    return trimesh.util.concatenate(parts)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was rendered."""
+
+    world_from_camera: np.ndarray
+    world_from_agent: np.ndarray
+    masks: np.ndarray
+
+
+def record(
+    folder: Path, world_from_camera: np.ndarray, world_from_agent: np.ndarray, odometry: np.ndarray | None, seed: int = 0
+) -> Recording:
+    """Render a frames artifact into ``folder``; an agent pose of NaN leaves the animal out."""
+    rng = np.random.default_rng(seed)
+    still, body = room(), animal()
+    for name in ("color", "depth", "confidence"):
+        (folder / name).mkdir(parents=True)
+    masks = []
+    for frame, (camera, agent) in enumerate(zip(world_from_camera, world_from_agent, strict=True)):
+        mesh = still if np.isnan(agent).any() else trimesh.util.concatenate([still, body.copy().apply_transform(agent)])
+        directions = cameras.ray_directions(INTRINSICS, *COLOR_SIZE).reshape(-1, 3) @ camera[:3, :3].T
+        hits = RayCaster(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces))).cast(camera[:3, 3], directions)
+        on_animal = hits.face >= len(still.faces)
+        points = camera[:3, 3] + directions * hits.distance[:, None]
+        check = np.where(np.floor(points / 0.17 + 0.013).astype(int).sum(1) % 2, 25, -25)[:, None]
+        color = np.where(on_animal[:, None], ANIMAL_COLOR, ROOM_COLOR + check) + rng.normal(0, 4, (len(points), 3))
+        depth = hits.distance + rng.normal(0, 0.005, len(points))
+        images.write_color(folder / "color" / f"{frame:06d}.jpg", np.clip(color, 0, 255).astype(np.uint8).reshape(*COLOR_SIZE, 3))
+        images.write_depth(folder / "depth" / f"{frame:06d}.exr", depth.reshape(DEPTH_SIZE))
+        images.write_gray(folder / "confidence" / f"{frame:06d}.png", np.full(DEPTH_SIZE, 2, np.uint8))
+        masks.append(on_animal.reshape(COLOR_SIZE))
+    count = len(world_from_camera)
+    table = {"odometry_from_camera": odometry} if odometry is not None else {}
+    arrays.save(
+        folder / "frames.npz",
+        timestamp_s=np.arange(count) * 0.1,
+        intrinsics=np.repeat(INTRINSICS[None], count, 0),
+        depth_intrinsics=np.repeat(INTRINSICS[None], count, 0),
+        gravity_known=np.array(True),
+        quality=np.ones(count, np.float32),
+        **table,
+    )
+    return Recording(world_from_camera, world_from_agent, np.stack(masks))
+
+
+def drifted(world_from_camera: np.ndarray, seed: int = 1) -> np.ndarray:
+    """Odometry with its own heading and origin that drifts 2 mm and 0.05 degrees a frame."""
+    rng = np.random.default_rng(seed)
+    relative = rigid.inverse(world_from_camera[:-1]) @ world_from_camera[1:]
+    noise = rigid.exp(rng.normal(0, [0.0009] * 3 + [0.002] * 3, (len(relative), 6)))
+    found = [rigid.exp(np.array([0, 1.1, 0, 0.4, 0.2, -0.7])) @ world_from_camera[0]]
+    for step, wrong in zip(relative, noise, strict=True):
+        found.append(found[-1] @ step @ wrong)
+    return np.stack(found)
+
+
+def turnaround(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Camera and agent poses of a full circle around the standing animal."""
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    middle = np.array([0.1, 0.2, -0.1])
+    eyes = middle + np.stack([0.95 * np.cos(angles), 0.55 + 0.1 * np.sin(2 * angles), 0.95 * np.sin(angles)], axis=1)
+    poses = np.stack([rigid.look_at(eye, middle, UP) for eye in eyes])
+    agent = rigid.exp(np.array([0, 0.6, 0, 0.1, 0.22, -0.1]))
+    return poses, np.repeat(agent[None], count, 0)
+
+
+def session(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """The animal walks, rests for the middle half, walks on, and is away in the last frames; the phone sways and follows."""
+    time = np.linspace(0, 1, count)
+    along = np.interp(time, [0, 0.25, 0.75, 0.95], [-0.7, 0.0, 0.0, 0.7])
+    agent = np.stack([rigid.exp(np.array([0, np.pi / 2, 0, x, 0.22, -0.2])) for x in along])
+    agent[-3:] = np.nan
+    eyes = np.stack([0.3 * np.sin(3 * time), 1.1 + 0.05 * np.cos(9 * time), 1.3 + 0.1 * np.sin(5 * time)], axis=1)
+    poses = np.stack([rigid.look_at(eye, np.array([0.4 * x, 0.2, -0.2]), UP) for eye, x in zip(eyes, along, strict=True)])
+    return poses, agent

@@ -1,0 +1,111 @@
+"""Masks of small rendered recordings with truth: walking, resting, away; standing for the turnaround; hints."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.files import arrays
+from pipeline.files.clips import Clip
+from stages.segment_agent import masks, movers, prompt
+from stages.segment_agent.masks import Options
+from stages.segment_agent.movers import Candidate, Hint, Mover
+
+_spec = importlib.util.spec_from_file_location("room_with_animal", Path(__file__).parent.parent / "room_with_animal.py")
+scenery = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scenery)
+
+
+def iou(found, truth) -> float:
+    return (found & truth).sum() / max((found | truth).sum(), 1)
+
+
+def make(folder, role, poses, agent, odometry, flow=Path("none"), hint=None):
+    """Record, segment, and return the masks with the truth."""
+    truth = scenery.record(folder, poses, agent, odometry)
+    found, _ = masks.segment(Clip.open(folder), flow, role, hint, Options(), np.random.default_rng(0))
+    return list(found), truth
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    poses, agent = scenery.session()
+    return make(tmp_path_factory.mktemp("walk") / "frames", "session", poses, agent, scenery.drifted(poses))
+
+
+def test_a_walking_and_a_resting_animal_is_found(walk):
+    found, truth = walk
+    scores = np.array([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)][:-3])
+    assert scores.mean() > 0.8, "share; the pictures are 90 pixels wide"
+    assert scores[12:28].mean() > 0.8, "at rest"
+    assert scores.min() > 0.6
+
+
+def test_an_absent_animal_leaves_frames_empty(walk):
+    found, _ = walk
+    assert [mask.visible for mask in found[-3:]] == [False] * 3
+    assert not any(mask.labels.any() for mask in found[-3:])
+
+
+def test_masks_speak_three_values_at_colour_resolution(walk):
+    for mask in walk[0]:
+        assert mask.labels.shape == scenery.COLOR_SIZE
+        assert mask.labels.dtype == np.uint8
+        assert set(np.unique(mask.labels)) <= {0, 128, 255}
+        assert 0 <= mask.confidence <= 1
+
+
+def test_a_standing_animal_is_found_from_around(tmp_path):
+    poses, agent = scenery.turnaround(30)
+    found, truth = make(tmp_path / "frames", "turnaround", poses, agent, scenery.drifted(poses))
+    assert np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.85
+
+
+def test_a_recording_without_odometry_still_works(tmp_path):
+    poses, agent = scenery.turnaround(40)
+    flow = tmp_path / "flow"
+    flow.mkdir()
+    forward = np.zeros((39, scenery.COLOR_SIZE[0] // 4, scenery.COLOR_SIZE[1] // 4, 2), np.float16)
+    arrays.save(flow / "flow_1_fw.npz", flow=forward)
+    found, truth = make(tmp_path / "frames", "turnaround", poses, agent, None, flow)
+    assert np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.6
+
+
+def candidate(x, area=0.03):
+    return Candidate(np.array([x, 0.0, 0.0]), area, 0.2, 2.0)
+
+
+def test_the_track_prefers_a_steady_mover_to_larger_flashes():
+    steady = [[candidate(0.05 * i, 0.02)] for i in range(12)]
+    for i in (3, 7):
+        steady[i].append(candidate(3.0 + i, 0.04))
+    assert movers.track(steady, np.arange(12) * 0.1, Mover()).tolist() == [0] * 12
+
+
+def test_a_hint_decides_between_two_movers():
+    both = [[candidate(0.0, 0.05), candidate(2.0, 0.02)] for _ in range(10)]
+    time = np.arange(10) * 0.1
+    assert set(movers.track(both, time, Mover())) == {0}
+    assert set(movers.track(both, time, Mover(), Hint(4, np.array([2.0, 0.0, 0.0])))) == {1}
+
+
+@pytest.mark.parametrize(
+    "text", ["frame = 999\nclick = [3, 4]", "frame = 0", "frame = 0\nbox = [5, 5, 900, 9]", "frame = [", "frame = 0\nclick = 'x'"]
+)
+def test_a_wrong_hint_is_refused(tmp_path, text):
+    poses, agent = scenery.turnaround(2)
+    scenery.record(tmp_path / "frames", poses, agent, poses)
+    (tmp_path / "hint.toml").write_text(text)
+    with pytest.raises(InputError, match="MSK-001"):
+        prompt.parse(tmp_path / "hint.toml", Clip.open(tmp_path / "frames"))
+
+
+def test_a_click_finds_the_surface(tmp_path):
+    poses, agent = scenery.turnaround(2)
+    scenery.record(tmp_path / "frames", poses, agent, poses)
+    clip = Clip.open(tmp_path / "frames")
+    (tmp_path / "hint.toml").write_text("frame = 1\nclick = [45, 60]")
+    place = prompt.position(prompt.parse(tmp_path / "hint.toml", clip), clip, poses)
+    assert np.linalg.norm(place - agent[0, :3, 3]) < 0.2, "the middle of the picture shows the body, 14 cm thick"
