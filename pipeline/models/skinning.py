@@ -51,8 +51,8 @@ def skinning_weights(
     return (logits if delta is None else logits + delta).softmax(-1)
 
 
-def _multiply(first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Multiply quaternions wxyz."""
+def multiply(first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Multiply quaternions wxyz (Hamilton product); leading axes broadcast."""
     w, vector, scalar, other = first[..., :1], first[..., 1:], second[..., :1], second[..., 1:]
     vector, other = torch.broadcast_tensors(vector, other)
     real = w * scalar - (vector * other).sum(-1, keepdim=True)
@@ -74,7 +74,7 @@ def blend(
     """
     motion = agent_from_bone @ rigid_torch.inverse(agent_from_bone_rest)
     real = rigid_torch.quaternion_from_rotation(motion[..., :3, :3])
-    dual = 0.5 * _multiply(functional.pad(motion[..., :3, 3], (1, 0)), real)
+    dual = 0.5 * multiply(functional.pad(motion[..., :3, 3], (1, 0)), real)
     with torch.no_grad():
         sign = torch.where(real @ real.transpose(-1, -2) < 0, -1.0, 1.0).to(weights)
         strongest = weights.argmax(-1)
@@ -85,7 +85,7 @@ def blend(
     length = real.norm(dim=-1, keepdim=True)
     real, dual = real / length, dual / length
     conjugate = real * real.new_tensor([1.0, -1.0, -1.0, -1.0])
-    translation = 2 * _multiply(dual, conjugate)[..., 1:]
+    translation = 2 * multiply(dual, conjugate)[..., 1:]
     return rigid_torch.make(rigid_torch.rotation_from_quaternion(real), translation)
 
 

@@ -56,10 +56,11 @@ def run(task: cli.Task) -> None:
     records = optimise.optimise(problem, plan)
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
     motions = results.motions(problem, videos, config.longest_gap_s)
+    sessions = [video.id for video in videos if video.camera_free]
     scene, agent = results.scene_surface(problem, config.scene_step_m), results.agent_surface(problem, config.agent_step_m)
     with task.create() as folder:
-        writing.write(folder, problem, reconstruction, motions, scene, agent)
-        pictures.report_quality(folder, reconstruction, motions, per_video, records)
+        writing.write(folder, problem, reconstruction, motions, sessions, scene, agent)
+        pictures.report_quality(folder, reconstruction, {id: motions[id] for id in sessions}, per_video, records)
 
 
 if __name__ == "__main__":

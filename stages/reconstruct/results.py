@@ -33,13 +33,11 @@ class FeatureVolume:
 
 @torch.no_grad()
 def motions(problem: Problem, videos: Sequence[Video], longest_gap_s: float) -> dict[str, Motion]:
-    """Return each session's motion; poses of the agent are interpolated over gaps up to ``longest_gap_s``."""
+    """Return each video's motion (the turnaround's world is the agent); poses of the agent are interpolated over gaps up to ``longest_gap_s``."""
     found, table = {}, problem.motion
     known = torch.zeros(len(problem.video), dtype=torch.bool)
     known[problem.agent_frames.cpu()] = True
     for index, video in enumerate(scene_first(videos)):
-        if not video.agent_visible.any() or not video.has_scene:
-            continue
         frame = torch.nonzero(problem.video == index)[:, 0]
         root = table.world_from_agent(frame).double().cpu().numpy()
         bones = table.agent_from_bone(frame).double().cpu().numpy()

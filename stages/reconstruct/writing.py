@@ -1,6 +1,6 @@
 """Write a solved problem as the artifact `reconstruction`."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +14,13 @@ from stages.reconstruct import results
 from stages.reconstruct.problem import Problem
 
 
-def write(folder: Path, problem: Problem, reconstruction: Reconstruction, motions: Mapping[str, Motion], scene: Mesh, agent: Mesh) -> None:
-    """Write motion per video, surfaces, skin, fields, feature volume and track points."""
+def write(folder: Path, problem: Problem, reconstruction: Reconstruction, motions: Mapping[str, Motion], sessions: Collection[str], scene: Mesh, agent: Mesh) -> None:
+    """Write motion per video (those of the templates apart), surfaces, skin, fields, feature volume and track points."""
+    (folder / "templates").mkdir()
     for id, found in motions.items():
-        (folder / id).mkdir()
-        motion.save(folder / id / "motion.npz", found)
+        if id in sessions:
+            (folder / id).mkdir()
+        motion.save(folder / id / "motion.npz" if id in sessions else folder / "templates" / f"{id}.npz", found)
     meshes.write_ply(folder / "scene.ply", scene)
     meshes.write_ply(folder / "agent.ply", agent)
     body = reconstruction.body

@@ -1,0 +1,181 @@
+"""3D Gaussians of scene and agent: made from meshes, posed by bones, drawn together, kept in standard PLY files.
+
+`Gaussians` holds learnable Gaussians; `from_mesh` covers a surface with them; `Splats` puts the room and the posed
+agent before one camera; `save_ply` and `load_ply` use the 62 floats a row that every viewer of 3DGS reads.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pipeline.errors import InputError
+from pipeline.models import rasterize, skinning
+from pipeline.models.skinning import blend
+from pipeline.space import rigid_torch
+from pipeline.space.meshes import Mesh
+
+BAND0 = 0.28209479177387814
+"""value of the constant spherical harmonic"""
+COLUMNS = (
+    ["x", "y", "z", "nx", "ny", "nz"] + [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(45)]
+    + ["opacity"] + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+)  # fmt: skip
+
+
+class Gaussians(nn.Module):
+    """Gaussians in one frame: the world for the scene, the agent at rest for the agent."""
+
+    def __init__(self, means: Float[Tensor, "point 3"], rotation: Float[Tensor, "point 4"], log_scale: Float[Tensor, "point 3"], opacity: Float[Tensor, "point"], color: Float[Tensor, "point 3"]):
+        """``opacity`` and ``color`` lie in 0..1; rotations are quaternions wxyz."""
+        super().__init__()
+        self.means, self.rotation, self.log_scale = nn.Parameter(means), nn.Parameter(rotation), nn.Parameter(log_scale)
+        self.opacity_logit = nn.Parameter(torch.logit(opacity.clamp(1e-4, 1 - 1e-4)))
+        self.band0 = nn.Parameter((color - 0.5) / BAND0)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def opacity(self) -> Float[Tensor, "point"]:
+        """0..1"""
+        return self.opacity_logit.sigmoid()
+
+    @property
+    def color(self) -> Float[Tensor, "point 3"]:
+        """Red, green, blue, about 0..1."""
+        return self.band0 * BAND0 + 0.5
+
+
+def from_mesh(mesh: Mesh, number: int, rng: np.random.Generator) -> Gaussians:
+    """Cover a coloured surface evenly with flat Gaussians."""
+    corner = mesh.vertices[mesh.faces].astype(np.float64)
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = 0.5 * np.linalg.norm(normal, axis=-1)
+    along = np.cumsum(area) / area.sum()
+    face = np.searchsorted(along, (np.arange(number) + rng.random()) / number).clip(0, len(area) - 1)
+    mix = rng.dirichlet(np.ones(3), number)
+    means = np.einsum("pk,pkd->pd", mix, corner[face])
+    color = np.einsum("pk,pkc->pc", mix, mesh.color[mesh.faces[face]] / 255)
+    size = np.log(0.7 * np.sqrt(area.sum() / number))
+    log_scale = np.tile([size, size, size - np.log(5)], (number, 1))
+    rotation = _facing(normal[face] / np.maximum(2 * area[face, None], 1e-12))
+    parts = (torch.from_numpy(part).float() for part in (means, rotation, log_scale, np.full(number, 0.9), color))
+    return Gaussians(*parts)
+
+
+def _facing(normal: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 4"]:
+    """Return quaternions that turn the z axis onto unit normals, by the shortest way."""
+    w = 1 + normal[:, 2]
+    turned = np.stack([w, -normal[:, 1], normal[:, 0], np.zeros_like(w)], axis=-1)
+    turned[w < 1e-6] = [0.0, 1.0, 0.0, 0.0]
+    return turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Gaussians placed in the world, ready to be drawn."""
+
+    means: Float[Tensor, "point 3"]
+    rotation: Float[Tensor, "point 4"]
+    log_scale: Float[Tensor, "point 3"]
+    opacity: Float[Tensor, "point"]
+    color: Float[Tensor, "point 3"]
+    agent: Float[Tensor, "point"]
+    """1 for the agent's, 0 for the scene's"""
+
+
+class Splats(nn.Module):
+    """The room and the animal as Gaussians, with the bones that move the animal and each video's exposure."""
+
+    def __init__(self, scene: Gaussians, agent: Gaussians, agent_weights: Float[Tensor, "point bone"], agent_from_bone_rest: Float[Tensor, "bone 4 4"], videos: int):
+        super().__init__()
+        self.scene, self.agent = scene, agent
+        self.register_buffer("agent_weights", agent_weights)
+        self.register_buffer("agent_from_bone_rest", agent_from_bone_rest)
+        self.appearance = nn.Parameter(torch.eye(3, 4).repeat(max(videos, 1), 1, 1))
+        """per video: red, green, blue <- matrix @ (red, green, blue, 1)"""
+
+    def place_scene(self, video: int | None) -> Cloud:
+        """Return the room as one video shows it (None: without exposure)."""
+        scene, color = self.scene, self.scene.color
+        if video is not None:
+            matrix = self.appearance[video]
+            color = color @ matrix[:, :3].T + matrix[:, 3]
+        return Cloud(scene.means, scene.rotation, scene.log_scale, scene.opacity, color, torch.zeros_like(scene.opacity))
+
+    def place_agent(self, world_from_agent: Float[Tensor, "4 4"], agent_from_bone: Float[Tensor, "bone 4 4"], video: int | None) -> Cloud:
+        """Return the animal in one pose, in the light of one video."""
+        agent = self.agent
+        world_from_rest = world_from_agent @ blend(self.agent_weights, agent_from_bone, self.agent_from_bone_rest)
+        turn = rigid_torch.quaternion_from_rotation(world_from_rest[:, :3, :3])
+        rotation = skinning.multiply(turn, functional.normalize(agent.rotation, dim=-1))
+        color = agent.color
+        if video is not None:
+            color = color @ self.appearance[video][:, :3].T + self.appearance[video][:, 3]
+        return Cloud(skinning.move(world_from_rest, agent.means), rotation, agent.log_scale, agent.opacity, color, torch.ones_like(agent.opacity))
+
+
+def together(*clouds: Cloud) -> Cloud:
+    """Put clouds into one."""
+    return Cloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in Cloud.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees of a cloud."""
+
+    color: Float[Tensor, "height width 3"]
+    """over black"""
+    depth: Float[Tensor, "height width"]
+    """mean z where something is, metres"""
+    agent: Float[Tensor, "height width"]
+    coverage: Float[Tensor, "height width"]
+    extra: Float[Tensor, "height width channel"]
+
+
+def see(
+    cloud: Cloud, camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int,
+    backend: rasterize.Backend = "tiles", extra: Float[Tensor, "point channel"] | None = None,
+) -> View:  # fmt: skip
+    """Draw a cloud: colour, depth, the agent's share, and any further values per Gaussian."""
+    depth = cloud.means @ camera_from_world[2, :3] + camera_from_world[2, 3]
+    values = [cloud.color, depth[:, None], cloud.agent[:, None]] + ([] if extra is None else [extra])
+    image, coverage = rasterize.draw(
+        cloud.means, cloud.rotation, cloud.log_scale, cloud.opacity, torch.cat(values, dim=-1), camera_from_world, intrinsics, height, width, backend
+    )
+    return View(image[..., :3], image[..., 3] / coverage.clamp_min(1e-3), image[..., 4], coverage, image[..., 5:])
+
+
+def save_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write a standard 3D Gaussian PLY; Gaussians that are not finite or fainter than 1/255 are left out."""
+    with torch.no_grad():
+        rotation = functional.normalize(gaussians.rotation, dim=-1)
+        rest = torch.zeros(len(gaussians), 45, device=rotation.device)
+        normals = torch.zeros_like(gaussians.means)
+        table = torch.cat([gaussians.means, normals, gaussians.band0, rest, gaussians.opacity_logit[:, None], gaussians.log_scale, rotation], dim=-1)
+        table = table[kept(gaussians)].cpu().numpy().astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *(f"property float {name}" for name in COLUMNS), "end_header", ""]
+    Path(path).write_bytes("\n".join(header).encode() + table.tobytes())
+
+
+@torch.no_grad()
+def kept(gaussians: Gaussians) -> Tensor:
+    """Tell which Gaussians a file holds: finite ones that can be seen."""
+    finite = torch.stack([getattr(gaussians, name).reshape(len(gaussians), -1).isfinite().all(-1) for name in ("means", "rotation", "log_scale", "opacity_logit", "band0")]).all(0)
+    return finite & (gaussians.opacity >= 1 / 255)
+
+
+def load_ply(path: Path) -> Gaussians:
+    """Read what `save_ply` wrote. Raises `InputError` ART-021 for any other file."""
+    data = Path(path).read_bytes()
+    end = data.find(b"end_header\n") + len(b"end_header\n")
+    names = [line.split()[-1] for line in data[:end].decode("ascii", "replace").splitlines() if line.startswith("property float ")]
+    if names != COLUMNS or (len(data) - end) % 248:
+        raise InputError("ART-021", what="not a 3D Gaussian file of 62 floats a row", where=str(path), remedy="rebuild `splats`")
+    table = torch.from_numpy(np.frombuffer(data, "<f4", offset=end).reshape(-1, 62).copy())
+    return Gaussians(table[:, :3], table[:, 58:62], table[:, 55:58], table[:, 54].sigmoid(), table[:, 6:9] * BAND0 + 0.5)

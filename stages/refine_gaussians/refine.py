@@ -1,0 +1,185 @@
+"""Refine Gaussians and motion: draw one frame a step, compare colour, depth, silhouette and flow."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from torch.nn import functional
+
+from pipeline.fit import FitRecord, fit
+from pipeline.models.gaussians import Cloud, Splats, see, together
+from pipeline.models.motion import Motion
+from pipeline.models.rasterize import Backend
+from pipeline.space import cameras, rigid_torch
+from stages.refine_gaussians.views import Recording, Target, flow_lattice, read
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much each loss counts."""
+
+    color: float = 1.0
+    """absolute difference of colours 0..1"""
+    depth: float = 0.3
+    """absolute difference of depth in units of 0.2 m, at most 1"""
+    silhouette: float = 0.3
+    """absolute difference of the agent's share and its mask"""
+    flow: float = 0.05
+    """difference of flow in drawn pixels, at most 4"""
+    stay: float = 1.0
+    """motion stays near the reconstruction's (1 cm, 1 degree count alike)"""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Learning rates of Adam; all fall to a tenth."""
+
+    means: float = 5e-4
+    """metres"""
+    rotation: float = 2e-3
+    """quaternions"""
+    log_scale: float = 1e-2
+    """logarithms of metres"""
+    opacity: float = 3e-2
+    """logits"""
+    color: float = 1e-2
+    """coefficients of the constant harmonic"""
+    appearance: float = 2e-3
+    """exposure per video"""
+    motion: float = 3e-4
+    """root and bones, metres and radians"""
+
+
+@dataclass(frozen=True)
+class Sequence4D:
+    """One video with its motion on the frame axis of all videos."""
+
+    recording: Recording
+    motion: Motion
+    first: int
+    """index of its first frame"""
+    video: int | None
+    """index of its appearance; None: the turnaround, whose world is the agent"""
+
+
+class MotionDeltas(nn.Module):
+    """Small corrections of roots and bones of all frames, as twists."""
+
+    def __init__(self, frames: int, bones: int):
+        super().__init__()
+        self.root, self.bone = nn.Parameter(torch.zeros(frames, 6)), nn.Parameter(torch.zeros(frames, bones, 6))
+
+    def apply(self, world_from_agent: Float[Tensor, "*batch 4 4"], agent_from_bone: Float[Tensor, "*batch bone 4 4"], frame) -> tuple[Tensor, Tensor]:
+        """Return the corrected root and bones of frames."""
+        return world_from_agent @ rigid_torch.se3_exp(self.root[frame]), agent_from_bone @ rigid_torch.se3_exp(self.bone[frame])
+
+
+class FrameLoss:
+    """The loss of one random frame."""
+
+    def __init__(self, splats: Splats, deltas: MotionDeltas, sequences: Sequence[Sequence4D], weights: Weights, size: tuple[int, int], backend: Backend):
+        self.splats, self.deltas, self.sequences, self.weights, self.size, self.backend = splats, deltas, sequences, weights, size, backend
+        self.device = str(splats.appearance.device)
+        self.frames = [(s, f) for s, sequence in enumerate(sequences) for f in usable_frames(sequence)]
+
+    def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
+        number, frame = self.frames[int(torch.randint(len(self.frames), (1,), generator=generator))]
+        sequence = self.sequences[number]
+        target = read(sequence.recording, frame, self.size, self.device)
+        cloud = self.cloud(sequence, frame)
+        camera = self._camera(sequence, frame)
+        later = self._later_pixels(sequence, frame, target, cloud)
+        view = see(cloud, camera, target.intrinsics, *self.size, self.backend, extra=later)
+        everywhere = torch.ones_like(target.agent) if sequence.video is not None else target.agent
+        measured = (target.depth > 0) & everywhere
+        weights, terms = self.weights, {}
+        terms["color"] = weights.color * (view.color - target.color).abs().mean(-1)[everywhere & target.known]
+        terms["depth"] = weights.depth * ((view.depth - target.depth).abs() / 0.2).clamp_max(1)[measured]
+        terms["silhouette"] = weights.silhouette * (view.agent - target.agent.float()).abs()[target.known]
+        if later is not None:
+            terms["flow"] = weights.flow * self._flow_errors(sequence, target, view.extra, view.coverage, everywhere)
+        index = sequence.first + frame
+        terms["stay"] = weights.stay * torch.cat([self.deltas.root[index : index + 1], self.deltas.bone[index]]).square() / 0.01
+        return {name: values.mean() if values.numel() else values.sum() for name, values in terms.items()}
+
+    def cloud(self, sequence: Sequence4D, frame: int) -> Cloud:
+        """Return what stands before the camera in one frame."""
+        parts = [] if sequence.video is None else [self.splats.place_scene(sequence.video)]
+        if np.isfinite(sequence.motion.world_from_agent[frame]).all():
+            parts.append(self.splats.place_agent(*self._pose(sequence, frame), sequence.video))
+        return together(*parts)
+
+    def _pose(self, sequence: Sequence4D, frame: int) -> tuple[Tensor, Tensor]:
+        root, bones = (torch.from_numpy(a[frame]).float().to(self.device) for a in (sequence.motion.world_from_agent, sequence.motion.agent_from_bone))
+        return self.deltas.apply(root, bones, sequence.first + frame)
+
+    def _camera(self, sequence: Sequence4D, frame: int) -> Tensor:
+        return torch.from_numpy(np.linalg.inv(sequence.motion.world_from_camera[frame])).float().to(self.device)
+
+    def _later_pixels(self, sequence: Sequence4D, frame: int, target: Target, cloud: Cloud) -> Tensor | None:
+        """Return where each Gaussian is seen one frame later, in drawn pixels from where it is now."""
+        motion, later = sequence.motion, frame + 1
+        if target.flow_px is None or later >= len(motion.timestamp_s) or not np.isfinite(motion.world_from_camera[later]).all():
+            return None
+        means = cloud.means
+        if cloud.agent.any():
+            if not np.isfinite(motion.world_from_agent[later]).all():
+                return None
+            moved = self.splats.place_agent(*self._pose(sequence, later), sequence.video).means
+            means = torch.cat([cloud.means[: len(cloud.means) - len(moved)], moved])
+        now = cameras.project(rigid_torch.apply(self._camera(sequence, frame), cloud.means), target.intrinsics)[0]
+        then = cameras.project(rigid_torch.apply(self._camera(sequence, later), means), target.intrinsics)[0]
+        return (then - now).clamp(-100, 100)
+
+    def _flow_errors(self, sequence: Sequence4D, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor) -> Tensor:
+        row, column = flow_lattice(*target.flow_confidence.shape, sequence.recording.clip.color_size, self.size)
+        found = drawn[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
+        error = functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0).sum(-1).clamp_max(4)
+        return (error * target.flow_confidence)[(coverage[row, column] > 0.5) & everywhere[row, column]]
+
+
+def usable_frames(sequence: Sequence4D) -> list[int]:
+    """Return the frames whose camera is known, and for the turnaround also the agent's mask."""
+    good = np.isfinite(sequence.motion.world_from_camera).all((1, 2))
+    if sequence.video is None:
+        good &= np.isfinite(sequence.motion.world_from_agent).all((1, 2)) & sequence.recording.masks.visible
+    return np.flatnonzero(good).tolist()
+
+
+def refine(loss: FrameLoss, rates: Rates, steps: int, seed: int, resume: Path | None, save_every: int) -> FitRecord:
+    """Optimise Gaussians, exposure and motion in place."""
+    splats, deltas = loss.splats, loss.deltas
+    groups = [{"params": [splats.appearance], "lr": rates.appearance}]
+    for gaussians in (splats.scene, splats.agent):
+        named = (gaussians.means, rates.means), (gaussians.rotation, rates.rotation), (gaussians.log_scale, rates.log_scale)
+        named += (gaussians.opacity_logit, rates.opacity), (gaussians.band0, rates.color)
+        groups += [{"params": [parameter], "lr": rate} for parameter, rate in named]
+    groups.append({"params": list(deltas.parameters()), "lr": rates.motion, "betas": (0.0, 0.99)})
+    return fit(
+        modules={"splats": splats, "motion": deltas},
+        optimizer=torch.optim.Adam(groups, lr=1.0),
+        loss=loss,
+        steps=steps,
+        seed=seed,
+        resume=resume,
+        save_every=save_every,
+        schedule=lambda progress: 0.1 ** progress,
+        label="gaussians",
+        clip_norm=math.inf,
+    )
+
+
+@torch.no_grad()
+def refined(motion: Motion, deltas: MotionDeltas, first: int) -> Motion:
+    """Return one video's motion with its corrections."""
+    frame = torch.arange(first, first + len(motion.timestamp_s))
+    device = deltas.root.device
+    root, bones = (torch.from_numpy(array).to(device) for array in (motion.world_from_agent.astype(np.float64), motion.agent_from_bone.astype(np.float64)))
+    root, bones = deltas.double().apply(root, bones, frame.to(device))
+    deltas.float()
+    return Motion(motion.timestamp_s, motion.world_from_camera, root.cpu().numpy(), bones.cpu().numpy(), motion.confidence, motion.agent_visible)

@@ -1,0 +1,70 @@
+"""Read single frames at drawing size: colour, depth, mask, flow, and which Gaussians they can speak about."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.files.clips import Clip, Masks
+from pipeline.space import cameras
+
+AGENT, UNKNOWN = 255, 128
+FLOW_STRIDE = 4
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One video's files."""
+
+    id: str
+    clip: Clip
+    masks: Masks | None
+    flow: np.ndarray | None
+    """forward flow of gap 1, [frame height width 2], colour pixels at stride 4, memory-mapped"""
+    flow_confidence: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Target:
+    """One frame at drawing size."""
+
+    color: Float[Tensor, "height width 3"]
+    depth: Float[Tensor, "height width"]
+    """metres; 0 = unknown"""
+    agent: Bool[Tensor, "height width"]
+    known: Bool[Tensor, "height width"]
+    """the mask says agent or not"""
+    intrinsics: Float[Tensor, "3 3"]
+    flow_px: Float[Tensor, "row column 2"] | None
+    """displacement in drawn pixels, on flow's own lattice"""
+    flow_confidence: Float[Tensor, "row column"] | None
+
+
+def read(recording: Recording, frame: int, size: tuple[int, int], device: str) -> Target:
+    """Read one frame and shrink it to (height, width)."""
+    clip, small = recording.clip, size[::-1]
+    color = cv2.resize(clip.color(frame), small, interpolation=cv2.INTER_AREA)
+    depth = clip.depth(frame)
+    depth = np.where((clip.confidence(frame) > 0) & (depth < 5), depth, 0)
+    depth = cv2.resize(depth, small, interpolation=cv2.INTER_NEAREST)
+    mask = np.zeros(size, np.uint8)
+    if recording.masks is not None:
+        mask = cv2.resize(recording.masks[frame], small, interpolation=cv2.INTER_NEAREST)
+    flow = confidence = None
+    if recording.flow is not None and frame < len(recording.flow):
+        scale = np.array([size[1] / clip.color_size[1], size[0] / clip.color_size[0]])
+        flow = torch.from_numpy((recording.flow[frame] * scale).astype(np.float32)).to(device)
+        confidence = torch.from_numpy(recording.flow_confidence[frame].astype(np.float32) / 255).to(device)
+    tensors = (color.astype(np.float32) / 255, depth.astype(np.float32), mask == AGENT, mask != UNKNOWN)
+    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size).astype(np.float32)
+    return Target(*(torch.from_numpy(array).to(device) for array in (*tensors, intrinsics)), flow, confidence)
+
+
+def flow_lattice(rows: int, columns: int, color_size: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return the drawn pixel (row, column) nearest to each cell centre of the flow."""
+    row = (torch.arange(rows) * FLOW_STRIDE + FLOW_STRIDE / 2) * size[0] / color_size[0]
+    column = (torch.arange(columns) * FLOW_STRIDE + FLOW_STRIDE / 2) * size[1] / color_size[1]
+    return row.long().clamp_max(size[0] - 1)[:, None], column.long().clamp_max(size[1] - 1)[None]
