@@ -65,10 +65,7 @@ def _skeleton() -> tuple[Bone, ...]:
         start = end
     rows += [*_limbs(1), *_limbs(-1)]
     names = [row[0] for row in rows]
-    return tuple(
-        Bone(name, names.index(parent) if parent else -1, head, tail, radius)
-        for name, parent, head, tail, radius in rows
-    )
+    return tuple(Bone(name, names.index(parent) if parent else -1, head, tail, radius) for name, parent, head, tail, radius in rows)
 
 
 BONES = _skeleton()
@@ -105,12 +102,8 @@ def _body_distance(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "p
     parts = [_cone(points, HEADS[k], TAILS[k], *BONES[k].radius) for k in range(len(BONES))]
     sharpness = [0.03] * 6 + [0.012] * 5 + [0.024, 0.012, 0.008, 0.03, 0.014, 0.008, 0.008] * 2
     for side in (-1, 1):
-        ear = _cone(
-            points, np.array([side * 0.030, 0.125, 0.225]), np.array([side * 0.040, 0.168, 0.216]), 0.020, 0.0065
-        )
-        cheek = _cone(
-            points, np.array([side * 0.022, 0.068, 0.262]), np.array([side * 0.014, 0.064, 0.283]), 0.026, 0.018
-        )
+        ear = _cone(points, np.array([side * 0.030, 0.125, 0.225]), np.array([side * 0.040, 0.168, 0.216]), 0.020, 0.0065)
+        cheek = _cone(points, np.array([side * 0.022, 0.068, 0.262]), np.array([side * 0.014, 0.064, 0.283]), 0.026, 0.018)
         parts += [ear, cheek]
         sharpness += [0.008, 0.012]
     parts.append(_cone(points, np.array([0, -0.025, -0.08]), np.array([0, -0.022, 0.07]), 0.06, 0.064))
@@ -125,9 +118,7 @@ def _body_distance(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "p
 def _cone(points: np.ndarray, head: np.ndarray, tail: np.ndarray, head_radius: float, tail_radius: float) -> np.ndarray:
     axis = tail - head
     along = np.clip((points - head) @ axis / (axis @ axis), 0, 1)
-    return np.linalg.norm(points - head - along[:, None] * axis, axis=-1) - (
-        head_radius + along * (tail_radius - head_radius)
-    )
+    return np.linalg.norm(points - head - along[:, None] * axis, axis=-1) - (head_radius + along * (tail_radius - head_radius))
 
 
 def _skin(vertices: Float[np.ndarray, "vertex 3"]) -> tuple[Int[np.ndarray, "vertex 4"], Float[np.ndarray, "vertex 4"]]:
@@ -149,9 +140,7 @@ def _coat(vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator) -> 
     ground = np.array([0.36, 0.22, 0.115]) * rng.uniform(0.8, 1.15)
     dark, pale = np.array([0.045, 0.032, 0.026]), np.array([0.72, 0.66, 0.56])
     phase = rng.uniform(0, 2 * np.pi, 6)
-    wobble = (
-        0.9 * np.sin(9 * y / 0.1 + phase[0]) + 0.8 * np.sin(x / 0.022 + phase[1]) + 0.6 * np.sin(z / 0.05 + phase[2])
-    )
+    wobble = 0.9 * np.sin(9 * y / 0.1 + phase[0]) + 0.8 * np.sin(x / 0.022 + phase[1]) + 0.6 * np.sin(z / 0.05 + phase[2])
     body = np.sin(2 * np.pi * z / 0.052 + wobble)
     tail = np.sin(2 * np.pi * z / 0.045 + phase[3])
     leg = np.sin(2 * np.pi * y / 0.042 + 0.5 * np.sin(z / 0.02 + phase[4]))

@@ -43,9 +43,7 @@ def walkthrough(room: Room, rng: np.random.Generator, duration_s: float) -> Came
     )
     swing = angle + 0.45 * np.sin(2 * np.pi * 4.3 * share)
     down = 0.28 + 0.42 * np.sin(2 * np.pi * (3.2 * rounds) * share)
-    eye = np.stack(
-        [position[:, 0], np.full(len(share), 1.42) + 0.12 * np.sin(2 * np.pi * 2.1 * share), position[:, 1]], axis=-1
-    )
+    eye = np.stack([position[:, 0], np.full(len(share), 1.42) + 0.12 * np.sin(2 * np.pi * 2.1 * share), position[:, 1]], axis=-1)
     forward = np.stack([np.sin(swing) * np.cos(down), -np.sin(down), np.cos(swing) * np.cos(down)], axis=-1)
     return _handheld(eye, eye + forward, rng, calm=0.8)
 
@@ -84,20 +82,14 @@ def bystanding(session: SessionTrajectories, room: Room, rng: np.random.Generato
     every = round(1.0 / STEP_S)
     stands = []
     for at, target in zip(animal[::every], opposite[::every], strict=True):
-        cost = np.linalg.norm(centers - target, axis=-1) + 3 * np.maximum(
-            1.3 - np.linalg.norm(centers - at, axis=-1), 0
-        )
+        cost = np.linalg.norm(centers - target, axis=-1) + 3 * np.maximum(1.3 - np.linalg.norm(centers - at, axis=-1), 0)
         cost += 0.6 * np.linalg.norm(centers - stands[-1], axis=-1) if stands else 0
         stands.append(centers[np.argmin(cost)])
     slow = gaussian_filter1d(np.array(stands), 1.6, axis=0)
     count = len(animal)
-    ground = np.stack(
-        [np.interp(np.arange(count), np.arange(len(slow)) * every, slow[:, axis]) for axis in range(2)], axis=-1
-    )
+    ground = np.stack([np.interp(np.arange(count), np.arange(len(slow)) * every, slow[:, axis]) for axis in range(2)], axis=-1)
     eye = np.stack([ground[:, 0], 1.36 + 0.06 * _wander(rng, count, 2.0)[:, 0], ground[:, 1]], axis=-1)
-    target = gaussian_filter1d(
-        session.animal.position + np.array([0, 0.25, 0]), 0.35 / STEP_S, axis=0
-    ) + 0.08 * _wander(rng, count, 0.9)
+    target = gaussian_filter1d(session.animal.position + np.array([0, 0.25, 0]), 0.35 / STEP_S, axis=0) + 0.08 * _wander(rng, count, 0.9)
     return _handheld(_inside(eye), target, rng, calm=0.7)
 
 

@@ -98,9 +98,7 @@ class Stage:
                 np.zeros((0, 4), np.float32),
                 np.zeros((0, 4)),
             )
-        received = light.light_on_body(
-            body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light
-        )
+        received = light.light_on_body(body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light)
         motion = self.script.motion
         camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
         balls = np.zeros((len(SHADOW_BALLS), 4))
@@ -117,9 +115,7 @@ def true_flow(stage: Stage, first: int, second: int, *, stride: int = 4) -> Floa
     """
     script = stage.script
     upright = cameras.turn_camera(script.world_from_camera[[first, second]], script.quarter_turns)
-    lenses = cameras.turn_intrinsics(
-        matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns
-    )
+    lenses = cameras.turn_intrinsics(matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns)
     height, width = script.color_size if script.quarter_turns % 2 == 0 else script.color_size[::-1]
     here, there = (stage.mesh(stage.animal_world(index)) for index in (first, second))
     cells = (height // stride, width // stride)
@@ -129,22 +125,13 @@ def true_flow(stage: Stage, first: int, second: int, *, stride: int = 4) -> Floa
     share = np.einsum("hwij,hwj->hwi", view.inverse_corners[np.maximum(view.face, 0)], rays)
     share /= np.maximum(share.sum(-1, keepdims=True), 1e-9)
     corners = there[0][there[1][np.maximum(view.face, 0)]]
-    moved = rigid.apply(rigid.inverse(upright[1]), np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3)).reshape(
-        *cells, 3
-    )
+    moved = rigid.apply(rigid.inverse(upright[1]), np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3)).reshape(*cells, 3)
     pixel, depth = cameras.project(moved, lenses[1])
     flow = (pixel - (cameras.pixel_grid(*cells) * stride)).astype(np.float32)
     inside = (
-        (depth > 0.05)
-        & (pixel[..., 0] >= 0)
-        & (pixel[..., 0] < width)
-        & (pixel[..., 1] >= 0)
-        & (pixel[..., 1] < height)
-        & (view.face >= 0)
+        (depth > 0.05) & (pixel[..., 0] >= 0) & (pixel[..., 0] < width) & (pixel[..., 1] >= 0) & (pixel[..., 1] < height) & (view.face >= 0)
     )
-    nearest = raster.see(
-        rigid.apply(rigid.inverse(upright[1]), there[0]), there[1], lenses[1], height, width
-    ).inverse_depth
+    nearest = raster.see(rigid.apply(rigid.inverse(upright[1]), there[0]), there[1], lenses[1], height, width).inverse_depth
     at = np.clip(np.nan_to_num(pixel), 0, [width - 1, height - 1]).astype(int)
     hidden = depth > 1.0 / np.maximum(nearest[at[..., 1], at[..., 0]], 1e-3) + 0.02 + 0.01 * depth
     flow[~inside | hidden] = np.nan

@@ -43,11 +43,7 @@ def shelf(rng: np.random.Generator) -> Piece:
     """Make a shelf with five rows of books and a few things between them."""
     timber = texture.wood(rng, (168, 128, 84))
     wide, deep = 1.16, 0.32
-    parts = [
-        sheet
-        for side in (-1, 1)
-        for sheet in sheets.box((side * wide / 2, 0.95, 0), (0.025, 1.9, deep), timber, skip="-y")
-    ]
+    parts = [sheet for side in (-1, 1) for sheet in sheets.box((side * wide / 2, 0.95, 0), (0.025, 1.9, deep), timber, skip="-y")]
     parts += sheets.box((0, 0.95, -deep / 2 + 0.01), (wide, 1.88, 0.012), timber, skip="-z -y +y +x -x")
     for level in range(6):
         parts += sheets.box((0, 0.06 + 0.365 * level, 0), (wide, 0.025, deep), timber, skip="-z +x -x")
@@ -57,9 +53,7 @@ def shelf(rng: np.random.Generator) -> Piece:
         right = min(max(right, left + 0.3), 0.55)
         tall = rng.uniform(0.22, 0.28)
         spines = {"+z": texture.books(rng), "": texture.plain(rng, (190, 180, 160))}
-        parts += sheets.box(
-            ((left + right) / 2, bottom + tall / 2, -0.02), (right - left, tall, 0.22), spines, skip="-y -z"
-        )
+        parts += sheets.box(((left + right) / 2, bottom + tall / 2, -0.02), (right - left, tall, 0.22), spines, skip="-y -z")
     parts += sheets.cylinder(
         (0.5, 0.0725 + 0.365 + 0.08, 0),
         0.05,
@@ -80,9 +74,7 @@ def media(rng: np.random.Generator) -> Piece:
     parts += [
         sheet
         for k in range(3)
-        for sheet in sheets.box(
-            (-0.48 + 0.48 * k, 0.24, 0.208), (0.45, 0.38, 0.016), texture.wood(rng, (140, 108, 80)), skip="-z"
-        )
+        for sheet in sheets.box((-0.48 + 0.48 * k, 0.24, 0.208), (0.45, 0.38, 0.016), texture.wood(rng, (140, 108, 80)), skip="-z")
     ]
     parts += sheets.box((0, 0.82, -0.08), (1.1, 0.64, 0.05), black, skip="-z")
     parts += sheets.box((0, 0.475, -0.05), (0.4, 0.03, 0.2), black, skip="-z -y")
@@ -117,12 +109,8 @@ def coffee_table(rng: np.random.Generator) -> Piece:
         {"+y": texture.poster(rng), "": texture.plain(rng, (230, 230, 226))},
         skip="-y",
     )
-    parts += sheets.box(
-        (-0.13, 0.445, 0.0), (0.2, 0.022, 0.14), {"+y": texture.poster(rng), "": texture.books(rng)}, skip="-y"
-    )
-    parts += sheets.cylinder(
-        (0.23, 0.46, 0.08), 0.038, 0.09, texture.plain(rng, (60, 96, 120)), texture.plain(rng, (70, 44, 26))
-    )
+    parts += sheets.box((-0.13, 0.445, 0.0), (0.2, 0.022, 0.14), {"+y": texture.poster(rng), "": texture.books(rng)}, skip="-y")
+    parts += sheets.cylinder((0.23, 0.46, 0.08), 0.038, 0.09, texture.plain(rng, (60, 96, 120)), texture.plain(rng, (70, 44, 26)))
     return Piece(parts, (0.86, 0.46), 0.42, 0.36)
 
 
@@ -166,9 +154,7 @@ def plant(rng: np.random.Generator) -> Piece:
         yaw, reach, rise = rng.uniform(0, 2 * np.pi), rng.uniform(0.12, 0.3), rng.uniform(0.35, 0.95)
         t = np.linspace(0, 1, 5)
         out, across = np.array([np.sin(yaw), 0, np.cos(yaw)]), np.array([np.cos(yaw), 0, -np.sin(yaw)])
-        spine = (
-            np.array([0, 0.34, 0]) + t[:, None] * reach * out + (rise * (1.7 * t - 0.75 * t**2))[:, None] * [0, 1, 0]
-        )
+        spine = np.array([0, 0.34, 0]) + t[:, None] * reach * out + (rise * (1.7 * t - 0.75 * t**2))[:, None] * [0, 1, 0]
         half = (0.045 * np.sin(np.pi * np.clip(t * 0.9 + 0.08, 0, 1)))[:, None] * across
         points = np.stack([spine - half, spine + half], axis=1)[::-1]
         green = np.array([62.0, 110, 52]) + rng.uniform(-18, 26, 3)
@@ -195,9 +181,7 @@ def lamp(rng: np.random.Generator) -> Piece:
 def bowls(rng: np.random.Generator) -> Piece:
     """Make a food and a water bowl, too low to be in anyone's way."""
     blue = texture.plain(rng, (60, 120, 170))
-    parts = sheets.cylinder(
-        (-0.11, 0.025, 0), 0.075, 0.05, blue, texture.fabric(rng, (110, 76, 46), grain=14), flare=0.8
-    )
+    parts = sheets.cylinder((-0.11, 0.025, 0), 0.075, 0.05, blue, texture.fabric(rng, (110, 76, 46), grain=14), flare=0.8)
     parts += sheets.cylinder((0.11, 0.025, 0.02), 0.075, 0.05, blue, texture.plain(rng, (170, 190, 200)), flare=0.8)
     return Piece(parts, (0.36, 0.15), 0.05)
 

@@ -20,9 +20,7 @@ WALK_OFFSET = np.array([0.75, 0.25, 0.5, 0.0])
 TROT_OFFSET = np.array([0.5, 0.0, 0.0, -0.5])
 SOLE_M = 0.016
 """Height of a foot bone's head above the sole."""
-NEUTRAL = np.array([HEADS[INDEX[name]] for name in FEET]) + np.array(
-    [[0, 0, 0.0], [0, 0, 0.0], [0, 0, 0.03], [0, 0, 0.03]]
-)
+NEUTRAL = np.array([HEADS[INDEX[name]] for name in FEET]) + np.array([[0, 0, 0.0], [0, 0, 0.0], [0, 0, 0.03], [0, 0, 0.03]])
 
 
 @dataclass(frozen=True)
@@ -86,9 +84,7 @@ def _rhythm(course: AnimalCourse) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     )
 
 
-def _planted(
-    course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, foot: int
-) -> Float[np.ndarray, "frame 3"]:
+def _planted(course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, foot: int) -> Float[np.ndarray, "frame 3"]:
     """Return where a foot stands in stride ``index``: under its neutral place at the middle of that stance."""
     rising = cycle + 1e-9 * np.arange(len(cycle))
     when = np.interp(index + half_duty, rising, course.timestamp_s)
@@ -144,26 +140,17 @@ def _sampled(course: AnimalCourse, timestamp_s: np.ndarray) -> _State:
 def _root(state: _State, timestamp_s: np.ndarray) -> Float[np.ndarray, "frame 4 4"]:
     height = STAND_HEIGHT_M - 0.012 - 0.012 * np.clip(state.speed, 0, 1.5) - 0.05 * state.crouch
     stand = 1 - state.sit - state.lie
-    height = (
-        height * stand
-        + 0.172 * state.sit
-        + 0.105 * state.lie
-        + 0.006 * np.sin(4 * np.pi * state.phase) * np.clip(state.speed, 0, 1)
-    )
+    height = height * stand + 0.172 * state.sit + 0.105 * state.lie + 0.006 * np.sin(4 * np.pi * state.phase) * np.clip(state.speed, 0, 1)
     height += 0.0015 * np.sin(2 * np.pi * 0.45 * timestamp_s)
     pitch = -0.56 * state.sit + 0.03 * np.sin(4 * np.pi * state.phase + 1.0) * np.clip(state.speed - 0.6, 0, 1)
     roll = np.clip(0.05 * state.turn * state.speed, -0.12, 0.12)
     climb = np.gradient(state.position[:, 1], timestamp_s) if len(timestamp_s) > 1 else np.zeros(1)
     pitch = pitch - np.clip(0.35 * climb, -0.6, 0.6) * state.air
     rotation = _turn(1, state.yaw) @ _turn(0, pitch) @ _turn(2, -roll)
-    return rigid.make(
-        rotation, state.position + np.stack([np.zeros_like(height), height, np.zeros_like(height)], axis=-1)
-    )
+    return rigid.make(rotation, state.position + np.stack([np.zeros_like(height), height, np.zeros_like(height)], axis=-1))
 
 
-def _posed_feet(
-    feet_agent: np.ndarray, world_from_agent: np.ndarray, state: _State
-) -> Float[np.ndarray, "frame foot 3"]:
+def _posed_feet(feet_agent: np.ndarray, world_from_agent: np.ndarray, state: _State) -> Float[np.ndarray, "frame foot 3"]:
     """Blend planted feet with those of sitting, lying and flying."""
     level_from_agent = _turn(1, -state.yaw) @ world_from_agent[:, :3, :3]
     ground = state.position[:, 1] - world_from_agent[:, 1, 3] + SOLE_M
@@ -176,9 +163,7 @@ def _posed_feet(
 
     sitting = on_ground([(0.036, 0.105), (-0.036, 0.105), (0.075, -0.05), (-0.075, -0.05)])
     lying = on_ground([(0.05, 0.19), (-0.05, 0.19), (0.095, -0.08), (-0.095, -0.08)])
-    flying = np.broadcast_to(
-        NEUTRAL + np.array([[0, 0.05, 0.07], [0, 0.05, 0.07], [0, 0.03, -0.09], [0, 0.03, -0.09]]), feet_agent.shape
-    )
+    flying = np.broadcast_to(NEUTRAL + np.array([[0, 0.05, 0.07], [0, 0.05, 0.07], [0, 0.03, -0.09], [0, 0.03, -0.09]]), feet_agent.shape)
     sit, lie, air = (part[:, None, None] for part in (state.sit, state.lie, state.air))
     return (feet_agent * (1 - sit - lie) + sitting * sit + lying * lie) * (1 - air) + flying * air
 
@@ -215,11 +200,7 @@ def _swing_tail(bones: np.ndarray, state: _State, timestamp_s: np.ndarray) -> No
     base = bones[:, INDEX["pelvis"], :3, :3]
     lift = (0.35 + 0.75 * state.tail) * (1 - rest) - 0.3 * rest + 0.45 * state.sit
     for index in range(5):
-        sway = (
-            0.16
-            * np.sin(2 * np.pi * (0.55 + 0.25 * np.abs(state.tail)) * timestamp_s - 0.7 * index)
-            * (1 + 0.5 * index)
-        )
+        sway = 0.16 * np.sin(2 * np.pi * (0.55 + 0.25 * np.abs(state.tail)) * timestamp_s - 0.7 * index) * (1 + 0.5 * index)
         curl = 0.38 * rest * (index > 0)
         bend = (0.75 if index == 0 else 0.22) * lift
         base = base @ _turn(1, sway * (1 - 0.7 * rest) + curl) @ _turn(0, bend)
@@ -249,9 +230,7 @@ def _hind_limb(bones: np.ndarray, side: str, foot: Float[np.ndarray, "frame 3"])
     bones[:, INDEX[toes], :3, 3] = foot
 
 
-def _two_bones(
-    bones: np.ndarray, first: str, second: str, start: np.ndarray, end: np.ndarray, *, pole: np.ndarray
-) -> None:
+def _two_bones(bones: np.ndarray, first: str, second: str, start: np.ndarray, end: np.ndarray, *, pole: np.ndarray) -> None:
     """Place two bones between two points by the law of cosines, the middle joint towards ``pole``."""
     a, b = _length(first), _length(second)
     axis = end - start

@@ -61,9 +61,7 @@ def lit_sheets(room: Room, light: Light, rng: np.random.Generator) -> list[UInt8
     return lit
 
 
-def _lit_picture(
-    sheet: Sheet, cells: Float[np.ndarray, "row column 3"], light: Light
-) -> UInt8[np.ndarray, "height width 3"]:
+def _lit_picture(sheet: Sheet, cells: Float[np.ndarray, "row column 3"], light: Light) -> UInt8[np.ndarray, "height width 3"]:
     height, width, _ = sheet.picture.shape
     albedo = (np.arange(256, dtype=np.float32) / 255) ** 2.2
     if sheet.glow > 0:
@@ -90,9 +88,7 @@ def _light_grid(sheet: Sheet) -> tuple[np.ndarray, np.ndarray]:
 def _bilinear(grid: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     i, j = np.clip(row.astype(int), 0, grid.shape[0] - 2), np.clip(column.astype(int), 0, grid.shape[1] - 2)
     s, t = (row - i)[..., None], (column - j)[..., None]
-    return (1 - s) * ((1 - t) * grid[i, j] + t * grid[i, j + 1]) + s * (
-        (1 - t) * grid[i + 1, j] + t * grid[i + 1, j + 1]
-    )
+    return (1 - s) * ((1 - t) * grid[i, j] + t * grid[i, j + 1]) + s * ((1 - t) * grid[i + 1, j] + t * grid[i + 1, j + 1])
 
 
 def _irradiance(
@@ -110,14 +106,10 @@ def _irradiance(
     for i in range(2):
         for j in range(3):
             jitter = rng.uniform(-0.12, 0.12, 2)
-            sample = (
-                corner + (j + 0.5 + jitter[0]) / 3 * right + (i + 0.5 + jitter[1]) / 2 * down - np.array([0.06, 0, 0])
-            )
+            sample = corner + (j + 0.5 + jitter[0]) / 3 * right + (i + 0.5 + jitter[1]) / 2 * down - np.array([0.06, 0, 0])
             area = np.linalg.norm(right) * np.linalg.norm(down) / 6
             total += (
-                _from_source(points, normals, sample, caster, facing=np.array([-1.0, 0, 0]), toward=light.toward_sun)[
-                    :, None
-                ]
+                _from_source(points, normals, sample, caster, facing=np.array([-1.0, 0, 0]), toward=light.toward_sun)[:, None]
                 * light.window
                 * area
             )

@@ -69,8 +69,7 @@ class Observer:
                 self._go_by(
                     animal,
                     lambda center: (
-                        0.9 * np.linalg.norm(center - animal, axis=-1)
-                        - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1)
+                        0.9 * np.linalg.norm(center - animal, axis=-1) - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1)
                     ),
                 )
             case "stroll":

@@ -46,9 +46,7 @@ class Policy:
 
     def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
         self.rng, self.places = rng, places
-        self.walker = Walker(
-            floor, floor.nearest(position), rng.uniform(-np.pi, np.pi), turn_rate=4.0, acceleration=3.0
-        )
+        self.walker = Walker(floor, floor.nearest(position), rng.uniform(-np.pi, np.pi), turn_rate=4.0, acceleration=3.0)
         self.height = 0.0
         self.place: Place | None = None
         self.perch: Place | None = None
@@ -77,9 +75,8 @@ class Policy:
                 self._jump(np.array([self.perch.entry[0], 0.0, self.perch.entry[1]]))
                 self.perch = None
             else:
-                face = None if moving or self.perch is None else self.perch.yaw
-                self.walker.turn_rate = 7.5 if self.reason == "flee" else 4.0
-                self.walker.step(seconds, self.pace, face=face if not moving else None)
+                self.walker.turn_rate = (7.5 if self.reason == "flee" else 4.0) if moving else 2.2
+                self.walker.step(seconds, self.pace, face=None if moving else self._faces(seen))
                 if moving and self.walker.arrived():
                     self._arrive()
         rate = 1 - np.exp(-seconds / 0.22)
@@ -99,9 +96,7 @@ class Policy:
     def _threatened(self) -> bool:
         near = 0.95 if self.height > 0.1 else 1.25
         return (
-            (self.distance < near and self.closing > 0.25)
-            or self.distance < 0.55
-            or (self.distance < near + 0.75 and self.closing > 0.65)
+            (self.distance < near and self.closing > 0.25) or self.distance < 0.55 or (self.distance < near + 0.75 and self.closing > 0.65)
         )
 
     def _decide(self, seconds: float, seen: Seen) -> None:
@@ -140,11 +135,7 @@ class Policy:
         """Return a high place close to where it runs, not on the person's side."""
         for place in self.places:
             entry = np.asarray(place.entry)
-            if (
-                place.position[1] > 0.1
-                and np.linalg.norm(entry - goal) < 0.8
-                and np.linalg.norm(entry - seen.position) > 1.3
-            ):
+            if place.position[1] > 0.1 and np.linalg.norm(entry - goal) < 0.8 and np.linalg.norm(entry - seen.position) > 1.3:
                 return place
         return None
 
@@ -162,9 +153,7 @@ class Policy:
     def _visit(self) -> None:
         """Go to a favourite place, or just somewhere."""
         weight = np.array([0.5 if self.perch is not None and place is self.perch else 1.0 for place in self.places])
-        weight *= np.exp(
-            -0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places])
-        )
+        weight *= np.exp(-0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places]))
         self.reason, self.pace = "own", self.rng.choice([0.5, 0.7, 0.9, 1.3], p=[0.2, 0.4, 0.25, 0.15])
         self._leave()
         if self.rng.random() < 0.75:
@@ -187,13 +176,20 @@ class Policy:
             self._jump(np.asarray(self.place.position, float))
         sit, lie = {"flee": (0.15, 0.0), "approach": (0.65, 0.1), "own": (0.4, 0.25)}[self.reason]
         draw = self.rng.random()
-        self.wanted = np.array(
-            [float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0]
-        )
+        self.wanted = np.array([float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0])
 
     def _jump(self, end: Float[np.ndarray, "3"]) -> None:
         self.leap = Leap(self.position, end)
         self.walker.speed = 0.0
+
+    def _faces(self, seen: Seen) -> float | None:
+        """Return where it turns to while it rests: out from a perch, towards a person that it minds, or nowhere."""
+        if self.perch is not None:
+            return self.perch.yaw
+        if self.reason == "own" or self.distance > NOTICE_M or self.posture[:2].max() > 0.3:
+            return None
+        toward = seen.position - self.walker.position
+        return float(np.arctan2(toward[0], toward[1]))
 
     def _fly(self, seconds: float) -> None:
         leap = self.leap

@@ -109,9 +109,7 @@ def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height,
                 x, y = (j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy
                 total = 0.0
                 for k in range(3):
-                    total += (
-                        inverse_corners[face, k, 0] * x + inverse_corners[face, k, 1] * y + inverse_corners[face, k, 2]
-                    )
+                    total += inverse_corners[face, k, 0] * x + inverse_corners[face, k, 1] * y + inverse_corners[face, k, 2]
                 near = inverse_depth[row, column]
                 depth[i, j] = 1.0 / min(max(total, 0.97 * near), 1.03 * near)
     return depth

@@ -38,17 +38,11 @@ def manner(sessions: list[SessionTrajectories]) -> Manner:
     for lived in sessions:
         speed = lived.animal.speed()
         reach = round(WINDOW_S / STEP_S)
-        moving += [
-            float(speed[start : start + reach].mean() > MOVING_M_S) for start in range(0, max(len(speed) - reach, 1), 6)
-        ]
+        moving += [float(speed[start : start + reach].mean() > MOVING_M_S) for start in range(0, max(len(speed) - reach, 1), 6)]
         flee = _begins(lived.reason == REASONS.index("flee"))
         ran += [bool(flee[max(start - 15, 0) : start + 30].any()) for start in np.flatnonzero(_begins(_pressed(lived)))]
         away = ~_pressed(lived) & (_distance(lived) > 1.6)
-        alone += [
-            bool(flee[start : start + 30].any())
-            for start in range(0, len(flee), 30)
-            if away[max(start - 20, 0) : start + 30].all()
-        ]
+        alone += [bool(flee[start : start + 30].any()) for start in range(0, len(flee), 30) if away[max(start - 20, 0) : start + 30].all()]
         came += int(_begins(lived.reason == REASONS.index("approach")).sum())
         seconds += lived.animal.timestamp_s[-1]
     return Manner(_mean(moving), _mean(ran), _mean(alone), 60 * came / max(seconds, 1e-6))
@@ -70,9 +64,7 @@ def report_quality(folder: Path, scripts: list[Script], made: list[Made]) -> Non
         ],
         pictures=[
             Picture("contact_sheet", contact_sheet(made), "Every recording, the animal's true outline, stored depth"),
-            Picture(
-                "birds_eye", birds_eye(scripts), "From above: the phone (blue), the animal (orange), its flights (red)"
-            ),
+            Picture("birds_eye", birds_eye(scripts), "From above: the phone (blue), the animal (orange), its flights (red)"),
         ],
     )
 
@@ -106,9 +98,7 @@ def _from_above(script: Script) -> UInt8[np.ndarray, "height width 3"]:
         corners = cv2.boxPoints(((0, 0), block.size, 0.0))
         cosine, sine = np.cos(block.yaw), np.sin(block.yaw)
         turned = corners @ np.array([[cosine, -sine], [sine, cosine]]) + np.asarray(block.center)
-        cv2.fillConvexPoly(
-            canvas, _pixels(turned), (205, 205, 200) if block.bottom == 0 else (228, 226, 220), cv2.LINE_AA
-        )
+        cv2.fillConvexPoly(canvas, _pixels(turned), (205, 205, 200) if block.bottom == 0 else (228, 226, 220), cv2.LINE_AA)
     cv2.polylines(canvas, [_pixels(script.world_from_camera[:, [0, 2], 3])], False, (60, 110, 220), 2, cv2.LINE_AA)
     for pose in script.world_from_camera[::15]:
         start = pose[[0, 2], 3]

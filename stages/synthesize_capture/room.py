@@ -119,8 +119,7 @@ def furnish(rng: np.random.Generator) -> Room:
         if pieces[name].top > 0.1
     )
     movables = tuple(
-        Movable(tuple(piece.sheets), piece.size, piece.top, home)
-        for piece, home in zip(furniture.loose_things(rng), _HOMES, strict=True)
+        Movable(tuple(piece.sheets), piece.size, piece.top, home) for piece, home in zip(furniture.loose_things(rng), _HOMES, strict=True)
     )
     window = np.array([[x - 0.02, 2.1, -0.75], [0, 0, 1.5], [0, -1.2, 0]], float)
     lamp = (stands["lamp"][0], 1.62, stands["lamp"][1])
@@ -183,9 +182,7 @@ def _shell(rng: np.random.Generator) -> list[Sheet]:
     panels = [
         sheet
         for y0 in (0.55, 1.45)
-        for sheet in sheets.box(
-            (1.0, y0, z - 0.042), (0.56, 0.7, 0.014), texture.wood(rng, (186, 172, 150), contrast=3), skip="+z"
-        )
+        for sheet in sheets.box((1.0, y0, z - 0.042), (0.56, 0.7, 0.014), texture.wood(rng, (186, 172, 150), contrast=3), skip="+z")
     ]
     return [*walls, *board, *leaf, *around, *handle, *panels]
 
@@ -202,9 +199,7 @@ def _window(rng: np.random.Generator) -> list[Sheet]:
     radiator = [
         sheet
         for k in range(12)
-        for sheet in sheets.box(
-            (x - 0.07, 0.42, -0.55 + 0.1 * k), (0.09, 0.6, 0.07), texture.plain(rng, (220, 220, 214)), skip="+x -y"
-        )
+        for sheet in sheets.box((x - 0.07, 0.42, -0.55 + 0.1 * k), (0.09, 0.6, 0.07), texture.plain(rng, (220, 220, 214)), skip="+x -y")
     ]
     pot = sheets.cylinder(
         (x - 0.1, 0.97, 0.45),

@@ -85,11 +85,7 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
     ]
     rng = next(streams)
     course = session.standing_course(room, rng, plan.turnaround_s)
-    out.append(
-        _script(
-            plan, rng, "turnaround", room, day, camera_motion.turnaround(course, rng), plan.turnaround_s, course=course
-        )
-    )
+    out.append(_script(plan, rng, "turnaround", room, day, camera_motion.turnaround(course, rng), plan.turnaround_s, course=course))
     for number in range(1, plan.session_count + 1):
         rng = next(streams)
         arranged = room.arranged(rng)

@@ -47,9 +47,7 @@ def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float
     return times[keep]
 
 
-def lens(
-    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], width: int, height: int
-) -> Float[np.ndarray, "frame 4"]:
+def lens(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], width: int, height: int) -> Float[np.ndarray, "frame 4"]:
     """Return fx, fy, cx, cy per frame: about 54 by 68 degrees, with a stabiliser and a focus that wander."""
     focal = 235.0 / 240.0 * width * rng.uniform(0.985, 1.015)
     center = np.array([width, height]) / 2 + rng.normal(0, 0.004 * width, 2)
@@ -68,7 +66,7 @@ def odometry(
     """
     count = len(timestamp_s)
     start = rigid.rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
-    rate = np.deg2rad(rng.normal(0, 0.7) + 0.7 * _slow(rng, timestamp_s, 15.0)) / 60
+    rate = np.deg2rad(rng.normal(0, 1.0) + 0.7 * _slow(rng, timestamp_s, 15.0)) / 60
     heading = np.concatenate([[0.0], np.cumsum(rate[1:] * np.diff(timestamp_s))])
     tilt = np.deg2rad(0.1) * np.stack([_slow(rng, timestamp_s, 8.0) for _ in range(2)], axis=-1)
     vector = np.stack([tilt[:, 0], heading, tilt[:, 1]], axis=-1)
@@ -116,17 +114,15 @@ def lidar(
         interpolation=cv2.INTER_LINEAR,
     )
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    seen = cv2.remap(
-        depth, x + 0.7 * bend[..., 0], y + 0.7 * bend[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
-    )
+    seen = cv2.remap(depth, x + 0.7 * bend[..., 0], y + 0.7 * bend[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     mixed = cv2.blur(seen, (3, 3))
     jump = cv2.morphologyEx(seen, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     edge = jump > 0.05 + 0.03 * seen
     seen = np.where(edge & (bend[..., 0] > 0.1), mixed, seen)
     grain = cv2.GaussianBlur(rng.standard_normal((height, width), dtype=np.float32), (0, 0), 1.6) * 5.6
-    measured = seen + (0.005 * seen + 0.004) * (
-        0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)
-    ).astype(np.float32)
+    measured = seen + (0.005 * seen + 0.004) * (0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)).astype(
+        np.float32
+    )
     slope = jump / np.maximum(seen, 0.3)
     confidence = np.where(slope > 0.09, 0, np.where((slope > 0.035) | (seen > 3.8), 1, 2)).astype(np.uint8)
     confidence = cv2.erode(confidence, np.ones((3, 3), np.uint8))
@@ -145,17 +141,13 @@ def motion_blur_px(
     shutter_s: float,
 ) -> Float[np.ndarray, "frame 2"]:
     """Return how far (x, y) the picture's centre moves while the shutter is open, from the camera's turning."""
-    turn = rigid.vector_from_rotation(
-        np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
-    )
+    turn = rigid.vector_from_rotation(np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3])
     rate = turn / np.diff(timestamp_s)[:, None]
     rate = np.concatenate([rate, rate[-1:]])
     return np.stack([-rate[:, 1], rate[:, 0]], axis=-1) * focal_px * shutter_s
 
 
-def gains(
-    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], exposure: Exposure
-) -> Float[np.ndarray, "frame"]:
+def gains(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], exposure: Exposure) -> Float[np.ndarray, "frame"]:
     """Return the automatic exposure's slow wander, around 1."""
     return np.exp(exposure.gain_wander * _slow(rng, timestamp_s, 2.5))
 

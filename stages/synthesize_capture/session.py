@@ -16,7 +16,7 @@ from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, Seen
 from stages.synthesize_capture.room import Room
 
 STEP_S = 1.0 / 30.0
-ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M = 0.24, 0.34
+ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M = 0.46, 0.34
 PERSON_BREADTH_M, PERSON_HEIGHT_M = 0.40, 1.7
 
 
@@ -58,9 +58,7 @@ def simulate_session(room: Room, rng: np.random.Generator, duration_s: float) ->
     person_floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
     start = person_floor.centers()[rng.integers(person_floor.free.sum())]
     centers = animal_floor.centers()
-    begin = centers[
-        np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))
-    ]
+    begin = centers[np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))]
     animal = Policy(animal_floor, room.places, begin, rng)
     observer = Observer(person_floor, start, rng)
     past: deque[Seen] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
@@ -86,9 +84,7 @@ def simulate_session(room: Room, rng: np.random.Generator, duration_s: float) ->
         )
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     timestamp_s = np.arange(count) * STEP_S
-    course = AnimalCourse(
-        timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5]
-    )
+    course = AnimalCourse(timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5])
     return SessionTrajectories(course, columns[6], columns[7], columns[8])
 
 

@@ -52,9 +52,7 @@ def backdrop(sheets: list[Sheet], lit: list[UInt8[np.ndarray, "height width 3"]]
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    return Backdrop(
-        vertices, faces, coordinates[faces], owner, normal.astype(np.float32), np.concatenate(parts), levels, density
-    )
+    return Backdrop(vertices, faces, coordinates[faces], owner, normal.astype(np.float32), np.concatenate(parts), levels, density)
 
 
 @dataclass(frozen=True)
@@ -178,12 +176,8 @@ def _sample(face, a, b, c, x, y, z, fx, sheet, corners, atlas, levels, density, 
         j1, i1 = min(j0 + 1, columns - 1), min(i0 + 1, rows - 1)
         s, t = p - j0, q - i0
         for channel in range(3):
-            upper = (1 - s) * atlas[start + (i0 * columns + j0) * 3 + channel] + s * atlas[
-                start + (i0 * columns + j1) * 3 + channel
-            ]
-            lower = (1 - s) * atlas[start + (i1 * columns + j0) * 3 + channel] + s * atlas[
-                start + (i1 * columns + j1) * 3 + channel
-            ]
+            upper = (1 - s) * atlas[start + (i0 * columns + j0) * 3 + channel] + s * atlas[start + (i0 * columns + j1) * 3 + channel]
+            lower = (1 - s) * atlas[start + (i1 * columns + j0) * 3 + channel] + s * atlas[start + (i1 * columns + j1) * 3 + channel]
             pixel[channel] += weight * ((1 - t) * upper + t * lower)
     for channel in range(3):
         root = pixel[channel] / 255.0
@@ -200,9 +194,7 @@ def _fur(corner, a, b, c, rest, light, pattern, footprint, pixel):
     y = a * rest[corner[0], 1] + b * rest[corner[1], 1] + c * rest[corner[2], 1]
     z = a * rest[corner[0], 2] + b * rest[corner[1], 2] + c * rest[corner[2], 2]
     strength = a * pattern[corner[0], 3] + b * pattern[corner[1], 3] + c * pattern[corner[2], 3]
-    fine = (
-        strength * min(1.0, 0.004 / max(footprint, 1e-4)) * (_grain(x, y, z, 90.0) * 0.8 + _grain(x, y, z, 230.0) * 0.5)
-    )
+    fine = strength * min(1.0, 0.004 / max(footprint, 1e-4)) * (_grain(x, y, z, 90.0) * 0.8 + _grain(x, y, z, 230.0) * 0.5)
     for channel in range(3):
         base = a * pattern[corner[0], channel] + b * pattern[corner[1], channel] + c * pattern[corner[2], channel]
         shine = a * light[corner[0], channel] + b * light[corner[1], channel] + c * light[corner[2], channel]

@@ -94,9 +94,7 @@ def cushion(center, size, paint: Paint, *, bulge: float, skip: str = "-y") -> li
     return soft
 
 
-def cylinder(
-    center, radius: float, height: float, side: Paint, top: Paint, *, flare: float = 1.0, segments: int = 16
-) -> list[Sheet]:
+def cylinder(center, radius: float, height: float, side: Paint, top: Paint, *, flare: float = 1.0, segments: int = 16) -> list[Sheet]:
     """Make a standing cylinder whose top radius is ``flare`` times the bottom one, with a lid."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
@@ -122,13 +120,9 @@ def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: 
 
 def ball(center, radius: float, paint: Paint, *, squash: float = 1.0, rings: int = 7) -> Sheet:
     """Make a ball, its height scaled by ``squash``."""
-    polar, angle = np.meshgrid(
-        np.linspace(0.02, np.pi - 0.02, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij"
-    )
+    polar, angle = np.meshgrid(np.linspace(0.02, np.pi - 0.02, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij")
     unit = np.stack([np.sin(polar) * np.sin(angle), squash * np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1)
-    return Sheet(
-        (np.asarray(center, float) + radius * unit).astype(np.float32), paint(2 * np.pi * radius, np.pi * radius)
-    )
+    return Sheet((np.asarray(center, float) + radius * unit).astype(np.float32), paint(2 * np.pi * radius, np.pi * radius))
 
 
 def triangles(
