@@ -10,9 +10,7 @@ from pipeline.space import rigid
 OUTLIER_FACTOR = 4.0
 
 
-def constant_between(
-    ours: Float[np.ndarray, "frame 4 4"], truth: Float[np.ndarray, "frame 4 4"]
-) -> Float[np.ndarray, "4 4"]:
+def constant_between(ours: Float[np.ndarray, "frame 4 4"], truth: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "4 4"]:
     """Fit ``ours_from_truth`` such that ``ours = ours_from_truth @ truth`` over all frames; no scale.
 
     Frames far beyond the median residual are left out of a second fit. Frames of ours that are NaN do not count.
@@ -55,6 +53,4 @@ def pose_errors(ours: Float[np.ndarray, "frame 4 4"], truth: Float[np.ndarray, "
 def joined(errors: list[PoseErrors]) -> PoseErrors:
     """Put the frames of several videos one after the other."""
     empty = [PoseErrors(np.zeros(0), np.zeros(0))]
-    return PoseErrors(
-        *(np.concatenate([getattr(each, name) for each in errors or empty]) for name in ("degrees", "meters"))
-    )
+    return PoseErrors(*(np.concatenate([getattr(each, name) for each in errors or empty]) for name in ("degrees", "meters")))

@@ -130,9 +130,7 @@ def _scores(
     return {name: np.mean(values, axis=0) for name, values in found.items()}
 
 
-def _goals(
-    method: Predictor, context: Context, count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "window sample 3"]:
+def _goals(method: Predictor, context: Context, count: int, rng: np.random.Generator) -> Float[np.ndarray, "window sample 3"]:
     """Draw goals only where a method can, which spares the networks of path and body."""
     return (method.goals if isinstance(method, Ats) else method.sample)(context, count, rng).goal
 
@@ -145,9 +143,7 @@ def _report(
 ) -> None:
     def interval(values: Float[np.ndarray, "window"]) -> Interval:
         chosen = episode if len(values) == len(episode) else episode[:: protocol.plan_stride]
-        return bootstrapped(
-            values, np.unique(chosen, return_inverse=True)[1], protocol.draws, np.random.default_rng(protocol.seed)
-        )
+        return bootstrapped(values, np.unique(chosen, return_inverse=True)[1], protocol.draws, np.random.default_rng(protocol.seed))
 
     for method, of_method in scores.items():
         for name in _SCORE:

@@ -39,9 +39,7 @@ class Effort:
     time_plans: bool
 
 
-def evaluate(
-    folders: Folders, videos: Sequence, effort: Effort, protocol: Protocol, rng: np.random.Generator, device: str
-) -> Figures:
+def evaluate(folders: Folders, videos: Sequence, effort: Effort, protocol: Protocol, rng: np.random.Generator, device: str) -> Figures:
     """Return all figures of a build."""
     figures = Figures()
     if folders.truth is None:
@@ -59,14 +57,9 @@ def evaluate(
     return figures
 
 
-def _against_truth(
-    folders: Folders, videos: Sequence, effort: Effort, rng: np.random.Generator, device: str
-) -> Figures:
+def _against_truth(folders: Folders, videos: Sequence, effort: Effort, rng: np.random.Generator, device: str) -> Figures:
     figures, known = Figures(), reading.recorded(folders, tuple(videos))
-    role = {
-        name: [each for each in known if each.video.role == name]
-        for name in ("walkthrough", "turnaround", "session", "heldout")
-    }
+    role = {name: [each for each in known if each.video.role == name] for name in ("walkthrough", "turnaround", "session", "heldout")}
     walkthrough, turnaround = role["walkthrough"][0], role["turnaround"][0]
     frames = reading.frames_of_truth(folders, walkthrough, turnaround)
     sessions = role["session"]
@@ -102,9 +95,7 @@ def _registration(folders: Folders, sessions: Sequence[Recorded], frames: Frames
     return figures
 
 
-def _single_frames(
-    folders: Folders, walkthrough: Recorded, sessions: Sequence[Recorded], frames: Frames, effort: Effort
-) -> Figures:
+def _single_frames(folders: Folders, walkthrough: Recorded, sessions: Sequence[Recorded], frames: Frames, effort: Effort) -> Figures:
     """Place single frames by our localizer and by its rivals."""
     table = arrays.load(folders.scene_template / "cameras.npz")
     mapped = np.flatnonzero(table["registered"])
@@ -135,10 +126,7 @@ def _single_frames(
 
 
 def _perception(folders: Folders, sessions: Sequence[Recorded], turnaround: Recorded) -> Figures:
-    seen = {
-        each.video.id: perception.overlaps(Masks.open(folders.masks[each.video.id]), each.truth)
-        for each in (*sessions, turnaround)
-    }
+    seen = {each.video.id: perception.overlaps(Masks.open(folders.masks[each.video.id]), each.truth) for each in (*sessions, turnaround)}
     pairs = []
     for each in sessions:
         true = read_flow(folders.truth, each.name, each.source_index)

@@ -5,14 +5,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import UInt8
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What `metrics.json` and `reasons.json` will hold."""
+    """What `metrics.json` and `reasons.json` will hold, and pictures beside them."""
 
     values: dict[str, float | None] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
+    pictures: dict[str, UInt8[np.ndarray, "height width 3"]] = field(default_factory=dict)
+    """by caption"""
 
     def put(self, name: str, value: float, why_unknown: str = "too few frames could be measured") -> None:
         """Record a figure; what is not finite becomes nothing with the reason given."""
@@ -30,6 +33,7 @@ class Figures:
         """Take over another room's figures."""
         self.values.update(other.values)
         self.reasons.update(other.reasons)
+        self.pictures.update(other.pictures)
 
 
 def median(errors: np.ndarray) -> float:

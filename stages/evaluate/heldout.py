@@ -66,6 +66,23 @@ def picture_figures(name: str, views: Sequence[View]) -> Figures:
     return figures
 
 
+def side_by_side(views: Sequence[View], count: int = 6) -> UInt8[np.ndarray, "height width 3"]:
+    """Put some views beside each other: truth, ours, true depth, our depth."""
+    chosen = [views[index] for index in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
+    rows = [
+        [view.true.color for view in chosen],
+        [view.color for view in chosen],
+        [_gray(view.true.depth) for view in chosen],
+        [_gray(view.depth) for view in chosen],
+    ]
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
+
+
+def _gray(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:
+    near = np.where(depth > 0, 255 * (1 - np.minimum(depth, RANGE_M) / RANGE_M), 0)
+    return np.repeat(near.astype(np.uint8)[..., None], 3, axis=-1)
+
+
 def depth_is_right(view: View) -> Bool[np.ndarray, "height width"]:
     """Tell which pixels are within 0.1 m of truth; holes are wrong."""
     return (view.depth > 0) & (np.abs(view.depth - view.true.depth) <= TOLERANCE_M)

@@ -49,9 +49,7 @@ def figures_of(name: str, errors: PoseErrors) -> Figures:
     return figures
 
 
-def placed_by_localizer(
-    localizer: Localizer, clip: Clip, frames: Sequence[int], hide: Sequence[np.ndarray]
-) -> np.ndarray:
+def placed_by_localizer(localizer: Localizer, clip: Clip, frames: Sequence[int], hide: Sequence[np.ndarray]) -> np.ndarray:
     """Return ``world_from_camera [frame 4 4]``, NaN where not placed; ``hide`` marks the agent's pixels."""
     found = []
     for frame, hidden in zip(frames, hide, strict=True):

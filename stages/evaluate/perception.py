@@ -60,10 +60,7 @@ def flow_pairs(ours: Float[np.ndarray, "frame height width 2"], true: TrueFlow, 
     """Pair up flow of gap 1; the agent's cells are those whose centre it covers."""
     stride = masks.shape[1] // ours.shape[1]
     agent = masks[:, stride // 2 :: stride, stride // 2 :: stride][:, : ours.shape[1], : ours.shape[2]]
-    return [
-        FlowPair(ours[first].astype(np.float32), flow, agent[first])
-        for first, flow in zip(true.first, true.flow, strict=True)
-    ]
+    return [FlowPair(ours[first].astype(np.float32), flow, agent[first]) for first, flow in zip(true.first, true.flow, strict=True)]
 
 
 def flow_figures(pairs: Sequence[FlowPair]) -> Figures:

@@ -84,9 +84,7 @@ def frames_of_truth(folders: Folders, walkthrough: Recorded, turnaround: Recorde
     true_agent_from_camera = rigid.inverse(turnaround.truth.world_from_agent) @ turnaround.truth.world_from_camera
     ours = _template_cameras(folders.scene_template, "world_from_camera")
     around = _template_cameras(folders.agent_template, "agent_from_camera")
-    return Frames(
-        constant_between(ours, walkthrough.truth.world_from_camera), constant_between(around, true_agent_from_camera)
-    )
+    return Frames(constant_between(ours, walkthrough.truth.world_from_camera), constant_between(around, true_agent_from_camera))
 
 
 def _template_cameras(folder: Path, name: str) -> Float[np.ndarray, "frame 4 4"]:

@@ -71,6 +71,9 @@ def _held_out(folders: Folders, phones: Sequence[Recorded], frames: Frames, effo
     if by_fields:
         figures.add(heldout.view_figures(by_fields))
         figures.add(heldout.picture_figures("splats", by_splats))
+        for name, views in (("fields", by_fields), ("splats", by_splats)):
+            caption = f"held-out phone: truth, ours ({name}), true depth, our depth"
+            figures.pictures[caption] = heldout.side_by_side(views)
     else:
         reason = "no held-out phone, or the session that it is synchronized with was not registered"
         figures.skip(heldout.NAMES, reason)
@@ -116,9 +119,7 @@ def _drawn_by_splats(folders: Folders, motion: Motion, shots: Sequence[Shot]) ->
             cloud = gaussians.together(cloud, splats.place_agent(*posed, None))
         camera = (rigid.inverse(shot.world_from_camera), shot.intrinsics)
         with torch.no_grad():
-            seen = gaussians.see(
-                cloud, *(torch.as_tensor(part, dtype=torch.float32) for part in camera), *shot.depth.shape
-            )
+            seen = gaussians.see(cloud, *(torch.as_tensor(part, dtype=torch.float32) for part in camera), *shot.depth.shape)
         color = (seen.color.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
         views.append(View(color, seen.depth.numpy(), shot))
     return views
@@ -132,9 +133,7 @@ def _skin(folders: Folders) -> tuple[Mesh, Skin]:
     return mesh, Skin(mesh.vertices, table["weights"], table["agent_from_bone_rest"])
 
 
-def _tracks(
-    folders: Folders, sessions: Sequence[Recorded], motions: dict, turnaround: Recorded, frames: Frames
-) -> Figures:
+def _tracks(folders: Folders, sessions: Sequence[Recorded], motions: dict, turnaround: Recorded, frames: Frames) -> Figures:
     """Follow surface points that are matched to truth once, in the turnaround's middle frame."""
     skin = _skin(folders)[1].only(arrays.load(folders.reconstruction / "tracks.npz")["vertex_index"])
     middle = len(turnaround.clip) // 2
@@ -157,17 +156,11 @@ def _posed(skin: Skin, motion: Motion | None, frame: int) -> np.ndarray | None:
     return skin.posed(motion.world_from_agent[frame], motion.agent_from_bone[frame])
 
 
-def _agent_chamfer(
-    folders: Folders, sessions: Sequence[Recorded], motions: dict, frames: Frames, effort: Effort
-) -> Figures:
+def _agent_chamfer(folders: Folders, sessions: Sequence[Recorded], motions: dict, frames: Frames, effort: Effort) -> Figures:
     figures, skin, distances = Figures(), _skin(folders)[1], []
     for each in sessions:
         visible = np.flatnonzero(each.truth.agent_visible)
-        chosen = (
-            visible[np.unique(np.linspace(0, len(visible) - 1, effort.surface_frames).astype(int))]
-            if len(visible)
-            else []
-        )
+        chosen = visible[np.unique(np.linspace(0, len(visible) - 1, effort.surface_frames).astype(int))] if len(visible) else []
         for frame in chosen:
             ours = _posed(skin, motions[each.video.id], frame)
             if ours is not None:
@@ -188,7 +181,5 @@ def _scene_chamfer(folders: Folders, walkthrough: Recorded, frames: Frames, rng:
     camera = (cameras[chosen], walkthrough.truth.intrinsics[chosen], walkthrough.clip.color_size)
     points = surfaces.sample_surface(true, surfaces.SAMPLES, rng)
     seen = points[surfaces.seen_by(caster, points, *camera)]
-    figures.put(
-        "reconstruction/scene_chamfer_m", surfaces.chamfer(surfaces.sample_surface(ours, surfaces.SAMPLES, rng), seen)
-    )
+    figures.put("reconstruction/scene_chamfer_m", surfaces.chamfer(surfaces.sample_surface(ours, surfaces.SAMPLES, rng), seen))
     return figures

@@ -14,9 +14,7 @@ GOOD = (2.0, 0.05)
 COVERAGES = (0.5, 0.8)
 
 
-def camera_figures(
-    errors: Mapping[str, PoseErrors], confidence: Mapping[str, Float[np.ndarray, "frame"]], registered: int
-) -> Figures:
+def camera_figures(errors: Mapping[str, PoseErrors], confidence: Mapping[str, Float[np.ndarray, "frame"]], registered: int) -> Figures:
     """Summarise camera errors of all sessions, and of the frames that were most certain."""
     figures, all_errors = Figures(), joined(list(errors.values()))
     _summarise(figures, "registration", all_errors)

@@ -15,16 +15,12 @@ class Interval:
     high: float
 
 
-def episodes(
-    start: Int[np.ndarray, "window"], video: Int[np.ndarray, "window"], frames: int
-) -> Int[np.ndarray, "window"]:
+def episodes(start: Int[np.ndarray, "window"], video: Int[np.ndarray, "window"], frames: int) -> Int[np.ndarray, "window"]:
     """Number stretches of ``frames`` frames, so that windows of different episodes hardly overlap."""
     return np.unique(np.stack([video, start // frames], axis=1), axis=0, return_inverse=True)[1].ravel()
 
 
-def bootstrapped(
-    values: Float[np.ndarray, "window"], episode: Int[np.ndarray, "window"], draws: int, rng: np.random.Generator
-) -> Interval:
+def bootstrapped(values: Float[np.ndarray, "window"], episode: Int[np.ndarray, "window"], draws: int, rng: np.random.Generator) -> Interval:
     """Resample episodes with replacement and return the mean with its percentiles 2.5 and 97.5."""
     count = episode.max() + 1
     total = np.bincount(episode, values, count)

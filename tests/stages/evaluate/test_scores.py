@@ -111,9 +111,7 @@ def test_chamfer_measures_the_distance_of_surfaces():
 
 
 def test_only_what_cameras_see_is_seen():
-    corner = np.array(
-        [[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]]
-    )
+    corner = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     mesh = Mesh(corner.astype(np.float32), faces)
     points = surfaces.sample_surface(mesh, 2000, np.random.default_rng(0))
@@ -151,9 +149,7 @@ def data():
     starts = {"a": np.arange(0, 136, 4), "b": np.arange(97)}
     video = np.concatenate([np.full(len(start), i) for i, start in enumerate(starts.values())])
     split = np.where(video == 0, TRAIN, TEST)
-    return BehaviorData(
-        trajectories, np.tile(np.eye(4), (3, 1, 1)), video, np.concatenate(list(starts.values())), split, ("a", "b")
-    )
+    return BehaviorData(trajectories, np.tile(np.eye(4), (3, 1, 1)), video, np.concatenate(list(starts.values())), split, ("a", "b"))
 
 
 class Oracle:
@@ -209,9 +205,7 @@ def test_the_energy_score_is_smallest_for_the_right_distribution():
     truth = rng.normal(0, 1, (4000, 3))
     future = Future(np.tile(np.eye(4), (4000, 1, 1, 1)), np.zeros((4000, 1, 1, 4, 4)))
     future.world_from_agent[:, 0, :3, 3] = truth
-    scores = [
-        behavior.goal_energy_score(Samples(rng.normal(0, std, (4000, 16, 3))), future).mean() for std in (0.01, 1, 3)
-    ]
+    scores = [behavior.goal_energy_score(Samples(rng.normal(0, std, (4000, 16, 3))), future).mean() for std in (0.01, 1, 3)]
     assert scores[1] == min(scores)
 
 

@@ -63,9 +63,7 @@ def test_masks_are_compared_where_they_know(folder):
         if i == 4:
             label[:] = 0
         images.write_gray(out / f"{i:06d}.png", label)
-    arrays.save(
-        out / "masks.npz", visible=np.ones(5, bool), confidence=np.ones(5, np.float32), area=np.ones(5, np.float32)
-    )
+    arrays.save(out / "masks.npz", visible=np.ones(5, bool), confidence=np.ones(5, np.float32), area=np.ones(5, np.float32))
     found = perception.overlaps(Masks.open(out), truth)
     np.testing.assert_allclose(found.iou, [1, 1, 1, 1, 0])
     figures = perception.mask_figures([found], None)
