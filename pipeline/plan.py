@@ -166,7 +166,8 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     for job in all_jobs:  # there from the start, so that a job that fails leaves no trace
         lock_file(job.home, job.id).parent.mkdir(parents=True, exist_ok=True)
         lock_file(job.home, job.id).touch()
-    artifact.write_if_changed(plan.home.plan / "dag.json", _json([asdict(job) | {"stamp": job.stamp} for job in all_jobs]))
+    lines = [json.dumps(asdict(job) | {"stamp": job.stamp}, sort_keys=True) for job in all_jobs]
+    artifact.write_if_changed(plan.home.plan / "dag.json", "[\n" + ",\n".join(lines) + "\n]\n")
     artifact.write_if_changed(plan.home.plan / "rules.mk", _rules(plan, all_jobs))
 
 

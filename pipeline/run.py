@@ -68,9 +68,10 @@ def _job(home: str, job_id: str) -> dict[str, Any]:
     path = plan.Home.parse(home).plan / "dag.json"
     if not path.is_file():
         raise InputError("RUN-001", "is not planned yet", home, f"run `make {home}`")
-    for job in json.loads(path.read_text()):
+    jobs = json.loads(path.read_text())
+    for number, job in enumerate(jobs, start=1):
         if job["id"] == job_id:
-            return job
+            return job | {"place": f"{number} of {len(jobs)}"}
     raise InputError("RUN-001", f"has no job {job_id!r}", home, f"see {path}")
 
 
@@ -118,7 +119,7 @@ def _do(job: dict[str, Any], key: str, resume: Path) -> int:
         resume.mkdir(parents=True, exist_ok=True)
         artifact.write_if_changed(resume / "key", key)
         arguments += ["--resume", str(resume)]
-    _say(job["id"], "begins")
+    _say(job["id"], f"begins ({job['place']})")
     start = time.time()
     code, peak_mb = _spawn(job, [sys.executable, "-m", f"stages.{job['stage']}", *arguments])
     seconds = time.time() - start

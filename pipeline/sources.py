@@ -5,6 +5,7 @@ comments, docstrings or layout; `settings` are the fields of its `Config`. Stand
 """
 
 import ast
+import functools
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,7 @@ def settings(stage: str, cache: Cache) -> dict[str, Any] | None:
     return None
 
 
+@functools.cache
 def _path_of(module: str) -> Path | None:
     path = Path(*module.split("."))
     return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)

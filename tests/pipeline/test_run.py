@@ -31,7 +31,7 @@ def house(built, tmp_path):
 
 def begun(made):
     assert made.returncode == 0, made.stderr
-    return {line.split("]")[0][1:] for line in made.stderr.splitlines() if line.endswith("] begins")}
+    return {line.split("]")[0][1:] for line in made.stderr.splitlines() if "] begins (" in line}
 
 
 def contents(house):
