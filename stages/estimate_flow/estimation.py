@@ -92,9 +92,7 @@ class Estimator:
 
     def _better(self, first: Gray, second: Gray, candidates: Sequence[Dense]) -> Dense:
         """Keep the first candidate but where the second one clearly makes the pictures look more alike."""
-        first, second = (
-            cv2.resize(gray, self.dense_size[::-1], interpolation=cv2.INTER_AREA) for gray in (first, second)
-        )
+        first, second = (cv2.resize(gray, self.dense_size[::-1], interpolation=cv2.INTER_AREA) for gray in (first, second))
         mismatch = []
         for candidate in candidates:
             difference = cv2.absdiff(_sampled(second, self._pixel + candidate), first).astype(np.float32)
@@ -109,9 +107,7 @@ class Estimator:
         return _sampled(dense, self.grid_px / self._color_per_dense - 0.5) * self._color_per_dense
 
 
-def flows(
-    gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimator: Estimator
-) -> Iterator[tuple[int, Flow, Flow]]:
+def flows(gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimator: Estimator) -> Iterator[tuple[int, Flow, Flow]]:
     """Yield (gap, forward, backward) for gaps that double from 1; ``gray(i)`` gives frame i reduced.
 
     Entry i of both directions belongs to frames i and i + gap; both are empty when the clip is too short.

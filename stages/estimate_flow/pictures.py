@@ -57,9 +57,7 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
         for each in reviews
     ] + [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
     pictures = [
-        qa.Picture(
-            f"gap_{each.gap}", each.strip, f"frames, flow to {each.gap} later (hue = direction), dark where uncertain"
-        )
+        qa.Picture(f"gap_{each.gap}", each.strip, f"frames, flow to {each.gap} later (hue = direction), dark where uncertain")
         for each in reviews
         if each.strip is not None
     ]

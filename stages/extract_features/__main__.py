@@ -24,9 +24,7 @@ def run(task: cli.Task) -> None:
     settings: Config = task.config
     clip, basis = Clip.open(task.input("frames")), FeatureBasis.load(task.input("feature_basis"))
     numbers = progress.track(range(len(clip)), "features: frames")
-    features = np.stack(
-        [basis.project(describe(clip.color(i), settings.stride_px)).astype(np.float16) for i in numbers]
-    )
+    features = np.stack([basis.project(describe(clip.color(i), settings.stride_px)).astype(np.float16) for i in numbers])
     with task.create() as folder:
         arrays.save(folder / "features.npz", features=features)
         pictures.report_quality(folder, clip, features)

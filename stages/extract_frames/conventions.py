@@ -38,8 +38,7 @@ class Convention:
 
 RECORD3D = Convention()
 CONVENTIONS = tuple(
-    Convention(*choice)
-    for choice in product(("camera_to_world", "world_to_camera"), ("opengl", "opencv"), range(4), ("xyzw", "wxyz"))
+    Convention(*choice) for choice in product(("camera_to_world", "world_to_camera"), ("opengl", "opencv"), range(4), ("xyzw", "wxyz"))
 )
 
 
@@ -97,13 +96,9 @@ def check_poses(
     tried = {convention: odometry_from_pose(pose, convention) for convention in CONVENTIONS}
     chosen = _moving_pairs(tried[RECORD3D], timestamp_s, pairs)
     if len(chosen) == 0:
-        return SelfCheck(
-            "untested", RECORD3D, 0, np.nan, np.nan, TOLERANCE_M, "the phone moved too little to test its poses"
-        )
+        return SelfCheck("untested", RECORD3D, 0, np.nan, np.nan, TOLERANCE_M, "the phone moved too little to test its poses")
     views = {frame: depth_view(frame) for frame in sorted(set(chosen.ravel().tolist()))}
-    scores = {
-        convention: _score(odometry_from_camera, chosen, views) for convention, odometry_from_camera in tried.items()
-    }
+    scores = {convention: _score(odometry_from_camera, chosen, views) for convention, odometry_from_camera in tried.items()}
     return _judge(scores, len(chosen))
 
 
@@ -136,9 +131,7 @@ def _unusable(reason: str) -> SelfCheck:
     return SelfCheck("unusable", RECORD3D, 0, np.nan, np.nan, TOLERANCE_M, reason)
 
 
-def _moving_pairs(
-    odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int
-) -> np.ndarray:
+def _moving_pairs(odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int) -> np.ndarray:
     """Pick up to ``pairs`` (first, second) frames with time and motion between, spread over the recording."""
     second = np.searchsorted(timestamp_s, timestamp_s + GAP_S[0])
     first = np.flatnonzero(second < len(timestamp_s))
@@ -151,9 +144,7 @@ def _moving_pairs(
     return usable[np.unique(np.linspace(0, len(usable) - 1, pairs).round().astype(int))] if len(usable) else usable
 
 
-def _score(
-    odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarray, views: dict[int, DepthView]
-) -> _Score:
+def _score(odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarray, views: dict[int, DepthView]) -> _Score:
     """Compare depth over all pairs under one convention."""
     rows = []
     for first, second in pairs:
@@ -169,9 +160,7 @@ def _score(
     )
 
 
-def _compare(
-    first: DepthView, second: DepthView, second_from_first: Float[np.ndarray, "4 4"]
-) -> tuple[float, float, float]:
+def _compare(first: DepthView, second: DepthView, second_from_first: Float[np.ndarray, "4 4"]) -> tuple[float, float, float]:
     """Return (median depth difference, share of points that can be compared, tolerance), metres."""
     every = np.s_[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX]
     points_first = cameras.back_project(first.depth, first.intrinsics)[every][first.depth[every] > 0]
@@ -198,14 +187,10 @@ def _judge(scores: dict[Convention, _Score], pairs: int) -> SelfCheck:
     if documented.accepted:
         return _checked("documented", RECORD3D, documented, pairs, "the documented convention explains the depth")
     if scores[best].accepted and scores[best].cost < 0.5 * documented.cost:
-        return _checked(
-            "other", best, scores[best], pairs, f"the documented convention is refuted by the depth; {best} explains it"
-        )
+        return _checked("other", best, scores[best], pairs, f"the documented convention is refuted by the depth; {best} explains it")
     if documented.residual_m < UNUSABLE_FACTOR * TOLERANCE_M and documented.overlap > MIN_OVERLAP:
         return _checked("documented", RECORD3D, documented, pairs, "device poses explain the depth only roughly")
-    return _checked(
-        "unusable", RECORD3D, documented, pairs, "device poses do not explain the depth under any convention"
-    )
+    return _checked("unusable", RECORD3D, documented, pairs, "device poses do not explain the depth under any convention")
 
 
 def _checked(verdict, convention: Convention, score: _Score, pairs: int, reason: str) -> SelfCheck:

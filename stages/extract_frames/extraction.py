@@ -102,9 +102,7 @@ def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality
         if color.shape[:2] != plan.stored_size:
             color = cv2.resize(color, plan.stored_size[::-1], interpolation=cv2.INTER_AREA)
         if plan.quarter_turns:
-            color, depth, confidence = (
-                cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence)
-            )
+            color, depth, confidence = (cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence))
         if plan.quarter_turns or plan.stored_size != recording.color_size:
             jpeg = images.encode_jpeg(color, jpeg_quality)
         sharpness, brightness = picture_statistics(color)

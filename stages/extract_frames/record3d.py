@@ -183,9 +183,7 @@ class _Metadata:
             raise self._broken(f"{key!r} is no picture size: {value:g}")
         return int(value)
 
-    def _numbers(
-        self, key: str, shape: tuple[int | None, ...], *, positive: bool = False, finite: bool = True
-    ) -> np.ndarray:
+    def _numbers(self, key: str, shape: tuple[int | None, ...], *, positive: bool = False, finite: bool = True) -> np.ndarray:
         """Read an array of numbers whose axes have the given lengths (None: any)."""
         if key not in self._table:
             raise self._broken(f"{key!r} is missing")
@@ -220,9 +218,7 @@ def _numbers(names: frozenset[str], pattern: str) -> set[int]:
     """Return the frame numbers of the members that follow a pattern such as ``rgbd/%d.jpg``."""
     prefix, suffix = pattern.split("%d")
     stems = (name[len(prefix) : -len(suffix)] for name in names if name.startswith(prefix) and name.endswith(suffix))
-    return {
-        int(stem) for stem in stems if stem.isascii() and stem.isdigit() and len(stem) < 10 and str(int(stem)) == stem
-    }
+    return {int(stem) for stem in stems if stem.isascii() and stem.isdigit() and len(stem) < 10 and str(int(stem)) == stem}
 
 
 def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, first: int) -> tuple[int, int]:
@@ -241,14 +237,10 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
 
 def _refuse_face_id(depth_size: tuple[int, int], pose: np.ndarray | None, where: str) -> None:
     """Refuse the front camera: its recordings have depth of another size and no pose at all."""
-    no_pose = (
-        pose is not None and len(pose) > 1 and np.array_equal(pose, np.tile([0, 0, 0, 1, 0, 0, 0], (len(pose), 1)))
-    )
+    no_pose = pose is not None and len(pose) > 1 and np.array_equal(pose, np.tile([0, 0, 0, 1, 0, 0, 0], (len(pose), 1)))
     if no_pose or math.prod(depth_size) in FACE_ID_FLOATS:
         remedy = "record with the LiDAR camera at the back of the phone"
-        raise InputError(
-            "CAP-005", what="recorded with the Face-ID camera: it has no device poses", where=where, remedy=remedy
-        )
+        raise InputError("CAP-005", what="recorded with the Face-ID camera: it has no device poses", where=where, remedy=remedy)
 
 
 def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
@@ -257,9 +249,7 @@ def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float
     else:
         depth = np.frombuffer(_decompress_exactly(container, name, 4 * math.prod(size)), "<f4").reshape(size)
     if depth.shape != size:
-        raise _wrong_depth(
-            f"{container.where}:{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}"
-        )
+        raise _wrong_depth(f"{container.where}:{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}")
     return depth
 
 
@@ -269,9 +259,7 @@ def _confidence_reader(
     """Return a reader of confidence pictures where every frame has one."""
     if isinstance(container, FolderContainer) or not set(index) <= _numbers(container.names, layout.confidence):
         return None
-    return lambda i: np.frombuffer(
-        _decompress_exactly(container, layout.confidence % i, math.prod(size)), np.uint8
-    ).reshape(size)
+    return lambda i: np.frombuffer(_decompress_exactly(container, layout.confidence % i, math.prod(size)), np.uint8).reshape(size)
 
 
 def _decompress_exactly(container: Container, name: str, expected: int) -> bytes:

@@ -17,9 +17,6 @@ def quarter_turns_from_gravity(
     The pictures stay as they are unless another turn is better by ``margin`` (mean cosine): a phone that looks
     straight down has no upright.
     """
-    up_in_picture = [
-        -(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean()
-        for turns in range(4)
-    ]
+    up_in_picture = [-(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean() for turns in range(4)]
     best = int(np.argmax(up_in_picture))
     return best if up_in_picture[best] > up_in_picture[0] + margin else 0

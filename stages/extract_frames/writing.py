@@ -50,9 +50,7 @@ def write_frames(folder: Path, frames: Iterable[Frame], *, total: int, min_depth
         kept[number] = True
     if not statistics:
         what = f"in no frame is {min_depth_valid:.0%} of the depth known"
-        raise InputError(
-            "CAP-007", what=what, where=where, remedy="record things within 5 m, in light, with the LiDAR camera"
-        )
+        raise InputError("CAP-007", what=what, where=where, remedy="record things within 5 m, in light, with the LiDAR camera")
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))
     return Written(kept, *np.array(statistics).T, color_strip, depth_strip)
 

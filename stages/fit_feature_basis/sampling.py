@@ -9,9 +9,7 @@ from pipeline.files.clips import Clip
 from pipeline.models.features import describe
 
 
-def sample_descriptors(
-    clips: Iterable[Clip], *, frames_per_clip: int, stride_px: int
-) -> Float[np.ndarray, "sample channel"]:
+def sample_descriptors(clips: Iterable[Clip], *, frames_per_clip: int, stride_px: int) -> Float[np.ndarray, "sample channel"]:
     """Describe ``frames_per_clip`` frames of each recording, evenly spread in time."""
     return np.concatenate([_of_clip(clip, frames_per_clip, stride_px) for clip in clips])
 

@@ -10,10 +10,7 @@ from pipeline.models.features import FeatureBasis, describe, fit_basis
 def texture(height, width, seed=0):
     """A random RGB picture with structure at several scales."""
     rng = np.random.default_rng(seed)
-    parts = [
-        cv2.resize(rng.normal(size=(height // s, width // s)), (width, height), interpolation=cv2.INTER_CUBIC) * s
-        for s in (4, 8, 16)
-    ]
+    parts = [cv2.resize(rng.normal(size=(height // s, width // s)), (width, height), interpolation=cv2.INTER_CUBIC) * s for s in (4, 8, 16)]
     total = sum(parts)
     gray = (40 + 170 * (total - total.min()) / np.ptp(total)).astype(np.uint8)
     return np.stack([gray, gray // 2, 255 - gray // 3], axis=-1)

@@ -18,8 +18,7 @@ def texture(height, width, seed=0):
     """A smooth random RGB picture."""
     rng = np.random.default_rng(seed)
     noise = sum(
-        cv2.resize(rng.normal(size=(height // s, width // s)), (width, height), interpolation=cv2.INTER_CUBIC) * s
-        for s in (4, 8, 16)
+        cv2.resize(rng.normal(size=(height // s, width // s)), (width, height), interpolation=cv2.INTER_CUBIC) * s for s in (4, 8, 16)
     )
     scaled = (noise - noise.min()) / np.ptp(noise) * 255
     return np.repeat(scaled.astype(np.uint8)[..., None], 3, axis=-1)

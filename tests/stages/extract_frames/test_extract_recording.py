@@ -34,9 +34,7 @@ def test_frames_are_upright_and_agree_with_truth(tmp_path, monkeypatch, turns):
     upright = walk(36)
     np.testing.assert_allclose(clip.depth(5), upright.depth(source[5]), rtol=1e-3)
     assert np.abs(clip.color(5).astype(int) - upright.color(source[5])).mean() < 3
-    np.testing.assert_allclose(
-        clip.depth_intrinsics[0], cameras.scale_intrinsics(clip.intrinsics[0], COLOR_SIZE, DEPTH_SIZE), atol=1e-9
-    )
+    np.testing.assert_allclose(clip.depth_intrinsics[0], cameras.scale_intrinsics(clip.intrinsics[0], COLOR_SIZE, DEPTH_SIZE), atol=1e-9)
 
 
 def test_colour_bytes_are_copied_untouched_when_upright(tmp_path, monkeypatch):

@@ -51,9 +51,7 @@ def test_another_convention_is_found(changes):
     convention = conventions.Convention(**changes)
     check = _check(made, _stored(made, convention))
     assert check.verdict == "other"
-    relative = [
-        rigid.inverse(poses[0]) @ poses[-1] for poses in (made.world_from_camera, _read(made, convention, check))
-    ]
+    relative = [rigid.inverse(poses[0]) @ poses[-1] for poses in (made.world_from_camera, _read(made, convention, check))]
     np.testing.assert_allclose(relative[0], relative[1], atol=1e-6)
 
 
