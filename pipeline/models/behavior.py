@@ -19,6 +19,7 @@ from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import (
     GRID_CELL_M,
     GRID_SHAPE,
+    Blind,
     Ego,
     Perception,
     PerceptionSize,
@@ -42,6 +43,7 @@ class Architecture:
     hidden: int = 128
     code: int = 64
     observer_radius_m: float = 4.0
+    blind_to: Blind = "nothing"
     unet_width: int = 32
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
     goal_hidden: int = 128
@@ -70,6 +72,7 @@ class Architecture:
             9 + 6 * self.bones,
             self.observer_radius_m,
             RATE_HZ,
+            self.blind_to,
         )
 
 
@@ -127,9 +130,7 @@ def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray
     first = _normalized(columns[..., :3])
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
     parallel = np.linalg.norm(second, axis=-1, keepdims=True) < 1e-4
-    second = _normalized(
-        np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + np.array([0.3, 0.2, 0.1])), second)
-    )
+    second = _normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + np.array([0.3, 0.2, 0.1])), second))
     return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 
@@ -162,9 +163,7 @@ def past_channels(
     return np.concatenate([root, bones], axis=-1).reshape(len(root), -1).astype(np.float32)
 
 
-def contract(
-    architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: Float[np.ndarray, "bone 4 4"]
-) -> dict:
+def contract(architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: Float[np.ndarray, "bone 4 4"]) -> dict:
     """Return the content of `behavior.json`: all that a sampler in another language must know."""
     bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
     root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]

@@ -16,9 +16,7 @@ TIME_CHANNELS = 64
 
 def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
     """Return sines and cosines of the step number at 32 frequencies from 1 down to 1e-4."""
-    frequency = torch.exp(
-        -math.log(1e4) / (TIME_CHANNELS // 2) * torch.arange(TIME_CHANNELS // 2, dtype=torch.float32, device=t.device)
-    )
+    frequency = torch.exp(-math.log(1e4) / (TIME_CHANNELS // 2) * torch.arange(TIME_CHANNELS // 2, dtype=torch.float32, device=t.device))
     angle = t[:, None] * frequency
     return torch.cat([angle.sin(), angle.cos()], dim=-1)
 
@@ -46,18 +44,12 @@ class Block(nn.Module):
 
     def __init__(self, inner: int, outer: int, embedding: int, kernel: int = 5):
         super().__init__()
-        self.first = nn.Sequential(
-            nn.Conv1d(inner, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
-        )
-        self.second = nn.Sequential(
-            nn.Conv1d(outer, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
-        )
+        self.first = nn.Sequential(nn.Conv1d(inner, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU())
+        self.second = nn.Sequential(nn.Conv1d(outer, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU())
         self.embedding = nn.Linear(embedding, outer)
         self.shortcut = nn.Conv1d(inner, outer, 1) if inner != outer else nn.Identity()
 
-    def forward(
-        self, h: Float[Tensor, "batch channel frame"], embedding: Float[Tensor, "batch e"]
-    ) -> Float[Tensor, "batch outer frame"]:
+    def forward(self, h: Float[Tensor, "batch channel frame"], embedding: Float[Tensor, "batch e"]) -> Float[Tensor, "batch outer frame"]:
         return self.second(self.first(h) + self.embedding(embedding)[..., None]) + self.shortcut(h)
 
 
@@ -104,9 +96,7 @@ class UNet(nn.Module):
 class ControlUNet(nn.Module):
     """Denoise a sequence under a control sequence (or one vector for all frames); ``keep`` 0 stands for no control."""
 
-    def __init__(
-        self, channels: int, control: int, condition: int, width: int = 32, multipliers: tuple[int, ...] = (1, 2, 4)
-    ):
+    def __init__(self, channels: int, control: int, condition: int, width: int = 32, multipliers: tuple[int, ...] = (1, 2, 4)):
         super().__init__()
         widths, embedding = tuple(width * m for m in multipliers), 128
         self.time = nn.Sequential(nn.Linear(TIME_CHANNELS, embedding), nn.SiLU(), nn.Linear(embedding, embedding))

@@ -18,6 +18,10 @@ from pipeline.files import arrays
 from pipeline.space import rigid
 
 Ego = Literal["yaw", "full"]
+Blind = Literal["nothing", "scene", "observer", "past"]
+CONDITIONS: tuple[Blind, ...] = ("scene", "observer", "past")
+Blind = Literal["nothing", "scene", "observer", "past"]
+CONDITIONS: tuple[Blind, ...] = ("scene", "observer", "past")
 GRID_SHAPE = (64, 8, 64)
 GRID_CELL_M = 0.1
 UPRIGHT = 0.2
@@ -57,9 +61,7 @@ class FeatureVolume:
         stored = arrays.load(path, ("features", "occupancy", "origin", "voxel_m"))
         return cls(stored["features"], stored["occupancy"], stored["origin"], float(stored["voxel_m"]))
 
-    def voxel(
-        self, points_world: Float[np.ndarray, "*batch 3"]
-    ) -> tuple[Int[np.ndarray, "*batch 3"], Bool[np.ndarray, "*batch"]]:
+    def voxel(self, points_world: Float[np.ndarray, "*batch 3"]) -> tuple[Int[np.ndarray, "*batch 3"], Bool[np.ndarray, "*batch"]]:
         """Return the voxel that holds each point (clamped to the volume) and whether it lies inside."""
         index = np.floor((points_world - self.origin) / self.voxel_m).astype(np.int64)
         last = np.array(self.occupancy.shape) - 1
@@ -142,9 +144,7 @@ class ObserverEncoder(nn.Module):
         self.frames, self.radius_m, self.rate_hz = frames, radius_m, rate_hz
         self.layers = mlp((frames * 3 + 3, hidden, hidden, code))
 
-    def forward(
-        self, observer_past: Float[Tensor, "batch frame*3"], keep: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch code"]:
+    def forward(self, observer_past: Float[Tensor, "batch frame*3"], keep: Float[Tensor, "batch"]) -> Float[Tensor, "batch code"]:
         position = observer_past.unflatten(1, (self.frames, 3))[:, :, ::2]
         distance = (position.square().sum(-1) + 1e-6).sqrt()
         nearness = (1 - distance / self.radius_m).clamp_min(0)
@@ -191,6 +191,8 @@ class PerceptionSize:
     past_channels: int
     observer_radius_m: float
     rate_hz: float
+    blind_to: Blind
+    blind_to: Blind
 
 
 class Perception(nn.Module):
@@ -207,6 +209,10 @@ class Perception(nn.Module):
                 assert_never(size.scene)
         self.observer = ObserverEncoder(size.past_frames, size.hidden, size.code, size.observer_radius_m, size.rate_hz)
         self.past = PastEncoder(size.past_frames, size.past_channels, size.hidden, size.code)
+        sees = torch.tensor([float(condition != size.blind_to) for condition in CONDITIONS])
+        self.register_buffer("sees", sees, persistent=False)
+        sees = torch.tensor([float(condition != size.blind_to) for condition in CONDITIONS])
+        self.register_buffer("sees", sees, persistent=False)
         self.scene_null = nn.Parameter(torch.zeros(size.code))
         self.past_null = nn.Parameter(torch.zeros(size.code))
 
@@ -218,12 +224,18 @@ class Perception(nn.Module):
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
-        return self.join(self.scene(scene_grid), self.observer(observer_past, keep[:, 1]), self.past(past), keep)
+        return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
 
     def join(
-        self, scene: Tensor, observer: Tensor, past: Tensor, keep: Float[Tensor, "batch 3"]
+        self,
+        scene: Float[Tensor, "batch code"],
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch code"],
+        keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
-        """Put the codes side by side, nulls where ``keep`` is 0 (the observer's code has seen it already)."""
+        """Put the codes side by side, nulls where ``keep`` is 0 and for what the model is blind to."""
+        keep = keep * self.sees
+        observer = self.observer(observer_past, keep[:, 1])
         scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
         past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
         return torch.cat([scene, observer, past], dim=-1)

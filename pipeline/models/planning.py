@@ -54,11 +54,7 @@ class TorchNetworks:
 
     def _run(self, module: nn.Module, *arguments: Array) -> Array:
         with torch.inference_mode():
-            return (
-                module(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device) for a in arguments))
-                .cpu()
-                .numpy()
-            )
+            return module(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device) for a in arguments)).cpu().numpy()
 
     def perceive(self, *arguments: Array) -> Array:
         return self._run(self.nets.perception, *arguments)
@@ -108,9 +104,7 @@ def observe(context: Context, volume: FeatureVolume, rest: Float[np.ndarray, "bo
     frame = world_from_ego(context.world_from_agent[:, -1], ego)
     ego_from_world = rigid.inverse(frame)
     observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
-    past = past_channels(
-        ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
-    )
+    past = past_channels(ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest))
     return Observation(volume.around(frame), observer, past)
 
 

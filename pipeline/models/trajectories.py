@@ -84,17 +84,11 @@ class BehaviorData:
         videos = tuple(str(video) for video in windows["videos"])
         names = ("timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "valid")
         trajectories = {video: Trajectory(*(tracks[f"{video}/{name}"] for name in names)) for video in videos}
-        return cls(
-            trajectories, tracks["agent_from_bone_rest"], windows["video"], windows["start"], windows["split"], videos
-        )
+        return cls(trajectories, tracks["agent_from_bone_rest"], windows["video"], windows["start"], windows["split"], videos)
 
     def save(self, folder: Path) -> None:
         """Write ``trajectories.npz`` and ``windows.npz``."""
-        tracks = {
-            f"{video}/{name}": value
-            for video, trajectory in self.trajectories.items()
-            for name, value in vars(trajectory).items()
-        }
+        tracks = {f"{video}/{name}": value for video, trajectory in self.trajectories.items() for name, value in vars(trajectory).items()}
         arrays.save(folder / "trajectories.npz", agent_from_bone_rest=self.agent_from_bone_rest, **tracks)
         arrays.save(
             folder / "windows.npz",
@@ -116,6 +110,4 @@ class BehaviorData:
             for name, rows in gathered.items():
                 rows.append(getattr(self.trajectories[self.videos[video]], name)[frame])
         agent, bone, camera = (np.stack(rows) for rows in gathered.values())
-        return Context(agent[:, :PAST], bone[:, :PAST], camera[:, :PAST, :3, 3]), Future(
-            agent[:, PAST:], bone[:, PAST:]
-        )
+        return Context(agent[:, :PAST], bone[:, :PAST], camera[:, :PAST, :3, 3]), Future(agent[:, PAST:], bone[:, PAST:])

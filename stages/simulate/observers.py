@@ -24,9 +24,7 @@ def scripted(script: Script, *, center: Float[np.ndarray, "3"], speed_m_s: float
         case "still":
             return lambda time_s, animal: center
         case "circle":
-            return lambda time_s, animal: (
-                center + 1.2 * np.array([np.cos(time_s * speed_m_s / 1.2), 0.0, np.sin(time_s * speed_m_s / 1.2)])
-            )
+            return lambda time_s, animal: center + 1.2 * np.array([np.cos(time_s * speed_m_s / 1.2), 0.0, np.sin(time_s * speed_m_s / 1.2)])
         case "approach":
             return _Walker(center, speed_m_s)
         case _:

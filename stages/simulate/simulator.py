@@ -90,9 +90,7 @@ class Simulator:
             self.plan, self.goal, self.blocked = self._planned()
             self.plan = faded(rest_of_plan, self.plan, self.chaining.fade_frames)
             self.played = 0
-        self.past.append(
-            Frames(self.plan.root[self.played : self.played + 1], self.plan.bones[self.played : self.played + 1])
-        )
+        self.past.append(Frames(self.plan.root[self.played : self.played + 1], self.plan.bones[self.played : self.played + 1]))
         self.played, self.frame = self.played + 1, self.frame + 1
         return self._state()
 
@@ -100,9 +98,7 @@ class Simulator:
         """Draw candidates and take the first of those that are blocked least."""
         root = np.concatenate([frame.root for frame in self.past])
         bones = bones_from_channels(np.concatenate([frame.bones for frame in self.past]), self.rest)
-        observation = observe(
-            Context(root[None], bones[None], np.array(self.observer)[None]), self.volume, self.rest, self.ego
-        )
+        observation = observe(Context(root[None], bones[None], np.array(self.observer)[None]), self.volume, self.rest, self.ego)
         frame = world_from_ego(root[-1:], self.ego)
         codes = self.sampler.codes(observation, self.sampling, self.chaining.candidates)
         goals = self.sampler.goals(codes, self.sampling, self.rng)

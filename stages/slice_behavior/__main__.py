@@ -44,9 +44,7 @@ def run(task: cli.Task) -> None:
         raise InputError("ART-004", "which recordings?", str(folder), "give --videos build/<agent>/plan/videos.json")
     motions: dict[str, Motion] = {id: read_motion(folder / id) for id in sessions if (folder / id).is_dir()}
     trajectories = {
-        id: trajectory_from_motion(
-            motion, min_confidence=settings.min_confidence, max_gap_s=settings.max_gap_s, smooth_s=settings.smooth_s
-        )
+        id: trajectory_from_motion(motion, min_confidence=settings.min_confidence, max_gap_s=settings.max_gap_s, smooth_s=settings.smooth_s)
         for id, motion in motions.items()
     }
     test = frozenset(id for id in trajectories if sessions[id].split == "test")
@@ -55,13 +53,9 @@ def run(task: cli.Task) -> None:
     if not len(data.indices(TRAIN)):
         remedy = "record longer sessions in which the animal stays in view, or lower min_confidence"
         raise InputError("BEH-001", "no 6.4 s of uninterrupted motion to learn from", str(folder), remedy)
-    progress.log(
-        f"{len(data.indices(TRAIN))} training windows, {len(data.start) - len(data.indices(TRAIN))} test windows"
-    )
+    progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start) - len(data.indices(TRAIN))} test windows")
     volume = FeatureVolume.load(folder / "feature_volume.npz")
-    allowed = allowed_voxels(
-        volume, {id: t for id, t in trajectories.items() if id not in test}, reach_voxels=settings.reach_voxels
-    )
+    allowed = allowed_voxels(volume, {id: t for id, t in trajectories.items() if id not in test}, reach_voxels=settings.reach_voxels)
     with task.create() as out:
         data.save(out)
         arrays.save(out / "volume.npz", compress=True, **vars(volume), allowed=allowed)

@@ -44,9 +44,7 @@ def trajectory_from_motion(motion: Motion, *, min_confidence: float, max_gap_s: 
     return Trajectory(grid, agent, np.stack(bone, 1).astype(np.float32), camera, enclosed(good, grid, max_gap_s))
 
 
-def enclosed(
-    good: Float[np.ndarray, "frame"], grid: Float[np.ndarray, "sample"], max_gap_s: float
-) -> Bool[np.ndarray, "sample"]:
+def enclosed(good: Float[np.ndarray, "frame"], grid: Float[np.ndarray, "sample"], max_gap_s: float) -> Bool[np.ndarray, "sample"]:
     """Tell which grid times lie between (or within half a grid step of) good times at most ``max_gap_s`` apart."""
     near = 0.5 / RATE_HZ
     after = np.searchsorted(good, grid, side="left").clip(0, len(good) - 1)

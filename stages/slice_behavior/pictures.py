@@ -96,9 +96,7 @@ def validity(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
     axis = figure.subplots()
     for row, video in enumerate(data.videos):
         trajectory = data.trajectories[video]
-        axis.scatter(
-            trajectory.timestamp_s[trajectory.valid], np.full(trajectory.valid.sum(), row), s=3, color="#3b6ea5"
-        )
+        axis.scatter(trajectory.timestamp_s[trajectory.valid], np.full(trajectory.valid.sum(), row), s=3, color="#3b6ea5")
         mine = data.video == row
         axis.scatter(trajectory.timestamp_s[data.start[mine]], np.full(mine.sum(), row + 0.25), s=3, color="#c44e52")
     names = [

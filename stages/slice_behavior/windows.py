@@ -30,9 +30,7 @@ def slice_windows(
     return BehaviorData({v: trajectories[v] for v in videos}, agent_from_bone_rest, video, start, split, videos)
 
 
-def allowed_voxels(
-    volume: FeatureVolume, trajectories: dict[str, Trajectory], *, reach_voxels: int
-) -> UInt8[np.ndarray, "x y z"]:
+def allowed_voxels(volume: FeatureVolume, trajectories: dict[str, Trajectory], *, reach_voxels: int) -> UInt8[np.ndarray, "x y z"]:
     """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of where it has been."""
     visited = np.zeros(volume.occupancy.shape, bool)
     for trajectory in trajectories.values():

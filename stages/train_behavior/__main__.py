@@ -27,6 +27,8 @@ class Config:
     """Scene encoder: 2.5-D with height in channels, or the paper's six 3-D convolutions."""
     scene_width: int = 32
     """Channels of the scene encoder; the paper's is 128."""
+    blind_to: Literal["nothing", "scene", "observer", "past"] = "nothing"
+    """Ablation: a condition that the model never perceives."""
     observer_radius_m: float = 4.0
     """Horizontal distance in metres from which on an observer is as good as none."""
     unet_width: int = 32
@@ -46,13 +48,11 @@ def run(task: cli.Task) -> None:
     volume = FeatureVolume.load(task.input("behavior_data") / "volume.npz")
     architecture = Architecture(
         bones=len(data.agent_from_bone_rest), ego=c.ego, scene=c.scene, scene_width=c.scene_width,
-        scene_channels=len(volume.features), observer_radius_m=c.observer_radius_m, unet_width=c.unet_width,
+        scene_channels=len(volume.features), observer_radius_m=c.observer_radius_m, blind_to=c.blind_to, unet_width=c.unet_width,
         unet_multipliers=c.unet_multipliers,
     )  # fmt: skip
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
-    fitted = train(
-        data, volume, architecture, Schedule(), c.training, seed=c.seed, resume=task.resume, device=task.device
-    )
+    fitted = train(data, volume, architecture, Schedule(), c.training, seed=c.seed, resume=task.resume, device=task.device)
     sampler = Sampler(TorchNetworks(fitted.nets.cpu()), Schedule(), fitted.scaling)
     moments = reactions.moments(data, volume, architecture)
     reaction = reactions.measure(sampler, moments.observation, radius_m=c.observer_radius_m, seed=c.seed)

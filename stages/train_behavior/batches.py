@@ -87,22 +87,15 @@ class SceneSampler:
         kernel = np.array([0.125, 0.75, 0.125]) if stride > 1 else np.array([1.0])
         for axis in (1, 2, 3):
             features = convolve1d(features, kernel, axis=axis, mode="constant")
-        flat = np.concatenate(
-            [np.moveaxis(features, 0, -1).reshape(-1, len(features)), np.zeros((1, len(features)), np.float32)]
-        )
+        flat = np.concatenate([np.moveaxis(features, 0, -1).reshape(-1, len(features)), np.zeros((1, len(features)), np.float32)])
         self.features = torch.from_numpy(flat).to(device)
         self.points = torch.from_numpy(grid_points_ego(stride).astype(np.float32)).to(device)
         self.origin = torch.from_numpy(volume.origin.astype(np.float32)).to(device)
         self.shape, self.voxel_m = torch.tensor(volume.occupancy.shape, device=device), volume.voxel_m
 
-    def __call__(
-        self, world_from_ego: Float[Tensor, "batch 4 4"], side: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch channel x y z"]:
+    def __call__(self, world_from_ego: Float[Tensor, "batch 4 4"], side: Float[Tensor, "batch"]) -> Float[Tensor, "batch channel x y z"]:
         """Sample the grid; ``side`` is -1 where left and right are exchanged."""
-        points = (
-            self.points.flatten(0, 2)
-            * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
-        )
+        points = self.points.flatten(0, 2) * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
         index = ((rigid_torch.apply(world_from_ego, points) - self.origin) / self.voxel_m).floor().long()
         inside = ((index >= 0) & (index < self.shape)).all(-1)
         row = (index[..., 0] * self.shape[1] + index[..., 1]) * self.shape[2] + index[..., 2]
@@ -119,10 +112,7 @@ def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], arch
     lengths = [len(data.trajectories[video].timestamp_s) for video in data.videos]
     first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
     bones = np.concatenate(
-        [
-            channels_from_bones(data.trajectories[video].agent_from_bone, data.agent_from_bone_rest)
-            for video in data.videos
-        ]
+        [channels_from_bones(data.trajectories[video].agent_from_bone, data.agent_from_bone_rest) for video in data.videos]
     )
     rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(agent.shape[1])
     observer = rigid.apply(ego_from_world, context.observer_world)
@@ -157,9 +147,7 @@ def past_statistics(windows: Windows) -> tuple[Float[Tensor, "channel"], Float[T
     return past.mean(0), torch.maximum(past.std(0), floor)
 
 
-def body_channels(
-    rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]
-) -> Float[Tensor, "*batch c"]:
+def body_channels(rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch c"]:
     """Put the root's rotation (6) before the bones."""
     return torch.cat([rigid_torch.rotation_to_6d(rotation), bones], dim=-1)
 
@@ -193,9 +181,7 @@ def draw_batch(
     deviation = torch.from_numpy(scaling.body_std[6:]).float()
     remembered = remembered + torch.randn(remembered.shape, generator=generator) * deviation * augmentation.bones
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
-    body = (
-        body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
-    )
+    body = body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
     device = scene.points.device
     return Batch(
         scene(ego.to(device), side.to(device)),

@@ -43,9 +43,7 @@ def write_networks(folder: Path, nets: BehaviorNets, architecture: Architecture)
     """Write the four ONNX files. Return the largest difference between ONNX and torch."""
     for name in NETWORKS:
         export_network(getattr(nets, name), folder / f"{name}.onnx", *signature(name, architecture))
-    return max(
-        difference(getattr(nets, name), folder / f"{name}.onnx", signature(name, architecture)[0]) for name in NETWORKS
-    )
+    return max(difference(getattr(nets, name), folder / f"{name}.onnx", signature(name, architecture)[0]) for name in NETWORKS)
 
 
 def export_network(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]], output: str) -> None:
@@ -102,15 +100,9 @@ def golden_observation(a: Architecture) -> Observation:
     """Return the fixed input of the golden plan; every number follows from its index."""
 
     def wave(*shape: int, amplitude: float, frequency: float) -> np.ndarray:
-        return (
-            (amplitude * np.sin(frequency * np.arange(np.prod(shape), dtype=np.float64)))
-            .reshape(1, *shape)
-            .astype(np.float32)
-        )
+        return (amplitude * np.sin(frequency * np.arange(np.prod(shape), dtype=np.float64))).reshape(1, *shape).astype(np.float32)
 
-    observer = np.stack(
-        [np.linspace(0.5, 0.2, PAST), np.full(PAST, 1.2), np.linspace(1.8, 1.1, PAST)], axis=-1
-    ).reshape(1, -1)
+    observer = np.stack([np.linspace(0.5, 0.2, PAST), np.full(PAST, 1.2), np.linspace(1.8, 1.1, PAST)], axis=-1).reshape(1, -1)
     scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
     return Observation(scene, observer.astype(np.float32), wave(PAST * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1))
 
@@ -122,10 +114,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
     noise = np.random.default_rng(0)
     shapes = {"goal": (1, 3), "path": (1, 3, FUTURE), "body": (1, architecture.body_channels, FUTURE)}
     drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}
-    plans = {
-        f"guidance_{s:g}": sampler.plan(observation, Sampling("ddim", 10, 10, s), np.random.default_rng(0))
-        for s in (1.0, 0.5)
-    }
+    plans = {f"guidance_{s:g}": sampler.plan(observation, Sampling("ddim", 10, 10, s), np.random.default_rng(0)) for s in (1.0, 0.5)}
     return {
         "input": {
             "scene_grid": "scene_grid.flat[i] = 0.25 sin(0.01 i)",

@@ -23,9 +23,7 @@ class Objective:
     """noise levels drawn per window for the goal, whose network is small"""
 
 
-def losses(
-    nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator
-) -> dict[str, Tensor]:
+def losses(nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator) -> dict[str, Tensor]:
     """Return the mean squared error of the predicted noise, per network."""
     code = perceive(nets, batch, objective, generator)
     draws = objective.goal_draws
@@ -39,21 +37,16 @@ def losses(
     path = squared_error(lambda x, t: nets.path(x, t, code, batch.goal, controlled), batch.path, schedule, generator)
     known = ~batch.mirrored
     controlled = controlled[known]
-    body = squared_error(
-        lambda x, t: nets.body(x, t, code[known], batch.path[known], controlled), batch.body[known], schedule, generator
-    )
+    body = squared_error(lambda x, t: nets.body(x, t, code[known], batch.path[known], controlled), batch.body[known], schedule, generator)
     return {"goal": goal.mean(), "path": path.mean(), "body": body.sum() / max(body.numel(), 1)}
 
 
-def perceive(
-    nets: BehaviorNets, batch: Batch, objective: Objective, generator: torch.Generator
-) -> Float[Tensor, "batch condition"]:
+def perceive(nets: BehaviorNets, batch: Batch, objective: Objective, generator: torch.Generator) -> Float[Tensor, "batch condition"]:
     """Encode a batch, dropping scene, observer and past independently."""
     keep = kept(len(batch.goal), 3, objective.drop, generator).to(batch.goal.device)
     network = nets.perception
     scene = network.scene.encode(batch.scene)
-    observer = network.observer(batch.observer_past, keep[:, 1])
-    code = network.join(scene, observer, network.past(batch.past, batch.bones_keep), keep)
+    code = network.join(scene, batch.observer_past, network.past(batch.past, batch.bones_keep), keep)
     return nn.functional.dropout(code, objective.code_dropout)
 
 
@@ -62,9 +55,7 @@ def kept(size: int, count: int, drop: float, generator: torch.Generator) -> Floa
     return (torch.rand(size, count, generator=generator) >= drop).float()
 
 
-def squared_error(
-    denoise, clean: Float[Tensor, "batch ..."], schedule: Schedule, generator: torch.Generator
-) -> Float[Tensor, "batch ..."]:
+def squared_error(denoise, clean: Float[Tensor, "batch ..."], schedule: Schedule, generator: torch.Generator) -> Float[Tensor, "batch ..."]:
     """Noise ``clean`` to a random step and compare the noise with its prediction."""
     t = torch.randint(schedule.steps, (len(clean),), generator=generator)
     share = torch.from_numpy(schedule.alpha_bar).float()[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)

@@ -19,9 +19,7 @@ FAN = 64
 SHOWN = 4
 
 
-def pictures(
-    sampler: Sampler, moments: Moments, volume: FeatureVolume, record: FitRecord, *, seed: int
-) -> list[Picture]:
+def pictures(sampler: Sampler, moments: Moments, volume: FeatureVolume, record: FitRecord, *, seed: int) -> list[Picture]:
     """Draw a few training windows, sampled under different conditions."""
     chosen = np.linspace(0, len(moments.observation) - 1, SHOWN + 2).astype(int)[1:-1]
     room, frame = _Room(volume), moments.world_from_ego[chosen]
@@ -57,9 +55,7 @@ def checks(record: FitRecord, reactions: Reactions, onnx_difference: float) -> l
         *(Check(f"{name}: squared error of the noise, last tenth", value, "", 0.9) for name, value in last.items()),
         Check("goals move away from an approaching observer", reactions.away_m, "m", 0.1, None, "higher"),
         Check("share of approaches that drive goals away", reactions.away_share, "share", 0.6, None, "higher"),
-        Check(
-            "goals after an approach from one side against the other", reactions.reversal_m, "m", 0.2, None, "higher"
-        ),
+        Check("goals after an approach from one side against the other", reactions.reversal_m, "m", 0.2, None, "higher"),
         Check("shift by a far observer against none", reactions.far_m, "m", 0.01, 0.1),
         Check("shift by a far observer against a farther one", reactions.farther_m, "m", 0.01, 0.1),
         Check("ONNX against torch, largest difference", onnx_difference, "", 1e-4, 1e-2),

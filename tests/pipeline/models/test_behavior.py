@@ -42,9 +42,7 @@ def test_plan_returns_to_the_world(data):
     _, future = data.windows(np.array([5]))
     frame = rigid.make(rigid.rotation_from_vector(np.array([[0, 0.4, 0]])), np.array([[1.0, 0, 2]]))
     ego = rigid.inverse(frame)[:, None] @ future.world_from_agent
-    body = np.concatenate(
-        [rotation_to_6d(ego[..., :3, :3]), channels_from_bones(future.agent_from_bone, REST)], axis=-1
-    )
+    body = np.concatenate([rotation_to_6d(ego[..., :3, :3]), channels_from_bones(future.agent_from_bone, REST)], axis=-1)
     plan = Plan(ego[:, -1, :3, 3], ego[..., :3, 3], body)
     np.testing.assert_allclose(plan.world_from_agent(frame), future.world_from_agent, atol=1e-9)
 
@@ -54,9 +52,7 @@ def test_same_noise_gives_the_same_plan_and_conditions_can_be_switched_off(ats, 
     observation = observe(context, room(), REST, "yaw")
 
     def plan(**switches):
-        return ats.sampler.plan(
-            observation, Sampling(goal_steps=4, sequence_steps=2, **switches), np.random.default_rng(1)
-        )
+        return ats.sampler.plan(observation, Sampling(goal_steps=4, sequence_steps=2, **switches), np.random.default_rng(1))
 
     np.testing.assert_array_equal(plan().goal, plan().goal)
     ignoring = plan(guidance=0.0).goal
@@ -99,10 +95,7 @@ def test_baseline_noise_is_that_of_training(data):
     still = StandStill.fit(*train)
     moved = train[1].goal_world - train[0].world_from_agent[:, -1, :3, 3]
     assert still.std[-1, 0] == pytest.approx(np.sqrt((moved[:, [0, 2]] ** 2).mean()))
-    drawn = (
-        still.sample(train[0][:50], 400, np.random.default_rng(0)).goal
-        - train[0].world_from_agent[:50, None, -1, :3, 3]
-    )
+    drawn = still.sample(train[0][:50], 400, np.random.default_rng(0)).goal - train[0].world_from_agent[:50, None, -1, :3, 3]
     assert drawn[..., 0].std() == pytest.approx(still.std[-1, 0], rel=0.05)
 
 

@@ -80,7 +80,5 @@ def test_goal_network_learns_where_goals_are():
         optimizer.step()
     code = torch.tensor([[1.0, -1.0]]).expand(200, 2)
     with torch.inference_mode():
-        x = sample(
-            lambda x, t: net(x, torch.full((200,), t), code), torch.randn(200, 3), SCHEDULE, method="ddim", count=10
-        )
+        x = sample(lambda x, t: net(x, torch.full((200,), t), code), torch.randn(200, 3), SCHEDULE, method="ddim", count=10)
     assert (x.mean(0) - torch.tensor([1.0, -1.0, 1.0])).abs().max() < 0.25

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -40,18 +42,12 @@ def test_turning_and_moving_the_world_changes_no_observation():
     data, volume = wandering(), room()
     context, _ = data.windows(np.array([3, 50]))
     quarter = rigid.make(rigid.rotation_from_vector(np.array([0, np.pi / 2, 0])), np.zeros(3))
-    turned_volume = FeatureVolume(
-        np.rot90(volume.features, 1, (3, 1)), np.rot90(volume.occupancy, 1, (2, 0)), volume.origin, 0.1
-    )
-    turned = Context(
-        quarter @ context.world_from_agent, context.agent_from_bone, rigid.apply(quarter, context.observer_world)
-    )
+    turned_volume = FeatureVolume(np.rot90(volume.features, 1, (3, 1)), np.rot90(volume.occupancy, 1, (2, 0)), volume.origin, 0.1)
+    turned = Context(quarter @ context.world_from_agent, context.agent_from_bone, rigid.apply(quarter, context.observer_world))
     before, after = observe(context, volume, REST, "yaw"), observe(turned, turned_volume, REST, "yaw")
     np.testing.assert_allclose(after.observer_past, before.observer_past, atol=1e-5)
     np.testing.assert_allclose(after.past, before.past, atol=1e-5)
-    assert (
-        after.scene_grid == before.scene_grid
-    ).mean() > 0.999  # points on the border of two voxels may fall either way
+    assert (after.scene_grid == before.scene_grid).mean() > 0.999  # points on the border of two voxels may fall either way
 
 
 def test_far_observer_equals_none_and_a_near_one_does_not():
@@ -63,6 +59,14 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
     torch.testing.assert_close(encode(far, torch.ones(1)), none)
     torch.testing.assert_close(encode(far * 2, torch.ones(1)), none)
     assert (encode(near, torch.ones(1)) - none).abs().max() > 1e-3
+
+
+def test_a_blind_model_never_sees_its_condition():
+    inputs = [torch.randn(2, 16, 64, 8, 64), torch.rand(2, 24), torch.randn(2, 8 * (9 + 18)), torch.ones(2, 3)]
+    for number, blind in enumerate(("scene", "observer", "past")):
+        code = BehaviorNets(replace(ARCHITECTURE, blind_to=blind)).perception(*inputs).unflatten(1, (3, -1))
+        same = (code[0] - code[1]).abs().amax(-1) < 1e-7
+        assert same.tolist() == [k == number for k in range(3)]
 
 
 def test_dropped_conditions_do_not_reach_the_code():

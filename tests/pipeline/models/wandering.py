@@ -13,9 +13,7 @@ REST = rigid.make(
     rigid.rotation_from_vector(np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.2, 0.1]])),
     np.array([[0, 0, 0], [0, 0, 0.1], [0, 0.05, -0.1]]),
 )
-ARCHITECTURE = Architecture(
-    bones=BONES, scene_width=8, hidden=16, code=8, unet_width=8, unet_multipliers=(1, 2), goal_hidden=16
-)
+ARCHITECTURE = Architecture(bones=BONES, scene_width=8, hidden=16, code=8, unet_width=8, unet_multipliers=(1, 2), goal_hidden=16)
 
 
 def room() -> FeatureVolume:
@@ -44,9 +42,7 @@ def wander(rng: np.random.Generator, seconds: float = 12.0) -> Trajectory:
     turn = rigid.rotation_from_vector(np.stack([sway, 0 * sway, 0 * sway], axis=-1))
     bones = rigid.make(turn @ REST[:, :3, :3], REST[:, :3, 3] + 0.02 * np.stack([0 * sway, sway, 0 * sway], axis=-1))
     person = gaussian_filter1d(rng.standard_normal((count, 2)), 15, axis=0, mode="wrap") * 4
-    camera = rigid.make(
-        np.broadcast_to(np.eye(3), (count, 3, 3)), np.stack([person[:, 0], np.full(count, 1.3), person[:, 1]], axis=-1)
-    )
+    camera = rigid.make(np.broadcast_to(np.eye(3), (count, 3, 3)), np.stack([person[:, 0], np.full(count, 1.3), person[:, 1]], axis=-1))
     agent = rigid.make(rigid.rotation_from_vector(upright), position)
     return Trajectory(np.arange(count) / RATE_HZ, agent, bones.astype(np.float32), camera, np.ones(count, bool))
 

@@ -24,9 +24,7 @@ def simulator():
     volume = room()
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)
     sampling = Sampling(goal_steps=4, sequence_steps=2)
-    return Simulator(
-        sampler, wandering(), volume, volume.occupancy == 0, "yaw", sampling=sampling, chaining=Chaining(candidates=3)
-    )
+    return Simulator(sampler, wandering(), volume, volume.occupancy == 0, "yaw", sampling=sampling, chaining=Chaining(candidates=3))
 
 
 def test_same_seed_same_life_and_it_goes_on(simulator):

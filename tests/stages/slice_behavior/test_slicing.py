@@ -16,9 +16,7 @@ def jittered(rng: np.random.Generator, seconds: float = 20.0) -> Motion:
     turn = rigid.rotation_from_vector(np.stack([0 * time, 0.2 * time, 0 * time], axis=-1))
     agent = rigid.make(turn, np.stack([0.1 * time, 0 * time + 0.2, 0 * time], axis=-1))
     bones = np.broadcast_to(REST, (len(time), *REST.shape)).copy()
-    camera = rigid.make(
-        np.broadcast_to(np.eye(3), turn.shape), np.stack([0.05 * time, 0 * time + 1, 0 * time], axis=-1)
-    )
+    camera = rigid.make(np.broadcast_to(np.eye(3), turn.shape), np.stack([0.05 * time, 0 * time + 1, 0 * time], axis=-1))
     return Motion(time, camera, agent, bones, np.ones(len(time)))
 
 

@@ -46,9 +46,7 @@ def windows(data):
 
 def drawn(windows, augmentation, seed=0):
     scaling = scaling_from_windows(windows, augmentation.largest_turn_rad)
-    batch = draw_batch(
-        windows, SceneSampler(room(), 2, "cpu"), scaling, augmentation, 16, torch.Generator().manual_seed(seed)
-    )
+    batch = draw_batch(windows, SceneSampler(room(), 2, "cpu"), scaling, augmentation, 16, torch.Generator().manual_seed(seed))
     return batch, scaling
 
 
@@ -74,8 +72,7 @@ def test_turning_and_mirroring_move_everything_together(windows):
             torch.testing.assert_close(ours[:, [0, 2]].norm(dim=1), theirs[:, [0, 2]].norm(dim=1), atol=1e-4, rtol=1e-4)
             torch.testing.assert_close(ours[:, 1], theirs[:, 1])
         between = [
-            b.observer_past[:, -3:] - b.goal * torch.from_numpy(scaling_from_windows(windows, 0.0).goal_std).float()
-            for b in (plain, moved)
+            b.observer_past[:, -3:] - b.goal * torch.from_numpy(scaling_from_windows(windows, 0.0).goal_std).float() for b in (plain, moved)
         ]
         torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
 
