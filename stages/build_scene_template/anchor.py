@@ -23,10 +23,10 @@ class AnchorOptions:
     """Share of the keyframes that must be in the largest model."""
     most_scale_spread: float = 0.06
     """Robust relative spread of depth over SfM depth beyond which the model is refuted."""
-    most_gap_m: float = 0.05
-    """Median gap between overlapping depth images beyond which the model is refuted, metres (and twice the
-    odometry's).
-    """
+    most_gap_m: float = 0.06
+    """Gap between overlapping depth images beyond which the model is refuted, metres ..."""
+    most_gap_ratio: float = 1.5
+    """... if it is also so many times the gap under the odometry."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Trajectory:
     odometry_scale: float | None
     """Length of the odometry's path over the model's, between neighbouring keyframes; 1 is agreement."""
     gap_m: dict[str, float]
-    """Median gap between overlapping depth images under each candidate trajectory."""
+    """Gap between overlapping depth images under each candidate trajectory (`depth_gap`)."""
 
 
 def metric_scale(sparse: Sparse, clip: Clip) -> tuple[float, float]:
@@ -63,9 +63,7 @@ def metric_scale(sparse: Sparse, clip: Clip) -> tuple[float, float]:
 
 
 def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "key 4 4"]) -> float:
-    """Return the median absolute difference in metres between depth images of keyframes 1, 3 and 8 apart, pose
-    against pose.
-    """
+    """Return how far depth images of keyframes 1, 3 and 8 apart differ, metres: the mean of their 75 % quantiles."""
     gaps = []
     for hop in (1, 3, 8):
         for first in range(len(keyframes) - hop):
@@ -79,7 +77,7 @@ def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "k
             inside = (z > 0.1) & (row >= 0) & (column >= 0) & (row < target.depth.shape[0]) & (column < target.depth.shape[1])
             met = target.depth[row[inside], column[inside]]
             gap = np.abs(met - z[inside])[met > 0]
-            gaps.append(np.median(gap) if len(gap) > 50 else np.nan)
+            gaps.append(np.quantile(gap, 0.75) if len(gap) > 50 else np.nan)
     return float(np.nanmean(gaps)) if np.isfinite(gaps).any() else np.inf
 
 
@@ -134,7 +132,7 @@ def _refutation(registered, spread, gap, options):
         return f"only {registered:.0%} of the keyframes were registered"
     if spread > options.most_scale_spread:
         return f"its scale wavers by {spread:.1%} against depth"
-    if gap["colmap"] > max(options.most_gap_m, 2 * gap.get("odometry", 0.0)):
+    if gap["colmap"] > max(options.most_gap_m, options.most_gap_ratio * gap.get("odometry", 0.0)):
         return f"overlapping depth images are {gap['colmap'] * 100:.1f} cm apart under its poses"
     return ""
 

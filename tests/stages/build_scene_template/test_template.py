@@ -1,0 +1,103 @@
+"""The walk-through becomes a metric, upright template: structure from motion, its refutation, refinement, fusion, cleaning."""
+
+import numpy as np
+import pytest
+from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
+
+from pipeline.files import meshes as mesh_files
+from pipeline.space import rigid, tsdf
+from pipeline.space.meshes import Mesh, RayCaster
+from stages.build_scene_template import anchor, fuse, refine, sfm, template
+
+STRUCTURE = sfm.SfmOptions(most_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> MemoryClip:
+    truth = walk(48)
+    folder = tmp_path_factory.mktemp("walk")
+    made = MemoryClip(RayCaster(textured_room()), truth, drifting(truth, 1), folder=folder)
+    made.write_color(folder)
+    return made
+
+
+def test_template_is_metric_upright_and_follows_the_truth(clip, tmp_path):
+    fusion = fuse.FuseOptions(voxel_m=0.05, truncation_m=0.15, island_faces=30, feature_frames=6)
+    features = np.random.default_rng(0).normal(size=(len(clip), 20, 15, 16))
+    made, sparse = template.build(
+        clip, features, structure=STRUCTURE, believe=anchor.AnchorOptions(), weights=refine.RefineOptions(rounds=6),
+        fusion=fusion, workspace=tmp_path, seed=0,
+    )  # fmt: skip
+    rotation, distance = aligned_errors(made.world_from_camera, clip.truth)
+    assert np.median(rotation) < 0.5, "degrees"
+    assert np.median(distance) < 0.015, "metres, without any scale"
+    assert made.start.source == "colmap"
+    assert len(sparse.frame) >= 10
+    up_error = made.world_from_camera[:, :3, :3] @ np.swapaxes(clip.truth[:, :3, :3], 1, 2) @ np.array([0, 1.0, 0])
+    assert np.rad2deg(np.arccos(up_error[:, 1])).max() < 1.5, "degrees between the world's +y and gravity"
+    camera_height = made.world_from_camera[:, 1, 3].mean() - made.floor_m
+    assert abs(camera_height - clip.truth[:, 1, 3].mean()) < 0.06, "metres above the floor"
+    assert (np.linalg.norm(made.features, axis=1) > 0.9).mean() > 0.5
+    template.write_model(sparse, made.world_from_camera, tmp_path / "colmap")
+    assert (tmp_path / "colmap" / "images.txt").exists()
+
+
+def test_wrong_structure_is_refuted_by_depth(clip):
+    frames = np.arange(0, 48, 4)
+    keyframes = [refine.load_keyframe(clip, int(frame), 10) for frame in frames]
+    bent = clip.truth[frames].copy()
+    bent[:, 0, 3] += np.linspace(0, 2.0, len(frames)) ** 2
+    rows = np.arange(len(frames) * 40)
+    key, pixel = rows % len(frames), np.random.default_rng(0).uniform(20, 100, (len(rows), 2))
+    points = np.stack([refine.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)])
+    world = np.stack([rigid.apply(bent[k], p[None])[0] for k, p in zip(key, points, strict=True)])
+    sparse = sfm.Sparse(frames, bent, world, rows, key, pixel, 0.5, None)
+    start = anchor.choose_start(clip, frames, keyframes, sparse, anchor.AnchorOptions())
+    assert start.source == "odometry"
+    assert "depth" in start.reason
+
+
+def test_depth_and_odometry_alone_straighten_keyframes(clip):
+    frames = np.arange(0, 48, 4)
+    keyframes = [refine.load_keyframe(clip, int(frame), 8) for frame in frames]
+    start = clip.odometry_from_camera[frames]
+    found = refine.refine_keyframes(clip, frames, keyframes, start, None, refine.RefineOptions())
+    before, after = aligned_errors(start, clip.truth[frames])[1], aligned_errors(found, clip.truth[frames])[1]
+    assert np.median(after) < 0.01, "metres"
+    assert np.median(after) < 0.7 * np.median(before)
+
+
+def test_bridge_is_exact_where_odometry_is(clip):
+    exact = MemoryClip(clip.caster, clip.truth, drifting(clip.truth, 3, deg=0, m=0))
+    frames = np.array([3, 17, 40])
+    assert np.abs(anchor.bridge(exact, frames, clip.truth[frames]) - clip.truth).max() < 1e-9
+
+
+def test_floor_direction_is_found_from_normals():
+    rng = np.random.default_rng(0)
+    turn = rigid.rotation_from_vector(np.array([0.2, 0.4, -0.15]))
+    walls = np.concatenate([np.repeat(np.eye(3), 200, axis=0), -np.repeat(np.eye(3), 100, axis=0)]) @ turn.T
+    normals = np.concatenate([walls, rng.normal(size=(200, 3))])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    up = anchor.floor_direction(normals, np.array([0.0, 1.0, 0.0]))
+    assert np.rad2deg(np.arccos(up @ turn[:, 1])) < 1.0, "degrees"
+
+
+def test_cleaning_drops_islands_and_keeps_colours(tmp_path):
+    volume = tsdf.Volume(np.zeros(3), (40, 40, 40), 0.05, 0.15)
+    grid = np.stack(np.meshgrid(*[np.arange(40) * 0.05] * 3, indexing="ij"), -1)
+    big, small = np.linalg.norm(grid - 0.9, axis=-1) - 0.5, np.linalg.norm(grid - 1.7, axis=-1) - 0.1
+    volume.distance[:] = np.clip(np.minimum(big, small) / 0.15, -1, 1)
+    volume.weight[:] = volume.color_weight[:] = 1
+    volume.color[:] = (200, 30, 90)
+    mesh = volume.surface(0.0)
+    cleaned = fuse.clean(mesh, tmp_path, island_faces=200)
+    assert len(cleaned.faces) < len(mesh.faces)
+    assert np.linalg.norm(cleaned.vertices - 0.9, axis=1).max() < 0.6, "the small sphere is gone"
+    assert (cleaned.color == (200, 30, 90)).all()
+    mesh_files.write_ply(tmp_path / "again.ply", Mesh(cleaned.vertices, cleaned.faces, cleaned.color))
+
+
+def test_nothing_is_marked_seen_by_an_empty_volume():
+    empty = tsdf.Volume(np.zeros(3), (8, 8, 8), 0.1, 0.3).surface(0.0)
+    assert len(empty.faces) == 0
