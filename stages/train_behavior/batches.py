@@ -1,7 +1,7 @@
 """Training windows as tensors in the ego frame, and the augmented batches drawn from them.
 
 Augmentation rotates the ego frame about its up axis, mirrors left and right (bones are hidden then, since nobody knows
-which bone mirrors which), shifts the observer and blurs the remembered bones: five minutes of video must go a long way.
+which bone mirrors which), shifts the observer and blurs what is remembered: five minutes of video must go a long way.
 """
 
 from dataclasses import dataclass
@@ -30,8 +30,8 @@ class Augmentation:
     """probability of mirroring left and right"""
     observer_m: float = 0.05
     """standard deviation of a shift of the observer's whole past"""
-    bones: float = 0.2
-    """standard deviation of noise on remembered bones, in their own standard deviations"""
+    past: float = 0.2
+    """standard deviation of noise on the remembered motion, in its own standard deviations"""
     hide_bones: float = 0.5
     """probability that a sample's remembered bones are hidden"""
 
@@ -55,6 +55,17 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.root)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Means and spreads of the training windows."""
+
+    scaling: Scaling
+    """of goal, path and body"""
+    past_mean: Float[Tensor, "channel"]
+    """per frame: root position, root rotation, bones"""
+    past_std: Float[Tensor, "channel"]
 
 
 @dataclass(frozen=True)
@@ -120,31 +131,29 @@ def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], arch
     return Windows(*(torch.from_numpy(array.astype(np.float32)) for array in arrays), torch.from_numpy(rows))
 
 
-def scaling_from_windows(windows: Windows, yaw_rad: float) -> Scaling:
-    """Fit the scales of goal, path (per frame; both horizontal axes alike) and body (per channel, with floors).
+def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
+    """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past.
 
-    The body's root rotation is scaled for ego frames that are turned by up to ``yaw_rad`` either way.
+    The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way.
     """
     future = windows.root[:, PAST:].double().numpy()
     level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(0.02)
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
-    turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, yaw_rad, 0])
-    root = rotation_to_6d(turns[:, None, None] @ windows.rotation[::4, PAST::4].double().numpy()).reshape(-1, 6)
-    bones = windows.bones[windows.frame[:, PAST:].unique()].double().numpy()
-    floor = np.concatenate([np.full(6, 0.05), np.tile([0.05] * 3 + [0.01] * 3, bones.shape[-1] // 6)])
-    mean, std = (np.concatenate([getattr(root, name)(0), getattr(bones, name)(0)]) for name in ("mean", "std"))
-    return Scaling(path_std[:, -1], path_std, mean, np.maximum(std, floor))
+    scaling = Scaling(path_std[:, -1], path_std, *body_statistics(windows, slice(PAST, None), turn_rad))
+    mean, std = (torch.from_numpy(a).float() for a in body_statistics(windows, slice(0, PAST), turn_rad))
+    position = windows.root[:, :PAST].std().clip(0.05).expand(3)
+    return Statistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 
-def past_statistics(windows: Windows) -> tuple[Float[Tensor, "channel"], Float[Tensor, "channel"]]:
-    """Return mean and standard deviation of the past's channels, with floors, for the inside of its encoder."""
-    past = torch.cat(
-        [windows.root[:, :PAST], body_channels(windows.rotation[:, :PAST], windows.bones[windows.frame[:, :PAST]])],
-        dim=-1,
-    ).flatten(0, 1)
-    floor = torch.tensor([0.05] * 9 + ([0.05] * 3 + [0.01] * 3) * ((past.shape[1] - 9) // 6))
-    return past.mean(0), torch.maximum(past.std(0), floor)
+def body_statistics(windows: Windows, frames: slice, turn_rad: float) -> tuple[Float[np.ndarray, "channel"], Float[np.ndarray, "channel"]]:
+    """Return mean and standard deviation, with floors, of root rotation and bones over some frames of all windows."""
+    turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, turn_rad, 0])
+    root = rotation_to_6d(turns[:, None, None] @ windows.rotation[::4, frames][:, ::4].double().numpy()).reshape(-1, 6)
+    bones = windows.bones[windows.frame[:, frames].unique()].double().numpy()
+    floor = np.concatenate([np.full(6, 0.1), np.tile([0.05] * 3 + [0.01] * 3, bones.shape[-1] // 6)])
+    std = np.concatenate([root.std(0), bones.std(0)])
+    return np.concatenate([root.mean(0), bones.mean(0)]), np.maximum(std, floor)
 
 
 def body_channels(rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch c"]:
@@ -155,12 +164,13 @@ def body_channels(rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*
 def draw_batch(
     windows: Windows,
     scene: SceneSampler,
-    scaling: Scaling,
+    statistics: Statistics,
     augmentation: Augmentation,
     size: int,
     generator: torch.Generator,
 ) -> Batch:
     """Draw windows with replacement and augment each on its own, on the CPU; the batch lands where the scene lies."""
+    scaling = statistics.scaling
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -177,16 +187,16 @@ def draw_batch(
     shift = torch.randn(size, 1, 3, generator=generator) * augmentation.observer_m
     observer = (windows.observer[index] + shift) @ new_from_old.mT
     frames = windows.frame[index]
-    remembered = windows.bones[frames[:, :PAST]]
-    deviation = torch.from_numpy(scaling.body_std[6:]).float()
-    remembered = remembered + torch.randn(remembered.shape, generator=generator) * deviation * augmentation.bones
+    remembered = body_channels(rotation[:, :PAST], windows.bones[frames[:, :PAST]])
+    past = torch.cat([root[:, :PAST], remembered], dim=-1)
+    past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
     body = body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
     device = scene.points.device
     return Batch(
         scene(ego.to(device), side.to(device)),
         observer.flatten(1),
-        torch.cat([root[:, :PAST], body_channels(rotation[:, :PAST], remembered)], dim=-1).flatten(1),
+        past.flatten(1),
         ((uniform(size) >= augmentation.hide_bones) & (side > 0)).float(),
         side < 0,
         root[:, -1] / torch.from_numpy(scaling.goal_std).float(),

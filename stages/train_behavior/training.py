@@ -15,10 +15,9 @@ from pipeline.models.trajectories import TRAIN, BehaviorData
 from stages.train_behavior.batches import (
     Augmentation,
     SceneSampler,
-    Windows,
+    Statistics,
     draw_batch,
-    past_statistics,
-    scaling_from_windows,
+    statistics_from_windows,
     windows_from_data,
 )
 from stages.train_behavior.objective import Objective, losses
@@ -75,15 +74,15 @@ def train(
 ) -> Fitted:
     """Fit the networks to the training windows of the data."""
     windows = windows_from_data(data, data.indices(TRAIN), architecture)
-    scaling = scaling_from_windows(windows, settings.augmentation.largest_turn_rad)
-    nets = initial_nets(architecture, windows, seed).to(device)
+    statistics = statistics_from_windows(windows, settings.augmentation.largest_turn_rad)
+    nets = initial_nets(architecture, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(volume, nets.perception.scene.stride, device)
     pace = settings.optimization
     optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay, fused=True)
 
     def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        batch = draw_batch(windows, scene, scaling, settings.augmentation, pace.batch, generator)
+        batch = draw_batch(windows, scene, statistics, settings.augmentation, pace.batch, generator)
         return losses(nets, batch, schedule, settings.objective, generator)
 
     def after_step(step: int) -> None:
@@ -105,15 +104,15 @@ def train(
         clip_norm=1.0,
         after_step=after_step,
     )
-    return Fitted(average.eval(), scaling, record)
+    return Fitted(average.eval(), statistics.scaling, record)
 
 
-def initial_nets(architecture: Architecture, windows: Windows, seed: int) -> BehaviorNets:
+def initial_nets(architecture: Architecture, statistics: Statistics, seed: int) -> BehaviorNets:
     """Return freshly initialised networks that know the statistics of the past."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         nets = BehaviorNets(architecture)
-    nets.perception.past.mean[:], nets.perception.past.std[:] = past_statistics(windows)
+    nets.perception.past.mean[:], nets.perception.past.std[:] = statistics.past_mean, statistics.past_std
     return nets
 
 

@@ -16,7 +16,7 @@ from stages.train_behavior.batches import (
     Augmentation,
     SceneSampler,
     draw_batch,
-    scaling_from_windows,
+    statistics_from_windows,
     windows_from_data,
 )
 from stages.train_behavior.export import (
@@ -31,7 +31,7 @@ from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.training import Optimization, Settings, initial_nets, train
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
 
-PLAIN = Augmentation(turn=0, yaw_rad=0, mirror=0, observer_m=0, bones=0, hide_bones=0)
+PLAIN = Augmentation(turn=0, yaw_rad=0, mirror=0, observer_m=0, past=0, hide_bones=0)
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +45,14 @@ def windows(data):
 
 
 def drawn(windows, augmentation, seed=0):
-    scaling = scaling_from_windows(windows, augmentation.largest_turn_rad)
-    batch = draw_batch(windows, SceneSampler(room(), 2, "cpu"), scaling, augmentation, 16, torch.Generator().manual_seed(seed))
-    return batch, scaling
+    statistics = statistics_from_windows(windows, augmentation.largest_turn_rad)
+    batch = draw_batch(windows, SceneSampler(room(), 2, "cpu"), statistics, augmentation, 16, torch.Generator().manual_seed(seed))
+    return batch, statistics.scaling
 
 
 def test_targets_have_unit_scale(windows):
     index = torch.arange(len(windows))
-    scaling = scaling_from_windows(windows, 0.0)
+    scaling = statistics_from_windows(windows, 0.0).scaling
     goal = windows.root[index, -1].numpy() / scaling.goal_std
     assert np.sqrt((goal[:, [0, 2]] ** 2).mean()) == pytest.approx(1, abs=1e-3)
     path = windows.root[:, 8:].numpy().swapaxes(1, 2) / scaling.path_std
@@ -72,7 +72,8 @@ def test_turning_and_mirroring_move_everything_together(windows):
             torch.testing.assert_close(ours[:, [0, 2]].norm(dim=1), theirs[:, [0, 2]].norm(dim=1), atol=1e-4, rtol=1e-4)
             torch.testing.assert_close(ours[:, 1], theirs[:, 1])
         between = [
-            b.observer_past[:, -3:] - b.goal * torch.from_numpy(scaling_from_windows(windows, 0.0).goal_std).float() for b in (plain, moved)
+            b.observer_past[:, -3:] - b.goal * torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal_std).float()
+            for b in (plain, moved)
         ]
         torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
 
@@ -118,7 +119,10 @@ def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatc
 
 
 def test_contract_is_whole_and_loads_back(windows, tmp_path):
-    nets, scaling = initial_nets(ARCHITECTURE, windows, 0).eval(), scaling_from_windows(windows, 0.0)
+    nets, scaling = (
+        initial_nets(ARCHITECTURE, statistics_from_windows(windows, 0.0), 0).eval(),
+        statistics_from_windows(windows, 0.0).scaling,
+    )
     write_contract(tmp_path, nets, ARCHITECTURE, scaling, Schedule(), REST)
     contract, golden = (json.loads((tmp_path / name).read_text()) for name in ("behavior.json", "golden.json"))
     assert contract["architecture"]["bones"] == len(contract["bones"]) == 3
@@ -131,7 +135,7 @@ def test_contract_is_whole_and_loads_back(windows, tmp_path):
 
 
 def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
-    goal = initial_nets(ARCHITECTURE, windows, 0).eval().goal
+    goal = initial_nets(ARCHITECTURE, statistics_from_windows(windows, 0.0), 0).eval().goal
     inputs, output = signature("goal", ARCHITECTURE)
     for name in ("first", "second"):
         export_network(goal, tmp_path / f"{name}.onnx", inputs, output)
@@ -140,7 +144,10 @@ def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
 
 
 def test_golden_plan_uses_the_noise_it_names(windows):
-    nets, scaling = initial_nets(ARCHITECTURE, windows, 0).eval(), scaling_from_windows(windows, 0.0)
+    nets, scaling = (
+        initial_nets(ARCHITECTURE, statistics_from_windows(windows, 0.0), 0).eval(),
+        statistics_from_windows(windows, 0.0).scaling,
+    )
     sampler = Sampler(TorchNetworks(nets), Schedule(), scaling)
     golden = golden_plan(sampler, ARCHITECTURE)
 
@@ -173,7 +180,7 @@ class Timid:
 
 def test_reactions_measure_a_known_animal(data, windows):
     seen = moments(data, room(), ARCHITECTURE, 3)
-    scaling = replace(scaling_from_windows(windows, 0.0), goal_std=np.ones(3))
+    scaling = replace(statistics_from_windows(windows, 0.0).scaling, goal_std=np.ones(3))
     measured = measure(Sampler(Timid(), Schedule(), scaling), seen.observation, radius_m=4.0, seed=0)
     expected = Reactions(away_m=1.0, away_share=1.0, reversal_m=2.0, far_m=0.0, farther_m=0.0)
     for name, value in vars(expected).items():
