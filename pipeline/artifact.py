@@ -8,6 +8,7 @@ part of an artifact. Standard library only: the planner and the runner use this 
 
 import contextlib
 import ctypes
+import fcntl
 import hashlib
 import json
 import os
@@ -115,6 +116,20 @@ def clean(out: Path) -> None:
             shutil.rmtree(left, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def held(lock: Path, waiting: str = "") -> Iterator[None]:
+    """Hold a kernel lock: it dies with its owner. Where another has it, say `waiting` and wait."""
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if waiting:
+                print(waiting, file=sys.stderr, flush=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def versions() -> dict[str, str]:
     """Return the versions of Python and of those libraries in use that decide numbers."""
     import importlib.metadata  # late: the planner does without
@@ -127,13 +142,16 @@ def versions() -> dict[str, str]:
 
 
 def write_if_changed(path: Path, text: str) -> bool:
-    """Replace a small file atomically; leave it, and so its age, alone when it says the same already."""
+    """Replace a small file atomically; leave it, and so its age, alone when it says the same already.
+
+    Writers of the same file hold a lock, so that what one that died has left is overwritten by the next.
+    """
     data = text.encode()
     with contextlib.suppress(FileNotFoundError):
         if path.read_bytes() == data:
             return False
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.tmp")
     with temporary.open("wb") as file:
         file.write(data)
         file.flush()

@@ -357,9 +357,10 @@ def _plan(home: Home) -> None:
     """Plan `home`; a variant stands on an up-to-date plan of its agent."""
     cache = _cache(home)
     planned = [read(each, cache) for each in dict.fromkeys((home.base, home))]
-    for plan in planned:
-        write(plan, cache)
-    artifact.write_if_changed(_cache_file(home), json.dumps(cache.fresh))
+    with artifact.held(home.base.folder / "plan.lock"):
+        for plan in planned:
+            write(plan, cache)
+        artifact.write_if_changed(_cache_file(home), json.dumps(cache.fresh))
     folder = Path("captures", home.agent)
     if planned[0].builtin:
         print(f"[{home}] nothing in {folder}/: building from the built-in synthetic capture")

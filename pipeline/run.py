@@ -7,10 +7,8 @@ atomically -> record -> stamp. Exit codes: the stage's own (2 bad input, 75 stop
 128 + n when signal n ended it. Standard library only.
 """
 
-import contextlib
 import ctypes
 import errno
-import fcntl
 import json
 import os
 import platform
@@ -21,7 +19,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -48,7 +45,8 @@ def run(home: str, job_id: str) -> int:
     out, stamp = Path(job["out"]), Path(job["stamp"])
     resume = Path("build", job["home"], "resume", job_id)
     redo = plan.redo_mark(job["home"], job_id)
-    with _lock(plan.lock_file(job["home"], job_id), job_id):
+    waiting = f"[{job_id}] is being made by another build; waiting for it"
+    with artifact.held(plan.lock_file(job["home"], job_id), waiting):
         artifact.clean(out)
         key = _key(job)
         made = artifact.read_manifest(out)
@@ -73,18 +71,6 @@ def _job(home: str, job_id: str) -> dict[str, Any]:
         if job["id"] == job_id:
             return job | {"place": f"{number} of {len(jobs)}"}
     raise InputError("RUN-001", f"has no job {job_id!r}", home, f"see {path}")
-
-
-@contextlib.contextmanager
-def _lock(path: Path, job_id: str) -> Iterator[None]:
-    """Hold the job's kernel lock: it dies with its owner, and a second runner waits for the first."""
-    with path.open("a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            _say(job_id, "is being made by another build; waiting for it")
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _key(job: dict[str, Any]) -> str:

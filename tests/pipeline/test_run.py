@@ -48,7 +48,7 @@ def contents(house):
 
 
 def leftovers(house):
-    return [p for pattern in (".*.tmp.*", ".*.old.*") for p in (house.folder / "build").rglob(pattern)]
+    return [p for pattern in (".*.tmp*", ".*.old*") for p in (house.folder / "build").rglob(pattern)]
 
 
 def test_a_second_build_does_nothing(house):
