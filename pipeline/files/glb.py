@@ -73,19 +73,13 @@ class _Document:
         self.file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="agent-to-sim"), scene=0)
         self.blob = bytearray()
 
-    def add(
-        self, values: np.ndarray, kind: str, component: int, *, target: int | None = None, bounds: bool = False
-    ) -> int:
+    def add(self, values: np.ndarray, kind: str, component: int, *, target: int | None = None, bounds: bool = False) -> int:
         """Append an array and return its accessor."""
         values = np.ascontiguousarray(values)
         self.blob.extend(b"\0" * (-len(self.blob) % 4))
-        self.file.bufferViews.append(
-            gltf.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=values.nbytes, target=target)
-        )
+        self.file.bufferViews.append(gltf.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=values.nbytes, target=target))
         self.blob.extend(values.tobytes())
-        accessor = gltf.Accessor(
-            bufferView=len(self.file.bufferViews) - 1, componentType=component, count=len(values), type=kind
-        )
+        accessor = gltf.Accessor(bufferView=len(self.file.bufferViews) - 1, componentType=component, count=len(values), type=kind)
         if bounds:
             rows = values.reshape(len(values), -1)
             accessor.min, accessor.max = rows.min(0).tolist(), rows.max(0).tolist()
@@ -106,18 +100,14 @@ class _Document:
         indices = self.add(mesh.faces.astype(np.uint32).reshape(-1), "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER)
         matte = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)
         self.file.materials = [gltf.Material(name="surface", doubleSided=True, pbrMetallicRoughness=matte)]
-        self.file.meshes = [
-            gltf.Mesh(name=name, primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)])
-        ]
+        self.file.meshes = [gltf.Mesh(name=name, primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)])]
 
     def animation(self, action: Action) -> gltf.Animation:
         """Turn an action into channels: translation and rotation of the root and of every joint."""
         animation = gltf.Animation(name=action.name)
         keys = self.add(action.time_s.astype(np.float32), "SCALAR", _FLOAT, bounds=True)
         tracks = [(_ROOT_NODE, action.world_from_agent)]
-        tracks += [
-            (_FIRST_JOINT + bone, action.agent_from_bone[:, bone]) for bone in range(action.agent_from_bone.shape[1])
-        ]
+        tracks += [(_FIRST_JOINT + bone, action.agent_from_bone[:, bone]) for bone in range(action.agent_from_bone.shape[1])]
         for node, parent_from_node in tracks:
             translation, quaternion = _translation_quaternion(parent_from_node)
             for path, values, kind in (

@@ -50,6 +50,4 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
         return rigid.interpolate(motion.timestamp_s, a_from_b, query_s)
 
     bones = [at(motion.agent_from_bone[:, bone]) for bone in range(motion.agent_from_bone.shape[1])]
-    return Motion(
-        motion.name, query_s - query_s[0], at(motion.world_from_agent), np.stack(bones, 1), at(motion.world_from_camera)
-    )
+    return Motion(motion.name, query_s - query_s[0], at(motion.world_from_agent), np.stack(bones, 1), at(motion.world_from_camera))

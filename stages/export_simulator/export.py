@@ -57,9 +57,7 @@ def simulator(
     )
 
 
-def fitted_skin(
-    body: Body, motions: list[Motion], poses: int, rng: np.random.Generator
-) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
+def fitted_skin(body: Body, motions: list[Motion], poses: int, rng: np.random.Generator) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
     """Fit four weights a vertex to recorded poses drawn at random; also return what is lost there, metres."""
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
     chosen = np.sort(rng.choice(len(recorded), size=min(poses, len(recorded)), replace=False))

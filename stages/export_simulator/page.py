@@ -26,9 +26,7 @@ def clip_rows(motions: list[Motion]) -> bytes:
     """Write all frames of all clips as float32 rows: root, bones, camera; place and quaternion wxyz each."""
     frames = []
     for motion in motions:
-        poses = np.concatenate(
-            [motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]], axis=1
-        )
+        poses = np.concatenate([motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]], axis=1)
         frames.append(pose_rows(poses))
     return np.concatenate(frames).astype("<f4").tobytes()
 
@@ -45,9 +43,7 @@ def page(*, contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> str:
     texts["simulator"] = packed(json.dumps(contract).encode())
     for name, file in {"worker": "worker.js.gz", "ort.wasm": "ort.wasm.gz"}.items():
         texts[name] = base64.b64encode(bundle.joinpath(file).read_bytes()).decode()
-    tags = [
-        f'<script type="application/octet-stream" id="asset-{name}">{text}</script>' for name, text in texts.items()
-    ]
+    tags = [f'<script type="application/octet-stream" id="asset-{name}">{text}</script>' for name, text in texts.items()]
     script = gzip.decompress(bundle.joinpath("page.js.gz").read_bytes()).decode()
     name = html.escape(str(contract["name"]))
     pieces = {

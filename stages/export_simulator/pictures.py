@@ -33,9 +33,7 @@ def from_above(mesh: Mesh, setting: Setting, pixel_m: float = 0.01) -> Float[np.
     return seen.reshape(len(z), len(x), 3).astype(np.float32)
 
 
-def visits(
-    mesh: Mesh, setting: Setting, motions: list[Motion], pixel_m: float = 0.01
-) -> UInt8[np.ndarray, "height width 3"]:
+def visits(mesh: Mesh, setting: Setting, motions: list[Motion], pixel_m: float = 0.01) -> UInt8[np.ndarray, "height width 3"]:
     """Lay over the pale room how long the animal (amber) and the person (blue) were where."""
     image = 0.45 * from_above(mesh, setting, pixel_m) + 0.55 * _PAPER
     for name, tint in (("world_from_camera", _OBSERVER), ("world_from_agent", _ANIMAL)):

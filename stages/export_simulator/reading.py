@@ -87,12 +87,7 @@ def gaussians(path: Path) -> Float[np.ndarray, "point 62"]:
     data = path.read_bytes()
     head, mark, rows = data.partition(b"end_header\n")
     properties = head.count(b"property float ")
-    if (
-        not mark
-        or b"binary_little_endian" not in head
-        or properties != _GAUSSIAN_COLUMNS
-        or len(rows) % (4 * _GAUSSIAN_COLUMNS)
-    ):
+    if not mark or b"binary_little_endian" not in head or properties != _GAUSSIAN_COLUMNS or len(rows) % (4 * _GAUSSIAN_COLUMNS):
         raise InputError(
             "ART-021",
             f"not a file of 3D Gaussians with {_GAUSSIAN_COLUMNS} floats a row",

@@ -24,13 +24,9 @@ def blend_dual_quaternions(
 ) -> Float[np.ndarray, "frame vertex 3"]:
     """Pose the surface as the reconstruction does: dual-quaternion blending with all weights; metres, agent frame."""
     points, weight, rest = (
-        torch.from_numpy(np.ascontiguousarray(values, np.float32))
-        for values in (vertices, weights, agent_from_bone_rest)
+        torch.from_numpy(np.ascontiguousarray(values, np.float32)) for values in (vertices, weights, agent_from_bone_rest)
     )
-    posed = [
-        skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points)
-        for bones in agent_from_bone
-    ]
+    posed = [skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points) for bones in agent_from_bone]
     return torch.stack(posed).numpy().astype(np.float64)
 
 
@@ -86,9 +82,7 @@ def _gram(
     return gram / len(posed)
 
 
-def _descend_on_simplex(
-    gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]
-) -> Float[np.ndarray, "vertex k"]:
+def _descend_on_simplex(gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]) -> Float[np.ndarray, "vertex k"]:
     """Minimise w' G w over convex weights by projected gradient descent."""
     rate = 1.0 / np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-20)[:, None]
     for _ in range(_DESCENT_STEPS):

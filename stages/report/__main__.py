@@ -42,9 +42,7 @@ def run(task: Task) -> None:
 
 def told(task: Task, chapter: Chapter, roles: dict[str, str]) -> collect.Told:
     """Open the chapter's artifacts, by recording where there is one for each, and read their notes."""
-    folders: dict[str | None, Path] = (
-        {**task.per_video(chapter.artifact)} if chapter.per_video else {None: task.input(chapter.artifact)}
-    )
+    folders: dict[str | None, Path] = {**task.per_video(chapter.artifact)} if chapter.per_video else {None: task.input(chapter.artifact)}
     manifest = artifact.read_manifest(next(iter(folders.values()), task.out))
     return collect.told(chapter, folders, roles, manifest.config if manifest else {})
 

@@ -43,10 +43,7 @@ class Judged:
 
 def beaten(metric: str, words: str) -> list[Bar]:
     """Promise that our figure is below that of every simple rival."""
-    return [
-        Bar(metric, f"{words}: below {rival}", "lower", metric.replace("/ats/", f"/{key}/"), "m")
-        for key, rival in RIVALS
-    ]
+    return [Bar(metric, f"{words}: below {rival}", "lower", metric.replace("/ats/", f"/{key}/"), "m") for key, rival in RIVALS]
 
 
 BARS = (

@@ -75,16 +75,10 @@ def role(video: Video) -> str:
     return f"{video.role}, {video.split}" if video.role == "session" else video.role
 
 
-def told(
-    chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str], settings: Mapping[str, Any]
-) -> Told:
+def told(chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str], settings: Mapping[str, Any]) -> Told:
     """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all)."""
     raw = {video: _read(folder) for video, folder in folders.items()}
-    files = [
-        folder / entry["file"]
-        for folder, qa in zip(folders.values(), raw.values(), strict=True)
-        for entry in qa["pictures"]
-    ]
+    files = [folder / entry["file"] for folder, qa in zip(folders.values(), raw.values(), strict=True) for entry in qa["pictures"]]
     total = sum(file.stat().st_size for file in files)
     shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
     notes = [_note(video, roles.get(video or "", ""), folders[video], qa, shrink) for video, qa in raw.items()]
@@ -93,11 +87,7 @@ def told(
 
 def _read(folder: Path) -> dict[str, Any]:
     path = folder / "qa.json"
-    return (
-        json.loads(path.read_bytes())
-        if path.exists()
-        else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
-    )
+    return json.loads(path.read_bytes()) if path.exists() else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
 
 
 def _note(video: str | None, about: str, folder: Path, qa: dict[str, Any], shrink: float) -> Note:

@@ -18,9 +18,7 @@ FLAGS = [
 
 
 @contextmanager
-def opened(
-    file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60
-) -> Iterator[tuple[Page, list[str]]]:
+def opened(file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60) -> Iterator[tuple[Page, list[str]]]:
     """Yield the page, once it is ready, and a growing list of everything it did wrong."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
@@ -30,9 +28,7 @@ def opened(
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on(
             "request",
-            lambda request: (
-                wrong.append(request.url[:200]) if request.url.split(":")[0] not in ("file", "data", "blob") else None
-            ),
+            lambda request: wrong.append(request.url[:200]) if request.url.split(":")[0] not in ("file", "data", "blob") else None,
         )
         page.goto(file.resolve().as_uri() + query)
         try:

@@ -65,9 +65,7 @@ def _sheet(center, along, up, first, second, cells: int = 16) -> Mesh:
     row, column = np.meshgrid(np.arange(cells + 1), np.arange(cells + 1), indexing="ij")
     color = np.where(((row // 2 + column // 2) % 2 == 0)[..., None], first, second).reshape(-1, 3).astype(np.uint8)
     at = (row * (cells + 1) + column)[:-1, :-1].reshape(-1)
-    faces = np.concatenate(
-        [np.stack([at, at + cells + 1, at + 1], -1), np.stack([at + 1, at + cells + 1, at + cells + 2], -1)]
-    )
+    faces = np.concatenate([np.stack([at, at + cells + 1, at + 1], -1), np.stack([at + 1, at + cells + 1, at + cells + 2], -1)])
     return Mesh(vertices.reshape(-1, 3).astype(np.float32), faces.astype(np.int32), color)
 
 
@@ -80,12 +78,8 @@ def trajectory(frames: int, seed: int) -> Trajectory:
     world_from_agent = rigid.make(rigid.rotation_from_vector(heading), position)
     phase = 2 * np.pi * time_s[:, None] + np.arange(BONES)
     wag = np.stack([0 * phase, 0.25 * np.sin(phase), 0 * phase, 0.02 * np.sin(phase), 0 * phase, 0 * phase], -1)
-    camera = np.stack(
-        [rigid.look_at(np.array([0.2, 1.4, 0.1 * seed]), point, np.array([0.0, 1, 0])) for point in position]
-    )
-    return Trajectory(
-        time_s, world_from_agent, (rest() @ rigid.exp(wag)).astype(np.float32), camera, np.ones(frames, bool)
-    )
+    camera = np.stack([rigid.look_at(np.array([0.2, 1.4, 0.1 * seed]), point, np.array([0.0, 1, 0])) for point in position])
+    return Trajectory(time_s, world_from_agent, (rest() @ rigid.exp(wag)).astype(np.float32), camera, np.ones(frames, bool))
 
 
 def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[BehaviorNets, Scaling]:
@@ -102,8 +96,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
-        noticed = nets.perception.observer(observer.flatten(1), torch.ones(128))
-        condition = nets.perception.join(elsewhere[0], noticed, elsewhere[1], torch.ones(128, 3))
+        condition = nets.perception.join(elsewhere[0], observer.flatten(1), elsewhere[1], torch.ones(128, 3))
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
         loss = (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise).square().mean()
@@ -147,9 +140,7 @@ def write(build: Path) -> None:
         origin=np.array([-2.2, -0.2, -2.2]),
         voxel_m=np.array(0.1),
     )
-    architecture = Architecture(
-        bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1,), goal_hidden=64
-    )
+    architecture = Architecture(bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1,), goal_hidden=64)
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10

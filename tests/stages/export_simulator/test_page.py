@@ -39,6 +39,7 @@ def test_page_lives_and_minds_the_observer(simulator: Path) -> None:
         page.evaluate("ats.pause()")
         _check_reaction(page)
         page.evaluate("ats.play()")
+        _check_hands(page)
         page.wait_for_function(f"ats.state().tick > {before['tick'] + 5}", timeout=30_000)
         after = page.evaluate("ats.state()")
         assert np.linalg.norm(np.subtract(after["animal"], before["animal"])[:3]) > 0.01, "metres within half a second"
@@ -50,6 +51,21 @@ def _check_golden(golden: dict, sampled: dict) -> None:
         for level, expected in plan.items():
             expected, found = np.array(expected), np.array(sampled[name][level])
             assert np.abs(found - expected).max() <= 1e-3 * expected.std(), f"{name} {level}"
+
+
+def _check_hands(page: Page) -> None:
+    """Click the floor for a goal; drag the person somewhere else."""
+    page.mouse.click(*page.evaluate("ats.screen([-1.2, 0, -1.0])"))
+    assert np.allclose(page.evaluate("ats.state().aim"), [-1.2, -1.0], atol=0.05), "metres"
+    assert "aim=" in page.evaluate("location.hash")
+    page.evaluate("ats.moveObserver([1.0, 0.5])")
+    page.wait_for_timeout(500)
+    page.mouse.move(*page.evaluate("ats.screen([1.0, 0.8, 0.5])"))
+    page.mouse.down()
+    page.mouse.move(*page.evaluate("ats.screen([-0.2, 0, 1.2])"), steps=5)
+    page.wait_for_timeout(1500)
+    page.mouse.up()
+    assert np.allclose(page.evaluate("ats.state().observer"), [-0.2, 1.2], atol=0.1), "metres"
 
 
 def _check_reaction(page: Page) -> None:

@@ -53,9 +53,7 @@ def test_splats_keep_the_strong_and_drop_the_broken() -> None:
 
 def test_resampling_passes_through_the_frames() -> None:
     track = small_world.trajectory(21, 0)
-    motion = actions.Motion(
-        "v", track.timestamp_s, track.world_from_agent, track.agent_from_bone, track.world_from_camera
-    )
+    motion = actions.Motion("v", track.timestamp_s, track.world_from_agent, track.agent_from_bone, track.world_from_camera)
     even = actions.resample(motion, 30.0)
     assert len(even.timestamp_s) == 61
     np.testing.assert_allclose(even.world_from_agent[::3], track.world_from_agent, atol=1e-6)

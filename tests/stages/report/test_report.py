@@ -28,18 +28,10 @@ def write_notes(build: Path, metrics: dict[str, float | None], reasons: dict[str
     """Write one small artifact per chapter, or per recording, with a note and a picture."""
     rng = np.random.default_rng(0)
     for chapter in CHAPTERS:
-        videos = (
-            [video.id for video in VIDEOS if video.role in dag.NODES[chapter.artifact].roles]
-            if chapter.per_video
-            else [""]
-        )
+        videos = [video.id for video in VIDEOS if video.role in dag.NODES[chapter.artifact].roles] if chapter.per_video else [""]
         for video in videos:
-            with artifact.create(
-                build / chapter.artifact / video, stage=chapter.artifact, config={"steps": 7}, inputs={}
-            ) as folder:
-                picture = qa.Picture(
-                    "view", rng.integers(0, 255, (24, 80, 3), dtype=np.uint8), f"a view of {chapter.artifact}"
-                )
+            with artifact.create(build / chapter.artifact / video, stage=chapter.artifact, config={"steps": 7}, inputs={}) as folder:
+                picture = qa.Picture("view", rng.integers(0, 255, (24, 80, 3), dtype=np.uint8), f"a view of {chapter.artifact}")
                 checks = [qa.Check("leak <script>", 2.0, "px", warn=1.0, fail=3.0), qa.Check("unmeasured", None)]
                 qa.write(folder, good="sharp", bad="blurred", checks=checks, pictures=[picture])
                 if chapter.artifact == "evaluation":
@@ -50,9 +42,7 @@ def write_notes(build: Path, metrics: dict[str, float | None], reasons: dict[str
 
 def make_report(build: Path, out: Path) -> dict[str, str]:
     """Run the stage and return its pages."""
-    paths = write_notes(
-        build, {"masks/iou_mean": 0.5, "reconstruction/lpips_all": None}, {"reconstruction/lpips_all": "no weights"}
-    )
+    paths = write_notes(build, {"masks/iou_mean": 0.5, "reconstruction/lpips_all": None}, {"reconstruction/lpips_all": "no weights"})
     run(Task("report", Config(name="toy"), out, None, VIDEOS, None, 1, None, paths, "cpu"))
     return {path.name: path.read_text() for path in out.glob("*.html")}
 
@@ -75,9 +65,7 @@ def test_same_notes_same_bytes(tmp_path: Path) -> None:
     assert make_report(tmp_path / "first", tmp_path / "one") == make_report(tmp_path / "second", tmp_path / "two")
 
 
-@pytest.mark.parametrize(
-    ("value", "verdict"), [(0.75, "ok"), (0.9, "ok"), (0.74, "fail"), (None, "none"), (float("nan"), "none")]
-)
+@pytest.mark.parametrize(("value", "verdict"), [(0.75, "ok"), (0.9, "ok"), (0.74, "fail"), (None, "none"), (float("nan"), "none")])
 def test_a_limit_may_be_met(value: float | None, verdict: str) -> None:
     judged = {row.bar.metric: row for row in bars.judge({"masks/iou_mean": value}, {"masks/iou_mean": "no truth"})}
     assert judged["masks/iou_mean"].verdict == verdict
@@ -86,14 +74,10 @@ def test_a_limit_may_be_met(value: float | None, verdict: str) -> None:
 
 def test_a_rival_must_be_beaten_and_all_videos_reached() -> None:
     even = {"behavior/ats/goal_minde_m": 0.3, "behavior/stand_still/goal_minde_m": 0.3}
-    assert [row.verdict for row in bars.judge(even, {}) if row.bar.limit == "behavior/stand_still/goal_minde_m"] == [
-        "fail"
-    ]
+    assert [row.verdict for row in bars.judge(even, {}) if row.bar.limit == "behavior/stand_still/goal_minde_m"] == ["fail"]
     for found, verdict in ((5, "fail"), (6, "ok")):
         counts = {"registration/videos_registered": found, "registration/videos_total": 6}
-        assert [row.verdict for row in bars.judge(counts, {}) if row.bar.limit == "registration/videos_total"] == [
-            verdict
-        ]
+        assert [row.verdict for row in bars.judge(counts, {}) if row.bar.limit == "registration/videos_total"] == [verdict]
 
 
 @pytest.mark.parametrize(
