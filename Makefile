@@ -23,7 +23,7 @@ help:
 
 include $(WANTED:%=build/%$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
 build/%/plan/rules.mk: .venv/.ok FORCE
-	@$(PLAN) plan $*
+	@$(PLAN) plan $* $(if $(MAKE_RESTARTS),>/dev/null)
 
 .venv/.ok: envs/cpu.txt envs/cuda.txt envs/setup
 	@envs/setup

@@ -367,6 +367,9 @@ def _plan(home: Home) -> None:
     else:
         for name in captures.not_understood(folder):
             print(f"[{home}] not a recording, left alone: {name!r}")
+        for video in planned[0].videos:
+            if video.role == "heldout" and video.synchronized_with is None:
+                print(f"[{home}] {video.file!r} measures nothing until the recipe's [videos] says what it is synchronized_with")
 
 
 def main(arguments: list[str]) -> int:

@@ -1,6 +1,7 @@
 """The rules of the house: floors, sizes, docstrings, doors, and a declaration that fits the programs."""
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import dag
+from pipeline import config, dag
 
 ROOT = Path(__file__).parent.parent
 FILES = sorted(path for top in ("pipeline", "stages") for path in (ROOT / top).rglob("*.py") if "node_modules" not in path.parts)
@@ -143,3 +144,14 @@ def test_truth_is_for_evaluate_alone():
         if path.parts[len(ROOT.parts)] == "stages" and path.parent.name not in {"synthesize_capture", "evaluate"}:
             strings = [n.value for n in ast.walk(tree_of(path)) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
             assert not any("truth/" in text for text in strings), name_of(path)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "agents").rglob("*.toml")), ids=name_of)
+def test_recipes_fit_the_programs(path):
+    """Every table of every recipe loads into its stage's Config."""
+    nodes = {dag.table_of(node): node for node in dag.FLOW}
+    for name, table in config.read_table(path).items():
+        if name == "videos":  # no stage's
+            continue
+        front = importlib.import_module(f"stages.{nodes[name].stage}.__main__")
+        config.from_table(front.Config, table, where=f"{path}: [{name}]")
