@@ -35,9 +35,11 @@ class Footprints:
 
 def project(
     means_world: Float[Tensor, "point 3"], rotation: Float[Tensor, "point 4"], log_scale: Float[Tensor, "point 3"],
-    camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"],
+    camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int,
 ) -> Footprints:  # fmt: skip
     """Project Gaussians by the local affine approximation of the camera (Zwicker et al. 2002).
+
+    The approximation is taken no farther than 15 % outside the picture, where it would explode.
 
     Args:
         rotation: quaternions wxyz, world from the Gaussian's own axes.
@@ -48,7 +50,9 @@ def project(
     z = depth.clamp_min(NEAREST_M)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     zero = torch.zeros_like(z)
-    affine = torch.stack([torch.stack([fx / z, zero, -fx * x / z**2], -1), torch.stack([zero, fy / z, -fy * y / z**2], -1)], dim=1)
+    right = (x / z).clamp(-(0.15 * width + cx) / fx, (1.15 * width - cx) / fx)
+    down = (y / z).clamp(-(0.15 * height + cy) / fy, (1.15 * height - cy) / fy)
+    affine = torch.stack([torch.stack([fx / z, zero, -fx * right / z], -1), torch.stack([zero, fy / z, -fy * down / z], -1)], dim=1)
     spread = affine @ turn @ (rigid_torch.rotation_from_quaternion(rotation) * log_scale.exp()[:, None])
     covariance = spread @ spread.transpose(1, 2)
     a, b, c = covariance[:, 0, 0] + BLUR_PX2, covariance[:, 0, 1], covariance[:, 1, 1] + BLUR_PX2
@@ -83,7 +87,7 @@ def draw(
     """Draw Gaussians with any values (colour, depth, masks ...): returns blended values and coverage 0..1."""
     match backend:
         case "tiles" | "dense":
-            footprints = project(means_world, rotation, log_scale, camera_from_world, intrinsics)
+            footprints = project(means_world, rotation, log_scale, camera_from_world, intrinsics, height, width)
             if backend == "dense":
                 return blend_dense(footprints, opacity, values, height, width)
             from pipeline.models.rasterize_tiles import blend_tiles  # numba compiles on import

@@ -21,8 +21,10 @@ from stages.reconstruct.settings import Weights
 DECIMETRE = 0.1
 REACH_M = 0.05
 """signed distances on the agent are compared up to here"""
-OUTLIER_M = 0.06
-"""measured points this far from the agent count a quarter"""
+OUTLIER_M = 0.1
+"""measured points this far from the agent count half; all keep pulling, or the body could hide behind the scene"""
+ROOT_M = 0.05
+"""registered roots are about this good"""
 MARGIN_M = 0.03
 """the posed surface may stand this much before the measured depth"""
 
@@ -60,7 +62,7 @@ def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, g
     target = (rays.depth[:, None] - depth) * rays.slope[:, None]
     color, feature = problem.agent.look(encoded.view(len(rays), 1 + near, -1)[:, 0])
     good = (rays.label == AGENT) & (rays.depth > 0)
-    trust = 1 / (1 + (distance[:, 0].detach() / OUTLIER_M).square()).square()
+    trust = 1 / (1 + distance[:, 0].detach().abs() / OUTLIER_M)
     at_depth = points.view(frames, number, 1 + near, 3)[:, :, 0]
     back = problem.body.pose(rest.view(frames, number, 1 + near, 3)[:, :, 0], pose.agent_from_bone)
     cycle = (back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2
@@ -101,7 +103,9 @@ def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6
     centre = rest[:, :3, 3]
     carried = (motion[:, first, :3, :3] @ centre[second][..., None])[..., 0] + motion[:, first, :3, 3]
     torn = (carried - pose.agent_from_bone[:, second, :3, 3]) / DECIMETRE
+    root = rigid_torch.inverse(problem.motion.initial_agent[pose.frame]) @ pose.world_from_agent
     terms = {
+        "root": (weights.root, (root[:, :3, 3] / ROOT_M).square().sum(-1)),
         "rigidity": (weights.rigidity, torn.square().sum(-1)),
         "rest": (weights.rest, twist.square().sum(-1) + 20 * twist.mean(1, keepdim=True).square().sum(-1)),
     }

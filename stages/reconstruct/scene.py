@@ -114,9 +114,9 @@ def render_depths(rays: Rays, generator: Generator, around: int = 12, along: int
 
 
 def drift_term(motion: MotionTable, weights: Weights) -> Terms:
-    """Keep the corrections of neighbouring camera knots alike (1 cm, half a degree) and small (10 cm, 6 degrees)."""
-    change = torch.diff(motion.camera, dim=0) / 0.01
-    return {"drift": (weights.drift * 1e-2, change.square()), "camera": (weights.drift * 1e-2, (motion.camera / 0.1).square())}
+    """Keep the corrections of cameras small, and those of neighbouring knots alike: units of 1 cm and half a degree."""
+    unit = 0.01
+    return {"drift": (weights.drift, (torch.diff(motion.camera, dim=0) / unit).square()), "anchor": (weights.anchor, (motion.camera / unit).square())}
 
 
 class SceneLoss:

@@ -37,8 +37,12 @@ class Weights:
     """accelerations of root and bones"""
     rest: float = 0.05
     """bones stay near rest"""
-    drift: float = 0.5
-    """corrections of neighbouring camera knots agree (relative motion of registration)"""
+    drift: float = 0.1
+    """corrections of neighbouring camera knots agree (relative motion of registration), per centimetre"""
+    anchor: float = 0.05
+    """corrections of cameras are small, per centimetre"""
+    root: float = 0.02
+    """the agent's root stays near the registered one, per 5 cm"""
     template: float = 0.3
     """the agent's field stays near its template where nothing is seen"""
 
@@ -93,7 +97,7 @@ class Rates:
     """grids of the fields"""
     heads: float = 4e-3
     """the fields' small networks and codes"""
-    camera: float = 1e-3
+    camera: float = 3e-4
     """corrections of cameras, metres and radians"""
     body: float = 2e-2
     """root and bones while the template is posed, metres and radians"""
