@@ -58,8 +58,10 @@ def meshes() -> Finding:
 
 def processors() -> Finding:
     """Count cores and look for a GPU that torch can use."""
-    import torch  # late: `libraries` has told whether it is there
-
+    try:
+        import torch  # late: it costs seconds
+    except ImportError:
+        return Finding("processors", "fail", f"{os.cpu_count()} cores; torch is missing; remedy: envs/setup")
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none, everything runs on the CPU"
     return Finding("processors", "ok", f"{os.cpu_count()} cores; GPU: {gpu}")
 

@@ -1,0 +1,18 @@
+"""The doctor looks at everything it says it does, and fails only for what every build needs."""
+
+from pipeline import doctor
+
+
+def test_a_machine_that_runs_these_tests_is_fit(capsys):
+    assert doctor.main() == 0
+    told = capsys.readouterr().out
+    assert [line.split()[1] for line in told.splitlines()] == [
+        "python", "libraries", "OpenGL", "pymeshlab", "processors", "memory", "disk", "browser", "recordings",
+    ]  # fmt: skip
+
+
+def test_a_missing_library_is_named(monkeypatch):
+    monkeypatch.setattr(doctor, "LIBRARIES", ("no_such_library",))
+    finding = doctor.libraries()
+    assert finding.state == "fail"
+    assert "no_such_library" in finding.text
