@@ -3,7 +3,8 @@
 from pipeline import doctor
 
 
-def test_a_machine_that_runs_these_tests_is_fit(capsys):
+def test_a_machine_that_runs_these_tests_is_fit(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "LIBRARIES", ("numpy", "torch"))
     assert doctor.main() == 0
     told = capsys.readouterr().out
     assert [line.split()[1] for line in told.splitlines()] == [
