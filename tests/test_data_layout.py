@@ -35,7 +35,7 @@ class Row:
 
 def pattern_of(text: str) -> re.Pattern[str]:
     text = re.escape(text).replace(r"%06d", r"\d{6}").replace("%06d", r"\d{6}")
-    text = re.sub(r"<\w+>", "[^/]+", text.replace(r"\<", "<").replace(r"\>", ">"))
+    text = re.sub(r"<\w+>", "[^/.]+", text.replace(r"\<", "<").replace(r"\>", ">"))
     text = re.sub(r"\\\{(\w+),(\w+)\\\}", r"(\1|\2)", text).replace(r"\*", "[^/]*")
     return re.compile(text + ".*" if text.endswith("/") else text)
 
