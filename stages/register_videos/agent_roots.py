@@ -24,7 +24,9 @@ class RootOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     """How the body is fitted."""
     kept: int = 5
-    """Hypotheses kept per frame."""
+    """Hypotheses kept per frame ..."""
+    apart_deg: float = 25.0
+    """... whose headings differ by at least this, degrees."""
     localizer_every_frames: int = 2
     """The agent's localizer is asked in one visible frame of so many."""
     cost_scale_m: float = 0.004
@@ -37,7 +39,7 @@ class RootOptions:
     """A turn by this in a tenth of a second costs one unit ..."""
     flip_cost: float = 40.0
     """... up to so many units."""
-    still_weight: float = 0.25
+    still_weight: float = 0.06
     """Weight of a frame in which neither animal nor phone moves, against one that shows something new."""
     step_m: float = 0.08
     """A step of this in a tenth of a second, beyond what its points did, costs one unit."""
@@ -94,7 +96,7 @@ def find_roots(
     ]
     path = best_path(clip.timestamp_s, candidates, pace(clip.timestamp_s, glimpses, options.still_weight), options)
     for glimpse, candidate, chosen in zip(glimpses, candidates, path, strict=True):
-        placed = bodies.fit(glimpse, body, candidate.world_from_agent[chosen][None], options.fit, tilt=True)
+        placed = bodies.fit_fine(glimpse, body, candidate.world_from_agent[chosen][None], options.fit, tilt=True)
         roots[glimpse.frame], visible[glimpse.frame], share[glimpse.frame] = placed[0], True, glimpse.share
         cost[glimpse.frame] = bodies.cost(glimpse, body, placed, options.fit)[0]
     return Roots(smooth(clip.timestamp_s, roots, cost, share, options), visible, cost, share)
@@ -107,20 +109,19 @@ def _candidates(clip: Clip, glimpse: Glimpse, body: Body, localizer: Localizer, 
         frame = glimpse.frame
         answers = localizer.localize(clip.color(frame), glimpse.depth, clip.depth_intrinsics[frame], clip.intrinsics[frame], glimpse.mask)
     told = [upright(glimpse.world_from_camera @ rigid.inverse(answer.map_from_camera)) for answer in answers[:2]]
-    placed = bodies.fit(glimpse, body, np.concatenate([start, told]) if told else start, options.fit, tilt=False)
+    placed = bodies.fit_coarse(glimpse, body, np.concatenate([start, told]) if told else start, options.fit)
+    kept: list[int] = []
+    for candidate in np.argsort(bodies.cost(glimpse, body, placed, options.fit), kind="stable"):
+        apart = np.abs(wrap(heading(placed[kept]) - heading(placed[candidate])))
+        if (apart > np.deg2rad(options.apart_deg)).all():
+            kept.append(int(candidate))
+    placed = bodies.fit_fine(glimpse, body, placed[kept[: options.kept]], options.fit, tilt=False)
     cost = bodies.cost(glimpse, body, placed, options.fit) / options.cost_scale_m
-    yaw = heading(placed)
     bonus = np.zeros(len(placed))
     for answer in answers:
-        turned = wrap(yaw - heading((glimpse.world_from_camera @ rigid.inverse(answer.map_from_camera))[None]))
+        turned = wrap(heading(placed) - heading(glimpse.world_from_camera @ rigid.inverse(answer.map_from_camera)))
         bonus = np.maximum(bonus, answer.probability * np.exp(-((turned / np.deg2rad(30)) ** 2)))
-    cost = cost - options.localizer_weight * bonus
-    kept: list[int] = []
-    for candidate in np.argsort(cost, kind="stable"):
-        if all(abs(wrap(yaw[candidate] - yaw[other])) > np.deg2rad(25) for other in kept):
-            kept.append(int(candidate))
-    kept = kept[: options.kept]
-    return Candidates(glimpse.frame, placed[kept], cost[kept])
+    return Candidates(glimpse.frame, placed, cost - options.localizer_weight * bonus)
 
 
 def heading(world_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:
@@ -145,7 +146,8 @@ class Pace:
     velocity: Float[np.ndarray, "glimpse 3"]
     """Horizontal velocity of the seen points' middle, m/s; zero across gaps."""
     novelty: Float[np.ndarray, "glimpse"]
-    """0..1: how much a glimpse shows that its neighbours did not; repeated views err alike."""
+    """0..1: how much a glimpse shows that its neighbours did not, times how much of the animal it shows: repeated and
+    partial views err alike."""
 
 
 def pace(timestamp_s: Float[np.ndarray, "frame"], glimpses: list[Glimpse], still_weight: float, span: int = 3) -> Pace:
@@ -158,7 +160,9 @@ def pace(timestamp_s: Float[np.ndarray, "frame"], glimpses: list[Glimpse], still
     velocity = (middle[after] - middle[before]) / elapsed
     moved = np.linalg.norm(velocity, axis=1) + 0.5 * np.linalg.norm((phone[after] - phone[before]) / elapsed, axis=1)
     velocity[(elapsed[:, 0] > 1.2) | (elapsed[:, 0] < 0.15)] = 0
-    return Pace(velocity, still_weight + (1 - still_weight) * np.minimum(moved / 0.4, 1.0))
+    share = np.array([glimpse.share for glimpse in glimpses])
+    novelty = still_weight + (1 - still_weight) * np.minimum(moved / 0.4, 1.0)
+    return Pace(velocity, novelty * np.minimum(share / 0.4, 1.0))
 
 
 def best_path(timestamp_s: Float[np.ndarray, "frame"], candidates: list[Candidates], moves: Pace, options: RootOptions) -> list[int]:

@@ -28,10 +28,14 @@ class FitOptions:
     """Vertices of the template that are used."""
     headings: int = 12
     """Headings tried from scratch in every frame."""
-    rounds: int = 7
-    """Gauss-Newton steps per start."""
+    coarse_rounds: int = 5
+    """Gauss-Newton steps from every start ..."""
+    fine_rounds: int = 12
+    """... and from those that are kept."""
     reach_m: float = 0.07
-    """Width of the robust weight, metres: legs and tail move, the trunk decides."""
+    """Width of the robust weight at the end, metres: legs and tail move, the trunk decides."""
+    first_reach_m: float = 0.18
+    """Width at the beginning of the coarse steps, metres."""
     tilt_sigma_deg: float = 15.0
     """Standard deviation of the root's tilt against upright, degrees."""
     color_weight_m: float = 0.06
@@ -133,14 +137,26 @@ def starts(glimpse: Glimpse, body: Body, headings: int) -> Float[np.ndarray, "st
     return rigid.make(rotation, behind - rotation @ centre)
 
 
-def fit(
+def fit_coarse(
+    glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "start 4 4"], options: FitOptions
+) -> Float[np.ndarray, "start 4 4"]:
+    """Fit upright from every start, with a weight that narrows from wide."""
+    reach = np.geomspace(options.first_reach_m, options.reach_m, options.coarse_rounds)
+    return _fit(glimpse, body, world_from_agent, reach, 1e-4)
+
+
+def fit_fine(
     glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "start 4 4"], options: FitOptions, *, tilt: bool
 ) -> Float[np.ndarray, "start 4 4"]:
-    """Fit from every start: robust point to plane, with a little point to point so that nothing slides away."""
+    """Fit to the end; with ``tilt`` the root may lean."""
+    reach = np.full(options.fine_rounds, options.reach_m)
+    return _fit(glimpse, body, world_from_agent, reach, np.deg2rad(options.tilt_sigma_deg) if tilt else 1e-4)
+
+
+def _fit(glimpse, body, world_from_agent, reaches, prior):
+    """Step robustly, point to plane, with a little point to point so that nothing slides away."""
     placed = np.array(world_from_agent, float)
-    prior = np.deg2rad(options.tilt_sigma_deg) if tilt else 1e-4
-    for step in range(options.rounds):
-        reach = options.reach_m * (2.0 if step < options.rounds // 2 else 1.0)
+    for reach in reaches:
         local = rigid.apply(rigid.inverse(placed), glimpse.points_world[None])
         distance, nearest = body.tree.query(local)
         target, normal = body.points_agent[nearest], body.normals_agent[nearest]

@@ -20,7 +20,9 @@ class VoteOptions:
     """Which frames vote, and when votes agree."""
 
     every_frames: int = 5
-    """One frame in so many votes (2 Hz)."""
+    """One frame in so many votes (2 Hz) ..."""
+    every_frames_alone: int = 2
+    """... and where there is no odometry to carry poses from one to the next."""
     least_probability: float = 0.2
     """Votes below this probability are not cast."""
     agree_deg: float = 8.0
@@ -68,7 +70,8 @@ class Agreement:
 
 def collect(clip: Clip, masks: Masks, localizer: Localizer, options: VoteOptions) -> Votes:
     """Localise every so many frames, with the agent masked out."""
-    asked = np.arange(options.every_frames // 2, len(clip), options.every_frames)
+    every = options.every_frames if clip.odometry_from_camera is not None else options.every_frames_alone
+    asked = np.arange(every // 2, len(clip), every)
     frames, answers, nearest = [], [], None
     for frame in track(asked.tolist(), "localising frames"):
         found = localizer.localize(

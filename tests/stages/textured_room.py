@@ -133,5 +133,3 @@ def aligned_errors(poses: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np
     moved = rigid.make(rotation, (truth[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(0)) @ poses
     angle = np.rad2deg(rigid.rotation_angle(moved[:, :3, :3], truth[:, :3, :3]))
     return angle, np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=1)
-
-

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from tests.stages.textured_room import INTRINSICS, SIZE, MemoryClip, textured_room, walk
 
 from pipeline.models import localizer as model
 from pipeline.space import rigid
 from pipeline.space.meshes import RayCaster
 from stages.train_localizer import training
 from stages.train_localizer.views import ViewOptions
+from tests.stages.textured_room import INTRINSICS, SIZE, MemoryClip, textured_room, walk
 
 
 @pytest.fixture(scope="module")

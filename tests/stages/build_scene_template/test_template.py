@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
 from pipeline.files import meshes as mesh_files
 from pipeline.space import rigid, tsdf
 from pipeline.space.meshes import Mesh, RayCaster
 from stages.build_scene_template import anchor, fuse, refine, sfm, template
+from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
 STRUCTURE = sfm.SfmOptions(most_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
 

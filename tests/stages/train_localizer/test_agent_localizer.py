@@ -2,10 +2,10 @@
 
 import numpy as np
 import trimesh
-from tests.stages.textured_room import noise_color
 
 from pipeline.space.meshes import Mesh
 from stages.train_localizer import training
+from tests.stages.textured_room import noise_color
 
 
 def test_agent_is_found_from_all_around():

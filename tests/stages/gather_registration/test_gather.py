@@ -1,0 +1,25 @@
+"""Gathering: the summary names what was registered and why the rest was not, the picture survives gaps."""
+
+import numpy as np
+
+from stages.gather_registration import gather
+
+STATUS = {"registered": True, "reason": None, "figures": {"depth_gap_m": 0.01, "confidence": 0.9}}
+REFUSED = {"registered": False, "reason": "no overlap", "figures": {}}
+
+
+def test_summary_and_checks():
+    poses = {name: np.repeat(np.eye(4)[None], 5, axis=0) for name in ("world_from_camera", "world_from_agent")}
+    poses["world_from_agent"][2] = np.nan
+    outcomes = [gather.Outcome("v002", STATUS, poses), gather.Outcome("v003", REFUSED, None)]
+    summary = gather.summarise(outcomes)
+    assert (summary["registered"], summary["total"]) == (1, 2)
+    assert summary["videos"]["v003"]["reason"] == "no overlap"
+    assert {check.name: check.value for check in gather.checks(outcomes)}["recordings registered"] == 0.5
+    assert gather.paths(outcomes).shape == (560, 560, 3)
+
+
+def test_nothing_registered_is_told_without_a_fault():
+    outcomes = [gather.Outcome("v002", REFUSED, None)]
+    assert gather.checks(outcomes)[0].status == "fail"
+    assert gather.paths(outcomes).shape == (560, 560, 3)

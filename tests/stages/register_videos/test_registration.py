@@ -1,0 +1,66 @@
+"""A whole recording in a textured room: registered to a degree and centimetres, its confidence sane, a foreign room refused."""
+
+import numpy as np
+import pytest
+
+from pipeline.models import localizer as model
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh, RayCaster
+from stages.register_videos import alignment, registration
+from stages.register_videos import votes as voting
+from stages.train_localizer import training
+from stages.train_localizer.views import ViewOptions
+from tests.stages.textured_room import MemoryClip, NoAgent, drifting, textured_room, walk
+
+
+@pytest.fixture(scope="module")
+def maps() -> registration.Maps:
+    mesh, path = textured_room(), walk(20)
+    clip = MemoryClip(RayCaster(mesh), path, None)
+    options = training.Options(views=45, held_out=14, frames=8, focal_px=90.0, view=ViewOptions(pitch_deg=(-50.0, 0.0)))
+    scene, _ = training.train_scene(mesh, path, 0.0, clip, options, np.random.default_rng(0))
+    agent = Mesh(np.eye(3, dtype=np.float32) * 0.1, np.array([[0, 1, 2]], np.int32), np.full((3, 3), 90, np.uint8))
+    return registration.Maps(mesh, agent, scene, scene)
+
+
+@pytest.mark.parametrize("with_odometry", [True, False])
+def test_recording_is_registered(maps, with_odometry):
+    truth = walk(40, seed=7)
+    clip = MemoryClip(RayCaster(maps.scene), truth, drifting(truth, 2, deg=0.03, m=0.001) if with_odometry else None)
+    options = registration.Options(align=alignment.AlignOptions(stride_px=9, picture_every_frames=8))
+    found = registration.register(clip, NoAgent(40), maps, options, np.random.default_rng(0))
+    rotation, distance = model.errors(found.aligned.world_from_camera, truth)
+    assert np.median(rotation) < (0.3 if with_odometry else 1.0), "degrees"
+    assert np.median(distance) < (0.015 if with_odometry else 0.04), "metres"
+    assert found.confidence.mean() > 0.5
+    assert not found.roots.visible.any()
+    assert np.isnan(found.roots.world_from_agent).all()
+
+
+def test_foreign_room_is_refused(maps):
+    truth = walk(40, seed=7)
+    other = textured_room(seed=99)
+    stretched = Mesh(other.vertices * np.array([1.5, 1.0, 0.8], np.float32), other.faces, other.color)
+    clip = MemoryClip(RayCaster(stretched), truth, drifting(truth, 2))
+    found = registration.register(clip, NoAgent(40), maps, registration.Options(), np.random.default_rng(0))
+    assert isinstance(found, registration.Refused)
+    assert found.reason
+
+
+def test_pictures_pull_a_camera_along_a_wall(maps):
+    truth = walk(8)[3]
+    clip = MemoryClip(RayCaster(maps.scene), truth[None], None, noise_m=0.0)
+    moved = truth @ rigid.exp(np.array([0.01, -0.01, 0.0, 0.03, 0.02, 0.0]))
+    contacts = alignment.picture_contacts(clip, NoAgent(1), RayCaster(maps.scene), 0, moved, alignment.AlignOptions())
+    before, after = (np.median(np.abs(alignment.relax.residuals(pose[None], contacts))) for pose in (moved, truth))
+    assert after < 0.5 * before, "the flow asks for the true pose"
+
+
+def test_votes_come_from_masked_frames_only(maps):
+    truth = walk(12)
+    clip = MemoryClip(RayCaster(maps.scene), truth, None)
+    hidden = NoAgent(12)
+    hidden.__class__ = type("AllAgent", (NoAgent,), {"__getitem__": lambda self, frame: np.full((160, 120), 255, np.uint8)})
+    votes = voting.collect(clip, hidden, maps.scene_localizer, voting.VoteOptions(every_frames=4))
+    assert len(votes.frame) == 0
+    assert votes.nearest is None

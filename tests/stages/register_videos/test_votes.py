@@ -1,0 +1,54 @@
+"""Votes: the motion most of them share is found among wrong ones, and too little agreement is refused in words."""
+
+import numpy as np
+
+from pipeline.models.localizer import Hypothesis
+from pipeline.space import rigid
+from stages.register_videos import votes as voting
+from tests.stages.textured_room import UP, drifting, walk
+
+
+def cast(truth, frames, wrong, rng) -> voting.Votes:
+    """Return votes with 1 deg and 2 cm of noise, some of them anywhere."""
+    answers = []
+    for frame, bad in zip(frames, wrong, strict=True):
+        pose = truth[frame] @ rigid.exp(rng.normal(0, 1, 6) * ([np.deg2rad(1.0)] * 3 + [0.02] * 3))
+        if bad:
+            pose = rigid.exp(np.concatenate([UP * rng.uniform(-3, 3), rng.uniform(-1, 1, 3)])) @ pose
+        answers.append(Hypothesis(pose, 0.4, 0.4 if bad else 0.8, 0, np.zeros((0, 3)), np.zeros((0, 3))))
+    return voting.Votes(frames, answers, len(frames), answers[0])
+
+
+def test_one_motion_is_found_among_wrong_votes():
+    rng, truth = np.random.default_rng(0), walk(60)
+    frames = np.arange(2, 60, 5)
+    wrong = rng.random(len(frames)) < 0.5
+    odometry = drifting(truth, 4)
+    agreement = voting.agree(cast(truth, frames, wrong, rng), odometry, True, voting.VoteOptions())
+    carried = agreement.world_from_odometry @ odometry
+    assert np.rad2deg(rigid.rotation_angle(carried[:, :3, :3], truth[:, :3, :3])).max() < 3.0, "degrees, drift included"
+    assert np.linalg.norm(carried[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.12, "metres"
+    assert (agreement.supports == ~wrong).mean() > 0.9
+    assert agreement.world_from_odometry[1, 1] > 1 - 1e-9, "gravity stays"
+
+
+def test_scattered_votes_are_refused():
+    rng, truth, options = np.random.default_rng(1), walk(60), voting.VoteOptions()
+    frames = np.arange(2, 60, 5)
+    votes = cast(truth, frames, np.ones(len(frames), bool), rng)
+    agreement = voting.agree(votes, drifting(truth, 4), True, options)
+    assert "agree" in voting.refusal(votes, agreement.supports if agreement else None, options)
+    few = voting.Votes(frames[:1], votes.answers[:1], 12, votes.nearest)
+    assert "recognised" in voting.refusal(few, None, options)
+
+
+def test_without_odometry_votes_are_interpolated_and_outliers_dropped():
+    rng, truth = np.random.default_rng(2), walk(60)
+    frames = np.arange(0, 60, 3)
+    wrong = np.isin(np.arange(len(frames)), [4, 11])
+    votes = cast(truth, frames, wrong, rng)
+    for index in np.flatnonzero(wrong):
+        votes.answers[index].map_from_camera[:3, 3] += 3.0
+    poses, supports = voting.without_odometry(votes, np.arange(60) * 0.1, voting.VoteOptions())
+    assert not supports[wrong].any()
+    assert np.median(np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)) < 0.05, "metres"
