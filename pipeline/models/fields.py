@@ -101,7 +101,9 @@ class Field(nn.Module):
         mean = self.codes.weight.mean(0)
         return torch.where(video[:, None] < 0, mean, self.codes(video.clamp_min(0)))
 
-    def encode(self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point channel"] | None = None) -> Float[Tensor, "point channel"]:
+    def encode(
+        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point channel"] | None = None
+    ) -> Float[Tensor, "point channel"]:
         """Read the grid and append the code: the input of both heads."""
         read = self.grid(points)
         return read if code is None else torch.cat([read, code], dim=-1)
@@ -136,7 +138,13 @@ def density(signed_distance: Float[Tensor, "*point"], beta_m: Float[Tensor, ""])
 class Body(nn.Module):
     """The agent's 25 Gaussian bones at rest and the skinning weights they give (paper 001, Eq. 3)."""
 
-    def __init__(self, agent_from_bone_rest: Float[Tensor, "bone 4 4"], bone_scale_m: Float[Tensor, "bone 3"], shape: FieldShape, voxel_m: float = 0.1):
+    def __init__(
+        self,
+        agent_from_bone_rest: Float[Tensor, "bone 4 4"],
+        bone_scale_m: Float[Tensor, "bone 3"],
+        shape: FieldShape,
+        voxel_m: float = 0.1,
+    ):
         """The small learned correction of the weights lives on a grid of ``voxel_m`` in the box of ``shape``."""
         super().__init__()
         self.register_buffer("agent_from_bone_rest", agent_from_bone_rest)
@@ -155,11 +163,15 @@ class Body(nn.Module):
         """Return the skinning weights of points of the rest shape."""
         return skinning.skinning_weights(points_rest, self.agent_from_bone_rest, self.bone_scale_m, delta=self._delta(points_rest))
 
-    def pose(self, points_rest: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]) -> Float[Tensor, "*batch point 3"]:
+    def pose(
+        self, points_rest: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]
+    ) -> Float[Tensor, "*batch point 3"]:
         """Move points of the rest shape to where the posed bones take them (forward warp)."""
         return skinning.move(skinning.blend(self.weights(points_rest), agent_from_bone, self.agent_from_bone_rest), points_rest)
 
-    def unpose(self, points_posed: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]) -> Float[Tensor, "*batch point 3"]:
+    def unpose(
+        self, points_posed: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]
+    ) -> Float[Tensor, "*batch point 3"]:
         """Move posed points back to the rest shape (backward warp).
 
         The weights come from the posed bones; the learned correction is read where they alone would land.
@@ -204,7 +216,10 @@ def save(folder: Path, reconstruction: Reconstruction) -> None:
 def load(folder: Path, device: str = "cpu") -> Reconstruction:
     """Read what `save` wrote, ready to be asked (no gradients)."""
     table = json.loads((folder / "fields.json").read_text())
-    shapes = {name: FieldShape(**{key: tuple(value) if isinstance(value, list) else value for key, value in table[name].items()}) for name in ("scene", "agent")}
+    shapes = {
+        name: FieldShape(**{key: tuple(value) if isinstance(value, list) else value for key, value in table[name].items()})
+        for name in ("scene", "agent")
+    }
     scene, agent = Field(shapes["scene"], free_m=0.1), Field(shapes["agent"], free_m=0.1)
     body = Body(torch.eye(4).repeat(table["bones"], 1, 1), torch.ones(table["bones"], 3), shapes["agent"])
     scene.load_state_dict(load_file(folder / "scene_field.safetensors"))

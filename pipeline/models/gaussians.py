@@ -30,7 +30,14 @@ COLUMNS = (
 class Gaussians(nn.Module):
     """Gaussians in one frame: the world for the scene, the agent at rest for the agent."""
 
-    def __init__(self, means: Float[Tensor, "point 3"], rotation: Float[Tensor, "point 4"], log_scale: Float[Tensor, "point 3"], opacity: Float[Tensor, "point"], color: Float[Tensor, "point 3"]):
+    def __init__(
+        self,
+        means: Float[Tensor, "point 3"],
+        rotation: Float[Tensor, "point 4"],
+        log_scale: Float[Tensor, "point 3"],
+        opacity: Float[Tensor, "point"],
+        color: Float[Tensor, "point 3"],
+    ):
         """``opacity`` and ``color`` lie in 0..1; rotations are quaternions wxyz."""
         super().__init__()
         self.means, self.rotation, self.log_scale = nn.Parameter(means), nn.Parameter(rotation), nn.Parameter(log_scale)
@@ -92,7 +99,14 @@ class Cloud:
 class Splats(nn.Module):
     """The room and the animal as Gaussians, with the bones that move the animal and each video's exposure."""
 
-    def __init__(self, scene: Gaussians, agent: Gaussians, agent_weights: Float[Tensor, "point bone"], agent_from_bone_rest: Float[Tensor, "bone 4 4"], videos: int):
+    def __init__(
+        self,
+        scene: Gaussians,
+        agent: Gaussians,
+        agent_weights: Float[Tensor, "point bone"],
+        agent_from_bone_rest: Float[Tensor, "bone 4 4"],
+        videos: int,
+    ):
         super().__init__()
         self.scene, self.agent = scene, agent
         self.register_buffer("agent_weights", agent_weights)
@@ -117,7 +131,9 @@ class Splats(nn.Module):
         color = agent.color
         if video is not None:
             color = color @ self.appearance[video][:, :3].T + self.appearance[video][:, 3]
-        return Cloud(skinning.move(world_from_rest, agent.means), rotation, agent.log_scale, agent.opacity, color, torch.ones_like(agent.opacity))
+        return Cloud(
+            skinning.move(world_from_rest, agent.means), rotation, agent.log_scale, agent.opacity, color, torch.ones_like(agent.opacity)
+        )
 
 
 def together(*clouds: Cloud) -> Cloud:
@@ -146,7 +162,16 @@ def see(
     depth = cloud.means @ camera_from_world[2, :3] + camera_from_world[2, 3]
     values = [cloud.color, depth[:, None], cloud.agent[:, None]] + ([] if extra is None else [extra])
     image, coverage = rasterize.draw(
-        cloud.means, cloud.rotation, cloud.log_scale, cloud.opacity, torch.cat(values, dim=-1), camera_from_world, intrinsics, height, width, backend
+        cloud.means,
+        cloud.rotation,
+        cloud.log_scale,
+        cloud.opacity,
+        torch.cat(values, dim=-1),
+        camera_from_world,
+        intrinsics,
+        height,
+        width,
+        backend,
     )
     return View(image[..., :3], image[..., 3] / coverage.clamp_min(1e-3), image[..., 4], coverage, image[..., 5:])
 
@@ -157,16 +182,30 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         rotation = functional.normalize(gaussians.rotation, dim=-1)
         rest = torch.zeros(len(gaussians), 45, device=rotation.device)
         normals = torch.zeros_like(gaussians.means)
-        table = torch.cat([gaussians.means, normals, gaussians.band0, rest, gaussians.opacity_logit[:, None], gaussians.log_scale, rotation], dim=-1)
+        table = torch.cat(
+            [gaussians.means, normals, gaussians.band0, rest, gaussians.opacity_logit[:, None], gaussians.log_scale, rotation], dim=-1
+        )
         table = table[kept(gaussians)].cpu().numpy().astype("<f4")
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *(f"property float {name}" for name in COLUMNS), "end_header", ""]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(table)}",
+        *(f"property float {name}" for name in COLUMNS),
+        "end_header",
+        "",
+    ]
     Path(path).write_bytes("\n".join(header).encode() + table.tobytes())
 
 
 @torch.no_grad()
 def kept(gaussians: Gaussians) -> Tensor:
     """Tell which Gaussians a file holds: finite ones that can be seen."""
-    finite = torch.stack([getattr(gaussians, name).reshape(len(gaussians), -1).isfinite().all(-1) for name in ("means", "rotation", "log_scale", "opacity_logit", "band0")]).all(0)
+    finite = torch.stack(
+        [
+            getattr(gaussians, name).reshape(len(gaussians), -1).isfinite().all(-1)
+            for name in ("means", "rotation", "log_scale", "opacity_logit", "band0")
+        ]
+    ).all(0)
     return finite & (gaussians.opacity >= 1 / 255)
 
 

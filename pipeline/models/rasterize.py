@@ -58,7 +58,9 @@ def project(
     a, b, c = covariance[:, 0, 0] + BLUR_PX2, covariance[:, 0, 1], covariance[:, 1, 1] + BLUR_PX2
     determinant = (a * c - b * b).clamp_min(1e-6)
     radius = REACH * (0.5 * (a + c) + (0.25 * (a - c) ** 2 + b * b).clamp_min(1e-9).sqrt()).detach().sqrt()
-    return Footprints(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), torch.stack([c, -b, a], -1) / determinant[:, None], radius, depth)
+    return Footprints(
+        torch.stack([fx * x / z + cx, fy * y / z + cy], -1), torch.stack([c, -b, a], -1) / determinant[:, None], radius, depth
+    )
 
 
 def blend_dense(

@@ -14,9 +14,14 @@ class Gsplat:
         try:
             import gsplat
         except ImportError as error:
-            raise InputError("DEP-001", what="gsplat is not installed", where="rasterizer gsplat", remedy="install the extra `cuda`, or set backend = \"tiles\"") from error
+            raise InputError(
+                "DEP-001",
+                what="gsplat is not installed",
+                where="rasterizer gsplat",
+                remedy='install the extra `cuda`, or set backend = "tiles"',
+            ) from error
         if not torch.cuda.is_available():
-            raise InputError("DEP-001", what="gsplat needs a CUDA device", where="rasterizer gsplat", remedy="set backend = \"tiles\"")
+            raise InputError("DEP-001", what="gsplat needs a CUDA device", where="rasterizer gsplat", remedy='set backend = "tiles"')
         self._rasterization = gsplat.rasterization
 
     def draw(

@@ -61,7 +61,9 @@ def extract_agent(field: Field, step_m: float) -> Mesh:
     volume = sample_distance(lambda points: field.distance(field.encode(points)), low, high, step_m)
     closed = np.pad(volume, 1, constant_values=step_m)
     mesh = zero_level(closed, low.cpu().numpy() - step_m, step_m)
-    pieces = trimesh.graph.connected_components(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).edges_unique, nodes=np.arange(len(mesh.vertices)))
+    pieces = trimesh.graph.connected_components(
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).edges_unique, nodes=np.arange(len(mesh.vertices))
+    )
     return paint(field, keep_vertices(mesh, np.isin(np.arange(len(mesh.vertices)), max(pieces, key=len))), -1)
 
 

@@ -64,4 +64,6 @@ def run(task: cli.Task) -> None:
 
 
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, reads=("frames", "masks", "flow", "features", "registration", "scene_template", "agent_template"))
+    cli.enter(
+        __doc__, run, config=Config, reads=("frames", "masks", "flow", "features", "registration", "scene_template", "agent_template")
+    )

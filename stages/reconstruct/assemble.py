@@ -76,9 +76,22 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     agent = np.concatenate([filled(video.timestamp_s, video.world_from_agent) for video in videos])
     rooted = torch.from_numpy(np.concatenate([np.isfinite(video.world_from_agent).all((1, 2)) for video in videos]))
     low, high = _measured_box(store, camera, shapes.scene_margin_m)
-    scene = Field(FieldShape(low, high, shapes.scene_voxel_m, shapes.grid_channels, shapes.width, sum(v.has_scene for v in videos), truncation_m=shapes.truncation_m), free_m=-0.03)
+    scene = Field(
+        FieldShape(
+            low,
+            high,
+            shapes.scene_voxel_m,
+            shapes.grid_channels,
+            shapes.width,
+            sum(v.has_scene for v in videos),
+            truncation_m=shapes.truncation_m,
+        ),
+        free_m=-0.03,
+    )
     vertices = template.mesh.vertices
-    low, high = (tuple(float(x) for x in corner) for corner in (vertices.min(0) - shapes.agent_margin_m, vertices.max(0) + shapes.agent_margin_m))
+    low, high = (
+        tuple(float(x) for x in corner) for corner in (vertices.min(0) - shapes.agent_margin_m, vertices.max(0) + shapes.agent_margin_m)
+    )
     agent_shape = FieldShape(low, high, shapes.agent_voxel_m, shapes.grid_channels, shapes.width)
     rest = torch.from_numpy(template.agent_from_bone_rest).float()
     by_frame = RaysByFrame.of(store.agent, len(camera))
@@ -89,7 +102,9 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
         scene=scene,
         agent=Field(agent_shape, free_m=0.1),
         body=Body(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape),
-        motion=MotionTable(torch.from_numpy(camera), torch.from_numpy(agent), rest, lengths, [v.camera_free for v in videos], shapes.knot_frames),
+        motion=MotionTable(
+            torch.from_numpy(camera), torch.from_numpy(agent), rest, lengths, [v.camera_free for v in videos], shapes.knot_frames
+        ),
         video=frame_table(lengths),
         has_scene=has_scene,
         surface=Surface.of(template.mesh, template.feature, np.random.default_rng(seed)),

@@ -117,7 +117,9 @@ def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6
     return terms
 
 
-def _bilinear(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> tuple[Float[Tensor, "frame point"], Bool[Tensor, "frame point"]]:
+def _bilinear(
+    images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]
+) -> tuple[Float[Tensor, "frame point"], Bool[Tensor, "frame point"]]:
     """Read thumbnails between their pixels, with gradients towards the place; also tell what lies inside."""
     place = _normalized(images, pixel)
     values = functional.grid_sample(images[:, None], place[:, :, None], padding_mode="border", align_corners=False)
@@ -127,7 +129,9 @@ def _bilinear(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, 
 def _nearest(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:
     """Read thumbnails at the nearest pixel."""
     place = _normalized(images, pixel)
-    return functional.grid_sample(images[:, None].float(), place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False)[:, 0, :, 0]
+    return functional.grid_sample(images[:, None].float(), place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False)[
+        :, 0, :, 0
+    ]
 
 
 def _normalized(images: Tensor, pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point 2"]:
@@ -158,7 +162,9 @@ class ChunkLoss(torch.nn.Module):
     def loss(self, progress: float, generator: Generator) -> dict[str, Tensor]:
         """Return the weighted terms over all frames of the chunk."""
         problem, pose = self.problem, self.pose(progress >= self.root_share)
-        seen = Pose(self.frame[self.seen], pose.world_from_camera[self.seen], pose.world_from_agent[self.seen], pose.agent_from_bone[self.seen])
+        seen = Pose(
+            self.frame[self.seen], pose.world_from_camera[self.seen], pose.world_from_agent[self.seen], pose.agent_from_bone[self.seen]
+        )
         rays = problem.store.agent.at(problem.agent_rays.pick(seen.frame, self.rays, generator).flatten())
         terms = measured_terms(problem, seen, rays, self.weights, generator, near=0)
         terms |= surface_terms(problem, seen, self.points, self.weights, generator)

@@ -1,7 +1,7 @@
 """The second phase: scene and agent together, all losses, composite rendering on rays around the agent."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Generator, Tensor
 
 from pipeline.models.fields import density
@@ -58,14 +58,18 @@ def rendered_terms(problem: Problem, pose: Pose, number: int, probability: float
     return compare(problem, pose, rays, seen, world, rest, has_scene, weights)
 
 
-def agent_layer(problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"], shape: tuple[int, int]) -> tuple[Layer, Float[Tensor, "frame point 3"]]:
+def agent_layer(
+    problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"], shape: tuple[int, int]
+) -> tuple[Layer, Float[Tensor, "frame point 3"]]:
     """Ask the agent's field along rays; also return where the samples lie at rest. Outside its box there is nothing."""
     field = problem.agent
     rest = problem.body.unpose(points_agent, pose.agent_from_bone)
     low, high = (torch.tensor(corner, device=problem.device) for corner in (field.shape.low_m, field.shape.high_m))
     inside = ((rest > low) & (rest < high)).all(-1).view(shape)
     values = field(rest.reshape(-1, 3))
-    layer = Layer(density(values.signed_distance, field.beta_m).view(shape) * inside, values.color.view(*shape, 3), values.feature.view(*shape, -1))
+    layer = Layer(
+        density(values.signed_distance, field.beta_m).view(shape) * inside, values.color.view(*shape, 3), values.feature.view(*shape, -1)
+    )
     return layer, rest
 
 
@@ -87,7 +91,9 @@ def compare(
     }
 
 
-def later_pixels(problem: Problem, pose: Pose, rays: Rays, seen: Rendered, world: Tensor, rest: Tensor) -> tuple[Float[Tensor, "ray 2"], Tensor]:
+def later_pixels(
+    problem: Problem, pose: Pose, rays: Rays, seen: Rendered, world: Tensor, rest: Tensor
+) -> tuple[Float[Tensor, "ray 2"], Tensor]:
     """Return where rendered points are seen at the flow's later frame, and for which rays that can be said.
 
     A sample's later place mixes the scene's (it stays) and the agent's (it follows the bones), by density.
@@ -130,8 +136,10 @@ class TemplateLoss:
         index = pick(len(surface.around), self.number, generator, self.problem.device)
         values = field(surface.around[index])
         close = surface.distance[index].abs() < body.REACH_M
-        return losses.weighted({
-            "distance": (1.0, ((values.signed_distance - surface.distance[index]) / body.REACH_M).abs()),
-            "color": (1.0, losses.color(values.color, surface.color[index])[close]),
-            "feature": (0.3, losses.feature(values.feature, surface.feature[index])[close]),
-        })
+        return losses.weighted(
+            {
+                "distance": (1.0, ((values.signed_distance - surface.distance[index]) / body.REACH_M).abs()),
+                "color": (1.0, losses.color(values.color, surface.color[index])[close]),
+                "feature": (0.3, losses.feature(values.feature, surface.feature[index])[close]),
+            }
+        )

@@ -5,7 +5,6 @@ Weights stand in the stage's configuration; `weighted` is the one place where lo
 
 from collections.abc import Mapping
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional

@@ -48,7 +48,9 @@ def optimise(problem: Problem, plan: Plan) -> dict[str, FitRecord]:
     if len(problem.agent_frames):
         for index, frame in enumerate(chunks(problem, steps.body_chunk_frames)):
             _pose_chunk(problem, plan, frame, f"body_{index:04d}")
-        records["joint"] = _run(problem, plan, "joint", JointLoss(problem, plan.weights, plan.batches, steps.joint), steps.joint, _joint_groups(problem, rates))
+        records["joint"] = _run(
+            problem, plan, "joint", JointLoss(problem, plan.weights, plan.batches, steps.joint), steps.joint, _joint_groups(problem, rates)
+        )
     return records
 
 
@@ -85,7 +87,9 @@ def _pose_chunk(problem: Problem, plan: Plan, frame: torch.Tensor, name: str) ->
     steps = plan.steps.body
     fit(
         modules={"chunk": _Learned(chunk)},
-        optimizer=torch.optim.AdamW([{"params": [chunk.root, chunk.bone], "lr": plan.rates.body, "weight_decay": 0.0, "betas": (0.8, 0.99)}]),
+        optimizer=torch.optim.AdamW(
+            [{"params": [chunk.root, chunk.bone], "lr": plan.rates.body, "weight_decay": 0.0, "betas": (0.8, 0.99)}]
+        ),
         loss=lambda step, generator: chunk.loss(step / steps, generator),
         steps=steps,
         seed=_seed(plan.seed, name),
@@ -112,7 +116,10 @@ class _Learned(nn.Module):
 def _field_groups(field: nn.Module, rates: Rates) -> list[dict]:
     grid = list(field.grid.parameters())
     heads = [parameter for name, parameter in field.named_parameters() if not name.startswith("grid.")]
-    return [{"params": grid, "lr": rates.grid, "weight_decay": 0.0, "betas": (0.9, 0.99)}, {"params": heads, "lr": rates.heads, "weight_decay": 1e-4}]
+    return [
+        {"params": grid, "lr": rates.grid, "weight_decay": 0.0, "betas": (0.9, 0.99)},
+        {"params": heads, "lr": rates.heads, "weight_decay": 1e-4},
+    ]
 
 
 def _motion_group(parameters: list[nn.Parameter], rate: float, momentum: float = 0.0) -> dict:

@@ -19,7 +19,13 @@ HEIGHT, WIDTH = 320, 240
 DEPTH_RANGE_M = 4.0
 
 
-def report_quality(folder: Path, reconstruction: Reconstruction, motions: Mapping[str, Motion], inputs: Mapping[str, Mapping[str, Path]], records: Mapping[str, FitRecord]) -> None:
+def report_quality(
+    folder: Path,
+    reconstruction: Reconstruction,
+    motions: Mapping[str, Motion],
+    inputs: Mapping[str, Mapping[str, Path]],
+    records: Mapping[str, FitRecord],
+) -> None:
     """Write qa.json: agreement with the sensor on a few frames of every session, pictures of three of them."""
     rows, pictures = [], []
     for id, motion in list(motions.items())[:8]:
@@ -29,7 +35,13 @@ def report_quality(folder: Path, reconstruction: Reconstruction, motions: Mappin
         compared = [compare(renderer, clip, masks[frame], motion, frame) for frame in frames]
         rows += [figures for figures, _ in compared]
         if compared and len(pictures) < 3:
-            pictures.append(qa.Picture(f"{id}_frames", np.vstack([image for _, image in compared[:3]]), f"{id}: picture, render, depth measured and rendered, opposite view, bones"))
+            pictures.append(
+                qa.Picture(
+                    f"{id}_frames",
+                    np.vstack([image for _, image in compared[:3]]),
+                    f"{id}: picture, render, depth measured and rendered, opposite view, bones",
+                )
+            )
     pictures.append(qa.Picture("losses", loss_curves(records), "losses of each phase, running mean, logarithmic"))
     psnr, depth, iou = (np.mean(column) for column in zip(*rows, strict=True)) if rows else (np.nan,) * 3
     checks = [
@@ -37,16 +49,26 @@ def report_quality(folder: Path, reconstruction: Reconstruction, motions: Mappin
         qa.Check("measured depth reproduced within 0.1 m", float(depth), "share", 0.9, 0.75, "higher"),
         qa.Check("agent's silhouette against its mask, IoU", float(iou), "share", 0.7, 0.5, "higher"),
     ]
-    qa.write(folder, good="renders that match pictures and depth, bones inside the body", bad="ghosts, a body beside its mask, bones torn apart", checks=checks, pictures=pictures)
+    qa.write(
+        folder,
+        good="renders that match pictures and depth, bones inside the body",
+        bad="ghosts, a body beside its mask, bones torn apart",
+        checks=checks,
+        pictures=pictures,
+    )
 
 
 def chosen_frames(motion: Motion, number: int) -> list[int]:
     """Choose frames spread over those where camera and agent are known."""
-    known = np.flatnonzero(np.isfinite(motion.world_from_agent).all((1, 2)) & np.isfinite(motion.world_from_camera).all((1, 2)) & motion.agent_visible)
+    known = np.flatnonzero(
+        np.isfinite(motion.world_from_agent).all((1, 2)) & np.isfinite(motion.world_from_camera).all((1, 2)) & motion.agent_visible
+    )
     return [int(known[i]) for i in np.unique(np.linspace(0, len(known) - 1, number).astype(int))] if len(known) else []
 
 
-def compare(renderer: Renderer, clip: Clip, mask: UInt8[np.ndarray, "height width"], motion: Motion, frame: int) -> tuple[tuple[float, float, float], UInt8[np.ndarray, "height width 3"]]:
+def compare(
+    renderer: Renderer, clip: Clip, mask: UInt8[np.ndarray, "height width"], motion: Motion, frame: int
+) -> tuple[tuple[float, float, float], UInt8[np.ndarray, "height width 3"]]:
     """Render one frame; return (PSNR, share of depth within 0.1 m, IoU) and one row of pictures."""
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, (HEIGHT, WIDTH))
     camera, root, bones = motion.world_from_camera[frame], motion.world_from_agent[frame], motion.agent_from_bone[frame]
@@ -54,7 +76,14 @@ def compare(renderer: Renderer, clip: Clip, mask: UInt8[np.ndarray, "height widt
     color = cv2.resize(clip.color(frame), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
     measured = cv2.resize(clip.depth(frame), (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
     opposite = renderer.draw(_opposite(camera, root), intrinsics, HEIGHT, WIDTH, root, bones)
-    row = [color, drawn.color, depth_colors(measured), depth_colors(drawn.depth), opposite.color, draw_bones(color, camera, intrinsics, root, bones)]
+    row = [
+        color,
+        drawn.color,
+        depth_colors(measured),
+        depth_colors(drawn.depth),
+        opposite.color,
+        draw_bones(color, camera, intrinsics, root, bones),
+    ]
     known, agent = (measured > 0.1) & (measured < 5), cv2.resize(mask, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST) == 255
     error = np.mean((color.astype(float) - drawn.color)[drawn.depth > 0] ** 2)
     iou = (agent & drawn.agent).sum() / max((agent | drawn.agent).sum(), 1)
@@ -103,7 +132,7 @@ def loss_curves(records: Mapping[str, FitRecord], height: int = 240, width: int 
             x = np.linspace(10, width - 10, len(mean))
             y = 30 + (high - mean) / (high - low) * (height - 40)
             cv2.polylines(panel, [np.rint(np.stack([x, y], axis=-1)).astype(np.int32)], False, (40, 80, 200), 2, cv2.LINE_AA)
-            name = f"{name}: {10**mean[0]:.3f} -> {10**mean[-1]:.3f}"
+            name = f"{name}: {10 ** mean[0]:.3f} -> {10 ** mean[-1]:.3f}"
         cv2.putText(panel, name, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
         panels.append(panel)
     return np.hstack(panels)

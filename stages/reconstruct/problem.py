@@ -86,7 +86,15 @@ class Surface:
     feature: Float[Tensor, "sample 16"]
 
     @classmethod
-    def of(cls, mesh: Mesh, feature: Float[np.ndarray, "vertex 16"], rng: np.random.Generator, margin_m: float = 0.25, on: int = 4000, off: int = 40000) -> "Surface":
+    def of(
+        cls,
+        mesh: Mesh,
+        feature: Float[np.ndarray, "vertex 16"],
+        rng: np.random.Generator,
+        margin_m: float = 0.25,
+        on: int = 4000,
+        off: int = 40000,
+    ) -> "Surface":
         """Sample a template mesh; distances are to the nearest of many surface samples, signed by their normals."""
         corner = mesh.vertices[mesh.faces].astype(np.float64)
         area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1)
@@ -96,7 +104,12 @@ class Surface:
         normal = mesh.face_normals()[face]
         low, high = mesh.vertices.min(0) - margin_m, mesh.vertices.max(0) + margin_m
         spread = rng.choice([0.01, 0.04], off // 2)[:, None]
-        around = np.concatenate([points[rng.integers(len(points), size=off // 2)] + rng.normal(size=(off // 2, 3)) * spread, rng.uniform(low, high, (off // 2, 3))])
+        around = np.concatenate(
+            [
+                points[rng.integers(len(points), size=off // 2)] + rng.normal(size=(off // 2, 3)) * spread,
+                rng.uniform(low, high, (off // 2, 3)),
+            ]
+        )
         near_m, near = cKDTree(points).query(around, 8)
         side = ((around[:, None] - points[near]) * normal[near]).sum(-1).mean(-1)
         distance = near_m[:, 0] * np.where(side < 0, -1, 1)

@@ -128,14 +128,19 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
         depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float16))
         outsides.append(_distance_outside(mask, small) if seen else np.full(small, 255, np.uint8))
     visible = source.masks.visible if source.masks is not None else np.zeros(len(source.clip), bool)
-    views = Views(torch.from_numpy(source.clip.intrinsics).float(), torch.from_numpy(np.stack(depths)), torch.from_numpy(np.stack(outsides)), torch.from_numpy(visible.astype(bool)))
+    views = Views(
+        torch.from_numpy(source.clip.intrinsics).float(),
+        torch.from_numpy(np.stack(depths)),
+        torch.from_numpy(np.stack(outsides)),
+        torch.from_numpy(visible.astype(bool)),
+    )
     return Store(_concatenate(scene), _concatenate(agent), views)
 
 
 def join(stores: Sequence[Store]) -> Store:
     """String videos together; frame indices of later videos are shifted by the frames before them."""
     starts = np.cumsum([0] + [len(store.views.intrinsics) for store in stores])
-    parts = [[_shift(getattr(store, name), int(start)) for store, start in zip(stores, starts)] for name in ("scene", "agent")]
+    parts = [[_shift(getattr(store, name), int(start)) for store, start in zip(stores, starts, strict=False)] for name in ("scene", "agent")]
     views = Views(*(torch.cat([getattr(store.views, field.name) for store in stores]) for field in fields(Views)))
     return Store(*(_concatenate(part) for part in parts), views)
 
@@ -148,7 +153,18 @@ def _concatenate(parts: Sequence[Rays]) -> Rays:
     if not parts:
         floats, bytes_ = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
         features, signed = torch.zeros(0, 16, dtype=torch.int8), torch.zeros(0, dtype=torch.int8)
-        return Rays(torch.zeros(0, dtype=torch.int64), floats, floats[:, 0], floats[:, 0], bytes_, features, bytes_[:, 0], floats[:, :2], bytes_[:, 0], signed)
+        return Rays(
+            torch.zeros(0, dtype=torch.int64),
+            floats,
+            floats[:, 0],
+            floats[:, 0],
+            bytes_,
+            features,
+            bytes_[:, 0],
+            floats[:, :2],
+            bytes_[:, 0],
+            signed,
+        )
     return Rays(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Rays)))
 
 
@@ -201,9 +217,17 @@ class _Reader:
         at_depth = cameras.project(direction, clip.depth_intrinsics[self.frame])[0].astype(int)
         x, y = np.clip(at_depth[:, 0], 0, self.depth.shape[1] - 1), np.clip(at_depth[:, 1], 0, self.depth.shape[0] - 1)
         features = self.source.features
-        feature = np.asarray(features[self.frame])[np.minimum(row // 8, features.shape[1] - 1), np.minimum(column // 8, features.shape[2] - 1)]
+        feature = np.asarray(features[self.frame])[
+            np.minimum(row // 8, features.shape[1] - 1), np.minimum(column // 8, features.shape[2] - 1)
+        ]
         flow, confidence, gap = self._flow(place, rng)
-        arrays = (direction.astype(np.float32), self.depth[y, x], self.slope[y, x], self.color[row, column], np.rint(feature.astype(np.float32) * 127).astype(np.int8))
+        arrays = (
+            direction.astype(np.float32),
+            self.depth[y, x],
+            self.slope[y, x],
+            self.color[row, column],
+            np.rint(feature.astype(np.float32) * 127).astype(np.int8),
+        )
         arrays += (self.mask[row, column], (pixel + flow).astype(np.float32), confidence, gap)
         return Rays(torch.full((len(place),), self.frame), *(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 

@@ -50,7 +50,11 @@ def motions(problem: Problem, videos: Sequence[Video], longest_gap_s: float) -> 
 
 
 def bridged(
-    timestamp_s: Float[np.ndarray, "frame"], root: Float[np.ndarray, "frame 4 4"], bones: Float[np.ndarray, "frame bone 4 4"], good: np.ndarray, longest_gap_s: float
+    timestamp_s: Float[np.ndarray, "frame"],
+    root: Float[np.ndarray, "frame 4 4"],
+    bones: Float[np.ndarray, "frame bone 4 4"],
+    good: np.ndarray,
+    longest_gap_s: float,
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame bone 4 4"]]:
     """Interpolate poses over short gaps between good frames; others become NaN (roots) and rest with their neighbours (bones)."""
     root, bones = root.copy(), bones.copy()

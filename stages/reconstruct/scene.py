@@ -7,7 +7,6 @@ from torch import Generator, Tensor
 from pipeline.models.fields import density
 from pipeline.models.motion import MotionTable
 from pipeline.models.render import Layer, composite
-from pipeline.space import rigid_torch
 from stages.reconstruct import losses
 from stages.reconstruct.problem import Problem, pick
 from stages.reconstruct.rays import Rays
@@ -48,7 +47,9 @@ def sample_depths(rays: Rays, near: int, free: int, reach_m: float, generator: G
     return torch.cat([depth, depth - around, before], dim=1)
 
 
-def measured_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, batches: Batches, generator: Generator) -> Terms:
+def measured_terms(
+    problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, batches: Batches, generator: Generator
+) -> Terms:
     """Fit the scene where the sensor measured: rays of known depth."""
     field, limit = problem.scene, problem.scene.shape.truncation_m
     origin, direction = world_rays(problem.motion, rays)
@@ -74,7 +75,6 @@ def measured_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], we
 
 def rendered_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, generator: Generator) -> Terms:
     """Fit the scene by volume rendering: any rays, with or without depth."""
-    field = problem.scene
     origin, direction = world_rays(problem.motion, rays)
     depth = render_depths(rays, generator)
     points = origin[:, None] + direction[:, None] * depth[..., None]
@@ -100,7 +100,9 @@ def scene_layer(problem: Problem, points: Float[Tensor, "ray sample 3"], code_of
     )
 
 
-def render_depths(rays: Rays, generator: Generator, around: int = 12, along: int = 12, reach_m: float = 0.15) -> Float[Tensor, "ray sample"]:
+def render_depths(
+    rays: Rays, generator: Generator, around: int = 12, along: int = 12, reach_m: float = 0.15
+) -> Float[Tensor, "ray sample"]:
     """Place samples for rendering: half around the measured depth, half up to it (up to 5 m where it is unknown)."""
     device = rays.depth.device
     end = torch.where(rays.depth > 0, rays.depth, torch.full_like(rays.depth, FARTHEST_M))[:, None]
@@ -116,7 +118,10 @@ def render_depths(rays: Rays, generator: Generator, around: int = 12, along: int
 def drift_term(motion: MotionTable, weights: Weights) -> Terms:
     """Keep the corrections of cameras small, and those of neighbouring knots alike: units of 1 cm and half a degree."""
     unit = 0.01
-    return {"drift": (weights.drift, (torch.diff(motion.camera, dim=0) / unit).square()), "anchor": (weights.anchor, (motion.camera / unit).square())}
+    return {
+        "drift": (weights.drift, (torch.diff(motion.camera, dim=0) / unit).square()),
+        "anchor": (weights.anchor, (motion.camera / unit).square()),
+    }
 
 
 class SceneLoss:
@@ -127,7 +132,10 @@ class SceneLoss:
         self.measured = torch.nonzero(problem.store.scene.depth > 0)[:, 0]
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
-        return losses.weighted(self.terms(self.batches.scene_rays, swap_probability(step / self.steps), generator) | drift_term(self.problem.motion, self.weights))
+        return losses.weighted(
+            self.terms(self.batches.scene_rays, swap_probability(step / self.steps), generator)
+            | drift_term(self.problem.motion, self.weights)
+        )
 
     def terms(self, number: int, probability: float, generator: Generator) -> Terms:
         """Return the scene's terms over random rays."""

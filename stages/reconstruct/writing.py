@@ -14,7 +14,15 @@ from stages.reconstruct import results
 from stages.reconstruct.problem import Problem
 
 
-def write(folder: Path, problem: Problem, reconstruction: Reconstruction, motions: Mapping[str, Motion], sessions: Collection[str], scene: Mesh, agent: Mesh) -> None:
+def write(
+    folder: Path,
+    problem: Problem,
+    reconstruction: Reconstruction,
+    motions: Mapping[str, Motion],
+    sessions: Collection[str],
+    scene: Mesh,
+    agent: Mesh,
+) -> None:
     """Write motion per video (those of the templates apart), surfaces, skin, fields, feature volume and track points."""
     (folder / "templates").mkdir()
     for id, found in motions.items():
@@ -32,6 +40,13 @@ def write(folder: Path, problem: Problem, reconstruction: Reconstruction, motion
     )
     fields.save(folder, reconstruction)
     volume = results.feature_volume(problem)
-    arrays.save(folder / "feature_volume.npz", compress=True, features=volume.features, occupancy=volume.occupancy, origin=volume.origin, voxel_m=np.float64(results.VOXEL_M))
+    arrays.save(
+        folder / "feature_volume.npz",
+        compress=True,
+        features=volume.features,
+        occupancy=volume.occupancy,
+        origin=volume.origin,
+        voxel_m=np.float64(results.VOXEL_M),
+    )
     index, rest = results.track_points(agent)
     arrays.save(folder / "tracks.npz", vertex_index=index.astype(np.int64), rest_agent=rest.astype(np.float32))

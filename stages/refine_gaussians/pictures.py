@@ -32,10 +32,22 @@ def report_quality(folder: Path, loss: FrameLoss, sequences: Sequence[Sequence4D
     window = max(1, len(color) // 10)
     checks = [
         qa.Check("PSNR of drawn training frames", float(np.mean(figures)) if figures else None, "dB", 20, 15, "higher"),
-        qa.Check("colour error of the last tenth against the first", float(np.nanmean(color[-window:]) / np.nanmean(color[:window])), "ratio", 1.0, 1.3),
+        qa.Check(
+            "colour error of the last tenth against the first",
+            float(np.nanmean(color[-window:]) / np.nanmean(color[:window])),
+            "ratio",
+            1.0,
+            1.3,
+        ),
     ]
     pictures = [qa.Picture("frames", np.vstack(rows[:6]), "picture, Gaussians, depth, the agent's share")] if rows else []
-    qa.write(folder, good="sharper pictures than the fields give, an agent of its own", bad="needles, fog, an agent that leaves colour in the room", checks=checks, pictures=pictures)
+    qa.write(
+        folder,
+        good="sharper pictures than the fields give, an agent of its own",
+        bad="needles, fog, an agent that leaves colour in the room",
+        checks=checks,
+        pictures=pictures,
+    )
 
 
 @torch.no_grad()

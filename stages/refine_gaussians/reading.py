@@ -25,7 +25,9 @@ class Counts:
     """of the agent"""
 
 
-def read_sequences(reconstruction: Path, frames: Mapping[str, Path], masks: Mapping[str, Path], flow: Mapping[str, Path]) -> list[Sequence4D]:
+def read_sequences(
+    reconstruction: Path, frames: Mapping[str, Path], masks: Mapping[str, Path], flow: Mapping[str, Path]
+) -> list[Sequence4D]:
     """Read all videos with their motion, sessions and templates, in id order on one frame axis."""
     sequences, first, video = [], 0, 0
     for id in sorted(frames):

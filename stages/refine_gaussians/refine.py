@@ -74,7 +74,9 @@ class MotionDeltas(nn.Module):
         super().__init__()
         self.root, self.bone = nn.Parameter(torch.zeros(frames, 6)), nn.Parameter(torch.zeros(frames, bones, 6))
 
-    def apply(self, world_from_agent: Float[Tensor, "*batch 4 4"], agent_from_bone: Float[Tensor, "*batch bone 4 4"], frame) -> tuple[Tensor, Tensor]:
+    def apply(
+        self, world_from_agent: Float[Tensor, "*batch 4 4"], agent_from_bone: Float[Tensor, "*batch bone 4 4"], frame
+    ) -> tuple[Tensor, Tensor]:
         """Return the corrected root and bones of frames."""
         return world_from_agent @ rigid_torch.se3_exp(self.root[frame]), agent_from_bone @ rigid_torch.se3_exp(self.bone[frame])
 
@@ -82,7 +84,15 @@ class MotionDeltas(nn.Module):
 class FrameLoss:
     """The loss of one random frame."""
 
-    def __init__(self, splats: Splats, deltas: MotionDeltas, sequences: Sequence[Sequence4D], weights: Weights, size: tuple[int, int], backend: Backend):
+    def __init__(
+        self,
+        splats: Splats,
+        deltas: MotionDeltas,
+        sequences: Sequence[Sequence4D],
+        weights: Weights,
+        size: tuple[int, int],
+        backend: Backend,
+    ):
         self.splats, self.deltas, self.sequences, self.weights, self.size, self.backend = splats, deltas, sequences, weights, size, backend
         self.device = str(splats.appearance.device)
         self.frames = [(s, f) for s, sequence in enumerate(sequences) for f in usable_frames(sequence)]
@@ -115,7 +125,9 @@ class FrameLoss:
         return together(*parts)
 
     def _pose(self, sequence: Sequence4D, frame: int) -> tuple[Tensor, Tensor]:
-        root, bones = (torch.from_numpy(a[frame]).float().to(self.device) for a in (sequence.motion.world_from_agent, sequence.motion.agent_from_bone))
+        root, bones = (
+            torch.from_numpy(a[frame]).float().to(self.device) for a in (sequence.motion.world_from_agent, sequence.motion.agent_from_bone)
+        )
         return self.deltas.apply(root, bones, sequence.first + frame)
 
     def _camera(self, sequence: Sequence4D, frame: int) -> Tensor:
@@ -168,7 +180,7 @@ def refine(loss: FrameLoss, rates: Rates, steps: int, seed: int, resume: Path | 
         seed=seed,
         resume=resume,
         save_every=save_every,
-        schedule=lambda progress: 0.1 ** progress,
+        schedule=lambda progress: 0.1**progress,
         label="gaussians",
         clip_norm=math.inf,
     )
@@ -179,7 +191,12 @@ def refined(motion: Motion, deltas: MotionDeltas, first: int) -> Motion:
     """Return one video's motion with its corrections."""
     frame = torch.arange(first, first + len(motion.timestamp_s))
     device = deltas.root.device
-    root, bones = (torch.from_numpy(array).to(device) for array in (motion.world_from_agent.astype(np.float64), motion.agent_from_bone.astype(np.float64)))
+    root, bones = (
+        torch.from_numpy(array).to(device)
+        for array in (motion.world_from_agent.astype(np.float64), motion.agent_from_bone.astype(np.float64))
+    )
     root, bones = deltas.double().apply(root, bones, frame.to(device))
     deltas.float()
-    return Motion(motion.timestamp_s, motion.world_from_camera, root.cpu().numpy(), bones.cpu().numpy(), motion.confidence, motion.agent_visible)
+    return Motion(
+        motion.timestamp_s, motion.world_from_camera, root.cpu().numpy(), bones.cpu().numpy(), motion.confidence, motion.agent_visible
+    )
