@@ -1,0 +1,68 @@
+"""Tell what a build cost: seconds, seconds per frame and peak memory of every stage, from the records beside its artifacts.
+
+    python -m benchmarks.stages cat
+
+Times are wall seconds of the job on the machine that ran it, other jobs beside it included; compare builds made alike.
+"""
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The jobs of one artifact together."""
+
+    artifact: str
+    jobs: int
+    seconds: float
+    frames: int
+    """Frames of the recordings whose jobs these are; 0 for an artifact made at once."""
+    peak_memory_mb: int
+
+
+def costs(build: Path) -> list[Cost]:
+    """Sum the records of a build per artifact, in flow order."""
+    jobs = {job["id"]: job for job in json.loads((build / "plan" / "dag.json").read_text())}
+    frames = {path.name: len(list((path / "color").glob("*.jpg"))) for path in (build / "frames").iterdir()}
+    grouped: dict[str, list[tuple[dict, dict]]] = {}
+    for name, job in jobs.items():
+        record = build / "records" / f"{name}.json"
+        if record.exists():
+            grouped.setdefault(job["artifact"], []).append((job, json.loads(record.read_text())))
+    return [
+        Cost(
+            artifact,
+            len(done),
+            sum(record["seconds"] for _, record in done),
+            sum(frames.get(job["video"], 0) for job, _ in done if job["video"]),
+            max(record["peak_memory_mb"] for _, record in done),
+        )
+        for artifact, done in grouped.items()
+    ]
+
+
+def table(found: list[Cost]) -> str:
+    """Lay the costs out as a Markdown table with a last line for the whole build."""
+    lines = ["| artifact | jobs | seconds | frames | s / frame | peak MB |", "|---|---|---|---|---|---|"]
+    for cost in found:
+        per_frame = f"{cost.seconds / cost.frames:.3f}" if cost.frames else ""
+        lines.append(f"| {cost.artifact} | {cost.jobs} | {cost.seconds:.0f} | {cost.frames or ''} | {per_frame} | {cost.peak_memory_mb} |")
+    whole = sum(cost.seconds for cost in found)
+    lines.append(f"| all, one after another | {sum(cost.jobs for cost in found)} | {whole:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table of one agent's build."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("agent", help="whose build, for example cat")
+    parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
+    given = parser.parse_args()
+    print(table(costs(given.build / given.agent)))
+
+
+if __name__ == "__main__":
+    main()
