@@ -14,7 +14,7 @@ from pipeline.progress import track
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.register_videos import body as bodies
-from stages.register_videos.body import Body, FitOptions, Glimpse
+from stages.register_videos.body import Body, FitOptions, Glimpse, Ground
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,7 @@ def find_roots(
     clip: Clip,
     masks: Masks,
     mesh: Mesh,
+    ground: Ground,
     localizer: Localizer,
     world_from_camera: Float[np.ndarray, "frame 4 4"],
     options: RootOptions,
@@ -84,7 +85,7 @@ def find_roots(
     glimpses = [
         glimpse
         for frame in track(np.flatnonzero(masks.visible).tolist(), "looking at the animal")
-        if (glimpse := bodies.observe(clip, masks[frame], frame, world_from_camera[frame], body, options.fit)) is not None
+        if (glimpse := bodies.observe(clip, masks[frame], frame, world_from_camera[frame], body, ground, options.fit)) is not None
     ]
     count = len(clip)
     roots = np.full((count, 4, 4), np.nan)
@@ -146,8 +147,7 @@ class Pace:
     velocity: Float[np.ndarray, "glimpse 3"]
     """Horizontal velocity of the seen points' middle, m/s; zero across gaps."""
     novelty: Float[np.ndarray, "glimpse"]
-    """0..1: how much a glimpse shows that its neighbours did not, times how much of the animal it shows: repeated and
-    partial views err alike."""
+    """0..1: how much a glimpse shows that its neighbours did not; repeated views err alike."""
 
 
 def pace(timestamp_s: Float[np.ndarray, "frame"], glimpses: list[Glimpse], still_weight: float, span: int = 3) -> Pace:
@@ -160,9 +160,8 @@ def pace(timestamp_s: Float[np.ndarray, "frame"], glimpses: list[Glimpse], still
     velocity = (middle[after] - middle[before]) / elapsed
     moved = np.linalg.norm(velocity, axis=1) + 0.5 * np.linalg.norm((phone[after] - phone[before]) / elapsed, axis=1)
     velocity[(elapsed[:, 0] > 1.2) | (elapsed[:, 0] < 0.15)] = 0
-    share = np.array([glimpse.share for glimpse in glimpses])
     novelty = still_weight + (1 - still_weight) * np.minimum(moved / 0.4, 1.0)
-    return Pace(velocity, novelty * np.minimum(share / 0.4, 1.0))
+    return Pace(velocity, novelty)
 
 
 def best_path(timestamp_s: Float[np.ndarray, "frame"], candidates: list[Candidates], moves: Pace, options: RootOptions) -> list[int]:

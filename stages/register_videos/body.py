@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
-from pipeline.space.meshes import Mesh
+from pipeline.space.meshes import Mesh, RayCaster
 
 UP = np.array([0.0, 1.0, 0.0])
 
@@ -38,6 +38,12 @@ class FitOptions:
     """Width at the beginning of the coarse steps, metres."""
     tilt_sigma_deg: float = 15.0
     """Standard deviation of the root's tilt against upright, degrees."""
+    stand_points: float = 40.0
+    """Standing on what lies below counts as much as so many depth points ..."""
+    stand_reach_m: float = 0.12
+    """... with a robust weight of this width, metres: animals jump and lie down."""
+    stand_cost_m: float = 0.012
+    """Cost in metres of floating or sinking by more than that."""
     color_weight_m: float = 0.06
     """Cost in metres of a full-scale difference of colour."""
     outside_weight_m: float = 0.05
@@ -55,6 +61,21 @@ class Body:
     tree: cKDTree
     length_m: float
     """Horizontal length."""
+    stand_m: float
+    """Height of the root above the paws."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What animals stand on: the scene's surface, and the floor where that has holes."""
+
+    caster: RayCaster
+    floor_m: float
+
+    def below(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
+        """Return the height of the first surface under each point, the floor's where there is none."""
+        hits = self.caster.cast(points_world, np.broadcast_to([0.0, -1.0, 0.0], points_world.shape))
+        return np.where(hits.face >= 0, points_world[:, 1] - hits.distance, self.floor_m)
 
 
 @dataclass(frozen=True)
@@ -68,6 +89,8 @@ class Glimpse:
     depth: Float[np.ndarray, "depth_height depth_width"]
     world_from_camera: Float[np.ndarray, "4 4"]
     intrinsics: Float[np.ndarray, "3 3"]
+    rest_m: float
+    """Height at which the root would be if the animal stood on what lies below it; NaN where nothing does."""
     share: float
     """Visible area over the area that the body would fill at this distance; 1 is in full view."""
 
@@ -82,7 +105,7 @@ def make_body(mesh: Mesh, options: FitOptions, rng: np.random.Generator) -> Body
     points = mesh.vertices[chosen].astype(float)
     color = np.full((len(chosen), 3), 0.5) if mesh.color is None else mesh.color[chosen] / 255.0
     extent = np.ptp(points[:, [0, 2]], axis=0)
-    return Body(points, normals[chosen], color, cKDTree(points), float(extent.max()))
+    return Body(points, normals[chosen], color, cKDTree(points), float(extent.max()), float(-np.quantile(points[:, 1], 0.01)))
 
 
 def observe(
@@ -91,6 +114,7 @@ def observe(
     frame: int,
     world_from_camera: Float[np.ndarray, "4 4"],
     body: Body,
+    ground: Ground,
     options: FitOptions,
 ) -> Glimpse | None:
     """Lift the masked depth to the world, without the mask's rim and without what lies far from the rest; None if too
@@ -113,14 +137,17 @@ def observe(
     limit = np.array(mask.shape[::-1]) - 1
     column, row = np.clip(pixel.astype(int), 0, limit).T
     full_px = 0.3 * body.length_m**2 * (clip.intrinsics[frame, 0, 0] / np.median(z)) ** 2
+    points_world = rigid.apply(world_from_camera, points)
+    inner = points_world[::8] + _behind(points_world, world_from_camera[:3, 3], body)
     return Glimpse(
         frame=frame,
-        points_world=rigid.apply(world_from_camera, points),
+        points_world=points_world,
         color=clip.color(frame)[row, column] / 255.0,
         mask=inside,
         depth=depth,
         world_from_camera=world_from_camera,
         intrinsics=clip.intrinsics[frame],
+        rest_m=float(np.median(ground.below(inner))) + body.stand_m,
         share=float(min(1.0, inside.sum() / full_px)),
     )
 
@@ -130,11 +157,14 @@ def starts(glimpse: Glimpse, body: Body, headings: int) -> Float[np.ndarray, "st
     yaw = 2 * np.pi * np.arange(headings) / headings
     rotation = rigid.rotation_from_vector(yaw[:, None] * UP)
     middle = np.median(glimpse.points_world, axis=0)
-    away = middle - glimpse.world_from_camera[:3, 3]
-    away[1] = 0
-    behind = middle + 0.1 * body.length_m * away / max(np.linalg.norm(away), 1e-6)
-    centre = np.median(body.points_agent, axis=0)
-    return rigid.make(rotation, behind - rotation @ centre)
+    middle = middle + _behind(glimpse.points_world, glimpse.world_from_camera[:3, 3], body)
+    return rigid.make(rotation, middle - rotation @ np.median(body.points_agent, axis=0))
+
+
+def _behind(points_world, eye, body):
+    """Return the horizontal step from the seen side of the body to its middle."""
+    away = (np.median(points_world, axis=0) - eye) * (1, 0, 1)
+    return 0.1 * body.length_m * away / max(np.linalg.norm(away), 1e-6)
 
 
 def fit_coarse(
@@ -142,7 +172,7 @@ def fit_coarse(
 ) -> Float[np.ndarray, "start 4 4"]:
     """Fit upright from every start, with a weight that narrows from wide."""
     reach = np.geomspace(options.first_reach_m, options.reach_m, options.coarse_rounds)
-    return _fit(glimpse, body, world_from_agent, reach, 1e-4)
+    return _fit(glimpse, body, world_from_agent, options, reach, 1e-4)
 
 
 def fit_fine(
@@ -150,10 +180,10 @@ def fit_fine(
 ) -> Float[np.ndarray, "start 4 4"]:
     """Fit to the end; with ``tilt`` the root may lean."""
     reach = np.full(options.fine_rounds, options.reach_m)
-    return _fit(glimpse, body, world_from_agent, reach, np.deg2rad(options.tilt_sigma_deg) if tilt else 1e-4)
+    return _fit(glimpse, body, world_from_agent, options, reach, np.deg2rad(options.tilt_sigma_deg) if tilt else 1e-4)
 
 
-def _fit(glimpse, body, world_from_agent, reaches, prior):
+def _fit(glimpse, body, world_from_agent, options, reaches, prior):
     """Step robustly, point to plane, with a little point to point so that nothing slides away."""
     placed = np.array(world_from_agent, float)
     for reach in reaches:
@@ -163,6 +193,8 @@ def _fit(glimpse, body, world_from_agent, reaches, prior):
         weight = (reach**2 / (reach**2 + distance**2)) ** 2
         gradient, curvature = _normal_equations(local, target, normal, weight)
         curvature, gradient = _keep_upright(placed, curvature, gradient, prior)
+        if np.isfinite(glimpse.rest_m):
+            curvature, gradient = _keep_standing(placed, curvature, gradient, glimpse.rest_m, options)
         placed = placed @ rigid.exp(np.linalg.solve(curvature, -gradient[..., None])[..., 0])
     return placed
 
@@ -192,6 +224,16 @@ def _keep_upright(placed, curvature, gradient, prior_rad, point_sigma_m=0.03):
     return curvature, gradient
 
 
+def _keep_standing(placed, curvature, gradient, rest_m, options):
+    """Add the prior that the animal stands on what lies below it; robust, since it jumps and lies down."""
+    height = placed[:, 1, 3] - rest_m
+    weight = options.stand_points * (options.stand_reach_m**2 / (options.stand_reach_m**2 + height**2)) ** 2
+    direction = placed[:, 1, :3]
+    curvature[:, 3:, 3:] += weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
+    gradient[:, 3:] += (weight * height)[:, None] * direction
+    return curvature, gradient
+
+
 def cost(glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "start 4 4"], options: FitOptions) -> Float[np.ndarray, "start"]:
     """Return metres: truncated distance of the seen points, difference of colour there, and template outside the
     mask.
@@ -201,6 +243,9 @@ def cost(glimpse: Glimpse, body: Body, world_from_agent: Float[np.ndarray, "star
     seen, model = glimpse.color - glimpse.color.mean(0), body.color[nearest]
     shade = np.abs(seen - (model - model.mean(1, keepdims=True))).mean((1, 2))
     geometry = np.minimum(distance, 1.5 * options.reach_m).mean(1)
+    height = np.nan_to_num(world_from_agent[:, 1, 3] - glimpse.rest_m)
+    lifted = height**2 / (height**2 + options.stand_reach_m**2)
+    geometry = geometry + options.stand_cost_m * lifted
     return geometry + options.color_weight_m * shade + options.outside_weight_m * _outside(glimpse, body, world_from_agent)
 
 

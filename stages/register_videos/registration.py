@@ -9,11 +9,12 @@ from pipeline.files.clips import Clip, Masks
 from pipeline.models.localizer import Localizer, calibrate
 from pipeline.progress import log
 from pipeline.space import rigid, surface
-from pipeline.space.meshes import Mesh
+from pipeline.space.meshes import Mesh, RayCaster
 from stages.register_videos import alignment
 from stages.register_videos import votes as voting
 from stages.register_videos.agent_roots import RootOptions, Roots, find_roots
 from stages.register_videos.alignment import Aligned, AlignOptions
+from stages.register_videos.body import Ground
 from stages.register_videos.votes import VoteOptions, Votes
 
 
@@ -106,7 +107,8 @@ def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.ran
             votes,
         )
     confidence = camera_confidence(clip.timestamp_s, surface.Surface(maps.scene), aligned, options.gate, rng)
-    roots = find_roots(clip, masks, maps.agent, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
+    ground = Ground(RayCaster(maps.scene), float(np.quantile(maps.scene.vertices[:, 1], 0.02)))
+    roots = find_roots(clip, masks, maps.agent, ground, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
     log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
     return Registered(aligned, confidence, roots, agent_confidence(roots), votes, supports)
 

@@ -32,7 +32,7 @@ def glimpse_of(mesh: Mesh, world_from_agent: np.ndarray, frame: int = 0) -> bodi
     ray = np.stack([(seen % 240 + 0.5 - 120) / 236, (seen // 240 + 0.5 - 160) / 236, np.ones(len(seen))], -1)
     noise = np.random.default_rng(0).normal(0, 0.01, len(seen))
     points = rigid.apply(camera, ray * (depth.ravel()[seen] + noise)[:, None])
-    return bodies.Glimpse(frame, points, shade[seen], depth > 0, np.where(depth > 0, depth, 9.0), camera, K, 1.0)
+    return bodies.Glimpse(frame, points, shade[seen], depth > 0, np.where(depth > 0, depth, 9.0), camera, K, np.nan, 1.0)
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 70.0, 160.0, -100.0])
