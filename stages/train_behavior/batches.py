@@ -30,7 +30,7 @@ class Augmentation:
     """probability of mirroring left and right"""
     observer_m: float = 0.05
     """standard deviation of a shift of the observer's whole past"""
-    past: float = 0.2
+    past: float = 0.3
     """standard deviation of noise on the remembered motion, in its own standard deviations"""
     hide_bones: float = 0.5
     """probability that a sample's remembered bones are hidden"""

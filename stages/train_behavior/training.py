@@ -27,7 +27,7 @@ from stages.train_behavior.objective import Objective, losses
 class Optimization:
     """How long and how fast."""
 
-    steps: int = 2000
+    steps: int = 1500
     batch: int = 64
     """windows per step"""
     rate: float = 1e-3
