@@ -30,7 +30,8 @@ class Row:
         """Name, number of axes, dtype and whether it may be absent, of every array told."""
         if "packed" in self.text:
             return []
-        return [(name, len(axes.split()), dtype, bool(absent)) for name, axes, dtype, absent in KEY.findall(self.text)]
+        some_lack_it = "has no animal" in self.text
+        return [(name, len(axes.split()), dtype, bool(absent) or some_lack_it) for name, axes, dtype, absent in KEY.findall(self.text)]
 
 
 def pattern_of(text: str) -> re.Pattern[str]:
