@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import cv2
 import numba
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.files.clips import Clip
-from pipeline.space import rigid
+from pipeline.space import cameras, rigid
 
 
 @dataclass(frozen=True)
 class FreeSpace:
     """How other frames judge a point."""
 
-    references: int = 60
+    references: int = 90
     """depth pictures that vote, spread evenly over the recording"""
     margin_m: float = 0.05
     """a surface must lie this far behind a point to prove it free"""
@@ -79,11 +79,12 @@ def soft_color(color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
 
 def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], options: FreeSpace, frame: int) -> Votes:
     """Let all references but the frame itself judge points (world, metres; NaN gets no vote)."""
-    pinhole = references.intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
-    other = references.frame != frame
     known = np.isfinite(points_world[..., 0])
+    points = np.ascontiguousarray(points_world[known], np.float32)
+    other = (references.frame != frame) & _looking_at(references, points)
+    pinhole = references.intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
     judged = _vote(
-        np.ascontiguousarray(points_world[known], np.float32),
+        points,
         references.camera_from_world[other].astype(np.float32),
         pinhole[other],
         references.depth[other],
@@ -96,6 +97,15 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], op
     for whole, values in zip(votes, judged, strict=True):
         whole[known] = values
     return Votes(*votes)
+
+
+def _looking_at(references: References, points_world: Float[np.ndarray, "point 3"], probes: int = 96) -> Bool[np.ndarray, "reference"]:
+    """Tell which references have any of some evenly chosen points in their picture, or nearly so."""
+    chosen = points_world[:: max(1, len(points_world) // probes)].astype(float)
+    pixel, depth = cameras.project(rigid.apply(references.camera_from_world, chosen[None]), references.intrinsics[:, None])
+    height, width = references.depth.shape[1:]
+    inside = (depth > 0.1) & (np.abs(pixel[..., 0] / width - 0.5) < 0.6) & (np.abs(pixel[..., 1] / height - 0.5) < 0.6)
+    return inside.any(1)
 
 
 def _nearest(depth: Float[np.ndarray, "height width"], focal_px: float, options: FreeSpace) -> Float[np.ndarray, "height width"]:

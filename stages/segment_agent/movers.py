@@ -34,6 +34,8 @@ class Mover:
     """fastest motion that costs nothing much"""
     candidates: int = 6
     """groups kept per frame"""
+    presumed_s: float = 3.0
+    """how long the animal is looked for around where it was last or will next be seen"""
     appear_cost: float = 1.5
     """cost of leaving or entering the view, in units of a convincing candidate"""
 

@@ -23,6 +23,8 @@ class Refinement:
     """colour variance (0..1 squared) below which the filter smooths"""
     unsure: float = 0.4
     """log-odds below which a pixel at the boundary is unknown"""
+    least_presumed_px: int = 25
+    """sure pixels that a frame needs in which the track was lost"""
     height_px: int = 320
     """working height; larger pictures are worked on at this size"""
 

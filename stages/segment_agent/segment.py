@@ -78,7 +78,22 @@ def find_mover(
     chosen = [group[index] if index >= 0 else None for group, index in zip(found, choice, strict=True)]
     radii = [candidate.radius_m for candidate in chosen if candidate]
     radius = float(np.clip(1.8 * np.quantile(radii, 0.9), 0.15, mover.largest_m)) if radii else 0.0
-    return [Sphere(candidate.centre_world, radius) if candidate else None for candidate in chosen]
+    return presume([Sphere(candidate.centre_world, radius) if candidate else None for candidate in chosen], clip.timestamp_s, mover)
+
+
+def presume(balls: list[Sphere | None], timestamp_s: Float[np.ndarray, "frame"], mover: Mover) -> list[Sphere | None]:
+    """Fill short gaps of a track between its ends, and a while before and after it, by where the animal may still be."""
+    seen = np.array([frame for frame, ball in enumerate(balls) if ball is not None])
+    if not len(seen):
+        return balls
+    centres = np.stack([balls[frame].centre_world for frame in seen])
+    guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], centres[:, axis]) for axis in range(3)], axis=1)
+    wait = np.abs(timestamp_s[:, None] - timestamp_s[seen]).min(1)
+    radius = balls[seen[0]].radius_m
+    return [
+        ball or (Sphere(guess[frame], radius, presumed=True) if wait[frame] < mover.presumed_s else None)
+        for frame, ball in enumerate(balls)
+    ]
 
 
 def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing: Weighing) -> Judge:
@@ -89,10 +104,10 @@ def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing
     """
 
     def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
-        votes = free_space.vote(references, window.points_world, free, frame)
         known = np.isfinite(window.points_world[..., 0])
         near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
-        animal = movers.moving(votes, mover) & near
+        votes = free_space.vote(references, np.where(near[..., None], window.points_world, np.nan), free, frame)
+        animal = movers.moving(votes, mover)
         settled = known & ~animal & (votes.occupied > 0)
         step = np.clip((votes.gap_m - weighing.step_m) / weighing.step_spread_m, -weighing.room, 1)
         log_odds = np.where(animal, weighing.moving, np.where(settled, step + weighing.recolored * recolored(window, votes, settled), 0.0))
@@ -123,7 +138,7 @@ def learn_palette(
 ) -> Palette:
     """Learn the animal's colours from frames spread over the recording."""
     palette = Palette()
-    seen = [frame for frame, ball in enumerate(balls) if ball is not None]
+    seen = [frame for frame, ball in enumerate(balls) if ball is not None and not ball.presumed]
     for frame in seen[:: max(1, len(seen) // pictures)]:
         window = cut(clip, frame, world_from_camera[frame], balls[frame], options.height_px)
         if window is not None:
@@ -156,7 +171,8 @@ def _paint_one(
     color = options.color_weight * palette.ratio(window.color, evidence.room)
     log_odds = refine.sharpen(evidence.log_odds + color, evidence.certainty, window.color, options)
     labels = refine.label(log_odds, evidence.animal, options)
-    if not (labels == 255).any():
+    least = options.least_presumed_px if ball.presumed else 1
+    if evidence.animal[labels == 255].sum() < least:
         return Mask(empty, False, 0.5)
     whole = np.zeros(working_size(clip, options.height_px), np.uint8)
     whole[window.rows, window.columns] = labels

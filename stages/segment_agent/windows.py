@@ -17,6 +17,8 @@ class Sphere:
 
     centre_world: Float[np.ndarray, "3"]
     radius_m: float
+    presumed: bool = False
+    """guessed from earlier or later frames"""
 
 
 @dataclass(frozen=True)
