@@ -50,7 +50,7 @@ class Shapes:
 
     scene_voxel_m: tuple[float, ...] = (0.32, 0.16, 0.08)
     """cells of the scene's grids"""
-    agent_voxel_m: tuple[float, ...] = (0.08, 0.04, 0.02)
+    agent_voxel_m: tuple[float, ...] = (0.06, 0.03, 0.015)
     """cells of the agent's grids"""
     grid_channels: int = 4
     """channels of each grid"""

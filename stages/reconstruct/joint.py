@@ -112,23 +112,27 @@ def later_pixels(
     return pixel, usable.repeat_interleave(number) & (ahead > 0.1) & (rays.flow_confidence > 25) & (seen.opacity.detach() > 0.5)
 
 
-def field_terms(problem: Problem, weights: Weights, generator: Generator, number: int = 256) -> Terms:
-    """Keep the agent's field a distance field, and near its template."""
+def field_terms(problem: Problem, weights: Weights, generator: Generator, number: int = 512) -> Terms:
+    """Keep the agent's field a distance field, and near its template in shape and colour."""
     field, surface = problem.agent, problem.surface
     index = pick(len(surface.around), number, generator, problem.device)
     points = surface.around[index]
     beside = points + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
-    distance, *shifted = field.distance(field.encode(torch.cat([points[None], beside]).view(-1, 3))).view(4, -1)
+    encoded = field.encode(torch.cat([points[None], beside]).view(-1, 3))
+    distance, *shifted = field.distance(encoded).view(4, -1)
+    close = surface.distance[index].abs() < body.REACH_M
+    color = field.look(encoded[: len(index)][close])[0]
     return {
         "agent eikonal": (weights.eikonal, losses.eikonal(distance, torch.stack(shifted), EIKONAL_STEP_M)),
         "template": (weights.template, losses.truncated_distance(distance, surface.distance[index], body.REACH_M)),
+        "template color": (weights.template * weights.color, losses.color(color, surface.color[index][close])),
     }
 
 
 class TemplateLoss:
     """Copies the agent template into the agent's field."""
 
-    def __init__(self, problem: Problem, number: int = 2048):
+    def __init__(self, problem: Problem, number: int = 4096):
         self.problem, self.number = problem, number
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
@@ -139,7 +143,7 @@ class TemplateLoss:
         return losses.weighted(
             {
                 "distance": (1.0, ((values.signed_distance - surface.distance[index]) / body.REACH_M).abs()),
-                "color": (1.0, losses.color(values.color, surface.color[index])[close]),
+                "color": (20.0, losses.color(values.color, surface.color[index])[close]),
                 "feature": (0.3, losses.feature(values.feature, surface.feature[index])[close]),
             }
         )

@@ -129,7 +129,8 @@ def _motion_group(parameters: list[nn.Parameter], rate: float, momentum: float =
 
 def _joint_groups(problem: Problem, rates: Rates) -> list[dict]:
     motion = problem.motion
-    groups = [{**group, "lr": group["lr"] * 0.5} for field in (problem.scene, problem.agent) for group in _field_groups(field, rates)]
+    shares = ((problem.scene, 0.25), (problem.agent, rates.agent))
+    groups = [{**group, "lr": group["lr"] * share} for field, share in shares for group in _field_groups(field, rates)]
     groups += [_motion_group([motion.camera], rates.camera * 0.3, momentum=0.9), _motion_group([motion.root, motion.bone], rates.motion)]
     return [*groups, {"params": list(problem.body.parameters()), "lr": rates.skin, "weight_decay": 0.0}]
 

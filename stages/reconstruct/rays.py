@@ -140,7 +140,9 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
 def join(stores: Sequence[Store]) -> Store:
     """String videos together; frame indices of later videos are shifted by the frames before them."""
     starts = np.cumsum([0] + [len(store.views.intrinsics) for store in stores])
-    parts = [[_shift(getattr(store, name), int(start)) for store, start in zip(stores, starts, strict=False)] for name in ("scene", "agent")]
+    parts = [
+        [_shift(getattr(store, name), int(start)) for store, start in zip(stores, starts, strict=False)] for name in ("scene", "agent")
+    ]
     views = Views(*(torch.cat([getattr(store.views, field.name) for store in stores]) for field in fields(Views)))
     return Store(*(_concatenate(part) for part in parts), views)
 

@@ -43,8 +43,8 @@ class Weights:
     """corrections of cameras are small, per centimetre"""
     root: float = 0.02
     """the agent's root stays near the registered one, per 5 cm"""
-    template: float = 0.3
-    """the agent's field stays near its template where nothing is seen"""
+    template: float = 2.0
+    """the agent's field stays near its template, in shape and colour"""
 
 
 @dataclass(frozen=True)
@@ -103,5 +103,7 @@ class Rates:
     """root and bones while the template is posed, metres and radians"""
     motion: float = 5e-4
     """root and bones in the second phase, metres and radians"""
+    agent: float = 0.2
+    """share of the rates above for the agent's field in the second phase"""
     skin: float = 2e-3
     """bone sizes and the correction of skinning weights"""
