@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 
 from pipeline.files.clips import Clip
 from pipeline.space import align, cameras, rigid
-from stages.build_scene_template.refine import Keyframe, points_under
+from stages.build_scene_template.matches import points_under
+from stages.build_scene_template.refine import Keyframe
 from stages.build_scene_template.sfm import Sparse
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, relax, rigid, surface
+from stages.build_scene_template.matches import points_under
 from stages.build_scene_template.sfm import Sparse
 
 
@@ -152,16 +153,6 @@ def tie_tracks(sparse: Sparse, clip: Clip, key_of_view: Int[np.ndarray, "view"],
     focal = clip.intrinsics[sparse.frame[sparse.observed_key[second]], 0, 0]
     views = [key_of_view[sparse.observed_key[index]] for index in (first, second)]
     return Ties(*views, points[first], points[second], sigma_px * points[second, 2] / focal)
-
-
-def points_under(clip: Clip, frame: int, pixel: Float[np.ndarray, "sample 2"]) -> Float[np.ndarray, "sample 3"]:
-    """Lift colour pixels by the depth under them to camera axes; NaN where depth is unknown or of low confidence."""
-    depth, confidence = clip.depth(frame), clip.confidence(frame)
-    scale = np.array(clip.depth_size[::-1]) / np.array(clip.color_size[::-1])
-    column, row = np.clip(np.floor(pixel * scale).astype(int), 0, np.array(clip.depth_size[::-1]) - 1).T
-    z = np.where(confidence[row, column] >= 1, depth[row, column], 0)
-    points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
-    return np.where((z > 0.1)[:, None], points, np.nan)
 
 
 def overlapping(world_from_camera: Float[np.ndarray, "key 4 4"], keyframes: list[Keyframe], neighbours: int) -> Int[np.ndarray, "pair 2"]:

@@ -4,7 +4,7 @@
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,9 @@ import pycolmap
 from jaxtyping import Float, Int
 
 from pipeline.files.clips import Clip
+from pipeline.progress import log
 from pipeline.space import rigid
+from stages.build_scene_template.matches import ConfirmOptions, confirm
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class SfmOptions:
     """... and whose viewing directions differ by less than this, degrees."""
     loops_per_keyframe: int = 4
     """At most this many loop candidates a keyframe."""
+    confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
+    """When depth confirms matches."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,8 @@ def reconstruct(clip: Clip, options: SfmOptions, workspace: Path, seed: int) -> 
     verification.ransac.random_seed = seed
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listing)
     pycolmap.match_image_pairs(database, matching, pairing, verification, device=pycolmap.Device.cpu)
+    kept, pairs = confirm(clip, database, options.confirm, np.random.default_rng(seed))
+    log(f"depth confirms {kept} of {pairs} matched pairs of {len(keyframes)} keyframes")
     mapping = pycolmap.IncrementalPipelineOptions(
         num_threads=1, random_seed=seed, ba_refine_focal_length=False, ba_refine_extra_params=False
     )

@@ -6,7 +6,7 @@ import pytest
 from pipeline.files import meshes as mesh_files
 from pipeline.space import rigid, tsdf
 from pipeline.space.meshes import Mesh, RayCaster
-from stages.build_scene_template import anchor, fuse, refine, sfm, template
+from stages.build_scene_template import anchor, fuse, matches, refine, sfm, template
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
 STRUCTURE = sfm.SfmOptions(most_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
@@ -49,7 +49,7 @@ def test_wrong_structure_is_refuted_by_depth(clip):
     bent[:, 0, 3] += np.linspace(0, 2.0, len(frames)) ** 2
     rows = np.arange(len(frames) * 40)
     key, pixel = rows % len(frames), np.random.default_rng(0).uniform(20, 100, (len(rows), 2))
-    points = np.stack([refine.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)])
+    points = np.stack([matches.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)])
     world = np.stack([rigid.apply(bent[k], p[None])[0] for k, p in zip(key, points, strict=True)])
     sparse = sfm.Sparse(frames, bent, world, rows, key, pixel, 0.5, None)
     start = anchor.choose_start(clip, frames, keyframes, sparse, anchor.AnchorOptions())
