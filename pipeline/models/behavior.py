@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from pipeline.models.denoisers import ControlUNet, GoalMLP
-from pipeline.models.diffusion import Schedule
+from pipeline.models.diffusion import STANDARD, Schedule
 from pipeline.models.perception import (
     GRID_CELL_M,
     GRID_SHAPE,
@@ -111,13 +111,13 @@ class Sampling:
 class BehaviorNets(nn.Module):
     """Perception and the three denoisers."""
 
-    def __init__(self, architecture: Architecture):
+    def __init__(self, architecture: Architecture, schedule: Schedule = STANDARD):
         super().__init__()
         a = architecture
         self.perception = Perception(a.perception)
-        self.goal = GoalMLP(a.condition, a.goal_hidden, a.goal_layers)
-        self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers)
-        self.body = ControlUNet(a.body_channels, 3, a.condition, a.unet_width, a.unet_multipliers)
+        self.goal = GoalMLP(a.condition, a.goal_hidden, a.goal_layers, schedule)
+        self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
+        self.body = ControlUNet(a.body_channels, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
 
 
 def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:
@@ -200,8 +200,8 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
     document = json.loads((folder / "behavior.json").read_text())
     shape = document["architecture"]
     architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
-    nets = BehaviorNets(architecture)
-    nets.load_state_dict(load_file(folder / "behavior.safetensors"))
     scaling = Scaling(**{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()})
     schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
+    nets = BehaviorNets(architecture, schedule)
+    nets.load_state_dict(load_file(folder / "behavior.safetensors"))
     return architecture, nets, scaling, schedule, np.asarray(document["agent_from_bone_rest"])

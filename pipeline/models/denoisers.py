@@ -1,6 +1,8 @@
 """The denoising networks: goal MLP (Eq. 7), and 1-D ControlUNets for path and body (Eq. 9, 10).
 
-All predict the noise in x at step t, given the perception code. A ControlUNet is two identical UNets: the first
+All predict the noise in x at step t, given the perception code. Inside they estimate the velocity v = sqrt(alpha_bar)
+noise - sqrt(1 - alpha_bar) clean (Salimans & Ho 2022), which is of unit scale at every step; `NoiseFromVelocity` turns
+it into the noise, so that an untrained network begins as the best linear predictor. A ControlUNet is two identical UNets: the first
 denoises, the second reads the control (goal or path) and adds its features to every block of the first.
 """
 
@@ -10,6 +12,8 @@ from itertools import pairwise
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from pipeline.models.diffusion import STANDARD, Schedule
 
 TIME_CHANNELS = 64
 
@@ -21,11 +25,28 @@ def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
     return torch.cat([angle.sin(), angle.cos()], dim=-1)
 
 
+class NoiseFromVelocity(nn.Module):
+    """The noise, given the noisy sample and its velocity."""
+
+    def __init__(self, schedule: Schedule):
+        super().__init__()
+        share = torch.from_numpy(schedule.alpha_bar).float()
+        self.register_buffer("of_sample", (1 - share).sqrt(), persistent=False)
+        self.register_buffer("of_velocity", share.sqrt(), persistent=False)
+
+    def forward(
+        self, x: Float[Tensor, "batch ..."], velocity: Float[Tensor, "batch ..."], t: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch ..."]:
+        step, shape = t.long(), (-1, *[1] * (x.ndim - 1))
+        return self.of_sample[step].reshape(shape) * x + self.of_velocity[step].reshape(shape) * velocity
+
+
 class GoalMLP(nn.Module):
     """Six layers of 128 (appendix A.2)."""
 
-    def __init__(self, condition: int, hidden: int = 128, layers: int = 6):
+    def __init__(self, condition: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD):
         super().__init__()
+        self.noise = NoiseFromVelocity(schedule)
         sizes = [3 + TIME_CHANNELS + condition] + [hidden] * (layers - 1)
         self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(sizes))
         self.out = nn.Linear(hidden, 3)
@@ -36,7 +57,7 @@ class GoalMLP(nn.Module):
         h = torch.cat([x, time_embedding(t), condition], dim=-1)
         for layer in self.hidden:
             h = nn.functional.silu(layer(h))
-        return self.out(h)
+        return self.noise(x, self.out(h), t)
 
 
 class Block(nn.Module):
@@ -96,8 +117,17 @@ class UNet(nn.Module):
 class ControlUNet(nn.Module):
     """Denoise a sequence under a control sequence (or one vector for all frames); ``keep`` 0 stands for no control."""
 
-    def __init__(self, channels: int, control: int, condition: int, width: int = 32, multipliers: tuple[int, ...] = (1, 2, 4)):
+    def __init__(
+        self,
+        channels: int,
+        control: int,
+        condition: int,
+        width: int = 32,
+        multipliers: tuple[int, ...] = (1, 2, 4),
+        schedule: Schedule = STANDARD,
+    ):
         super().__init__()
+        self.noise = NoiseFromVelocity(schedule)
         widths, embedding = tuple(width * m for m in multipliers), 128
         self.time = nn.Sequential(nn.Linear(TIME_CHANNELS, embedding), nn.SiLU(), nn.Linear(embedding, embedding))
         self.condition = nn.Linear(condition, embedding)
@@ -121,4 +151,4 @@ class ControlUNet(nn.Module):
         control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
         side = self.side(control, embedding)
         added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
-        return self.out(self.main(x, embedding, added)[-1])
+        return self.noise(x, self.out(self.main(x, embedding, added)[-1]), t)

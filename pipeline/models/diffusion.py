@@ -39,6 +39,10 @@ class Schedule:
         return [int(np.floor(t + 0.5)) for t in np.linspace(self.steps - 1, 0, count)]
 
 
+STANDARD = Schedule()
+"""50 linear steps, as in the paper"""
+
+
 def noised(clean: Array, noise: Array, alpha_bar: Array) -> Array:
     """Return x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise; ``alpha_bar`` broadcasts against both."""
     return alpha_bar**0.5 * clean + (1 - alpha_bar) ** 0.5 * noise

@@ -1,6 +1,8 @@
 """The denoising losses of goal, path and body (Eq. 8), with conditions dropped at random for guidance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -9,6 +11,9 @@ from torch import Tensor, nn
 from pipeline.models.behavior import BehaviorNets
 from pipeline.models.diffusion import Schedule, noised
 from stages.train_behavior.batches import Batch
+
+Denoise = Callable[[Tensor, Tensor], Tensor]
+"""From noisy samples and their steps to the noise"""
 
 
 @dataclass(frozen=True)
@@ -19,25 +24,28 @@ class Objective:
     """probability that a condition is replaced by its null, for each condition on its own"""
     code_dropout: float = 0.1
     """dropout on the perception code"""
+    weighting: Literal["noise", "velocity"] = "velocity"
+    """which error counts evenly at all steps: that of the noise, as in the paper, or that of the velocity, which gives
+    the noisy steps, where the outline is decided, their share"""
     goal_draws: int = 8
     """noise levels drawn per window for the goal, whose network is small"""
 
 
 def losses(nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator) -> dict[str, Tensor]:
-    """Return the mean squared error of the predicted noise, per network."""
+    """Return the weighted mean squared error of the predicted noise, per network."""
     code = perceive(nets, batch, objective, generator)
     draws = objective.goal_draws
-    goal = squared_error(
-        lambda x, t: nets.goal(x, t, code.repeat_interleave(draws, 0)),
-        batch.goal.repeat_interleave(draws, 0),
-        schedule,
-        generator,
-    )
-    controlled = kept(len(code), 1, objective.drop, generator).to(code.device)
-    path = squared_error(lambda x, t: nets.path(x, t, code, batch.goal, controlled), batch.path, schedule, generator)
+
+    def error(denoise: Denoise, clean: Tensor) -> Tensor:
+        return squared_error(denoise, clean, schedule, objective.weighting, generator)
+
+    repeated = code.repeat_interleave(draws, 0)
+    goal = error(lambda x, t: nets.goal(x, t, repeated), batch.goal.repeat_interleave(draws, 0))
+    steered = kept(len(code), 1, objective.drop, generator).to(code.device)
+    path = error(lambda x, t: nets.path(x, t, code, batch.goal, steered), batch.path)
     known = ~batch.mirrored
-    controlled = controlled[known]
-    body = squared_error(lambda x, t: nets.body(x, t, code[known], batch.path[known], controlled), batch.body[known], schedule, generator)
+    along = batch.path[known]
+    body = error(lambda x, t: nets.body(x, t, code[known], along, steered[known]), batch.body[known])
     return {"goal": goal.mean(), "path": path.mean(), "body": body.sum() / max(body.numel(), 1)}
 
 
@@ -55,9 +63,16 @@ def kept(size: int, count: int, drop: float, generator: torch.Generator) -> Floa
     return (torch.rand(size, count, generator=generator) >= drop).float()
 
 
-def squared_error(denoise, clean: Float[Tensor, "batch ..."], schedule: Schedule, generator: torch.Generator) -> Float[Tensor, "batch ..."]:
-    """Noise ``clean`` to a random step and compare the noise with its prediction."""
+def squared_error(
+    denoise: Denoise,
+    clean: Float[Tensor, "batch ..."],
+    schedule: Schedule,
+    weighting: Literal["noise", "velocity"],
+    generator: torch.Generator,
+) -> Float[Tensor, "batch ..."]:
+    """Noise ``clean`` to a random step and compare the noise, or the velocity, with its prediction."""
     t = torch.randint(schedule.steps, (len(clean),), generator=generator)
     share = torch.from_numpy(schedule.alpha_bar).float()[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
     noise = torch.randn(clean.shape, generator=generator).to(clean.device)
-    return (denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise) ** 2
+    error = (denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise) ** 2
+    return error / share if weighting == "velocity" else error

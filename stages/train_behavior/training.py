@@ -75,7 +75,7 @@ def train(
     """Fit the networks to the training windows of the data."""
     windows = windows_from_data(data, data.indices(TRAIN), architecture)
     statistics = statistics_from_windows(windows, settings.augmentation.largest_turn_rad)
-    nets = initial_nets(architecture, statistics, seed).to(device)
+    nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(volume, nets.perception.scene.stride, device)
     pace = settings.optimization
@@ -107,11 +107,11 @@ def train(
     return Fitted(average.eval(), statistics.scaling, record)
 
 
-def initial_nets(architecture: Architecture, statistics: Statistics, seed: int) -> BehaviorNets:
+def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Statistics, seed: int) -> BehaviorNets:
     """Return freshly initialised networks that know the statistics of the past."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        nets = BehaviorNets(architecture)
+        nets = BehaviorNets(architecture, schedule)
     nets.perception.past.mean[:], nets.perception.past.std[:] = statistics.past_mean, statistics.past_std
     return nets
 

@@ -120,7 +120,7 @@ def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatc
 
 def test_contract_is_whole_and_loads_back(windows, tmp_path):
     nets, scaling = (
-        initial_nets(ARCHITECTURE, statistics_from_windows(windows, 0.0), 0).eval(),
+        initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval(),
         statistics_from_windows(windows, 0.0).scaling,
     )
     write_contract(tmp_path, nets, ARCHITECTURE, scaling, Schedule(), REST)
@@ -135,7 +135,7 @@ def test_contract_is_whole_and_loads_back(windows, tmp_path):
 
 
 def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
-    goal = initial_nets(ARCHITECTURE, statistics_from_windows(windows, 0.0), 0).eval().goal
+    goal = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval().goal
     inputs, output = signature("goal", ARCHITECTURE)
     for name in ("first", "second"):
         export_network(goal, tmp_path / f"{name}.onnx", inputs, output)
@@ -145,7 +145,7 @@ def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
 
 def test_golden_plan_uses_the_noise_it_names(windows):
     nets, scaling = (
-        initial_nets(ARCHITECTURE, statistics_from_windows(windows, 0.0), 0).eval(),
+        initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval(),
         statistics_from_windows(windows, 0.0).scaling,
     )
     sampler = Sampler(TorchNetworks(nets), Schedule(), scaling)
