@@ -12,7 +12,7 @@ VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
 """Roles that models may see; the held-out phone is for `evaluate` alone."""
 AGENT: tuple[Role, ...] = ("turnaround", "session")
 """Roles in which the animal is meant to be seen."""
-PLUMBING = ("errors", "config", "artifact", "cli", "progress", "videos", "dag")
+PLUMBING = ("errors", "config", "artifact", "cli", "processes", "progress", "videos", "dag")
 """Files of `pipeline/` whose change cannot change what a stage computes."""
 
 

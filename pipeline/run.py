@@ -7,7 +7,6 @@ atomically -> record -> stamp. Exit codes: the stage's own (2 bad input, 75 stop
 128 + n when signal n ended it. Standard library only.
 """
 
-import ctypes
 import errno
 import json
 import os
@@ -23,7 +22,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from pipeline import artifact, plan
+from pipeline import artifact, plan, processes
 from pipeline.errors import InputError
 
 LEAST_FREE_BYTES = 1 << 29
@@ -165,7 +164,7 @@ def _spawn(job: dict[str, Any], command: list[str]) -> tuple[int, float]:
 
 def _bind_to_parent() -> None:
     """In the child: die with the runner, leave no core dump."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    processes.die_with_parent()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 

@@ -18,7 +18,7 @@ FRONTS = sorted((ROOT / "stages").glob("*/__main__.py"))
 FLOORS = (
     {"errors"},
     {"space"},
-    {"files", "models", "videos", "progress"},
+    {"files", "models", "videos", "progress", "processes"},
     {"fit"},
     {"artifact", "config", "dag", "qa"},
     {"sources", "captures", "cli", "plan"},

@@ -4,14 +4,14 @@ Each is a function of its script alone, so order and number of workers change no
 """
 
 import json
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
+from pipeline import processes, progress
 from pipeline.files import meshes
 from pipeline.space.meshes import Mesh
 from stages.synthesize_capture import record3d, sheets
@@ -45,8 +45,11 @@ def produce(scripts: list[Script], creature: Animal, recordings: Path, truth: Pa
     if workers <= 1:
         made = [record(*job) for job in jobs]
     else:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            made = [future.result() for future in [pool.submit(record, *job) for job in jobs]]
+        with processes.pool(workers) as pool:
+            futures = [pool.submit(record, *job) for job in jobs]
+            for _ in progress.track(as_completed(futures), "recordings", total=len(futures)):
+                pass
+            made = [future.result() for future in futures]
     return [made[order.index(index)] for index in range(len(scripts))]
 
 
