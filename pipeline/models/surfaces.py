@@ -31,7 +31,7 @@ def zero_level(volume: Float[np.ndarray, "x y z"], low_m: Float[np.ndarray, "3"]
     """Return the surface where the signed distance is 0, faces turned towards positive distance."""
     if not volume.min() < 0 < volume.max():
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
-    vertices, faces, _, _ = measure.marching_cubes(volume, 0.0, spacing=(step_m,) * 3, gradient_direction="ascent")
+    vertices, faces, _, _ = measure.marching_cubes(volume, 0.0, spacing=(step_m,) * 3, gradient_direction="descent")
     return Mesh((vertices + low_m).astype(np.float32), faces.astype(np.int32))
 
 

@@ -1,0 +1,171 @@
+"""A ball in a box, seen by a moving camera: the phases find both, and a killed run ends with the same bits."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from pipeline.models import fields
+from pipeline.models.fields import Reconstruction
+from pipeline.space import cameras, rigid
+from pipeline.space.meshes import Mesh
+from stages.reconstruct import assemble, optimise, results
+from stages.reconstruct.assemble import Shapes, Template, Video
+from stages.reconstruct.rays import AGENT, Rays, Store, Views
+from stages.reconstruct.settings import Batches, Rates, Steps, Weights
+
+SIZE = (24, 32)
+"""height and width of thumbnails; pictures are four times larger"""
+INTRINSICS = np.array([[100.0, 0, 64], [0, 100.0, 48], [0, 0, 1]])
+ROOM_M, RADIUS_M = 1.5, 0.2
+SHAPES = Shapes(scene_voxel_m=(0.4, 0.2), agent_voxel_m=(0.1, 0.05), width=32, knot_frames=4)
+
+
+def cast(origin, direction, ball_centre):
+    """Return z-depth and whether the ball is hit, inside a cube room."""
+    with np.errstate(divide="ignore"):
+        wall = np.min(np.where(direction > 0, (ROOM_M - origin) / direction, (-ROOM_M - origin) / direction), axis=-1)
+    to_ball = origin - ball_centre
+    a, b, c = (direction**2).sum(-1), (direction * to_ball).sum(-1), (to_ball**2).sum(-1) - RADIUS_M**2
+    root = b * b - a * c
+    near = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+    hit = (near > 0) & (near < wall)
+    return np.where(hit, near, wall), hit
+
+
+def film(id: str, frames: int, has_scene: bool, rng) -> Video:
+    """Film the ball as it moves along x; the turnaround's world is the ball."""
+    directions = cameras.ray_directions(INTRINSICS, SIZE[0] * 4, SIZE[1] * 4).reshape(-1, 3)
+    rays, depths, outside, camera, root = [], [], [], [], []
+    for frame in range(frames):
+        centre = np.array([0.03 * frame, 0, 0]) if has_scene else np.zeros(3)
+        angle = 0.4 * frame
+        eye = np.array([np.cos(angle), 0.3, np.sin(angle)])
+        camera.append(rigid.look_at(eye, centre, np.array([0.0, 1, 0])))
+        root.append(rigid.make(np.eye(3), centre))
+        depth, hit = cast(eye, directions @ camera[-1][:3, :3].T, centre)
+        chosen = np.concatenate([rng.choice(np.flatnonzero(~hit), 60), rng.choice(np.flatnonzero(hit), 40)])
+        rays.append((frame, directions[chosen], depth[chosen], hit[chosen]))
+        image = hit.reshape(SIZE[0] * 4, SIZE[1] * 4)[2::4, 2::4]
+        depths.append(depth.reshape(SIZE[0] * 4, SIZE[1] * 4)[2::4, 2::4])
+        outside.append(np.where(image, 0, 20))
+    store = pack(rays, depths, outside, frames, has_scene)
+    registered = np.stack(root)
+    if has_scene:
+        registered = registered @ rigid.make(np.eye(3), np.array([0.03, -0.03, 0.02]))
+    ones = np.ones(frames, bool)
+    return Video(id, np.arange(frames) * 0.1, np.stack(camera), registered, ones.astype(float), ones, has_scene, has_scene, store)
+
+
+def pack(rays, depths, outside, frames: int, has_scene: bool) -> Store:
+    frame = torch.cat([torch.full((len(direction),), number) for number, direction, _, _ in rays])
+    direction, depth, hit = (torch.from_numpy(np.concatenate([ray[k] for ray in rays])) for k in (1, 2, 3))
+    count = len(frame)
+    color = torch.where(hit[:, None], torch.tensor([200, 40, 40]), torch.tensor([40, 40, 200])).byte()
+    feature = torch.zeros(count, 16, dtype=torch.int8)
+    feature[:, 0] = 127
+    plain = torch.zeros(count)
+    table = Rays(
+        frame, direction.float(), depth.float(), torch.full((count,), 0.9), color, feature,
+        torch.where(hit, AGENT, 0).byte(), plain[:, None].repeat(1, 2), plain.byte(), plain.to(torch.int8) + 1,
+    )  # fmt: skip
+    views = Views(
+        torch.from_numpy(INTRINSICS).float().repeat(frames, 1, 1), torch.from_numpy(np.stack(depths)).half(),
+        torch.from_numpy(np.stack(outside)).byte(), torch.ones(frames, dtype=torch.bool),
+    )  # fmt: skip
+    return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
+
+
+def problem():
+    rng = np.random.default_rng(0)
+    videos = [film("v002", 12, True, rng), film("v001", 6, False, rng)]
+    ball = trimesh.creation.icosphere(2, RADIUS_M)
+    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), np.full((len(ball.vertices), 3), [200, 40, 40], np.uint8))
+    feature = np.zeros((len(mesh.vertices), 16), np.float32)
+    feature[:, 0] = 1
+    rest = rigid.make(np.tile(np.eye(3), (6, 1, 1)), 0.1 * np.concatenate([np.eye(3), -np.eye(3)]))
+    template = Template(mesh, feature, rest, np.full((6, 3), 0.1))
+    return assemble.build(videos, template, SHAPES, 0, "cpu"), videos
+
+
+def plan(resume=None, **steps) -> optimise.Plan:
+    batches = Batches(scene_rays=256, joint_scene_rays=128, rendered_rays=16, runs=2, agent_rays=16, surface_points=32)
+    return optimise.Plan(Steps(**steps), Weights(), batches, Rates(), 0, resume)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    torch.set_num_threads(1)
+    found, videos = problem()
+    optimise.optimise(found, plan(template=80, scene=120, body=40, joint=6))
+    return found, videos
+
+
+def test_room_and_ball_are_found(solved):
+    found, _ = solved
+    centre = torch.tensor([[0.0, 0.0, -0.8], [0.5, 0.5, 0.5]])
+    wall = torch.tensor([[ROOM_M, 0.1, 0.1], [0.1, -0.2, ROOM_M]])
+    code = found.scene.code(torch.full((2,), -1))
+    with torch.no_grad():
+        assert (found.scene(centre, code).signed_distance > 0.05).all(), "the middle of the room is free"
+        assert (found.scene(wall, code).signed_distance.abs() < 0.05).all(), "metres; cells are 0.2 m"
+    ball = results.agent_surface(found, 0.04)
+    assert np.abs(np.linalg.norm(ball.vertices, axis=-1) - RADIUS_M).mean() < 0.02
+
+
+def test_roots_come_nearer_to_the_truth(solved):
+    found, videos = solved
+    motion = results.motions(found, videos, 1.0)["v002"]
+    truth = np.stack([0.03 * np.arange(12), np.zeros(12), np.zeros(12)], axis=-1)
+    before = np.linalg.norm(videos[0].world_from_agent[:, :3, 3] - truth, axis=-1).mean()
+    assert np.linalg.norm(motion.world_from_agent[:, :3, 3] - truth, axis=-1).mean() < 0.6 * before
+
+
+def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
+    found, videos = solved
+    fields.save(tmp_path, Reconstruction(found.scene, found.agent, found.body, assemble.scene_ids(videos)))
+    back = fields.load(tmp_path)
+    points = torch.rand(20, 3)
+    torch.testing.assert_close(back.agent(points).color, found.agent(points).color.detach())
+    torch.testing.assert_close(back.body.weights(points), found.body.weights(points).detach())
+    assert back.videos == ("v002",) and back.video_code(None) == -1
+
+
+def test_volume_tells_free_surface_and_unseen(solved):
+    volume = results.feature_volume(solved[0])
+
+    def at(*point: float) -> int:
+        return int(volume.occupancy[tuple(np.floor((np.array(point) - volume.origin) / results.VOXEL_M).astype(int))])
+
+    assert at(-0.55, 0.35, 0.35) == results.FREE
+    surface = volume.occupancy == results.SURFACE
+    assert surface.any() and not volume.features[:, ~surface].any()
+
+
+def test_a_killed_run_ends_with_the_same_bits(tmp_path):
+    settings = dict(template=6, scene=8, body=2, joint=6, save_every=3)
+    whole, _ = problem()
+    optimise.optimise(whole, plan(**settings))
+
+    class Killed(Exception):
+        pass
+
+    broken, _ = problem()
+    calls = 0
+    original = optimise.JointLoss.__call__
+
+    def dies(self, step, generator):
+        nonlocal calls
+        calls += 1
+        if calls == 5:
+            raise Killed
+        return original(self, step, generator)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(optimise.JointLoss, "__call__", dies)
+        optimise.optimise(broken, plan(tmp_path, **settings))
+    again, _ = problem()
+    optimise.optimise(again, plan(tmp_path, **settings))
+    for name, module in whole.modules().items():
+        for key, value in module.state_dict().items():
+            assert torch.equal(value, again.modules()[name].state_dict()[key]), f"{name}.{key}"

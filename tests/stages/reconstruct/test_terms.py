@@ -1,0 +1,83 @@
+"""Losses, composite rendering and gap filling: each with the property that a wrong one cannot have."""
+
+import numpy as np
+import torch
+
+from pipeline.models.fields import density
+from pipeline.models.motion import MotionTable
+from pipeline.models.render import Layer, composite
+from pipeline.models.surfaces import zero_level
+from pipeline.space import rigid
+from stages.reconstruct import losses, results, scene
+
+
+def layer(value: torch.Tensor, color: tuple[float, float, float]) -> Layer:
+    tint = torch.tensor(color).expand(*value.shape, 3)
+    return Layer(value, tint, torch.zeros(*value.shape, 16))
+
+
+def test_composite_shows_what_stands_in_front():
+    depth = torch.linspace(0.1, 3, 300).expand(2, -1)
+    wall = layer(density(2.0 - depth, torch.tensor(0.005)), (0.0, 0.0, 1.0))
+    agent_at = torch.tensor([[1.0], [9.0]])  # before the wall on the first ray, nowhere on the second
+    agent = layer(density((depth - agent_at).abs() - 0.1, torch.tensor(0.005)), (1.0, 0.0, 0.0))
+    seen = composite(depth, torch.ones(2), wall, agent)
+    torch.testing.assert_close(seen.agent, torch.tensor([1.0, 0.0]), atol=0.01, rtol=0)
+    torch.testing.assert_close(seen.depth, torch.tensor([0.9, 2.0]), atol=0.03, rtol=0)
+    assert seen.color[0, 0] > 0.98 and seen.color[1, 2] > 0.98
+    assert (seen.opacity > 0.99).all()
+
+
+def test_composite_mixes_by_density():
+    depth = torch.linspace(0, 1, 50)[None]
+    seen = composite(depth, torch.ones(1), layer(torch.full((1, 50), 3.0), (0, 0, 1)), layer(torch.full((1, 50), 1.0), (1, 0, 0)))
+    torch.testing.assert_close(seen.color[0, 0] / seen.color[0, 2], torch.tensor(1 / 3))
+
+
+def test_eikonal_is_zero_on_a_distance_field_and_not_on_a_scaled_one():
+    points, step = torch.randn(50, 3), 0.01
+    beside = points + step * torch.eye(3)[:, None]
+    plane = torch.tensor([0.6, 0.8, 0.0])
+    assert losses.eikonal(points @ plane, beside @ plane, step).max() < 1e-3
+    assert losses.eikonal(2 * points @ plane, 2 * beside @ plane, step).min() > 0.9
+
+
+def test_codes_are_swapped_as_often_as_asked():
+    video = torch.zeros(20000, dtype=torch.int64)
+    generator = torch.Generator().manual_seed(0)
+    assert scene.swap_probability(0.0) == 1.0 and abs(scene.swap_probability(1.0) - 0.05) < 1e-9
+    assert (scene.swap(video, 4, 0.0, generator) == 0).all()
+    changed = (scene.swap(video, 4, 0.4, generator) != 0).float().mean()
+    assert abs(changed - 0.4 * 3 / 4) < 0.02, "a swap may draw the same video again"
+
+
+def test_held_cameras_do_not_move_and_free_ones_move_smoothly():
+    pose = torch.eye(4).repeat(30, 1, 1)
+    table = MotionTable(pose, pose, torch.eye(4)[None], [10, 20], [False, True], knot_frames=5)
+    torch.nn.init.normal_(table.camera, std=0.1)
+    moved = table.world_from_camera(torch.arange(30))
+    torch.testing.assert_close(moved[:10], pose[:10])
+    bend = torch.diff(moved[10:, 0, 3], n=2)
+    assert (bend.abs() > 1e-6).sum() <= 3, "corrections bend at knots only"
+
+
+def test_short_gaps_are_bridged_and_long_ones_are_not():
+    time = np.arange(40) * 0.1
+    root = rigid.make(np.tile(np.eye(3), (40, 1, 1)), np.stack([time, 0 * time, 0 * time], axis=-1))
+    good = np.ones(40, bool)
+    good[5:9] = good[20:36] = False
+    garbled = np.where(good[:, None, None], root, 7.0 * np.eye(4))
+    found, _ = results.bridged(time, garbled, garbled[:, None], good, longest_gap_s=1.0)
+    np.testing.assert_allclose(found[:20], root[:20], atol=1e-9)
+    assert np.isnan(found[20:36]).all() and np.isfinite(found[36:]).all()
+
+
+def test_surface_of_a_ball_is_closed_and_looks_outwards():
+    axis = np.arange(-0.6, 0.61, 0.1)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    ball = zero_level((np.sqrt(x * x + y * y + z * z) - 0.413).astype(np.float32), np.full(3, -0.6), 0.1)
+    np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=-1), 0.413, atol=0.02)
+    centre = ball.vertices[ball.faces].mean(1)
+    assert ((ball.face_normals() * centre).sum(-1) > 0).all()
+    edges = np.sort(ball.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=-1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
