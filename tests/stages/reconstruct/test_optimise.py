@@ -147,7 +147,7 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path):
     whole, _ = problem()
     optimise.optimise(whole, plan(**settings))
 
-    class Killed(Exception):
+    class KilledError(Exception):
         pass
 
     broken, _ = problem()
@@ -158,10 +158,10 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path):
         nonlocal calls
         calls += 1
         if calls == 5:
-            raise Killed
+            raise KilledError
         return original(self, step, generator)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KilledError):
         patch.setattr(optimise.JointLoss, "__call__", dies)
         optimise.optimise(broken, plan(tmp_path, **settings))
     again, _ = problem()
