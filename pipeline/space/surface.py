@@ -58,8 +58,9 @@ class Surface:
     """A mesh's vertices and normals, ready for nearest-neighbour queries."""
 
     def __init__(self, mesh: Mesh):
-        self.points_world = np.asarray(mesh.vertices, float)
-        self.normals_world = mesh.vertex_normals()
+        normals = mesh.vertex_normals()
+        used = np.linalg.norm(normals, axis=1) > 0.5
+        self.points_world, self.normals_world = np.asarray(mesh.vertices, float)[used], normals[used]
         self._tree = cKDTree(self.points_world)
 
     def contacts(

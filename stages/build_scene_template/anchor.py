@@ -48,8 +48,8 @@ class Trajectory:
     """Gap between overlapping depth images under each candidate trajectory (`depth_gap`)."""
 
 
-def metric_scale(sparse: Sparse, clip: Clip) -> tuple[float, float]:
-    """Return metres per model unit and its robust relative spread, from depth under the tracks."""
+def metric_scale(sparse: Sparse, clip: Clip) -> tuple[float, float] | None:
+    """Return metres per model unit and its robust relative spread, from depth under the tracks; None without depth."""
     ratios = []
     for view, frame in enumerate(sparse.frame):
         row = np.flatnonzero(sparse.observed_key == view)
@@ -58,7 +58,7 @@ def metric_scale(sparse: Sparse, clip: Clip) -> tuple[float, float]:
         ratios.append((measured / model)[np.isfinite(measured) & (model > 0)])
     ratio = np.concatenate(ratios)
     if len(ratio) < 20:
-        return np.nan, np.inf
+        return None
     scale = float(np.median(ratio))
     return scale, float(1.4826 * np.median(np.abs(ratio - scale)) / scale)
 
@@ -105,14 +105,20 @@ def bridge(clip: Clip, frames: Int[np.ndarray, "key"], world_from_camera: Float[
 
 def choose_start(
     clip: Clip, frames: Int[np.ndarray, "key"], keyframes: list[Keyframe], sparse: Sparse | None, options: AnchorOptions
-) -> Trajectory:
-    """Believe SfM if enough keyframes are in it, its scale is steady and depth agrees; otherwise take the odometry."""
+) -> Trajectory | None:
+    """Believe SfM if enough keyframes are in it, its scale is steady and depth agrees; otherwise take the odometry.
+
+    None where there is neither.
+    """
     odometry = clip.odometry_from_camera
     gap = {} if odometry is None else {"odometry": depth_gap(keyframes, odometry[frames])}
     scale = spread = ratio = None
     poses, reason = None, "no model came out"
-    if sparse is not None:
-        scale, spread = metric_scale(sparse, clip)
+    measured = None if sparse is None else metric_scale(sparse, clip)
+    if sparse is not None and measured is None:
+        reason = "depth lies under too few of its points"
+    elif sparse is not None:
+        scale, spread = measured
         poses = sparse.model_from_camera.copy()
         poses[:, :3, 3] *= scale
         poses = bridge(clip, sparse.frame, poses)
@@ -122,6 +128,8 @@ def choose_start(
             step = [np.linalg.norm(np.diff(path[sparse.frame, :3, 3], axis=0), axis=1).sum() for path in (odometry, poses)]
             ratio = float(step[0] / max(step[1], 1e-9))
     registered = sparse.frame if sparse is not None else np.zeros(0, int)
+    if poses is None and odometry is None:
+        return None
     if poses is None or (reason and odometry is not None):
         return Trajectory(odometry, "odometry", reason, registered, scale, spread, ratio, gap)
     return Trajectory(poses, "colmap", reason, registered, scale, spread, ratio, gap)

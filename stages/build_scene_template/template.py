@@ -50,14 +50,14 @@ def build(
     sparse = sfm.reconstruct(clip, structure, workspace, seed)
     frames = sfm.choose_keyframes(clip, structure)
     keyframes = [refine.load_keyframe(clip, int(frame), weights.stride_px) for frame in frames]
-    if sparse is None and clip.odometry_from_camera is None:
+    start = anchor.choose_start(clip, frames, keyframes, sparse, believe)
+    if start is None:
         raise InputError(
             "MAP-001",
-            "the walk-through has neither odometry nor enough texture for COLMAP",
+            "the walk-through has no odometry, and COLMAP found no metric model in it",
             str(clip.folder),
             "record a slower walk-through in better light",
         )
-    start = anchor.choose_start(clip, frames, keyframes, sparse, believe)
     log(
         f"start from {start.source}{': ' + start.reason if start.reason else ''}; "
         f"{len(start.registered)} of {len(frames)} keyframes in the model"

@@ -1,6 +1,7 @@
 """The walk-through becomes a metric, upright template: structure from motion, its refutation, refinement, fusion, cleaning."""
 
 import numpy as np
+import pycolmap
 import pytest
 
 from pipeline.files import meshes as mesh_files
@@ -101,3 +102,18 @@ def test_cleaning_drops_islands_and_keeps_colours(tmp_path):
 def test_nothing_is_marked_seen_by_an_empty_volume():
     empty = tsdf.Volume(np.zeros(3), (8, 8, 8), 0.1, 0.3).surface(0.0)
     assert len(empty.faces) == 0
+
+
+def test_false_matches_are_dropped_by_depth(clip, tmp_path):
+    sfm.reconstruct(clip, STRUCTURE, tmp_path, 0)
+    with pycolmap.Database.open(tmp_path / "database.db") as table:
+        pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
+        geometry = table.read_two_view_geometry(*pairs[0])
+        wrong = geometry.inlier_matches.copy()
+        wrong[:, 1] = np.random.default_rng(0).permutation(wrong[:, 1])
+        geometry.inlier_matches = wrong
+        table.delete_two_view_geometry(*pairs[0])
+        table.write_two_view_geometry(*pairs[0], geometry)
+    kept, all_pairs = matches.confirm(clip, tmp_path / "database.db", matches.ConfirmOptions(), np.random.default_rng(0))
+    assert all_pairs == len(pairs)
+    assert kept == len(pairs) - 1, "the scrambled pair goes, the others stay"
