@@ -7,7 +7,7 @@ the same terms while everything learns.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Generator, Tensor
 from torch.nn import functional
 
@@ -81,9 +81,10 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
     posed = problem.body.pose(problem.surface.points[index], pose.agent_from_bone)
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
-    outside_px, inside_picture = _bilinear(views.outside_px[pose.frame].float(), pixel)
+    outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel)
     with torch.no_grad():
         measured = _nearest(views.depth[pose.frame], pixel)
+        inside_picture = ((pixel >= 0) & (pixel <= views.size_px[pose.frame, None])).all(-1)
         in_view = inside_picture & (depth > 0.1)
         hidden = (measured > 0) & (measured < depth - MARGIN_M)
     outside_m = outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None]
@@ -117,13 +118,10 @@ def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6
     return terms
 
 
-def _bilinear(
-    images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]
-) -> tuple[Float[Tensor, "frame point"], Bool[Tensor, "frame point"]]:
-    """Read thumbnails between their pixels, with gradients towards the place; also tell what lies inside."""
+def _bilinear(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:
+    """Read thumbnails between their pixels, with gradients towards the place."""
     place = _normalized(images, pixel)
-    values = functional.grid_sample(images[:, None], place[:, :, None], padding_mode="border", align_corners=False)
-    return values[:, 0, :, 0], (place.abs() <= 1).all(-1)
+    return functional.grid_sample(images[:, None], place[:, :, None], padding_mode="border", align_corners=False)[:, 0, :, 0]
 
 
 def _nearest(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:

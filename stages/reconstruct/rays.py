@@ -6,7 +6,7 @@ against. `join` strings the videos together on one frame axis.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int8, UInt8
 from numpy.random import Generator
 from torch import Tensor
+from torch.nn import functional
 
 from pipeline.files.clips import Clip, Masks
 from pipeline.space import cameras
@@ -60,10 +61,12 @@ class Rays:
 
 @dataclass(frozen=True)
 class Views:
-    """One entry per frame: intrinsics and thumbnails."""
+    """One entry per frame: intrinsics and thumbnails, which lie in the upper left corner where pictures differ in size."""
 
     intrinsics: Float[Tensor, "frame 3 3"]
     """colour pixels"""
+    size_px: Float[Tensor, "frame 2"]
+    """width and height of the picture, colour pixels"""
     depth: Float[Tensor, "frame height width"]
     """metres, half precision; 0 = unknown"""
     outside_px: UInt8[Tensor, "frame height width"]
@@ -130,6 +133,7 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
     visible = source.masks.visible if source.masks is not None else np.zeros(len(source.clip), bool)
     views = Views(
         torch.from_numpy(source.clip.intrinsics).float(),
+        torch.tensor(source.clip.color_size[::-1]).float().expand(len(source.clip), 2),
         torch.from_numpy(np.stack(depths)),
         torch.from_numpy(np.stack(outsides)),
         torch.from_numpy(visible.astype(bool)),
@@ -143,8 +147,16 @@ def join(stores: Sequence[Store]) -> Store:
     parts = [
         [_shift(getattr(store, name), int(start)) for store, start in zip(stores, starts, strict=False)] for name in ("scene", "agent")
     ]
-    views = Views(*(torch.cat([getattr(store.views, field.name) for store in stores]) for field in fields(Views)))
+    size = tuple(max(store.views.depth.shape[axis] for store in stores) for axis in (1, 2))
+    padded = [_padded(store.views, *size) for store in stores]
+    views = Views(*(torch.cat([getattr(view, field.name) for view in padded]) for field in fields(Views)))
     return Store(*(_concatenate(part) for part in parts), views)
+
+
+def _padded(views: Views, height: int, width: int) -> Views:
+    """Widen thumbnails to the right and below with unknown depth and no mask: recordings may be upright or wide."""
+    edge = (0, width - views.depth.shape[2], 0, height - views.depth.shape[1])
+    return replace(views, depth=functional.pad(views.depth, edge), outside_px=functional.pad(views.outside_px, edge, value=255))
 
 
 def _shift(rays: Rays, start: int) -> Rays:

@@ -14,9 +14,8 @@ from stages.reconstruct.assemble import Shapes, Template, Video
 from stages.reconstruct.rays import AGENT, Rays, Store, Views
 from stages.reconstruct.settings import Batches, Rates, Steps, Weights
 
-SIZE = (24, 32)
+WIDE, UPRIGHT = (24, 32), (32, 24)
 """height and width of thumbnails; pictures are four times larger"""
-INTRINSICS = np.array([[100.0, 0, 64], [0, 100.0, 48], [0, 0, 1]])
 ROOM_M, RADIUS_M = 1.5, 0.2
 SHAPES = Shapes(scene_voxel_m=(0.4, 0.2), agent_voxel_m=(0.1, 0.05), width=32, knot_frames=4)
 
@@ -33,9 +32,11 @@ def cast(origin, direction, ball_centre):
     return np.where(hit, near, wall), hit
 
 
-def film(id: str, frames: int, has_scene: bool, rng) -> Video:
+def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> Video:
     """Film the ball as it moves along x; the turnaround's world is the ball."""
-    directions = cameras.ray_directions(INTRINSICS, SIZE[0] * 4, SIZE[1] * 4).reshape(-1, 3)
+    height, width = size[0] * 4, size[1] * 4
+    intrinsics = np.array([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
+    directions = cameras.ray_directions(intrinsics, height, width).reshape(-1, 3)
     rays, depths, outside, camera, root = [], [], [], [], []
     for frame in range(frames):
         centre = np.array([0.03 * frame, 0, 0]) if has_scene else np.zeros(3)
@@ -46,10 +47,10 @@ def film(id: str, frames: int, has_scene: bool, rng) -> Video:
         depth, hit = cast(eye, directions @ camera[-1][:3, :3].T, centre)
         chosen = np.concatenate([rng.choice(np.flatnonzero(~hit), 60), rng.choice(np.flatnonzero(hit), 40)])
         rays.append((frame, directions[chosen], depth[chosen], hit[chosen]))
-        image = hit.reshape(SIZE[0] * 4, SIZE[1] * 4)[2::4, 2::4]
-        depths.append(depth.reshape(SIZE[0] * 4, SIZE[1] * 4)[2::4, 2::4])
+        image = hit.reshape(height, width)[2::4, 2::4]
+        depths.append(depth.reshape(height, width)[2::4, 2::4])
         outside.append(np.where(image, 0, 20))
-    store = pack(rays, depths, outside, frames, has_scene)
+    store = pack(rays, depths, outside, intrinsics, has_scene)
     registered = np.stack(root)
     if has_scene:
         registered = registered @ rigid.make(np.eye(3), np.array([0.03, -0.03, 0.02]))
@@ -57,7 +58,8 @@ def film(id: str, frames: int, has_scene: bool, rng) -> Video:
     return Video(id, np.arange(frames) * 0.1, np.stack(camera), registered, ones.astype(float), ones, has_scene, has_scene, store)
 
 
-def pack(rays, depths, outside, frames: int, has_scene: bool) -> Store:
+def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
+    frames, (height, width) = len(depths), depths[0].shape
     frame = torch.cat([torch.full((len(direction),), number) for number, direction, _, _ in rays])
     direction, depth, hit = (torch.from_numpy(np.concatenate([ray[k] for ray in rays])) for k in (1, 2, 3))
     count = len(frame)
@@ -70,7 +72,8 @@ def pack(rays, depths, outside, frames: int, has_scene: bool) -> Store:
         torch.where(hit, AGENT, 0).byte(), plain[:, None].repeat(1, 2), plain.byte(), plain.to(torch.int8) + 1,
     )  # fmt: skip
     views = Views(
-        torch.from_numpy(INTRINSICS).float().repeat(frames, 1, 1), torch.from_numpy(np.stack(depths)).half(),
+        torch.from_numpy(intrinsics).float().repeat(frames, 1, 1), torch.tensor([width * 4.0, height * 4.0]).repeat(frames, 1),
+        torch.from_numpy(np.stack(depths)).half(),
         torch.from_numpy(np.stack(outside)).byte(), torch.ones(frames, dtype=torch.bool),
     )  # fmt: skip
     return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
@@ -78,7 +81,7 @@ def pack(rays, depths, outside, frames: int, has_scene: bool) -> Store:
 
 def problem():
     rng = np.random.default_rng(0)
-    videos = [film("v002", 12, True, rng), film("v001", 6, False, rng)]
+    videos = [film("v002", 12, True, rng), film("v001", 6, False, rng, UPRIGHT)]
     ball = trimesh.creation.icosphere(2, RADIUS_M)
     mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), np.full((len(ball.vertices), 3), [200, 40, 40], np.uint8))
     feature = np.zeros((len(mesh.vertices), 16), np.float32)
