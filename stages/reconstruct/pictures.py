@@ -15,7 +15,8 @@ from pipeline.models.motion import Motion
 from pipeline.models.render import Renderer
 from pipeline.space import cameras, rigid
 
-HEIGHT, WIDTH = 320, 240
+LONG_SIDE_PX = 320
+"""of each drawn picture"""
 DEPTH_RANGE_M = 4.0
 
 
@@ -70,12 +71,13 @@ def compare(
     renderer: Renderer, clip: Clip, mask: UInt8[np.ndarray, "height width"], motion: Motion, frame: int
 ) -> tuple[tuple[float, float, float], UInt8[np.ndarray, "height width 3"]]:
     """Render one frame; return (PSNR, share of depth within 0.1 m, IoU) and one row of pictures."""
-    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, (HEIGHT, WIDTH))
+    height, width = (round(side * LONG_SIDE_PX / max(clip.color_size)) for side in clip.color_size)
+    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, (height, width))
     camera, root, bones = motion.world_from_camera[frame], motion.world_from_agent[frame], motion.agent_from_bone[frame]
-    drawn = renderer.draw(camera, intrinsics, HEIGHT, WIDTH, root, bones)
-    color = cv2.resize(clip.color(frame), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
-    measured = cv2.resize(clip.depth(frame), (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST)
-    opposite = renderer.draw(_opposite(camera, root), intrinsics, HEIGHT, WIDTH, root, bones)
+    drawn = renderer.draw(camera, intrinsics, height, width, root, bones)
+    color = cv2.resize(clip.color(frame), (width, height), interpolation=cv2.INTER_AREA)
+    measured = cv2.resize(clip.depth(frame), (width, height), interpolation=cv2.INTER_NEAREST)
+    opposite = renderer.draw(_opposite(camera, root), intrinsics, height, width, root, bones)
     row = [
         color,
         drawn.color,
@@ -84,7 +86,7 @@ def compare(
         opposite.color,
         draw_bones(color, camera, intrinsics, root, bones),
     ]
-    known, agent = (measured > 0.1) & (measured < 5), cv2.resize(mask, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST) == 255
+    known, agent = (measured > 0.1) & (measured < 5), cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) == 255
     error = np.mean((color.astype(float) - drawn.color)[drawn.depth > 0] ** 2)
     iou = (agent & drawn.agent).sum() / max((agent | drawn.agent).sum(), 1)
     share = np.mean(np.abs(drawn.depth - measured)[known] < 0.1) if known.any() else np.nan
@@ -92,9 +94,11 @@ def compare(
 
 
 def _opposite(world_from_camera: Float[np.ndarray, "4 4"], world_from_agent: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Return a camera on the other side of the agent, at the same height and distance."""
+    """Return a camera on the other side of the agent, at the same height, at most 0.8 m away so that no wall comes between."""
     target, eye = world_from_agent[:3, 3], world_from_camera[:3, 3]
-    across = np.array([2 * target[0] - eye[0], eye[1], 2 * target[2] - eye[2]])
+    beyond = (target - eye)[[0, 2]]
+    beyond *= min(1.0, 0.8 / max(np.linalg.norm(beyond), 1e-6))
+    across = np.array([target[0] + beyond[0], min(eye[1], target[1] + 0.6), target[2] + beyond[1]])
     return rigid.look_at(across, target, np.array([0.0, 1.0, 0.0]))
 
 

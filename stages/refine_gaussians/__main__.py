@@ -25,8 +25,8 @@ class Config:
     """frames drawn, one a step"""
     counts: Counts = Counts()
     """numbers of Gaussians"""
-    size: tuple[int, int] = (160, 120)
-    """height and width of drawn pictures, pixels"""
+    long_side_px: int = 160
+    """longer side of drawn pictures, pixels"""
     weights: Weights = Weights()
     """of the losses"""
     rates: Rates = Rates()
@@ -48,7 +48,7 @@ def run(task: cli.Task) -> None:
     splats = reading.read_splats(folder_4d, config.counts, videos, np.random.default_rng(config.seed), task.device)
     total = sum(len(sequence.motion.timestamp_s) for sequence in sequences)
     deltas = refine.MotionDeltas(total, len(splats.agent_from_bone_rest)).to(task.device)
-    loss = refine.FrameLoss(splats, deltas, sequences, config.weights, config.size, backend)
+    loss = refine.FrameLoss(splats, deltas, sequences, config.weights, config.long_side_px, backend)
     record = refine.refine(loss, config.rates, config.steps, config.seed, task.resume, config.save_every)
     with task.create() as folder:
         writing.write(folder, splats, deltas, sequences)

@@ -12,7 +12,7 @@ from pipeline import qa
 from pipeline.fit import FitRecord
 from pipeline.models.gaussians import see
 from stages.refine_gaussians.refine import FrameLoss, Sequence4D, usable_frames
-from stages.refine_gaussians.views import read
+from stages.refine_gaussians.views import drawn_size, read
 
 DEPTH_RANGE_M = 4.0
 
@@ -40,7 +40,7 @@ def report_quality(folder: Path, loss: FrameLoss, sequences: Sequence[Sequence4D
             1.3,
         ),
     ]
-    pictures = [qa.Picture("frames", np.vstack(rows[:6]), "picture, Gaussians, depth, the agent's share")] if rows else []
+    pictures = [qa.Picture("frames", stacked(rows[:6]), "picture, Gaussians, depth, the agent's share")] if rows else []
     qa.write(
         folder,
         good="sharper pictures than the fields give, an agent of its own",
@@ -50,12 +50,19 @@ def report_quality(folder: Path, loss: FrameLoss, sequences: Sequence[Sequence4D
     )
 
 
+def stacked(rows: Sequence[UInt8[np.ndarray, "height width 3"]]) -> UInt8[np.ndarray, "height width 3"]:
+    """Put pictures of different widths below each other, on white."""
+    width = max(row.shape[1] for row in rows)
+    return np.vstack([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows])
+
+
 @torch.no_grad()
 def compare(loss: FrameLoss, sequence: Sequence4D, frame: int) -> tuple[UInt8[np.ndarray, "height width 3"], float]:
     """Draw one frame beside its picture; return the row of pictures and the PSNR."""
-    target = read(sequence.recording, frame, loss.size, loss.device)
+    size = drawn_size(sequence.recording, loss.long_side_px)
+    target = read(sequence.recording, frame, size, loss.device)
     camera = torch.from_numpy(np.linalg.inv(sequence.motion.world_from_camera[frame])).float().to(loss.device)
-    view = see(loss.cloud(sequence, frame), camera, target.intrinsics, *loss.size, loss.backend)
+    view = see(loss.cloud(sequence, frame), camera, target.intrinsics, *size, loss.backend)
     error = (view.color.clamp(0, 1) - target.color).square().mean()
     near = (255 * (1 - view.depth / DEPTH_RANGE_M)).clamp(0, 255).byte().cpu().numpy()
     depth = cv2.applyColorMap(near, cv2.COLORMAP_VIRIDIS)[..., ::-1]

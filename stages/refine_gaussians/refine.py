@@ -16,7 +16,7 @@ from pipeline.models.gaussians import Cloud, Splats, see, together
 from pipeline.models.motion import Motion
 from pipeline.models.rasterize import Backend
 from pipeline.space import cameras, rigid_torch
-from stages.refine_gaussians.views import Recording, Target, flow_lattice, read
+from stages.refine_gaussians.views import Recording, Target, drawn_size, flow_lattice, read
 
 
 @dataclass(frozen=True)
@@ -90,21 +90,29 @@ class FrameLoss:
         deltas: MotionDeltas,
         sequences: Sequence[Sequence4D],
         weights: Weights,
-        size: tuple[int, int],
+        long_side_px: int,
         backend: Backend,
     ):
-        self.splats, self.deltas, self.sequences, self.weights, self.size, self.backend = splats, deltas, sequences, weights, size, backend
+        self.splats, self.deltas, self.sequences, self.weights, self.long_side_px, self.backend = (
+            splats,
+            deltas,
+            sequences,
+            weights,
+            long_side_px,
+            backend,
+        )
         self.device = str(splats.appearance.device)
         self.frames = [(s, f) for s, sequence in enumerate(sequences) for f in usable_frames(sequence)]
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
         number, frame = self.frames[int(torch.randint(len(self.frames), (1,), generator=generator))]
         sequence = self.sequences[number]
-        target = read(sequence.recording, frame, self.size, self.device)
+        size = drawn_size(sequence.recording, self.long_side_px)
+        target = read(sequence.recording, frame, size, self.device)
         cloud = self.cloud(sequence, frame)
         camera = self._camera(sequence, frame)
         later = self._later_pixels(sequence, frame, target, cloud)
-        view = see(cloud, camera, target.intrinsics, *self.size, self.backend, extra=later)
+        view = see(cloud, camera, target.intrinsics, *size, self.backend, extra=later)
         everywhere = torch.ones_like(target.agent) if sequence.video is not None else target.agent
         measured = (target.depth > 0) & everywhere
         weights, terms = self.weights, {}
@@ -149,7 +157,7 @@ class FrameLoss:
         return (then - now).clamp(-100, 100)
 
     def _flow_errors(self, sequence: Sequence4D, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor) -> Tensor:
-        row, column = flow_lattice(*target.flow_confidence.shape, sequence.recording.clip.color_size, self.size)
+        row, column = flow_lattice(*target.flow_confidence.shape, sequence.recording.clip.color_size, tuple(target.color.shape[:2]))
         found = drawn[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
         error = functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0).sum(-1).clamp_max(4)
         return (error * target.flow_confidence)[(coverage[row, column] > 0.5) & everywhere[row, column]]

@@ -43,6 +43,13 @@ class Target:
     flow_confidence: Float[Tensor, "row column"] | None
 
 
+def drawn_size(recording: Recording, long_side_px: int) -> tuple[int, int]:
+    """Return height and width of drawn pictures, in the shape of the recording's."""
+    longest = max(recording.clip.color_size)
+    height, width = (round(side * long_side_px / longest) for side in recording.clip.color_size)
+    return height, width
+
+
 def read(recording: Recording, frame: int, size: tuple[int, int], device: str) -> Target:
     """Read one frame and shrink it to (height, width)."""
     clip, small = recording.clip, size[::-1]
