@@ -100,7 +100,7 @@ def plan(resume=None, **steps) -> optimise.Plan:
 def solved():
     torch.set_num_threads(1)
     found, videos = problem()
-    optimise.optimise(found, plan(template=60, scene=90, body=30, joint=4))
+    optimise.optimise(found, plan(template=80, scene=90, body=40, joint=4))
     return found, videos
 
 
