@@ -57,7 +57,7 @@ class Steps:
     """steps of the first phase: scene and cameras"""
     body: int = 80
     """steps per chunk that pose the template to the masked depth"""
-    joint: int = 1500
+    joint: int = 1000
     """steps of the second phase: everything"""
     body_chunk_frames: int = 100
     """frames posed together"""
