@@ -51,7 +51,7 @@ def pictures(held: HeldOut, localizer: Localizer) -> list[Picture]:
     """Draw the histogram and the worst eight."""
     rotation = np.nan_to_num(held.rotation_deg, nan=180.0)
     worst = np.argsort(-rotation, kind="stable")[:8]
-    edge = max(max(view.color.shape[:2]) for view in held.views)
+    edge = 240
     tiles = [
         _label(
             _square(held.views[index].color, edge),
@@ -97,6 +97,6 @@ def _square(picture, edge):
 
 
 def _label(picture, text):
-    cv2.putText(picture, text, (3, picture.shape[0] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.33, (255, 255, 255), 2, cv2.LINE_AA)
-    cv2.putText(picture, text, (3, picture.shape[0] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.33, (20, 20, 20), 1, cv2.LINE_AA)
-    return picture
+    picture[-20:] = overview.BACKGROUND
+    place = (4, picture.shape[0] - 6)
+    return cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20, 20, 20), 1, cv2.LINE_AA)
