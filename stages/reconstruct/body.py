@@ -23,7 +23,7 @@ REACH_M = 0.05
 """signed distances on the agent are compared up to here"""
 OUTLIER_M = 0.1
 """measured points this far from the agent count half; all keep pulling, or the body could hide behind the scene"""
-ROOT_M = 0.05
+ROOT_M, ROOT_RAD = 0.05, 0.05
 """registered roots are about this good"""
 MARGIN_M = 0.03
 """the posed surface may stand this much before the measured depth"""
@@ -105,8 +105,9 @@ def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6
     carried = (motion[:, first, :3, :3] @ centre[second][..., None])[..., 0] + motion[:, first, :3, 3]
     torn = (carried - pose.agent_from_bone[:, second, :3, 3]) / DECIMETRE
     root = rigid_torch.inverse(problem.motion.initial_agent[pose.frame]) @ pose.world_from_agent
+    trace = root[:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
     terms = {
-        "root": (weights.root, (root[:, :3, 3] / ROOT_M).square().sum(-1)),
+        "root": (weights.root, (root[:, :3, 3] / ROOT_M).square().sum(-1) + (3 - trace) / ROOT_RAD**2),
         "rigidity": (weights.rigidity, torn.square().sum(-1)),
         "rest": (weights.rest, twist.square().sum(-1) + 20 * twist.mean(1, keepdim=True).square().sum(-1)),
     }

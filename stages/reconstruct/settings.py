@@ -31,9 +31,9 @@ class Weights:
     """posed surface outside the mask, per decimetre"""
     in_front: float = 0.5
     """posed surface in space seen free, per decimetre"""
-    rigidity: float = 3.0
+    rigidity: float = 10.0
     """neighbouring bones agree where they meet, per decimetre"""
-    smoothness: float = 1.0
+    smoothness: float = 0.3
     """accelerations of root and bones"""
     rest: float = 0.05
     """bones stay near rest"""
@@ -42,7 +42,7 @@ class Weights:
     anchor: float = 0.05
     """corrections of cameras are small, per centimetre"""
     root: float = 0.02
-    """the agent's root stays near the registered one, per 5 cm"""
+    """the agent's root stays near the registered one, per 5 cm and 3 degrees"""
     template: float = 2.0
     """the agent's field stays near its template, in shape and colour"""
 
@@ -53,7 +53,7 @@ class Steps:
 
     template: int = 200
     """steps that copy the agent template into the agent field"""
-    scene: int = 1200
+    scene: int = 2000
     """steps of the first phase: scene and cameras"""
     body: int = 80
     """steps per chunk that pose the template to the masked depth"""
