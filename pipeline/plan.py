@@ -198,7 +198,8 @@ def new_agent(name: str) -> None:
     recipe = Path("agents", f"{home.agent}.toml")
     if not recipe.exists():
         template = Path("agents", "cat.toml").read_text()
-        artifact.write_if_changed(recipe, template.replace("captures/cat/", f"captures/{home.agent}/"))
+        renamed = template.replace("captures/cat/", f"captures/{home.agent}/").replace('name = "cat"', f'name = "{home.agent}"')
+        artifact.write_if_changed(recipe, renamed)
     Path("captures", home.agent).mkdir(parents=True, exist_ok=True)
     print(f"recipe {recipe}; put recordings into captures/{home.agent}/, then: make {home.agent}")
 
