@@ -116,12 +116,16 @@ def test_room_and_ball_are_found(solved):
     assert np.abs(np.linalg.norm(ball.vertices, axis=-1) - RADIUS_M).mean() < 0.02
 
 
-def test_roots_come_nearer_to_the_truth(solved):
+def test_posed_surface_comes_nearer_to_the_truth(solved):
+    """Registered roots are off by 4.7 cm; bones and root together must carry the ball to where it is."""
     found, videos = solved
     motion = results.motions(found, videos, 1.0)["v002"]
+    with torch.no_grad():
+        posed = found.body.pose(found.surface.points, torch.from_numpy(motion.agent_from_bone).float()).numpy()
+    centre = rigid.apply(motion.world_from_agent, posed).mean(1)
     truth = np.stack([0.03 * np.arange(12), np.zeros(12), np.zeros(12)], axis=-1)
     before = np.linalg.norm(videos[0].world_from_agent[:, :3, 3] - truth, axis=-1).mean()
-    assert np.linalg.norm(motion.world_from_agent[:, :3, 3] - truth, axis=-1).mean() < 0.6 * before
+    assert np.linalg.norm(centre - truth, axis=-1).mean() < 0.6 * before
 
 
 def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
