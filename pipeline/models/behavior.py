@@ -46,6 +46,7 @@ class Architecture:
     blind_to: Blind = "nothing"
     unet_width: int = 32
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
+    goal_from: Literal["scene_observer", "all"] = "all"
     goal_hidden: int = 128
     goal_layers: int = 6
 
@@ -58,6 +59,11 @@ class Architecture:
     def condition(self) -> int:
         """Length of the perception code."""
         return 3 * self.code
+
+    @property
+    def goal_condition(self) -> int:
+        """How much of the code the goal depends on: all of it, or scene and observer, which come first."""
+        return self.condition if self.goal_from == "all" else 2 * self.code
 
     @property
     def perception(self) -> PerceptionSize:
@@ -115,7 +121,7 @@ class BehaviorNets(nn.Module):
         super().__init__()
         a = architecture
         self.perception = Perception(a.perception)
-        self.goal = GoalMLP(a.condition, a.goal_hidden, a.goal_layers, schedule)
+        self.goal = GoalMLP(a.goal_condition, a.goal_hidden, a.goal_layers, schedule)
         self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
         self.body = ControlUNet(a.body_channels, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
 

@@ -42,11 +42,11 @@ class NoiseFromVelocity(nn.Module):
 
 
 class GoalMLP(nn.Module):
-    """Six layers of 128 (appendix A.2)."""
+    """Six layers of 128 (appendix A.2); of the perception code it reads the first ``condition`` numbers."""
 
     def __init__(self, condition: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD):
         super().__init__()
-        self.noise = NoiseFromVelocity(schedule)
+        self.noise, self.condition = NoiseFromVelocity(schedule), condition
         sizes = [3 + TIME_CHANNELS + condition] + [hidden] * (layers - 1)
         self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(sizes))
         self.out = nn.Linear(hidden, 3)
@@ -54,7 +54,7 @@ class GoalMLP(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch 3"], t: Float[Tensor, "batch"], condition: Float[Tensor, "batch condition"]
     ) -> Float[Tensor, "batch 3"]:
-        h = torch.cat([x, time_embedding(t), condition], dim=-1)
+        h = torch.cat([x, time_embedding(t), condition[:, : self.condition]], dim=-1)
         for layer in self.hidden:
             h = nn.functional.silu(layer(h))
         return self.noise(x, self.out(h), t)

@@ -29,6 +29,8 @@ class Config:
     """Channels of the scene encoder; the paper's is 128."""
     blind_to: Literal["nothing", "scene", "observer", "past"] = "nothing"
     """Ablation: a condition that the model never perceives."""
+    goal_from: Literal["scene_observer", "all"] = "all"
+    """What goals depend on; the paper's `all` includes the past."""
     observer_radius_m: float = 4.0
     """Horizontal distance in metres from which on an observer is as good as none."""
     unet_width: int = 32
@@ -48,7 +50,7 @@ def run(task: cli.Task) -> None:
     volume = FeatureVolume.load(task.input("behavior_data") / "volume.npz")
     architecture = Architecture(
         bones=len(data.agent_from_bone_rest), ego=c.ego, scene=c.scene, scene_width=c.scene_width,
-        scene_channels=len(volume.features), observer_radius_m=c.observer_radius_m, blind_to=c.blind_to, unet_width=c.unet_width,
+        scene_channels=len(volume.features), observer_radius_m=c.observer_radius_m, blind_to=c.blind_to, goal_from=c.goal_from, unet_width=c.unet_width,
         unet_multipliers=c.unet_multipliers,
     )  # fmt: skip
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")

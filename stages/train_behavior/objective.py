@@ -1,5 +1,6 @@
 """The denoising losses of goal, path and body (Eq. 8), with conditions dropped at random for guidance."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -31,16 +32,29 @@ class Objective:
     """noise levels drawn per window for the goal, whose network is small"""
 
 
-def losses(nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator) -> dict[str, Tensor]:
-    """Return the weighted mean squared error of the predicted noise, per network."""
-    code = perceive(nets, batch, objective, generator)
+def losses(
+    nets: BehaviorNets,
+    batch: Batch,
+    schedule: Schedule,
+    objective: Objective,
+    generator: torch.Generator,
+    *,
+    goals: bool = True,
+) -> dict[str, Tensor]:
+    """Return the weighted mean squared error of the predicted noise, per network.
+
+    Without ``goals`` perception and goal network rest: their weights get no gradient, and the goal's error only tells.
+    """
+    with contextlib.nullcontext() if goals else torch.no_grad():
+        code = perceive(nets, batch, objective, generator)
     draws = objective.goal_draws
 
     def error(denoise: Denoise, clean: Tensor) -> Tensor:
         return squared_error(denoise, clean, schedule, objective.weighting, generator)
 
     repeated = code.repeat_interleave(draws, 0)
-    goal = error(lambda x, t: nets.goal(x, t, repeated), batch.goal.repeat_interleave(draws, 0))
+    with contextlib.nullcontext() if goals else torch.no_grad():
+        goal = error(lambda x, t: nets.goal(x, t, repeated), batch.goal.repeat_interleave(draws, 0))
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
     path = error(lambda x, t: nets.path(x, t, code, batch.goal, steered), batch.path)
     known = ~batch.mirrored

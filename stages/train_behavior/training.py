@@ -27,7 +27,10 @@ from stages.train_behavior.objective import Objective, losses
 class Optimization:
     """How long and how fast."""
 
-    steps: int = 1500
+    steps: int = 1200
+    goal_steps: int = 300
+    """first steps, in which perception and goals are trained too; then both rest, for they learn minutes of video by heart
+    long before path and body are good"""
     batch: int = 64
     """windows per step"""
     rate: float = 1e-3
@@ -83,13 +86,16 @@ def train(
 
     def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
         batch = draw_batch(windows, scene, statistics, settings.augmentation, pace.batch, generator)
-        return losses(nets, batch, schedule, settings.objective, generator)
+        return losses(nets, batch, schedule, settings.objective, generator, goals=step < pace.goal_steps)
 
     def after_step(step: int) -> None:
         decay = min(pace.average, (step + 1) / (step + 10))
         with torch.no_grad():
             for mean, parameter in zip(average.parameters(), nets.parameters(), strict=True):
                 mean.lerp_(parameter, 1 - decay)
+        if step + 1 == pace.goal_steps:
+            nets.perception.load_state_dict(average.perception.state_dict())
+            nets.goal.load_state_dict(average.goal.state_dict())
 
     record = fit(
         modules={"nets": nets, "average": average},
@@ -99,7 +105,7 @@ def train(
         seed=seed,
         resume=resume,
         save_every=pace.save_every,
-        schedule=warm_cosine,
+        schedule=lambda progress: two_cosines(progress, pace.goal_steps / pace.steps),
         label="behaviour",
         clip_norm=1.0,
         after_step=after_step,
@@ -114,6 +120,13 @@ def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Sta
         nets = BehaviorNets(architecture, schedule)
     nets.perception.past.mean[:], nets.perception.past.std[:] = statistics.past_mean, statistics.past_std
     return nets
+
+
+def two_cosines(progress: float, turn: float) -> float:
+    """Return the factor on the learning rate: one `warm_cosine` up to ``turn``, another after it."""
+    if turn >= 1 or progress < turn:
+        return warm_cosine(min(progress / turn, 1.0))
+    return warm_cosine((progress - turn) / (1 - turn))
 
 
 def warm_cosine(progress: float) -> float:

@@ -98,7 +98,7 @@ def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
 
 
 def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
-    settings = Settings(Optimization(steps=8, batch=8, save_every=3))
+    settings = Settings(Optimization(steps=8, goal_steps=4, batch=8, save_every=3))
     whole = train(data, room(), ARCHITECTURE, Schedule(), settings, seed=3)
     assert set(whole.record.terms) == {"goal", "path", "body"}
     assert all(np.isfinite(values).all() for values in whole.record.terms.values())
