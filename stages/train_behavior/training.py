@@ -124,9 +124,9 @@ def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Sta
 
 def two_cosines(progress: float, turn: float) -> float:
     """Return the factor on the learning rate: one `warm_cosine` up to ``turn``, another after it."""
-    if turn >= 1 or progress < turn:
-        return warm_cosine(min(progress / turn, 1.0))
-    return warm_cosine((progress - turn) / (1 - turn))
+    if turn >= 1:
+        return warm_cosine(progress)
+    return warm_cosine(progress / turn if progress < turn else (progress - turn) / (1 - turn))
 
 
 def warm_cosine(progress: float) -> float:

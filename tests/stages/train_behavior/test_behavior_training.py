@@ -27,8 +27,9 @@ from stages.train_behavior.export import (
     signature,
     write_contract,
 )
+from stages.train_behavior.objective import Objective, losses
 from stages.train_behavior.reactions import Reactions, measure, moments
-from stages.train_behavior.training import Optimization, Settings, initial_nets, train
+from stages.train_behavior.training import Optimization, Settings, initial_nets, train, two_cosines
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
 
 PLAIN = Augmentation(turn=0, yaw_rad=0, mirror=0, observer_m=0, past=0, hide_bones=0)
@@ -185,3 +186,24 @@ def test_reactions_measure_a_known_animal(data, windows):
     expected = Reactions(away_m=1.0, away_share=1.0, reversal_m=2.0, far_m=0.0, farther_m=0.0)
     for name, value in vars(expected).items():
         assert getattr(measured, name) == pytest.approx(value, abs=0.05), name
+
+
+def test_learning_rate_falls_twice():
+    factor = [two_cosines(step / 100, 0.3) for step in range(100)]
+    assert max(factor) == pytest.approx(1, abs=0.02)
+    assert factor[29] < 0.05
+    assert factor[40] > 0.9
+    assert factor[99] < 0.05
+    assert two_cosines(0.99, 2.5) < 0.05
+
+
+def test_perception_and_goals_rest_in_the_second_part(data, windows):
+    batch, _ = drawn(windows, Augmentation())
+    nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 3.0), 0)
+    for goals in (True, False):
+        nets.zero_grad(set_to_none=True)
+        generator = torch.Generator().manual_seed(0)
+        sum(losses(nets, batch, Schedule(), Objective(), generator, goals=goals).values()).backward()
+        for part, learns in (("perception", goals), ("goal", goals), ("path", True), ("body", True)):
+            moved = [parameter.grad is not None for parameter in getattr(nets, part).parameters()]
+            assert any(moved) == learns, part
