@@ -109,11 +109,14 @@ def digest_of(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def clean(out: Path) -> None:
-    """Remove what writers of `out` that died have left; the caller holds the job's lock."""
-    for pattern in (f".{out.name}.tmp.*", f".{out.name}.old.*"):
-        for left in out.parent.glob(pattern):
-            shutil.rmtree(left, ignore_errors=True)
+def clean(*outs: Path) -> None:
+    """Remove what writers of these artifacts and small files that died have left; the caller holds the job's lock."""
+    for out in outs:
+        for left in (*out.parent.glob(f".{out.name}.tmp*"), *out.parent.glob(f".{out.name}.old.*")):
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -46,7 +46,7 @@ def run(home: str, job_id: str) -> int:
     redo = plan.redo_mark(job["home"], job_id)
     waiting = f"[{job_id}] is being made by another build; waiting for it"
     with artifact.held(plan.lock_file(job["home"], job_id), waiting):
-        artifact.clean(out)
+        artifact.clean(out, _record(job))
         key = _key(job)
         made = artifact.read_manifest(out)
         if made is None or made.key != key or redo.exists():
@@ -70,6 +70,10 @@ def _job(home: str, job_id: str) -> dict[str, Any]:
         if job["id"] == job_id:
             return job | {"place": f"{number} of {len(jobs)}"}
     raise InputError("RUN-001", f"has no job {job_id!r}", home, f"see {path}")
+
+
+def _record(job: dict[str, Any]) -> Path:
+    return Path("build", job["home"], "records", f"{job['id']}.json")
 
 
 def _key(job: dict[str, Any]) -> str:
@@ -122,8 +126,7 @@ def _do(job: dict[str, Any], key: str, resume: Path) -> int:
         "commit": _commit(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
-    path = Path("build", job["home"], "records", f"{job['id']}.json")
-    artifact.write_if_changed(path, json.dumps(record, indent=1, sort_keys=True) + "\n")
+    artifact.write_if_changed(_record(job), json.dumps(record, indent=1, sort_keys=True) + "\n")
     _say(job["id"], f"done in {seconds:.1f} s, peak {peak_mb:.0f} MB{_quality(out)}")
     return 0
 

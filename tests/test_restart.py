@@ -1,5 +1,6 @@
 """Kill the toy's build twenty times while stages write, without the truth on disk: the artifacts are the same bytes."""
 
+import contextlib
 import os
 import random
 import shutil
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from pipeline import artifact, dag
+from tests.pipeline import checkout
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.toy
@@ -58,24 +60,31 @@ def being_written(folder: Path, name: str) -> Iterator[Path]:
 
 
 def kill_while_writing(folder: Path, names: list[str], choice: random.Random) -> tuple[str, str]:
-    """Build until one of `names` is being written, then SIGKILL the group; return which, and what was there."""
-    left_over = {path for name in names for path in being_written(folder, name)}
-    build = begin(folder)
+    """Build until one of `names` is being written, then SIGKILL the group; return which, and what was there.
+
+    A kill a moment after the last write does not count; where a build ends before one counts, they are made again.
+    """
     end = time.monotonic() + LIMIT_S
-    while build.poll() is None and time.monotonic() < end:
-        for name in names:
-            seen = next((path for path in being_written(folder, name) if path not in left_over), None)
-            if seen is not None:
-                time.sleep(choice.uniform(0, 0.3 if name in TRAININGS else 0.02))
-                os.killpg(build.pid, signal.SIGKILL)
-                build.wait()
-                if seen.exists():  # otherwise it was done a moment before, and this kill does not count
-                    return name, str(seen.relative_to(folder))
-                build = begin(folder)
-        time.sleep(0.002)
-    if build.poll() is None:
-        os.killpg(build.pid, signal.SIGKILL)
-    raise AssertionError(f"none of {names} was ever written; make ended with {build.wait()}")
+    while time.monotonic() < end:
+        left_over = {path for name in names for path in being_written(folder, name)}
+        new: list[tuple[str, Path]] = []
+        build = begin(folder)
+        while build.poll() is None and not new and time.monotonic() < end:
+            time.sleep(0.002)
+            new = [(name, path) for name in names for path in being_written(folder, name) if path not in left_over]
+        if new:
+            time.sleep(choice.uniform(0, 0.3 if new[0][0] in TRAININGS else 0.02))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(build.pid, signal.SIGKILL)
+        code = build.wait()
+        checkout.wait_for_group(build.pid)
+        if not new:
+            assert code == 0, (folder / "build.log").read_text()[-3000:]
+            for name in names:
+                shutil.rmtree(folder / "build" / "toy" / name)
+        elif new[0][1].exists():
+            return new[0][0], str(new[0][1].relative_to(folder))
+    raise AssertionError(f"no kill met {names} while they were written")
 
 
 def complete(folder: Path) -> dict[str, artifact.Manifest]:

@@ -1,8 +1,10 @@
 """A small house of its own for tests of the orchestration: the real ground floor, tiny stages, real recipes."""
 
+import os
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,3 +108,22 @@ def create(folder: Path) -> Checkout:
         made.write(f"stages/{stage}/__init__.py", "")
         made.write(f"stages/{stage}/__main__.py", STAGE.format(stage=stage, settings=settings, reads=reads, optional=optional))
     return made
+
+
+def alive_of_group(group: int) -> list[int]:
+    """Return the processes of a process group that have not ended yet; those that nobody has waited for have."""
+    alive = []
+    for process in map(int, filter(str.isdigit, os.listdir("/proc"))):
+        try:
+            state, _, its_group = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[:3]
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(its_group) == group and state not in "ZX":
+            alive.append(process)
+    return alive
+
+
+def wait_for_group(group: int) -> None:
+    """Wait until a killed process group has ended: Make may be gone before what it started."""
+    while alive_of_group(group):
+        time.sleep(0.01)
