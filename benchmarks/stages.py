@@ -51,7 +51,9 @@ def table(found: list[Cost]) -> str:
         per_frame = f"{cost.seconds / cost.frames:.3f}" if cost.frames else ""
         lines.append(f"| {cost.artifact} | {cost.jobs} | {cost.seconds:.0f} | {cost.frames or ''} | {per_frame} | {cost.peak_memory_mb} |")
     whole = sum(cost.seconds for cost in found)
-    lines.append(f"| all, one after another | {sum(cost.jobs for cost in found)} | {whole:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |")
+    lines.append(
+        f"| all, one after another | {sum(cost.jobs for cost in found)} | {whole:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |"
+    )
     return "\n".join(lines)
 
 

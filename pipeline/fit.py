@@ -127,7 +127,11 @@ class _Loop:
         return True
 
     def _fall_back(self, terms: Mapping[str, Tensor], norm: float) -> None:
-        diagnosis = {"step": self.step, "gradient_norm": repr(norm), "terms": {name: repr(float(value.detach())) for name, value in terms.items()}}
+        diagnosis = {
+            "step": self.step,
+            "gradient_norm": repr(norm),
+            "terms": {name: repr(float(value.detach())) for name, value in terms.items()},
+        }
         if self.rolled_back >= 1:
             if self.folder:
                 (self.folder / "diagnosis.json").write_text(json.dumps(diagnosis, indent=2) + "\n")
@@ -143,7 +147,14 @@ class _Loop:
     def _state(self) -> dict:
         copy = {name: {key: value.clone() for key, value in module.state_dict().items()} for name, module in self.modules.items()}
         optimizer = _deep_clone(self.optimizer.state_dict())
-        return {"step": self.step, "rate": self.rate, "rolled_back": self.rolled_back, "terms": {k: list(v) for k, v in self.terms.items()}, "modules": copy, "optimizer": optimizer}
+        return {
+            "step": self.step,
+            "rate": self.rate,
+            "rolled_back": self.rolled_back,
+            "terms": {k: list(v) for k, v in self.terms.items()},
+            "modules": copy,
+            "optimizer": optimizer,
+        }
 
     def _load(self, state: dict) -> None:
         self.step, self.rate, self.rolled_back = state["step"], state["rate"], state["rolled_back"]

@@ -38,7 +38,9 @@ def load(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarr
                 raise ValueError(f"missing {', '.join(sorted(missing))}; it holds {', '.join(members)}")
             return {name: _read(archive, name) for name in (names or members)}
     except (zipfile.BadZipFile, ValueError, OSError, EOFError) as error:
-        raise InputError("ART-010", what=f"cannot be read as NPZ: {error}", where=str(path), remedy="rebuild the stage that wrote it") from error
+        raise InputError(
+            "ART-010", what=f"cannot be read as NPZ: {error}", where=str(path), remedy="rebuild the stage that wrote it"
+        ) from error
 
 
 def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray:

@@ -48,7 +48,9 @@ def read_gray(path: Path) -> UInt8[np.ndarray, "height width"]:
     """Read an 8-bit single-channel PNG (masks, confidence) with its values as they are."""
     image = _decoded(Path(path).read_bytes(), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
-        raise InputError("CAP-021", what="not a readable 8-bit single-channel picture", where=str(path), remedy="rebuild the stage that wrote it")
+        raise InputError(
+            "CAP-021", what="not a readable 8-bit single-channel picture", where=str(path), remedy="rebuild the stage that wrote it"
+        )
     return image
 
 
@@ -68,7 +70,9 @@ def read_depth(path: Path, channel: str = "Z") -> Float[np.ndarray, "height widt
         with OpenEXR.File(str(path), separate_channels=True) as file:
             pixels = file.channels()[channel].pixels.astype(np.float32)
     except (RuntimeError, KeyError, ValueError) as error:
-        raise InputError("CAP-022", what=f"not a depth EXR with a channel {channel!r} ({error})", where=str(path), remedy="export the recording again") from error
+        raise InputError(
+            "CAP-022", what=f"not a depth EXR with a channel {channel!r} ({error})", where=str(path), remedy="export the recording again"
+        ) from error
     return np.where(np.isfinite(pixels) & (pixels > 0) & (pixels < MAX_DEPTH_M), pixels, np.float32(0))
 
 

@@ -43,7 +43,9 @@ def read_ply(path: Path) -> Mesh:
     try:
         return _parse(Path(path).read_bytes())
     except (ValueError, IndexError, KeyError, StopIteration) as error:
-        raise InputError("ART-020", what=f"not a binary PLY of triangles: {error}", where=str(path), remedy="export it again as binary little-endian PLY") from error
+        raise InputError(
+            "ART-020", what=f"not a binary PLY of triangles: {error}", where=str(path), remedy="export it again as binary little-endian PLY"
+        ) from error
 
 
 def _parse(data: bytes) -> Mesh:

@@ -10,7 +10,9 @@ from pipeline.space import rigid
 
 
 def kabsch(
-    source: Float[np.ndarray, "*batch point 3"], target: Float[np.ndarray, "*batch point 3"], weights: Float[np.ndarray, "*batch point"] | None = None
+    source: Float[np.ndarray, "*batch point 3"],
+    target: Float[np.ndarray, "*batch point 3"],
+    weights: Float[np.ndarray, "*batch point"] | None = None,
 ) -> Float[np.ndarray, "*batch 4 4"]:
     """Return ``target_from_source`` that minimises the weighted squared distance, without scale (Kabsch 1976)."""
     source, target = np.asarray(source, float), np.asarray(target, float)

@@ -42,7 +42,9 @@ def project(points_camera, intrinsics):
     return _stack([x, y]), z
 
 
-def scale_intrinsics(intrinsics: Float[np.ndarray, "*batch 3 3"], from_size: tuple[int, int], to_size: tuple[int, int]) -> Float[np.ndarray, "*batch 3 3"]:
+def scale_intrinsics(
+    intrinsics: Float[np.ndarray, "*batch 3 3"], from_size: tuple[int, int], to_size: tuple[int, int]
+) -> Float[np.ndarray, "*batch 3 3"]:
     """Adapt intrinsics to a resized image; sizes are (height, width)."""
     scaled = np.array(intrinsics, float)
     scaled[..., 0, :] *= to_size[1] / from_size[1]
@@ -55,7 +57,9 @@ def opencv_from_opengl(world_from_camera_opengl: Float[np.ndarray, "*batch 4 4"]
     return world_from_camera_opengl @ OPENCV_FROM_OPENGL
 
 
-def turn_intrinsics(intrinsics: Float[np.ndarray, "*batch 3 3"], size: tuple[int, int], quarter_turns: int) -> Float[np.ndarray, "*batch 3 3"]:
+def turn_intrinsics(
+    intrinsics: Float[np.ndarray, "*batch 3 3"], size: tuple[int, int], quarter_turns: int
+) -> Float[np.ndarray, "*batch 3 3"]:
     """Adapt intrinsics to an image of (height, width) ``size`` turned clockwise by quarter turns."""
     turned = np.array(intrinsics, float)
     height, width = size

@@ -56,7 +56,10 @@ def log(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 
 def rotation_angle(first: Float[np.ndarray, "*batch 3 3"], second: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
     """Return the geodesic angle between rotations, exact at zero and at pi (atan2 form)."""
     relative = np.swapaxes(first, -1, -2) @ second
-    axis = np.stack([relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0], relative[..., 1, 0] - relative[..., 0, 1]], -1)
+    axis = np.stack(
+        [relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0], relative[..., 1, 0] - relative[..., 0, 1]],
+        -1,
+    )
     return np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(relative, axis1=-2, axis2=-1) - 1.0)
 
 
@@ -86,7 +89,9 @@ def interpolate(
     return make(rotation, translation)
 
 
-def mean_rotation(rotation: Float[np.ndarray, "sample 3 3"], weights: Float[np.ndarray, "sample"] | None = None) -> Float[np.ndarray, "3 3"]:
+def mean_rotation(
+    rotation: Float[np.ndarray, "sample 3 3"], weights: Float[np.ndarray, "sample"] | None = None
+) -> Float[np.ndarray, "3 3"]:
     """Return the weighted chordal mean of rotations."""
     return Rotation.from_matrix(rotation).mean(weights).as_matrix()
 

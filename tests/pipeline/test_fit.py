@@ -22,7 +22,9 @@ def make_problem(seed: int = 0):
 
 def run(resume, *, loss_of=lambda loss: loss, steps=60, **options):
     net, optimizer, loss = make_problem()
-    record = fitting.fit(modules={"net": net}, optimizer=optimizer, loss=loss_of(loss), steps=steps, seed=3, resume=resume, save_every=7, **options)
+    record = fitting.fit(
+        modules={"net": net}, optimizer=optimizer, loss=loss_of(loss), steps=steps, seed=3, resume=resume, save_every=7, **options
+    )
     return record, torch.cat([p.detach().flatten() for p in net.parameters()])
 
 

@@ -67,10 +67,14 @@ def test_arrays_refuse_pickles_damage_and_missing_names(tmp_path):
 
 def test_meshes_come_back_and_damage_is_refused(tmp_path):
     rng = np.random.default_rng(0)
-    mesh = Mesh(rng.normal(size=(10, 3)).astype(np.float32), rng.integers(0, 10, (6, 3)).astype(np.int32), rng.integers(0, 256, (10, 3), np.uint8))
+    mesh = Mesh(
+        rng.normal(size=(10, 3)).astype(np.float32), rng.integers(0, 10, (6, 3)).astype(np.int32), rng.integers(0, 256, (10, 3), np.uint8)
+    )
     meshes.write_ply(tmp_path / "a.ply", mesh, nx=np.zeros(10))
     back = meshes.read_ply(tmp_path / "a.ply")
-    assert np.array_equal(back.vertices, mesh.vertices) and np.array_equal(back.faces, mesh.faces) and np.array_equal(back.color, mesh.color)
+    assert (
+        np.array_equal(back.vertices, mesh.vertices) and np.array_equal(back.faces, mesh.faces) and np.array_equal(back.color, mesh.color)
+    )
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-8])
     with pytest.raises(InputError, match="ART-020"):
         meshes.read_ply(tmp_path / "a.ply")

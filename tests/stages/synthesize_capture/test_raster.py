@@ -26,9 +26,7 @@ def test_depth_agrees_with_embree():
 def test_depth_of_another_size_is_exact_on_a_plane():
     wall = np.array([[-9, -9, 2.0], [9, -9, 2.0], [0, 18, 5.0]])
     view = raster.see(wall, np.array([[0, 1, 2]], np.int32), INTRINSICS, 64, 80)
-    depth = raster.depth_through(
-        view.face, view.inverse_depth, view.inverse_corners, np.array([72.0, 66.0, 32.24, 23.325]), 48, 64
-    )
+    depth = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, np.array([72.0, 66.0, 32.24, 23.325]), 48, 64)
     x, y = (np.arange(64) + 0.5 - 32.24) / 72, (np.arange(48) + 0.5 - 23.325) / 66
     expected = (2.0 + 1.0) / (1 - y / 9)  # the plane z = 3 + y / 9
     np.testing.assert_allclose(depth, np.broadcast_to(expected[:, None], (48, 64)), rtol=1e-5)

@@ -61,9 +61,7 @@ def test_container_follows_the_format(scripts, made):
     assert len(about["poses"]) == len(about["frameTimestamps"]) == len(scripts[2].timestamp_s)
     assert about["frameTimestamps"][0] == 0
     x, y, z, w = about["poses"][3][:4]
-    up = cameras.opencv_from_opengl(
-        rigid.make(rigid.rotation_from_quaternion(np.array([w, x, y, z])), np.array(about["poses"][3][4:]))
-    )
+    up = cameras.opencv_from_opengl(rigid.make(rigid.rotation_from_quaternion(np.array([w, x, y, z])), np.array(about["poses"][3][4:])))
     np.testing.assert_allclose(up, scripts[2].odometry_from_camera[3], atol=1e-6)
 
 
@@ -75,9 +73,7 @@ def test_truth_is_upright_and_the_animal_fills_its_mask(scripts, made):
         assert (truth["world_from_camera"][:, 1, 1] < -0.3).all(), "the picture's y axis points down"
         frame = int(np.argmax(masks.mean((1, 2))))
         points = truth["agent_vertices_world"][frame].astype(float) + truth["world_from_agent"][frame, :3, 3]
-        pixel, depth = cameras.project(
-            rigid.apply(rigid.inverse(truth["world_from_camera"][frame]), points), truth["intrinsics"][frame]
-        )
+        pixel, depth = cameras.project(rigid.apply(rigid.inverse(truth["world_from_camera"][frame]), points), truth["intrinsics"][frame])
         height, width = masks.shape[1:]
         inside = (depth > 0) & (pixel >= 0).all(-1) & (pixel < [width, height]).all(-1)
         at = pixel[inside].astype(int)
