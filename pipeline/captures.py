@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline import config
 from pipeline.errors import InputError
+from pipeline.recordings.formats import format_of
 from pipeline.videos import ROLES, SPLITS, Role, Split, Video
 
 SIDECAR = ".toml"
@@ -37,10 +38,10 @@ class Remarks:
 
 
 def find(folder: Path) -> list[str]:
-    """Return the names of the recordings in `folder`: `.r3d` files and EXR + JPG export folders."""
+    """Return the names of the recordings in `folder`, of every format that is understood."""
     if not folder.is_dir():
         return []
-    return sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and _is_recording(path))
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and format_of(path))
 
 
 def not_understood(folder: Path) -> list[str]:
@@ -94,12 +95,6 @@ def builtin(session_count: int, heldout_of: int) -> dict[str, Remarks]:
     if not heldout_of:
         return plain
     return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}
-
-
-def _is_recording(path: Path) -> bool:
-    if path.is_dir():
-        return any((path / inner / "metadata.json").is_file() for inner in (".", "EXR_RGBD"))
-    return path.suffix.lower() == ".r3d"
 
 
 def _role(name: str, remark: Remarks, where: str) -> Role:

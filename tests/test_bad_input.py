@@ -52,12 +52,13 @@ def bomb(good: Path, bad: Path) -> None:
 
 
 def face_id(good: Path, bad: Path) -> None:
-    """No device poses at all, as the Face-ID camera leaves them."""
+    """Another camera type and no device poses, as the Face-ID camera leaves them."""
     with zipfile.ZipFile(good) as source, zipfile.ZipFile(bad, "w") as archive:
         for name in source.namelist():
             data = source.read(name)
             if name == "metadata":
                 told = json.loads(data)
+                told["cameraType"] = 0
                 told["poses"] = [[0, 0, 0, 1, 0, 0, 0]] * len(told["poses"])
                 data = json.dumps(told).encode()
             archive.writestr(name, data)

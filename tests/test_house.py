@@ -19,6 +19,7 @@ FLOORS = (
     {"errors"},
     {"space"},
     {"files", "models", "videos", "progress", "processes"},
+    {"recordings"},
     {"fit"},
     {"artifact", "config", "dag", "qa"},
     {"sources", "captures", "cli", "plan"},

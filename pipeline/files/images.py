@@ -60,15 +60,16 @@ def write_gray(path: Path, image: UInt8[np.ndarray, "height width"]) -> None:
     Path(path).write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
-def read_depth(path: Path, channel: str = "Z") -> Float[np.ndarray, "height width"]:
+def read_depth(path: Path, channel: str | None = "Z") -> Float[np.ndarray, "height width"]:
     """Read a depth EXR as float32 metres, 0 where the value is not finite, not positive or absurdly far.
 
-    Raises InputError CAP-022 for files that are not EXR, ask for too many pixels or lack the channel.
+    Without a ``channel`` the file must have exactly one.     Raises InputError CAP-022 for files that are not EXR, ask for too many pixels or lack the channel.
     """
     _check_exr_size(Path(path))
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            pixels = file.channels()[channel].pixels.astype(np.float32)
+            (name,) = [channel] if channel else file.channels()
+            pixels = file.channels()[name].pixels.astype(np.float32)
     except (RuntimeError, KeyError, ValueError) as error:
         raise InputError(
             "CAP-022", what=f"not a depth EXR with a channel {channel!r} ({error})", where=str(path), remedy="export the recording again"

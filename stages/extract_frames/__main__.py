@@ -1,13 +1,15 @@
 """Turn one phone recording into upright frames at 10 Hz with metric depth, intrinsics and odometry.
 
-Reads a Record3D `.r3d` file or a folder with its EXR + JPG export. Checks on the depth what the device poses mean.
+Reads Record3D (`.r3d`, EXR + JPG), Stray Scanner, Polycam raw data, NeRFCapture streams, TUM and 7-Scenes folders, and
+video with depth pictures. Checks on the depth what the device poses mean.
 """
 
 from dataclasses import dataclass
 
 from pipeline import cli, progress
-from stages.extract_frames import extraction, writing
-from stages.extract_frames.record3d import open_recording
+from pipeline.recordings import extraction
+from pipeline.recordings.formats import open_recording
+from stages.extract_frames import writing
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,11 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline import qa
 from pipeline.errors import InputError
 from pipeline.files import arrays, images
-from stages.extract_frames.extraction import DARK, Frame, Plan, quality_of
-from stages.extract_frames.record3d import Recording
+from pipeline.recordings.extraction import DARK, Frame, Plan, quality_of
+from pipeline.recordings.recording import Recording
 
+MOST_LOST = 0.5
+"""share of damaged pictures (0..1) beyond which a recording is refused"""
 SHEET_FRAMES = 12
 SHEET_HEIGHT_PX = 200
 
@@ -24,6 +26,8 @@ class Written:
 
     kept: Bool[np.ndarray, "frame"]
     """of the plan's frames, those with enough depth"""
+    lost: float
+    """share (0..1) of the plan's frames at which the file is damaged"""
     sharpness: Float[np.ndarray, "kept"]
     brightness: Float[np.ndarray, "kept"]
     depth_valid: Float[np.ndarray, "kept"]
@@ -31,13 +35,19 @@ class Written:
     depth_strip: UInt8[np.ndarray, "height width 3"]
 
 
-def write_frames(folder: Path, frames: Iterable[Frame], *, total: int, min_depth_valid: float, where: str) -> Written:
-    """Write the frames that have enough depth, numbered without gaps. Raises InputError CAP-007 when none has."""
+def write_frames(folder: Path, frames: Iterable[Frame | None], *, total: int, min_depth_valid: float, where: str) -> Written:
+    """Write the frames that have enough depth, numbered without gaps.
+
+    Raises InputError CAP-007 when none has, CAP-001 when the file is damaged in more than half of them.
+    """
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir()
-    kept, statistics, strip = np.zeros(total, bool), [], []
+    kept, lost, statistics, strip = np.zeros(total, bool), 0, [], []
     shown = set(np.linspace(0, total - 1, SHEET_FRAMES).astype(int).tolist())
     for number, frame in enumerate(frames):
+        if frame is None:
+            lost += 1
+            continue
         if number in shown:
             strip.append((_thumbnail(frame.color), _thumbnail(_colored_depth(frame.depth))))
         if frame.depth_valid < min_depth_valid:
@@ -48,11 +58,13 @@ def write_frames(folder: Path, frames: Iterable[Frame], *, total: int, min_depth
         images.write_gray(folder / "confidence" / f"{name}.png", frame.confidence)
         statistics.append((frame.sharpness, frame.brightness, frame.depth_valid))
         kept[number] = True
+    if lost > MOST_LOST * total:
+        raise damaged(where, f"{lost} of {total} pictures cannot be decoded")
     if not statistics:
         what = f"in no frame is {min_depth_valid:.0%} of the depth known"
         raise InputError("CAP-007", what=what, where=where, remedy="record things within 5 m, in light, with the LiDAR camera")
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))
-    return Written(kept, *np.array(statistics).T, color_strip, depth_strip)
+    return Written(kept, lost / total, *np.array(statistics).T, color_strip, depth_strip)
 
 
 def write_table(folder: Path, recording: Recording, plan: Plan, written: Written) -> None:
@@ -90,7 +102,8 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
         qa.Check("dark frames", 100 * float((written.brightness < DARK).mean()), "%", warn=20.0),
         qa.Check("blurred frames", 100 * float((written.sharpness < 0.4 * median_sharpness).mean()), "%", warn=25.0),
         qa.Check("known depth", 100 * float(written.depth_valid.mean()), "%", warn=50.0, better="higher"),
-        qa.Check("frames dropped for lack of depth", 100 * float((~written.kept).mean()), "%", warn=10.0),
+        qa.Check("frames dropped for lack of depth", 100 * (float((~written.kept).mean()) - written.lost), "%", warn=10.0),
+        qa.Check("damaged frames", 100 * written.lost, "%", warn=0.0),
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
         qa.Check("device poses usable", float(plan.odometry_from_camera is not None), "", warn=0.5, better="higher"),
         qa.Check(f"device poses against depth ({check.reason})", residual_mm, "mm", warn=1000 * check.tolerance_m),

@@ -10,8 +10,8 @@ import pytest
 
 from pipeline import cli
 from pipeline.files import images
+from pipeline.recordings import lzfse_blocks
 from stages.extract_frames import __main__ as front
-from stages.extract_frames import lzfse_blocks
 from tests.stages.extract_frames.made_recordings import walk, write_zip
 
 
@@ -48,7 +48,7 @@ CASES = {
         {"metadata": {"h": 60}},
     ],
     "CAP-005": [
-        {"metadata": {"poses": [[0, 0, 0, 1, 0, 0, 0]] * 12}},
+        {"metadata": {"cameraType": 0}},
         {"metadata": {"dw": 480, "dh": 640}},
     ],
     "CAP-006": [{"members": {f"rgbd/{i}.depth": None for i in range(12)}}],

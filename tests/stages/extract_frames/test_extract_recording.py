@@ -64,9 +64,10 @@ def test_old_recordings_get_times_from_the_rate_and_no_gravity(tmp_path, monkeyp
     np.testing.assert_allclose(np.diff(clip.timestamp_s), 0.1)
 
 
-def test_unusable_poses_are_left_out_and_said(tmp_path, monkeypatch):
+@pytest.mark.parametrize("pose", [[0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0, 0]], ids=["zero", "identity"])
+def test_unusable_poses_are_left_out_and_said(tmp_path, monkeypatch, pose):
     made = walk(24)
-    made.metadata["poses"] = np.zeros((24, 7)).tolist()
+    made.metadata["poses"] = [pose] * 24
     clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
     assert clip.odometry_from_camera is None
     assert '"status": "warn"' in (tmp_path / "out" / "qa.json").read_text()

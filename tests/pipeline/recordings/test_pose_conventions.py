@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.recordings import conventions, upright
 from pipeline.space import cameras, rigid
-from stages.extract_frames import conventions, upright
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 

@@ -3,6 +3,7 @@
 `understand` costs a second and reads a dozen depth pictures; `frames` then yields one `Frame` at a time.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,15 +11,19 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.errors import InputError
 from pipeline.files import images
-from pipeline.space import cameras
-from stages.extract_frames import conventions
-from stages.extract_frames.conventions import SelfCheck
-from stages.extract_frames.record3d import Recording
-from stages.extract_frames.selection import choose_frames
-from stages.extract_frames.upright import quarter_turns_from_gravity
+from pipeline.recordings import conventions
+from pipeline.recordings.conventions import SelfCheck
+from pipeline.recordings.recording import Picture, Recording, broken_metadata, no_depth
+from pipeline.recordings.selection import choose_frames
+from pipeline.recordings.upright import quarter_turns_from_gravity
+from pipeline.space import cameras, rigid
 
+JPEG = b"\xff\xd8"
+MAX_DEPTH_SIDE_PX = 640
+"""larger depth was enlarged by the app; it is sampled down again"""
+LEAST_TRACKED = 0.8
+"""share of frames with a device pose below which device poses are not used at all"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
 """mean brightness (0..1) below which a picture loses quality"""
@@ -62,58 +67,100 @@ class Frame:
 
 
 def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pairs: int, max_side_px: int) -> Plan:
-    """Choose frames, check the poses on the depth, find the upright turn and the size of the pictures."""
-    depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, recording.depth_size)
+    """Choose frames, check the poses on the depth, find the upright turn and the size of the pictures.
+
+    Raises InputError CAP-006 for a recording without depth.
+    """
+    if recording.depth_size is None or recording.intrinsics is None:
+        raise no_depth(recording.where, f"{recording.kind}; without metres neither room nor animal can be measured")
+    depth_size = reduced_size(recording.depth_size, MAX_DEPTH_SIDE_PX)
+    depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, depth_size)
+    used, pose, lost = _tracked(recording)
 
     def view(frame: int) -> conventions.DepthView:
-        depth = known_depth(recording.read_depth(int(recording.index[frame])), max_depth_m)
-        return conventions.DepthView(depth, depth_intrinsics[frame])
+        return conventions.DepthView(stored_depth(recording, int(recording.index[used[frame]]), max_depth_m), depth_intrinsics[used[frame]])
 
-    check = conventions.check_poses(recording.pose, recording.timestamp_s, view, pairs)
-    odometry_from_camera, gravity_known, turns = None, False, 0
+    check = conventions.check_poses(pose, recording.timestamp_s[used], view, pairs, recording.convention)
+    if lost and check.verdict == "unusable":
+        used, check = np.arange(len(recording.index)), dataclasses.replace(check, reason=f"{check.reason}; {lost}")
+    chosen = used[choose_frames(recording.timestamp_s[used], rate_hz)]
+    odometry_from_camera, turns = None, recording.quarter_turns
     if check.verdict != "unusable":
-        odometry_from_camera = conventions.odometry_from_pose(recording.pose, check.convention)
-        gravity_known = not conventions.starts_at_identity(recording.pose, check.convention)
-        turns = quarter_turns_from_gravity(odometry_from_camera) if gravity_known else 0
+        odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)[np.searchsorted(used, chosen)]
+        if recording.up is not None:
+            odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
+            turns = quarter_turns_from_gravity(odometry_from_camera)
         odometry_from_camera = cameras.turn_camera(odometry_from_camera, turns)
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
-    chosen = choose_frames(recording.timestamp_s, rate_hz)
     return Plan(
         chosen=chosen,
         timestamp_s=recording.timestamp_s[chosen],
         stored_size=size,
         intrinsics=cameras.turn_intrinsics(intrinsics, size, turns)[chosen],
-        depth_intrinsics=cameras.turn_intrinsics(depth_intrinsics, recording.depth_size, turns)[chosen],
-        odometry_from_camera=None if odometry_from_camera is None else odometry_from_camera[chosen],
-        gravity_known=gravity_known,
+        depth_intrinsics=cameras.turn_intrinsics(depth_intrinsics, depth_size, turns)[chosen],
+        odometry_from_camera=odometry_from_camera,
+        gravity_known=odometry_from_camera is not None and recording.up is not None,
         quarter_turns=turns,
         self_check=check,
     )
 
 
-def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality: int) -> Iterator[Frame]:
-    """Yield the plan's frames in order, upright. Raises InputError for pictures that cannot be decoded."""
+def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.ndarray, "used 7"] | None, str]:
+    """Return the frames to use, their poses, and what was lost.
+
+    Where the tracking was lost for a few frames, the others are used; where it was lost for many, all are, without poses.
+    """
+    everything = np.arange(len(recording.index))
+    if recording.pose is None:
+        return everything, None, ""
+    known = np.isfinite(recording.pose).all(1)
+    if known.all():
+        return everything, recording.pose, ""
+    lost = f"{100 * (1 - known.mean()):.0f} % of the frames have no device pose"
+    if known.mean() < LEAST_TRACKED:
+        return everything, recording.pose, lost
+    return everything[known], recording.pose[known], lost
+
+
+def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
+    """Return the smallest turn of the poses' world that brings ``up`` to +y."""
+    axis, angle = np.cross(up, (0.0, 1.0, 0.0)), np.arccos(np.clip(up[1] / np.linalg.norm(up), -1, 1))
+    axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return rigid.make(rigid.rotation_from_vector(axis * angle), np.zeros(3))
+
+
+def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality: int) -> Iterator[Frame | None]:
+    """Yield the plan's frames in order, upright; None where the file is damaged. Raises InputError for broken pictures."""
     for number in recording.index[plan.chosen]:
-        jpeg = recording.read_color(int(number))
-        color = _decoded(jpeg, recording.color_size, f"{recording.where}, frame {number}")
-        depth = known_depth(recording.read_depth(int(number)), max_depth_m)
+        stored = recording.read_color(int(number))
+        if stored is None:
+            yield None
+            continue
+        color = _decoded(stored, recording.color_size, f"{recording.where}, frame {number}")
+        depth = stored_depth(recording, int(number), max_depth_m)
         confidence = _confidence(recording, int(number), depth)
         if color.shape[:2] != plan.stored_size:
             color = cv2.resize(color, plan.stored_size[::-1], interpolation=cv2.INTER_AREA)
         if plan.quarter_turns:
             color, depth, confidence = (cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence))
-        if plan.quarter_turns or plan.stored_size != recording.color_size:
-            jpeg = images.encode_jpeg(color, jpeg_quality)
+        untouched = isinstance(stored, bytes) and stored[:2] == JPEG and not plan.quarter_turns and plan.stored_size == recording.color_size
+        jpeg = stored if untouched else images.encode_jpeg(color, jpeg_quality)
         sharpness, brightness = picture_statistics(color)
         yield Frame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
 
 
-def _decoded(jpeg: bytes, size: tuple[int, int], where: str) -> UInt8[np.ndarray, "height width 3"]:
-    color = images.decode_color(jpeg, where)
+def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float[np.ndarray, "height width"]:
+    """Read one frame's known depth as stored (not turned), metres; enlarged depth is brought back to a sensor's size."""
+    depth = known_depth(recording.read_depth(number), max_depth_m)
+    size = reduced_size(depth.shape, MAX_DEPTH_SIDE_PX)
+    return depth if depth.shape == size else cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+
+
+def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.ndarray, "height width 3"]:
+    color = images.decode_color(stored, where) if isinstance(stored, bytes) else stored
     if color.shape[:2] != size:
-        what = f"the picture is {color.shape[1]} x {color.shape[0]}, the metadata say {size[1]} x {size[0]}"
-        raise InputError("CAP-004", what=what, where=where, remedy="export the recording again")
+        raise broken_metadata(where, f"the picture is {color.shape[1]} x {color.shape[0]}, they say {size[1]} x {size[0]}")
     return color
 
 
@@ -121,7 +168,10 @@ def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[n
     """Return the phone's confidence; an export without it trusts all depth that there is."""
     if recording.read_confidence is None:
         return np.where(depth > 0, 2, 0).astype(np.uint8)
-    return np.minimum(recording.read_confidence(number), 2)
+    confidence = np.minimum(recording.read_confidence(number), 2)
+    return (
+        confidence if confidence.shape == depth.shape else cv2.resize(confidence, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    )
 
 
 def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
@@ -161,4 +211,5 @@ def sentence(recording: Recording, plan: Plan) -> str:
     seen = f"{seconds:.1f} s, {len(recording.index)} frames {width} x {height}, {len(plan.chosen)} kept, {turned}"
     check = plan.self_check
     measured = f" ({1000 * check.residual_m:.1f} mm)" if np.isfinite(check.residual_m) else ""
-    return f"{recording.where}: {seen}; {check.reason}{measured}"
+    told = "".join(f"; {remark}" for remark in recording.remarks)
+    return f"{recording.where}: {recording.kind}, {seen}; {check.reason}{measured}{told}"

@@ -1,7 +1,6 @@
 """Record3D recordings, both ways the app exports them: one ``.r3d`` archive, or a folder of EXR and JPEG files.
 
-`open_recording` reads the metadata and pairs the files; `Recording` then hands out one picture at a time. Poses and
-pictures are as stored: turning and checking them is the next files' work.
+Files are paired with the metadata's rows by number, so that missing ones shift nothing.
 """
 
 import json
@@ -13,42 +12,31 @@ from typing import Any
 
 import lzfse
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 
 from pipeline.errors import InputError
 from pipeline.files import images
-from stages.extract_frames import lzfse_blocks
-from stages.extract_frames.containers import Container, FolderContainer, ZipContainer, damaged
+from pipeline.recordings import lzfse_blocks
+from pipeline.recordings.containers import Container, FolderContainer, ZipContainer
+from pipeline.recordings.conventions import OPENGL
+from pipeline.recordings.recording import (
+    MAX_PICTURE_BYTES,
+    MAX_TEXT_BYTES,
+    Y_UP,
+    Recording,
+    broken_metadata,
+    damaged,
+    intrinsics_from_coefficients,
+    no_depth,
+    no_frames,
+    wrong_depth,
+)  # fmt: skip
 
-MAX_METADATA_BYTES = 64 << 20
-MAX_PICTURE_BYTES = 64 << 20
 DEPTH_SIZES = {49_152: (256, 192), 307_200: (640, 480), 691_200: (960, 720)}
 """floats per picture -> (height, width) of a portrait recording, where the metadata do not say"""
 FACE_ID_FLOATS = (307_200, 691_200)
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A recording whose frames are known and whose pictures are read on demand, all as stored (not yet upright)."""
-
-    where: str
-    index: Int[np.ndarray, "frame"]
-    """the app's number of each frame that has both colour and depth"""
-    timestamp_s: Float[np.ndarray, "frame"]
-    intrinsics: Float[np.ndarray, "frame 3 3"]
-    """colour pixels"""
-    pose: Float[np.ndarray, "frame 7"] | None
-    """four quaternion and three translation (metres) numbers as the file has them; None where it has none"""
-    color_size: tuple[int, int]
-    """(height, width) in pixels"""
-    depth_size: tuple[int, int]
-    """(height, width) in pixels"""
-    read_color: Callable[[int], bytes]
-    """encoded picture of the app's frame number"""
-    read_depth: Callable[[int], Float[np.ndarray, "height width"]]
-    """metres as stored, of the app's frame number"""
-    read_confidence: Callable[[int], UInt8[np.ndarray, "height width"]] | None
-    """0 low, 1 medium, 2 high; None where the export has none"""
+LIDAR = 1
+"""the app's number of the camera at the back"""
 
 
 @dataclass(frozen=True)
@@ -68,54 +56,33 @@ _FOLDER = _Layout("metadata.json", "rgb/%d.jpg", "depth/%d.exr", "confidence/%d.
 def open_recording(path: Path) -> Recording:
     """Open a ``.r3d`` file, or a folder that is or holds Record3D's ``EXR_RGBD``.
 
-    Raises InputError CAP-001..006 for what cannot be a usable recording.
+    Raises InputError CAP-001..008 for what cannot be a usable recording.
     """
-    path = Path(path)
     if path.is_dir():
         inner = path / "EXR_RGBD"
         return _open(FolderContainer(inner if inner.is_dir() else path), _FOLDER)
-    if not path.is_file():
-        raise InputError(
-            "CAP-003",
-            what="there is no such recording",
-            where=str(path),
-            remedy="give a .r3d file or a folder with Record3D's EXR + JPG export",
-        )
     return _open(ZipContainer(path), _ARCHIVE)
 
 
 def _open(container: Container, layout: _Layout) -> Recording:
     if layout.metadata not in container.names:
         remedy = "export from Record3D as 'Shareable/Internal format (.r3d)' or 'EXR + JPG sequence'"
-        raise InputError(
-            "CAP-003",
-            what=f"not a Record3D recording: it has no {layout.metadata!r}",
-            where=container.where,
-            remedy=remedy,
-        )
+        raise InputError("CAP-003", f"not a Record3D recording: it has no {layout.metadata!r}", container.where, remedy)
     metadata = _Metadata(container, layout.metadata)
     stored = _numbers(container.names, layout.depth)
     if not stored:
-        remedy = "record with Record3D's LiDAR camera; a plain video has no depth"
-        raise InputError("CAP-006", what="no depth in the recording", where=container.where, remedy=remedy)
+        raise no_depth(container.where, "Record3D's archive holds none")
     index = np.array(sorted(stored & _numbers(container.names, layout.color)), int)
-    timestamp_s, intrinsics, pose = (
-        metadata.timestamp_s(max(stored) + 1),
-        metadata.intrinsics(max(stored) + 1),
-        metadata.pose(),
-    )
+    count = max(stored) + 1
+    timestamp_s, intrinsics, pose = metadata.timestamp_s(count), metadata.intrinsics(count), metadata.pose()
     index = index[index < min(len(timestamp_s), len(intrinsics), len(timestamp_s) if pose is None else len(pose))]
     if len(index) == 0:
-        raise InputError(
-            "CAP-007",
-            what="no frame has colour, depth and metadata",
-            where=container.where,
-            remedy="export it from the phone again",
-        )
+        raise no_frames(container.where, "none has colour, depth and metadata")
     depth_size = _depth_size(container, layout, metadata, int(index[0]))
-    _refuse_face_id(depth_size, pose, container.where)
+    _refuse_face_id(depth_size, metadata.camera_type(), container.where)
     return Recording(
         where=container.where,
+        kind="Record3D .r3d" if layout is _ARCHIVE else "Record3D EXR + JPG",
         index=index,
         timestamp_s=timestamp_s[index],
         intrinsics=intrinsics[index],
@@ -125,6 +92,8 @@ def _open(container: Container, layout: _Layout) -> Recording:
         read_color=lambda i: container.read(layout.color % i, MAX_PICTURE_BYTES),
         read_depth=lambda i: _read_depth(container, layout.depth % i, depth_size),
         read_confidence=_confidence_reader(container, layout, index, depth_size),
+        convention=OPENGL,
+        up=None if pose is None or np.allclose(pose[0], (0, 0, 0, 1, 0, 0, 0), atol=1e-6) else Y_UP,
     )
 
 
@@ -134,7 +103,7 @@ class _Metadata:
     def __init__(self, container: Container, name: str) -> None:
         self._where = f"{container.where}:{name}"
         try:
-            self._table = json.loads(container.read(name, MAX_METADATA_BYTES))
+            self._table = json.loads(container.read(name, MAX_TEXT_BYTES))
         except (ValueError, RecursionError) as error:
             raise self._broken(f"not JSON ({error})") from error
         if not isinstance(self._table, dict):
@@ -157,19 +126,15 @@ class _Metadata:
     def intrinsics(self, frames: int) -> Float[np.ndarray, "frame 3 3"]:
         """Return K in colour pixels: per frame where the app wrote it, else the first frame's (stored by columns)."""
         if "perFrameIntrinsicCoeffs" in self._table:
-            focal_x, focal_y, center_x, center_y = self._numbers("perFrameIntrinsicCoeffs", (None, 4)).T
-            intrinsics = np.tile(np.eye(3), (len(focal_x), 1, 1))
-            intrinsics[:, 0, 0], intrinsics[:, 1, 1], intrinsics[:, 0, 2], intrinsics[:, 1, 2] = (
-                focal_x,
-                focal_y,
-                center_x,
-                center_y,
-            )
+            coefficients = self._numbers("perFrameIntrinsicCoeffs", (None, 4))
         else:
-            intrinsics = np.tile(self._numbers("K", (9,)).reshape(3, 3).T, (frames, 1, 1))
-        if np.any(intrinsics[:, [0, 1], [0, 1]] <= 0):
-            raise self._broken("the focal length must be positive")
-        return intrinsics
+            first = self._numbers("K", (9,)).reshape(3, 3).T
+            coefficients = np.tile(first[[0, 1, 0, 1], [0, 1, 2, 2]], (frames, 1))
+        return intrinsics_from_coefficients(coefficients, self._where)
+
+    def camera_type(self) -> int | None:
+        """Return the app's number of the camera (1: LiDAR), where it wrote one."""
+        return int(self._numbers("cameraType", ())) if "cameraType" in self._table else None
 
     def pose(self) -> Float[np.ndarray, "frame 7"] | None:
         """Return the device poses as stored; values that are no numbers come back as NaN."""
@@ -199,12 +164,7 @@ class _Metadata:
         return array
 
     def _broken(self, why: str) -> InputError:
-        return InputError(
-            "CAP-004",
-            what=f"the recording's metadata cannot be used: {why}",
-            where=self._where,
-            remedy="export it from the phone again",
-        )
+        return broken_metadata(self._where, why)
 
 
 def _array_from_json(value: Any) -> np.ndarray | None:
@@ -230,17 +190,16 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
         return images.read_depth(container.path(layout.depth % first), channel="R").shape
     floats = len(_decompress(container, layout.depth % first, 4 * max(DEPTH_SIZES))) // 4
     if floats not in DEPTH_SIZES:
-        raise _wrong_depth(f"{container.where}:{layout.depth % first}", f"{floats} values fit no known depth camera")
+        raise wrong_depth(f"{container.where}:{layout.depth % first}", f"{floats} values fit no known depth camera")
     portrait = DEPTH_SIZES[floats]
     return portrait if metadata.color_size[0] >= metadata.color_size[1] else portrait[::-1]
 
 
-def _refuse_face_id(depth_size: tuple[int, int], pose: np.ndarray | None, where: str) -> None:
-    """Refuse the front camera: its recordings have depth of another size and no pose at all."""
-    no_pose = pose is not None and len(pose) > 1 and np.array_equal(pose, np.tile([0, 0, 0, 1, 0, 0, 0], (len(pose), 1)))
-    if no_pose or math.prod(depth_size) in FACE_ID_FLOATS:
+def _refuse_face_id(depth_size: tuple[int, int], camera_type: int | None, where: str) -> None:
+    """Refuse the front camera: depth of another size, another camera type, and no device poses at all."""
+    if camera_type not in (None, LIDAR) or math.prod(depth_size) in FACE_ID_FLOATS:
         remedy = "record with the LiDAR camera at the back of the phone"
-        raise InputError("CAP-005", what="recorded with the Face-ID camera: it has no device poses", where=where, remedy=remedy)
+        raise InputError("CAP-005", "recorded with the Face-ID camera: it has no device poses", where, remedy)
 
 
 def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
@@ -249,7 +208,7 @@ def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float
     else:
         depth = np.frombuffer(_decompress_exactly(container, name, 4 * math.prod(size)), "<f4").reshape(size)
     if depth.shape != size:
-        raise _wrong_depth(f"{container.where}:{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}")
+        raise wrong_depth(f"{container.where}:{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}")
     return depth
 
 
@@ -265,7 +224,7 @@ def _confidence_reader(
 def _decompress_exactly(container: Container, name: str, expected: int) -> bytes:
     data = _decompress(container, name, expected)
     if len(data) != expected:
-        raise _wrong_depth(f"{container.where}:{name}", f"{len(data)} bytes instead of {expected}")
+        raise wrong_depth(f"{container.where}:{name}", f"{len(data)} bytes instead of {expected}")
     return data
 
 
@@ -275,16 +234,7 @@ def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
     packed = container.read(name, max_bytes + max_bytes // 8 + 4096)
     try:
         if lzfse_blocks.unpacked_bytes(packed) > max_bytes:
-            raise _wrong_depth(where, f"more than {max_bytes} bytes")
+            raise wrong_depth(where, f"more than {max_bytes} bytes")
         return lzfse.decompress(packed)
     except (lzfse_blocks.BrokenBlockError, lzfse.error) as error:
         raise damaged(where, f"LZFSE: {error}") from error
-
-
-def _wrong_depth(where: str, why: str) -> InputError:
-    return InputError(
-        "CAP-008",
-        what=f"a depth picture has the wrong size: {why}",
-        where=where,
-        remedy="export it from the phone again",
-    )

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Protocol
 
 from pipeline.errors import InputError
+from pipeline.recordings.recording import damaged
 
 MAX_MEMBERS = 200_000
 MAX_TOTAL_BYTES = 64 << 30
@@ -68,16 +69,6 @@ class ZipContainer:
                 return _within(member.read(max_bytes + 1), max_bytes, where)
         except (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError, OSError) as error:
             raise damaged(where, str(error)) from error
-
-
-def damaged(where: str, why: str) -> InputError:
-    """Make the error for a container that cannot be read to its end."""
-    return InputError(
-        "CAP-001",
-        what=f"the recording is damaged or was not copied completely ({why})",
-        where=where,
-        remedy="export it from the phone again",
-    )
 
 
 def _within(data: bytes, max_bytes: int, where: str) -> bytes:

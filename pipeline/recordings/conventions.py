@@ -21,8 +21,8 @@ MIN_OVERLAP = 0.25
 MIN_TURN_RAD = np.radians(3.0)
 MIN_SHIFT_M = 0.05
 GAP_S = (0.33, 1.5)
-STRIDE_PX = 3
-"""every third pixel of the first picture is enough"""
+STRIDE_PX, POINTS_A_SIDE = 3, 80
+"""every third pixel of the first picture is enough, and so are 80 along its longer side"""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,10 @@ class Convention:
     quaternion: Literal["xyzw", "wxyz"] = "xyzw"
 
 
-RECORD3D = Convention()
+OPENGL = Convention()
+"""Record3D, Polycam, NeRFCapture"""
+OPENCV = Convention(axes="opencv")
+"""Stray Scanner, TUM, 7-Scenes"""
 CONVENTIONS = tuple(
     Convention(*choice) for choice in product(("camera_to_world", "world_to_camera"), ("opengl", "opencv"), range(4), ("xyzw", "wxyz"))
 )
@@ -77,29 +80,24 @@ def odometry_from_pose(pose: Float[np.ndarray, "frame 7"], convention: Conventio
     return cameras.turn_camera(odometry_from_camera, -convention.quarter_turns)
 
 
-def starts_at_identity(pose: Float[np.ndarray, "frame 7"], convention: Convention) -> bool:
-    """Tell whether the world is the first camera (old apps), so that its axes say nothing about gravity."""
-    identity = (0, 0, 0, 1, 0, 0, 0) if convention.quaternion == "xyzw" else (1, 0, 0, 0, 0, 0, 0)
-    return bool(np.allclose(pose[0], identity, atol=1e-6))
-
-
 def check_poses(
     pose: Float[np.ndarray, "frame 7"] | None,
     timestamp_s: Float[np.ndarray, "frame"],
     depth_view: Callable[[int], DepthView],
     pairs: int = 6,
+    documented: Convention = OPENGL,
 ) -> SelfCheck:
     """Decide which convention the poses follow; ``depth_view(i)`` gives the depth of frame i on demand."""
     broken = _fault_of(pose)
     if broken:
-        return _unusable(broken)
+        return SelfCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
     tried = {convention: odometry_from_pose(pose, convention) for convention in CONVENTIONS}
-    chosen = _moving_pairs(tried[RECORD3D], timestamp_s, pairs)
+    chosen = _moving_pairs(tried[documented], timestamp_s, pairs)
     if len(chosen) == 0:
-        return SelfCheck("untested", RECORD3D, 0, np.nan, np.nan, TOLERANCE_M, "the phone moved too little to test its poses")
+        return SelfCheck("untested", documented, 0, np.nan, np.nan, TOLERANCE_M, "the phone moved too little to test its poses")
     views = {frame: depth_view(frame) for frame in sorted(set(chosen.ravel().tolist()))}
     scores = {convention: _score(odometry_from_camera, chosen, views) for convention, odometry_from_camera in tried.items()}
-    return _judge(scores, len(chosen))
+    return _judge(scores, documented, len(chosen))
 
 
 @dataclass(frozen=True)
@@ -127,10 +125,6 @@ def _fault_of(pose: Float[np.ndarray, "frame 7"] | None) -> str | None:
     return None
 
 
-def _unusable(reason: str) -> SelfCheck:
-    return SelfCheck("unusable", RECORD3D, 0, np.nan, np.nan, TOLERANCE_M, reason)
-
-
 def _moving_pairs(odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int) -> np.ndarray:
     """Pick up to ``pairs`` (first, second) frames with time and motion between, spread over the recording."""
     second = np.searchsorted(timestamp_s, timestamp_s + GAP_S[0])
@@ -140,7 +134,8 @@ def _moving_pairs(odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestam
     moved = (rigid.rotation_angle(np.eye(3), relative[:, :3, :3]) > MIN_TURN_RAD) | (
         np.linalg.norm(relative[:, :3, 3], axis=1) > MIN_SHIFT_M
     )
-    usable = np.stack([first, second], axis=1)[moved & (timestamp_s[second] - timestamp_s[first] <= GAP_S[1])]
+    longest_s = max(GAP_S[1], 2.5 * float(np.median(np.diff(timestamp_s)))) if len(timestamp_s) > 1 else GAP_S[1]
+    usable = np.stack([first, second], axis=1)[moved & (timestamp_s[second] - timestamp_s[first] <= longest_s)]
     return usable[np.unique(np.linspace(0, len(usable) - 1, pairs).round().astype(int))] if len(usable) else usable
 
 
@@ -162,7 +157,8 @@ def _score(odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarr
 
 def _compare(first: DepthView, second: DepthView, second_from_first: Float[np.ndarray, "4 4"]) -> tuple[float, float, float]:
     """Return (median depth difference, share of points that can be compared, tolerance), metres."""
-    every = np.s_[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX]
+    stride = max(STRIDE_PX, max(first.depth.shape) // POINTS_A_SIDE)
+    every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     points_first = cameras.back_project(first.depth, first.intrinsics)[every][first.depth[every] > 0]
     pixel, depth = cameras.project(rigid.apply(second_from_first, points_first), second.intrinsics)
     height, width = second.depth.shape
@@ -180,17 +176,17 @@ def _compare(first: DepthView, second: DepthView, second_from_first: Float[np.nd
     )
 
 
-def _judge(scores: dict[Convention, _Score], pairs: int) -> SelfCheck:
+def _judge(scores: dict[Convention, _Score], documented: Convention, pairs: int) -> SelfCheck:
     """Keep the documented convention unless it is refuted and another one is clearly right."""
-    documented = scores[RECORD3D]
+    told = scores[documented]
     best = min(scores, key=lambda convention: scores[convention].cost)
-    if documented.accepted:
-        return _checked("documented", RECORD3D, documented, pairs, "the documented convention explains the depth")
-    if scores[best].accepted and scores[best].cost < 0.5 * documented.cost:
+    if told.accepted:
+        return _checked("documented", documented, told, pairs, "the documented convention explains the depth")
+    if scores[best].accepted and scores[best].cost < 0.5 * told.cost:
         return _checked("other", best, scores[best], pairs, f"the documented convention is refuted by the depth; {best} explains it")
-    if documented.residual_m < UNUSABLE_FACTOR * TOLERANCE_M and documented.overlap > MIN_OVERLAP:
-        return _checked("documented", RECORD3D, documented, pairs, "device poses explain the depth only roughly")
-    return _checked("unusable", RECORD3D, documented, pairs, "device poses do not explain the depth under any convention")
+    if told.residual_m < UNUSABLE_FACTOR * TOLERANCE_M and told.overlap > MIN_OVERLAP:
+        return _checked("documented", documented, told, pairs, "device poses explain the depth only roughly: they drift")
+    return _checked("unusable", documented, told, pairs, "device poses do not explain the depth under any convention")
 
 
 def _checked(verdict, convention: Convention, score: _Score, pairs: int, reason: str) -> SelfCheck:

@@ -1,0 +1,110 @@
+"""Video files by frame number: any codec that PyAV reads, damaged places left out, nothing held in memory.
+
+Frames are told apart by their presentation time, read from the packets without decoding: a frame that a damaged place
+swallows shifts no other.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.recordings.recording import damaged, no_frames
+
+SKIP_FRAMES = 90
+"""further ahead than this, decoding begins anew at the nearest key frame"""
+
+
+class Movie:
+    """A video whose frames are read by number, cheapest in order."""
+
+    def __init__(self, path: Path) -> None:
+        self.where = str(path)
+        self._path = path
+        with self._opened() as container:
+            stream = container.streams.video[0]
+            times = sorted(set(_packet_times(container, stream)))
+            if not times:
+                raise no_frames(self.where, "the video is empty")
+            self._pts = np.array(times)
+            self.timestamp_s = (self._pts - self._pts[0]) * float(stream.time_base)
+        self._decoder: Iterator[av.VideoFrame] | None = None
+        self._position = 0
+        first = self._first()
+        self.size = (first.height, first.width)
+        self.quarter_turns = round(-first.rotation / 90) % 4
+
+    def __len__(self) -> int:
+        return len(self._pts)
+
+    def read(self, number: int) -> UInt8[np.ndarray, "height width 3"] | None:
+        """Return one frame as RGB, as stored (not turned); None where the file is damaged there."""
+        if self._decoder is None or number < self._position or number > self._position + SKIP_FRAMES:
+            self._decoder = self._decoded_from(number)
+        wanted = int(self._pts[number])
+        self._position = number + 1
+        for frame in self._decoder:
+            if frame.pts is None or frame.pts < wanted:
+                continue
+            if frame.pts > wanted:  # the wanted one is lost; this one may be asked for next
+                self._decoder = _again(frame, self._decoder)
+                return None
+            return None if frame.is_corrupt else frame.to_ndarray(format="rgb24")
+        self._decoder = iter(())
+        return None
+
+    def _first(self) -> av.VideoFrame:
+        frame = next((frame for frame in self._decoded_from(0)), None)
+        if frame is None:
+            raise damaged(self.where, "no frame of the video can be decoded")
+        return frame
+
+    def _decoded_from(self, number: int) -> Iterator[av.VideoFrame]:
+        """Yield decoded frames from the key frame at or before a number on, stepping over what is damaged."""
+        with self._opened() as container:
+            stream = container.streams.video[0]
+            if number:
+                container.seek(int(self._pts[number]), stream=stream, backward=True)
+            packets = container.demux(stream)
+            while True:
+                try:
+                    packet = next(packets, None)
+                    if packet is None:
+                        return
+                    yield from packet.decode()
+                except av.error.EOFError:
+                    return
+                except av.error.FFmpegError:
+                    continue
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[av.container.InputContainer]:
+        try:
+            container = av.open(str(self._path))
+        except (av.error.FFmpegError, OSError) as error:
+            raise damaged(self.where, f"not a readable video: {error}") from error
+        with container:
+            if not container.streams.video:
+                raise no_frames(self.where, "the file holds no pictures")
+            yield container
+
+
+def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+        except av.error.FFmpegError:
+            return
+        if packet is None:
+            return
+        if packet.pts is not None and packet.size:
+            yield packet.pts
+
+
+def _again(frame: av.VideoFrame, rest: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
+    yield frame
+    yield from rest

@@ -1,0 +1,113 @@
+"""NeRFCapture: the folder that its streaming scripts write (metric depth). The zip the phone saves itself is refused.
+
+Stream: `transforms.json` with `integer_depth_scale` (metres per unit), one colour and one 16-bit depth picture per frame.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.files import images
+from pipeline.recordings.containers import Container, FolderContainer, ZipContainer
+from pipeline.recordings.conventions import OPENGL
+from pipeline.recordings.recording import (
+    MAX_PICTURE_BYTES,
+    MAX_TEXT_BYTES,
+    Y_UP,
+    Recording,
+    broken_metadata,
+    intrinsics_from_coefficients,
+    meters_from_png,
+    no_frames,
+    pose_from_matrix,
+)  # fmt: skip
+
+COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
+ASSUMED_HZ = 10.0
+"""of streams whose frames carry no times"""
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a streamed NeRFCapture folder. Raises CAP-010 for the phone's own zip, whose depth is not metric."""
+    container: Container = FolderContainer(path) if path.is_dir() else ZipContainer(path)
+    table = _table(container)
+    if not path.is_dir() or "depth_integer_scale" in table:
+        what = (
+            "NeRFCapture's saved zip holds no metric depth" if "depth_integer_scale" in table else "a zip of transforms has no metric depth"
+        )
+        remedy = "stream from the app with its nerfcapture_dataset.py and give the folder that it writes"
+        raise InputError("CAP-010", what, container.where, remedy)
+    scale = table.get("integer_depth_scale")
+    if not isinstance(scale, int | float) or not 0 < scale < 1:
+        raise broken_metadata(container.where, "'integer_depth_scale' (metres per unit of depth) is missing")
+    frames = [frame for frame in _frames(table, container) if {frame["file_path"], frame["depth_path"]} <= container.names]
+    if not frames:
+        raise no_frames(container.where, "no frame has colour and depth")
+    timestamp_s, remarks = _times(frames, container.where)
+    depth_size = meters_from_png(container.read(frames[0]["depth_path"], MAX_PICTURE_BYTES), None, container.where).shape
+    color_size = images.decode_color(container.read(frames[0]["file_path"], MAX_PICTURE_BYTES), container.where).shape[:2]
+
+    def depth(number: int) -> np.ndarray:
+        name = frames[number]["depth_path"]
+        return meters_from_png(container.read(name, MAX_PICTURE_BYTES), depth_size, f"{container.where}/{name}", 1 / scale)
+
+    return Recording(
+        where=container.where,
+        kind="NeRFCapture stream",
+        index=np.arange(len(frames)),
+        timestamp_s=timestamp_s,
+        intrinsics=intrinsics_from_coefficients(np.array([frame["coefficients"] for frame in frames]), container.where),
+        pose=pose_from_matrix(np.stack([frame["matrix"] for frame in frames])),
+        color_size=color_size,
+        depth_size=depth_size,
+        read_color=lambda i: container.read(frames[i]["file_path"], MAX_PICTURE_BYTES),
+        read_depth=depth,
+        convention=OPENGL,
+        up=Y_UP,
+        remarks=remarks,
+    )
+
+
+def _table(container: Container) -> dict[str, Any]:
+    if "transforms.json" not in container.names:
+        raise InputError("CAP-003", "not a NeRFCapture recording: it has no transforms.json", container.where, "give the streamed folder")
+    try:
+        table = json.loads(container.read("transforms.json", MAX_TEXT_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise broken_metadata(container.where, f"transforms.json is no JSON ({error})") from error
+    if not isinstance(table, dict):
+        raise broken_metadata(container.where, "transforms.json holds no table")
+    return table
+
+
+def _frames(table: dict[str, Any], container: Container) -> list[dict[str, Any]]:
+    """Return the frames in the order of their numbers: the app appends them from parallel tasks."""
+    found = []
+    try:
+        for frame in table["frames"]:
+            matrix = np.array(frame["transform_matrix"], float).reshape(4, 4)
+            coefficients = [float(frame.get(key, table.get(key))) for key in COEFFICIENTS]
+            names = [str(frame[key]).removeprefix("./") for key in ("file_path", "depth_path")]
+            told = frame.get("timestamp")
+            entry = dict(file_path=names[0], depth_path=names[1], matrix=matrix, coefficients=coefficients)
+            found.append(entry | dict(time=None if told is None else float(told), order=_order(names[0])))
+    except (KeyError, TypeError, ValueError) as error:
+        raise broken_metadata(container.where, f"a frame of transforms.json cannot be read ({error!r})") from error
+    return sorted(found, key=lambda entry: entry["order"])
+
+
+def _order(name: str) -> tuple[int, str]:
+    stem = Path(name).stem
+    return (int(stem) if stem.isdigit() else 0, stem)
+
+
+def _times(frames: list[dict[str, Any]], where: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    if any(frame["time"] is None for frame in frames):
+        return np.arange(len(frames)) / ASSUMED_HZ, (f"the frames carry no times: {ASSUMED_HZ:g} per second are assumed",)
+    timestamp_s = np.array([frame["time"] for frame in frames])
+    if np.any(np.diff(timestamp_s) <= 0):
+        raise broken_metadata(where, "the frames' times must increase with their numbers")
+    return timestamp_s - timestamp_s[0], ()

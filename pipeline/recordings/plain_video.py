@@ -1,0 +1,105 @@
+"""A plain video: alone, or in a folder with `depth/` (one picture per video frame, by its number) and `intrinsics.txt`.
+
+Depth: 16-bit PNG in millimetres or EXR in metres, aligned with the picture as stored. `poses.txt`, where there is one:
+frame number, tx ty tz qx qy qz qw of the camera (OpenCV axes) in its world. A video alone has no depth and no scale.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files import images
+from pipeline.recordings import text_files
+from pipeline.recordings.containers import FolderContainer
+from pipeline.recordings.conventions import OPENCV
+from pipeline.recordings.formats import MOVIES
+from pipeline.recordings.movies import Movie
+from pipeline.recordings.recording import (
+    MAX_PICTURE_BYTES,
+    MAX_TEXT_BYTES,
+    Recording,
+    broken_metadata,
+    intrinsics_from_coefficients,
+    meters_from_png,
+    no_depth,
+    no_frames,
+    wrong_depth,
+)  # fmt: skip
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a video file, or a folder with one video and its depth. Raises InputError CAP-001..011."""
+    if path.is_file():
+        return _alone(path)
+    container = FolderContainer(path)
+    movies = sorted(name for name in container.names if Path(name).suffix.lower() in MOVIES and "/" not in name)
+    if len(movies) != 1:
+        raise broken_metadata(container.where, f"{len(movies)} videos in the folder instead of one")
+    movie = Movie(path / movies[0])
+    depth = {int(Path(name).stem): name for name in container.names if name.startswith("depth/") and Path(name).stem.isdigit()}
+    depth = {number: name for number, name in depth.items() if Path(name).suffix.lower() in (".png", ".exr")}
+    if not depth:
+        raise no_depth(container.where, "depth/ holds no numbered PNG or EXR pictures")
+    index = np.array(sorted(number for number in depth if number < len(movie)), int)
+    if len(index) == 0:
+        raise no_frames(container.where, "no depth picture carries the number of a video frame, counted from 0")
+    if max(depth) + 1 < 0.5 * len(movie):
+        why = f"{len(movie)} video frames but depth up to number {max(depth)}: name depth pictures by the frame they belong to"
+        raise broken_metadata(container.where, why)
+    size = _depth(container, depth[int(index[0])], None).shape
+    coefficients, remarks = text_files.coefficients(container, default=None)
+    return Recording(
+        where=container.where,
+        kind="video and depth",
+        index=index,
+        timestamp_s=movie.timestamp_s[index] - movie.timestamp_s[index[0]],
+        intrinsics=intrinsics_from_coefficients(np.tile(coefficients, (len(index), 1)), container.where),
+        pose=_poses(container, index),
+        color_size=movie.size,
+        depth_size=size,
+        read_color=movie.read,
+        read_depth=lambda i: _depth(container, depth[i], size),
+        convention=OPENCV,
+        quarter_turns=movie.quarter_turns,
+        remarks=remarks,
+    )
+
+
+def _alone(path: Path) -> Recording:
+    movie = Movie(path)
+    return Recording(
+        where=str(path),
+        kind="video without depth",
+        index=np.arange(len(movie)),
+        timestamp_s=movie.timestamp_s,
+        intrinsics=None,
+        pose=None,
+        color_size=movie.size,
+        depth_size=None,
+        read_color=movie.read,
+        read_depth=lambda i: np.zeros((0, 0), np.float32),
+        quarter_turns=movie.quarter_turns,
+    )
+
+
+def _depth(container: FolderContainer, name: str, size: tuple[int, int] | None) -> Float[np.ndarray, "height width"]:
+    if name.lower().endswith(".png"):
+        return meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, f"{container.where}/{name}")
+    depth = images.read_depth(container.path(name), channel=None)
+    if size is not None and depth.shape != size:
+        raise wrong_depth(f"{container.where}/{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}")
+    return depth
+
+
+def _poses(container: FolderContainer, index: np.ndarray) -> Float[np.ndarray, "frame 7"] | None:
+    if "poses.txt" not in container.names:
+        return None
+    where = f"{container.where}/poses.txt"
+    table = text_files.table(container.read("poses.txt", MAX_TEXT_BYTES).decode(errors="replace"), 8, where)
+    row = {int(number): i for i, number in enumerate(table[:, 0])}
+    pose = np.full((len(index), 7), np.nan)
+    for frame, number in enumerate(index):
+        if int(number) in row:
+            pose[frame] = table[row[int(number)], [4, 5, 6, 7, 1, 2, 3]]
+    return pose

@@ -1,0 +1,115 @@
+"""Polycam raw data (LiDAR or room mode, developer mode): sparse keyframes with poses, for the walk-through.
+
+Optimised pictures and cameras (`corrected_*`) are used where both exist; their black borders carry no depth.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.files import images
+from pipeline.recordings.containers import FolderContainer
+from pipeline.recordings.conventions import OPENGL
+from pipeline.recordings.recording import (
+    MAX_PICTURE_BYTES,
+    MAX_TEXT_BYTES,
+    Y_UP,
+    Recording,
+    broken_metadata,
+    decode_gray,
+    intrinsics_from_coefficients,
+    meters_from_png,
+    no_depth,
+    no_frames,
+    pose_from_matrix,
+)  # fmt: skip
+
+TRUSTED_M = 5.0
+"""depth beyond this is unknown, metres"""
+COEFFICIENTS = ("fx", "fy", "cx", "cy")
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a Polycam raw data folder. Raises InputError CAP-001..008."""
+    container = FolderContainer(path)
+    corrected = {"corrected_images", "corrected_cameras"} <= {
+        name.split("/")[1] for name in container.names if name.startswith("keyframes/")
+    }
+    color, camera = ("corrected_images", "corrected_cameras") if corrected else ("images", "cameras")
+    stems = [_stems(container, part) for part in (color, camera, "depth")]
+    if not stems[2]:
+        raise no_depth(container.where, "keyframes/depth is empty: record in LiDAR or room mode")
+    index = np.array(sorted(set.intersection(*stems)), int)
+    if len(index) == 0:
+        raise no_frames(container.where, "no keyframe has picture, camera and depth")
+    tables = [_camera(container, f"keyframes/{camera}/{number}.json") for number in index]
+    sizes = {(int(table["height"]), int(table["width"])) for table in tables}
+    if len(sizes) != 1:
+        raise broken_metadata(container.where, f"keyframes of {len(sizes)} sizes")
+    size = _depth(container, int(index[0]), None).shape
+    known = set(index.tolist()) <= _stems(container, "confidence")
+
+    def depth(number: int) -> np.ndarray:
+        measured = _depth(container, number, size)
+        return np.where(_border(container, f"keyframes/{color}/{number}.jpg", size), 0, measured) if corrected else measured
+
+    return Recording(
+        where=container.where,
+        kind="Polycam raw data",
+        index=index,
+        timestamp_s=(index - index[0]) * 1e-6,
+        intrinsics=intrinsics_from_coefficients(np.array([[table[key] for key in COEFFICIENTS] for table in tables]), container.where),
+        pose=pose_from_matrix(np.stack([_world_from_camera(table) for table in tables])),
+        color_size=next(iter(sizes)),
+        depth_size=size,
+        read_color=lambda i: container.read(f"keyframes/{color}/{i}.jpg", MAX_PICTURE_BYTES),
+        read_depth=depth,
+        read_confidence=(lambda i: _confidence(container, i, size)) if known else None,
+        convention=OPENGL,
+        up=Y_UP,
+        remarks=("Polycam keeps sparse keyframes: good for the walk-through, too few for the animal",),
+    )
+
+
+def _stems(container: FolderContainer, part: str) -> set[int]:
+    names = (Path(name) for name in container.names if name.startswith(f"keyframes/{part}/"))
+    return {int(name.stem) for name in names if name.stem.isdigit()}
+
+
+def _camera(container: FolderContainer, name: str) -> dict[str, Any]:
+    where = f"{container.where}/{name}"
+    try:
+        table = json.loads(container.read(name, MAX_TEXT_BYTES))
+        wanted = (*COEFFICIENTS, "width", "height", *(f"t_{row}{column}" for row in range(3) for column in range(4)))
+        return {key: float(table[key]) for key in wanted}
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise broken_metadata(where, f"not a camera ({error!r})") from error
+
+
+def _world_from_camera(table: dict[str, float]) -> Float[np.ndarray, "4 4"]:
+    rows = [[table[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
+    return np.array([*rows, [0.0, 0.0, 0.0, 1.0]])
+
+
+def _depth(container: FolderContainer, number: int, size: tuple[int, int] | None) -> Float[np.ndarray, "height width"]:
+    name = f"keyframes/depth/{number}.png"
+    depth = meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, f"{container.where}/{name}")
+    return np.where(depth <= TRUSTED_M, depth, np.float32(0))
+
+
+def _border(container: FolderContainer, name: str, size: tuple[int, int]) -> np.ndarray:
+    color = images.decode_color(container.read(name, MAX_PICTURE_BYTES), f"{container.where}/{name}")
+    return cv2.resize(color.max(-1), size[::-1], interpolation=cv2.INTER_AREA) < 3
+
+
+def _confidence(container: FolderContainer, number: int, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
+    """Read 0 as low, 255 as high and whatever lies between as medium."""
+    name = f"keyframes/confidence/{number}.png"
+    raw = decode_gray(container.read(name, MAX_PICTURE_BYTES), f"{container.where}/{name}", np.uint8)
+    if raw.shape != size:
+        raw = cv2.resize(raw, size[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.where(raw == 0, 0, np.where(raw == 255, 2, 1)).astype(np.uint8)

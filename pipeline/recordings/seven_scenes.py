@@ -1,0 +1,78 @@
+"""7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimetres), `.pose.txt` where there is one.
+
+The frame number counts at 30 per second. Intrinsics from `camera-intrinsics.txt` or the set's default (depth camera).
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files import images
+from pipeline.recordings import text_files
+from pipeline.recordings.containers import FolderContainer
+from pipeline.recordings.conventions import OPENCV
+from pipeline.recordings.recording import (
+    MAX_PICTURE_BYTES,
+    MAX_TEXT_BYTES,
+    Recording,
+    intrinsics_from_coefficients,
+    meters_from_png,
+    no_depth,
+    no_frames,
+    pose_from_matrix,
+)  # fmt: skip
+
+RATE_HZ = 30.0
+DEFAULT = (585.0, 585.0, 320.0, 240.0)
+"""fx, fy, cx, cy of the depth camera at 640 x 480, pixels"""
+NAME = re.compile(r"frame-(\d+)\.(color\.(?:png|jpg|jpeg)|depth\.png|pose\.txt)\Z")
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a 7-Scenes style folder. Raises InputError CAP-001..011."""
+    container = FolderContainer(path)
+    files: dict[str, dict[int, str]] = {"color": {}, "depth": {}, "pose": {}}
+    for name in sorted(container.names):
+        match = NAME.match(name)
+        if match:
+            files[match[2].split(".")[0]][int(match[1])] = name
+    if not files["depth"]:
+        raise no_depth(container.where, "there is no frame-*.depth.png")
+    index = np.array(sorted(files["color"].keys() & files["depth"].keys()), int)
+    if len(index) == 0:
+        raise no_frames(container.where, "no frame has colour and depth")
+    first = int(index[0])
+    color_size = images.decode_color(container.read(files["color"][first], MAX_PICTURE_BYTES), container.where).shape[:2]
+    depth_size = meters_from_png(container.read(files["depth"][first], MAX_PICTURE_BYTES), None, container.where).shape
+    coefficients, remarks = text_files.coefficients(container, default=DEFAULT if color_size == (480, 640) else None)
+    return Recording(
+        where=container.where,
+        kind="7-Scenes RGB-D",
+        index=index,
+        timestamp_s=(index - first) / RATE_HZ,
+        intrinsics=intrinsics_from_coefficients(np.tile(coefficients, (len(index), 1)), container.where),
+        pose=_poses(container, index, files["pose"]),
+        color_size=color_size,
+        depth_size=depth_size,
+        read_color=lambda i: container.read(files["color"][i], MAX_PICTURE_BYTES),
+        read_depth=lambda i: meters_from_png(
+            container.read(files["depth"][i], MAX_PICTURE_BYTES), depth_size, f"{container.where}/{files['depth'][i]}"
+        ),
+        convention=OPENCV,
+        remarks=remarks,
+    )
+
+
+def _poses(container: FolderContainer, index: np.ndarray, names: dict[int, str]) -> Float[np.ndarray, "frame 7"] | None:
+    """Return the stored poses; frames that the set marks as lost (not finite) or lack one are NaN. None without any."""
+    if not names:
+        return None
+    matrices = np.full((len(index), 4, 4), np.nan)
+    for row, number in enumerate(index):
+        if int(number) in names:
+            name = names[int(number)]
+            text = container.read(name, MAX_TEXT_BYTES).decode(errors="replace")
+            matrices[row] = text_files.table(text, 4, f"{container.where}/{name}", rows=4)
+    return pose_from_matrix(matrices)

@@ -1,0 +1,235 @@
+"""One walk, written in every format, comes back the same: upright, metric, with its poses, whatever the app stores."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.recordings import extraction, stray_scanner, tum
+from pipeline.recordings.formats import format_of, open_recording
+from pipeline.recordings.movies import Movie
+from pipeline.space import rigid
+from tests.pipeline.recordings import made_formats
+from tests.stages.extract_frames.made_recordings import Made, walk
+
+LANDSCAPE = 3
+"""quarter turns from upright to the sensor landscape in which iPhones store pictures"""
+RATE_HZ = 15.0
+"""of the made walk: all formats can tell its times exactly"""
+CASES = {
+    "Stray Scanner": (made_formats.stray, LANDSCAPE),
+    "Polycam raw data": (made_formats.polycam, LANDSCAPE),
+    "NeRFCapture": (made_formats.nerfcapture, LANDSCAPE),
+    "TUM RGB-D": (made_formats.tum, 0),
+    "7-Scenes RGB-D": (made_formats.seven_scenes, 0),
+    "video and depth": (made_formats.video_and_depth, 0),
+}
+
+
+def _understand(path):
+    recording = open_recording(path)
+    return recording, extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
+
+
+def _frames(recording, plan):
+    return list(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=95))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_walk_comes_back(tmp_path, name):
+    write, turns = CASES[name]
+    made, upright = walk(18, rate_hz=RATE_HZ, quarter_turns=turns), walk(18, rate_hz=RATE_HZ)
+    path = write(tmp_path / "walkthrough", made)
+    assert format_of(path).name == name
+    recording, plan = _understand(path)
+    assert plan.self_check.verdict == "documented", plan.self_check
+    assert (turns + plan.quarter_turns) % 4 == 0
+    assert plan.gravity_known == (turns == LANDSCAPE)
+    np.testing.assert_allclose(plan.timestamp_s, made.timestamp_s[plan.chosen], atol=1e-3)
+    np.testing.assert_allclose(plan.odometry_from_camera, upright.world_from_camera[plan.chosen], atol=1e-5)
+    np.testing.assert_allclose(plan.intrinsics[0], upright.intrinsics, atol=1e-6)
+    frames = _frames(recording, plan)
+    for position in (0, 7, len(frames) - 1):
+        frame, source = frames[position], plan.chosen[position]
+        assert np.abs(frame.color.astype(int) - upright.color(source)).mean() < 4
+        known = frame.depth[:: frame.depth.shape[0] // 32, :: frame.depth.shape[1] // 24]
+        np.testing.assert_allclose(known, upright.depth(source), atol=1.1e-3)
+
+
+@pytest.mark.parametrize("write", [made_formats.tum, made_formats.seven_scenes, made_formats.video_and_depth])
+def test_poses_may_be_missing(tmp_path, write):
+    _, plan = _understand(write(tmp_path / "a", walk(8), poses=False))
+    assert plan.odometry_from_camera is None
+    assert plan.self_check.reason == "the recording has no device poses"
+    assert len(plan.chosen) >= 5
+
+
+@pytest.mark.parametrize("columns", [7, 9, 15])
+def test_every_age_of_stray_scanner_is_read(tmp_path, columns):
+    made = walk(8, quarter_turns=LANDSCAPE)
+    recording = open_recording(made_formats.stray(tmp_path / "a", made, columns))
+    np.testing.assert_allclose(recording.intrinsics[5], made.intrinsics, atol=1e-6)
+    np.testing.assert_allclose(np.abs(recording.pose), np.abs(made_formats.quaternion_poses(made)), atol=1e-9)
+    if columns > 7:  # the oldest has no times but the video's
+        np.testing.assert_allclose(recording.timestamp_s, made.timestamp_s, atol=1e-6)
+
+
+def test_frames_without_depth_shift_nothing(tmp_path):
+    made = walk(12, quarter_turns=LANDSCAPE)
+    path = made_formats.stray(tmp_path / "a", made)
+    (path / "depth" / "000004.png").unlink()
+    recording = open_recording(path)
+    assert recording.index.tolist() == [i for i in range(12) if i != 4]
+    np.testing.assert_allclose(recording.timestamp_s, np.delete(made.timestamp_s, 4), atol=1e-6)
+    assert np.abs(recording.read_color(9).astype(int) - made.color(9)).mean() < 4
+
+
+def test_times_of_a_real_odometry_are_its_own():
+    text = "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, distortion_center_x, distortion_center_y\n"
+    text += "5.0, 000000, 0, 0, 0, 0, 0, 0, 1, 1597.8, 1597.8, 955.3, 717.7, , \n5.05, 000003, 0, 0, 0, 0, 0, 0, 1, 1604.2, 1604.2, 955.5, 717.8, , "
+    rows = stray_scanner.read_odometry(text, "a")
+    assert rows.frame.tolist() == [0, 3]
+    assert rows.coefficients[:, 0].tolist() == [1597.8, 1604.2]
+
+
+def test_lost_tracking_leaves_frames_out_or_all_poses(tmp_path):
+    path = made_formats.seven_scenes(tmp_path / "a", walk(20))
+    lost = sorted(path.glob("*.pose.txt"))[5:7]
+    for file in lost:
+        file.write_text("\n".join(["-1.#IND " * 4] * 4))
+    _, plan = _understand(path)
+    assert plan.odometry_from_camera is not None
+    assert not {5, 6} & set(plan.chosen.tolist())
+    for file in sorted(path.glob("*.pose.txt"))[:10]:
+        file.unlink()
+    _, plan = _understand(path)
+    assert plan.odometry_from_camera is None
+    assert "50 % of the frames have no device pose" in plan.self_check.reason
+
+
+def test_corrected_polycam_pictures_win_and_their_borders_are_no_depth(tmp_path):
+    made = walk(6, quarter_turns=LANDSCAPE)
+    drawn = Made.color
+    dark = walk(6, quarter_turns=LANDSCAPE)
+    path = made_formats.polycam(tmp_path / "a", made)
+
+    class Bordered(Made):
+        def color(self, frame):
+            picture = drawn(self, frame).copy()
+            picture[:, :16] = 0
+            return picture
+
+    made_formats.polycam(path, Bordered(dark.world_from_camera, dark.timestamp_s, quarter_turns=LANDSCAPE), corrected=True)
+    depth = open_recording(path).read_depth(1_600_000_000)
+    assert (depth[:, :7] == 0).all()
+    assert (depth[:, 9:] > 0).all()
+
+
+def test_associated_by_time():
+    times = np.array([0.0, 0.1, 0.2, 5.0])
+    assert tum.nearest(times, np.array([0.015, 0.19]), 0.02).tolist() == [0, -1, 1, -1]
+
+
+def test_a_video_knows_its_damage(tmp_path):
+    made = walk(40)
+    made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(40)], rate=15)
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    start = data.find(b"mdat")
+    middle = start + (len(data) - start) // 2
+    data[middle - 300 : middle + 300] = bytes(600)
+    (tmp_path / "a.mp4").write_bytes(data)
+    movie = Movie(tmp_path / "a.mp4")
+    assert len(movie) == 40
+    right = [
+        picture is not None and np.abs(picture.astype(int) - made.color(i)).mean() < 4 for i in range(40) for picture in [movie.read(i)]
+    ]
+    assert right[0] and right[39]
+    assert 20 < sum(right) < 40
+
+
+def test_a_video_is_read_in_any_order(tmp_path):
+    made = walk(30)
+    made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(30)])
+    movie = Movie(tmp_path / "a.mp4")
+    for number in (3, 4, 20, 2, 29, 0):
+        assert np.abs(movie.read(number).astype(int) - made.color(number)).mean() < 0.6, number
+
+
+def _no_depth(path, made):
+    made_formats.write_movie(path.with_suffix(".mp4"), [made.color(i) for i in range(6)])
+    return path.with_suffix(".mp4")
+
+
+def _no_intrinsics(path, made):
+    made_formats.video_and_depth(path, made)
+    (path / "intrinsics.txt").unlink()
+    return path
+
+
+def _constant_rows(path, made):
+    made_formats.stray(path, made)
+    for file in (path / "depth").iterdir():
+        file.write_bytes(made_formats.png(np.repeat(np.arange(32, dtype=np.uint16)[:, None] + 900, 24, axis=1)))
+    return path
+
+
+def _new_odometry(path, made):
+    made_formats.stray(path, made)
+    (path / "odometry.csv").write_text("time, pose\n0.0, 1\n")
+    return path
+
+
+def _new_polycam(path, made):
+    made_formats.polycam(path, made)
+    for file in (path / "keyframes" / "cameras").iterdir():
+        file.write_text(json.dumps({"transform": np.eye(4).tolist()}))
+    return path
+
+
+def _cut_video(path, made):
+    made_formats.stray(path, made)
+    (path / "rgb.mp4").write_bytes((path / "rgb.mp4").read_bytes()[:900])
+    return path
+
+
+def _other_depth_size(path, made):
+    made_formats.seven_scenes(path, made)
+    sorted(path.glob("*.depth.png"))[0].write_bytes(made_formats.png(np.zeros((5, 6), np.uint8)))
+    return path
+
+
+def _unmatched(path, made):
+    made_formats.tum(path, made)
+    (path / "depth.txt").write_text("1.0 depth/a.png\n")
+    return path
+
+
+FAULTS = {
+    "CAP-001": _cut_video,
+    "CAP-003": lambda path, made: path,
+    "CAP-004": _new_odometry,
+    "CAP-004 ": _new_polycam,
+    "CAP-006": _no_depth,
+    "CAP-007": _unmatched,
+    "CAP-008": _other_depth_size,
+    "CAP-009": _constant_rows,
+    "CAP-010": lambda path, made: made_formats.nerfcapture_zip(path.with_suffix(".zip"), made),
+    "CAP-011": _no_intrinsics,
+}
+
+
+@pytest.mark.parametrize("code", FAULTS)
+def test_what_cannot_be_used_is_refused_with_a_remedy(tmp_path, code):
+    path = FAULTS[code](tmp_path / "a", walk(6))
+    with pytest.raises(InputError) as refused:
+        _understand(path)
+    assert refused.value.code == code.strip()
+    assert refused.value.remedy
+
+
+def test_up_may_be_any_axis():
+    turned = extraction._y_up_from((0.0, 0.0, 1.0))
+    np.testing.assert_allclose(turned[:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(extraction._y_up_from((0.0, -1.0, 0.0))[:3, :3] @ [0, -1, 0], [0, 1, 0], atol=1e-12)
+    assert rigid.rotation_angle(np.eye(3), extraction._y_up_from((0.0, 1.0, 0.0))[:3, :3]) < 1e-12

@@ -1,0 +1,104 @@
+"""Real recordings: the importers' reading of the poses agrees with the depth."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.recordings import conventions, extraction, stray_scanner, upright
+from pipeline.recordings.formats import format_of, open_recording
+from pipeline.recordings.recording import pose_from_matrix
+from pipeline.space import cameras, rigid
+
+REAL = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata"))
+LIMIT_M = 0.015
+"""the app's documented convention explains real LiDAR depth within 15 mm"""
+
+
+def _sample(name: str) -> Path:
+    if not (REAL / name).exists():
+        pytest.skip(f"no real recordings at {REAL} (set ATS_REALDATA)")
+    return REAL / name
+
+
+def test_exr_pictures_are_paired_with_their_rows():
+    recording = open_recording(_sample("record3d_exr12"))
+    told = json.loads((_sample("record3d_exr12") / "EXR_RGBD" / "metadata.json").read_text())
+    assert len(told["poses"]) == 345
+    assert recording.index.tolist() == [0, 30, 59, *range(90, 331, 30)]
+    for row, number in enumerate(recording.index):
+        np.testing.assert_array_equal(recording.pose[row], told["poses"][number])
+        assert recording.timestamp_s[row] == told["frameTimestamps"][number]
+
+
+def test_seven_scenes_pass_the_self_check():
+    path = _sample("7scenes_AB50")
+    assert format_of(path).name == "7-Scenes RGB-D"
+    recording = open_recording(path)
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
+    assert len(plan.chosen) == 50
+    assert plan.self_check.verdict == "documented"
+    assert plan.self_check.residual_m < 2 * LIMIT_M  # a first Kinect, whose own truth is good to some centimetres
+    assert not plan.gravity_known
+
+
+@pytest.mark.parametrize("turn", range(1, 4))
+def test_turned_seven_scenes_are_found_out(turn):
+    recording = open_recording(_sample("7scenes_AB50"))
+    turned = cameras.turn_camera(conventions.odometry_from_pose(recording.pose, conventions.OPENCV), turn)
+    recording = dataclasses.replace(recording, pose=pose_from_matrix(turned))
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
+    assert plan.self_check.convention.quarter_turns == turn
+
+
+def test_stray_odometry_is_read():
+    folder = _sample("stray_odometry")
+    rows = stray_scanner.read_odometry((folder / "odometry_rows.csv").read_text(), "odometry_rows.csv")
+    assert rows.frame.tolist() == [0, 1, 2, 3, 4, 5, 1641, 1642, 1643, 1714]
+    np.testing.assert_allclose(np.linalg.norm(rows.pose[:, :4], axis=1), 1, atol=1e-6)
+    assert rows.coefficients[6, 0] == 1604.2147
+    odometry = conventions.odometry_from_pose(rows.pose, conventions.OPENCV)
+    turned = np.degrees(rigid.rotation_angle(odometry[6, :3, :3], odometry[7, :3, :3]))
+    assert abs(turned - 4.07) < 0.02  # although the quaternion's sign flips between the two
+    assert odometry[0, 1, 0] < -0.8  # held upright: the stored picture's right points down
+    assert upright.quarter_turns_from_gravity(odometry[:6]) == 1
+
+
+def test_exr_export_passes_the_self_check():
+    recording = open_recording(_sample("record3d_exr12"))
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
+    assert plan.self_check.verdict == "documented"
+    assert plan.self_check.residual_m < LIMIT_M
+    assert plan.gravity_known
+    assert plan.quarter_turns == 0
+    frames = list(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=95))
+    assert len(frames) == 12
+    assert frames[0].color.shape == (640, 480, 3)
+    np.testing.assert_allclose(plan.intrinsics[0], np.diag([1 / 3, 1 / 3, 1]) @ recording.intrinsics[0])
+    assert min(frame.depth_valid for frame in frames) > 0.9
+
+
+def test_archive_of_the_2022_app_is_understood_although_its_pictures_are_gone():
+    with pytest.raises(InputError, match="CAP-006"):
+        open_recording(_sample("record3d_r3d_metadata") / "data.r3d")
+
+
+@pytest.mark.parametrize("turn", range(1, 4))
+def test_turned_readings_are_refuted_by_real_depth(turn):
+    recording = open_recording(_sample("record3d_exr12"))
+    wrong = conventions.odometry_from_pose(recording.pose, conventions.Convention(quarter_turns=turn))
+    wxyz = rigid.quaternion_from_rotation(cameras.opencv_from_opengl(wrong)[:, :3, :3])
+    pose = np.concatenate([np.roll(wxyz, -1, axis=1), wrong[:, :3, 3]], axis=1)
+    size = recording.depth_size
+    intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
+
+    def view(frame):
+        return conventions.DepthView(recording.read_depth(int(recording.index[frame])), intrinsics[frame])
+
+    check = conventions.check_poses(pose, recording.timestamp_s, view)
+    assert check.verdict == "other"
+    assert check.convention == conventions.Convention(quarter_turns=4 - turn)
