@@ -1,0 +1,94 @@
+"""A real kitchen: a template from one half of a walk, single frames of the other half on it, without odometry."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from pipeline.models import localizer as model
+from stages.build_scene_template import template
+from stages.build_scene_template.anchor import AnchorOptions
+from stages.build_scene_template.fuse import FuseOptions
+from stages.build_scene_template.refine import RefineOptions
+from stages.build_scene_template.sfm import SfmOptions
+from stages.evaluate import localizing
+from stages.evaluate.alignment import PoseErrors, constant_between, pose_errors
+from stages.train_localizer import training
+from tests.real.seven_scenes import Half, halves
+
+FRAMES = range(25)
+NEAR = (7.0, 0.15)
+"""degrees and metres of the share that methods are compared by"""
+
+
+@dataclass(frozen=True)
+class Kitchen:
+    """The template of the first half and the second half beside it."""
+
+    made: template.Template
+    walk: Half
+    session: Half
+    truth: Float[np.ndarray, "frame 4 4"]
+    """the session's cameras in the template's world"""
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory) -> Kitchen:
+    walk, session = halves(tmp_path_factory.mktemp("kitchen"))
+    cv2.setNumThreads(1)
+    made, _ = template.build(
+        walk.clip,
+        np.zeros((len(walk.clip), 4, 4, 2), np.float16),
+        structure=SfmOptions(),
+        believe=AnchorOptions(),
+        weights=RefineOptions(),
+        fusion=FuseOptions(),
+        workspace=Path(tmp_path_factory.mktemp("workspace")),
+        seed=0,
+    )
+    world = constant_between(made.world_from_camera, walk.world_from_camera)
+    return Kitchen(made, walk, session, world @ session.world_from_camera)
+
+
+def _near(errors: PoseErrors) -> float:
+    return float(((errors.degrees <= NEAR[0]) & (errors.meters <= NEAR[1])).mean())
+
+
+def test_template_is_metric_without_odometry(kitchen: Kitchen):
+    truth = constant_between(kitchen.made.world_from_camera, kitchen.walk.world_from_camera) @ kitchen.walk.world_from_camera
+    errors = pose_errors(kitchen.made.world_from_camera, truth)
+    assert np.sqrt((errors.meters**2).mean()) <= 0.08
+    assert len(kitchen.made.start.registered) == len(kitchen.walk.clip)
+
+
+def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitchen):
+    made, walk, clip = kitchen.made, kitchen.walk.clip, kitchen.session.clip
+    options = training.Options(views=200, held_out=40)
+    localizer, _ = training.train_scene(made.mesh, made.world_from_camera, made.floor_m, walk, options, np.random.default_rng(0))
+    hide = [np.zeros(clip.color_size, bool)] * len(clip)
+    ours = pose_errors(localizing.placed_by_localizer(localizer, clip, FRAMES, hide), kitchen.truth)
+    points = localizing.sift_map(walk, made.world_from_camera, FRAMES)
+    sift = pose_errors(localizing.placed_by_sift(points, clip, FRAMES), kitchen.truth)
+    pictures = localizing.gallery(walk, made.world_from_camera, FRAMES)
+    retrieval = pose_errors(localizing.placed_by_retrieval(pictures, clip, FRAMES), kitchen.truth)
+    assert np.median(ours.degrees) <= 4.0
+    assert np.median(ours.meters) <= 0.06
+    assert _near(ours) > _near(sift)
+    assert _near(ours) >= _near(retrieval) + 0.5
+
+
+def test_doubtful_answers_are_told_from_good_ones(kitchen: Kitchen):
+    """A frame of noise finds no believable place in the kitchen."""
+    made, rng = kitchen.made, np.random.default_rng(0)
+    options = training.Options(views=60, held_out=40, frames=25)
+    localizer, _ = training.train_scene(made.mesh, made.world_from_camera, made.floor_m, kitchen.walk.clip, options, rng)
+    clip = kitchen.session.clip
+    noise = rng.integers(0, 255, (*clip.color_size, 3)).astype(np.uint8)
+    blurred = cv2.GaussianBlur(noise, (0, 0), 5)
+    answers = localizer.localize(blurred, clip.depth(0), clip.depth_intrinsics[0], clip.intrinsics[0])
+    right = localizer.localize(clip.color(0), clip.depth(0), clip.depth_intrinsics[0], clip.intrinsics[0])
+    assert isinstance(right[0], model.Hypothesis)
+    assert not answers or answers[0].probability < 0.5 * right[0].probability
