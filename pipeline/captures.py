@@ -10,17 +10,23 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import config
+from pipeline.dag import Flow
 from pipeline.errors import InputError
 from pipeline.recordings.formats import format_of
 from pipeline.videos import ROLES, SPLITS, Role, Split, Video
 
 SIDECAR = ".toml"
 """`<recording>.toml` beside a recording may hold the same keys as its table in the recipe's `[videos]`."""
-_NEEDED: tuple[tuple[Role, str], ...] = (
-    ("walkthrough", "one slow walk through the empty room, named walkthrough..."),
-    ("turnaround", "one circle around the resting animal, named turnaround..."),
-    ("session", "one or more clips of the animal, named anything else"),
-)
+_NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
+    "recordings": (
+        ("walkthrough", "one slow walk through the empty room, named walkthrough..."),
+        ("turnaround", "one circle around the resting animal, named turnaround..."),
+        ("session", "one or more clips of the animal, named anything else"),
+    ),
+    "trajectories": (("session", "one or more tables of its motion, CSV or NPZ"),),
+}
+TABLES = (".csv", ".npz")
+"""Kinds of files that hold motion."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +43,17 @@ class Remarks:
     """Time in that recording = time in this one + offset, seconds."""
 
 
-def find(folder: Path) -> list[str]:
-    """Return the names of the recordings in `folder`, of every format that is understood."""
+def find(folder: Path, flow: Flow = "recordings") -> list[str]:
+    """Return the names of the recordings in `folder`, of every format that is understood, or of the tables of motion."""
     if not folder.is_dir():
         return []
-    return sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and format_of(path))
+    understood = format_of if flow == "recordings" else _is_table
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith(".") and understood(path))
 
 
-def not_understood(folder: Path) -> list[str]:
+def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
     """Return the names of whatever else lies there."""
-    known = set(find(folder)) | {f"{name}{SIDECAR}" for name in find(folder)}
+    known = set(find(folder, flow)) | {f"{name}{SIDECAR}" for name in find(folder, flow)}
     return sorted(path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith("."))
 
 
@@ -61,14 +68,20 @@ def remarks(folder: Path, names: Sequence[str], overrides: Mapping[str, Any], wh
     return said
 
 
-def assign(said: Mapping[str, Remarks], known_ids: Mapping[str, str], hashes: Mapping[str, str | None], where: str) -> tuple[Video, ...]:
+def assign(
+    said: Mapping[str, Remarks],
+    known_ids: Mapping[str, str],
+    hashes: Mapping[str, str | None],
+    where: str,
+    flow: Flow = "recordings",
+) -> tuple[Video, ...]:
     """Give every recording its id, role, split and clock.
 
     `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another file.
     Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be).
     """
     roles = {name: _role(name, remark, where) for name, remark in said.items()}
-    for role, what in _NEEDED:
+    for role, what in _NEEDED[flow]:
         if role not in roles.values():
             raise InputError("CAP-040", f"there is no {role} among the recordings", where, f"add {what}")
     order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
@@ -95,6 +108,16 @@ def builtin(session_count: int, heldout_of: int) -> dict[str, Remarks]:
     if not heldout_of:
         return plain
     return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}
+
+
+def builtin_lives(homes: int, sessions_per_home: int) -> dict[str, Remarks]:
+    """Return the recordings that `synthesize_capture.lives` writes; those of the last home are the test."""
+    names = [f"session-{number + 1:02d}.npz" for number in range(homes * sessions_per_home)]
+    return {name: Remarks(split="test" if name in names[(homes - 1) * sessions_per_home :] else "train") for name in names}
+
+
+def _is_table(path: Path) -> bool:
+    return path.suffix.lower() in TABLES or (path / "trajectory.csv").is_file()
 
 
 def _role(name: str, remark: Remarks, where: str) -> Role:

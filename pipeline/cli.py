@@ -9,7 +9,7 @@ import dataclasses
 import errno
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,10 @@ class Task:
         chosen = sorted(v.id for v in self.videos if v.role in wanted and (splits is None or v.split in splits))
         return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in chosen}
 
+    def per_trial(self, name: str, trials: Sequence[str]) -> dict[str, Path]:
+        """Return the folder of `name` for every one of the trials, by id."""
+        return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in trials}
+
     @contextmanager
     def create(self) -> Iterator[Path]:
         """Yield the folder to fill; it becomes the artifact if, and only if, the block ends well."""
@@ -137,8 +141,9 @@ def _parser(doc: str, reads: tuple[str, ...], optional: tuple[str, ...]) -> argp
 def _what(name: str) -> str:
     if name not in dag.NODES:
         return f"path of the {name}"
-    per_video = " (or the folder with one per recording)" if dag.NODES[name].roles else ""
-    return f"finished artifact `{name}`{per_video}"
+    several = " (or the folder with one per recording)" if dag.NODES[name].roles else ""
+    several = " (or the folder with one per trial)" if dag.NODES[name].trials == "each" else several
+    return f"finished artifact `{name}`{several}"
 
 
 def _task(given: argparse.Namespace, stage: str, config: type, names: tuple[str, ...]) -> Task:

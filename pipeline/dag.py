@@ -5,13 +5,20 @@ only what `plan` wrote. Standard library only, no side effects.
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from pipeline.videos import Role, Split
 
+Flow = Literal["recordings", "trajectories"]
+"""Where an agent's flow begins: at recordings of it, or at tables of its motion, which spares all that comes before
+behaviour."""
+BUILTIN: dict[Flow, str] = {"recordings": "synthetic_capture", "trajectories": "synthetic_lives"}
+"""What stands in where `captures/<agent>/` is empty."""
 VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
 """Roles that models may see; the held-out phone is for `evaluate` alone."""
 AGENT: tuple[Role, ...] = ("turnaround", "session")
 """Roles in which the animal is meant to be seen."""
+BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
 PLUMBING = ("errors", "config", "artifact", "cli", "processes", "progress", "videos", "dag")
 """Files of `pipeline/` whose change cannot change what a stage computes."""
 
@@ -28,6 +35,8 @@ class Need:
     """Subfolder that is read, where it is not the whole artifact."""
     option: str | None = None
     """Command line option without dashes; the artifact's name if None."""
+    flow: Flow | None = None
+    """The flow in which it is an input; None: in all that the node is part of."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,12 @@ class Node:
     """What a scheduler reserves; not a limit."""
     resumable: bool = False
     """Owns a folder for checkpoints that survives a kill."""
+    flows: tuple[Flow, ...] = ("recordings",)
+    """The flows that it is part of."""
+    trials: Literal["none", "each", "all"] = "none"
+    """Made only for the tables of `make behavior-tables`: one job per trial (a method with a seed), or one over all."""
+    table: str | None = None
+    """The recipe's table that configures it, where it is another node's too."""
 
 
 def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Need, ...]:
@@ -84,8 +99,18 @@ FLOW: tuple[Node, ...] = (
     Node("splats", "refine_gaussians",
          ("reconstruction", *merging("frames", roles=VIEWED), *merging("masks", "flow")),
          gpu=1, memory_mb=6000, resumable=True),
-    Node("behavior_data", "slice_behavior", ("reconstruction",), sees=("session",)),
-    Node("behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True),
+    Node("synthetic_lives", "synthesize_capture.lives", flows=("trajectories",)),
+    Node("trajectories", "read_trajectories", (Need("synthetic_lives", part="recordings", option="recording"),),
+         roles=("session",), flows=("trajectories",)),
+    Node("behavior_data", "slice_behavior",
+         (Need("reconstruction", flow="recordings"), Need("trajectories", flow="trajectories")), sees=("session",), flows=BOTH),
+    Node("behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True, flows=BOTH),
+    Node("behavior_trials", "train_behavior", ("behavior_data",), table="train_behavior", fixed={"export": False}, gpu=1, resumable=True,
+         flows=BOTH, trials="each"),
+    Node("behavior_scores", "score_behavior",
+         ("behavior_data", "behavior_trials", Need("synthetic_lives", part="approaches", option="approaches", flow="trajectories")),
+         flows=BOTH, trials="each"),
+    Node("behavior_tables", "tabulate_behavior", ("behavior_data", "behavior_scores"), flows=BOTH, trials="all"),
     Node("simulator", "export_simulator", ("reconstruction", "splats", "behavior", "behavior_data")),
     Node("evaluation", "evaluate",
          (*merging("frames", "masks", "flow"), "scene_template", "agent_template", "scene_localizer",
@@ -103,13 +128,19 @@ NODES = {node.artifact: node for node in FLOW}
 
 def table_of(node: Node) -> str:
     """Return the name of the recipe's table that configures `node`: its program's, or its own where they share one."""
-    shared = sum(other.stage == node.stage for other in FLOW) > 1
-    return node.artifact if shared else node.stage
+    shared = sum(other.stage == node.stage and other.table is None for other in FLOW) > 1
+    return node.table or (node.artifact if shared or "." in node.stage else node.stage)
 
 
-def needs_of(node: Node) -> tuple[Need, ...]:
-    """Return the node's inputs, in declared order."""
-    return tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
+def nodes_of(flow: Flow, *, trials: bool = False) -> tuple[Node, ...]:
+    """Return the nodes of one flow, in declared order, without those that are made for tables only, or with them."""
+    return tuple(node for node in FLOW if flow in node.flows and (trials or node.trials == "none"))
+
+
+def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
+    """Return the node's inputs, in declared order; those of one flow only, if given."""
+    needs = tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
+    return tuple(need for need in needs if flow is None or need.flow in (None, flow))
 
 
 def check() -> None:

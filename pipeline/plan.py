@@ -1,6 +1,6 @@
 """The planner: recipe + recordings + declaration -> `build/<home>/plan/`, which Make, Snakemake and `run` read.
 
-    python -SE -m pipeline.plan plan HOME             HOME is an agent, or <agent>/variants/<name>
+    python -SE -m pipeline.plan plan HOME             HOME is an agent, <agent>/variants/<name>, or <agent>/tables
     python -SE -m pipeline.plan redo HOME ARTIFACT    have one artifact made again
     python -SE -m pipeline.plan new AGENT             a recipe and a capture folder for a new animal
 
@@ -16,15 +16,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline import artifact, captures, config, dag, sources
-from pipeline.dag import Need, Node
+from pipeline import artifact, captures, dag, recipes, sources
+from pipeline.dag import Flow, Need, Node
 from pipeline.errors import InputError
+from pipeline.recipes import Trial
 from pipeline.videos import Video
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}\Z")
 NAME_RULE = "use a-z, 0-9, _ and -, beginning with a letter or digit, 63 at most"
-VIDEOS_TABLE = "videos"
-BUILTIN = "synthetic_capture"
 
 
 @dataclass(frozen=True)
@@ -33,28 +32,31 @@ class Home:
 
     agent: str
     variant: str | None = None
+    tables: bool = False
+    """A plan of its own, with the trials of `make behavior-tables`, whose artifacts stand among the agent's."""
 
     @classmethod
     def parse(cls, text: str) -> "Home":
-        """Read `agent` or `agent/variants/name`; raises REC-004 for names that are no plain names."""
-        agent, *rest = text.split("/variants/", 1)
+        """Read `agent`, `agent/tables` or `agent/variants/name`; raises REC-004 for names that are no plain names."""
+        agent, *rest = text.removesuffix("/tables").split("/variants/", 1)
         for name in (agent, *rest):
             if not NAME.match(name):
                 raise InputError("REC-004", f"{name!r} is no name for an agent or a variant", remedy=NAME_RULE)
-        return cls(agent, *rest)
+        return cls(agent, *rest, tables=text.endswith("/tables"))
 
     def __str__(self) -> str:
-        return self.agent if self.variant is None else f"{self.agent}/variants/{self.variant}"
+        name = self.agent if self.variant is None else f"{self.agent}/variants/{self.variant}"
+        return f"{name}/tables" if self.tables else name
 
     @property
     def folder(self) -> Path:
         """Return where its artifacts stand."""
-        return Path("build", str(self))
+        return Path("build", str(self).removesuffix("/tables"))
 
     @property
     def plan(self) -> Path:
         """Return where its plan stands."""
-        return self.folder / "plan"
+        return Path("build", str(self), "plan")
 
     @property
     def base(self) -> "Home":
@@ -80,6 +82,7 @@ class Job:
     artifact: str
     stage: str
     video: str | None
+    trial: str | None
     home: str
     out: str
     inputs: tuple[Input, ...]
@@ -109,6 +112,14 @@ class Plan:
     """Per artifact: its stage's table, with the variant's changes."""
     touched: frozenset[str]
     """Artifacts that the variant makes anew; all of them for an agent itself."""
+    flow: Flow = "recordings"
+    trials: tuple[Trial, ...] = ()
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """Return what is to be made, in flow order."""
+        found = dag.nodes_of(self.flow, trials=self.home.tables)
+        return tuple(node for node in found if self.builtin or node.artifact not in dag.BUILTIN.values())
 
     def home_of(self, name: str) -> Home:
         """Return where the artifact `name` stands."""
@@ -117,30 +128,38 @@ class Plan:
 
 def read(home: Home, cache: sources.Cache) -> Plan:
     """Check recipe and recordings and return the plan; changes nothing on disk."""
-    recipe, where = _recipe(Path("agents", f"{home.agent}.toml"), cache)
+    recipe, where = recipes.read(Path("agents", f"{home.agent}.toml"), cache)
+    flow = recipes.flow(recipe.get(recipes.FLOW_TABLE, {}), where)
     overlay = {}
     if home.variant:
-        overlay, _ = _recipe(Path("agents", "variants", f"{home.variant}.toml"), cache)
+        overlay, _ = recipes.read(Path("agents", "variants", f"{home.variant}.toml"), cache)
     tables = {n.artifact: {**recipe.get(dag.table_of(n), {}), **n.fixed} for n in dag.FLOW}
-    changed = {n.artifact: {**tables[n.artifact], **overlay.get(dag.table_of(n), {}), **n.fixed} for n in dag.FLOW}
+    changed = {n.artifact: {**recipes.merged(tables[n.artifact], overlay.get(dag.table_of(n), {})), **n.fixed} for n in dag.FLOW}
     folder = Path("captures", home.agent)
-    names = captures.find(folder)
+    names = captures.find(folder, flow)
     if names:
-        said = captures.remarks(folder, names, recipe.get(VIDEOS_TABLE, {}), where)
+        said = captures.remarks(folder, names, recipe.get(recipes.VIDEOS_TABLE, {}), where)
         hashes = {name: _digest_of_recording(folder / name, cache) for name in names}
     else:
-        said = _builtin_remarks(recipe.get("synthesize_capture", {}), recipe.get(VIDEOS_TABLE, {}), cache, where)
+        said = recipes.builtin_remarks(flow, recipe, cache, where)
         hashes = dict.fromkeys(said)
-    videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where)
+    videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
     touched = _touched(tables, changed) if home.variant else frozenset(dag.NODES)
-    return Plan(home, videos, not names, changed, touched)
+    if home.tables:
+        touched = frozenset(n.artifact for n in dag.FLOW if n.trials != "none")
+    trials = tuple(recipes.trials(recipe.get(recipes.TABLES_STAGE, {}), cache)) if home.tables else ()
+    return Plan(home, videos, not names, changed, touched, flow, trials)
 
 
 def jobs(plan: Plan) -> list[Job]:
-    """Expand the declaration for the plan's recordings, in flow order."""
-    nodes = [node for node in dag.FLOW if plan.builtin or node.artifact != BUILTIN]
-    chosen = {n.artifact: [v for v in plan.videos if v.role in n.roles] if n.roles else [None] for n in nodes}
-    return [_job(plan, node, video) for node in nodes for video in chosen[node.artifact]]
+    """Expand the declaration for the plan's recordings and trials, in flow order."""
+
+    def parts(node: Node) -> list[Video | Trial | None]:
+        if node.trials == "each":
+            return list(plan.trials)
+        return [video for video in plan.videos if video.role in node.roles] if node.roles else [None]
+
+    return [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
 
 
 def write(plan: Plan, cache: sources.Cache) -> None:
@@ -152,8 +171,12 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     artifact.write_if_changed(base / "videos.json", _json([asdict(video) for video in plan.videos]))
     for video in plan.videos:
         artifact.write_if_changed(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
-    for name in {job.artifact for job in all_jobs if job.home == str(plan.home)}:
+    for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(plan.home)}:
         node, table = dag.NODES[name], plan.tables[name]
+        overlay = next((each.overlay for each in plan.trials if each.id == trial), {})
+        if trial and dag.table_of(node) == recipes.TRIED_TABLE:
+            table = recipes.merged(table, overlay)
+        name = f"{name}.{trial}" if trial else name
         artifact.write_if_changed(plan.home.plan / f"configs/{name}.json", _json(table))
         key = {
             "stage": node.stage,
@@ -204,36 +227,6 @@ def new_agent(name: str) -> None:
     print(f"recipe {recipe}; put recordings into captures/{home.agent}/, then: make {home.agent}")
 
 
-def _recipe(path: Path, cache: sources.Cache) -> tuple[dict[str, Any], str]:
-    """Read a recipe or an overlay and refuse tables and keys that no stage knows."""
-    if not path.is_file():
-        known = ", ".join(sorted(other.stem for other in path.parent.glob("*.toml"))) or "none"
-        raise InputError("REC-005", "there is no such recipe", str(path), f"known: {known}; a new animal: make new AGENT=...")
-    recipe = config.read_table(path)
-    stages = {dag.table_of(node): node for node in dag.FLOW}
-    config.refuse_unknown(recipe, {*stages, VIDEOS_TABLE}, where=str(path), kind="table")
-    for name, table in recipe.items():
-        if not isinstance(table, dict):
-            raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
-        known = sources.settings(stages[name].stage, cache) if name in stages else None
-        if known is not None:
-            config.refuse_unknown(table, set(known) - set(stages[name].fixed), where=f"{path}: [{name}]")
-    return recipe, str(path)
-
-
-def _builtin_remarks(
-    table: Mapping[str, Any], overrides: Mapping[str, Any], cache: sources.Cache, where: str
-) -> dict[str, captures.Remarks]:
-    """Return the built-in capture's recordings; an override may change them as it may a user's."""
-    settings = {**(sources.settings("synthesize_capture", cache) or {}), **table}
-    said = captures.builtin(settings["session_count"], settings["heldout_of"])
-    config.refuse_unknown(overrides, said, where=f"{where}: [videos]", kind="recording")
-    given = {name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()}
-    return {
-        name: config.from_table(captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]") for name in said
-    }
-
-
 def _digest_of_recording(path: Path, cache: sources.Cache) -> str:
     if path.is_file():
         return cache.get(path, artifact.digest_of_file)
@@ -258,30 +251,33 @@ def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any]) -> frozenset
     return frozenset(touched)
 
 
-def _job(plan: Plan, node: Node, video: Video | None) -> Job:
-    home = plan.home_of(node.artifact)
-    out = home.folder / node.artifact / (video.id if video else "")
+def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
+    home, video, trial = plan.home_of(node.artifact), part if isinstance(part, Video) else None, part if isinstance(part, Trial) else None
+    out = home.folder / node.artifact / (part.id if part else "")
     inputs: list[Input] = []
     arguments: list[str] = []
-    for need in dag.needs_of(node):
-        if need.artifact == BUILTIN and not plan.builtin:
+    for need in dag.needs_of(node, plan.flow):
+        if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:
                 arguments += [f"--{need.option}", f"captures/{plan.home.agent}/{video.file}"]
             continue
-        found = list(_inputs(plan, need, node, video))
+        found = list(_inputs(plan, need, node, part))
         inputs += found
+        several = dag.NODES[need.artifact].roles and not node.roles or dag.NODES[need.artifact].trials == "each" and not trial
         together = plan.home_of(need.artifact).folder / need.artifact
-        path = together if dag.NODES[need.artifact].roles and not node.roles else Path(found[0].path, found[0].part or "")
+        path = together if several else Path(found[0].path, found[0].part or "")
         arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
-    arguments += ["--config", str(home.plan / f"configs/{node.artifact}.json"), "--out", str(out)]
+    named = f"{node.artifact}.{trial.id}" if trial else node.artifact
+    arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
     arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
-    keys = [str(home.plan / f"keys/{node.artifact}.json")]
+    keys = [str(home.plan / f"keys/{named}.json")]
     keys += [str(home.base.plan / f"keys/video.{video.id}.json")] if video else []
     return Job(
-        id=f"{node.artifact}.{video.id}" if video else node.artifact,
+        id=f"{node.artifact}.{part.id}" if part else node.artifact,
         artifact=node.artifact,
         stage=node.stage,
         video=video.id if video else None,
+        trial=trial.id if trial else None,
         home=str(home),
         out=str(out),
         inputs=tuple(inputs),
@@ -294,15 +290,19 @@ def _job(plan: Plan, node: Node, video: Video | None) -> Job:
     )
 
 
-def _inputs(plan: Plan, need: Need, node: Node, video: Video | None) -> Iterator[Input]:
+def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> Iterator[Input]:
     """Yield the artifacts that one need of one job means."""
     source = dag.NODES[need.artifact]
     folder = plan.home_of(need.artifact).folder / need.artifact
-    if not source.roles:
-        part = f"{need.part}/{video.file}" if need.part and video else need.part
-        yield Input(need.artifact, str(folder), part)
+    if source.trials == "each":
+        for trial in [part] if isinstance(part, Trial) else plan.trials:
+            yield Input(f"{need.artifact}/{trial.id}", str(folder / trial.id), need.part)
         return
-    for other in [video] if node.roles else plan.videos:
+    if not source.roles:
+        inner = f"{need.part}/{part.file}" if need.part and isinstance(part, Video) else need.part
+        yield Input(need.artifact, str(folder), inner)
+        return
+    for other in [part] if node.roles else plan.videos:
         if node.roles or (other.role in (need.roles or source.roles) and other.role in source.roles and other.split in need.splits):
             yield Input(f"{need.artifact}/{other.id}", str(folder / other.id), need.part)
 
@@ -312,7 +312,7 @@ def _seen(plan: Plan, node: Node) -> list[Video]:
     if node.roles:
         return []
     roles, splits = set(node.sees), {role: {"train", "test", "none"} for role in node.sees}
-    for need in dag.needs_of(node):
+    for need in dag.needs_of(node, plan.flow):
         for role in need.roles or dag.NODES[need.artifact].roles:
             roles.add(role)
             splits.setdefault(role, set()).update(need.splits)
@@ -331,10 +331,11 @@ def _rules(plan: Plan, all_jobs: list[Job]) -> str:
     for node, made in stamps.items():
         lines += [f".PHONY: {name}.{node} {name}.{node}.redo", f"{name}.{node}: {' '.join(made)}"]
         lines += [f"{name}.{node}.redo:", f"\t@$(PLAN) redo {home} {node}", f"\t@$(MAKE) --no-print-directory {name}.{node}"]
-    pages = [f"{plan.home_of(node).folder}/{node}/index.html" for node in ("report", "simulator")]
-    lines += [f".PHONY: {name}", f"{name}: {' '.join(stamp for made in stamps.values() for stamp in made)}"]
-    lines += [f"\t@echo '[{home}] done. Open:'", *(f"\t@echo '  {page}'" for page in pages)]
-    lines += [f"\t@echo 'Next: make {name}.<artifact>[.redo], make {name} VARIANT=no_scene, make new AGENT=<name>, make help'"]
+    if not home.tables:
+        pages = [f"{plan.home_of(node).folder}/{node}/index.html" for node in ("report", "simulator") if node in stamps]
+        lines += [f".PHONY: {name}", f"{name}: {' '.join(stamp for made in stamps.values() for stamp in made)}"]
+        lines += [f"\t@echo '[{home}] done.{' Open:' if pages else ''}'", *(f"\t@echo '  {page}'" for page in pages)]
+        lines += [f"\t@echo 'Next: make {name}.<artifact>[.redo], make {name} VARIANT=no_scene, make new AGENT=<name>, make help'"]
     return "\n".join(lines) + "\n"
 
 
@@ -366,7 +367,7 @@ def _plan(home: Home) -> None:
     if planned[0].builtin:
         print(f"[{home}] nothing in {folder}/: building from the built-in synthetic capture")
     else:
-        for name in captures.not_understood(folder):
+        for name in captures.not_understood(folder, planned[0].flow):
             print(f"[{home}] not a recording, left alone: {name!r}")
         for video in planned[0].videos:
             if video.role == "heldout" and video.synchronized_with is None:

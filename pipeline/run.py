@@ -98,7 +98,7 @@ def _other_key(resume: Path, key: str) -> bool:
 def _do(job: dict[str, Any], key: str, resume: Path) -> int:
     """Run the stage program and, if its artifact stands, record how it went."""
     out = Path(job["out"])
-    if not Path("stages", job["stage"], "__main__.py").is_file():
+    if not Path("stages", *job["stage"].split("."), "__main__.py").is_file():
         raise InputError("RUN-002", f"there is no stage program {job['stage']!r}", "stages/", "this build is incomplete")
     free = shutil.disk_usage("build").free
     if free < LEAST_FREE_BYTES:

@@ -1,0 +1,84 @@
+"""The recipe of an agent and the overlays of its variants: which tables and keys there may be, and what they mean.
+
+`read` refuses what no stage knows; `flow`, `builtin_remarks` and `trials` draw from it what the planner must know
+before any stage runs. Standard library only.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline import captures, config, dag, sources
+from pipeline.dag import Flow
+from pipeline.errors import InputError
+
+VIDEOS_TABLE, FLOW_TABLE, TABLES_STAGE, TRIED_TABLE = "videos", "flow", "tabulate_behavior", "train_behavior"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One method with one seed, for the tables."""
+
+    id: str
+    """`<method>-<seed>`."""
+    overlay: dict[str, Any]
+    """Keys of the trained stage's table that differ."""
+
+
+def read(path: Path, cache: sources.Cache) -> tuple[dict[str, Any], str]:
+    """Read a recipe or an overlay and refuse tables and keys that no stage knows."""
+    if not path.is_file():
+        known = ", ".join(sorted(other.stem for other in path.parent.glob("*.toml"))) or "none"
+        raise InputError("REC-005", "there is no such recipe", str(path), f"known: {known}; a new animal: make new AGENT=...")
+    recipe = config.read_table(path)
+    stages = {dag.table_of(node): node for node in reversed(dag.FLOW)}
+    config.refuse_unknown(recipe, {*stages, VIDEOS_TABLE, FLOW_TABLE}, where=str(path), kind="table")
+    for name, table in recipe.items():
+        if not isinstance(table, dict):
+            raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
+        known = sources.settings(stages[name].stage, cache) if name in stages else None
+        if known is not None:
+            config.refuse_unknown(table, set(known) - set(stages[name].fixed), where=f"{path}: [{name}]")
+    return recipe, str(path)
+
+
+def flow(table: Mapping[str, Any], where: str) -> Flow:
+    """Return where the agent's flow begins, as the recipe's `[flow]` says."""
+    config.refuse_unknown(table, ("begins_at",), where=f"{where}: [flow]")
+    begins = table.get("begins_at", "recordings")
+    if begins not in dag.BUILTIN:
+        raise InputError("REC-002", f"no flow begins at {begins!r}", f"{where}: [flow]", f"begins_at: {' or '.join(dag.BUILTIN)}")
+    return begins
+
+
+def trials(table: Mapping[str, Any], cache: sources.Cache) -> Iterator[Trial]:
+    """Yield every trained method of the tables with every seed; a method is a variant of that name."""
+    settings = {**(sources.settings(TABLES_STAGE, cache) or {}), **table}
+    for method in settings["methods"]:
+        path = Path("agents", "variants", f"{method}.toml")
+        overlay, _ = read(path, cache)
+        config.refuse_unknown(overlay, (TRIED_TABLE,), where=f"{path}, a method of the tables", kind="table")
+        for seed in range(settings["seeds"]):
+            yield Trial(f"{method}-{seed}", {**overlay.get(TRIED_TABLE, {}), "seed": seed})
+
+
+def merged(table: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the table with the overlay's keys, table by table where tables lie in it."""
+    inner = {key: merged(table[key], value) for key, value in overlay.items() if isinstance(value, Mapping) and key in table}
+    return {**table, **overlay, **inner}
+
+
+def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], cache: sources.Cache, where: str) -> dict[str, captures.Remarks]:
+    """Return the built-in capture's recordings; an override may change them as it may a user's."""
+    node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
+    settings = {**(sources.settings(node.stage, cache) or {}), **recipe.get(dag.table_of(node), {})}
+    if begins == "recordings":
+        said = captures.builtin(settings["session_count"], settings["heldout_of"])
+    else:
+        said = captures.builtin_lives(settings["homes"], settings["sessions_per_home"])
+    config.refuse_unknown(overrides, said, where=f"{where}: [videos]", kind="recording")
+    given = {name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()}
+    return {
+        name: config.from_table(captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]") for name in said
+    }

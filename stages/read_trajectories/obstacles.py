@@ -1,0 +1,42 @@
+"""An obstacle map as a feature volume: floor, obstacles, and free space around where the animal went."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.models.perception import FeatureVolume
+from stages.read_trajectories.tables import columns, numbers
+
+CHANNELS = 16
+FLOOR, OBSTACLE = 0, 1
+"""Channels that are 1 in the floor's and in obstacles' voxels."""
+MARGIN_M = 1.0
+HEADROOM_M = 1.0
+
+
+def no_scene() -> FeatureVolume:
+    """Return a volume of one voxel of which nothing is known."""
+    return FeatureVolume(np.zeros((CHANNELS, 1, 1, 1), np.float16), np.full((1, 1, 1), 2, np.uint8), np.zeros(3), 0.1)
+
+
+def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: float, top_m: float) -> FeatureVolume:
+    """Read occupied cells (x, z, optionally bottom and top) around the animal's ways. Raises TRJ-001 as `columns` does."""
+    table = columns(path, ("x", "z"))
+    x, z = numbers(path, table, "x"), numbers(path, table, "z")
+    floor = float(np.nanmin(visited[:, 1])) if len(visited) else 0.0
+    floor = 0.0 if 0.0 <= floor < HEADROOM_M else floor
+    bottom = numbers(path, table, "bottom") if "bottom" in table else np.full(len(x), floor)
+    top = numbers(path, table, "top") if "top" in table else np.full(len(x), floor + top_m)
+    corners = np.concatenate([np.stack([x, bottom, z], -1), np.stack([x, top, z], -1), visited])
+    low = np.floor((np.nanmin(corners, axis=0) - [MARGIN_M, 0, MARGIN_M]) / cell_m) * cell_m
+    low[1] = floor - 2 * cell_m
+    shape = np.ceil((np.nanmax(corners, axis=0) + [MARGIN_M, HEADROOM_M, MARGIN_M] - low) / cell_m).astype(int)
+    kind = np.full(shape, -1)
+    kind[:, :2] = FLOOR
+    column = np.floor((np.stack([x, z], -1) - low[[0, 2]]) / cell_m).astype(int)
+    span = np.round((np.stack([bottom, top], -1) - low[1]) / cell_m).astype(int)
+    for (i, k), (first, last) in zip(column, span, strict=True):
+        kind[i, max(first, 0) : max(last, first + 1), k] = OBSTACLE
+    features = np.stack([kind == channel for channel in range(CHANNELS)]).astype(np.float16)
+    return FeatureVolume(features, (kind >= 0).astype(np.uint8), low, cell_m)

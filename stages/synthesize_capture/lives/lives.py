@@ -1,0 +1,61 @@
+"""One session of a life as a table of motion at 10 Hz, with the home around it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files import arrays
+from pipeline.models.perception import FeatureVolume
+from stages.synthesize_capture import camera_motion, gait, session
+from stages.synthesize_capture.animal import BONES, HEADS
+from stages.synthesize_capture.dwellings import Dwelling
+from stages.synthesize_capture.voxels import volume_of
+
+RATE_HZ = 10.0
+
+
+@dataclass(frozen=True)
+class Life:
+    """What animal and person did in a home."""
+
+    timestamp_s: Float[np.ndarray, "frame"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    volume: FeatureVolume
+    reason: np.ndarray
+    """Index into `policy.REASONS`, per frame."""
+
+
+def lived(home: Dwelling, rng: np.random.Generator, duration_s: float) -> Life:
+    """Let animal and person live together for a while."""
+    told = session.simulate_session(home.room, rng, duration_s)
+    timestamp_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
+    sample = np.round(timestamp_s / session.STEP_S).astype(int)
+    motion = gait.poses(told.animal, timestamp_s)
+    camera = camera_motion.filming(told, rng)[sample]
+    return Life(timestamp_s, motion.world_from_agent, motion.agent_from_bone, camera, volume_of(home), told.reason[sample])
+
+
+def rest() -> Float[np.ndarray, "bone 4 4"]:
+    """Return ``agent_from_bone`` of the animal at rest: level bones at their heads."""
+    bones = np.tile(np.eye(4, dtype=np.float32), (len(BONES), 1, 1))
+    bones[:, :3, 3] = HEADS
+    return bones
+
+
+def write(path: Path, life: Life) -> None:
+    """Write a recording that `read_trajectories` takes."""
+    volume = {f"volume/{name}": value for name, value in vars(life.volume).items()}
+    arrays.save(
+        path,
+        compress=True,
+        timestamp_s=life.timestamp_s,
+        world_from_agent=life.world_from_agent,
+        agent_from_bone=life.agent_from_bone.astype(np.float32),
+        world_from_camera=life.world_from_camera,
+        agent_from_bone_rest=rest(),
+        **volume,
+    )

@@ -1,0 +1,64 @@
+"""What the quality page of simulated lives shows: homes from above with the animal's ways, and some shares."""
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.figure import Figure
+
+from pipeline import figures
+from pipeline.qa import Check, Picture
+from stages.synthesize_capture.lives.approaches import Approaches
+from stages.synthesize_capture.lives.lives import RATE_HZ, Life
+from stages.synthesize_capture.policy import REASONS
+
+ROOT_CELLS = slice(3, 6)
+"""Levels of the volume, 0.1 to 0.4 m, at which the animal walks."""
+FLED_M = 0.8
+
+
+def pictures(lived: dict[str, Life]) -> list[Picture]:
+    """Draw up to eight sessions, evenly chosen."""
+    names = list(lived)[:: max(len(lived) // 8, 1)][:8]
+    caption = "Homes from above: what stands between 0.1 and 0.4 m (grey), the animal's way (blue), the person's (green)."
+    return [Picture("homes", homes({name: lived[name] for name in names}), caption)]
+
+
+def homes(lived: dict[str, Life]) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw sessions over their homes."""
+    figure = Figure(figsize=(12, 5.2), dpi=80, layout="constrained")
+    for axis, (name, life) in zip(figure.subplots(2, 4).ravel(), lived.items(), strict=False):
+        volume = life.volume
+        low, high = volume.origin[[0, 2]], volume.origin[[0, 2]] + np.array(volume.occupancy.shape)[[0, 2]] * volume.voxel_m
+        solid = (volume.occupancy[:, ROOT_CELLS] == 1).any(1)
+        axis.imshow(solid.T, cmap="Greys", extent=(low[0], high[0], high[1], low[1]), vmax=2)
+        axis.plot(*life.world_from_camera[:, [0, 2], 3].T, color="#55a868", linewidth=0.5)
+        axis.plot(*life.world_from_agent[:, [0, 2], 3].T, color="#3b6ea5", linewidth=0.8)
+        axis.set(title=name, xticks=[], yticks=[])
+    return figures.pixels(figure)
+
+
+def checks(lived: dict[str, Life], met: Approaches | None) -> list[Check]:
+    """Judge the lives."""
+    reason = np.concatenate([life.reason for life in lived.values()])
+    inside = np.concatenate([_inside(life) for life in lived.values()])
+    minutes = sum(len(life.timestamp_s) for life in lived.values()) / RATE_HZ / 60
+    shares = [Check(f"share of time: {name}", float((reason == code).mean()), "") for code, name in enumerate(REASONS)]
+    found = [Check("minutes in all", minutes, "min", 1, 0.5, "higher"), *shares]
+    found.append(Check("root inside something solid", float(inside.mean()), "share", 0.01, 0.05))
+    if met:
+        walked, stood = fled(met)
+        found += [Check("flees from a walking person", walked, "share", 0.6, 0.4, "higher"), Check("flees from a standing one", stood, "share", 0.2)]
+    return found
+
+
+def fled(met: Approaches) -> tuple[float, float]:
+    """Return in which shares of approaches, and of their twins, the animal gets 0.8 m further off within 3 s."""
+    person = met.observer[:, :, -1:]
+    away = np.linalg.norm((met.world_from_agent[..., :3, 3] - person)[..., [0, 2]], axis=-1)
+    now = met.observer.shape[2] - 1
+    flight = (away[..., now : now + 31].max(-1) - away[..., now]) > FLED_M
+    return float(flight[0].mean()), float(flight[1].mean())
+
+
+def _inside(life: Life) -> Float[np.ndarray, "frame"]:
+    voxel, known = life.volume.voxel(life.world_from_agent[:, :3, 3])
+    return (life.volume.occupancy[tuple(voxel.T)] == 1) | ~known
