@@ -263,7 +263,8 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
             continue
         found = list(_inputs(plan, need, node, part))
         inputs += found
-        several = dag.NODES[need.artifact].roles and not node.roles or dag.NODES[need.artifact].trials == "each" and not trial
+        source = dag.NODES[need.artifact]
+        several = (source.roles and not node.roles) or (source.trials == "each" and not trial)
         together = plan.home_of(need.artifact).folder / need.artifact
         path = together if several else Path(found[0].path, found[0].part or "")
         arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]

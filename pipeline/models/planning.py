@@ -24,6 +24,7 @@ from pipeline.models.behavior import (
 )
 from pipeline.models.diffusion import Schedule, guided, sample
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import FUTURE, Context
 from pipeline.space import rigid
 
@@ -99,13 +100,14 @@ class Plan:
         return world_from_ego[:, None] @ ego_from_agent
 
 
-def observe(context: Context, volume: FeatureVolume, rest: Float[np.ndarray, "bone 4 4"], ego: Ego) -> Observation:
+def observe(context: Context, scenes: FeatureVolume | Scenes, rest: Float[np.ndarray, "bone 4 4"], ego: Ego) -> Observation:
     """Encode contexts as network inputs (Eq. 11, 12, 13)."""
     frame = world_from_ego(context.world_from_agent[:, -1], ego)
     ego_from_world = rigid.inverse(frame)
     observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
     past = past_channels(ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest))
-    return Observation(volume.around(frame), observer, past)
+    grid = scenes.around(frame, context.video) if isinstance(scenes, Scenes) else scenes.around(frame)
+    return Observation(grid, observer, past)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pipeline.models import behavior
 from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
 from pipeline.models.planning import Observation, Sampler, TorchNetworks, observe
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, Context, Future
 from pipeline.space import rigid
 
@@ -132,13 +133,13 @@ class Ats:
     """The behaviour model: goal, path and body by diffusion from the perception code."""
 
     sampler: Sampler
-    volume: FeatureVolume
+    volume: FeatureVolume | Scenes
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     ego: Ego
     sampling: Sampling
 
     @classmethod
-    def load(cls, model: Path, volume: FeatureVolume, sampling: Sampling, *, device: str = "cpu") -> "Ats":
+    def load(cls, model: Path, volume: FeatureVolume | Scenes, sampling: Sampling, *, device: str = "cpu") -> "Ats":
         """Read a trained model (`behavior/`)."""
         architecture, nets, scaling, schedule, rest = behavior.load(model)
         return cls(Sampler(TorchNetworks(nets, device), schedule, scaling), volume, rest, architecture.ego, sampling)

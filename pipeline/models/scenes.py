@@ -50,7 +50,9 @@ class Scenes:
             return np.zeros(windows, int)
         return self.of_video[video]
 
-    def around(self, ego: Float[np.ndarray, "window 4 4"], video: Int[np.ndarray, "window"] | None) -> Float[np.ndarray, "window channel 64 8 64"]:
+    def around(
+        self, ego: Float[np.ndarray, "window 4 4"], video: Int[np.ndarray, "window"] | None
+    ) -> Float[np.ndarray, "window channel 64 8 64"]:
         """Sample the ego grid of every window in its own scene."""
         number = self.number(video, len(ego))
         grid = np.zeros((len(ego), self.channels, *GRID_SHAPE), np.float32)
@@ -58,7 +60,9 @@ class Scenes:
             grid[number == scene] = self.volumes[scene].around(ego[number == scene])
         return grid
 
-    def inside_solid(self, points_world: Float[np.ndarray, "window *some 3"], video: Int[np.ndarray, "window"] | None) -> Bool[np.ndarray, "window *some"]:
+    def inside_solid(
+        self, points_world: Float[np.ndarray, "window *some 3"], video: Int[np.ndarray, "window"] | None
+    ) -> Bool[np.ndarray, "window *some"]:
         """Tell which points lie inside something solid or outside the mapped space."""
         number = self.number(video, len(points_world))
         solid = np.zeros(points_world.shape[:-1], bool)

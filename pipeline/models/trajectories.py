@@ -36,10 +36,13 @@ class Context:
     world_from_agent: Float[np.ndarray, "window 8 4 4"]
     agent_from_bone: Float[np.ndarray, "window 8 bone 4 4"]
     observer_world: Float[np.ndarray, "window 8 3"]
+    video: Int[np.ndarray, "window"] | None = None
+    """number of the recording, which names the scene; None where there is one scene"""
 
     def __getitem__(self, index: slice | np.ndarray) -> "Context":
         """Return some of the windows."""
-        return Context(self.world_from_agent[index], self.agent_from_bone[index], self.observer_world[index])
+        video = None if self.video is None else self.video[index]
+        return Context(self.world_from_agent[index], self.agent_from_bone[index], self.observer_world[index], video)
 
     def __len__(self) -> int:
         return len(self.world_from_agent)
@@ -110,4 +113,5 @@ class BehaviorData:
             for name, rows in gathered.items():
                 rows.append(getattr(self.trajectories[self.videos[video]], name)[frame])
         agent, bone, camera = (np.stack(rows) for rows in gathered.values())
-        return Context(agent[:, :PAST], bone[:, :PAST], camera[:, :PAST, :3, 3]), Future(agent[:, PAST:], bone[:, PAST:])
+        context = Context(agent[:, :PAST], bone[:, :PAST], camera[:, :PAST, :3, 3], self.video[index])
+        return context, Future(agent[:, PAST:], bone[:, PAST:])

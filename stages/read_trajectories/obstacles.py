@@ -29,9 +29,11 @@ def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: f
     bottom = numbers(path, table, "bottom") if "bottom" in table else np.full(len(x), floor)
     top = numbers(path, table, "top") if "top" in table else np.full(len(x), floor + top_m)
     corners = np.concatenate([np.stack([x, bottom, z], -1), np.stack([x, top, z], -1), visited])
-    low = np.floor((np.nanmin(corners, axis=0) - [MARGIN_M, 0, MARGIN_M]) / cell_m) * cell_m
+    around = np.array([MARGIN_M, 0.0, MARGIN_M])
+    low = np.floor((np.nanmin(corners, axis=0) - around) / cell_m) * cell_m
     low[1] = floor - 2 * cell_m
-    shape = np.ceil((np.nanmax(corners, axis=0) + [MARGIN_M, HEADROOM_M, MARGIN_M] - low) / cell_m).astype(int)
+    high = np.nanmax(corners, axis=0) + around + [0.0, HEADROOM_M, 0.0]
+    shape = np.ceil((high - low) / cell_m).astype(int)
     kind = np.full(shape, -1)
     kind[:, :2] = FLOOR
     column = np.floor((np.stack([x, z], -1) - low[[0, 2]]) / cell_m).astype(int)

@@ -36,7 +36,9 @@ def numbers(path: Path, table: dict[str, list[str]], name: str) -> Float[np.ndar
     try:
         return np.array([float(value) if value else np.nan for value in table[name]])
     except ValueError as error:
-        raise InputError("TRJ-001", f"column {name} is not numeric: {error}", str(path), "one number per cell, metres or seconds") from error
+        raise InputError(
+            "TRJ-001", f"column {name} is not numeric: {error}", str(path), "one number per cell, metres or seconds"
+        ) from error
 
 
 def motion_from_csv(

@@ -1,22 +1,17 @@
 """Turn reconstructed motion into trajectories on a 10 Hz grid and windows of 6.4 s for the behaviour model.
 
-A window is 0.8 s of past and 5.6 s of future, all of it valid; the split is by recording. Writes also the scene's
-feature volume, with the voxels in which the animal may be.
+A window is 0.8 s of past and 5.6 s of future, all of it valid; the split is by recording. Motion comes from the
+reconstruction or from tables. Writes also the scenes' feature volumes, with the voxels in which the animal may be.
 """
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from pipeline import cli, progress, qa
 from pipeline.errors import InputError
-from pipeline.files import arrays
-from pipeline.models.perception import FeatureVolume
 from pipeline.models.trajectories import TRAIN
-from stages.slice_behavior import pictures
-from stages.slice_behavior.gridding import Motion, trajectory_from_motion
-from stages.slice_behavior.reading import read_motion
-from stages.slice_behavior.windows import allowed_voxels, slice_windows
+from stages.slice_behavior import pictures, reading, writing
+from stages.slice_behavior.gridding import trajectory_from_motion
+from stages.slice_behavior.windows import slice_windows
 
 
 @dataclass(frozen=True)
@@ -36,37 +31,35 @@ class Config:
 
 
 def run(task: cli.Task) -> None:
-    """Slice all reconstructed sessions."""
+    """Slice all sessions, reconstructed or read from tables."""
     settings: Config = task.config
-    folder = task.input("reconstruction")
     sessions = {video.id: video for video in task.videos if video.role == "session"}
     if not sessions:
-        raise InputError("ART-004", "which recordings?", str(folder), "give --videos build/<agent>/plan/videos.json")
-    motions: dict[str, Motion] = {id: read_motion(folder / id) for id in sessions if (folder / id).is_dir()}
-    trajectories = {
-        id: trajectory_from_motion(motion, min_confidence=settings.min_confidence, max_gap_s=settings.max_gap_s, smooth_s=settings.smooth_s)
-        for id, motion in motions.items()
-    }
+        raise InputError("ART-004", "which recordings?", task.stage, "give --videos build/<agent>/plan/videos.json")
+    if task.has("trajectories"):
+        source = reading.read_tables(task.per_video("trajectories"))
+    else:
+        source = reading.read_reconstruction(task.input("reconstruction"), list(sessions))
+    gaps = {"min_confidence": settings.min_confidence, "max_gap_s": settings.max_gap_s, "smooth_s": settings.smooth_s}
+    trajectories = {id: trajectory_from_motion(motion, **gaps) for id, motion in source.motions.items()}
     test = frozenset(id for id in trajectories if sessions[id].split == "test")
-    rest = arrays.load(folder / "skin.npz", ("agent_from_bone_rest",))["agent_from_bone_rest"]
-    data = slice_windows(trajectories, test, np.asarray(rest, np.float32), stride=settings.stride)
+    data = slice_windows(trajectories, test, source.agent_from_bone_rest, stride=settings.stride)
     if not len(data.indices(TRAIN)):
         remedy = "record longer sessions in which the animal stays in view, or lower min_confidence"
-        raise InputError("BEH-001", "no 6.4 s of uninterrupted motion to learn from", str(folder), remedy)
+        raise InputError("BEH-001", "no 6.4 s of uninterrupted motion to learn from", source.where, remedy)
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start) - len(data.indices(TRAIN))} test windows")
-    volume = FeatureVolume.load(folder / "feature_volume.npz")
-    allowed = allowed_voxels(volume, {id: t for id, t in trajectories.items() if id not in test}, reach_voxels=settings.reach_voxels)
+    seen = {id: trajectory for id, trajectory in trajectories.items() if id not in test}
     with task.create() as out:
         data.save(out)
-        arrays.save(out / "volume.npz", compress=True, **vars(volume), allowed=allowed)
+        writing.write_volumes(out, source.volumes, seen, tuple(source.motions), reach_voxels=settings.reach_voxels)
         qa.write(
             out,
             good="hundreds of windows, an animal that covers the room, and an observer at many distances",
             bad="long invalid stretches, or an animal that never moves",
             checks=pictures.checks(data),
-            pictures=pictures.pictures(data, volume),
+            pictures=pictures.pictures(data, source.volumes[0]),
         )
 
 
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, reads=("reconstruction",))
+    cli.enter(__doc__, run, config=Config, optional=("reconstruction", "trajectories"))

@@ -10,8 +10,8 @@ from typing import Literal
 from pipeline import cli, progress, qa
 from pipeline.models.behavior import Architecture
 from pipeline.models.diffusion import Schedule
-from pipeline.models.perception import FeatureVolume
 from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN, BehaviorData
 from stages.train_behavior import export, pictures, reactions
 from stages.train_behavior.training import Settings, train
@@ -47,16 +47,16 @@ def run(task: cli.Task) -> None:
     """Train, export, judge."""
     c: Config = task.config
     data = BehaviorData.load(task.input("behavior_data"))
-    volume = FeatureVolume.load(task.input("behavior_data") / "volume.npz")
+    scenes = Scenes.load(task.input("behavior_data"), data.videos)
     architecture = Architecture(
         bones=len(data.agent_from_bone_rest), ego=c.ego, scene=c.scene, scene_width=c.scene_width,
-        scene_channels=len(volume.features), observer_radius_m=c.observer_radius_m, blind_to=c.blind_to, goal_from=c.goal_from, unet_width=c.unet_width,
+        scene_channels=scenes.channels, observer_radius_m=c.observer_radius_m, blind_to=c.blind_to, goal_from=c.goal_from, unet_width=c.unet_width,
         unet_multipliers=c.unet_multipliers,
     )  # fmt: skip
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
-    fitted = train(data, volume, architecture, Schedule(), c.training, seed=c.seed, resume=task.resume, device=task.device)
+    fitted = train(data, scenes, architecture, Schedule(), c.training, seed=c.seed, resume=task.resume, device=task.device)
     sampler = Sampler(TorchNetworks(fitted.nets.cpu()), Schedule(), fitted.scaling)
-    moments = reactions.moments(data, volume, architecture)
+    moments = reactions.moments(data, scenes, architecture)
     reaction = reactions.measure(sampler, moments.observation, radius_m=c.observer_radius_m, seed=c.seed)
     progress.log(f"an approaching observer shifts goals {reaction.away_m:.2f} m away, a far one {reaction.far_m:.3f} m")
     with task.create() as folder:
@@ -67,7 +67,7 @@ def run(task: cli.Task) -> None:
             good="goals that spread over where the animal could go and shift away from a close observer",
             bad="goals inside furniture, goals that ignore an approach, or an animal that shies at someone far away",
             checks=pictures.checks(fitted.record, reaction, difference),
-            pictures=pictures.pictures(sampler, moments, volume, fitted.record, seed=c.seed),
+            pictures=pictures.pictures(sampler, moments, scenes, fitted.record, seed=c.seed),
         )
 
 

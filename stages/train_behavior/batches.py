@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pipeline.models.behavior import Architecture, Scaling, channels_from_bones, rotation_to_6d
 from pipeline.models.perception import FeatureVolume, grid_points_ego, world_from_ego
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, BehaviorData
 from pipeline.space import rigid, rigid_torch
 
@@ -52,6 +53,8 @@ class Windows:
     bones: Float[Tensor, "frame channel"]
     frame: Int[Tensor, "window 64"]
     """rows of ``bones``"""
+    scene: Int[Tensor, "window"]
+    """number of the window's feature volume"""
 
     def __len__(self) -> int:
         return len(self.root)
@@ -93,28 +96,41 @@ class SceneSampler:
     at the blocks' centres.
     """
 
-    def __init__(self, volume: FeatureVolume, stride: int, device: str):
-        features = volume.features.astype(np.float32)
-        kernel = np.array([0.125, 0.75, 0.125]) if stride > 1 else np.array([1.0])
-        for axis in (1, 2, 3):
-            features = convolve1d(features, kernel, axis=axis, mode="constant")
-        flat = np.concatenate([np.moveaxis(features, 0, -1).reshape(-1, len(features)), np.zeros((1, len(features)), np.float32)])
-        self.features = torch.from_numpy(flat).to(device)
+    def __init__(self, scenes: Scenes, stride: int, device: str):
+        volumes = scenes.volumes
+        flat = [_smoothed(volume, stride).reshape(-1, scenes.channels) for volume in volumes]
+        rows = np.concatenate([*flat, np.zeros((1, flat[0].shape[1]), np.float32)])
+        self.features = torch.from_numpy(rows).to(device)
         self.points = torch.from_numpy(grid_points_ego(stride).astype(np.float32)).to(device)
-        self.origin = torch.from_numpy(volume.origin.astype(np.float32)).to(device)
-        self.shape, self.voxel_m = torch.tensor(volume.occupancy.shape, device=device), volume.voxel_m
+        first = np.cumsum([0, *(len(part) for part in flat[:-1])])
+        self.first = torch.from_numpy(first).to(device)
+        self.origin = torch.from_numpy(np.stack([volume.origin for volume in volumes]).astype(np.float32)).to(device)
+        self.shape = torch.tensor([volume.occupancy.shape for volume in volumes], device=device)
+        self.voxel_m = torch.tensor([volume.voxel_m for volume in volumes], device=device)
 
-    def __call__(self, world_from_ego: Float[Tensor, "batch 4 4"], side: Float[Tensor, "batch"]) -> Float[Tensor, "batch channel x y z"]:
-        """Sample the grid; ``side`` is -1 where left and right are exchanged."""
+    def __call__(
+        self, world_from_ego: Float[Tensor, "batch 4 4"], side: Float[Tensor, "batch"], scene: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "batch channel x y z"]:
+        """Sample the grid in the volumes ``scene``; ``side`` is -1 where left and right are exchanged."""
         points = self.points.flatten(0, 2) * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
-        index = ((rigid_torch.apply(world_from_ego, points) - self.origin) / self.voxel_m).floor().long()
-        inside = ((index >= 0) & (index < self.shape)).all(-1)
-        row = (index[..., 0] * self.shape[1] + index[..., 1]) * self.shape[2] + index[..., 2]
+        away = rigid_torch.apply(world_from_ego, points) - self.origin[scene][:, None]
+        index, shape = (away / self.voxel_m[scene][:, None, None]).floor().long(), self.shape[scene][:, None]
+        inside = ((index >= 0) & (index < shape)).all(-1)
+        row = (index[..., 0] * shape[..., 1] + index[..., 1]) * shape[..., 2] + index[..., 2] + self.first[scene][:, None]
         features = self.features[torch.where(inside, row, len(self.features) - 1)]
         return features.transpose(1, 2).unflatten(2, self.points.shape[:3])
 
 
-def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture) -> Windows:
+def _smoothed(volume: FeatureVolume, stride: int) -> Float[np.ndarray, "x y z channel"]:
+    """Return features as averaging over 2 x 2 x 2 cells would leave them, or as they are."""
+    features = volume.features.astype(np.float32)
+    kernel = np.array([0.125, 0.75, 0.125]) if stride > 1 else np.array([1.0])
+    for axis in (1, 2, 3):
+        features = convolve1d(features, kernel, axis=axis, mode="constant")
+    return np.moveaxis(features, 0, -1)
+
+
+def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture, scenes: Scenes) -> Windows:
     """Express windows in the ego frame of their current time."""
     context, future = data.windows(index)
     frame = world_from_ego(context.world_from_agent[:, -1], architecture.ego)
@@ -128,7 +144,8 @@ def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], arch
     rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(agent.shape[1])
     observer = rigid.apply(ego_from_world, context.observer_world)
     arrays = (frame, agent[..., :3, 3], agent[..., :3, :3], observer, bones)
-    return Windows(*(torch.from_numpy(array.astype(np.float32)) for array in arrays), torch.from_numpy(rows))
+    number = scenes.number(context.video, len(index))
+    return Windows(*(torch.from_numpy(array.astype(np.float32)) for array in arrays), torch.from_numpy(rows), torch.from_numpy(number))
 
 
 def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
@@ -194,7 +211,7 @@ def draw_batch(
     body = body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
     device = scene.points.device
     return Batch(
-        scene(ego.to(device), side.to(device)),
+        scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
         observer.flatten(1),
         past.flatten(1),
         ((uniform(size) >= augmentation.hide_bones) & (side > 0)).float(),

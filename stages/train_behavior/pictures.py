@@ -11,6 +11,7 @@ from pipeline.fit import FitRecord
 from pipeline.models.behavior import Sampling
 from pipeline.models.perception import FeatureVolume
 from pipeline.models.planning import Observation, Sampler
+from pipeline.models.scenes import Scenes
 from pipeline.qa import Check, Picture
 from pipeline.space import rigid
 from stages.train_behavior.reactions import SIDES, Moments, Reactions, approach
@@ -19,10 +20,10 @@ FAN = 64
 SHOWN = 4
 
 
-def pictures(sampler: Sampler, moments: Moments, volume: FeatureVolume, record: FitRecord, *, seed: int) -> list[Picture]:
+def pictures(sampler: Sampler, moments: Moments, scenes: Scenes, record: FitRecord, *, seed: int) -> list[Picture]:
     """Draw a few training windows, sampled under different conditions."""
     chosen = np.linspace(0, len(moments.observation) - 1, SHOWN + 2).astype(int)[1:-1]
-    room, frame = _Room(volume), moments.world_from_ego[chosen]
+    rooms, frame = [_Room(scenes.volumes[number]) for number in moments.scene[chosen]], moments.world_from_ego[chosen]
     some = moments.observation[chosen]
     removed = {
         "all": Sampling(),
@@ -40,9 +41,9 @@ def pictures(sampler: Sampler, moments: Moments, volume: FeatureVolume, record: 
         "losses": "Squared error of the predicted noise, smoothed.",
     }
     images = {
-        "goals": room.fans(sampler, some, frame, removed, seed),
-        "guidance": room.fans(sampler, close, frame, strength, seed),
-        "paths": room.fans(sampler, some, frame, with_scene, seed, paths=True),
+        "goals": fans(rooms, sampler, some, frame, removed, seed),
+        "guidance": fans(rooms, sampler, close, frame, strength, seed),
+        "paths": fans(rooms, sampler, some, frame, with_scene, seed, paths=True),
         "losses": losses(record),
     }
     return [Picture(name, image, captions[name]) for name, image in images.items()]
@@ -76,6 +77,33 @@ def losses(record: FitRecord) -> UInt8[np.ndarray, "height width 3"]:
     return figures.pixels(figure)
 
 
+def fans(
+    rooms: "list[_Room]",
+    sampler: Sampler,
+    observation: Observation,
+    frame: Float[np.ndarray, "window 4 4"],
+    samplings: dict[str, Sampling],
+    seed: int,
+    *,
+    paths: bool = False,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw one row per way of sampling, one column per window."""
+    figure = Figure(figsize=(2.6 * len(frame), 2.3 * len(samplings)), dpi=80, layout="constrained")
+    grid = figure.subplots(len(samplings), len(frame), squeeze=False)
+    count = 12 if paths else FAN
+    for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
+        rng, codes = np.random.default_rng(seed), sampler.codes(observation, sampling, count)
+        goals = sampler.goals(codes, sampling, rng)
+        lines = sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3) if paths else None
+        goals = goals.reshape(len(frame), count, 3)
+        for column, axis in enumerate(row):
+            rooms[column].window(axis, frame[column], observation.observer_past[column].reshape(-1, 3), goals[column])
+            if lines is not None:
+                rooms[column].lines(axis, frame[column], lines[column])
+        row[0].set_ylabel(name)
+    return figures.pixels(figure)
+
+
 class _Room:
     """The room from above, to draw on."""
 
@@ -84,33 +112,7 @@ class _Room:
         self.low = volume.origin[[0, 2]]
         self.high = self.low + np.array(self.solid.shape) * volume.voxel_m
 
-    def fans(
-        self,
-        sampler: Sampler,
-        observation: Observation,
-        frame: Float[np.ndarray, "window 4 4"],
-        samplings: dict[str, Sampling],
-        seed: int,
-        *,
-        paths: bool = False,
-    ) -> UInt8[np.ndarray, "height width 3"]:
-        """Draw one row per way of sampling, one column per window."""
-        figure = Figure(figsize=(2.6 * len(frame), 2.3 * len(samplings)), dpi=80, layout="constrained")
-        grid = figure.subplots(len(samplings), len(frame), squeeze=False)
-        count = 12 if paths else FAN
-        for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
-            rng, codes = np.random.default_rng(seed), sampler.codes(observation, sampling, count)
-            goals = sampler.goals(codes, sampling, rng)
-            lines = sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3) if paths else None
-            goals = goals.reshape(len(frame), count, 3)
-            for column, axis in enumerate(row):
-                self._window(axis, frame[column], observation.observer_past[column].reshape(-1, 3), goals[column])
-                if lines is not None:
-                    self._lines(axis, frame[column], lines[column])
-            row[0].set_ylabel(name)
-        return figures.pixels(figure)
-
-    def _window(
+    def window(
         self,
         axis,
         frame: Float[np.ndarray, "4 4"],
@@ -126,6 +128,6 @@ class _Room:
         axis.quiver(*frame[[0, 2], 3], *(frame[[0, 2], 2] * [1, 1]), angles="xy", color="#3b6ea5", scale=8, width=0.02)
         axis.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
 
-    def _lines(self, axis, frame: Float[np.ndarray, "4 4"], paths: Float[np.ndarray, "sample frame 3"]) -> None:
+    def lines(self, axis, frame: Float[np.ndarray, "4 4"], paths: Float[np.ndarray, "sample frame 3"]) -> None:
         for path in rigid.apply(frame, paths):
             axis.plot(path[:, 0], path[:, 2], color="#c44e52", linewidth=0.8, alpha=0.7)

@@ -7,11 +7,12 @@ dropped; everything else, scene, past and noise, is the same.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.models.behavior import Architecture, Sampling
-from pipeline.models.perception import FeatureVolume, world_from_ego
+from pipeline.models.perception import world_from_ego
 from pipeline.models.planning import Observation, Sampler, observe
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData
 
 SAMPLES = 16
@@ -41,14 +42,17 @@ class Moments:
 
     observation: Observation
     world_from_ego: Float[np.ndarray, "window 4 4"]
+    scene: Int[np.ndarray, "window"]
+    """number of each window's feature volume"""
 
 
-def moments(data: BehaviorData, volume: FeatureVolume, architecture: Architecture, count: int = 24) -> Moments:
+def moments(data: BehaviorData, scenes: Scenes, architecture: Architecture, count: int = 24) -> Moments:
     """Choose training windows and encode what the animal perceives in them."""
     train = data.indices(TRAIN)
     context, _ = data.windows(train[np.linspace(0, len(train) - 1, min(count, len(train))).astype(int)])
-    observation = observe(context, volume, data.agent_from_bone_rest, architecture.ego)
-    return Moments(observation, world_from_ego(context.world_from_agent[:, -1], architecture.ego))
+    observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)
+    number = scenes.number(context.video, len(context))
+    return Moments(observation, world_from_ego(context.world_from_agent[:, -1], architecture.ego), number)
 
 
 def approach(side: Float[np.ndarray, "3"], distance_m: float, speed_m_s: float) -> Float[np.ndarray, "frame*3"]:

@@ -10,7 +10,7 @@ import torch
 from pipeline.fit import FitRecord, fit
 from pipeline.models.behavior import Architecture, BehaviorNets, Scaling
 from pipeline.models.diffusion import Schedule
-from pipeline.models.perception import FeatureVolume
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN, BehaviorData
 from stages.train_behavior.batches import (
     Augmentation,
@@ -66,7 +66,7 @@ class Fitted:
 
 def train(
     data: BehaviorData,
-    volume: FeatureVolume,
+    scenes: Scenes,
     architecture: Architecture,
     schedule: Schedule,
     settings: Settings,
@@ -76,11 +76,11 @@ def train(
     device: str = "cpu",
 ) -> Fitted:
     """Fit the networks to the training windows of the data."""
-    windows = windows_from_data(data, data.indices(TRAIN), architecture)
+    windows = windows_from_data(data, data.indices(TRAIN), architecture, scenes)
     statistics = statistics_from_windows(windows, settings.augmentation.largest_turn_rad)
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
-    scene = SceneSampler(volume, nets.perception.scene.stride, device)
+    scene = SceneSampler(scenes, nets.perception.scene.stride, device)
     pace = settings.optimization
     optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay, fused=True)
 

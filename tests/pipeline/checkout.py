@@ -33,7 +33,7 @@ class Config:
 
 def run(task):
     digest = hashlib.sha256(repr(task.config).encode())
-    needs = {{need.option or need.artifact: need for node in dag.FLOW if node.stage == {stage!r} for need in dag.needs_of(node)}}
+    needs = {{need.option or need.artifact: need for node in dag.FLOW if node.stage == {stage!r} for need in dag.needs_of(node, "recordings")}}
     for name in sorted(task.paths):
         need = needs[name]
         if name in dag.NODES and dag.NODES[name].roles and task.video is None:
@@ -99,8 +99,8 @@ def create(folder: Path) -> Checkout:
     for name in ("envs/cpu.txt", "envs/cuda.txt", "envs/setup", ".venv/.ok", "stages/__init__.py", "agents/toy.toml"):
         made.write(name, "")
     made.write("agents/variants/other.toml", "[train_behavior]\nseed = 7\n")
-    for stage in {node.stage for node in dag.FLOW}:
-        needs = [need for node in dag.FLOW if node.stage == stage for need in dag.needs_of(node)]
+    for stage in {node.stage for node in dag.nodes_of("recordings")}:
+        needs = [need for node in dag.FLOW if node.stage == stage for need in dag.needs_of(node, "recordings")]
         names = tuple(dict.fromkeys(need.option or need.artifact for need in needs))
         optional = names if stage == "train_localizer" else tuple(name for name in names if name == "truth")
         reads = tuple(name for name in names if name not in optional)

@@ -46,7 +46,10 @@ def checks(lived: dict[str, Life], met: Approaches | None) -> list[Check]:
     found.append(Check("root inside something solid", float(inside.mean()), "share", 0.01, 0.05))
     if met:
         walked, stood = fled(met)
-        found += [Check("flees from a walking person", walked, "share", 0.6, 0.4, "higher"), Check("flees from a standing one", stood, "share", 0.2)]
+        found += [
+            Check("flees from a walking person", walked, "share", 0.6, 0.4, "higher"),
+            Check("flees from a standing one", stood, "share", 0.2),
+        ]
     return found
 
 

@@ -11,6 +11,7 @@ from pipeline.models.behavior import Sampling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN
 from stages.train_behavior.batches import (
     Augmentation,
@@ -42,12 +43,14 @@ def data():
 
 @pytest.fixture(scope="module")
 def windows(data):
-    return windows_from_data(data, data.indices(TRAIN), ARCHITECTURE)
+    return windows_from_data(data, data.indices(TRAIN), ARCHITECTURE, Scenes.of(room()))
 
 
 def drawn(windows, augmentation, seed=0):
     statistics = statistics_from_windows(windows, augmentation.largest_turn_rad)
-    batch = draw_batch(windows, SceneSampler(room(), 2, "cpu"), statistics, augmentation, 16, torch.Generator().manual_seed(seed))
+    batch = draw_batch(
+        windows, SceneSampler(Scenes.of(room()), 2, "cpu"), statistics, augmentation, 16, torch.Generator().manual_seed(seed)
+    )
     return batch, statistics.scaling
 
 
@@ -92,7 +95,7 @@ def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):
 def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
     volume = room()
     exact = torch.nn.functional.avg_pool3d(torch.from_numpy(volume.around(windows.world_from_ego[:4].numpy())), 2)
-    fast = SceneSampler(volume, 2, "cpu")(windows.world_from_ego[:4], torch.ones(4))
+    fast = SceneSampler(Scenes.of(volume), 2, "cpu")(windows.world_from_ego[:4], torch.ones(4), torch.zeros(4, dtype=torch.long))
     assert fast.shape == exact.shape == (4, 16, *(n // 2 for n in GRID_SHAPE))
     together = torch.stack([exact.flatten(), fast.flatten()])
     assert torch.corrcoef(together)[0, 1] > 0.9  # one reads smoothed voxels, the other averages eight nearest ones
@@ -100,7 +103,7 @@ def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
 
 def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
     settings = Settings(Optimization(steps=8, goal_steps=4, batch=8, save_every=3))
-    whole = train(data, room(), ARCHITECTURE, Schedule(), settings, seed=3)
+    whole = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3)
     assert set(whole.record.terms) == {"goal", "path", "body"}
     assert all(np.isfinite(values).all() for values in whole.record.terms.values())
     restore = fit._Loop.advance
@@ -113,8 +116,8 @@ def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(fit._Loop, "advance", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            train(data, room(), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
-    resumed = train(data, room(), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
+            train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
+    resumed = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
     for name, value in whole.nets.state_dict().items():
         torch.testing.assert_close(resumed.nets.state_dict()[name], value, atol=0, rtol=0)
 
@@ -180,7 +183,7 @@ class Timid:
 
 
 def test_reactions_measure_a_known_animal(data, windows):
-    seen = moments(data, room(), ARCHITECTURE, 3)
+    seen = moments(data, Scenes.of(room()), ARCHITECTURE, 3)
     scaling = replace(statistics_from_windows(windows, 0.0).scaling, goal_std=np.ones(3))
     measured = measure(Sampler(Timid(), Schedule(), scaling), seen.observation, radius_m=4.0, seed=0)
     expected = Reactions(away_m=1.0, away_share=1.0, reversal_m=2.0, far_m=0.0, farther_m=0.0)
