@@ -7,13 +7,14 @@ functions between define the channels of body and past. Plans are drawn by `pipe
 import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
+from pipeline.models.concatenation import ConcatenationUNet
 from pipeline.models.denoisers import ControlUNet, GoalMLP
 from pipeline.models.diffusion import STANDARD, Schedule
 from pipeline.models.perception import (
@@ -49,6 +50,9 @@ class Architecture:
     goal_from: Literal["scene_observer", "all"] = "all"
     goal_hidden: int = 128
     goal_layers: int = 6
+    family: Literal["diffusion", "gaussian", "one_stage"] = "diffusion"
+    control: Literal["unet", "concatenation"] = "unet"
+    future: int = FUTURE
 
     @property
     def body_channels(self) -> int:
@@ -122,8 +126,16 @@ class BehaviorNets(nn.Module):
         a = architecture
         self.perception = Perception(a.perception)
         self.goal = GoalMLP(a.goal_condition, a.goal_hidden, a.goal_layers, schedule)
-        self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
-        self.body = ControlUNet(a.body_channels, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
+        body = a.body_channels + (3 if a.family == "one_stage" else 0)
+        match a.control:
+            case "unet":
+                self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                self.body = ControlUNet(body, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
+            case "concatenation":
+                self.path = ConcatenationUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                self.body = ConcatenationUNet(body, 3 * a.future, a.condition, a.unet_width, a.unet_multipliers, schedule)
+            case _:
+                assert_never(a.control)
 
 
 def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:
@@ -178,7 +190,7 @@ def contract(architecture: Architecture, scaling: Scaling, schedule: Schedule, r
         "up": [0, 1, 0],
         "rate_hz": RATE_HZ,
         "past_frames": PAST,
-        "future_frames": FUTURE,
+        "future_frames": architecture.future,
         "architecture": asdict(architecture),
         "bones": [f"bone_{number:02d}" for number in range(architecture.bones)],
         "agent_from_bone_rest": np.asarray(rest, float).tolist(),

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from pipeline.files import arrays
 from pipeline.space import rigid
 
-Ego = Literal["yaw", "full"]
+Ego = Literal["yaw", "full", "world"]
 Blind = Literal["nothing", "scene", "observer", "past"]
 CONDITIONS: tuple[Blind, ...] = ("scene", "observer", "past")
 Blind = Literal["nothing", "scene", "observer", "past"]
@@ -31,10 +31,15 @@ UPRIGHT = 0.2
 def world_from_ego(world_from_agent: Float[np.ndarray, "*batch 4 4"], ego: Ego) -> Float[np.ndarray, "*batch 4 4"]:
     """Return the ego frame at the agent's root: its full rotation, or only its heading about world +y (``yaw``).
 
-    A head that points straight up or down has no heading: the belly's, or the back's, direction takes its place.
+    A head that points straight up or down has no heading: the belly's, or the back's, direction takes its place. The
+    ablation ``world`` keeps the world's axes and horizontal origin, and takes only the height from the root.
     """
     if ego == "full":
         return np.asarray(world_from_agent, float)
+    if ego == "world":
+        frame = np.broadcast_to(np.eye(4), np.shape(world_from_agent)).copy()
+        frame[..., 1, 3] = np.asarray(world_from_agent)[..., 1, 3]
+        return frame
     rotation = np.asarray(world_from_agent, float)[..., :3, :3]
     head, back = rotation[..., :, 2], rotation[..., :, 1]
     lying = np.hypot(head[..., 0], head[..., 2]) < UPRIGHT

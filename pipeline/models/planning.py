@@ -25,7 +25,7 @@ from pipeline.models.behavior import (
 from pipeline.models.diffusion import Schedule, guided, sample
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import FUTURE, Context
+from pipeline.models.trajectories import Context
 from pipeline.space import rigid
 
 Array = np.ndarray
@@ -173,7 +173,7 @@ class Sampler:
             return lambda x, t: self.networks.path(x, _filled(len(x), t), code, control, _filled((len(x), 1), keep))
 
         pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
-        path = self._drawn(*pair, (len(goal), 3, FUTURE), sampling, sampling.sequence_steps, rng)
+        path = self._drawn(*pair, (len(goal), *self.scaling.path_std.shape), sampling, sampling.sequence_steps, rng)
         return np.swapaxes(path * self.scaling.path_std, 1, 2)
 
     def bodies(
@@ -185,7 +185,7 @@ class Sampler:
         def denoise(code: Array) -> Callable[[Array, float], Array]:
             return lambda x, t: self.networks.body(x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0))
 
-        shape = (len(path), len(self.scaling.body_mean), FUTURE)
+        shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         body = self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 

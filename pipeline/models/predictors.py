@@ -15,6 +15,7 @@ from pipeline.models import behavior
 from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
 from pipeline.models.planning import Observation, Sampler, TorchNetworks, observe
+from pipeline.models.rivals import sampler_of
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, Context, Future
 from pipeline.space import rigid
@@ -142,7 +143,8 @@ class Ats:
     def load(cls, model: Path, volume: FeatureVolume | Scenes, sampling: Sampling, *, device: str = "cpu") -> "Ats":
         """Read a trained model (`behavior/`)."""
         architecture, nets, scaling, schedule, rest = behavior.load(model)
-        return cls(Sampler(TorchNetworks(nets, device), schedule, scaling), volume, rest, architecture.ego, sampling)
+        sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
+        return cls(sampler, volume, rest, architecture.ego, sampling)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` plans for each window; goal and path are each as sampled."""

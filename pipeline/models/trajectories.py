@@ -4,12 +4,13 @@
 as a `Context` (the past, all that a predictor may see) and a `Future` (what it must predict).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline.errors import InputError
 from pipeline.files import arrays
 
 RATE_HZ = 10
@@ -66,6 +67,22 @@ class Future:
         return self.world_from_agent[:, :, :3, 3]
 
 
+def frames_from_seconds(seconds: float) -> int:
+    """Return the frames of a horizon. Raises InputError BEH-003 where the UNets could not halve it twice."""
+    frames = round(seconds * RATE_HZ)
+    if frames <= 0 or frames % 4:
+        raise InputError("BEH-003", f"cannot predict {seconds:g} s", "horizon_s", "take a multiple of 0.4 s: 4.0, 5.6, 7.2")
+    return frames
+
+
+def window_starts(valid: Bool[np.ndarray, "frame"], length: int, stride: int = 1) -> Int[np.ndarray, "window"]:
+    """Return the first frames of all windows of ``length`` valid frames."""
+    if len(valid) < length:
+        return np.zeros(0, np.int64)
+    run = np.lib.stride_tricks.sliding_window_view(valid, length).all(-1)
+    return np.flatnonzero(run & (np.arange(len(run)) % stride == 0))
+
+
 @dataclass(frozen=True)
 class BehaviorData:
     """Everything in `behavior_data/`: trajectories per recording and the exact list of windows."""
@@ -79,6 +96,8 @@ class BehaviorData:
     split: Int[np.ndarray, "window"]
     """0 train, 1 test"""
     videos: tuple[str, ...]
+    future: int = FUTURE
+    """frames that are predicted"""
 
     @classmethod
     def load(cls, folder: Path) -> "BehaviorData":
@@ -105,9 +124,19 @@ class BehaviorData:
         """Return the windows of one split."""
         return np.flatnonzero(self.split == split)
 
+    def with_horizon(self, future: int) -> "BehaviorData":
+        """Return the same recordings cut into windows of another horizon, in frames, all that are valid throughout."""
+        if future == self.future:
+            return self
+        tested = {int(video) for video in self.video[self.split == TEST]}
+        starts = [window_starts(self.trajectories[video].valid, PAST + future) for video in self.videos]
+        video = np.repeat(np.arange(len(starts)), [len(mine) for mine in starts]).astype(np.int32)
+        split = np.where(np.isin(video, list(tested)), TEST, TRAIN).astype(np.uint8)
+        return replace(self, video=video, start=np.concatenate(starts).astype(np.int32), split=split, future=future)
+
     def windows(self, index: Int[np.ndarray, "window"]) -> tuple[Context, Future]:
         """Gather windows by their number in the list."""
-        frames = self.start[index][:, None] + np.arange(PAST + FUTURE)
+        frames = self.start[index][:, None] + np.arange(PAST + self.future)
         gathered = {name: [] for name in ("world_from_agent", "agent_from_bone", "world_from_camera")}
         for video, frame in zip(self.video[index], frames, strict=True):
             for name, rows in gathered.items():

@@ -1,20 +1,11 @@
 """The exact list of training and test windows, and where in the room an animal may be."""
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import UInt8
 from scipy.ndimage import binary_dilation
 
 from pipeline.models.perception import FeatureVolume
-from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData, Trajectory
-
-
-def window_starts(valid: Bool[np.ndarray, "frame"], stride: int) -> Int[np.ndarray, "window"]:
-    """Return the first frames of all windows of 64 valid frames."""
-    length = PAST + FUTURE
-    if len(valid) < length:
-        return np.zeros(0, np.int64)
-    run = np.lib.stride_tricks.sliding_window_view(valid, length).all(-1)
-    return np.flatnonzero(run & (np.arange(len(run)) % stride == 0))
+from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData, Trajectory, window_starts
 
 
 def slice_windows(
@@ -22,7 +13,7 @@ def slice_windows(
 ) -> BehaviorData:
     """List the windows of every recording: with ``stride`` in training recordings, every one in test recordings."""
     videos = tuple(sorted(trajectories))
-    starts = [window_starts(trajectories[v].valid, 1 if v in test else stride) for v in videos]
+    starts = [window_starts(trajectories[v].valid, PAST + FUTURE, 1 if v in test else stride) for v in videos]
     video = np.repeat(np.arange(len(videos)), [len(s) for s in starts]).astype(np.int32)
     tested = np.array([v in test for v in videos])
     split = np.where(tested[video], TEST, TRAIN).astype(np.uint8)

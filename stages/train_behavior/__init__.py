@@ -1,6 +1,6 @@
 """Train the behaviour model from trajectories: perception, goal, path and body.
 
-`batches` draws augmented windows in the ego frame, `objective` turns them into denoising losses, `training` runs the
-loop, `reactions` asks whether the animal minds the observer, `export` writes weights, ONNX and the sampler's contract,
-`pictures` judges it all.
+`batches` draws augmented windows in the ego frame, `objective` turns them into denoising losses (`rival_losses` into
+those of the rivals of Table 4), `training` runs the loop, `reactions` asks whether the animal minds the observer,
+`export` writes weights, ONNX and the sampler's contract, `pictures` judges it all, `outcome` has all of this written.
 """

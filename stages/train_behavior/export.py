@@ -15,7 +15,7 @@ from pipeline.models.behavior import Architecture, BehaviorNets, Sampling, Scali
 from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.planning import Observation, Sampler, TorchNetworks
-from pipeline.models.trajectories import FUTURE, PAST
+from pipeline.models.trajectories import PAST
 
 NETWORKS = ("perception", "goal", "path", "body")
 
@@ -31,12 +31,13 @@ def write_model(
 def write_contract(
     folder: Path, nets: BehaviorNets, architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: np.ndarray
 ) -> None:
-    """Write weights, `behavior.json` and `golden.json`."""
+    """Write weights, `behavior.json` and, of the model that other samplers know, `golden.json`."""
     save_file({name: value.contiguous() for name, value in nets.state_dict().items()}, folder / "behavior.safetensors")
     document = contract(architecture, scaling, schedule, rest)
     (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
-    golden = golden_plan(Sampler(TorchNetworks(nets), schedule, scaling), architecture)
-    (folder / "golden.json").write_text(json.dumps(golden) + "\n")
+    if architecture.family == "diffusion":
+        golden = golden_plan(Sampler(TorchNetworks(nets), schedule, scaling), architecture)
+        (folder / "golden.json").write_text(json.dumps(golden) + "\n")
 
 
 def write_networks(folder: Path, nets: BehaviorNets, architecture: Architecture) -> float:
@@ -91,9 +92,9 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
         case "goal":
             return {"x": (3,)} | step, "epsilon"
         case "path":
-            return {"x": (3, FUTURE)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
+            return {"x": (3, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
         case _:
-            return {"x": (a.body_channels, FUTURE)} | step | {"control": (3, FUTURE), "keep": (1,)}, "epsilon"
+            return {"x": (a.body_channels, a.future)} | step | {"control": (3, a.future), "keep": (1,)}, "epsilon"
 
 
 def golden_observation(a: Architecture) -> Observation:
@@ -112,7 +113,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
     observation = golden_observation(architecture)
     sampling = Sampling(method="ddim", goal_steps=10, sequence_steps=10)
     noise = np.random.default_rng(0)
-    shapes = {"goal": (1, 3), "path": (1, 3, FUTURE), "body": (1, architecture.body_channels, FUTURE)}
+    shapes = {"goal": (1, 3), "path": (1, 3, architecture.future), "body": (1, architecture.body_channels, architecture.future)}
     drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}
     plans = {f"guidance_{s:g}": sampler.plan(observation, Sampling("ddim", 10, 10, s), np.random.default_rng(0)) for s in (1.0, 0.5)}
     return {

@@ -21,6 +21,7 @@ from stages.train_behavior.batches import (
     windows_from_data,
 )
 from stages.train_behavior.objective import Objective, losses
+from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ def train(
     device: str = "cpu",
 ) -> Fitted:
     """Fit the networks to the training windows of the data."""
+    minimised = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}[architecture.family]
     windows = windows_from_data(data, data.indices(TRAIN), architecture, scenes)
     statistics = statistics_from_windows(windows, settings.augmentation.largest_turn_rad)
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
@@ -86,7 +88,7 @@ def train(
 
     def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
         batch = draw_batch(windows, scene, statistics, settings.augmentation, pace.batch, generator)
-        return losses(nets, batch, schedule, settings.objective, generator, goals=step < pace.goal_steps)
+        return minimised(nets, batch, schedule, settings.objective, generator, goals=step < pace.goal_steps)
 
     def after_step(step: int) -> None:
         decay = min(pace.average, (step + 1) / (step + 10))

@@ -1,9 +1,9 @@
 import numpy as np
 
-from pipeline.models.trajectories import TEST, TRAIN
+from pipeline.models.trajectories import TEST, TRAIN, window_starts
 from pipeline.space import rigid
 from stages.slice_behavior.gridding import Motion, smoothed, trajectory_from_motion
-from stages.slice_behavior.windows import allowed_voxels, slice_windows, window_starts
+from stages.slice_behavior.windows import allowed_voxels, slice_windows
 from tests.pipeline.models.wandering import REST, room, wander
 
 OPTIONS = {"min_confidence": 0.5, "max_gap_s": 0.6, "smooth_s": 0.0}
@@ -71,7 +71,7 @@ def test_windows_hold_only_valid_frames_of_one_recording():
     trajectories = {name: wander(rng) for name in ("v002", "v003", "v004")}
     trajectories["v003"].valid[70] = False
     data = slice_windows(trajectories, frozenset({"v004"}), REST, stride=1)
-    assert len(window_starts(np.ones(120, bool), 1)) == 120 - 63
+    assert len(window_starts(np.ones(120, bool), 64)) == 120 - 63
     assert (data.video == 0).sum() == 120 - 63
     assert (data.video == 1).sum() == 7
     for video, start in zip(data.video, data.start, strict=True):
@@ -81,7 +81,7 @@ def test_windows_hold_only_valid_frames_of_one_recording():
 
 
 def test_too_short_a_recording_gives_no_window():
-    assert len(window_starts(np.ones(63, bool), 1)) == 0
+    assert len(window_starts(np.ones(63, bool), 64)) == 0
 
 
 def test_animal_may_be_where_it_is_free_or_where_it_has_been():

@@ -1,0 +1,43 @@
+"""The ablation of Table 5: the spatial control is put beside the perception code, in place of a twin UNet."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.models.denoisers import TIME_CHANNELS, NoiseFromVelocity, UNet, time_embedding
+from pipeline.models.diffusion import STANDARD, Schedule
+
+EMBEDDING = 128
+
+
+class ConcatenationUNet(nn.Module):
+    """Denoise a sequence under a control that is one more part of the code; called as `ControlUNet` is."""
+
+    def __init__(
+        self,
+        channels: int,
+        control: int,
+        condition: int,
+        width: int = 32,
+        multipliers: tuple[int, ...] = (1, 2, 4),
+        schedule: Schedule = STANDARD,
+    ):
+        """``control`` counts the numbers of the whole control: 3 of a goal, 3 per frame of a path."""
+        super().__init__()
+        self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
+        self.time = nn.Sequential(nn.Linear(TIME_CHANNELS, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
+        self.condition = nn.Sequential(nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
+        self.main = UNet(channels, widths, EMBEDDING)
+        self.out = nn.Conv1d(widths[0], channels, 1)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch channel frame"]:
+        code = torch.cat([condition, control.flatten(1) * keep, keep], dim=-1)
+        embedding = nn.functional.silu(self.time(time_embedding(t)) + self.condition(code))
+        return self.noise(x, self.out(self.main(x, embedding)[-1]), t)

@@ -1,0 +1,140 @@
+"""Samplers of the rival models of Table 4, which share networks, training and perception with ours.
+
+`GaussianSampler`: the networks tell mean and spread, once each, of goal, path and body (Kendall & Gal 2017); the mean of
+one level steers the next. `OneStageSampler`: path and body are denoised as one sequence, with no goal before them (Tevet
+et al. 2022). `sampler_of` chooses by the architecture.
+"""
+
+from dataclasses import dataclass
+from typing import assert_never
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.models.behavior import Architecture, Sampling, Scaling
+from pipeline.models.diffusion import Schedule
+from pipeline.models.planning import Array, Codes, Networks, Observation, Plan, Sampler
+
+MEAN, SPREAD = 0.0, 1.0
+"""Steps at which a Gaussian's networks, shown no sample, tell its mean and the logarithm of its standard deviation."""
+LOG_STD = (-5.0, 2.0)
+"""Bounds of that logarithm."""
+
+
+def sampler_of(architecture: Architecture, networks: Networks, schedule: Schedule, scaling: Scaling) -> Sampler:
+    """Return the sampler that draws plans from networks of this kind."""
+    match architecture.family:
+        case "diffusion":
+            return Sampler(networks, schedule, scaling)
+        case "one_stage":
+            return OneStageSampler(networks, schedule, scaling)
+        case "gaussian":
+            return GaussianSampler(networks, schedule, scaling)
+        case _:
+            assert_never(architecture.family)
+
+
+@dataclass(frozen=True)
+class GaussianSampler(Sampler):
+    """Draws from Gaussians, each number on its own."""
+
+    def plan(
+        self,
+        observation: Observation,
+        sampling: Sampling,
+        rng: np.random.Generator,
+        *,
+        count: int = 1,
+        goal: Float[np.ndarray, "plan 3"] | None = None,
+        path: Float[np.ndarray, "plan frame 3"] | None = None,
+    ) -> Plan:
+        """Draw plans; the means lead from level to level."""
+        codes = self.codes(observation, sampling, count)
+        given_goal, given_path = goal, path
+        still = np.random.default_rng(0)
+        goal = self.goals(codes, sampling, rng) if given_goal is None else given_goal
+        towards = self._scaled(self._goal(codes), still, 0.0) * self.scaling.goal_std if given_goal is None else given_goal
+        path = self.paths(codes, towards, sampling, rng) if given_path is None else given_path
+        along = self._metres(self._scaled(self._path(codes, towards, sampling), still, 0.0)) if given_path is None else given_path
+        return Plan(goal, path, self.bodies(codes, along, sampling, rng))
+
+    def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
+        """Draw goals in the ego frame, metres."""
+        return self._scaled(self._goal(codes), rng, 1.0) * self.scaling.goal_std
+
+    def paths(
+        self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw paths to goals."""
+        return self._metres(self._scaled(self._path(codes, goal, sampling), rng, 1.0))
+
+    def bodies(
+        self, codes: Codes, path: Float[np.ndarray, "plan frame 3"], sampling: Sampling, rng: np.random.Generator
+    ) -> Float[np.ndarray, "plan frame channel"]:
+        """Draw bodies along paths."""
+        control = (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
+        nothing = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
+        told = [self.networks.body(nothing, _step(nothing, t), codes.full, control, _kept(nothing, 1.0)) for t in (MEAN, SPREAD)]
+        return np.swapaxes(self._scaled(told, rng, 1.0), 1, 2) * self.scaling.body_std + self.scaling.body_mean
+
+    def _goal(self, codes: Codes) -> list[Array]:
+        nothing = np.zeros((len(codes.full), 3), np.float32)
+        return [self.networks.goal(nothing, _step(nothing, t), codes.full) for t in (MEAN, SPREAD)]
+
+    def _path(self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling) -> list[Array]:
+        control = (goal / self.scaling.goal_std).astype(np.float32)
+        nothing = np.zeros((len(goal), *self.scaling.path_std.shape), np.float32)
+        keep = _kept(nothing, float(sampling.goal))
+        return [self.networks.path(nothing, _step(nothing, t), codes.full, control, keep) for t in (MEAN, SPREAD)]
+
+    def _scaled(self, told: list[Array], rng: np.random.Generator, spread: float) -> Array:
+        mean, log_std = told
+        return mean + spread * np.exp(np.clip(log_std, *LOG_STD)) * rng.standard_normal(mean.shape, dtype=np.float32)
+
+    def _metres(self, path: Array) -> Float[np.ndarray, "plan frame 3"]:
+        return np.swapaxes(path * self.scaling.path_std, 1, 2)
+
+
+@dataclass(frozen=True)
+class OneStageSampler(Sampler):
+    """Draws path and body together; the goal is where the path ends."""
+
+    def plan(
+        self,
+        observation: Observation,
+        sampling: Sampling,
+        rng: np.random.Generator,
+        *,
+        count: int = 1,
+        goal: Float[np.ndarray, "plan 3"] | None = None,
+        path: Float[np.ndarray, "plan frame 3"] | None = None,
+    ) -> Plan:
+        """Draw plans. A given goal or path cannot steer a model without stages."""
+        assert goal is None and path is None, "a one-stage model takes no goal and no path"
+        codes = self.codes(observation, sampling, count)
+        whole = self._whole(codes, sampling, rng)
+        path = np.swapaxes(whole[:, :3] * self.scaling.path_std, 1, 2)
+        body = np.swapaxes(whole[:, 3:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
+        return Plan(path[:, -1], path, body)
+
+    def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
+        """Draw whole plans and keep where they end."""
+        return (self._whole(codes, sampling, rng)[:, :3] * self.scaling.path_std)[..., -1]
+
+    def _whole(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Array:
+        frames = self.scaling.path_std.shape[1]
+        control = np.zeros((len(codes.full), 3, frames), np.float32)
+
+        def denoise(code: Array):
+            return lambda x, t: self.networks.body(x, _step(x, t), code, control, _kept(x, 0.0))
+
+        shape = (len(codes.full), 3 + len(self.scaling.body_mean), frames)
+        return self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng)
+
+
+def _step(x: Array, t: float) -> Array:
+    return np.full(len(x), t, np.float32)
+
+
+def _kept(x: Array, keep: float) -> Array:
+    return np.full((len(x), 1), keep, np.float32)
