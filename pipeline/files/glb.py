@@ -141,9 +141,9 @@ def _without_flips(quaternion: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray
 
 def _unit_normals(mesh: Mesh) -> Float32[np.ndarray, "vertex 3"]:
     """Vertex normals of unit length, +y where a vertex has no face: glTF forbids zero normals."""
-    normals = mesh.vertex_normals()
-    lost = np.linalg.norm(normals, axis=1, keepdims=True) < 0.5
-    return np.where(lost, [0.0, 1.0, 0.0], normals).astype(np.float32)
+    normals = mesh.vertex_normals().astype(np.float64)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length < 1e-6, [0.0, 1.0, 0.0], normals / np.maximum(length, 1e-6)).astype(np.float32)
 
 
 def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "vertex 4"]:

@@ -7,8 +7,6 @@ session as an animation), `scene.glb` and `simulator.json` (what any other playe
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from pipeline import cli, qa
 from pipeline.cli import Task
 from stages.export_simulator import export, reading, writing
@@ -26,14 +24,16 @@ class Config:
     """triangles kept of the animal"""
     scene_splats: int = 150_000
     """Gaussians kept of the room, the faintest go first"""
+    agent_splats: int = 20_000
+    """Gaussians kept of the animal"""
+    layout: writing.Layout = "file"
+    """one page that opens from the disk, or a folder for big scenes that wants a static host"""
     fitted_poses: int = 48
-    """recorded poses that the four skinning weights are fitted to"""
+    """recorded poses, as different as can be, that the four skinning weights are fitted to"""
     action_rate_hz: float = 30.0
     """keys of the animations in `agent.glb`"""
     warn_page_mb: float = 30.0
     """megabytes above which the report warns about the page"""
-    seed: int = 0
-    """choice of the fitted poses"""
 
 
 def run(task: Task) -> None:
@@ -42,14 +42,13 @@ def run(task: Task) -> None:
     made = export.simulator(
         reading.body(reconstruction),
         reading.scene(reconstruction),
-        reading.gaussians(task.input("splats") / "scene.ply"),
+        reading.gaussians(task.input("splats")),
         reading.motions(behavior_data),
         task.config,
-        np.random.default_rng(task.config.seed),
     )
     minds = reading.minds(task.input("behavior"), behavior_data)
     with task.create() as folder:
-        size_mb = writing.write_simulator(folder, made, minds, task.config.name)
+        size_mb = writing.write_simulator(folder, made, minds, task.config.name, task.config.layout)
         qa.write(folder, **writing.quality(made, size_mb, task.config.warn_page_mb))
 
 

@@ -6,9 +6,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.files.glb import Skin
+from pipeline.space import rigid
 from stages.export_simulator.actions import Motion
 
-VERSION = 1
+VERSION = 2
+_WALKING_M_S = 0.15
+_DEFAULT_PACE_M_S = 0.4
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,7 @@ def contract(
     behavior: dict[str, Any],
     setting: Setting,
     motions: list[Motion],
-    bone_names: tuple[str, ...],
+    skin: Skin,
     skinning_residual_m: Float[np.ndarray, "frame vertex"],
     volume: dict[str, Any],
 ) -> dict[str, Any]:
@@ -48,7 +52,9 @@ def contract(
             "start_m": np.round(np.median(observers[:, [0, 2]], axis=0), 4).tolist(),
         },
         "agent": {
-            "bones": list(bone_names),
+            "bones": list(skin.bone_names),
+            "rest": np.round(rigid_rows(skin.agent_from_bone_rest), 6).tolist(),
+            **gait(motions),
             "root_height_m": [round(float(height), 4) for height in np.percentile(heights, [0.5, 99.5])],
             "skinning_residual_mm": {
                 "mean": round(float(residual_mm.mean()), 3),
@@ -62,4 +68,27 @@ def contract(
         ],
         "volume": volume,
         "behavior": behavior,
+    }
+
+
+def rigid_rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
+    """Turn rigid motions into rows of place and quaternion wxyz."""
+    return np.concatenate([a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1)
+
+
+def gait(motions: list[Motion]) -> dict[str, float]:
+    """Say how fast the animal walks when it walks, and how high its root then is: medians of all recordings."""
+    speeds, heights = [], []
+    for motion in motions:
+        place = motion.world_from_agent[:, :3, 3]
+        speed = np.linalg.norm(np.gradient(place[:, [0, 2]], motion.timestamp_s, axis=0), axis=1)
+        walking = speed > _WALKING_M_S
+        speeds.append(speed[walking])
+        heights.append(place[walking, 1])
+    speed, height = np.concatenate(speeds), np.concatenate(heights)
+    if not len(speed):
+        height = np.concatenate([motion.world_from_agent[:, 1, 3] for motion in motions])
+    return {
+        "pace_m_s": round(float(np.median(speed)), 4) if len(speed) else _DEFAULT_PACE_M_S,
+        "standing_m": round(float(np.median(height)), 4),
     }

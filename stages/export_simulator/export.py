@@ -12,7 +12,9 @@ from pipeline.space.meshes import Mesh
 from stages.export_simulator import refit, surfaces
 from stages.export_simulator.actions import Motion, resample
 from stages.export_simulator.contract import Setting
-from stages.export_simulator.reading import Body
+from stages.export_simulator.reading import Body, Gaussians
+
+_JUDGED_POSES = 200
 
 
 @dataclass(frozen=True)
@@ -22,10 +24,11 @@ class Made:
     agent: Mesh
     skin: Skin
     residual_m: Float[np.ndarray, "frame vertex"]
-    """distance of the four-weight linear blend from dual-quaternion blending, fitted poses"""
+    """distance of the four-weight linear blend from dual-quaternion blending, poses that were not fitted"""
     actions: list[Action]
     scene: Mesh
     splat_rows: bytes
+    agent_splats: surfaces.SkinnedSplats
     setting: Setting
     motions: list[Motion]
 
@@ -33,15 +36,14 @@ class Made:
 def simulator(
     body: Body,
     scene: Mesh,
-    gaussians: Float[np.ndarray, "point 62"],
+    gaussians: Gaussians,
     motions: list[Motion],
     limits: Any,
-    rng: np.random.Generator,
 ) -> Made:
     """Thin the surfaces, fit the weights, resample the motion; `limits` are the stage's settings."""
     agent, kept = surfaces.thin(body.mesh, limits.agent_faces)
     thinned = Body(agent, body.weights[kept], body.agent_from_bone_rest)
-    skin, residual_m = fitted_skin(thinned, motions, limits.fitted_poses, rng)
+    skin, residual_m = fitted_skin(thinned, motions, limits.fitted_poses)
     room, _ = surfaces.thin(scene, limits.scene_faces)
     inside = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions]).mean(0)
     positions = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
@@ -51,24 +53,27 @@ def simulator(
         residual_m=residual_m,
         actions=[action(motion, limits.action_rate_hz) for motion in motions],
         scene=surfaces.facing(room, inside),
-        splat_rows=surfaces.splat_rows(gaussians, limits.scene_splats),
+        splat_rows=surfaces.splat_rows(gaussians.scene, limits.scene_splats),
+        agent_splats=surfaces.skinned_splats(gaussians.agent, gaussians.agent_weights, limits.agent_splats),
         setting=Setting(surfaces.floor_height_m(room, positions), surfaces.bounds(room)),
         motions=motions,
     )
 
 
-def fitted_skin(body: Body, motions: list[Motion], poses: int, rng: np.random.Generator) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
-    """Fit four weights a vertex to recorded poses drawn at random; also return what is lost there, metres."""
+def fitted_skin(body: Body, motions: list[Motion], poses: int) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
+    """Fit four weights a vertex to recorded poses that differ most; also return what is lost in others, metres."""
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
-    chosen = np.sort(rng.choice(len(recorded), size=min(poses, len(recorded)), replace=False))
-    agent_from_bone = recorded[chosen]
-    vertices = body.mesh.vertices.astype(np.float64)
-    posed = refit.blend_dual_quaternions(vertices, body.weights, agent_from_bone, body.agent_from_bone_rest)
-    posed_from_rest = agent_from_bone @ rigid.inverse(body.agent_from_bone_rest)
-    joints, weights = refit.refit_weights(vertices, body.weights, posed_from_rest, posed)
-    names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
-    residual_m = refit.residual_m(vertices, joints, weights, posed_from_rest, posed)
-    return Skin(joints, weights, body.agent_from_bone_rest, names), residual_m
+    chosen = refit.different_poses(recorded, poses)
+    others = np.setdiff1d(np.arange(len(recorded)), chosen)
+    judged = others[np.linspace(0, len(others) - 1, min(_JUDGED_POSES, len(others))).astype(int)] if len(others) else chosen
+    vertices, rest = body.mesh.vertices.astype(np.float64), body.agent_from_bone_rest
+    fit, held = (
+        refit.Poses(recorded[at] @ rigid.inverse(rest), refit.blend_dual_quaternions(vertices, body.weights, recorded[at], rest))
+        for at in (chosen, judged)
+    )
+    joints, weights = refit.refit_weights(vertices, body.weights, fit)
+    names = tuple(f"bone_{bone:02d}" for bone in range(len(rest)))
+    return Skin(joints, weights, rest, names), refit.residual_m(vertices, joints, weights, held)
 
 
 def action(motion: Motion, rate_hz: float) -> Action:

@@ -9,17 +9,11 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from pipeline.space import rigid
 from stages.export_simulator.actions import Motion
+from stages.export_simulator.contract import rigid_rows
 
 _BUNDLE = "web/dist"
-
-
-def packed(content: bytes) -> str:
-    """Compress to text; the same content always gives the same text."""
-    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode()
 
 
 def clip_rows(motions: list[Motion]) -> bytes:
@@ -27,28 +21,44 @@ def clip_rows(motions: list[Motion]) -> bytes:
     frames = []
     for motion in motions:
         poses = np.concatenate([motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]], axis=1)
-        frames.append(pose_rows(poses))
+        frames.append(rigid_rows(poses))
     return np.concatenate(frames).astype("<f4").tobytes()
 
 
-def pose_rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
-    """Turn rigid motions into rows of place and quaternion wxyz."""
-    return np.concatenate([a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1)
-
-
 def page(*, contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> str:
-    """Return the whole page; `assets` are what differs between builds, by the names that the script asks for."""
+    """Return the page with everything in it; `assets` are what differs between builds, by the names the script asks for."""
+    content = compressed(contract, assets)
+    tags = [f'<script type="application/octet-stream" id="asset-{name}">{_text(file)}</script>' for name, file in content.items()]
+    return _assembled(contract, tags, connect="")
+
+
+def light_page(*, contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> tuple[str, dict[str, bytes]]:
+    """Return a page that loads its assets from beside it, and these files by name; it wants a static host."""
+    files = {f"assets/{name}.gz": file for name, file in compressed(contract, assets).items()}
+    tags = [f'<script type="application/octet-stream" id="asset-{file[7:-3]}" data-file="{file}"></script>' for file in files]
+    return _assembled(contract, tags, connect="'self'"), files
+
+
+def compressed(contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> dict[str, bytes]:
+    """Compress all that the page needs beside its script; the same content always gives the same bytes."""
     bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
-    texts = {name: packed(content) for name, content in assets.items()}
-    texts["simulator"] = packed(json.dumps(contract).encode())
-    for name, file in {"worker": "worker.js.gz", "ort.wasm": "ort.wasm.gz"}.items():
-        texts[name] = base64.b64encode(bundle.joinpath(file).read_bytes()).decode()
-    tags = [f'<script type="application/octet-stream" id="asset-{name}">{text}</script>' for name, text in texts.items()]
+    files = {name: gzip.compress(content, 9, mtime=0) for name, content in assets.items()}
+    files["simulator"] = gzip.compress(json.dumps(contract).encode(), 9, mtime=0)
+    return files | {name: bundle.joinpath(f"{file}.gz").read_bytes() for name, file in (("worker", "worker.js"), ("ort.wasm", "ort.wasm"))}
+
+
+def _text(content: bytes) -> str:
+    return base64.b64encode(content).decode()
+
+
+def _assembled(contract: Mapping[str, Any], tags: list[str], connect: str) -> str:
+    bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
     script = gzip.decompress(bundle.joinpath("page.js.gz").read_bytes()).decode()
     name = html.escape(str(contract["name"]))
     pieces = {
         "@@TITLE@@": f"{name}: a behaviour simulator",
         "@@NAME@@": name,
+        "@@CONNECT@@": connect,
         "@@NOTICES@@": bundle.joinpath("NOTICES.txt").read_text(),
         "@@STYLE@@": bundle.joinpath("style.css").read_text(),
         "@@ASSETS@@": "\n".join(tags),

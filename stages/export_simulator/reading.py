@@ -29,6 +29,15 @@ class Body:
 
 
 @dataclass(frozen=True)
+class Gaussians:
+    """Room (world frame) and animal (agent frame, at rest) as standard rows of 3D Gaussians."""
+
+    scene: Float[np.ndarray, "point 62"]
+    agent: Float[np.ndarray, "point 62"]
+    agent_weights: Float[np.ndarray, "point bone"]
+
+
+@dataclass(frozen=True)
 class Minds:
     """The behaviour models as files, and the scene's features they perceive."""
 
@@ -82,7 +91,13 @@ def motions(behavior_data: Path) -> list[Motion]:
     return found
 
 
-def gaussians(path: Path) -> Float[np.ndarray, "point 62"]:
+def gaussians(splats: Path) -> Gaussians:
+    """Read room and animal as Gaussians, and the animal's skin."""
+    weights = arrays.load(splats / "splats.npz", names=("agent_weights",))["agent_weights"]
+    return Gaussians(rows_of_gaussians(splats / "scene.ply"), rows_of_gaussians(splats / "agent.ply"), weights)
+
+
+def rows_of_gaussians(path: Path) -> Float[np.ndarray, "point 62"]:
     """Read a standard file of 3D Gaussians, 62 floats a row. Raises InputError ART-021 when it is something else."""
     data = path.read_bytes()
     head, mark, rows = data.partition(b"end_header\n")

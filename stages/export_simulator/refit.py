@@ -4,6 +4,7 @@
 bones and convex weights for linear blending over a set of poses; `residual_m` says what is lost.
 """
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -14,6 +15,28 @@ from pipeline.models import skinning
 
 _CANDIDATES = 8
 _DESCENT_STEPS = 150
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Some poses of bones and surface, agent frame, metres."""
+
+    posed_from_rest: Float[np.ndarray, "frame bone 4 4"]
+    """motion of each bone"""
+    posed: Float[np.ndarray, "frame vertex 3"]
+    """the surface that is to be met"""
+
+
+def different_poses(agent_from_bone: Float[np.ndarray, "frame bone 4 4"], count: int) -> Int[np.ndarray, " chosen"]:
+    """Choose poses far from each other, beginning with the one furthest from the mean, so that the extremes are among them."""
+    flat = agent_from_bone[:, :, :3].reshape(len(agent_from_bone), -1)
+    distance = ((flat - flat.mean(0)) ** 2).sum(1)
+    chosen = [int(distance.argmax())]
+    distance = ((flat - flat[chosen[0]]) ** 2).sum(1)
+    while len(chosen) < min(count, len(flat)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, ((flat - flat[chosen[-1]]) ** 2).sum(1))
+    return np.unique(chosen)
 
 
 def blend_dual_quaternions(
@@ -33,13 +56,12 @@ def blend_dual_quaternions(
 def refit_weights(
     vertices: Float[np.ndarray, "vertex 3"],
     weights: Float[np.ndarray, "vertex bone"],
-    posed_from_rest: Float[np.ndarray, "frame bone 4 4"],
-    posed: Float[np.ndarray, "frame vertex 3"],
+    poses: Poses,
 ) -> tuple[UInt8[np.ndarray, "vertex 4"], Float32[np.ndarray, "vertex 4"]]:
     """Return bones and convex weights whose linear blend is nearest, in squares, to the posed surface."""
     count = min(_CANDIDATES, weights.shape[1])
     candidates = np.argsort(-weights, axis=1, kind="stable")[:, :count]
-    gram = _gram(vertices, candidates, posed_from_rest, posed)
+    gram = _gram(vertices, candidates, poses)
     start = np.take_along_axis(weights, candidates, 1)
     descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
     kept = np.argsort(-descended, axis=1, kind="stable")[:, : min(4, count)]
@@ -59,27 +81,24 @@ def residual_m(
     vertices: Float[np.ndarray, "vertex 3"],
     joints: UInt8[np.ndarray, "vertex 4"],
     weights: Float[np.ndarray, "vertex 4"],
-    posed_from_rest: Float[np.ndarray, "frame bone 4 4"],
-    posed: Float[np.ndarray, "frame vertex 3"],
+    poses: Poses,
 ) -> Float[np.ndarray, "frame vertex"]:
     """Return the distance between the linear blend and the posed surface."""
-    distance = np.empty(posed.shape[:2])
-    for frame, bones in enumerate(posed_from_rest):
+    distance = np.empty(poses.posed.shape[:2])
+    for frame, bones in enumerate(poses.posed_from_rest):
         each = np.einsum("vkij,vj->vki", bones[joints][..., :3, :3], vertices) + bones[joints][..., :3, 3]
-        distance[frame] = np.linalg.norm(np.einsum("vk,vki->vi", weights, each) - posed[frame], axis=1)
+        distance[frame] = np.linalg.norm(np.einsum("vk,vki->vi", weights, each) - poses.posed[frame], axis=1)
     return distance
 
 
-def _gram(
-    vertices: np.ndarray, candidates: Int[np.ndarray, "vertex k"], posed_from_rest: np.ndarray, posed: np.ndarray
-) -> Float[np.ndarray, "vertex k k"]:
+def _gram(vertices: np.ndarray, candidates: Int[np.ndarray, "vertex k"], poses: Poses) -> Float[np.ndarray, "vertex k k"]:
     """Sum over frames the products of each bone's error: for convex w the squared error is w' G w."""
     gram = np.zeros((len(vertices), candidates.shape[1], candidates.shape[1]))
-    for bones, target in zip(posed_from_rest, posed, strict=True):
+    for bones, target in zip(poses.posed_from_rest, poses.posed, strict=True):
         each = np.einsum("bij,vj->vbi", bones[:, :3, :3], vertices) + bones[None, :, :3, 3]
         error = np.take_along_axis(each, candidates[:, :, None], 1) - target[:, None]
         gram += error @ error.transpose(0, 2, 1)
-    return gram / len(posed)
+    return gram / len(poses.posed)
 
 
 def _descend_on_simplex(gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]) -> Float[np.ndarray, "vertex k"]:

@@ -1,5 +1,7 @@
 """Make surfaces light enough for a page: thin them, keep their colour and weights, find the floor, shrink splats."""
 
+from dataclasses import dataclass
+
 import fast_simplification
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -56,19 +58,52 @@ def facing(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
     return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.color)
 
 
+@dataclass(frozen=True)
+class SkinnedSplats:
+    """The animal's Gaussians at rest, agent frame, and what moves them."""
+
+    rows: bytes
+    """32 bytes each: place, size, colour with opacity, rotation"""
+    skin: bytes
+    """8 bytes each: four bones, four weights in 255ths"""
+
+
 def splat_rows(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> bytes:
-    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation."""
-    opacity = 1 / (1 + np.exp(-gaussians[:, 54].astype(np.float64)))
-    size = np.exp(gaussians[:, 55:58].astype(np.float64))
+    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation; the faintest go first."""
+    return _packed(gaussians[_weightiest(gaussians, max_points)])
+
+
+def skinned_splats(gaussians: Float[np.ndarray, "point 62"], weights: Float[np.ndarray, "point bone"], max_points: int) -> SkinnedSplats:
+    """Shrink the animal's Gaussians likewise and keep each one's four heaviest bones."""
+    kept = _weightiest(gaussians, max_points)
+    joints = np.argsort(-weights[kept], axis=1, kind="stable")[:, :4]
+    heaviest = np.take_along_axis(weights[kept], joints, 1)
+    padding = ((0, 0), (0, 4 - joints.shape[1]))
+    shares = _bytes(255 * heaviest / heaviest.sum(1, keepdims=True))
+    return SkinnedSplats(
+        _packed(gaussians[kept]), np.concatenate([np.pad(joints, padding), np.pad(shares, padding)], 1).astype(np.uint8).tobytes()
+    )
+
+
+def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> Int[np.ndarray, " kept"]:
+    """Choose the sound Gaussians that cover most, heaviest first."""
+    opacity, size = _opacity(gaussians), np.exp(gaussians[:, 55:58].astype(np.float64))
     sound = np.isfinite(gaussians).all(1) & (opacity >= 1 / 255)
     weight = np.where(sound, opacity * np.sort(size, axis=1)[:, 1:].prod(1), -1)
-    kept = np.argsort(-weight, kind="stable")[: min(max_points, int(sound.sum()))]
-    rows = np.zeros(len(kept), _SPLAT_ROW)
-    rows["position"], rows["scale"] = gaussians[kept, :3], size[kept]
-    rows["color"] = _bytes(np.concatenate([gaussians[kept, 6:9] * _BAND_0 + 0.5, opacity[kept, None]], 1) * 255)
-    rotation = gaussians[kept, 58:62] / np.linalg.norm(gaussians[kept, 58:62], axis=1, keepdims=True)
+    return np.argsort(-weight, kind="stable")[: min(max_points, int(sound.sum()))]
+
+
+def _packed(gaussians: Float[np.ndarray, "point 62"]) -> bytes:
+    rows = np.zeros(len(gaussians), _SPLAT_ROW)
+    rows["position"], rows["scale"] = gaussians[:, :3], np.exp(gaussians[:, 55:58].astype(np.float64))
+    rows["color"] = _bytes(np.concatenate([gaussians[:, 6:9] * _BAND_0 + 0.5, _opacity(gaussians)[:, None]], 1) * 255)
+    rotation = gaussians[:, 58:62] / np.linalg.norm(gaussians[:, 58:62], axis=1, keepdims=True)
     rows["rotation"] = _bytes(rotation * 128 + 128)
     return rows.tobytes()
+
+
+def _opacity(gaussians: Float[np.ndarray, "point 62"]) -> Float[np.ndarray, " point"]:
+    return 1 / (1 + np.exp(-gaussians[:, 54].astype(np.float64)))
 
 
 def _bytes(values: np.ndarray) -> UInt8[np.ndarray, "*any"]:

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, assert_never
 
 import numpy as np
 
@@ -13,15 +13,17 @@ from stages.export_simulator.contract import contract
 from stages.export_simulator.export import Made
 from stages.export_simulator.reading import Minds
 
+Layout = Literal["file", "folder"]
 
-def write_simulator(folder: Path, made: Made, minds: Minds, name: str) -> float:
-    """Write the page, the animated agent, the room and the contract; return the page's size in megabytes."""
+
+def write_simulator(folder: Path, made: Made, minds: Minds, name: str, layout: Layout) -> float:
+    """Write the page, the animated agent, the room and the contract; return the size of what a visitor loads, megabytes."""
     about = contract(
         name=name,
         behavior=minds.behavior,
         setting=made.setting,
         motions=made.motions,
-        bone_names=made.skin.bone_names,
+        skin=made.skin,
         skinning_residual_m=made.residual_m,
         volume=minds.volume,
     )
@@ -31,16 +33,31 @@ def write_simulator(folder: Path, made: Made, minds: Minds, name: str) -> float:
         "agent": glb.skinned(made.agent, made.skin, []),
         "clips": page.clip_rows(made.motions),
         "splats": made.splat_rows,
+        "agent-splats": made.agent_splats.rows,
+        "agent-skin": made.agent_splats.skin,
         "volume": minds.features,
         "allowed": minds.allowed,
         **minds.networks,
     }
-    text = page.page(contract=about, assets=assets).encode()
-    (folder / "index.html").write_bytes(text)
+    size = _write_page(folder, about, assets, layout)
     (folder / "agent.glb").write_bytes(glb.skinned(made.agent, made.skin, made.actions))
     (folder / "scene.glb").write_bytes(room)
     (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
-    return len(text) / 1e6
+    return size / 1e6
+
+
+def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, bytes], layout: Layout) -> int:
+    match layout:
+        case "file":
+            text, files = page.page(contract=about, assets=assets), {}
+        case "folder":
+            text, files = page.light_page(contract=about, assets=assets)
+            (folder / "assets").mkdir()
+        case _:
+            assert_never(layout)
+    for name, content in {"index.html": text.encode(), **files}.items():
+        (folder / name).write_bytes(content)
+    return len(text.encode()) + sum(map(len, files.values()))
 
 
 def quality(made: Made, size_mb: float, warn_page_mb: float) -> dict[str, Any]:

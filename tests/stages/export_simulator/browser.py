@@ -1,10 +1,11 @@
-"""Open a page in headless Chromium with software WebGL and watch it: console, errors, requests."""
+"""Open pages in headless Chromium with software WebGL and watch them: console, errors, requests."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 from playwright.sync_api import TimeoutError as PlaywrightTimeout
 
 CHROMIUM = "/usr/bin/chromium"
@@ -18,23 +19,44 @@ FLAGS = [
 
 
 @contextmanager
-def opened(file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60) -> Iterator[tuple[Page, list[str]]]:
-    """Yield the page, once it is ready, and a growing list of everything it did wrong."""
+def chromium() -> Iterator[Browser]:
+    """Yield a browser."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
-        wrong: list[str] = []
-        page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on(
-            "request",
-            lambda request: wrong.append(request.url[:200]) if request.url.split(":")[0] not in ("file", "data", "blob") else None,
-        )
-        page.goto(file.resolve().as_uri() + query)
         try:
-            page.wait_for_function(READY, timeout=timeout_s * 1000)
-            yield page, wrong
-        except PlaywrightTimeout as error:
-            raise AssertionError(f"{page.inner_text('body')}; {wrong}") from error
+            yield browser
         finally:
             browser.close()
+
+
+@contextmanager
+def shown(
+    browser: Browser, address: str, *, size: tuple[int, int] = (480, 320), script: str = "", timeout_s: float = 60, **more: Any
+) -> Iterator[tuple[Page, list[str]]]:
+    """Yield the page at an address, once it is ready or sorry, and a growing list of everything it did wrong.
+
+    `script` runs before the page's own; `more` are settings of the browser's context.
+    """
+    home = address.rsplit("/", 1)[0]
+    context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **more)
+    page = context.new_page()
+    page.add_init_script(script)
+    wrong: list[str] = []
+    page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("request", lambda request: None if request.url.startswith((home, "data:", "blob:")) else wrong.append(request.url[:200]))
+    try:
+        page.goto(address)
+        page.wait_for_function(READY, timeout=timeout_s * 1000)
+        yield page, wrong
+    except PlaywrightTimeout as error:
+        raise AssertionError(f"{page.inner_text('body')}; {wrong}; {error}") from error
+    finally:
+        context.close()
+
+
+@contextmanager
+def opened(file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60) -> Iterator[tuple[Page, list[str]]]:
+    """Yield a page from the disk in a browser of its own."""
+    with chromium() as browser, shown(browser, file.resolve().as_uri() + query, size=size, timeout_s=timeout_s) as page_and_wrong:
+        yield page_and_wrong

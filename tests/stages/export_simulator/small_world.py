@@ -83,7 +83,7 @@ def trajectory(frames: int, seed: int) -> Trajectory:
 
 
 def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[BehaviorNets, Scaling]:
-    """Train perception and goal network, briefly, to run from whoever is near; path and body only at random."""
+    """Train perception and goal network, briefly, to run from whoever is near; path network to go straight; the body only at random."""
     torch.manual_seed(0)
     nets, schedule = BehaviorNets(architecture), Schedule()
     optimizer = torch.optim.Adam([*nets.perception.observer.parameters(), *nets.goal.parameters()], 3e-3)
@@ -103,12 +103,30 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+    _teach_paths(nets, architecture, schedule)
     grow = np.arange(1, FUTURE + 1) / FUTURE
     path_std = np.stack([grow, 0.02 + 0 * grow, grow])
     channels = architecture.body_channels
     mean = np.zeros(channels)
     mean[[0, 4]] = 1.0
     return nets, Scaling(np.ones(3), path_std, mean, np.full(channels, 0.05))
+
+
+def _teach_paths(nets: BehaviorNets, architecture: Architecture, schedule: Schedule, steps: int = 100) -> None:
+    """Train the path network, briefly, to go straight to its goal."""
+    optimizer = torch.optim.Adam(nets.path.parameters(), 3e-3)
+    alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
+    for _ in range(steps):
+        goal = torch.randn(32, 3)
+        path = goal[:, :, None].expand(-1, -1, FUTURE) + 0.05 * torch.randn(32, 3, FUTURE)
+        t = torch.randint(schedule.steps, (32,))
+        noise = torch.randn(32, 3, FUTURE)
+        x = noised(path, noise, alpha_bar[t][:, None, None])
+        told = nets.path(x, t.float(), torch.randn(32, architecture.condition), goal, torch.ones(32, 1))
+        loss = (told - noise).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
 
 
 def write(build: Path) -> None:
@@ -125,6 +143,8 @@ def write(build: Path) -> None:
         bone_scale_m=np.full((BONES, 3), 0.06, np.float32),
     )
     write_gaussians(build / "splats/scene.ply", room())
+    write_gaussians(build / "splats/agent.ply", body)
+    arrays.save(build / "splats/splats.npz", agent_weights=weights.astype(np.float32), agent_from_bone_rest=rest().astype(np.float32))
     tracks = {f"v{2 + k:03d}": trajectory(120, k) for k in range(2)}
     zeros = np.zeros(2, np.int32)
     BehaviorData(tracks, rest(), np.arange(2, dtype=np.int32), zeros, np.array([0, 1], np.uint8), tuple(tracks)).save(

@@ -1,12 +1,19 @@
-"""The page in headless Chromium, from a file: it lives, asks nobody, samples as Python does, minds the observer."""
+"""The page in headless Chromium, from a file: it lives, asks nobody, samples as Python does, and obeys hands."""
 
+import functools
+import http.server
 import json
 import shutil
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pygltflib
 import pytest
-from playwright.sync_api import Page
+import trimesh
+from playwright.sync_api import Browser, Page
 
 from pipeline import artifact
 from pipeline.cli import Task
@@ -19,30 +26,47 @@ READS = ("reconstruction", "splats", "behavior", "behavior_data")
 
 @pytest.fixture(scope="module")
 def simulator(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Export a small world."""
+    """Export a small world, as one file and as a folder beside it."""
     raw, build = tmp_path_factory.mktemp("raw"), tmp_path_factory.mktemp("build")
     small_world.write(raw)
     for name in READS:
         with artifact.create(build / name, stage=name, config={}, inputs={}) as folder:
             shutil.copytree(raw / name, folder, dirs_exist_ok=True)
     paths = {name: build / name for name in READS}
-    run(Task("export_simulator", Config(name="tube"), build / "simulator", None, (), None, 1, None, paths, "cpu"))
+    task = Task("export_simulator", Config(name="tube"), build / "simulator", None, (), None, 1, None, paths, "cpu")
+    run(task)
+    run(replace(task, config=Config(name="tube", layout="folder"), out=build / "light"))
     shutil.copy(raw / "behavior/golden.json", build / "golden.json")
     return build / "simulator"
 
 
-def test_page_lives_and_minds_the_observer(simulator: Path) -> None:
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    with browser.chromium() as opened:
+        yield opened
+
+
+def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -> None:
     golden = json.loads((simulator.parent / "golden.json").read_bytes())
-    with browser.opened(simulator / "index.html") as (page, wrong):
+    with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
         before = page.evaluate("ats.state()")
         _check_golden(golden, page.evaluate("golden => ats.golden(golden)", golden))
         page.evaluate("ats.pause()")
         _check_reaction(page)
         page.evaluate("ats.play()")
-        _check_hands(page)
+        _check_the_person_is_carried(page)
         page.wait_for_function(f"ats.state().tick > {before['tick'] + 5}", timeout=30_000)
         after = page.evaluate("ats.state()")
         assert np.linalg.norm(np.subtract(after["animal"], before["animal"])[:3]) > 0.01, "metres within half a second"
+        assert wrong == []
+
+
+def test_goals_and_paths_are_obeyed_and_takes_are_kept(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(900, 760), accept_downloads=True) as (page, wrong):
+        _check_a_clicked_goal(page)
+        _check_a_drawn_path(page)
+        _check_downloads(page, tmp_path)
+        _check_a_clip_beside(page)
         assert wrong == []
 
 
@@ -53,43 +77,140 @@ def _check_golden(golden: dict, sampled: dict) -> None:
             assert np.abs(found - expected).max() <= 1e-3 * expected.std(), f"{name} {level}"
 
 
-def _check_hands(page: Page) -> None:
-    """Click the floor for a goal; drag the person somewhere else."""
-    page.mouse.click(*page.evaluate("ats.screen([-1.2, 0, -1.0])"))
-    assert np.allclose(page.evaluate("ats.state().aim"), [-1.2, -1.0], atol=0.05), "metres"
-    assert "aim=" in page.evaluate("location.hash")
+def _check_reaction(page: Page) -> None:
+    here = np.array(page.evaluate("ats.state()")["animal"])[[0, 2]]
+    side = np.array([0.8, 0.6])
+    near = here + 0.5 * side
+    far = reaction.goals(page, here + 9 * side)
+    assert np.abs(reaction.goals(page, here - 9 * side) - far).max() < 1e-5, "a far observer does not matter"
+    assert (reaction.away_m(page, directions=4) > 0.3).all(), "metres: away from who comes near, whichever way"
+    page.click("#panel-toggle")
+    page.locator("#interactivity").press("Home")
+    assert page.inner_text("#interactivity-value") == "0.00"
+    assert np.abs(reaction.goals(page, near) - far).max() < 1e-5, "nor does one it is told to ignore"
+    page.locator("#interactivity").press("End")
+    page.locator("[data-sense=observer]").locator("xpath=..").click()
+    assert "observer=0" in page.evaluate("location.hash")
+    assert np.abs(reaction.goals(page, near) - far).max() < 1e-5, "nor one it is not aware of"
+    page.locator("[data-sense=observer]").locator("xpath=..").click()
+    assert np.abs(reaction.goals(page, near) - far).max() > 0.3, "metres: aware again"
+    page.click("#panel-toggle")
+
+
+def _check_the_person_is_carried(page: Page) -> None:
     page.evaluate("ats.moveObserver([1.0, 0.5])")
     page.wait_for_timeout(500)
     page.mouse.move(*page.evaluate("ats.screen([1.0, 0.8, 0.5])"))
     page.mouse.down()
     page.mouse.move(*page.evaluate("ats.screen([-0.2, 0, 1.2])"), steps=5)
-    page.wait_for_timeout(1500)
+    page.wait_for_function("Math.hypot(ats.state().observer[0] + 0.2, ats.state().observer[1] - 1.2) < 0.1", timeout=10_000)
     page.mouse.up()
-    assert np.allclose(page.evaluate("ats.state().observer"), [-0.2, 1.2], atol=0.1), "metres"
+    page.keyboard.down("d")
+    page.wait_for_function("Math.hypot(ats.state().observer[0] + 0.2, ats.state().observer[1] - 1.2) > 0.3", timeout=10_000)
+    page.keyboard.up("d")
 
 
-def _check_reaction(page: Page) -> None:
-    here = np.array(page.evaluate("ats.state()")["animal"])[[0, 2]]
-    side = np.array([0.8, 0.6])
-    far = reaction.goals(page, here + 9 * side)
-    assert np.abs(reaction.goals(page, here - 9 * side) - far).max() < 1e-5, "a far observer does not matter"
-    unaware = reaction.goals(page, here + 0.5 * side, interactivity=0)
-    assert np.abs(unaware - far).max() < 1e-5, "nor one it is told to ignore"
-    assert (reaction.away_m(page, directions=4) > 0.3).all(), "metres: away from who comes near, whichever way"
+def _check_a_clicked_goal(page: Page) -> None:
+    """The animal comes to where the floor is clicked, then is free again."""
+    goal = np.array([-0.6, -0.5])
+    page.mouse.click(*page.evaluate("ats.screen([-0.6, 0, -0.5])"))
+    assert np.allclose(page.evaluate("ats.state().aim"), goal, atol=0.05), "metres"
+    assert "aim=" in page.evaluate("location.hash")
+    page.wait_for_function("Math.hypot(ats.state().animal[0] + 0.6, ats.state().animal[2] + 0.5) < 0.3", timeout=30_000)
+    page.wait_for_function("ats.state().aim === null", timeout=10_000)
 
 
-def test_hash_keeps_a_setting(simulator: Path) -> None:
-    with browser.opened(simulator / "index.html", "#interactivity=0.25&samples=16&steps=50&scene=0&aim=0.5,0.5") as (
-        page,
-        wrong,
-    ):
-        settings = page.evaluate("ats.state().settings")
-        assert (settings["interactivity"], settings["samples"], settings["steps"], settings["scene"]) == (
-            0.25,
-            16,
-            50,
-            0,
-        )
-        assert page.evaluate("ats.state().aim") == [0.5, 0.5]
+def _check_a_drawn_path(page: Page) -> None:
+    """A stroke of the pen over the floor is walked within 0.1 m, to its end."""
+    angle = np.linspace(np.pi, 0.2, 12)
+    stroke = np.stack([0.1 + 0.7 * np.cos(angle), 0 * angle, 0.1 + 0.7 * np.sin(angle)], -1)
+    page.click("#draw")
+    page.mouse.move(*page.evaluate("p => ats.screen(p)", stroke[0].tolist()))
+    page.mouse.down()
+    for point in stroke[1:]:
+        page.mouse.move(*page.evaluate("p => ats.screen(p)", point.tolist()))
+    page.mouse.up()
+    assert "route=" in page.evaluate("location.hash")
+    route = np.array(page.evaluate("ats.state().route.points"))
+    assert np.linalg.norm(route[-1] - stroke[-1, [0, 2]]) < 0.1, "metres: the route ends where the stroke does"
+    page.wait_for_timeout(500)  # until the last plan has faded
+    aside, ends = [], []
+    while page.evaluate("ats.state().route !== null"):
+        place = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
+        aside.append(np.linalg.norm(route - place, axis=1).min())
+        ends.append(np.linalg.norm(route[-1] - place))
+        page.wait_for_timeout(100)
+        assert len(aside) < 300, "half a minute"
+    assert np.median(aside) < 0.1 and min(ends) < 0.2, "metres"
+
+
+def _check_downloads(page: Page, folder: Path) -> None:
+    """Table and model tell the same take; the model opens elsewhere."""
+    page.evaluate("ats.pause()")
+    for kind in ("csv", "glb"):
+        with page.expect_download() as download:
+            page.click(f"#{kind}")
+        download.value.save_as(folder / f"take.{kind}")
+    table = np.genfromtxt(folder / "take.csv", delimiter=",", names=True)
+    assert len(table) > 20 and np.allclose(np.diff(table["time_s"]), 0.1, atol=1e-4)
+    model = pygltflib.GLTF2().load(str(folder / "take.glb"))
+    animation = model.animations[0]
+    track = model.accessors[animation.samplers[0].output]
+    view = model.bufferViews[track.bufferView]
+    place = np.frombuffer(model.binary_blob(), "<f4", track.count * 3, view.byteOffset).reshape(-1, 3)
+    np.testing.assert_allclose(place, np.stack([table[axis] for axis in "xyz"], -1), atol=2e-5)
+    assert len(animation.channels) == 2 * (1 + small_world.BONES)
+    assert len(trimesh.load(folder / "take.glb").geometry) == 1
+    page.evaluate("ats.play()")
+
+
+def _check_a_clip_beside(page: Page) -> None:
+    """A recorded session plays beside the simulated one, which begins where it begins."""
+    page.select_option("#replay", "v002")
+    page.wait_for_function("ats.state().replay && ats.state().tick > 4", timeout=20_000)
+    state = page.evaluate("ats.state()")
+    truth = small_world.trajectory(120, 0).world_from_agent[state["replay"]["tick"], :3, 3]
+    np.testing.assert_allclose(state["replay"]["place"], truth, atol=1e-4)
+    assert np.linalg.norm(np.array(state["animal"])[[0, 2]] - truth[[0, 2]]) < 1.5, "metres: it began there"
+
+
+def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> None:
+    address = (simulator / "index.html").as_uri() + "#interactivity=0.25&samples=16&steps=50&scene=0&aim=0.5,0.5"
+    with browser.shown(chromium, address, size=(390, 780), has_touch=True, is_mobile=True) as (page, wrong):
+        state = page.evaluate("ats.state()")
+        kept = {"interactivity": 0.25, "samples": 16, "steps": 50, "scene": 0}
+        assert {key: state["settings"][key] for key in kept} == kept
+        assert state["aim"] == [0.5, 0.5]
         assert page.input_value("#interactivity") == "0.25"
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390, "pixels"
+        page.touchscreen.tap(*page.evaluate("ats.screen([0.2, 0, -0.3])"))
+        assert np.allclose(page.evaluate("ats.state().aim"), [0.2, -0.3], atol=0.05), "metres"
         assert wrong == []
+
+
+@pytest.mark.parametrize(
+    ("script", "word"),
+    [
+        ("delete window.WebAssembly", "WebAssembly"),
+        ("HTMLCanvasElement.prototype.getContext = () => null", "WebGL"),
+    ],
+)
+def test_a_page_that_cannot_live_says_so(simulator: Path, chromium: Browser, script: str, word: str) -> None:
+    with browser.shown(chromium, (simulator / "index.html").as_uri(), script=script) as (page, wrong):
+        assert word in page.inner_text("#splash")
+        assert wrong == []
+
+
+def test_folder_variant_lives_on_a_static_host(simulator: Path, chromium: Browser) -> None:
+    folder = simulator.parent / "light"
+    assert (folder / "index.html").stat().st_size < 5e6 < (simulator / "index.html").stat().st_size
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None: ...
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with browser.shown(chromium, f"http://127.0.0.1:{server.server_port}/index.html") as (page, wrong):
+            assert page.evaluate("ats.state().plans") >= 1
+            assert [line for line in wrong if "favicon" not in line] == []
+        server.shutdown()

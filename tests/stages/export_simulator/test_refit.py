@@ -22,23 +22,29 @@ def world(bones: int, bend_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 @pytest.mark.parametrize("bones", [2, 4, 12])
 def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
     points, weights, rest, posed_bones = world(bones, 0.3)
-    motion = posed_bones @ rigid.inverse(rest)
-    posed = refit.blend_dual_quaternions(points, weights, posed_bones, rest)
-    joints, fitted = refit.refit_weights(points, weights, motion, posed)
+    poses = refit.Poses(posed_bones @ rigid.inverse(rest), refit.blend_dual_quaternions(points, weights, posed_bones, rest))
+    joints, fitted = refit.refit_weights(points, weights, poses)
     assert (fitted >= 0).all()
     np.testing.assert_allclose(fitted.sum(1), 1, atol=1e-6)
     heaviest = np.argsort(-weights, axis=1)[:, :4]
     plain = np.take_along_axis(weights, heaviest, 1)
     plain /= plain.sum(1, keepdims=True)
-    error = refit.residual_m(points, joints, fitted, motion, posed)
-    before = refit.residual_m(points, heaviest.astype(np.uint8), plain, motion, posed)
+    error = refit.residual_m(points, joints, fitted, poses)
+    before = refit.residual_m(points, heaviest.astype(np.uint8), plain, poses)
     assert (error**2).mean() <= (before**2).mean() + 1e-12
 
 
 def test_one_bone_a_point_is_exact() -> None:
     points, weights, rest, posed_bones = world(6, 0.5)
     alone = np.eye(6)[weights.argmax(1)]
-    motion = posed_bones @ rigid.inverse(rest)
-    posed = refit.blend_dual_quaternions(points, alone, posed_bones, rest)
-    joints, fitted = refit.refit_weights(points, alone, motion, posed)
-    assert refit.residual_m(points, joints, fitted, motion, posed).max() < 1e-4, "metres: float32 blending"
+    poses = refit.Poses(posed_bones @ rigid.inverse(rest), refit.blend_dual_quaternions(points, alone, posed_bones, rest))
+    joints, fitted = refit.refit_weights(points, alone, poses)
+    assert refit.residual_m(points, joints, fitted, poses).max() < 1e-4, "metres: float32 blending"
+
+
+def test_different_poses_hold_the_extremes() -> None:
+    turn = np.zeros((50, 1, 6))
+    turn[:, 0, 0] = np.sort(RNG.uniform(-1, 1, 50))
+    chosen = refit.different_poses(rigid.exp(turn), 5)
+    assert len(chosen) == 5 and {0, 49} <= set(chosen.tolist())
+    assert len(refit.different_poses(rigid.exp(turn), 80)) == 50

@@ -2,7 +2,8 @@
 
 import * as THREE from 'three';
 import { clone } from 'three/examples/jsm/utils/SkeletonUtils.js';
-import { ROW } from './rigid.js';
+import { SplatFileType, SplatMesh, SplatSkinning } from '@sparkjsdev/spark';
+import { ROW, compose, inverse } from './rigid.js';
 import { parseModel } from './room.js';
 
 export class Animal {
@@ -28,6 +29,36 @@ export class Animal {
     return copy;
   }
 
+  // Gaussians in place of the surface. rows: 32 bytes each, at rest; skin: four joints and four weights a Gaussian,
+  // bytes; rest: the bones' rows at rest. The skin follows dual quaternions, as the reconstruction does.
+  async addSplats(rows, skin, rest, scene) {
+    const splats = new SplatMesh({ fileBytes: rows, fileType: SplatFileType.SPLAT });
+    await splats.initialized;
+    const skinning = new SplatSkinning({ mesh: splats, numBones: rest.length });
+    const [zero, still] = [new THREE.Vector3(), new THREE.Quaternion()];
+    rest.forEach((_, bone) => skinning.setRestQuatPos(bone, still, zero));
+    for (let i = 0; i < skin.length / 8; i++) {
+      const [joints, weights] = [skin.subarray(8 * i, 8 * i + 4), skin.subarray(8 * i + 4, 8 * i + 8)];
+      skinning.setSplatBones(i, new THREE.Vector4(...joints), new THREE.Vector4(...weights).divideScalar(255));
+    }
+    splats.skinning = skinning;
+    scene.add(splats);
+    this.mesh.visible = false;
+    Object.assign(this, { splats, skinning, motions: rest.map(inverse) });
+  }
+
+  poseSplats(frame) {
+    const [place, turn] = [new THREE.Vector3(), new THREE.Quaternion()];
+    this.motions.forEach((boneFromAgent, bone) => {
+      const row = compose(Array.from(frame.subarray((bone + 1) * ROW, (bone + 2) * ROW)), boneFromAgent);
+      const sign = row[3] < 0 ? -1 : 1;
+      this.skinning.setBoneQuatPos(bone, turn.set(sign * row[4], sign * row[5], sign * row[6], sign * row[3]), place.set(row[0], row[1], row[2]));
+    });
+    this.skinning.updateBones();
+    setRow(this.splats, frame, 0);
+    this.splats.needsUpdate = true;
+  }
+
   addTo(scene) {
     scene.add(this.group, this.shadow);
     return this;
@@ -46,6 +77,7 @@ export class Animal {
   pose(frame, floor) {
     setRow(this.root, frame, 0);
     this.bones.forEach((bone, index) => setRow(bone, frame, (index + 1) * ROW));
+    if (this.splats) this.poseSplats(frame);
     const height = Math.max(0, frame[1] - floor);
     this.shadow.position.set(frame[0], floor + 0.012, frame[2]);
     this.shadow.scale.setScalar(1 + height);

@@ -1,9 +1,11 @@
-// Assets ride in the page as gzip + base64 text; nothing is ever requested from outside.
+// Assets ride in the page as gzip + base64 text; in the folder variant they lie beside it as `assets/<name>.gz`.
+// Nothing is ever requested from elsewhere.
 
 export async function bytes(name) {
-  const text = document.getElementById(`asset-${name}`)?.textContent;
-  if (!text) return null;
-  const response = await fetch(`data:application/octet-stream;base64,${text}`);
+  const source = document.getElementById(`asset-${name}`);
+  if (!source) return null;
+  const response = await fetch(source.dataset.file ?? `data:application/octet-stream;base64,${source.textContent}`);
+  if (!response.ok) throw new Error(`${source.dataset.file} is missing beside the page`);
   const stream = response.body.pipeThrough(new DecompressionStream('gzip'));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }

@@ -27,6 +27,12 @@ export class Clips {
     for (const clip of this.list) for (let tick = 0; tick < clip.count; tick++) visit(this.frame(clip, tick), this.camera(clip, tick));
   }
 
+  // The first `count` frames of a clip.
+  beginning(clip, count) {
+    const frames = Array.from({ length: count }, (_, i) => this.frame(clip, Math.min(clip.count - 1, i)));
+    return { frames, observer: this.camera(clip, Math.min(clip.count, count) - 1) };
+  }
+
   // A recorded past of `count` frames; the same seed gives the same moment.
   moment(seed, count) {
     const draw = uniforms(seed + 1);

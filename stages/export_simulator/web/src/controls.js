@@ -1,11 +1,14 @@
-// Hands on the scene: keys walk the observer, a drag on the figure carries it, a click on the floor is a goal.
+// Hands on the scene: keys walk the observer and turn the view, a drag on the figure carries it, a click on the floor
+// is a goal, a stroke with the pen (or with shift) is a path.
 
 const KEYS = { w: [0, 1], arrowup: [0, 1], s: [0, -1], arrowdown: [0, -1], a: [-1, 0], arrowleft: [-1, 0], d: [1, 0], arrowright: [1, 0] };
+const TURNS = { q: [-1, 0], e: [1, 0], '+': [0, -1], '=': [0, -1], '-': [0, 1] };
 const CLICK_PX = 6;
+const STROKE_M = 0.03;
 
 export class Controls {
   constructor(room, observer, on) {
-    Object.assign(this, { room, observer, on, down: new Set(), press: null, dragging: false });
+    Object.assign(this, { room, observer, on, down: new Set(), press: null, dragging: false, drawing: false, stroke: null });
     addEventListener('keydown', (event) => this.key(event, true));
     addEventListener('keyup', (event) => this.key(event, false));
     addEventListener('blur', () => this.down.clear());
@@ -17,39 +20,65 @@ export class Controls {
   }
 
   direction() {
-    return [...this.down].reduce(([x, y], key) => [x + KEYS[key][0], y + KEYS[key][1]], [0, 0]);
+    return [...this.down].reduce(([x, y], key) => [x + (KEYS[key]?.[0] ?? 0), y + (KEYS[key]?.[1] ?? 0)], [0, 0]);
+  }
+
+  // How the view is to turn (about the animal) and to close in, -1..1 each.
+  turning() {
+    return [...this.down].reduce(([x, y], key) => [x + (TURNS[key]?.[0] ?? 0), y + (TURNS[key]?.[1] ?? 0)], [0, 0]);
   }
 
   key(event, pressed) {
     if (event.target.matches?.('input, select') || event.ctrlKey || event.metaKey || event.altKey) return;
     const key = event.key.toLowerCase();
-    if (key in KEYS) {
+    if (key in KEYS || key in TURNS) {
       this.down[pressed ? 'add' : 'delete'](key);
       event.preventDefault();
     } else if (pressed && key === ' ' && !event.target.matches?.('button')) {
       this.on.play();
       event.preventDefault();
     } else if (pressed && key === 'r') this.on.reset();
+    else if (pressed && key === 'c') this.on.aim([...this.observer.place]);
+    else if (pressed && (key === 'p' || (key === 'escape' && this.drawing))) this.on.draw();
   }
 
   overObserver(event) {
-    return this.room.aim(event).intersectObject(this.observer.figure, true).length > 0;
+    return this.observer.figure.visible && this.room.aim(event).intersectObject(this.observer.figure, true).length > 0;
   }
 
   start(event) {
+    if (!event.isPrimary) return this.cancel();
     this.press = { x: event.clientX, y: event.clientY, moved: false };
-    if (event.button === 0 && this.overObserver(event)) {
-      this.dragging = true;
-      this.room.orbit.enabled = false;
-      this.room.canvas.setPointerCapture(event.pointerId);
-    }
+    if (event.button !== 0) return;
+    if (this.drawing || event.shiftKey) this.stroke = [];
+    else if (this.overObserver(event)) this.dragging = true;
+    else return;
+    this.room.orbit.enabled = false;
+    this.room.canvas.setPointerCapture(event.pointerId);
+    this.draw(event);
+  }
+
+  // A second finger means that the view is to be moved.
+  cancel() {
+    Object.assign(this, { press: null, dragging: false, stroke: null });
+    this.room.orbit.enabled = true;
+  }
+
+  draw(event) {
+    const point = this.stroke && this.room.floorPoint(event);
+    if (!point) return;
+    const last = this.stroke.at(-1);
+    if (!last || Math.hypot(point[0] - last[0], point[1] - last[1]) > STROKE_M) this.stroke.push(point);
+    this.on.stroke(this.stroke);
   }
 
   move(event) {
+    if (!event.isPrimary) return;
     if (this.press && Math.hypot(event.clientX - this.press.x, event.clientY - this.press.y) > CLICK_PX) this.press.moved = true;
-    if (this.dragging) {
+    if (this.stroke) this.draw(event);
+    else if (this.dragging) {
       const point = this.room.floorPoint(event);
-      if (point) this.observer.target = point;
+      if (point) this.on.carry(point);
     } else if (!this.press) {
       const over = this.overObserver(event);
       this.room.canvas.classList.toggle('over-observer', over);
@@ -58,12 +87,13 @@ export class Controls {
   }
 
   end(event) {
-    const clicked = this.press && !this.press.moved && !this.dragging && event.type === 'pointerup' && event.button === 0;
-    this.press = null;
-    this.dragging = false;
-    this.room.orbit.enabled = true;
-    if (!clicked) return;
-    const point = this.room.floorPoint(event);
-    if (point) this.on.aim(point);
+    const { stroke, press, dragging } = this;
+    this.cancel();
+    if (event.type !== 'pointerup') return;
+    if (stroke) this.on.drawn(stroke);
+    else if (press && !press.moved && !dragging && event.button === 0) {
+      const point = this.room.floorPoint(event);
+      if (point) this.on.aim(point);
+    }
   }
 }

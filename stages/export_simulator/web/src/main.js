@@ -2,16 +2,21 @@
 
 import * as assets from './assets.js';
 import { Animal } from './animal.js';
+import { api } from './api.js';
 import { Clips } from './clips.js';
 import { Controls } from './controls.js';
+import { Film } from './film.js';
 import { Minimap } from './minimap.js';
 import { Observer } from './observer.js';
 import { Overlays } from './overlays.js';
 import * as panel from './panel.js';
 import { Planner } from './planner.js';
-import { ROW, apply, rotate } from './rigid.js';
+import { rotate } from './rigid.js';
 import { Room } from './room.js';
-import { readPoint, readState, writeState } from './state.js';
+import { Route } from './route.js';
+import { readPoint, readRoute, readState, writeState } from './state.js';
+import { Tags } from './tags.js';
+import { Take, save } from './take.js';
 import { Timeline, rootOf } from './timeline.js';
 
 const TICK_S = 0.1;
@@ -27,13 +32,16 @@ class Simulator {
     await this.room.addMesh(await assets.bytes('room'));
     panel.progress(0.3, 'waking the animal');
     this.clips = new Clips(this.contract, await assets.floats('clips'));
-    this.animal = (await Animal.parse(await assets.bytes('agent'))).addTo(this.room.scene);
+    this.model = await assets.bytes('agent');
+    this.animal = (await Animal.parse(this.model)).addTo(this.room.scene);
     this.ghost = this.animal.ghost(0xc8722b, 0.16).addTo(this.room.scene);
     this.recorded = this.animal.ghost(0x6d675e, 0.6).addTo(this.room.scene);
     this.recorded.visible = this.ghost.visible = false;
     this.observer = new Observer(this.contract);
     this.room.scene.add(this.observer.figure);
     this.overlays = new Overlays(this.room.scene, this.contract.scene.floor_m, this.contract.agent.root_height_m[0] - this.contract.scene.floor_m);
+    this.tags = new Tags(this.room.camera, ['simulated', 'recorded', 'observer']);
+    this.film = new Film(this.room.canvas);
     this.map = new Minimap(document.getElementById('minimap'), this.room.picture(256));
     this.clips.each((frame, camera) => {
       this.map.visit('animal', frame[0], frame[2], 0.25);
@@ -56,6 +64,8 @@ class Simulator {
     if (wanted.has('mesh') || (this.room.software && !wanted.has('splats'))) return;
     const rows = await assets.bytes('splats');
     if (rows) await this.room.addSplats(rows);
+    const body = await assets.bytes('agent-splats');
+    if (body) await this.animal.addSplats(body, await assets.bytes('agent-skin'), this.contract.agent.rest, this.room.scene);
   }
 
   connect() {
@@ -65,8 +75,23 @@ class Simulator {
       play: () => this.play(),
       reset: () => this.reset(),
       free: () => this.aimAt(null),
+      draw: () => this.takePen(!this.controls.drawing),
+      csv: () => save(this.take.csv(), `${this.fileName}.csv`),
+      glb: () => save(this.take.glb(this.model), `${this.fileName}.glb`),
+      film: () => this.shoot(),
+      link: () => this.copyLink(),
     });
-    this.controls = new Controls(this.room, this.observer, { play: () => this.play(), reset: () => this.reset(), aim: (point) => this.aimAt(point) });
+    panel.showFilm(false, Film.possible);
+    this.controls = new Controls(this.room, this.observer, {
+      play: () => this.play(),
+      reset: () => this.reset(),
+      aim: (point) => this.aimAt(point),
+      draw: () => this.takePen(!this.controls.drawing),
+      stroke: (points) => this.overlays.ask(points, null),
+      drawn: (points) => this.follow(points),
+      carry: (point) => { this.observer.target = point; this.taken = true; },
+    });
+    this.room.canvas.addEventListener('webglcontextlost', () => panel.sorry('The graphics card has dropped this page.', 'Reload it; if that keeps happening, close other pages that draw in 3D.'));
     addEventListener('hashchange', () => {
       Object.assign(this.state, readState());
       this.panel.refresh();
@@ -85,14 +110,19 @@ class Simulator {
     Object.assign(this.overlays.layers, { goals: Boolean(this.state.goals), path: Boolean(this.state.path) });
     this.overlays.refresh();
     this.replaying = this.clips.list.find((clip) => clip.name === this.state.replay) ?? null;
-    this.replayTick = 0;
-    if (key === 'seed') this.reset();
-    else if (!['goals', 'path', 'speed', 'replay'].includes(key)) this.urgent = true;
+    if (key === 'view') this.room.look(this.state.view, this.eyes(), this.observer.animal);
+    if (key === 'seed' || key === 'replay') this.reset();
+    else if (!['goals', 'path', 'speed', 'view'].includes(key)) this.urgent = true;
   }
 
-  // Begin at a recorded moment that the seed picks; the observer stands where the person stood.
+  // Begin at a recorded moment that the seed picks, or where the clip beside begins; the observer stands where the
+  // person stood and, beside a clip, walks as the person walked until somebody takes over.
   reset() {
-    const moment = this.clips.moment(this.state.seed, this.contract.behavior.past_frames);
+    const count = this.contract.behavior.past_frames;
+    const moment = this.replaying ? this.clips.beginning(this.replaying, count) : this.clips.moment(this.state.seed, count);
+    this.replayTick = count - 1;
+    this.taken = Boolean(this.state.at);
+    this.take = new Take();
     this.timeline = new Timeline(moment.frames);
     this.now = 0;
     this.turnNumber = 0;
@@ -101,31 +131,86 @@ class Simulator {
     this.planStart = -REPLAN_TICKS;
     this.overlays.plan = null;
     this.overlays.refresh();
-    this.aim = readPoint(this.state.aim);
-    panel.showFree(Boolean(this.aim));
     this.observer.animal = moment.frames.at(-1).slice(0, 3);
     this.observer.place = readPoint(this.state.at) ?? [moment.observer[0], moment.observer[2]];
     this.observer.target = null;
     this.observer.settle();
+    const route = readRoute(this.state.route);
+    this.route = route && new Route([[this.observer.animal[0], this.observer.animal[2]], ...route]);
+    this.aim = this.route ? null : readPoint(this.state.aim);
+    this.showWishes();
+    if (this.state.view !== 'room') this.room.look(this.state.view, this.eyes(), this.observer.animal);
     this.epoch = (this.epoch ?? 0) + 1;
   }
 
   aimAt(point) {
+    this.route = null;
     this.aim = point;
-    this.state.aim = point ? point.map((value) => value.toFixed(2)).join(',') : '';
-    writeState(this.state);
-    panel.showFree(Boolean(point));
+    this.showWishes();
     this.urgent = true;
+  }
+
+  // Walk along a stroke of points [x, z]; a dot is a goal.
+  follow(points) {
+    this.takePen(false);
+    if (points.length < 3) return points.length ? this.aimAt(points.at(-1)) : this.showWishes();
+    this.aim = null;
+    this.route = new Route([[this.observer.animal[0], this.observer.animal[2]], ...points]);
+    this.showWishes();
+    this.urgent = true;
+  }
+
+  takePen(drawing) {
+    this.controls.drawing = drawing;
+    panel.showDrawing(drawing);
+  }
+
+  // The visitor's goal or path: on the floor, in the address, and as a way out of it.
+  showWishes() {
+    this.state.aim = this.aim ? this.aim.map((value) => value.toFixed(2)).join(',') : '';
+    this.state.route = this.route ? this.route.text : '';
+    writeState(this.state);
+    panel.showFree(Boolean(this.aim || this.route));
+    this.overlays.ask(this.route?.points ?? null, this.aim);
+  }
+
+  get fileName() {
+    return `${this.contract.name.replace(/[^\w-]+/g, '_')}_seed${this.state.seed}`;
+  }
+
+  eyes() {
+    return [this.observer.place[0], this.contract.scene.floor_m + this.observer.eye, this.observer.place[1]];
+  }
+
+  async shoot() {
+    if (!this.film.running) {
+      this.film.start();
+      return panel.showFilm(true, true);
+    }
+    panel.showFilm(false, true);
+    save(await this.film.stop(), `${this.fileName}.webm`);
+  }
+
+  async copyLink() {
+    try {
+      await navigator.clipboard.writeText(location.href);
+      panel.help('The address of this behaviour is copied.', 4);
+    } catch {
+      panel.help('The address of this behaviour stands in the browser\'s address line.', 6);
+    }
   }
 
   frame() {
     const time = performance.now();
     const seconds = Math.min(0.25, (time - this.last) / 1000);
+    if (time - this.last < 1000) this.room.steadiness.note(time - this.last);
     this.last = time;
     if (this.playing) {
       this.advance(seconds * this.state.speed, seconds);
-      this.room.attend(this.observer.animal, seconds);
+      this.room.attend(this.observer.animal, seconds, this.eyes());
     }
+    const [turn, closer] = this.controls.turning();
+    if (turn || closer) this.room.turn(1.2 * turn * seconds, Math.exp(closer * seconds));
     this.draw();
   }
 
@@ -134,16 +219,25 @@ class Simulator {
     // Never run past what is planned: wait for the mind rather than freeze in mid-step.
     this.now = this.timeline.plans.length ? Math.min(this.now + seconds / TICK_S, this.now + Math.max(0, this.timeline.ticksLeft(this.now))) : this.now;
     const walked = this.observer.step(wallSeconds, this.controls.direction(), this.room.heading());
-    if (walked) this.moved = true;
+    if (walked) this.moved = this.taken = true;
     for (let tick = before; tick < Math.floor(this.now); tick++) {
       this.observer.tick();
       this.map.visit('animal', this.observer.animal[0], this.observer.animal[2]);
       this.map.visit('observer', ...this.observer.place);
       this.replayTick += 1;
+      this.take.add(this.timeline.at(tick + 1), this.observer.pose(), this.overlays.plan?.goals[this.overlays.plan.chosen]);
+      if (this.replaying && !this.taken) this.followPerson();
       if (this.moved && tick % 10 === 0) this.rememberPlace();
     }
     this.timeline.record(this.now);
     this.plan();
+  }
+
+  // Beside a clip the observer walks as the person did.
+  followPerson() {
+    const camera = this.clips.camera(this.replaying, this.replayTick);
+    this.observer.place = [camera[0], camera[2]];
+    this.observer.step(0, [0, 0], 0);
   }
 
   rememberPlace() {
@@ -172,6 +266,7 @@ class Simulator {
     this.ghost.pose(plan.frames.at(-1), this.contract.scene.floor_m);
     this.milliseconds = plan.milliseconds;
     panel.status(`planned ${(plan.frames.length * TICK_S).toFixed(1)} s ahead in ${(plan.milliseconds / 1000).toFixed(2)} s`);
+    if (this.route?.finished) this.aimAt(null);
     if (this.aim && Math.hypot(this.aim[0] - this.observer.animal[0], this.aim[1] - this.observer.animal[2]) < ARRIVED_M) this.aimAt(null);
   }
 
@@ -187,8 +282,18 @@ class Simulator {
       samples: state.samples,
       steps: state.steps,
       aim: this.aim ? [this.aim[0], this.observer.animal[1], this.aim[1]] : null,
+      path: this.route && this.ahead(this.contract.behavior.future_frames),
       ...changes,
     };
+  }
+
+  // Where the drawn path leads from here, a place a tick.
+  ahead(count) {
+    const { pace_m_s: pace, standing_m: standing } = this.contract.agent;
+    const [before, here] = this.timeline.past(2);
+    this.route.advance([here[0], here[2]]);
+    const speed = Math.min(pace, Math.hypot(here[0] - before[0], here[2] - before[2]) / TICK_S);
+    return this.route.ahead(Array.from(here.slice(0, 3)), speed, pace, standing, count);
   }
 
   draw() {
@@ -202,9 +307,18 @@ class Simulator {
     const recorded = this.replaying && this.clips.frame(this.replaying, this.replayTick);
     this.recorded.visible = Boolean(recorded);
     if (recorded) this.recorded.pose(recorded, floor);
+    this.observer.figure.visible = this.state.view !== 'you';
     this.frames = (this.frames ?? 0) + 1;
     if (this.frames % (this.room.software ? 6 : 3) === 0) this.drawMap(root, recorded);
     this.room.render();
+    this.drawTags(root, recorded);
+  }
+
+  drawTags(root, recorded) {
+    const above = (x, y, z, lift) => this.room.orbit.target.clone().set(x, y + lift, z);
+    this.tags.put('simulated', recorded ? 'simulated' : '', above(root[0], root[1], root[2], 0.2));
+    this.tags.put('recorded', recorded ? 'recorded' : '', recorded ? above(recorded[0], recorded[1], recorded[2], 0.2) : null);
+    this.tags.put('observer', this.state.view === 'you' ? '' : 'you', above(this.observer.place[0], this.contract.scene.floor_m, this.observer.place[1], this.observer.eye + 0.1));
   }
 
   drawMap(root, recorded) {
@@ -217,74 +331,17 @@ class Simulator {
       goals: this.state.goals ? plan?.goals : null,
       chosen: plan?.chosen,
       path: this.state.path ? plan?.path : null,
+      wish: this.aim ?? this.route?.at(this.route.length),
       recorded,
     });
   }
 }
 
-// For tests and for the curious: ask the page the same questions that it asks itself.
-function api(simulator) {
-  return {
-    ready: true,
-    contract: simulator.contract,
-    state: () => {
-      const root = rootOf(simulator.timeline.at(simulator.now));
-      return {
-        tick: simulator.now,
-        animal: root,
-        nose: rotate(root.slice(3), [0, 0, 1]),
-        observer: [...simulator.observer.place],
-        plans: simulator.turnNumber,
-        milliseconds: simulator.milliseconds,
-        aim: simulator.aim,
-        software: simulator.room.software,
-        settings: { ...simulator.state },
-      };
-    },
-    // observer: its last places on the floor, [[x, z], ...], oldest first (or one place where it stands still).
-    sampleGoals: async ({ observer, seed = 0, K = 16, steps = 10, ...rest }) => {
-      const places = typeof observer?.[0] === 'number' ? [observer] : observer;
-      const count = simulator.contract.behavior.past_frames;
-      const walked = places && Array.from({ length: count }, (_, i) => places[Math.max(0, places.length - count + i)]);
-      const changes = walked ? { observer: walked.map((place) => simulator.observer.pose(place)) } : {};
-      const answer = await simulator.planner.goals(simulator.question({ ...changes, seed, samples: K, steps, aim: null, ...rest }));
-      return answer.goals;
-    },
-    plan: (changes = {}) => simulator.planner.plan(simulator.question({ seed: 0, ...changes })),
-    golden: (golden) => simulator.planner.golden(golden),
-    pause: () => { if (simulator.playing) simulator.play(); },
-    play: () => { if (!simulator.playing) simulator.play(); },
-    reset: () => simulator.reset(),
-    aimAt: (point) => simulator.aimAt(point),
-    moveObserver: (place) => { simulator.observer.place = [...place]; simulator.observer.target = null; },
-    screen: (point) => {
-      const camera = simulator.room.camera;
-      const spot = simulator.room.orbit.target.clone().set(...point).project(camera);
-      return [((spot.x + 1) / 2) * innerWidth, ((1 - spot.y) / 2) * innerHeight];
-    },
-    frames: () => simulator.frames ?? 0,
-    apply,
-    ROW,
-  };
-}
-
-function missing() {
-  const canvas = document.createElement('canvas');
-  if (!canvas.getContext('webgl2')) return ['This page draws in 3D and your browser offers no WebGL 2.', 'Turn on hardware acceleration, or open the page in a current Firefox, Chrome, Edge or Safari.'];
-  if (typeof WebAssembly !== 'object') return ['The animal thinks in WebAssembly, which is switched off here.', 'Open the page in another browser, or leave lockdown mode for it.'];
-  if (typeof DecompressionStream !== 'function') return ['Your browser is too old to unpack this page.', 'A browser of 2023 or later will do.'];
-  return null;
-}
-
-const lack = missing();
-if (lack) panel.sorry(...lack);
-else {
-  const simulator = new Simulator();
-  simulator.open().then(
-    () => { window.ats = api(simulator); },
-    (error) => {
-      panel.sorry(`Something went wrong while opening: ${error.message}`, 'Reload the page; if it stays, build the simulator again.');
-      console.error(error);
-    },
-  );
-}
+const simulator = new Simulator();
+simulator.open().then(
+  () => { window.ats = api(simulator); },
+  (error) => {
+    panel.sorry(`Something went wrong while opening: ${error.message}`, 'Reload the page; if it stays, build the simulator again.');
+    console.error(error);
+  },
+);

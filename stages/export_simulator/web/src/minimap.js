@@ -40,7 +40,7 @@ export class Minimap {
     this.stale = true;
   }
 
-  draw({ animal, observer, goals, chosen, path, recorded }) {
+  draw({ animal, observer, goals, chosen, path, recorded, wish }) {
     const { pen, size } = this;
     if (this.stale) for (const who of ['observer', 'animal']) paintHeat(this.layers[who], this.heat[who], COLORS[who]);
     this.stale = false;
@@ -52,6 +52,7 @@ export class Minimap {
     for (const who of ['observer', 'animal']) pen.drawImage(this.layers[who], 0, 0, size, size);
     if (path) this.line(path);
     for (const [i, goal] of (goals ?? []).entries()) this.dot(goal[0], goal[2], i === chosen ? 5 : 3, i === chosen ? 1 : 0.45);
+    if (wish) this.cross(wish);
     if (recorded) this.dot(recorded[0], recorded[2], 7, 0.9, '#6d675e');
     this.wedge(animal, '#c8722b', false);
     this.wedge(observer, '#2f6f9f', true);
@@ -75,6 +76,16 @@ export class Minimap {
     pen.arc(...this.pixel(x, z), radius, 0, 7);
     pen.fill();
     pen.globalAlpha = 1;
+  }
+
+  cross([x, z]) {
+    const { pen } = this;
+    const [px, py] = this.pixel(x, z);
+    pen.strokeStyle = '#2d2b28';
+    pen.lineWidth = 2.5;
+    pen.beginPath();
+    for (const side of [-1, 1]) { pen.moveTo(px - 6, py - 6 * side); pen.lineTo(px + 6, py + 6 * side); }
+    pen.stroke();
   }
 
   // A round body with a nose for the animal, a triangle for the person; both point where they look.

@@ -26,7 +26,9 @@ export class Overlays {
     );
     this.fan.frustumCulled = false;
     this.ribbon = ribbon();
-    for (const node of [this.goals, this.chosen, this.fan, this.ribbon]) {
+    this.route = ribbon(0xc8722b);
+    this.wish = wish();
+    for (const node of [this.goals, this.chosen, this.fan, this.ribbon, this.route, this.wish]) {
       node.renderOrder = 3;
       node.visible = false;
       scene.add(node);
@@ -50,6 +52,18 @@ export class Overlays {
     this.refresh();
   }
 
+  // A path that the visitor draws or has drawn, [[x, z], ...] or null; and a goal, [x, z] or null.
+  ask(route, aim) {
+    const height = this.floor + LIFT_M;
+    this.route.visible = Boolean(route && route.length > 1);
+    if (this.route.visible) {
+      const every = Math.ceil(route.length / 250);
+      fillRibbon(this.route, route.filter((_, i) => i % every === 0 || i === route.length - 1).map(([x, z]) => [x, this.floor, z]), () => height + 0.003, 0);
+    }
+    this.wish.visible = Boolean(aim);
+    if (aim) this.wish.position.set(aim[0], height + 0.004, aim[1]);
+  }
+
   // Keep the fan rooted in the moving animal.
   follow(root) {
     if (!this.plan) return;
@@ -71,7 +85,7 @@ export class Overlays {
   }
 }
 
-function ribbon() {
+function ribbon(color = 0x4c8067) {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute('position', new THREE.BufferAttribute(new Float32Array(256 * 6), 3));
   geometry.setAttribute('color', new THREE.BufferAttribute(new Float32Array(256 * 8), 4));
@@ -80,12 +94,22 @@ function ribbon() {
   geometry.setIndex(index);
   const mesh = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ vertexColors: true, transparent: true, depthWrite: false, side: THREE.DoubleSide }));
   mesh.frustumCulled = false;
+  mesh.userData.tint = new THREE.Color(color);
   return mesh;
 }
 
-function fillRibbon(mesh, path, ground) {
+// The visitor's goal: a flat cross in a ring.
+function wish() {
+  const material = new THREE.MeshBasicMaterial({ color: 0x2d2b28, transparent: true, opacity: 0.9, depthWrite: false });
+  const group = new THREE.Group();
+  group.add(new THREE.Mesh(new THREE.RingGeometry(0.15, 0.17, 40).rotateX(-Math.PI / 2), material));
+  for (const angle of [Math.PI / 4, -Math.PI / 4]) group.add(new THREE.Mesh(new THREE.PlaneGeometry(0.2, 0.024).rotateX(-Math.PI / 2).rotateY(angle), material));
+  return group;
+}
+
+function fillRibbon(mesh, path, ground, fade = 0.7) {
   const { position, color } = mesh.geometry.attributes;
-  const tint = new THREE.Color(0x4c8067);
+  const { tint } = mesh.userData;
   const count = Math.min(256, path.length);
   let [sideX, sideZ] = [0, 0];
   for (let i = 0; i < count; i++) {
@@ -96,7 +120,7 @@ function fillRibbon(mesh, path, ground) {
     const height = ground(path[i]);
     position.setXYZ(2 * i, path[i][0] + sideX, height, path[i][2] + sideZ);
     position.setXYZ(2 * i + 1, path[i][0] - sideX, height, path[i][2] - sideZ);
-    const alpha = 0.85 * (1 - 0.7 * (i / count));
+    const alpha = 0.85 * (1 - fade * (i / count));
     color.setXYZW(2 * i, tint.r, tint.g, tint.b, alpha);
     color.setXYZW(2 * i + 1, tint.r, tint.g, tint.b, alpha);
   }

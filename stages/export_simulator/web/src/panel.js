@@ -42,6 +42,13 @@ export function buildPanel(state, clips, on) {
   at('replay').addEventListener('change', (event) => change('replay', event.target.value));
   sync.push(() => { at('replay').value = state.replay; });
 
+  for (const button of document.querySelectorAll('[data-view]')) {
+    button.addEventListener('click', () => change('view', button.dataset.view));
+    sync.push(() => button.setAttribute('aria-pressed', state.view === button.dataset.view));
+  }
+
+  for (const name of ['csv', 'glb', 'film', 'link']) at(name).addEventListener('click', on[name]);
+  at('draw').addEventListener('click', on.draw);
   at('play').addEventListener('click', on.play);
   at('reset').addEventListener('click', on.reset);
   at('free').addEventListener('click', on.free);
@@ -65,6 +72,26 @@ export function showFree(visible) {
   at('free').hidden = !visible;
 }
 
+export function showDrawing(drawing) {
+  at('draw').setAttribute('aria-pressed', drawing);
+  at('view').classList.toggle('drawing', drawing);
+  help(drawing ? 'Draw on the floor with one stroke; it walks there.' : '');
+}
+
+export function showFilm(running, possible) {
+  at('film').hidden = !possible;
+  at('film').textContent = running ? 'stop filming' : 'film';
+  at('film').setAttribute('aria-pressed', running);
+}
+
+// A line above the buttons, for as long as it matters.
+export function help(text, seconds = 0) {
+  at('help').classList.toggle('gone', !text);
+  if (text) at('help').textContent = text;
+  clearTimeout(help.timer);
+  if (seconds) help.timer = setTimeout(() => at('help').classList.add('gone'), 1000 * seconds);
+}
+
 export function status(text) {
   at('status').textContent = text;
 }
@@ -76,12 +103,7 @@ export function progress(share, text) {
 
 export function ready() {
   at('splash').classList.add('gone');
-  setTimeout(() => at('help').classList.add('gone'), 12000);
+  help.timer = setTimeout(() => at('help').classList.add('gone'), 12000);
 }
 
-// Say plainly why there is nothing to see.
-export function sorry(text, remedy) {
-  const card = document.querySelector('#splash .card');
-  card.classList.add('sorry');
-  card.replaceChildren(...[['h1', 'Not here, sadly'], ['p', text], ['p', remedy]].map(([tag, content]) => Object.assign(document.createElement(tag), { textContent: content })));
-}
+export { sorry } from './sorry.js';

@@ -4,10 +4,15 @@ import * as THREE from 'three';
 import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
 import { SparkRenderer, SplatEdit, SplatEditRgbaBlendMode, SplatEditSdf, SplatEditSdfType, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
+import { BACKDROP_LAYER, Backdrop } from './backdrop.js';
+import { Steadiness } from './steadiness.js';
 
 const HEADROOM_M = 1.9; // what hangs higher above the floor is cut away, so that one can look in
-const SOFTWARE_PIXELS = 0.75; // drawn per pixel of the screen, where a processor has to draw them
+const PIXELS = { software: [0.75, 0.3, 75], graphics: [2, 0.6, 28] }; // drawn per pixel of the screen, most and least; wanted ms a frame
 const WALL_M = 0.35; // a wall's thickness, with what leans on it
+
+const FOG_M = 0.5; // Gaussians nearer to the eye are hidden
+const CLOSE_M = 1.7; // how far away the view stays that follows the animal
 
 export const parseModel = (bytes) => new Promise((done, fail) => {
   new GLTFLoader().parse(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength), '', done, fail);
@@ -21,8 +26,12 @@ export class Room {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.software, powerPreference: 'high-performance' });
     this.renderer.setClearColor(0xf5f2ec);
     this.renderer.localClippingEnabled = true;
-    this.renderer.setPixelRatio(this.software ? SOFTWARE_PIXELS : Math.min(2, devicePixelRatio));
+    const [most, least, wanted] = PIXELS[this.software ? 'software' : 'graphics'];
+    this.steadiness = new Steadiness(this.software ? most : Math.min(most, devicePixelRatio), least, wanted, (ratio) => this.renderer.setPixelRatio(ratio));
+    this.renderer.setPixelRatio(this.steadiness.ratio);
     this.scene = new THREE.Scene();
+    if (this.software) this.backdrop = new Backdrop(this.renderer);
+    document.body.classList.toggle('software', this.software);
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0xd9cdbd, 2.4));
     const sun = new THREE.DirectionalLight(0xfff4e2, 1.3);
     sun.position.set(1, 3, 2);
@@ -53,6 +62,7 @@ export class Room {
       if (!node.isMesh) return;
       node.material = new THREE.MeshBasicMaterial({ vertexColors: true, side: THREE.FrontSide, clippingPlanes: [above] });
       this.mesh = node;
+      if (this.backdrop) node.layers.set(BACKDROP_LAYER);
     });
     this.scene.add(model.scene);
   }
@@ -62,7 +72,10 @@ export class Room {
     const splats = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.SPLAT, editable: true });
     this.shell = new SplatEditSdf({ type: SplatEditSdfType.BOX, opacity: 0, invert: true });
     const edit = new SplatEdit({ rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY, sdfs: [this.shell] });
-    splats.add(edit, this.shell);
+    // What floats right before the eye is fog, whatever it is made of.
+    this.near = new SplatEditSdf({ type: SplatEditSdfType.SPHERE, opacity: 0, radius: FOG_M });
+    const clear = new SplatEdit({ rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY, softEdge: 0.1, sdfs: [this.near] });
+    splats.add(edit, this.shell, clear, this.near);
     this.scene.add(splats);
     await splats.initialized;
     this.splats = splats;
@@ -86,14 +99,41 @@ export class Room {
     this.shell.scale.set(...low.map((value, axis) => (high[axis] - value) / 2));
   }
 
+  // Look at the room, follow the animal closely, or stand in the person's place.
+  look(view, eye, animal) {
+    this.view = view;
+    this.orbit.minDistance = view === 'room' ? 0.6 : 0.35;
+    if (view === 'room') return this.frameRoom();
+    this.orbit.target.set(...animal);
+    if (view === 'you') this.camera.position.set(...eye);
+    else {
+      const away = this.camera.position.clone().sub(this.orbit.target).setY(0).normalize();
+      this.camera.position.copy(this.orbit.target).addScaledVector(away, CLOSE_M).setY(animal[1] + 0.55 * CLOSE_M);
+    }
+    this.orbit.update();
+  }
+
+  // Turn about what is looked at (radians) or come closer (a factor).
+  turn(angle, closer) {
+    const offset = this.camera.position.clone().sub(this.orbit.target);
+    offset.applyAxisAngle(this.camera.up, angle).multiplyScalar(closer);
+    offset.setLength(Math.min(this.orbit.maxDistance, Math.max(this.orbit.minDistance, offset.length())));
+    this.camera.position.copy(this.orbit.target).add(offset);
+  }
+
   // Drift gently with what matters, so that it stays in view.
-  attend(point, seconds) {
+  attend(point, seconds, eye) {
+    if (this.view === 'you') {
+      this.camera.position.set(...eye);
+      return this.orbit.target.set(...point);
+    }
+    if (this.backdrop && this.view !== 'animal') return; // the whole room is in view, and a still view is cheap to draw
     const { target } = this.orbit;
     const [dx, dz] = [point[0] - target.x, point[2] - target.z];
     const distance = Math.hypot(dx, dz);
-    const slack = 0.9;
+    const slack = this.view === 'animal' ? 0.12 : 0.9;
     if (distance < slack) return;
-    const share = ((distance - slack) / distance) * Math.min(1, 0.5 * seconds);
+    const share = ((distance - slack) / distance) * Math.min(1, (this.view === 'animal' ? 2.5 : 0.5) * seconds);
     for (const spot of [target, this.camera.position]) {
       spot.x += dx * share;
       spot.z += dz * share;
@@ -108,6 +148,7 @@ export class Room {
     eye.position.set((low[0] + high[0]) / 2, high[1] + 1, (low[2] + high[2]) / 2);
     eye.up.set(0, 0, -1);
     eye.lookAt(eye.position.x, 0, eye.position.z);
+    eye.layers.enable(BACKDROP_LAYER);
     const target = new THREE.WebGLRenderTarget(size, size, { colorSpace: THREE.SRGBColorSpace });
     const hidden = this.scene.children.filter((child) => child.visible && !child.isLight && !child.getObjectById(this.mesh.id));
     const shown = this.mesh.visible;
@@ -157,8 +198,10 @@ export class Room {
 
   render() {
     if (this.splats) this.openShell();
+    if (this.near && this.near.position.distanceTo(this.camera.position) > 0.05) this.near.position.copy(this.camera.position);
     this.orbit.update();
-    this.renderer.render(this.scene, this.camera);
+    if (this.backdrop && !this.splats) this.backdrop.render(this.scene, this.camera);
+    else this.renderer.render(this.scene, this.camera);
   }
 }
 

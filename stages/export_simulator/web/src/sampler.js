@@ -5,12 +5,13 @@ import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
 
 const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
+const SOONEST = 6; // frames that a visitor's goal leaves at least
 const FURTHEST = 2; // a clicked goal further away than this, in deviations of learned goals, is approached in legs
 
 export class Sampler {
   // networks: name -> async (feeds: {name: [values, shape]}) -> Float32Array
   constructor(contract, networks, senses) {
-    Object.assign(this, { contract: contract.behavior, heights: contract.agent.root_height_m, networks, senses });
+    Object.assign(this, { contract: contract.behavior, heights: contract.agent.root_height_m, pace: contract.agent.pace_m_s, networks, senses });
     this.frames = this.contract.future_frames;
     this.channels = this.contract.scaling.body_mean.length;
   }
@@ -83,28 +84,57 @@ export class Sampler {
     return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, [0, 1, 2].map((axis) => scaled[3 * i + axis] * scale[axis])));
   }
 
-  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim}.
+  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, path}.
   async plan(question) {
     const observation = this.senses.observe(question.past, question.observer);
     const { frame } = observation;
     const codes = await this.codes(observation, question.keep, question.interactivity);
     const { scaled: dreamt, options } = await this.think(codes, question);
+    if (question.path) return this.followed(frame, codes, question.path, options);
     const scaled = question.aim ? this.leg(frame, question.aim) : dreamt;
     const commanded = Boolean(question.aim);
     const keepGoal = commanded ? 1 : question.keep.goal;
     const tried = Math.min(CANDIDATES, question.samples);
     const targets = commanded ? Float32Array.from({ length: 3 * tried }, (_, i) => scaled[i % 3]) : scaled.slice(0, 3 * tried);
     const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(3 * this.frames * tried) });
+    if (commanded) for (let i = 0; i < tried; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
     const path = paths.slice(3 * this.frames * best, 3 * this.frames * (best + 1));
+    return { goals: this.goalsInWorld(frame, scaled), chosen: commanded ? 0 : best, ...(await this.embodied(frame, codes, path, options)) };
+  }
+
+  // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the animal's pace
+  // would be, and stays.
+  meet(path, goal) {
+    const { goal_std: scale, path_std: spread } = this.contract.scaling;
+    const target = [0, 1, 2].map((axis) => goal[axis] * scale[axis]);
+    const arrival = Math.min(this.frames - 1, Math.max(SOONEST, Math.ceil((Math.hypot(target[0], target[2]) / this.pace) * this.contract.rate_hz)));
+    for (const axis of [0, 2]) {
+      const missing = target[axis] - path[axis * this.frames + arrival] * spread[axis][arrival];
+      for (let i = 0; i < this.frames; i++) {
+        const place = path[axis * this.frames + i] * spread[axis][i] + missing * ((i + 1) / (arrival + 1)) ** 1.2;
+        path[axis * this.frames + i] = (i < arrival ? place : target[axis]) / spread[axis][i];
+      }
+    }
+  }
+
+  // A plan along places that the visitor has drawn, points of the world, one a frame.
+  async followed(frame, codes, places, options) {
+    const egoFromWorld = inverse(frame);
+    const path = new Float32Array(3 * this.frames);
+    places.forEach((place, i) => apply(egoFromWorld, place).forEach((value, axis) => {
+      path[axis * this.frames + i] = value / this.contract.scaling.path_std[axis][i];
+    }));
+    return { goals: [places.at(-1)], chosen: 0, ...(await this.embodied(frame, codes, path, options)) };
+  }
+
+  // The body along a scaled path, and both in the world.
+  async embodied(frame, codes, path, options) {
     const body = await this.body(codes, path, { ...options, noise: options.draw(this.channels * this.frames) });
     const { positions, bodies } = this.unscaled(path, body);
-    const frames = positions.map((position, i) => this.grounded(this.senses.rows(frame, position, bodies[i])));
     return {
-      goals: this.goalsInWorld(frame, scaled),
-      chosen: commanded ? 0 : best,
       path: positions.map((position) => apply(frame, position)),
-      frames,
+      frames: positions.map((position, i) => this.grounded(this.senses.rows(frame, position, bodies[i]))),
     };
   }
 

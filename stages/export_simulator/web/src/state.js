@@ -3,8 +3,10 @@
 const DEFAULTS = {
   interactivity: 1, scene: 1, observer: 1, past: 1, goal: 1,
   samples: 4, steps: 10, seed: 0, replay: '', speed: 1,
-  aim: '', at: '', goals: 1, path: 1,
+  aim: '', route: '', at: '', view: 'room', goals: 1, path: 1,
 };
+
+export const VIEWS = ['room', 'animal', 'you'];
 
 export function readState() {
   const state = { ...DEFAULTS };
@@ -16,6 +18,7 @@ export function readState() {
   state.interactivity = Math.min(1, Math.max(0, state.interactivity));
   state.samples = [1, 4, 16].includes(state.samples) ? state.samples : DEFAULTS.samples;
   state.steps = [10, 50].includes(state.steps) ? state.steps : DEFAULTS.steps;
+  state.view = VIEWS.includes(state.view) ? state.view : DEFAULTS.view;
   state.seed = Math.min(999999, Math.max(0, Math.round(state.seed)));
   return state;
 }
@@ -24,6 +27,12 @@ export function writeState(state) {
   const changed = Object.entries(state).filter(([key, value]) => key in DEFAULTS && value !== DEFAULTS[key]);
   const hash = new URLSearchParams(changed.map(([key, value]) => [key, String(value)])).toString();
   history.replaceState(null, '', hash ? `#${hash}` : location.pathname + location.search);
+}
+
+// 'x,z;x,z;...' in metres to a list of points, or null.
+export function readRoute(text) {
+  const points = text.split(';').map(readPoint);
+  return points.length > 1 && points.every(Boolean) ? points : null;
 }
 
 // 'x,z' in metres to two numbers, or null.

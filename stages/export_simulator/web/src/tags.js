@@ -1,0 +1,23 @@
+// Words beside what is drawn, so that nothing is told by colour alone.
+
+export class Tags {
+  constructor(camera, names) {
+    this.camera = camera;
+    this.labels = Object.fromEntries(names.map((name) => {
+      const label = Object.assign(document.createElement('span'), { className: `tag ${name}`, hidden: true });
+      document.body.append(label);
+      return [name, label];
+    }));
+  }
+
+  // point: a THREE.Vector3 in the world, which is overwritten; text: null hides the word.
+  put(name, text, point) {
+    const label = this.labels[name];
+    label.hidden = !text;
+    if (!text) return;
+    if (label.textContent !== text) label.textContent = text;
+    point.project(this.camera);
+    label.hidden = point.z > 1 || Math.abs(point.x) > 1.1 || Math.abs(point.y) > 1.1;
+    label.style.transform = `translate(-50%, -100%) translate(${(((point.x + 1) / 2) * innerWidth).toFixed(1)}px, ${(((1 - point.y) / 2) * innerHeight).toFixed(1)}px)`;
+  }
+}
