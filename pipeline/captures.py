@@ -80,10 +80,9 @@ def assign(
     `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another file.
     Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be).
     """
-    roles = {name: _role(name, remark, where) for name, remark in said.items()}
-    for role, what in _NEEDED[flow]:
-        if role not in roles.values():
-            raise InputError("CAP-040", f"there is no {role} among the recordings", where, f"add {what}")
+    roles = {name: role_of(name, remark, where) for name, remark in said.items()}
+    for role, what in missing_roles(list(roles.values()), flow):
+        raise InputError("CAP-040", f"there is no {role} among the recordings", where, f"add {what}")
     order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
     splits = _splits([name for name in order if roles[name] == "session"], said, where)
     ids = _ids(order, known_ids)
@@ -99,6 +98,20 @@ def assign(
         )
         for name in sorted(said, key=ids.__getitem__)
     )
+
+
+def role_of(name: str, remark: Remarks, where: str) -> Role:
+    """Return a recording's role: the user's word, else the beginning of its name. Raises CAP-041 for an unknown one."""
+    if remark.role is None:
+        return next((role for role in ROLES if name.lower().startswith(role)), "session")
+    if remark.role not in ROLES:
+        raise InputError("CAP-041", f"{name!r} cannot have the role {remark.role!r}", where, f"roles: {', '.join(ROLES)}")
+    return remark.role
+
+
+def missing_roles(roles: Sequence[Role], flow: Flow = "recordings") -> list[tuple[Role, str]]:
+    """Return the roles that a build still needs beside recordings of these, each with what to add."""
+    return [(role, what) for role, what in _NEEDED[flow] if role not in roles]
 
 
 def builtin(session_count: int, heldout_of: int) -> dict[str, Remarks]:
@@ -118,14 +131,6 @@ def builtin_lives(homes: int, sessions_per_home: int) -> dict[str, Remarks]:
 
 def _is_table(path: Path) -> bool:
     return path.suffix.lower() in TABLES or (path / "trajectory.csv").is_file()
-
-
-def _role(name: str, remark: Remarks, where: str) -> Role:
-    if remark.role is None:
-        return next((role for role in ROLES if name.lower().startswith(role)), "session")
-    if remark.role not in ROLES:
-        raise InputError("CAP-041", f"{name!r} cannot have the role {remark.role!r}", where, f"roles: {', '.join(ROLES)}")
-    return remark.role
 
 
 def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) -> dict[str, Split]:

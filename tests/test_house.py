@@ -140,8 +140,8 @@ def test_the_declaration_fits_the_program(node):
 
 
 def test_every_room_is_in_the_flow():
-    """Every stage program has its place in the declaration; `simulate` stands behind it."""
-    assert {stage_of(path) for path in FRONTS} == {node.stage for node in dag.FLOW} | {"simulate"}
+    """Every stage program has its place in the declaration; these stand beside it."""
+    assert {stage_of(path) for path in FRONTS} == {node.stage for node in dag.FLOW} | {"simulate", "check_captures"}
 
 
 def test_truth_is_for_evaluate_alone():
@@ -161,3 +161,12 @@ def test_recipes_fit_the_programs(path):
             continue
         front = importlib.import_module(f"stages.{nodes[name].stage}.__main__")
         config.from_table(front.Config, table, where=f"{path}: [{name}]")
+
+
+def test_every_code_about_recordings_is_in_the_catalogue():
+    """What a user may meet before the first stage is explained in one place."""
+    catalogue = (ROOT / "ERRORS.md").read_text()
+    strings = {n.value for path in FILES for n in ast.walk(tree_of(path)) if isinstance(n, ast.Constant) and isinstance(n.value, str)}
+    codes = {text for text in strings if re.fullmatch(r"CAP-\d{3}", text)}
+    assert len(codes) > 25
+    assert codes <= set(re.findall(r"CAP-\d{3}", catalogue)), codes

@@ -144,7 +144,7 @@ def _score(odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarr
     rows = []
     for first, second in pairs:
         second_from_first = rigid.inverse(odometry_from_camera[second]) @ odometry_from_camera[first]
-        rows.append(_compare(views[first], views[second], second_from_first))
+        rows.append(compare(views[first], views[second], second_from_first))
     residual_m, overlap, tolerance_m = np.array(rows).T
     accepted = (residual_m < tolerance_m) & (overlap > MIN_OVERLAP)
     return _Score(
@@ -155,7 +155,7 @@ def _score(odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarr
     )
 
 
-def _compare(first: DepthView, second: DepthView, second_from_first: Float[np.ndarray, "4 4"]) -> tuple[float, float, float]:
+def compare(first: DepthView, second: DepthView, second_from_first: Float[np.ndarray, "4 4"]) -> tuple[float, float, float]:
     """Return (median depth difference, share of points that can be compared, tolerance), metres."""
     stride = max(STRIDE_PX, max(first.depth.shape) // POINTS_A_SIDE)
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]

@@ -1,0 +1,47 @@
+"""A recording and its problems as a few lines of text."""
+
+import math
+from collections.abc import Sequence
+
+from pipeline.errors import InputError
+from pipeline.videos import Role
+from stages.check_captures.problems import Problem, Seen
+
+
+def told(name: str, role: Role, seen: Seen, found: Sequence[Problem]) -> str:
+    """Return what a recording is, its figures, and each problem with its remedy."""
+    look, recording = seen.look, seen.look.recording
+    height, width = recording.color_size
+    lines = [f"{name}  {role}, {recording.kind}", f"  {look.duration_s:.1f} s, {look.rate_hz:.1f} fps, {width} x {height}, {_turn(seen)}"]
+    lines.append(f"  pictures: dark {look.dark:.0%}, blurred {look.blurred:.0%}")
+    if look.plan is not None:
+        lines[-1] += f"; depth: known {look.depth_valid:.0%}, beyond range {look.beyond:.0%}"
+        lines.append(f"  device poses: {_poses(seen)}")
+    if seen.placed is not None:
+        lines.append(f"  found in the walk-through: {seen.placed:.0%} of the frames")
+    if seen.moving is not None and role == "session":
+        lines.append(f"  an animal moves in {seen.moving.seen:.0%} of the frames")
+    lines += [f"  note: {remark}" for remark in recording.remarks]
+    lines += [f"  {each.code} {each.what}\n    -> {each.remedy}" for each in found]
+    return "\n".join(lines if found else [*lines, "  good"])
+
+
+def refused(name: str, role: Role, error: InputError) -> str:
+    """Return why a recording cannot be used."""
+    return f"{name}  {role}\n  {error.code} {error.what}\n    -> {error.remedy}"
+
+
+def _turn(seen: Seen) -> str:
+    turns = seen.look.plan.quarter_turns if seen.look.plan else seen.look.recording.quarter_turns
+    return f"turned {90 * turns} deg clockwise to be upright" if turns else "upright as stored"
+
+
+def _poses(seen: Seen) -> str:
+    plan = seen.look.plan
+    assert plan is not None
+    if plan.odometry_from_camera is None:
+        return "none usable"
+    check = plan.self_check
+    residual = f"{1000 * check.residual_m:.0f} mm against depth" if math.isfinite(check.residual_m) else check.reason
+    drift = "no place seen twice" if math.isnan(seen.drift_m) else f"{100 * seen.drift_m:.1f} cm between visits"
+    return f"{residual}, {drift}, gravity {'known' if plan.gravity_known else 'unknown'}"

@@ -1,0 +1,197 @@
+"""Every problem that a recording may have is found by its code, and a good recording has none."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pipeline.recordings.formats import open_recording
+from pipeline.space import cameras, rigid
+from pipeline.space.meshes import RayCaster, render_view
+from pipeline.videos import Role
+from stages.check_captures import __main__ as front
+from stages.check_captures import looking, movers, overlap, poses, problems
+from stages.check_captures.looking import Shot
+from tests.pipeline.recordings import made_formats
+from tests.stages import textured_room
+from tests.stages.extract_frames.made_recordings import COLOR_SIZE, Made, walk
+
+
+class Textured(Made):
+    """A recording whose pictures have enough edges to be sharp."""
+
+    brightness, sharp_until = 1.0, 10**6
+
+    def color(self, frame: int) -> np.ndarray:
+        rng = np.random.default_rng(frame)
+        picture = rng.integers(30, 220, (*COLOR_SIZE, 3)) if frame < self.sharp_until else np.full((*COLOR_SIZE, 3), 120)
+        return cameras.turn_image((self.brightness * picture).astype(np.uint8), self.quarter_turns)
+
+
+def _made(seconds: float = 10.0, turns: int = 0, rate_hz: float = 6.0) -> Textured:
+    """A phone that goes back and forth, so that it sees every place again."""
+    plain = walk(round(seconds * rate_hz), rate_hz)
+    there_and_back = 1.5 - np.abs(plain.timestamp_s % 3.0 - 1.5)
+    source = walk(200, 100.0).world_from_camera[np.rint(100 * there_and_back).astype(int)]
+    return Textured(source, plain.timestamp_s, quarter_turns=turns)
+
+
+def _codes(path, role: Role = "heldout") -> set[str]:
+    look = looking.look(open_recording(path), 20, max_depth_m=6.0)
+    return {each.code for each in problems.problems(problems.Seen(look, poses.drift_m(look.shots)), role)}
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_a_good_recording_has_no_problem_sideways_or_not(tmp_path, turns):
+    assert _codes(_made(turns=turns).write(tmp_path / "a.r3d")) == set()
+
+
+def _dark(made):
+    made.brightness = 0.1
+
+
+def _blurred(made):
+    made.sharp_until = 20
+
+
+def _gap(made):
+    made.timestamp_s[30:] += 4
+
+
+def _hollow(made):
+    inner = made.depth
+    made.depth = lambda frame: np.where(np.arange(inner(frame).shape[1]) % 4 > 0, 0, inner(frame)).astype("<f4")
+
+
+def _far(made):
+    inner = made.depth
+    made.depth = lambda frame: np.where(np.arange(inner(frame).shape[1]) % 3 == 0, np.float32(7.5), inner(frame))
+
+
+def _identity(made):
+    made.metadata["poses"] = [[0, 0, 0, 1, 0, 0, 0]] * len(made.timestamp_s)
+
+
+def _other_axes(made):
+    made.metadata["poses"] = made_formats.quaternion_poses(made).tolist()
+
+
+def _drift(made):
+    inner, seconds = made.poses(), made.timestamp_s
+    inner[:, 4:] += 0.05 * seconds[:, None]
+    made.metadata["poses"] = inner.tolist()
+
+
+FAULTS = {
+    "CAP-032": _dark, "CAP-033": _blurred, "CAP-034": _gap, "CAP-037": _hollow, "CAP-038": _far, "CAP-050": _identity,
+    "CAP-051": _other_axes, "CAP-052": _drift,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("code", FAULTS)
+def test_a_fault_is_told_by_its_code(tmp_path, code):
+    made = _made()
+    FAULTS[code](made)
+    assert code in _codes(made.write(tmp_path / "a.r3d"))
+
+
+def test_a_short_or_sparse_one_is_told(tmp_path):
+    assert "CAP-031" in _codes(_made(3.0).write(tmp_path / "a.r3d"))
+    sparse = _made(12.0, rate_hz=1.0)
+    assert "CAP-035" in _codes(made_formats.polycam(tmp_path / "b", sparse), "session")
+    assert "CAP-035" not in _codes(tmp_path / "b", "walkthrough")
+
+
+def test_damaged_pictures_and_missing_depth_are_told(tmp_path):
+    made = _made()
+    made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(60)])
+    assert "CAP-036" in _codes(tmp_path / "a.mp4")
+    data = bytearray((tmp_path / "a.mp4").read_bytes())
+    middle = len(data) // 2
+    data[middle - 20_000 : middle + 20_000] = bytes(40_000)
+    (tmp_path / "a.mp4").write_bytes(data)
+    assert "CAP-030" in _codes(tmp_path / "a.mp4")
+
+
+def _shots(seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: ()) -> list[Shot]:
+    """Rendered views of a room with the given colours, with balls of (centre, radius) per frame."""
+    mesh = textured_room.textured_room(seed, edge_m=0.08)
+    caster, size, intrinsics = RayCaster(mesh), (240, 180), np.array([[178.0, 0, 90], [0, 178.0, 120], [0, 0, 1]])
+    found = []
+    for frame, camera in enumerate(textured_room.walk(count, seed=7)):
+        depth, hits = render_view(caster, camera, intrinsics, *size)
+        color = hits.interpolate(mesh, mesh.color).reshape(*size, 3)
+        for center, radius in balls(frame):
+            depth = np.minimum(depth, _ball(camera, intrinsics, size, center, radius))
+        odometry = camera if offset is None else offset @ camera
+        gray = color.mean(-1).astype(np.uint8)
+        small = depth[1::3, 1::3].astype(np.float32)
+        depth_intrinsics = cameras.scale_intrinsics(intrinsics, size, small.shape)
+        found.append(Shot(float(frame), gray, intrinsics, small, depth_intrinsics, odometry, 20.0, 0.5, 0.0))
+    return found
+
+
+def _ball(camera, intrinsics, size, center, radius):
+    rays = cameras.ray_directions(intrinsics, *size)
+    at = rigid.apply(rigid.inverse(camera), np.array([center]))[0]
+    along, square = rays @ at, (rays**2).sum(-1)
+    inside = along**2 - square * (at @ at - radius**2)
+    return np.where(inside > 0, (along - np.sqrt(np.maximum(inside, 0))) / square, np.inf)
+
+
+def test_the_same_room_is_found_and_another_is_not():
+    rng = np.random.default_rng(0)
+    offset = rigid.make(rigid.rotation_from_vector(np.array([0, 1.0, 0])), np.array([3.0, 0, 1]))
+    room, again, other = (overlap.describe(shots) for shots in (_shots(0, 24), _shots(0, 9, offset), _shots(5, 9, offset)))
+    assert overlap.placed_share(room, again, rng) > 0.5
+    assert overlap.placed_share(room, other, rng) < problems.LEAST_PLACED
+    for share, told in ((0.01, {"CAP-053"}), (0.6, set())):
+        look = looking.Look(*[None] * 2, [], 0.0)
+        assert {each.code for each in problems._of_content(problems.Seen(look, placed=share), "session")} == told
+
+
+def test_movers_are_counted():
+    def one(frame):
+        return [((0.6 * np.sin(frame), 0.2, 0.6 * np.cos(frame)), 0.14)]
+
+    def two(frame):
+        return [((0.8 * np.sin(frame), 0.2, 0.7 * np.cos(frame)), 0.14), ((-0.8 * np.sin(frame), 0.2, -0.7 * np.cos(frame)), 0.14)]
+
+    still = movers.moving(_shots(0, 16))
+    lone, pair = movers.moving(_shots(0, 16, balls=one)), movers.moving(_shots(0, 16, balls=two))
+    assert still.seen == 0
+    assert lone.seen > 0.6
+    assert lone.several < 0.2
+    assert pair.several > problems.MOST_SEVERAL
+    look = looking.Look(*[None] * 2, [], 0.0)
+    codes = [{each.code for each in problems._of_content(problems.Seen(look, moving=seen), "session")} for seen in (still, lone, pair)]
+    assert codes == [{"CAP-054"}, set(), {"CAP-055"}]
+
+
+def test_without_poses_nothing_is_claimed():
+    shots = [dataclasses.replace(shot, odometry_from_camera=None) for shot in _shots(0, 4)]
+    assert movers.moving(shots) is None
+    assert np.isnan(poses.drift_m(shots))
+
+
+def test_subsampled_depth_keeps_its_geometry():
+    made = _made(2.0)
+    size, view = (512, 384), cameras.scale_intrinsics(made.intrinsics, COLOR_SIZE, (512, 384))
+    depth = np.fromfunction(lambda row, column: 1 + 0.001 * row + 0.002 * column, size)
+    plan = type("Plan", (), {"depth_intrinsics": view[None], "intrinsics": view[None], "timestamp_s": [0.0], "odometry_from_camera": None})
+    frame = type("Frame", (), {"depth": depth, "color": np.zeros((*size, 3), np.uint8), "sharpness": 1.0, "brightness": 1.0})
+    shot = looking._shot(plan, 0, frame, 0.0)
+    whole = cameras.back_project(depth, view)[1::2, 1::2]
+    np.testing.assert_allclose(cameras.back_project(shot.depth, shot.depth_intrinsics), whole, atol=1e-9)
+
+
+def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
+    assert front.main([str(tmp_path)]) == 2
+    assert "CAP-042" in capsys.readouterr().err
+    _made().write(tmp_path / "walkthrough.r3d")
+    (tmp_path / "broken.r3d").write_bytes(b"PK")
+    (tmp_path / "notes.txt").write_text("x")
+    assert front.main([str(tmp_path)]) == 2
+    told = capsys.readouterr().out
+    for expected in ("Record3D .r3d", "CAP-031", "CAP-001", "notes.txt", "CAP-003", "CAP-040", "turnaround"):
+        assert expected in told, told
