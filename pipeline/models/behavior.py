@@ -22,7 +22,7 @@ from pipeline.models.perception import (
     GRID_SHAPE,
     Blind,
     Ego,
-    Perception,
+    Minds,
     PerceptionSize,
 )
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ
@@ -40,6 +40,7 @@ class Architecture:
     ego: Ego = "yaw"
     scene: Literal["pillars", "volume"] = "pillars"
     scene_width: int = 32
+    scene_block: int = 4
     scene_channels: int = 16
     hidden: int = 128
     code: int = 64
@@ -53,6 +54,7 @@ class Architecture:
     family: Literal["diffusion", "gaussian", "one_stage"] = "diffusion"
     control: Literal["unet", "concatenation"] = "unet"
     future: int = FUTURE
+    minds: int = 3
 
     @property
     def body_channels(self) -> int:
@@ -60,14 +62,19 @@ class Architecture:
         return ROOT_CHANNELS + 6 * self.bones
 
     @property
+    def scene_stride(self) -> int:
+        """How many cells of the ego grid the scene encoder averages along each axis before it begins."""
+        return self.scene_block if self.scene == "pillars" else 1
+
+    @property
     def condition(self) -> int:
-        """Length of the perception code."""
-        return 3 * self.code
+        """Length of the perception code of all minds."""
+        return 3 * self.code * self.minds
 
     @property
     def goal_condition(self) -> int:
-        """How much of the code the goal depends on: all of it, or scene and observer, which come first."""
-        return self.condition if self.goal_from == "all" else 2 * self.code
+        """How much of a mind's code the goal depends on: all of it, or scene and observer, which come first."""
+        return (3 if self.goal_from == "all" else 2) * self.code
 
     @property
     def perception(self) -> PerceptionSize:
@@ -75,6 +82,7 @@ class Architecture:
         return PerceptionSize(
             self.scene,
             self.scene_width,
+            self.scene_block,
             self.scene_channels,
             self.hidden,
             self.code,
@@ -124,8 +132,8 @@ class BehaviorNets(nn.Module):
     def __init__(self, architecture: Architecture, schedule: Schedule = STANDARD):
         super().__init__()
         a = architecture
-        self.perception = Perception(a.perception)
-        self.goal = GoalMLP(a.goal_condition, a.goal_hidden, a.goal_layers, schedule)
+        self.perception = Minds(a.perception, a.minds)
+        self.goal = GoalMLP(a.goal_condition, a.goal_hidden, a.goal_layers, schedule, minds=a.minds, code=3 * a.code)
         body = a.body_channels + (3 if a.family == "one_stage" else 0)
         match a.control:
             case "unet":

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pipeline.models.diffusion import STANDARD, Schedule
 
-TIME_CHANNELS = 64
+TIME_CHANNELS, HORIZON_CHANNELS = 64, 8
 
 
 def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
@@ -42,22 +42,47 @@ class NoiseFromVelocity(nn.Module):
 
 
 class GoalMLP(nn.Module):
-    """Six layers of 128 (appendix A.2); of the perception code it reads the first ``condition`` numbers."""
+    """Six layers of 128 (appendix A.2), one stack per mind, whose answers are averaged.
 
-    def __init__(self, condition: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD):
+    Of each mind's perception code a stack reads the first ``condition`` numbers. Training may ask where the animal is
+    at another part of the 5.6 s (``horizon`` below 1), which teaches it more from as many minutes.
+    """
+
+    def __init__(
+        self, condition: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *, minds: int = 1, code: int | None = None
+    ):
         super().__init__()
-        self.noise, self.condition = NoiseFromVelocity(schedule), condition
-        sizes = [3 + TIME_CHANNELS + condition] + [hidden] * (layers - 1)
-        self.hidden = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(sizes))
-        self.out = nn.Linear(hidden, 3)
+        self.noise, self.condition, self.code = NoiseFromVelocity(schedule), condition, code or condition
+        self.stacks = nn.ModuleList(goal_stack(condition, hidden, layers) for _ in range(minds))
 
     def forward(
-        self, x: Float[Tensor, "batch 3"], t: Float[Tensor, "batch"], condition: Float[Tensor, "batch condition"]
+        self,
+        x: Float[Tensor, "batch 3"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        horizon: Float[Tensor, "batch"] | None = None,
     ) -> Float[Tensor, "batch 3"]:
-        h = torch.cat([x, time_embedding(t), condition[:, : self.condition]], dim=-1)
-        for layer in self.hidden:
-            h = nn.functional.silu(layer(h))
-        return self.noise(x, self.out(h), t)
+        return self.apart(x, t, condition, torch.ones_like(t) if horizon is None else horizon).mean(0)
+
+    def apart(
+        self,
+        x: Float[Tensor, "batch 3"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        horizon: Float[Tensor, "batch"],
+    ) -> Float[Tensor, "mind batch 3"]:
+        """Return what each stack makes of it: they are trained apart and only averaged to sample."""
+        angle = horizon[:, None] * torch.tensor([1.0, 2.0, 4.0, 8.0], device=x.device)
+        begin = torch.cat([x, time_embedding(t), angle.sin(), angle.cos()], dim=-1)
+        codes = [condition[:, i * self.code : i * self.code + self.condition] for i in range(len(self.stacks))]
+        return torch.stack([self.noise(x, stack(torch.cat([begin, c], dim=-1)), t) for stack, c in zip(self.stacks, codes, strict=True)])
+
+
+def goal_stack(condition: int, hidden: int, layers: int) -> nn.Sequential:
+    """Return one stack of linear layers: from sample, step, horizon and code to the velocity."""
+    sizes = [3 + TIME_CHANNELS + HORIZON_CHANNELS + condition] + [hidden] * (layers - 1)
+    inner = [layer for i, o in pairwise(sizes) for layer in (nn.Linear(i, o), nn.SiLU())]
+    return nn.Sequential(*inner, nn.Linear(hidden, 3))
 
 
 class Block(nn.Module):

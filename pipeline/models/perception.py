@@ -2,8 +2,10 @@
 
 `world_from_ego` gives the frame everything is told in, `FeatureVolume.around` samples the scene in it, and `Perception`
 turns the three raw inputs (metres, ego frame) into a code of 3 x 64 numbers. Normalisation happens inside the network.
+`Minds` holds several perceptions, each with weights of its own, side by side.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -18,8 +20,6 @@ from pipeline.files import arrays
 from pipeline.space import rigid
 
 Ego = Literal["yaw", "full", "world"]
-Blind = Literal["nothing", "scene", "observer", "past"]
-CONDITIONS: tuple[Blind, ...] = ("scene", "observer", "past")
 Blind = Literal["nothing", "scene", "observer", "past"]
 CONDITIONS: tuple[Blind, ...] = ("scene", "observer", "past")
 GRID_SHAPE = (64, 8, 64)
@@ -95,31 +95,30 @@ def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
 
 
 class PillarScene(nn.Module):
-    """A 2.5-D encoder: blocks of 2 x 2 x 2 cells averaged, height folded into channels, then 2-D convolutions."""
+    """A 2.5-D encoder: blocks of cells averaged, height folded into channels, 2-D convolutions down to 4 x 4.
 
-    stride = 2
+    Measured on minutes of data, blocks of 0.4 m predict as well as blocks of 0.2 m at a quarter of the time.
+    """
 
-    def __init__(self, channels: int, width: int, code: int):
+    def __init__(self, channels: int, width: int, code: int, block: int):
         super().__init__()
-        self.pool = nn.AvgPool3d(2)
-        folded = channels * GRID_SHAPE[1] // 2
-        convolutions = [nn.Conv2d(folded, width, 1), nn.SiLU(), nn.Conv2d(width, width, 3, 2, 1), nn.SiLU()]
-        convolutions += [nn.Conv2d(width, width, 3, 2, 1), nn.SiLU(), nn.Conv2d(width, width, 3, 2, 1), nn.SiLU()]
-        self.convolutions = nn.Sequential(*convolutions)
+        self.pool = nn.AvgPool3d(block)
+        layers = [nn.Conv2d(channels * GRID_SHAPE[1] // block, width, 1), nn.SiLU()]
+        for _ in range(int(np.log2(GRID_SHAPE[0] // block // 4))):
+            layers += [nn.Conv2d(width, width, 3, 2, 1), nn.SiLU()]
+        self.convolutions = nn.Sequential(*layers)
         self.out = nn.Linear(width * 16, code)
 
     def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Float[Tensor, "batch code"]:
         return self.encode(self.pool(grid))
 
-    def encode(self, pooled: Float[Tensor, "batch channel 32 4 32"]) -> Float[Tensor, "batch code"]:
-        """Encode a grid that is already averaged over 2 x 2 x 2 cells."""
+    def encode(self, pooled: Float[Tensor, "batch channel x y z"]) -> Float[Tensor, "batch code"]:
+        """Encode a grid that is already averaged over blocks of cells."""
         return self.out(self.convolutions(pooled.transpose(2, 3).flatten(1, 2).transpose(2, 3)).flatten(1))
 
 
 class VolumeScene(nn.Module):
     """The paper's encoder: six 3-D convolutions of kernel 3 with residual connections."""
-
-    stride = 1
 
     def __init__(self, channels: int, width: int, code: int):
         super().__init__()
@@ -189,6 +188,8 @@ class PerceptionSize:
 
     scene: Literal["pillars", "volume"]
     scene_width: int
+    scene_block: int
+    """cells that pillars average along each axis"""
     scene_channels: int
     hidden: int
     code: int
@@ -196,7 +197,6 @@ class PerceptionSize:
     past_channels: int
     observer_radius_m: float
     rate_hz: float
-    blind_to: Blind
     blind_to: Blind
 
 
@@ -207,15 +207,13 @@ class Perception(nn.Module):
         super().__init__()
         match size.scene:
             case "pillars":
-                self.scene = PillarScene(size.scene_channels, size.scene_width, size.code)
+                self.scene = PillarScene(size.scene_channels, size.scene_width, size.code, size.scene_block)
             case "volume":
                 self.scene = VolumeScene(size.scene_channels, size.scene_width, size.code)
             case _:
                 assert_never(size.scene)
         self.observer = ObserverEncoder(size.past_frames, size.hidden, size.code, size.observer_radius_m, size.rate_hz)
         self.past = PastEncoder(size.past_frames, size.past_channels, size.hidden, size.code)
-        sees = torch.tensor([float(condition != size.blind_to) for condition in CONDITIONS])
-        self.register_buffer("sees", sees, persistent=False)
         sees = torch.tensor([float(condition != size.blind_to) for condition in CONDITIONS])
         self.register_buffer("sees", sees, persistent=False)
         self.scene_null = nn.Parameter(torch.zeros(size.code))
@@ -229,9 +227,20 @@ class Perception(nn.Module):
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
-        return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
+        return self._joined(self.scene(scene_grid), observer_past, self.past(past), keep)
 
-    def join(
+    def training_code(
+        self,
+        pooled: Float[Tensor, "batch channel x y z"],
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch frame*channel"],
+        keep: Float[Tensor, "batch 3"],
+        bones_keep: Float[Tensor, "batch"],
+    ) -> Float[Tensor, "batch condition"]:
+        """Return the code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides remembered bones."""
+        return self._joined(self.scene.encode(pooled), observer_past, self.past(past, bones_keep), keep)
+
+    def _joined(
         self,
         scene: Float[Tensor, "batch code"],
         observer_past: Float[Tensor, "batch frame*3"],
@@ -244,3 +253,24 @@ class Perception(nn.Module):
         scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
         past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
         return torch.cat([scene, observer, past], dim=-1)
+
+
+class Minds(nn.Module):
+    """Several perceptions side by side; the code of the whole is the codes of all, one after another."""
+
+    def __init__(self, size: PerceptionSize, count: int):
+        super().__init__()
+        self.minds = nn.ModuleList(Perception(size) for _ in range(count))
+
+    def __iter__(self) -> Iterator[Perception]:
+        return iter(self.minds)
+
+    def forward(
+        self,
+        scene_grid: Float[Tensor, "batch channel 64 8 64"],
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch frame*channel"],
+        keep: Float[Tensor, "batch 3"],
+    ) -> Float[Tensor, "batch condition"]:
+        """``keep`` holds 1 or 0 for scene, observer and past."""
+        return torch.cat([mind(scene_grid, observer_past, past, keep) for mind in self.minds], dim=-1)

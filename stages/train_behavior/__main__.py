@@ -34,6 +34,10 @@ class Config:
     """Scene encoder: 2.5-D with height in channels, or the paper's six 3-D convolutions."""
     scene_width: int = 32
     """Channels of the scene encoder; the paper's is 128."""
+    scene_block: Literal[1, 2, 4, 8] = 4
+    """Cells of 0.1 m that pillars average along each axis before they convolve."""
+    minds: int = 3
+    """Perceptions and goal networks that learn apart and whose answers are averaged: fewer minutes of video by heart."""
     blind_to: Literal["nothing", "scene", "observer", "past"] = "nothing"
     """Ablation: a condition that the model never perceives."""
     goal_from: Literal["scene_observer", "all"] = "all"

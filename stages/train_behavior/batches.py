@@ -81,6 +81,8 @@ class Batch:
     bones_keep: Float[Tensor, "batch"]
     mirrored: Bool[Tensor, "batch"]
     goal: Float[Tensor, "batch 3"]
+    track: Float[Tensor, "batch 3 56"]
+    """the path in units of the goal"""
     path: Float[Tensor, "batch 3 56"]
     body: Float[Tensor, "batch channel 56"]
 
@@ -92,7 +94,7 @@ class Batch:
 class SceneSampler:
     """Samples the ego grid at the resolution that the scene encoder works on, fast enough for every step.
 
-    The encoder averages blocks of 2 x 2 x 2 cells; here the volume is smoothed once as that averaging would, and read
+    The encoder averages blocks of cells; here the volume is smoothed once as that averaging would, and read
     at the blocks' centres.
     """
 
@@ -122,9 +124,9 @@ class SceneSampler:
 
 
 def _smoothed(volume: FeatureVolume, stride: int) -> Float[np.ndarray, "x y z channel"]:
-    """Return features as averaging over 2 x 2 x 2 cells would leave them, or as they are."""
+    """Return features as averaging the nearest voxels of blocks of cells would leave them, or as they are."""
     features = volume.features.astype(np.float32)
-    kernel = np.array([0.125, 0.75, 0.125]) if stride > 1 else np.array([1.0])
+    kernel = np.convolve(np.ones(stride), [0.5, 0.5]) / stride if stride > 1 else np.array([1.0])
     for axis in (1, 2, 3):
         features = convolve1d(features, kernel, axis=axis, mode="constant")
     return np.moveaxis(features, 0, -1)
@@ -209,14 +211,15 @@ def draw_batch(
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
     body = body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
-    device = scene.points.device
+    device, goal_std = scene.points.device, torch.from_numpy(scaling.goal_std).float()
     return Batch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
         observer.flatten(1),
         past.flatten(1),
         ((uniform(size) >= augmentation.hide_bones) & (side > 0)).float(),
         side < 0,
-        root[:, -1] / torch.from_numpy(scaling.goal_std).float(),
+        root[:, -1] / goal_std,
+        (root[:, PAST:] / goal_std).mT,
         root[:, PAST:].mT / torch.from_numpy(scaling.path_std).float(),
         (body / torch.from_numpy(scaling.body_std).float()).mT,
     ).to(device)

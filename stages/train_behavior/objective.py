@@ -30,6 +30,10 @@ class Objective:
     the noisy steps, where the outline is decided, their share"""
     goal_draws: int = 8
     """noise levels drawn per window for the goal, whose network is small"""
+    earlier_share: float = 0.7
+    """share of those draws that ask where the animal is before the 5.6 s are over: minutes of video hold few goals"""
+    earliest: float = 0.2
+    """earliest time that they ask for, as a part of the 5.6 s"""
 
 
 def losses(
@@ -47,14 +51,12 @@ def losses(
     """
     with contextlib.nullcontext() if goals else torch.no_grad():
         code = perceive(nets, batch, objective, generator)
-    draws = objective.goal_draws
+    with contextlib.nullcontext() if goals else torch.no_grad():
+        goal = goal_error(nets, batch, code, schedule, objective, generator)
 
     def error(denoise: Denoise, clean: Tensor) -> Tensor:
         return squared_error(denoise, clean, schedule, objective.weighting, generator)
 
-    repeated = code.repeat_interleave(draws, 0)
-    with contextlib.nullcontext() if goals else torch.no_grad():
-        goal = error(lambda x, t: nets.goal(x, t, repeated), batch.goal.repeat_interleave(draws, 0))
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
     path = error(lambda x, t: nets.path(x, t, code, batch.goal, steered), batch.path)
     known = ~batch.mirrored
@@ -64,12 +66,31 @@ def losses(
 
 
 def perceive(nets: BehaviorNets, batch: Batch, objective: Objective, generator: torch.Generator) -> Float[Tensor, "batch condition"]:
-    """Encode a batch, dropping scene, observer and past independently."""
+    """Encode a batch, dropping scene, observer and past independently, for every mind alike."""
     keep = kept(len(batch.goal), 3, objective.drop, generator).to(batch.goal.device)
-    network = nets.perception
-    scene = network.scene.encode(batch.scene)
-    code = network.join(scene, batch.observer_past, network.past(batch.past, batch.bones_keep), keep)
-    return nn.functional.dropout(code, objective.code_dropout)
+    codes = [mind.training_code(batch.scene, batch.observer_past, batch.past, keep, batch.bones_keep) for mind in nets.perception]
+    return nn.functional.dropout(torch.cat(codes, dim=-1), objective.code_dropout)
+
+
+def goal_error(
+    nets: BehaviorNets,
+    batch: Batch,
+    code: Float[Tensor, "batch condition"],
+    schedule: Schedule,
+    objective: Objective,
+    generator: torch.Generator,
+) -> Float[Tensor, "draw 3"]:
+    """Return the error of the goals, each mind's on its own, averaged; some of the draws ask for earlier times."""
+    draws, frames = objective.goal_draws, batch.track.shape[-1]
+    count = len(code) * draws
+    earlier = torch.rand(count, generator=generator) < objective.earlier_share
+    drawn = torch.randint(round(objective.earliest * frames), frames, (count,), generator=generator)
+    frame = torch.where(earlier, drawn, frames - 1).to(code.device)
+    row = torch.arange(count, device=code.device) // draws
+    horizon = (frame + 1) / frames
+    return squared_error(
+        lambda x, t: nets.goal.apart(x, t, code[row], horizon), batch.track[row, :, frame], schedule, objective.weighting, generator
+    ).mean(0)
 
 
 def kept(size: int, count: int, drop: float, generator: torch.Generator) -> Float[Tensor, "batch count"]:

@@ -82,7 +82,7 @@ def train(
     statistics = statistics_from_windows(windows, settings.augmentation.largest_turn_rad)
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
-    scene = SceneSampler(scenes, nets.perception.scene.stride, device)
+    scene = SceneSampler(scenes, architecture.scene_stride, device)
     pace = settings.optimization
     optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay, fused=True)
 
@@ -120,7 +120,8 @@ def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Sta
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         nets = BehaviorNets(architecture, schedule)
-    nets.perception.past.mean[:], nets.perception.past.std[:] = statistics.past_mean, statistics.past_std
+    for mind in nets.perception:
+        mind.past.mean[:], mind.past.std[:] = statistics.past_mean, statistics.past_std
     return nets
 
 

@@ -82,3 +82,18 @@ def test_goal_network_learns_where_goals_are():
     with torch.inference_mode():
         x = sample(lambda x, t: net(x, torch.full((200,), t), code), torch.randn(200, 3), SCHEDULE, method="ddim", count=10)
     assert (x.mean(0) - torch.tensor([1.0, -1.0, 1.0])).abs().max() < 0.25
+
+
+def test_minds_are_averaged_and_read_their_own_codes():
+    torch.manual_seed(0)
+    net = GoalMLP(condition=4, hidden=16, minds=2, code=6)
+    x, t, code = torch.randn(5, 3), torch.full((5,), 7.0), torch.randn(5, 12)
+    first, second = net.apart(x, t, code, torch.ones(5))
+    torch.testing.assert_close(net(x, t, code), (first + second) / 2)
+    other = code.clone()
+    other[:, 6:10] += 1.0
+    unmoved, moved = net.apart(x, t, other, torch.ones(5))
+    torch.testing.assert_close(unmoved, first)
+    assert (moved - second).abs().max() > 1e-4
+    earlier = net(x, t, code, torch.full((5,), 0.3))
+    assert (earlier - net(x, t, code)).abs().max() > 1e-4

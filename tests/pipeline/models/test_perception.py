@@ -52,7 +52,7 @@ def test_turning_and_moving_the_world_changes_no_observation():
 
 def test_far_observer_equals_none_and_a_near_one_does_not():
     nets = BehaviorNets(ARCHITECTURE).eval()
-    encode = nets.perception.observer
+    encode = next(iter(nets.perception)).observer
     track = torch.linspace(1, 0, 8)[:, None] * torch.tensor([[0.5, 0.0, 0.5]]) + torch.tensor([[0.0, 1.3, 1.0]])
     near, far = track.reshape(1, -1), (track + torch.tensor([0.0, 0.0, 3.5])).reshape(1, -1)
     none = encode(near, torch.zeros(1))
@@ -64,8 +64,8 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
 def test_a_blind_model_never_sees_its_condition():
     inputs = [torch.randn(2, 16, 64, 8, 64), torch.rand(2, 24), torch.randn(2, 8 * (9 + 18)), torch.ones(2, 3)]
     for number, blind in enumerate(("scene", "observer", "past")):
-        code = BehaviorNets(replace(ARCHITECTURE, blind_to=blind)).perception(*inputs).unflatten(1, (3, -1))
-        same = (code[0] - code[1]).abs().amax(-1) < 1e-7
+        code = BehaviorNets(replace(ARCHITECTURE, blind_to=blind)).perception(*inputs).unflatten(1, (ARCHITECTURE.minds, 3, -1))
+        same = (code[0] - code[1]).abs().amax((0, 2)) < 1e-7
         assert same.tolist() == [k == number for k in range(3)]
 
 
@@ -77,6 +77,6 @@ def test_dropped_conditions_do_not_reach_the_code():
     for number in range(3):
         keep = torch.zeros(2, 3)
         keep[:, number] = 1
-        code = nets.perception(*inputs, keep).unflatten(1, (3, -1))
-        same = (code[0] - code[1]).abs().amax(-1) < 1e-7
+        code = nets.perception(*inputs, keep).unflatten(1, (ARCHITECTURE.minds, 3, -1))
+        same = (code[0] - code[1]).abs().amax((0, 2)) < 1e-7
         assert same.tolist() == [k != number for k in range(3)]

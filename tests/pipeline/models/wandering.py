@@ -13,7 +13,7 @@ REST = rigid.make(
     rigid.rotation_from_vector(np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.2, 0.1]])),
     np.array([[0, 0, 0], [0, 0, 0.1], [0, 0.05, -0.1]]),
 )
-ARCHITECTURE = Architecture(bones=BONES, scene_width=8, hidden=16, code=8, unet_width=8, unet_multipliers=(1, 2), goal_hidden=16)
+ARCHITECTURE = Architecture(bones=BONES, scene_width=8, hidden=16, code=8, unet_width=8, unet_multipliers=(1, 2), goal_hidden=16, minds=2)
 
 
 def room() -> FeatureVolume:

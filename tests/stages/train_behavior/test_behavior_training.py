@@ -49,7 +49,7 @@ def windows(data):
 def drawn(windows, augmentation, seed=0):
     statistics = statistics_from_windows(windows, augmentation.largest_turn_rad)
     batch = draw_batch(
-        windows, SceneSampler(Scenes.of(room()), 2, "cpu"), statistics, augmentation, 16, torch.Generator().manual_seed(seed)
+        windows, SceneSampler(Scenes.of(room()), 4, "cpu"), statistics, augmentation, 16, torch.Generator().manual_seed(seed)
     )
     return batch, statistics.scaling
 
@@ -94,11 +94,11 @@ def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):
 
 def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
     volume = room()
-    exact = torch.nn.functional.avg_pool3d(torch.from_numpy(volume.around(windows.world_from_ego[:4].numpy())), 2)
-    fast = SceneSampler(Scenes.of(volume), 2, "cpu")(windows.world_from_ego[:4], torch.ones(4), torch.zeros(4, dtype=torch.long))
-    assert fast.shape == exact.shape == (4, 16, *(n // 2 for n in GRID_SHAPE))
+    exact = torch.nn.functional.avg_pool3d(torch.from_numpy(volume.around(windows.world_from_ego[:4].numpy())), 4)
+    fast = SceneSampler(Scenes.of(volume), 4, "cpu")(windows.world_from_ego[:4], torch.ones(4), torch.zeros(4, dtype=torch.long))
+    assert fast.shape == exact.shape == (4, 16, *(n // 4 for n in GRID_SHAPE))
     together = torch.stack([exact.flatten(), fast.flatten()])
-    assert torch.corrcoef(together)[0, 1] > 0.9  # one reads smoothed voxels, the other averages eight nearest ones
+    assert torch.corrcoef(together)[0, 1] > 0.95  # one reads smoothed voxels, the other averages the nearest ones
 
 
 def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
