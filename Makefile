@@ -15,7 +15,7 @@ RUN    := $(PYTHON) -SE -m pipeline.run
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check test doctor clean FORCE
+.PHONY: help new capture-check annotate test doctor clean FORCE
 
 help:
 	@sed 's/make cat/make $(or $(AGENT),cat)/' pipeline/help.txt
@@ -30,6 +30,9 @@ build/%/plan/rules.mk: .venv/.ok FORCE
 
 new: .venv/.ok
 	@$(PLAN) new '$(AGENT)'
+
+annotate: .venv/.ok
+	@$(PYTHON) -m stages.annotate build/$(or $(AGENT),cat) --clicks captures/$(or $(AGENT),cat)/clicks.json
 
 capture-check: .venv/.ok
 	@$(PYTHON) -m stages.check_captures captures/$(or $(AGENT),cat)

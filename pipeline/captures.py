@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline import config
+from pipeline import config, dag
 from pipeline.dag import Flow
 from pipeline.errors import InputError
 from pipeline.recordings.formats import format_of
@@ -53,8 +53,15 @@ def find(folder: Path, flow: Flow = "recordings") -> list[str]:
 
 def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
     """Return the names of whatever else lies there."""
-    known = set(find(folder, flow)) | {f"{name}{SIDECAR}" for name in find(folder, flow)}
+    known = (
+        set(find(folder, flow)) | {f"{name}{SIDECAR}" for name in find(folder, flow)} | {name for node in dag.FLOW for name in node.beside}
+    )
     return sorted(path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith("."))
+
+
+def beside(agent: str, names: Sequence[str]) -> list[Path]:
+    """Return those files beside an agent's recordings that exist."""
+    return [path for path in (Path("captures", agent, name) for name in names) if path.is_file()]
 
 
 def remarks(folder: Path, names: Sequence[str], overrides: Mapping[str, Any], where: str) -> dict[str, Remarks]:

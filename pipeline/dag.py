@@ -61,6 +61,8 @@ class Node:
     """What a scheduler reserves; not a limit."""
     resumable: bool = False
     """Owns a folder for checkpoints that survives a kill."""
+    beside: tuple[str, ...] = ()
+    """Files in the capture folder that it reads where they exist, each as `--<stem>`."""
     flows: tuple[Flow, ...] = ("recordings",)
     """The flows that it is part of."""
     trials: Literal["none", "each", "all"] = "none"
@@ -110,7 +112,7 @@ FLOW: tuple[Node, ...] = (
          (*merging("frames", "masks", "flow"), "scene_template", "agent_template", "scene_localizer",
           "agent_localizer", "registration", "reconstruction", "splats", "behavior_data", "behavior",
           Need("synthetic_capture", part="truth", option="truth")),
-         sees=("session", "heldout"), gpu=1),
+         sees=("session", "heldout"), gpu=1, beside=("clicks.json",)),
     Node("report", "report",
          (*merging("frames", "flow", "masks"), "feature_basis", *merging("features"),
           "scene_template", "agent_template", "scene_localizer", "agent_localizer", *merging("video_poses"),

@@ -273,6 +273,8 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
     keys = [str(home.plan / f"keys/{named}.json")]
     keys += [str(home.base.plan / f"keys/video.{video.id}.json")] if video else []
+    for file in captures.beside(plan.home.agent, node.beside):
+        keys, arguments = [*keys, str(home.base.plan / f"keys/beside.{file.name}")], [*arguments, f"--{file.stem}", str(file)]
     return Job(
         id=f"{node.artifact}.{part.id}" if part else node.artifact,
         artifact=node.artifact,

@@ -1,6 +1,7 @@
 """Measure a build: registration, localizer, masks, flow, reconstruction and behaviour, beside simple rivals.
 
-Truth is read where it is given (the built-in capture); figures that need it are left out elsewhere, with the reason.
+Truth is read where it is given (the built-in capture). Elsewhere clicked correspondences (`make annotate`) stand for it,
+and a held-out phone is placed by them or by registration; figures that need more are left out with the reason.
 """
 
 import json
@@ -53,7 +54,7 @@ def run(task: cli.Task) -> None:
     folders = reading.Folders(
         **{name: task.per_video(name) for name in PER_VIDEO},
         **{name: task.input(name) for name in ARTIFACTS},
-        truth=task.input("truth") if task.has("truth") else None,
+        **{name: task.input(name) if task.has(name) else None for name in ("truth", "clicks")},
     )
     effort = evaluation.Effort(c.localizer_frames, c.map_frames, c.heldout_frames, c.surface_frames, c.time_plans)
     protocol = Protocol(c.samples, c.trials, c.plan_trials, c.plan_stride, c.bootstrap_draws, c.seed)
@@ -66,4 +67,4 @@ def run(task: cli.Task) -> None:
 
 
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, reads=PER_VIDEO + ARTIFACTS + ("agent_localizer",), optional=("truth",))
+    cli.enter(__doc__, run, config=Config, reads=PER_VIDEO + ARTIFACTS + ("agent_localizer",), optional=("truth", "clicks"))

@@ -13,7 +13,8 @@ from pipeline.models.behavior import Sampling
 from pipeline.models.perception import FeatureVolume
 from pipeline.models.predictors import Ats
 from pipeline.models.trajectories import BehaviorData
-from stages.evaluate import behavior, localizing, perception, reading, reconstruction, registration, speed
+from pipeline.videos import Video
+from stages.evaluate import behavior, clicked, heldout, localizing, perception, reading, real_phone, reconstruction, registration, speed
 from stages.evaluate.alignment import PoseErrors, joined, pose_errors
 from stages.evaluate.behavior import Protocol
 from stages.evaluate.figures import Figures
@@ -48,12 +49,36 @@ def evaluate(folders: Folders, videos: Sequence, effort: Effort, protocol: Proto
         figures.put("registration/videos_registered", placed)
         figures.put("registration/videos_total", len(sessions))
         figures.skip(NEED_TRUTH + reconstruction.NAMES, NO_TRUTH)
+        figures.add(_against_clicks(folders, tuple(videos), effort, device))
     else:
         figures.add(_against_truth(folders, videos, effort, rng, device))
     progress.log("evaluate: behaviour")
     data, ours = _predictor(folders, device)
     figures.add(behavior.behavior_figures(data, ours, protocol))
     figures.add(speed.plan_figures(data, ours, protocol.seed, measure=effort.time_plans))
+    return figures
+
+
+def _against_clicks(folders: Folders, videos: tuple[Video, ...], effort: Effort, device: str) -> Figures:
+    """Measure a real capture: registration by clicks, held-out views by the phone itself, placed by clicks or registration."""
+    figures, cameras = Figures(), {}
+    if folders.clicks is None:
+        figures.skip(clicked.NAMES + clicked.OWN_NAMES, clicked.NO_CLICKS)
+    else:
+        progress.log("evaluate: clicks")
+        cameras = clicked.cameras_from_clicks(folders.clicks, folders, videos)
+        figures.add(clicked.clicked_figures(cameras, folders, videos))
+    seen, told = [], []
+    for video in (video for video in videos if video.role == "heldout" and video.synchronized_with):
+        placed = real_phone.cameras_of(folders, video, cameras.get(video.id))
+        told.append(placed[1] if placed else real_phone.UNPLACED)
+        if placed:
+            seen.append((video.synchronized_with, real_phone.shots(folders, video, placed[0], effort.heldout_frames)))
+    if told:
+        progress.log("evaluate: held-out phone")
+        figures.add(reconstruction.held_out_figures(folders, seen, device) if seen else Figures())
+        figures.skip(heldout.NAMES if not seen else real_phone.PARTS_WITHOUT_MASKS, "; ".join(told) if not seen else real_phone.NO_MASKS)
+        figures.skip(["reconstruction/heldout_cameras"], f"from {'; '.join(told)}")
     return figures
 
 

@@ -30,7 +30,10 @@ class Figures:
             self.values[name], self.reasons[name] = None, reason
 
     def add(self, other: "Figures") -> None:
-        """Take over another room's figures."""
+        """Take over another room's figures; what is measured there needs no reason any more."""
+        for name, value in other.values.items():
+            if value is not None:
+                self.reasons.pop(name, None)
         self.values.update(other.values)
         self.reasons.update(other.reasons)
         self.pictures.update(other.pictures)

@@ -34,6 +34,8 @@ class Folders:
     behavior: Path
     truth: Path | None
     """None for a user's own recordings"""
+    clicks: Path | None = None
+    """file of clicked correspondences, where there is one"""
 
 
 @dataclass(frozen=True)

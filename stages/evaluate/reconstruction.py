@@ -58,14 +58,18 @@ def reconstruction_figures(
 
 
 def _held_out(folders: Folders, phones: Sequence[Recorded], frames: Frames, effort: Effort, device: str) -> Figures:
-    """Compare with what the held-out phones saw, drawn by the fields and by the 3D Gaussians."""
+    """Compare with what the held-out phones truly saw."""
+    seen = [(phone.video.synchronized_with, _shots(folders, phone, frames, effort.heldout_frames)) for phone in phones]
+    return held_out_figures(folders, seen, device)
+
+
+def held_out_figures(folders: Folders, seen: Sequence[tuple[str | None, Sequence[Shot]]], device: str) -> Figures:
+    """Draw the shots of phones, each with the session it is synchronized with, by the fields and by the 3D Gaussians."""
     figures, by_fields, by_splats = Figures(), [], []
-    for phone in phones:
-        session = phone.video.synchronized_with
-        motion = reading.read_motion(folders.reconstruction, session)
+    for session, shots in seen:
+        motion = None if session is None else reading.read_motion(folders.reconstruction, session)
         if motion is None:
             continue
-        shots = _shots(folders, phone, frames, effort.heldout_frames)
         by_fields += _drawn_by_fields(folders, session, motion, shots, device)
         by_splats += _drawn_by_splats(folders, reading.read_motion(folders.splats, session) or motion, shots)
     if by_fields:

@@ -146,3 +146,18 @@ def test_a_new_session_does_not_touch_the_maps(house):
     changed = {name for name in before if after[name] != before[name]}
     assert changed >= {"registration.json", "reconstruction.json", "behavior_data.json"}
     assert not changed & {"scene_template.json", "agent_template.json", "frames.json", "video.v002.json", "masks.json"}
+
+
+def test_clicks_are_read_by_the_evaluation_alone(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.plan", "plan", "toy")
+    before = key_files(house)
+    house.write("captures/toy/clicks.json", "not even JSON")
+    house.python("pipeline.plan", "plan", "toy")
+    after = key_files(house)
+    assert {name for name in after if before.get(name) != after[name]} == {"beside.clicks.json"}
+    jobs = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
+    readers = [job["id"] for job in jobs if "--clicks" in job["arguments"]]
+    assert readers == ["evaluation"]
+    assert all("beside.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)

@@ -1,0 +1,137 @@
+"""The page's server on 127.0.0.1: pictures, fits, and the file of clicks. Nothing leaves the machine."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.errors import InputError
+from pipeline.files import clicks
+from pipeline.files.clicks import Pair, Recorded
+
+HOST = "127.0.0.1"
+PICTURE = re.compile(r"/picture/(\d+)/(\d+)\.jpg\Z")
+
+
+@dataclass(frozen=True)
+class Desk:
+    """What is clicked on, and where clicks are kept."""
+
+    recordings: Mapping[str, Recorded]
+    """by file name"""
+    shown: Mapping[str, list[int]]
+    """frames to click in, by file name"""
+    reference: str
+    """file name of the walk-through"""
+    world_from_reference: Float[np.ndarray, "frame 4 4"]
+    path: Path
+    """file of clicks"""
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page needs to begin."""
+        names = list(self.recordings)
+        frames = {
+            name: [
+                {"source_index": int(self.recordings[name].source_index[frame]), "url": f"/picture/{names.index(name)}/{frame}.jpg"}
+                for frame in self.shown[name]
+            ]
+            for name in names
+        }
+        pairs = clicks.read(self.path) if self.path.exists() else []
+        return {"reference": self.reference, "wanted": clicks.WANTED, "frames": frames, "pairs": [asdict(pair) for pair in pairs]}
+
+    def fits(self, pairs: list[Pair]) -> dict[str, Any]:
+        """Return, per frame with enough pairs, what is left of each pair in millimetres (null without depth)."""
+        found = {}
+        for name, recorded in self.recordings.items():
+            for source_index, group in clicks.by_frame(pairs, name).items():
+                fit = clicks.fit(group, recorded, self.recordings[self.reference], self.world_from_reference)
+                if fit is not None:
+                    left = [None if np.isnan(m) else round(1000 * float(m), 1) for m in fit.residual_m]
+                    found[f"{name}/{source_index}"] = {"typical_mm": round(1000 * fit.typical_m, 1), "left_mm": left}
+        return found
+
+    def keep(self, pairs: list[Pair]) -> None:
+        """Replace the file of clicks; names must be of recordings that are shown."""
+        for pair in pairs:
+            if pair.seen.recording not in self.recordings or pair.reference.recording != self.reference:
+                raise ValueError(f"{pair.seen.recording!r} and {pair.reference.recording!r} are not what is clicked on")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = self.path.with_name(f".{self.path.name}.tmp")
+        fresh.write_text(clicks.text(pairs))
+        fresh.replace(self.path)
+
+    def picture(self, recording: int, frame: int) -> bytes:
+        """Return a JPEG; raises LookupError for one that is not shown."""
+        name = list(self.recordings)[recording]
+        if frame not in self.shown[name]:
+            raise LookupError(frame)
+        return (self.recordings[name].clip.folder / "color" / f"{frame:06d}.jpg").read_bytes()
+
+
+def server(desk: Desk, port: int) -> ThreadingHTTPServer:
+    """Return a server that is bound but not yet running; port 0 takes any free one."""
+
+    class Handler(BaseHTTPRequestHandler):
+        """One request; only the page itself, asked for by its own address, is served."""
+
+        def do_GET(self) -> None:
+            """Serve the page, its state or a picture."""
+            if not self._from_here():
+                return self._send(403, b"", "text/plain")
+            match = PICTURE.match(self.path)
+            if self.path == "/":
+                page = resources.files("stages.annotate").joinpath("page.html").read_bytes()
+                return self._send(200, page, "text/html; charset=utf-8")
+            if self.path == "/state":
+                return self._json(desk.state())
+            try:
+                return (
+                    self._send(200, desk.picture(int(match[1]), int(match[2])), "image/jpeg")
+                    if match
+                    else self._send(404, b"", "text/plain")
+                )
+            except LookupError:
+                return self._send(404, b"", "text/plain")
+
+        def do_POST(self) -> None:
+            """Keep the clicks and answer with their fits."""
+            length = int(self.headers.get("Content-Length") or 0)
+            if not self._from_here() or self.path != "/clicks" or self.headers.get("Content-Type") != "application/json":
+                return self._send(403, b"", "text/plain")
+            if not 0 < length <= clicks.MAX_BYTES:
+                return self._send(413, b"", "text/plain")
+            try:
+                pairs = clicks.parse(json.loads(self.rfile.read(length)))
+                desk.keep(pairs)
+            except (ValueError, RecursionError, InputError) as error:
+                return self._send(400, str(error).encode(), "text/plain")
+            return self._json({"fits": desk.fits(pairs)})
+
+        def log_message(self, format: str, *arguments: Any) -> None:
+            """Stay silent."""
+
+        def _from_here(self) -> bool:
+            """Refuse other sites that point a name or a form at this server."""
+            own = {f"{name}:{self.server.server_address[1]}" for name in (HOST, "localhost")}
+            origin = self.headers.get("Origin")
+            return self.headers.get("Host") in own and (origin is None or origin.removeprefix("http://") in own)
+
+        def _json(self, value: Any) -> None:
+            self._send(200, json.dumps(value).encode(), "application/json")
+
+        def _send(self, code: int, body: bytes, kind: str) -> None:
+            self.send_response(code)
+            for name, text in (("Content-Type", kind), ("Content-Length", str(len(body))), ("Cache-Control", "no-store")):
+                self.send_header(name, text)
+            self.end_headers()
+            self.wfile.write(body)
+
+    return ThreadingHTTPServer((HOST, port), Handler)

@@ -1,0 +1,72 @@
+"""The held-out phone of a real capture: its cameras from clicks, else from registration; what it measured stands for truth.
+
+Its own depth sensor is compared with, as the paper does; there are no masks, so animal and room are not told apart.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files.clips import Clip
+from pipeline.models import localizer as localizers
+from pipeline.space import rigid
+from pipeline.videos import Video
+from stages.evaluate.clicked import Clicked, all_cameras
+from stages.evaluate.heldout import NAMES, RANGE_M, Shot
+from stages.evaluate.reading import Folders
+
+LOCALIZED = 24
+"""frames that vote where registration places the phone"""
+AGREE = (5.0, 0.2)
+"""degrees and metres within which two frames mean the same place"""
+LEAST_VOTES = 4
+UNPLACED = "the held-out phone was neither clicked (`make annotate`) nor could registration place it"
+NO_MASKS = "the held-out phone of a real capture has no masks"
+PARTS_WITHOUT_MASKS = tuple(name for name in NAMES if name.endswith(("_agent", "_scene")))
+
+
+def cameras_of(folders: Folders, video: Video, clicked: Clicked | None) -> tuple[Float[np.ndarray, "frame 4 4"], str] | None:
+    """Return ``world_from_camera`` of all frames (NaN where unknown) and where it comes from; None where nothing places it."""
+    clip = Clip.open(folders.frames[video.id])
+    if clicked is not None and clicked.trusted.any():
+        return all_cameras(clicked, clip.odometry_from_camera, len(clip)), f"clicked correspondences in {int(clicked.trusted.sum())} frames"
+    if clip.odometry_from_camera is None:
+        return None
+    model = localizers.load(folders.scene_localizer)
+    votes = []
+    for frame in np.unique(np.linspace(0, len(clip) - 1, LOCALIZED).astype(int)).tolist():
+        answers = model.localize(clip.color(frame), clip.depth(frame), clip.depth_intrinsics[frame], clip.intrinsics[frame])
+        votes += [answers[0].world_from_camera @ rigid.inverse(clip.odometry_from_camera[frame])] if answers else []
+    agreed = agreement(np.array(votes).reshape(-1, 4, 4))
+    return (
+        None
+        if agreed is None
+        else (agreed[0] @ clip.odometry_from_camera, f"registration: {agreed[1]} of {len(votes)} single frames agree")
+    )
+
+
+def agreement(votes: Float[np.ndarray, "vote 4 4"]) -> tuple[Float[np.ndarray, "4 4"], int] | None:
+    """Return the mean of the largest group of votes that agree, and its size; None below four."""
+    if len(votes) < LEAST_VOTES:
+        return None
+    degrees = np.degrees(rigid.rotation_angle(votes[:, None, :3, :3], votes[None, :, :3, :3]))
+    meters = np.linalg.norm(votes[:, None, :3, 3] - votes[None, :, :3, 3], axis=-1)
+    near = (degrees < AGREE[0]) & (meters < AGREE[1])
+    group = near[near.sum(1).argmax()]
+    if group.sum() < LEAST_VOTES:
+        return None
+    return rigid.make(rigid.mean_rotation(votes[group][:, :3, :3]), np.median(votes[group][:, :3, 3], axis=0)), int(group.sum())
+
+
+def shots(folders: Folders, video: Video, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> Sequence[Shot]:
+    """Return what the phone saw and measured in up to ``count`` frames whose camera is known."""
+    clip, found = Clip.open(folders.frames[video.id]), []
+    known = np.flatnonzero(np.isfinite(world_from_camera).all((1, 2)))
+    for frame in known[np.unique(np.linspace(0, len(known) - 1, count).astype(int))].tolist():
+        depth = np.where((clip.confidence(frame) > 0) & (clip.depth(frame) <= RANGE_M), clip.depth(frame), 0).astype(np.float32)
+        color = cv2.resize(clip.color(frame), depth.shape[::-1], interpolation=cv2.INTER_AREA)
+        time_s = float(clip.timestamp_s[frame] + video.offset_s)
+        found.append(Shot(world_from_camera[frame], clip.depth_intrinsics[frame], time_s, color, depth, np.zeros(depth.shape, bool)))
+    return found
