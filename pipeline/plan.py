@@ -166,11 +166,12 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     """Write the plan's files, each only if it changed."""
     all_jobs = jobs(plan)
     base = plan.home.base.plan
-    ids = _known_ids(plan.home.base) | {video.file: video.id for video in plan.videos}
-    artifact.write_if_changed(base / "ids.json", _json(ids))
+    artifact.write_if_changed(base / "ids.json", _json(_known_ids(plan.home.base) | {video.file: video.id for video in plan.videos}))
     artifact.write_if_changed(base / "videos.json", _json([asdict(video) for video in plan.videos]))
     for video in plan.videos:
         artifact.write_if_changed(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
+    for file in (file for node in dag.FLOW for file in captures.beside(plan.home.agent, node.beside)):
+        artifact.write_if_changed(base / f"keys/beside.{file.name}", _json({"sha256": cache.get(file, artifact.digest_of_file)}))
     for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(plan.home)}:
         node, table = dag.NODES[name], plan.tables[name]
         overlay = next((each.overlay for each in plan.trials if each.id == trial), {})
@@ -271,8 +272,7 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     named = f"{node.artifact}.{trial.id}" if trial else node.artifact
     arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
     arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
-    keys = [str(home.plan / f"keys/{named}.json")]
-    keys += [str(home.base.plan / f"keys/video.{video.id}.json")] if video else []
+    keys = [str(home.plan / f"keys/{named}.json"), *([str(home.base.plan / f"keys/video.{video.id}.json")] if video else [])]
     for file in captures.beside(plan.home.agent, node.beside):
         keys, arguments = [*keys, str(home.base.plan / f"keys/beside.{file.name}")], [*arguments, f"--{file.stem}", str(file)]
     return Job(
