@@ -1,7 +1,7 @@
 """The canonical structure T: what is where in the scene and on the agent (paper 001, Eqs. 1-2).
 
 `Field` maps points to signed distance, colour and feature: a multi-resolution dense grid and two small heads,
-with a learnable code per video for the scene. `density` turns signed distance into the density of volume
+with a learnable code per video for the scene. Where the scene was fused beforehand (`fused`), the heads learn the rest. `density` turns signed distance into the density of volume
 rendering. `Body` skins the agent's field with Gaussian bones. `Reconstruction` holds all of it; `save` and `load`
 move it to and from a folder. Points and distances are in metres, inside and outside.
 """
@@ -17,10 +17,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.models import skinning
+from pipeline.models import fused, skinning
+from pipeline.models.fused import Fused
 from pipeline.space import rigid_torch
 
 FEATURE_CHANNELS = 16
+FUSED_CHANNELS = fused.CHANNELS
 
 
 @dataclass(frozen=True)
@@ -79,49 +81,76 @@ class DenseGrid(nn.Module):
 class Field(nn.Module):
     """Signed distance, colour and feature at points (paper 001, Eqs. 1 and 2)."""
 
-    def __init__(self, shape: FieldShape, free_m: float):
-        """``free_m`` is the signed distance that an untrained field gives."""
+    def __init__(self, shape: FieldShape, free_m: float, fused: Fused | None = None):
+        """``free_m`` is the signed distance that an untrained field gives where nothing is fused."""
         super().__init__()
-        self.shape = shape
+        self.shape, self.fused = shape, fused
         self.grid = DenseGrid(shape.low_m, shape.high_m, shape.voxel_m, shape.grid_channels)
         self.codes = nn.Embedding(max(shape.videos, 1), shape.code_channels) if shape.videos else None
-        inputs = self.grid.channels + (shape.code_channels if shape.videos else 0)
-        self.geometry = nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 1))
+        inputs = self.grid.channels + (shape.code_channels if shape.videos else 0) + (FUSED_CHANNELS if fused else 0)
+        self.geometry = None if fused else nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 1))
         self.appearance = nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 3 + FEATURE_CHANNELS))
         self.log_beta = nn.Parameter(torch.tensor(-4.0))
         if self.codes:
             nn.init.normal_(self.codes.weight, std=0.1)
-        limit = shape.truncation_m
-        nn.init.constant_(self.geometry[-1].bias, torch.atanh(torch.tensor(min(free_m / limit, 0.9))).item() if limit else free_m)
+        if fused:
+            nn.init.zeros_(self.appearance[-1].weight.data[:3])
+            nn.init.zeros_(self.appearance[-1].bias.data[:3])
+        else:
+            limit = shape.truncation_m
+            nn.init.constant_(self.geometry[-1].bias, torch.atanh(torch.tensor(min(free_m / limit, 0.9))).item() if limit else free_m)
 
-    def code(self, video: Int[Tensor, "point"]) -> Float[Tensor, "point channel"] | None:
-        """Return the codes of videos; -1 asks for the mean of all, the scene that the videos share."""
-        if self.codes is None:
-            return None
-        mean = self.codes.weight.mean(0)
-        return torch.where(video[:, None] < 0, mean, self.codes(video.clamp_min(0)))
+    @property
+    def lattice_m(self) -> float:
+        """The resolution at which the surface is worth extracting, metres."""
+        return self.fused.voxel_m if self.fused else 0.05
 
     def encode(
-        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point channel"] | None = None
+        self, points: Float[Tensor, "point 3"], video: Int[Tensor, "point"] | None = None, code: Int[Tensor, "point"] | None = None
     ) -> Float[Tensor, "point channel"]:
-        """Read the grid and append the code: the input of both heads."""
-        read = self.grid(points)
-        return read if code is None else torch.cat([read, code], dim=-1)
+        """Read the grid, the video's code and what is fused: the input of both heads.
+
+        Args:
+            video: whose scene; -1 asks for the scene that the videos share. None without codes.
+            code: whose code instead of the video's own (scene annealing).
+        """
+        read = [self.grid(points)]
+        if self.codes is not None:
+            code = video if code is None else code
+            read.append(torch.where(code[:, None] < 0, self.codes.weight.mean(0), self.codes(code.clamp_min(0))))
+        if self.fused:
+            read.append(self.fused(points, video))
+        return torch.cat(read, dim=-1)
 
     def distance(self, encoded: Float[Tensor, "point channel"]) -> Float[Tensor, "point"]:
-        """Return signed distances in metres, positive in free space."""
-        raw, limit = self.geometry(encoded)[:, 0], self.shape.truncation_m
+        """Return signed distances in metres, positive in free space: those fused, or else those of the head."""
+        limit = self.shape.truncation_m
+        if self.fused:
+            return limit * encoded[:, -FUSED_CHANNELS]
+        raw = self.geometry(encoded)[:, 0]
         return limit * torch.tanh(raw) if limit else raw
 
     def look(self, encoded: Float[Tensor, "point channel"]) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 16"]]:
-        """Return colour in 0..1 and unit-length features."""
+        """Return colour in 0..1 and unit-length features; the head corrects fused colours."""
         color, feature = self.appearance(encoded).split([3, FEATURE_CHANNELS], dim=-1)
+        if self.fused:
+            color = color + encoded[:, 1 - FUSED_CHANNELS : -1].logit(0.02)
         return color.sigmoid(), functional.normalize(feature, dim=-1, eps=1e-4)
 
-    def forward(self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point channel"] | None = None) -> Values:
-        """Return all values at points."""
-        encoded = self.encode(points, code)
+    def forward(
+        self, points: Float[Tensor, "point 3"], video: Int[Tensor, "point"] | None = None, code: Int[Tensor, "point"] | None = None
+    ) -> Values:
+        """Return all values at points; arguments as `encode`'s."""
+        encoded = self.encode(points, video, code)
         return Values(self.distance(encoded), *self.look(encoded))
+
+    def distance_at(
+        self, points: Float[Tensor, "point 3"], video: Int[Tensor, "point"], code: Int[Tensor, "point"] | None = None
+    ) -> Float[Tensor, "point"]:
+        """Return signed distances alone, the quickest way; arguments as `encode`'s."""
+        if self.fused:
+            return self.shape.truncation_m * self.fused(points, video)[:, 0]
+        return self.distance(self.encode(points, video, code))
 
     @property
     def beta_m(self) -> Float[Tensor, ""]:
@@ -220,9 +249,16 @@ def load(folder: Path, device: str = "cpu") -> Reconstruction:
         name: FieldShape(**{key: tuple(value) if isinstance(value, list) else value for key, value in table[name].items()})
         for name in ("scene", "agent")
     }
-    scene, agent = Field(shapes["scene"], free_m=0.1), Field(shapes["agent"], free_m=0.1)
+    state = load_file(folder / "scene_field.safetensors")
+    ground = {key.removeprefix("fused."): value for key, value in state.items() if key.startswith("fused.")}
+    scene = Field(
+        shapes["scene"],
+        free_m=0.1,
+        fused=Fused(ground["low"], *ground["sizes"].tolist(), ground["table"], ground["blocks"]) if ground else None,
+    )
+    agent = Field(shapes["agent"], free_m=0.1)
     body = Body(torch.eye(4).repeat(table["bones"], 1, 1), torch.ones(table["bones"], 3), shapes["agent"])
-    scene.load_state_dict(load_file(folder / "scene_field.safetensors"))
+    scene.load_state_dict(state)
     state = load_file(folder / "agent_field.safetensors")
     for prefix, module in (("field.", agent), ("body.", body)):
         module.load_state_dict({key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)})

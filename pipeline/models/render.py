@@ -81,12 +81,12 @@ class Picture:
 class Renderer:
     """Draws views of a reconstruction as one video saw it; build once per video, draw often."""
 
-    def __init__(self, reconstruction: Reconstruction, video: str | None = None, step_m: float = 0.05, agent_step_m: float = 0.02):
-        """``video`` chooses the scene's code (None: the shared scene); the steps are the meshes' resolutions."""
+    def __init__(self, reconstruction: Reconstruction, video: str | None = None, agent_step_m: float = 0.02):
+        """``video`` chooses the scene's code (None: the shared scene); the step is the resolution of the agent's mesh."""
         self.reconstruction = reconstruction
         self.code = reconstruction.video_code(video)
         self.device = reconstruction.scene.log_beta.device
-        self.scene_caster = RayCaster(surfaces.extract_scene(reconstruction.scene, self.code, step_m))
+        self.scene_caster = RayCaster(surfaces.extract_scene(reconstruction.scene, self.code, reconstruction.scene.lattice_m))
         self.agent_mesh = surfaces.extract_agent(reconstruction.agent, agent_step_m)
         self._rest = torch.from_numpy(self.agent_mesh.vertices).to(self.device)
 
@@ -132,5 +132,5 @@ class Renderer:
     def _scene_color(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 3"]:
         field = self.reconstruction.scene
         points = torch.from_numpy(points_world.astype(np.float32)).to(self.device)
-        code = field.code(torch.full((len(points),), self.code, device=self.device))
-        return field.look(field.encode(points, code))[0].cpu().numpy()
+        video = torch.full((len(points),), self.code, device=self.device)
+        return field.look(field.encode(points, video))[0].cpu().numpy()

@@ -39,20 +39,17 @@ def zero_level(volume: Float[np.ndarray, "x y z"], low_m: Float[np.ndarray, "3"]
 def paint(field: Field, mesh: Mesh, code: int) -> Mesh:
     """Return the mesh with the field's colour at its vertices."""
     points = torch.from_numpy(mesh.vertices).to(field.log_beta.device)
-    codes = field.code(torch.full((len(points),), code, device=points.device))
-    color = field.look(field.encode(points, codes))[0]
+    color = field.look(field.encode(points, torch.full((len(points),), code, device=points.device)))[0]
     return Mesh(mesh.vertices, mesh.faces, (color * 255 + 0.5).byte().cpu().numpy())
 
 
 def extract_scene(field: Field, code: int, step_m: float) -> Mesh:
     """Return the scene's surface as one video's code (-1: all videos') shapes it, coloured."""
-
-    def distance(points: Tensor) -> Tensor:
-        return field.distance(field.encode(points, field.code(torch.full((len(points),), code, device=points.device))))
-
     low, high = _box(field)
-    mesh = zero_level(sample_distance(distance, low, high, step_m), low.cpu().numpy(), step_m)
-    return paint(field, mesh, code)
+    volume = sample_distance(
+        lambda points: field.distance_at(points, torch.full((len(points),), code, device=points.device)), low, high, step_m
+    )
+    return paint(field, zero_level(volume, low.cpu().numpy(), step_m), code)
 
 
 def extract_agent(field: Field, step_m: float) -> Mesh:

@@ -6,11 +6,13 @@ turnaround; then extracts surfaces, skin, motion per video and the scene's featu
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 from pipeline import cli, progress
 from pipeline.models.fields import Reconstruction
-from stages.reconstruct import assemble, optimise, pictures, reading, results, writing
+from stages.reconstruct import assemble, fuse, optimise, pictures, reading, results, writing
 from stages.reconstruct.assemble import Shapes
+from stages.reconstruct.fuse import Fusion
 from stages.reconstruct.rays import Sampling
 from stages.reconstruct.settings import Batches, Rates, Steps, Weights
 
@@ -33,8 +35,10 @@ class Config:
     """of the losses"""
     rates: Rates = Rates()
     """of learning"""
-    scene_step_m: float = 0.05
-    """resolution of the extracted scene, metres"""
+    ground: Literal["fused", "none"] = "fused"
+    """what the scene's field learns on: fused depth, or nothing (baselines)"""
+    fusion: Fusion = Fusion()
+    """how depth is fused"""
     agent_step_m: float = 0.015
     """resolution of the extracted agent, metres"""
     longest_gap_s: float = 1.0
@@ -50,14 +54,15 @@ def run(task: cli.Task) -> None:
     folders = reading.Folders(**per_video, **{name: task.input(name) for name in ("registration", "scene_template", "agent_template")})
     by_role = {video.role: video.id for video in task.videos}
     videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed)
-    problem = assemble.build(videos, reading.read_template(folders.agent_template), config.shapes, config.seed, task.device)
+    fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion) if config.ground == "fused" else None
+    problem = assemble.build(videos, reading.read_template(folders.agent_template), config.shapes, config.seed, task.device, fused)
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(problem.store.scene)} scene rays, {len(problem.store.agent)} agent rays")
     plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, task.resume)
     records = optimise.optimise(problem, plan)
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
     motions = results.motions(problem, videos, config.longest_gap_s)
     sessions = [video.id for video in videos if video.camera_free]
-    scene, agent = results.scene_surface(problem, config.scene_step_m), results.agent_surface(problem, config.agent_step_m)
+    scene, agent = results.scene_surface(problem), results.agent_surface(problem, config.agent_step_m)
     with task.create() as folder:
         writing.write(folder, problem, reconstruction, motions, sessions, scene, agent)
         pictures.report_quality(folder, reconstruction, {id: motions[id] for id in sessions}, per_video, records)

@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Bool, Float
 
 from pipeline.models.fields import Body, Field, FieldShape
+from pipeline.models.fused import Fused
 from pipeline.models.motion import MotionTable
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.reconstruct.problem import Problem, RaysByFrame, Surface, frame_table
-from stages.reconstruct.rays import Store, join
+from stages.reconstruct.rays import Source, Store, join
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,8 @@ class Video:
     has_scene: bool
     """False for the turnaround: its world is the agent"""
     store: Store
+    source: Source | None = None
+    """its pictures; None where all that is wanted of them stands in the store"""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Shapes:
     width: int = 64
     """units of each head's hidden layer"""
     truncation_m: float = 0.08
-    """the scene's signed distance saturates here"""
+    """the signed distance of a scene without fused depth saturates here"""
     scene_margin_m: float = 0.2
     """space kept around all that was measured"""
     agent_margin_m: float = 0.12
@@ -66,8 +69,8 @@ class Shapes:
     """frames between the knots of camera corrections"""
 
 
-def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int, device: str) -> Problem:
-    """Make the problem; videos with a scene come first, so that codes count them."""
+def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int, device: str, fused: Fused | None = None) -> Problem:
+    """Make the problem; videos with a scene come first, so that codes count them. The scene learns on what is fused."""
     videos = scene_first(videos)
     torch.manual_seed(seed)
     store = join([usable(video) for video in videos])
@@ -75,7 +78,7 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     camera = np.concatenate([filled(video.timestamp_s, video.world_from_camera) for video in videos])
     agent = np.concatenate([filled(video.timestamp_s, video.world_from_agent) for video in videos])
     rooted = torch.from_numpy(np.concatenate([np.isfinite(video.world_from_agent).all((1, 2)) for video in videos]))
-    low, high = _measured_box(store, camera, shapes.scene_margin_m)
+    low, high = measured_box(videos, shapes.scene_margin_m)
     scene = Field(
         FieldShape(
             low,
@@ -84,9 +87,10 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
             shapes.grid_channels,
             shapes.width,
             sum(v.has_scene for v in videos),
-            truncation_m=shapes.truncation_m,
+            truncation_m=fused.truncation_m if fused else shapes.truncation_m,
         ),
         free_m=-0.03,
+        fused=fused,
     )
     vertices = template.mesh.vertices
     low, high = (
@@ -139,12 +143,16 @@ def filled(timestamp_s: Float[np.ndarray, "frame"], a_from_b: Float[np.ndarray, 
     return rigid.interpolate(timestamp_s[known], a_from_b[known], timestamp_s)
 
 
-def _measured_box(store: Store, camera: Float[np.ndarray, "frame 4 4"], margin_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def measured_box(videos: Sequence[Video], margin_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the box of nearly all measured points of the scene, and of the cameras that saw them."""
-    rays = store.scene.at(torch.nonzero(store.scene.depth > 0)[:, 0][::7])
-    pose = camera[rays.frame.numpy()]
-    points = rigid.apply(pose, (rays.direction * rays.depth[:, None]).numpy()[:, None])[:, 0]
-    eyes = pose[:, :3, 3]
+    stores = [usable(video).scene for video in videos]
+    rays = [store.at(torch.nonzero(store.depth > 0)[:, 0][::7]) for store in stores]
+    points = [
+        rigid.apply(video.world_from_camera[some.frame.numpy()], (some.direction * some.depth[:, None]).numpy()[:, None])[:, 0]
+        for video, some in zip(videos, rays, strict=True)
+    ]
+    eyes = [video.world_from_camera[np.unique(some.frame.numpy()), :3, 3] for video, some in zip(videos, rays, strict=True)]
+    points, eyes = np.concatenate(points), np.concatenate(eyes)
     low = np.minimum(np.quantile(points, 0.002, axis=0), eyes.min(0)) - margin_m
     high = np.maximum(np.quantile(points, 0.998, axis=0), eyes.max(0)) + margin_m
     return tuple(float(x) for x in low), tuple(float(x) for x in high)

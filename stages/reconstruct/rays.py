@@ -118,10 +118,10 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
     """Read every frame of a video once; frames count from 0."""
     scene, agent, depths, outsides = [], [], [], []
     for frame in range(len(source.clip)):
-        depth, slope = _trusted_depth(source.clip, frame)
+        depth, slope = trusted_depth(source.clip, frame)
         mask = source.masks[frame] if source.masks is not None else np.zeros(source.clip.color_size, np.uint8)
         seen = source.masks is not None and source.masks.visible[frame]
-        near = _near_agent(mask, sampling.ring_px) if seen else np.zeros(mask.shape, bool)
+        near = near_agent(mask, sampling.ring_px) if seen else np.zeros(mask.shape, bool)
         reader = _Reader(source, frame, mask, depth, slope)
         if source.has_scene:
             scene.append(reader.read(_choose(mask == NOT_AGENT, sampling.scene_per_frame, rng), rng))
@@ -182,7 +182,7 @@ def _concatenate(parts: Sequence[Rays]) -> Rays:
     return Rays(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Rays)))
 
 
-def _trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+def trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
     """Return depth (0 where the sensor doubts it) and each pixel's slope from the depth's own normals."""
     depth = clip.depth(frame).astype(np.float32)
     depth[(clip.confidence(frame) == 0) | (depth < SEEN_M[0]) | (depth > SEEN_M[1])] = 0
@@ -198,7 +198,8 @@ def _trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height wi
     return depth, np.clip(slope, 0.15, None).astype(np.float32)
 
 
-def _near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np.ndarray, "height width"]:
+def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np.ndarray, "height width"]:
+    """Return the agent's mask and a ring around it."""
     kernel = np.ones((2 * ring_px + 1, 2 * ring_px + 1), np.uint8)
     return cv2.dilate((mask == AGENT).astype(np.uint8), kernel) > 0
 

@@ -47,7 +47,18 @@ def _walkthrough(id: str, folders: Folders, sampling: Sampling, seed: int) -> Vi
     source = Source(Clip.open(folders.frames[id]), _features(folders, id))
     nowhere, nothing = np.full_like(cameras, np.nan), np.zeros(len(cameras), bool)
     store = collect(source, sampling, _rng(seed, id))
-    return Video(id, table["timestamp_s"], cameras, nowhere, np.ones(len(cameras)), nothing, camera_free=False, has_scene=True, store=store)
+    return Video(
+        id,
+        table["timestamp_s"],
+        cameras,
+        nowhere,
+        np.ones(len(cameras)),
+        nothing,
+        camera_free=False,
+        has_scene=True,
+        store=store,
+        source=source,
+    )
 
 
 def _turnaround(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
@@ -61,8 +72,8 @@ def _turnaround(id: str, folders: Folders, sampling: Sampling, seed: int) -> Vid
 
 
 def _session(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
-    table = arrays.load(folders.registration / id / "poses.npz")
-    store = collect(_masked(id, folders, has_scene=True), sampling, _rng(seed, id))
+    table, source = arrays.load(folders.registration / id / "poses.npz"), _masked(id, folders, has_scene=True)
+    store = collect(source, sampling, _rng(seed, id))
     return Video(
         id,
         table["timestamp_s"],
@@ -73,6 +84,7 @@ def _session(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
         camera_free=True,
         has_scene=True,
         store=store,
+        source=source,
     )
 
 

@@ -73,9 +73,9 @@ def bridged(
     return root, bones
 
 
-def scene_surface(problem: Problem, step_m: float, reach_m: float = 0.12) -> Mesh:
-    """Return the shared scene's surface, cut where nothing was measured within ``reach_m``."""
-    mesh = surfaces.extract_scene(problem.scene, -1, step_m)
+def scene_surface(problem: Problem, reach_m: float = 0.045) -> Mesh:
+    """Return the shared scene's surface, cut where nothing was measured within ``reach_m``: backs of thin shells, rims."""
+    mesh = surfaces.extract_scene(problem.scene, -1, problem.scene.lattice_m)
     near, _ = cKDTree(measured_points(problem)).query(mesh.vertices, distance_upper_bound=reach_m)
     return surfaces.keep_vertices(mesh, np.isfinite(near))
 
@@ -104,7 +104,7 @@ def feature_volume(problem: Problem, most_frames: int = 300) -> FeatureVolume:
     size = np.ceil((np.array(field.shape.high_m) - low) / VOXEL_M).astype(int)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
     points = torch.from_numpy(low + (index + 0.5) * VOXEL_M).float().to(problem.device)
-    encoded = field.encode(points, field.code(torch.full((len(points),), -1, device=points.device)))
+    encoded = field.encode(points, torch.full((len(points),), -1, device=points.device))
     distance, feature = field.distance(encoded).cpu().numpy(), field.look(encoded)[1].cpu().numpy()
     free = looked_through(problem, points, most_frames).cpu().numpy()
     measured = np.isfinite(cKDTree(measured_points(problem)).query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)[0])

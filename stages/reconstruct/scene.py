@@ -15,7 +15,7 @@ from stages.reconstruct.settings import Batches, Weights
 Terms = dict[str, tuple[float, Tensor]]
 FREE_FROM_M = 0.1
 FARTHEST_M = 5.0
-BEHIND_M = 0.08
+BEHIND_M = 0.06
 """samples behind a measured surface; deeper ones would fill thin things and what lies behind edges"""
 EIKONAL_STEP_M = 0.04
 
@@ -55,22 +55,22 @@ def measured_terms(
     origin, direction = world_rays(problem.motion, rays)
     depth = sample_depths(rays, batches.near, batches.free, limit, generator)
     points = origin[:, None] + direction[:, None] * depth[..., None]
-    code = field.code(code_of)
-    samples = depth.shape[1]
-    encoded = field.encode(points.view(-1, 3), code.repeat_interleave(samples, 0))
-    distance = field.distance(encoded).view(-1, samples)
+    video, samples = problem.video[rays.frame], depth.shape[1]
+    distance = field.distance_at(points.view(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)).view(-1, samples)
     target = (rays.depth[:, None] - depth) * rays.slope[:, None]
     target[:, 1 + batches.near :] = target[:, 1 + batches.near :].clamp_min(limit)
-    color, feature = field.look(encoded.view(-1, samples, encoded.shape[-1])[:, 0])
-    few = slice(0, len(rays) // 8)
-    beside = points[few, 0].detach() + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
-    shifted = field.distance(field.encode(beside.reshape(-1, 3), code[few].repeat(3, 1))).view(3, -1)
-    return {
+    color, feature = field.look(field.encode(points[:, 0], video, code_of))
+    terms = {
         "distance": (weights.distance, losses.truncated_distance(distance, target, limit)),
         "color": (weights.color, losses.color(color, rays.color / 255)),
         "feature": (weights.feature, losses.feature(feature, rays.feature / 127)),
-        "eikonal": (weights.eikonal, losses.eikonal(distance[few, 0], shifted, EIKONAL_STEP_M)),
     }
+    if field.fused is None:
+        few = slice(0, len(rays) // 8)
+        beside = points[few, 0].detach() + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
+        shifted = field.distance_at(beside.reshape(-1, 3), video[few].repeat(3), code_of[few].repeat(3)).view(3, -1)
+        terms["eikonal"] = (weights.eikonal, losses.eikonal(distance[few, 0], shifted, EIKONAL_STEP_M))
+    return terms
 
 
 def rendered_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, generator: Generator) -> Terms:
@@ -78,7 +78,7 @@ def rendered_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], we
     origin, direction = world_rays(problem.motion, rays)
     depth = render_depths(rays, generator)
     points = origin[:, None] + direction[:, None] * depth[..., None]
-    scene = scene_layer(problem, points, code_of)
+    scene = scene_layer(problem, points, problem.video[rays.frame], code_of)
     empty = Layer(torch.zeros_like(scene.density), torch.zeros_like(scene.color), torch.zeros_like(scene.feature))
     seen = composite(depth, direction.norm(dim=-1), scene, empty)
     known = rays.depth > 0
@@ -89,10 +89,10 @@ def rendered_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], we
     }
 
 
-def scene_layer(problem: Problem, points: Float[Tensor, "ray sample 3"], code_of: Int[Tensor, "ray"]) -> Layer:
-    """Ask the scene's field along rays."""
+def scene_layer(problem: Problem, points: Float[Tensor, "ray sample 3"], video: Int[Tensor, "ray"], code_of: Int[Tensor, "ray"]) -> Layer:
+    """Ask the scene's field along rays, each with its video's scene and some video's code."""
     field, (rays, samples) = problem.scene, points.shape[:2]
-    values = field(points.reshape(-1, 3), field.code(code_of).repeat_interleave(samples, 0))
+    values = field(points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples))
     return Layer(
         density(values.signed_distance, field.beta_m).view(rays, samples),
         values.color.view(rays, samples, 3),

@@ -53,7 +53,7 @@ class Steps:
 
     template: int = 200
     """steps that copy the agent template into the agent field"""
-    scene: int = 2000
+    scene: int = 1000
     """steps of the first phase: scene and cameras"""
     body: int = 80
     """steps per chunk that pose the template to the masked depth"""
@@ -97,7 +97,7 @@ class Rates:
     """grids of the fields"""
     heads: float = 4e-3
     """the fields' small networks and codes"""
-    camera: float = 3e-4
+    camera: float = 5e-5
     """corrections of cameras, metres and radians"""
     body: float = 2e-2
     """root and bones while the template is posed, metres and radians"""
