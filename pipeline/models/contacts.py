@@ -1,0 +1,108 @@
+"""What touches the scene, found from the data: contact vertices, the feet they form, and when each foot stands.
+
+`find_contacts` needs no list made by hand: a vertex counts that is among the closest to the scene in a fair share of
+the frames. `planted` then tells, for any motion, in which frames each foot carries weight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pipeline.models.bodies import Body, PosedSurface
+from pipeline.models.short_motions import RATE_HZ, Moving
+from pipeline.space.signed_distance import SignedDistance
+
+TOUCH_M = 0.01
+"""A vertex this close to the frame's closest ones touches too."""
+SHARE = 0.15
+"""A vertex that touches in this share of the frames is a contact vertex."""
+FOOT_M = 0.035
+"""Contact vertices closer than this at rest belong to the same foot."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Where a body touches the world."""
+
+    vertices: Int[np.ndarray, "vertex"]
+    """contact vertices, indices into the body's surface"""
+    foot: Int[np.ndarray, "vertex"]
+    """foot that each contact vertex belongs to"""
+
+    @property
+    def feet(self) -> int:
+        """How many feet there are."""
+        return int(self.foot.max()) + 1 if len(self.foot) else 0
+
+    def centres(self, vertices_world: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "frame foot 3"]:
+        """Return the mean of each foot's vertices, given the contact vertices."""
+        share = torch.zeros(self.feet, len(self.foot), dtype=vertices_world.dtype, device=vertices_world.device)
+        share[torch.from_numpy(self.foot), torch.arange(len(self.foot))] = 1
+        return (share / share.sum(1, keepdim=True)) @ vertices_world
+
+
+def find_contacts(body: Body, motions: list[Moving], scenes: list[SignedDistance], *, most_frames: int = 400) -> Contacts:
+    """Find the contact vertices of a body from motions, each in its scene, and group them to feet.
+
+    In each frame those vertices touch that are within 1 cm of the lowest percentile of the distances, so that a root
+    that hovers or sinks a little does not matter.
+    """
+    surface = PosedSurface(body)
+    every = max(1, sum(map(len, motions)) // most_frames)
+    touches, frames = np.zeros(len(body.mesh.vertices)), 0
+    for motion, scene in zip(motions, scenes, strict=True):
+        part = motion[:: min(every, len(motion))]
+        distance = scene.at(surface(*tensors(part))).numpy()
+        touches += (distance < np.percentile(distance, 1, axis=1, keepdims=True) + TOUCH_M).sum(0)
+        frames += len(part)
+    share = touches / max(frames, 1)
+    chosen = np.flatnonzero(share > min(SHARE, 0.5 * share.max()))
+    return Contacts(chosen, _feet(np.asarray(body.mesh.vertices)[chosen], body.weights[chosen]))
+
+
+def _feet(points: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"]) -> Int[np.ndarray, "vertex"]:
+    """Group close vertices; largest group first."""
+    pairs = cKDTree(points).query_pairs(FOOT_M, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(-np.bincount(label), kind="stable")
+    return np.argsort(order, kind="stable")[label]
+
+
+def planted(
+    centres_world: Float[np.ndarray, "frame foot 3"],
+    height_m: Float[np.ndarray, "frame foot"],
+    root_world: Float[np.ndarray, "frame 3"],
+    *,
+    lifted_m: float = 0.03,
+    rate_hz: float = RATE_HZ,
+) -> Bool[np.ndarray, "frame foot"]:
+    """Tell when each foot stands: clearly slower than the body or hardly moving, and near the scene.
+
+    ``height_m`` is the foot's distance from the scene. The paper takes the foot that moves less between two frames for
+    the stable one; an animal has more than two, so each is judged by itself. Blinks under 0.1 s do not count.
+    """
+    foot = _speed(centres_world, rate_hz)
+    body = _speed(root_world[:, None], rate_hz)
+    slow = foot < np.maximum(0.4 * body, 0.08)
+    low = height_m < np.percentile(height_m, 20, axis=0, keepdims=True).clip(-0.02, 0.02) + lifted_m
+    both = ndimage.binary_closing(slow & low, np.ones((3, 1)))
+    return ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
+
+
+def tensors(motion: Moving) -> tuple[Tensor, Tensor]:
+    """Return root and bones of a motion as torch tensors."""
+    return torch.from_numpy(np.asarray(motion.world_from_agent)).float(), torch.from_numpy(np.asarray(motion.agent_from_bone)).float()
+
+
+def _speed(points: Float[np.ndarray, "frame foot 3"], rate_hz: float) -> Float[np.ndarray, "frame foot"]:
+    if len(points) < 2:
+        return np.zeros(points.shape[:2])
+    return ndimage.median_filter(np.linalg.norm(np.gradient(points, 1 / rate_hz, axis=0), axis=-1), size=(3, 1))

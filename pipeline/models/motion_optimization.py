@@ -1,0 +1,163 @@
+"""Make a motion physical: feet that stand do not slide, nothing is inside furniture, what touches keeps touching.
+
+`optimise` moves positions, orientations and poses of all frames at once by Adam (Wang et al. 2021, Sec. 3.4). The same
+function with the same `Settings` serves long-term motion, samples of the behaviour model and reconstructed motion.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, assert_never
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.models.behavior import channels_from_bones
+from pipeline.models.bodies import Body, PosedSurface, PoseSpace
+from pipeline.models.contacts import Contacts, tensors
+from pipeline.models.plausibility import Judge
+from pipeline.models.short_motions import RATE_HZ, Moving
+from pipeline.space import rigid_torch
+from pipeline.space.signed_distance import SignedDistance
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Weights and length of the optimisation; every term is a mean over frames, in metres or square metres of motion."""
+
+    steps: int = 150
+    """steps of Adam"""
+    rate: float = 0.004
+    """learning rate, metres and radians a step; falls to a tenth"""
+    foot: float = 40.0
+    """a standing foot stays where it stands on average"""
+    collision: float = 20.0
+    """nothing is inside the scene"""
+    contact: float = 0.02
+    """contact vertices near the scene touch it"""
+    contact_scale_m: float = 0.02
+    """distance at which the Geman-McClure function lets go"""
+    smooth: float = 30.0
+    """neighbouring meshes"""
+    smoothness: Literal["acceleration", "velocity"] = "acceleration"
+    """what is kept small between neighbouring meshes; the paper's is the velocity, which also slows the animal down"""
+    stay: float = 1.0
+    """stay near the motion that was given"""
+    vertices: int = 300
+    """vertices of the surface that collision and smoothness look at"""
+    margin_m: float = 0.002
+    """keep this far off what is solid"""
+
+
+@dataclass(frozen=True)
+class Physique:
+    """What a body brings to the optimisation: surface, contacts, and the directions in which its pose may move."""
+
+    body: Body
+    contacts: Contacts
+    poses: PoseSpace
+
+
+class _Correction(torch.nn.Module):
+    """A motion and what is added to it: shift and turn of the root, and p of the pose."""
+
+    def __init__(self, moving: Moving, poses: PoseSpace):
+        super().__init__()
+        self.root, _ = tensors(moving)
+        rest = poses.rest.double().numpy()
+        self.channels = torch.from_numpy(channels_from_bones(np.asarray(moving.agent_from_bone, np.float64), rest)).float()
+        self.poses = poses
+        self.shift = torch.nn.Parameter(torch.zeros(len(moving), 3))
+        self.turn = torch.nn.Parameter(torch.zeros(len(moving), 3))
+        self.pose = torch.nn.Parameter(torch.zeros(len(moving), poses.components))
+
+    def forward(self) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
+        rotation = self.root[:, :3, :3] @ rigid_torch.so3_exp(self.turn)
+        bones = self.poses.bones(self.channels + self.pose @ self.poses.basis)
+        return rigid_torch.make(rotation, self.root[:, :3, 3] + self.shift), bones
+
+
+def optimise(
+    moving: Moving,
+    physique: Physique,
+    scene: SignedDistance,
+    settings: Settings,
+    *,
+    rate_hz: float = RATE_HZ,
+    held: Bool[np.ndarray, "frame"] | None = None,
+) -> Moving:
+    """Return the motion with all constraints weighed against each other; ``held`` frames stay as they are."""
+    stance = Judge(physique.body, physique.contacts, scene).stance(moving, rate_hz)
+    chosen = physique.body.spread(settings.vertices)
+    count = len(chosen)
+    surface = PosedSurface(physique.body, np.concatenate([chosen, physique.contacts.vertices]))
+    correction = _Correction(moving, physique.poses)
+    free = torch.ones(len(moving), 1) if held is None else torch.from_numpy(~held).float()[:, None]
+    phases = phase_means(stance)
+    with torch.no_grad():
+        given = surface(*correction())
+    optimizer = torch.optim.Adam(correction.parameters(), lr=settings.rate)
+    for step in range(settings.steps):
+        for group in optimizer.param_groups:
+            group["lr"] = settings.rate * (1 - 0.9 * step / settings.steps)
+        points = surface(*correction())
+        body, touching = points[:, :count], points[:, count:]
+        distance = scene.at(points)
+        feet = physique.contacts.centres(touching)
+        total = (
+            settings.foot * foot_error(feet, phases).mean()
+            + settings.collision * collision_error(distance, settings.margin_m).mean()
+            + settings.contact * contact_error(distance[:, count:], settings.contact_scale_m).mean()
+            + settings.smooth * smooth_error(body, settings.smoothness).mean()
+            + settings.stay * ((points - given) ** 2).sum(-1).mean()
+        )
+        optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        for parameter in correction.parameters():
+            parameter.grad *= free
+        optimizer.step()
+    with torch.no_grad():
+        root, bones = correction()
+    return Moving(root.double().numpy(), bones.double().numpy())
+
+
+def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Tensor, Tensor]:
+    """Return which (frame, foot) stand, flat, and the number of the phase that each belongs to."""
+    began = stance & ~np.concatenate([np.zeros_like(stance[:1]), stance[:-1]])
+    number = np.cumsum(began.T.reshape(-1)).reshape(stance.T.shape).T  # counts along one foot after the other
+    flat = np.flatnonzero(stance.reshape(-1))
+    return torch.from_numpy(flat), torch.from_numpy(number.reshape(-1)[flat] - 1)
+
+
+def foot_error(feet: Float[Tensor, "frame foot 3"], phases: tuple[Tensor, Tensor]) -> Float[Tensor, "stand"]:
+    """Return the squared distance of each standing foot from its mean place in that phase (E_foot)."""
+    flat, phase = phases
+    if not len(flat):
+        return feet.sum()[None] * 0
+    points = feet.flatten(0, 1)[flat]
+    count = torch.bincount(phase).to(points)[:, None]
+    mean = torch.zeros(len(count), 3).index_add(0, phase, points) / count
+    return ((points - mean[phase]) ** 2).sum(-1)
+
+
+def collision_error(distance_m: Float[Tensor, "frame vertex"], margin_m: float) -> Float[Tensor, "frame vertex"]:
+    """Return how deep each vertex is inside the scene or its margin, given its distance from the scene (E_col, Eq. 5)."""
+    return (margin_m - distance_m).clamp_min(0)
+
+
+def contact_error(distance_m: Float[Tensor, "frame vertex"], scale_m: float) -> Float[Tensor, "frame vertex"]:
+    """Return the Geman-McClure function of the distance to the scene (E_cont, Eq. 6)."""
+    square = distance_m**2
+    return square / (square + scale_m**2)
+
+
+def smooth_error(points: Float[Tensor, "frame vertex 3"], kind: Literal["acceleration", "velocity"]) -> Float[Tensor, "frame vertex"]:
+    """Return the squared difference between neighbouring meshes (E_smooth, Eq. 7), or the change of that difference."""
+    step = points[1:] - points[:-1]
+    match kind:
+        case "velocity":
+            return (step**2).sum(-1)
+        case "acceleration":
+            return ((step[1:] - step[:-1]) ** 2).sum(-1)
+        case _:
+            assert_never(kind)

@@ -1,0 +1,91 @@
+"""How physical a motion in a scene is: collision, contact, sliding feet and seams, as the paper counts them.
+
+`stance` says which feet stand when; `plausibility` measures a motion with it, so that a motion before and after it was
+optimised is judged by the same stance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from pipeline.models.bodies import Body, PosedSurface
+from pipeline.models.contacts import Contacts, planted, tensors
+from pipeline.models.short_motions import RATE_HZ, Moving
+from pipeline.space.signed_distance import SignedDistance
+
+SOLID_M = 0.005
+"""A vertex deeper than this inside the scene collides: half a centimetre is what grid and fur leave open."""
+CONTACT_M = 0.02
+"""A body whose closest contact vertex is no further than this from the scene touches it."""
+
+
+@dataclass(frozen=True)
+class Plausibility:
+    """Figures of one motion."""
+
+    non_collision: float
+    """share of vertices and frames outside of what is solid"""
+    contact: float
+    """share of frames in which the body touches the scene"""
+    penetration_m: float
+    """mean depth inside the scene over vertices and frames"""
+    deepest_m: float
+    """deepest vertex of any frame, a positive number"""
+    slide_m_s: float
+    """median speed along the ground of feet while they stand; NaN where none does"""
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A body and its contacts in a scene, ready to measure motions."""
+
+    body: Body
+    contacts: Contacts
+    scene: SignedDistance
+
+    def stance(self, motion: Moving, rate_hz: float = RATE_HZ) -> Bool[np.ndarray, "frame foot"]:
+        """Tell which feet stand when."""
+        points = PosedSurface(self.body, self.contacts.vertices)(*tensors(motion))
+        centres, height = self.contacts.centres(points), _lowest(self.scene.at(points), self.contacts)
+        return planted(centres.numpy(), height.numpy(), motion.world_from_agent[:, :3, 3], rate_hz=rate_hz)
+
+    def fit_of(self, motion: Moving) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
+        """Return, per frame, the gap between the body and the scene, and its deepest vertex inside the scene, metres."""
+        distance = self.scene.at(PosedSurface(self.body)(*tensors(motion)))
+        gap = distance[:, self.contacts.vertices].min(1).values.clamp_min(0)
+        return gap.numpy(), (-distance).clamp_min(0).amax(1).numpy()
+
+    def plausibility(self, motion: Moving, stance: Bool[np.ndarray, "frame foot"], rate_hz: float = RATE_HZ) -> Plausibility:
+        """Measure a motion on all vertices of the body."""
+        distance, points = [], []
+        everything = PosedSurface(self.body)
+        for start in range(0, len(motion), 200):
+            vertices = everything(*tensors(motion[start : start + 200]))
+            distance.append(self.scene.at(vertices))
+            points.append(vertices[:, self.contacts.vertices])
+        depth, touching = torch.cat(distance), torch.cat(points)
+        centres = self.contacts.centres(touching).numpy()
+        both = stance[1:] & stance[:-1]
+        slide = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1)[both] * rate_hz
+        return Plausibility(
+            non_collision=float((depth > -SOLID_M).float().mean()),
+            contact=float((depth[:, self.contacts.vertices].min(1).values < CONTACT_M).float().mean()),
+            penetration_m=float((-depth).clamp_min(0).mean()),
+            deepest_m=float((-depth).clamp_min(0).max()),
+            slide_m_s=float(np.median(slide)) if len(slide) else float("nan"),
+        )
+
+
+def _lowest(distance: Float[torch.Tensor, "frame vertex"], contacts: Contacts) -> Float[torch.Tensor, "frame foot"]:
+    return torch.stack([distance[:, np.flatnonzero(contacts.foot == foot)].min(1).values for foot in range(contacts.feet)], dim=1)
+
+
+def seams(body: Body, motion: Moving, every: int, vertices: int = 200) -> Float[np.ndarray, "seam"]:
+    """Return the jump at every ``every``-th frame: how much further than in the frames beside it a vertex moves, metres."""
+    points = PosedSurface(body, body.spread(vertices))(*tensors(motion))
+    step = (points[1:] - points[:-1]).norm(dim=-1).numpy()
+    at = np.arange(every, len(motion) - 2, every)
+    beside = np.maximum(step[at - 2], step[at + 1])
+    return (np.maximum(step[at - 1], step[at]) - beside).clip(0).max(axis=1, initial=0.0)

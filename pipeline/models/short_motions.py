@@ -1,0 +1,66 @@
+"""Motion at 30 fps and its 2-second pieces, in which long-term motion is learned and made.
+
+`Moving` is a stretch of motion of one body; `resampled` brings a trajectory to 30 fps (spline on positions, slerp on
+rotations), `stretches` cuts it where frames are missing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from pipeline.models.trajectories import Trajectory
+from pipeline.space import rigid
+
+RATE_HZ = 30
+STEPS = 60
+"""k of the paper: a short motion has k + 1 frames, the first and the last of which are given"""
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Consecutive frames of one body at one rate."""
+
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.world_from_agent)
+
+    def __getitem__(self, frames: slice | np.ndarray) -> "Moving":
+        """Return some of the frames."""
+        return Moving(self.world_from_agent[frames], self.agent_from_bone[frames])
+
+
+def joined(parts: Sequence[Moving]) -> Moving:
+    """Put stretches one after the other; frames in which one ends and the next begins count once."""
+    first, *rest = parts
+    kept = [first, *(part[1:] for part in rest)]
+    return Moving(np.concatenate([part.world_from_agent for part in kept]), np.concatenate([part.agent_from_bone for part in kept]))
+
+
+def resampled(timestamp_s: Float[np.ndarray, "frame"], moving: Moving, rate_hz: float = RATE_HZ) -> Moving:
+    """Bring motion to an even rate: cubic spline on positions, slerp on rotations; roots and bones alike."""
+    count = int(np.floor((timestamp_s[-1] - timestamp_s[0]) * rate_hz + 1e-6)) + 1
+    query_s = np.minimum(timestamp_s[0] + np.arange(count) / rate_hz, timestamp_s[-1])
+    bones = [_at(timestamp_s, moving.agent_from_bone[:, bone], query_s) for bone in range(moving.agent_from_bone.shape[1])]
+    return Moving(_at(timestamp_s, moving.world_from_agent, query_s), np.stack(bones, axis=1))
+
+
+def stretches(trajectory: Trajectory, shortest_s: float = STEPS / RATE_HZ) -> list[Moving]:
+    """Return every uninterrupted stretch of a trajectory that is long enough, at 30 fps."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], trajectory.valid, [False]]).astype(np.int8)))
+    found = []
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        when = trajectory.timestamp_s[start:end]
+        if len(when) > 2 and when[-1] - when[0] >= shortest_s - 1e-6:
+            found.append(resampled(when, Moving(trajectory.world_from_agent[start:end], trajectory.agent_from_bone[start:end])))
+    return found
+
+
+def _at(timestamp_s: np.ndarray, a_from_b: Float[np.ndarray, "frame 4 4"], query_s: np.ndarray) -> Float[np.ndarray, "sample 4 4"]:
+    rotation = Slerp(timestamp_s, Rotation.from_matrix(np.asarray(a_from_b[:, :3, :3], np.float64)))(query_s).as_matrix()
+    return rigid.make(rotation, CubicSpline(timestamp_s, a_from_b[:, :3, 3])(query_s))

@@ -1,0 +1,73 @@
+"""The scene around a motion: its signed distance, and points of its surface as PointNet reads them.
+
+`Surroundings.of` prepares a mesh once; `Surroundings.around` draws the points near any frame, in that frame.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.space import rigid, signed_distance
+from pipeline.space.meshes import Mesh
+from pipeline.space.signed_distance import SignedDistance, SurfacePoints
+
+SPACING_M = 0.07
+STANDING = 0.7
+"""A surface whose normal has a smaller vertical part stands; half of the points are drawn from such."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """A still surface, ready to be asked."""
+
+    distance: SignedDistance
+    surface: SurfacePoints
+
+    @classmethod
+    def of(cls, mesh: Mesh, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], *, voxel_m: float = 0.04) -> "Surroundings":
+        """Prepare the part of a mesh between two corners of a box, world frame."""
+        distance = signed_distance.from_mesh(mesh, np.asarray(low, float), np.asarray(high, float), voxel_m=voxel_m)
+        points = signed_distance.surface_points(mesh, SPACING_M)
+        inside = ((points.points > low) & (points.points < high)).all(1)
+        return cls(distance, SurfacePoints(points.points[inside], points.normals[inside]))
+
+    @classmethod
+    def for_motion(cls, mesh: Mesh, roots_world: Float[np.ndarray, "frame 3"], reach_m: float = 0.7) -> "Surroundings":
+        """Prepare the whole breadth of a mesh, at the heights where a body has been."""
+        low, high = np.asarray(mesh.vertices).min(0) - 0.15, np.asarray(mesh.vertices).max(0) + 0.15
+        low[1] = max(low[1], roots_world[:, 1].min() - reach_m)
+        high[1] = min(high[1], roots_world[:, 1].max() + reach_m)
+        return cls.of(mesh, low, high)
+
+    @property
+    def floor_m(self) -> float:
+        """Height of the floor: the lowest level with a fair share of the surface that lies facing up."""
+        level = self.surface.points[self.surface.normals[:, 1] > 0.9, 1]
+        if not len(level):
+            return float(self.surface.points[:, 1].min())
+        count, edges = np.histogram(level, np.arange(level.min() - 0.02, level.max() + 0.06, 0.02))
+        lowest = edges[np.flatnonzero(count > 0.25 * count.max())[0]] + 0.01
+        return float(np.median(level[np.abs(level - lowest) < 0.03]))
+
+    def around(
+        self,
+        world_from_frame: Float[np.ndarray, "batch 4 4"],
+        centre_world: Float[np.ndarray, "batch 3"],
+        reach_m: float,
+        count: int,
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "batch point 3"]:
+        """Draw points no further than ``reach_m`` from each centre, in the given frames; zeros where there are none."""
+        points, standing = self.surface.points.astype(np.float32), np.abs(self.surface.normals[:, 1]) < STANDING
+        frame_from_world = rigid.inverse(world_from_frame)
+        drawn = np.zeros((len(centre_world), count, 3), np.float32)
+        for row, centre in enumerate(np.asarray(centre_world, np.float32)):
+            near = np.flatnonzero(((points - centre) ** 2).sum(1) < reach_m**2)
+            if not len(near):
+                continue
+            upright = near[standing[near]]
+            first = rng.choice(upright, count // 2) if len(upright) else near[:0]
+            index = np.concatenate([first, rng.choice(near, count - len(first))])
+            drawn[row] = rigid.apply(frame_from_world[row], points[index])
+        return drawn

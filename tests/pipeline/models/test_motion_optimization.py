@@ -1,0 +1,108 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter1d
+
+from pipeline.models.bodies import PosedSurface, PoseSpace
+from pipeline.models.contacts import find_contacts, tensors
+from pipeline.models.motion_optimization import Physique, Settings, contact_error, foot_error, optimise, phase_means, smooth_error
+from pipeline.models.plausibility import Judge, seams
+from pipeline.models.short_motions import Moving
+from pipeline.space import rigid
+from tests.pipeline.models import strider
+
+SETTINGS = Settings(steps=60, vertices=40)
+
+
+@pytest.fixture(scope="module")
+def lives():
+    return strider.lives()
+
+
+@pytest.fixture(scope="module")
+def physique(lives):
+    contacts = find_contacts(lives.body, list(lives.stretches), lives.distances)
+    poses = PoseSpace(lives.body.agent_from_bone_rest, 16).fit(np.concatenate([s.agent_from_bone for s in lives.stretches]))
+    return Physique(lives.body, contacts, poses)
+
+
+def test_soles_are_found_and_form_four_feet(lives, physique):
+    soles = np.flatnonzero(lives.body.mesh.vertices[:, 1] < -0.199)
+    assert physique.contacts.vertices.tolist() == soles.tolist()
+    assert physique.contacts.feet == 4
+    bone = lives.body.weights[physique.contacts.vertices].argmax(1)
+    assert all(len(set(bone[physique.contacts.foot == foot])) == 1 for foot in range(4))
+
+
+def test_feet_stand_two_thirds_of_the_time_and_true_motion_is_physical(lives, physique):
+    judge, moving = Judge(lives.body, physique.contacts, lives.scenes[0].distance), lives.stretches[0]
+    stance = judge.stance(moving)
+    assert stance.mean(0) == pytest.approx([0.67] * 4, abs=0.12)
+    worth = judge.plausibility(moving, stance)
+    assert worth.slide_m_s < 0.01
+    assert worth.contact == 1
+    assert worth.non_collision > 0.999
+
+
+def test_a_shaken_motion_becomes_physical_and_stays_near(lives, physique):
+    truth = lives.stretches[0][:120]
+    shake = gaussian_filter1d(np.random.default_rng(1).normal(size=(120, 3)), 4, axis=0) * [0.05, 0.05, 0.05]
+    root = truth.world_from_agent.copy()
+    root[:, :3, 3] += shake
+    shaken = Moving(root, truth.agent_from_bone)
+    scene = lives.scenes[0].distance
+    judge = Judge(lives.body, physique.contacts, scene)
+    stance = judge.stance(truth)
+    done = optimise(shaken, physique, scene, SETTINGS)
+    before, after = judge.plausibility(shaken, stance), judge.plausibility(done, stance)
+    assert after.penetration_m < 0.2 * before.penetration_m
+    assert after.slide_m_s < 0.5 * before.slide_m_s
+    surface = PosedSurface(lives.body)
+    error = [float((surface(*tensors(m)) - surface(*tensors(truth))).norm(dim=-1).mean()) for m in (shaken, done)]
+    assert error[1] < 1.1 * error[0]
+
+
+def test_held_frames_stay(lives, physique):
+    moving, held = lives.stretches[1][:30], np.arange(30) % 29 == 0
+    lifted = Moving(moving.world_from_agent + np.eye(4)[:, 3] * 0 + _lift(0.03), moving.agent_from_bone)
+    done = optimise(lifted, physique, lives.scenes[0].distance, replace(SETTINGS, steps=10), held=held)
+    np.testing.assert_allclose(done.world_from_agent[held], lifted.world_from_agent[held], atol=1e-6)
+    assert np.abs(done.world_from_agent[~held] - lifted.world_from_agent[~held]).max() > 1e-3
+
+
+def test_a_motion_pushed_into_the_block_comes_out(lives, physique):
+    walk = strider.striding(np.array([[0.36, 0, -0.2], [0.36, 0, 0.2]]), 1.0)
+    scene = lives.scenes[0].distance
+    judge = Judge(lives.body, physique.contacts, scene)
+    stance = judge.stance(walk)
+    assert judge.plausibility(walk, stance).deepest_m > 0.05
+    done = optimise(walk, physique, scene, replace(SETTINGS, steps=150))
+    assert judge.plausibility(done, stance).deepest_m < 0.02
+
+
+def test_terms_are_what_they_say():
+    stance = np.array([[1, 0], [1, 1], [0, 1], [1, 1]], bool)
+    flat, phase = phase_means(stance)
+    assert flat.tolist() == [0, 2, 3, 5, 6, 7]
+    assert phase.tolist() == [0, 0, 2, 2, 1, 2]
+    feet = torch.zeros(4, 2, 3)
+    feet[1, 0, 0] = 0.2
+    torch.testing.assert_close(foot_error(feet, (flat, phase)), torch.tensor([0.01, 0.01, 0, 0, 0, 0]))
+    torch.testing.assert_close(contact_error(torch.tensor([0.0, 0.02, 100.0]), 0.02), torch.tensor([0.0, 0.5, 1.0]))
+    even = torch.arange(5.0)[:, None, None].expand(5, 1, 3)
+    assert smooth_error(even, "acceleration").sum() == 0
+    assert smooth_error(even, "velocity").sum() == 4 * 3
+
+
+def test_a_jump_at_a_seam_is_measured(lives):
+    moving = lives.stretches[0]
+    assert seams(lives.body, moving, 60).max() < 0.02
+    root = moving.world_from_agent.copy()
+    root[60:, 0, 3] += 0.1
+    assert seams(lives.body, Moving(root, moving.agent_from_bone), 60).max() > 0.08
+
+
+def _lift(height_m):
+    return rigid.make(np.zeros((3, 3)), np.array([0.0, height_m, 0.0])) * (np.arange(4) == 3)[None] * (np.arange(4) < 3)[:, None]
