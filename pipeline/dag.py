@@ -69,6 +69,8 @@ class Node:
     """Made only for the tables of `make behavior-tables`: one job per trial (a method with a seed), or one over all."""
     table: str | None = None
     """The recipe's table that configures it, where it is another node's too."""
+    aside: bool = False
+    """Made only where it is asked for by its name, or needed by something that is."""
 
 
 def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Need, ...]:
@@ -107,6 +109,10 @@ FLOW: tuple[Node, ...] = (
     Node("behavior_data", "slice_behavior",
          (Need("reconstruction", flow="recordings"), Need("trajectories", flow="trajectories")), sees=("session",), flows=BOTH),
     Node("behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True, flows=BOTH),
+    Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True),
+    Node("longterm_world", "synthesize_capture.motions", aside=True),
+    Node("longterm_ablations", "train_longterm", ("reconstruction", "behavior_data"), fixed={"ablations": True}, resumable=True, aside=True),
+    Node("longterm_study", "train_longterm", ("longterm_world",), fixed={"ablations": True}, resumable=True, aside=True),
     Node("simulator", "export_simulator", ("reconstruction", "splats", "behavior", "behavior_data")),
     Node("evaluation", "evaluate",
          (*merging("frames", "masks", "flow"), "scene_template", "agent_template", "scene_localizer",
@@ -116,7 +122,7 @@ FLOW: tuple[Node, ...] = (
     Node("report", "report",
          (*merging("frames", "flow", "masks"), "feature_basis", *merging("features"),
           "scene_template", "agent_template", "scene_localizer", "agent_localizer", *merging("video_poses"),
-          "registration", "reconstruction", "splats", "behavior_data", "behavior", "simulator", "evaluation")),
+          "registration", "reconstruction", "splats", "behavior_data", "behavior", "longterm", "simulator", "evaluation")),
 )
 # fmt: on
 NODES = {node.artifact: node for node in FLOW}

@@ -30,6 +30,7 @@ CHAPTERS = (
     Chapter("splats", "Gaussians", "The same world as 3D Gaussians, refined for looks and motion."),
     Chapter("behavior_data", "Behaviour data", "The motion cut into windows of 6.4 s, split by recording."),
     Chapter("behavior", "Behaviour model", "Goal, path and body diffusion, conditioned on room, observer and past."),
+    Chapter("longterm", "Long-term motion", "Bodies at sub-goals, routes between them and poses along routes, in two-second pieces."),
     Chapter("simulator", "Simulator", "The page that lets the animal live, and files for other programs."),
     Chapter("evaluation", "Evaluation", "Everything measured against what is known to be true."),
 )

@@ -1,0 +1,79 @@
+"""The networks that long-term motion is compared with (Table 1 of the paper), all with one face: `Ablated.between`.
+
+`KINDS` names them; `build` makes one, `Ablated.load` reads one back.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from pipeline.models.longterm import ROOT, BaseNet, PoseNet, RouteNet, Sizes
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What one of them may do."""
+
+    seeing: bool = True
+    """see the scene"""
+    route_turns: bool = True
+    """RouteNet predicts orientations; else PoseNet does"""
+    route_blind: bool = False
+    """RouteNet sees positions and orientations only, as in the paper"""
+    follows: bool = True
+    """PoseNet is given the route"""
+    one: bool = False
+    """BaseNet: one network for everything"""
+
+
+KINDS: dict[str, Kind] = {
+    "ours_no_scene": Kind(seeing=False),
+    "ours_route_blind": Kind(route_blind=True),
+    "route_t_pose": Kind(route_turns=False, follows=False),
+    "route_t_pose_no_scene": Kind(seeing=False, route_turns=False, follows=False),
+    "route_tr_pose": Kind(follows=False),
+    "route_tr_pose_no_scene": Kind(seeing=False, follows=False),
+    "base": Kind(one=True),
+    "base_no_scene": Kind(seeing=False, one=True),
+}
+
+
+class Ablated(nn.Module):
+    """Short motions by other networks."""
+
+    def __init__(self, route: RouteNet | None, pose: PoseNet | None, base: BaseNet | None):
+        super().__init__()
+        self.route, self.pose, self.base = route, pose, base
+
+    def between(
+        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], points: Float[Tensor, "clip point 3"]
+    ) -> Float[Tensor, "clip frame channel"]:
+        """Return t, r, p between first and last frames, in the clips' frames."""
+        with torch.no_grad():
+            if self.base is not None:
+                return self.base(start, end, points)
+            route = self.route(start, end, points)
+            return self.pose(start[:, ROOT:], end[:, ROOT:], route, points)
+
+    def save(self, path: Path) -> None:
+        """Write the weights."""
+        save_file({name: value.contiguous() for name, value in self.state_dict().items()}, path)
+
+
+def build(kind: Kind, sizes: Sizes) -> Ablated:
+    """Make untrained networks."""
+    if kind.one:
+        return Ablated(None, None, BaseNet(sizes, seeing=kind.seeing))
+    route = RouteNet(sizes, seeing=kind.seeing, turns=kind.route_turns, blind=kind.route_blind)
+    return Ablated(route, PoseNet(sizes, seeing=kind.seeing, follows=kind.follows, turns=not kind.route_turns), None)
+
+
+def load(path: Path, kind: Kind, sizes: Sizes) -> Ablated:
+    """Read networks that `Ablated.save` wrote."""
+    made = build(kind, sizes)
+    made.load_state_dict(load_file(path))
+    return made.eval()

@@ -1,0 +1,209 @@
+"""The networks of long-term motion: bodies at sub-goals, routes between them, poses along routes (paper 002, Sec. 3).
+
+All speak in a clip's frame: heading and position of its first body, +y up. `t` is the root's position in metres, `r` its
+rotation by its first two columns, `p` the pose by `pipeline.models.bodies.PoseSpace`. RouteNet, PoseNet and BaseNet
+say how far the truth lies from the straight line between start and end; at both ends that is nothing, so that short
+motions join without seams.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pipeline.models.short_motions import STEPS
+from pipeline.space import rigid_torch
+
+ROOT = 9
+"""t and r together"""
+REACH_M = 1.5
+"""scene points of a clip come from this far around the middle between start and end"""
+BODY_REACH_M = 0.8
+"""scene points of a static body come from this far around it"""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Everything that fixes the shape of the networks."""
+
+    pose: int = 32
+    """length of p, as of the body prior of SMPL-X"""
+    shape: int = 0
+    """numbers that tell bodies apart"""
+    latent: int = 32
+    """length of the CVAE's code z"""
+    scene: int = 128
+    """length of the code of PointNet (the paper: 256)"""
+    hidden: int = 96
+    """width of each direction of the LSTMs"""
+    width: int = 192
+    """width of linear layers"""
+    points: int = 128
+    """scene points that PointNet sees"""
+
+
+class PointNet(nn.Module):
+    """A code for a set of points: shared layers, then the maximum (no transformation nets, as in the paper)."""
+
+    def __init__(self, code: int, seeing: bool = True):
+        super().__init__()
+        self.seeing, self.code = seeing, code
+        self.layers = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 64), nn.ReLU(), nn.Linear(64, code)) if seeing else None
+
+    def forward(self, points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch code"]:
+        if not self.seeing:
+            return points.new_zeros(len(points), self.code)
+        return self.layers(points).amax(1)
+
+
+class ResidualBlock(nn.Module):
+    """Two linear layers and what came in."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(width, width), nn.LeakyReLU(0.2), nn.Linear(width, width), nn.LeakyReLU(0.2))
+
+    def forward(self, x: Float[Tensor, "batch width"]) -> Float[Tensor, "batch width"]:
+        return x + self.layers(x)
+
+
+class StaticBody(nn.Module):
+    """A conditional VAE of bodies at a place: (t, r, p) given shape, clearance, orientation and scene points (Sec. 3.2)."""
+
+    def __init__(self, sizes: Sizes):
+        super().__init__()
+        self.sizes = sizes
+        body, width = ROOT + sizes.pose, sizes.width
+        self.point_net = PointNet(sizes.scene)
+        self.condition = nn.Sequential(nn.Linear(sizes.scene + sizes.shape + 7, width), nn.LeakyReLU(0.2))
+        self.encoder_in = nn.Linear(body, width)
+        self.encoder = nn.Sequential(ResidualBlock(width), ResidualBlock(width))
+        self.encoder_out = nn.Sequential(nn.Linear(2 * width, width), nn.LeakyReLU(0.2), nn.Linear(width, 2 * sizes.latent))
+        self.decoder_in = nn.Linear(sizes.latent + width, width)
+        self.decoder = nn.Sequential(ResidualBlock(width), ResidualBlock(width))
+        self.decoder_out = nn.Linear(width, body)
+
+    def given(
+        self, place: Float[Tensor, "batch 7"], shape: Float[Tensor, "batch shape"], points: Float[Tensor, "batch point 3"]
+    ) -> Float[Tensor, "batch width"]:
+        """Encode the condition: ``place`` is the clearance above the scene and r, in the body's own heading frame."""
+        return self.condition(torch.cat([self.point_net(points), shape, place], dim=-1))
+
+    def encode(self, body: Float[Tensor, "batch channel"], given: Float[Tensor, "batch width"]) -> tuple[Tensor, Tensor]:
+        """Return mean and log variance of z."""
+        features = self.encoder(self.encoder_in(body))
+        return self.encoder_out(torch.cat([features, given], dim=-1)).chunk(2, dim=-1)
+
+    def decode(self, z: Float[Tensor, "batch latent"], given: Float[Tensor, "batch width"]) -> Float[Tensor, "batch channel"]:
+        """Return a body: t and r in the heading frame of its place, p."""
+        out = self.decoder_out(self.decoder(self.decoder_in(torch.cat([z, given], dim=-1))))
+        upright = out.new_tensor([0.0, 0, 0, 1, 0, 0, 0, 1, 0])
+        return torch.cat([out[:, :ROOT] * 0.1 + upright, out[:, ROOT:]], dim=-1)
+
+
+class Between(nn.Module):
+    """What RouteNet, PoseNet and BaseNet share: a bi-LSTM over start and end, the scene's code, two linear layers."""
+
+    def __init__(self, channels: int, extra: int, sizes: Sizes, seeing: bool):
+        super().__init__()
+        self.point_net = PointNet(sizes.scene, seeing)
+        self.lstm = nn.LSTM(3 * channels + extra + 2, sizes.hidden, batch_first=True, bidirectional=True)
+        self.out = nn.Sequential(nn.Linear(2 * sizes.hidden + sizes.scene, sizes.width), nn.ReLU(), nn.Linear(sizes.width, channels))
+
+    def forward(
+        self,
+        start: Float[Tensor, "batch channel"],
+        end: Float[Tensor, "batch channel"],
+        points: Float[Tensor, "batch point 3"],
+        extra: Float[Tensor, "batch frame extra"] | None = None,
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return the channels of all k + 1 frames, those of start and end at the ends."""
+        share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)[None, :, None].expand(len(start), -1, 1)
+        line = torch.lerp(start[:, None], end[:, None], share)
+        both = torch.cat([start, end], dim=-1)[:, None].expand(-1, STEPS + 1, -1)
+        parts = [line, both, share, 4 * share * (1 - share)] + ([] if extra is None else [extra])
+        features, _ = self.lstm(torch.cat(parts, dim=-1))
+        code = self.point_net(points)[:, None].expand(-1, STEPS + 1, -1)
+        return line + _ends_open(share) * self.out(torch.cat([features, code], dim=-1))
+
+
+def _ends_open(share: Float[Tensor, "batch frame 1"]) -> Float[Tensor, "batch frame 1"]:
+    """A factor that is 0 at both ends and near 1 from a tenth of a second on."""
+    return torch.tanh(STEPS / 3 * share) * torch.tanh(STEPS / 3 * (1 - share))
+
+
+def rotations_of(channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch channel"]:
+    """Make the columns of r orthonormal."""
+    r = rigid_torch.rotation_to_6d(rigid_torch.rotation_from_6d(channels[..., 3:ROOT]))
+    return torch.cat([channels[..., :3], r, channels[..., ROOT:]], dim=-1)
+
+
+class RouteNet(nn.Module):
+    """Positions and orientations between start and end (Eq. 1); or positions alone, orientations being left to PoseNet.
+
+    Beyond the paper it also sees the poses at both ends, which tell whether the body is on the move; not if ``blind``.
+    """
+
+    def __init__(self, sizes: Sizes, *, seeing: bool = True, turns: bool = True, blind: bool = False):
+        super().__init__()
+        self.turns, self.blind = turns, blind
+        self.between = Between(ROOT, 0 if blind else 2 * sizes.pose, sizes, seeing)
+
+    def forward(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], points: Float[Tensor, "batch point 3"]
+    ) -> Float[Tensor, "batch frame 9"]:
+        """Return t and r of all frames; r on the straight line between the ends where the network does not turn."""
+        poses = None if self.blind else torch.cat([start[:, ROOT:], end[:, ROOT:]], -1)[:, None].expand(-1, STEPS + 1, -1)
+        start, end = start[:, :ROOT], end[:, :ROOT]
+        route = self.between(start, end, points, poses)
+        if not self.turns:
+            share = torch.linspace(0, 1, STEPS + 1, device=route.device)[None, :, None]
+            route = torch.cat([route[..., :3], torch.lerp(start[:, None, 3:], end[:, None, 3:], share)], dim=-1)
+        return rotations_of(route)
+
+
+class PoseNet(nn.Module):
+    """Poses between start and end along a route (Eq. 2); blind to the route, or also turning the body, as variants."""
+
+    def __init__(self, sizes: Sizes, *, seeing: bool = True, follows: bool = True, turns: bool = False):
+        super().__init__()
+        self.follows, self.turns = follows, turns
+        self.between = Between(sizes.pose + (6 if turns else 0), 2 * ROOT if follows else 0, sizes, seeing)
+
+    def forward(
+        self,
+        start: Float[Tensor, "batch pose"],
+        end: Float[Tensor, "batch pose"],
+        route: Float[Tensor, "batch frame 9"],
+        points: Float[Tensor, "batch point 3"],
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return t, r and p of all frames: the route's, with the poses and, as a variant, the turns."""
+        if self.turns:
+            start, end = torch.cat([route[:, 0, 3:], start], -1), torch.cat([route[:, -1, 3:], end], -1)
+        made = self.between(start, end, points, along(route) if self.follows else None)
+        if self.turns:
+            return rotations_of(torch.cat([route[..., :3], made], dim=-1))
+        return torch.cat([route, made], dim=-1)
+
+
+def along(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 18"]:
+    """Return a route with its change per tenth of a second, the velocity in the body's own axes."""
+    rate = functional.pad(route[:, 1:] - route[:, :-1], (0, 0, 0, 1), mode="replicate") * (STEPS / 20)
+    own = rigid_torch.rotation_from_6d(route[..., 3:]).transpose(-1, -2)
+    return torch.cat([route, (own @ rate[..., :3, None])[..., 0], rate[..., 3:]], dim=-1)
+
+
+class BaseNet(nn.Module):
+    """Route and poses from one network (ablation)."""
+
+    def __init__(self, sizes: Sizes, *, seeing: bool = True):
+        super().__init__()
+        self.between = Between(ROOT + sizes.pose, 0, sizes, seeing)
+
+    def forward(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], points: Float[Tensor, "batch point 3"]
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return t, r and p of all frames."""
+        return rotations_of(self.between(start, end, points))

@@ -1,0 +1,168 @@
+"""Long-term motion as a whole: the trained networks with all they need, and motion between sub-goals.
+
+`LongTerm.load` reads what `train_longterm` wrote; `bodies` puts bodies at places, `short_motions` fills the two seconds
+between pairs of them, `long_motion` does both for a whole row of places; `motion_optimization.optimise` finishes it.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from pipeline.models.bodies import Body, PoseSpace
+from pipeline.models.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
+from pipeline.models.contacts import Contacts, tensors
+from pipeline.models.longterm import ROOT, PoseNet, RouteNet, Sizes, StaticBody
+from pipeline.models.motion_optimization import Physique
+from pipeline.models.plausibility import Judge
+from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, joined
+from pipeline.models.surroundings import Surroundings
+
+NETWORKS = ("static", "route", "pose")
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How the body was seen to move."""
+
+    clearance_m: float
+    """median distance of the root from the scene while it travels"""
+    pace_m: float
+    """median way of a two-second motion that travels"""
+
+
+@dataclass(frozen=True)
+class LongTerm:
+    """Everything that makes long-term motion of one body."""
+
+    sizes: Sizes
+    poses: PoseSpace
+    contacts: Contacts
+    habits: Habits
+    static: StaticBody
+    route: RouteNet
+    pose: PoseNet
+
+    def save(self, folder: Path) -> None:
+        """Write `longterm.safetensors` and `longterm.json`."""
+        state = {f"poses.{name}": value for name, value in self.poses.state_dict().items()}
+        for name in NETWORKS:
+            state |= {f"{name}.{key}": value for key, value in getattr(self, name).state_dict().items()}
+        save_file({name: value.contiguous() for name, value in state.items()}, folder / "longterm.safetensors")
+        document = {
+            "units": "metres, radians, seconds",
+            "up": [0, 1, 0],
+            "rate_hz": RATE_HZ,
+            "frames": STEPS + 1,
+            "bones": len(self.poses.rest),
+            "sizes": asdict(self.sizes),
+            "seeing": self.route.between.point_net.seeing,
+            "habits": asdict(self.habits),
+            "contact_vertices": self.contacts.vertices.tolist(),
+            "foot_of_contact_vertex": self.contacts.foot.tolist(),
+        }
+        (folder / "longterm.json").write_text(json.dumps(document, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "LongTerm":
+        """Read a trained model."""
+        document = json.loads((folder / "longterm.json").read_text())
+        state, sizes = load_file(folder / "longterm.safetensors"), Sizes(**document["sizes"])
+        poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
+        nets = (StaticBody(sizes), RouteNet(sizes, seeing=document["seeing"]), PoseNet(sizes, seeing=document["seeing"]))
+        for name, module in zip(("poses", *NETWORKS), (poses, *nets), strict=True):
+            module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in state.items() if key.startswith(f"{name}.")})
+        contacts = Contacts(np.array(document["contact_vertices"]), np.array(document["foot_of_contact_vertex"]))
+        return cls(sizes, poses, contacts, Habits(**document["habits"]), *(net.eval() for net in nets))
+
+    def physique(self, body: Body) -> Physique:
+        """Return what the optimisation needs of a body."""
+        return Physique(body, self.contacts, self.poses)
+
+    def bodies(
+        self,
+        world_from_agent: Float[np.ndarray, "body 4 4"],
+        body: Body,
+        scene: Surroundings,
+        rng: np.random.Generator,
+        *,
+        candidates: int = 8,
+    ) -> Moving:
+        """Put a body at each place: of several that the CVAE draws, the one that stands in the scene best.
+
+        A good body touches the scene, is not inside it, and stays near its place.
+        """
+        places = encode_places(world_from_agent, np.zeros(len(world_from_agent), int), [scene], self.sizes.points, rng)
+        shape = torch.from_numpy(body.shape).float().expand(len(world_from_agent), -1)
+        judge, best, least = Judge(body, self.contacts, scene.distance), None, np.full(len(world_from_agent), np.inf)
+        with torch.no_grad():
+            given = self.static.given(places.place, shape, places.points)
+        for _ in range(candidates):
+            z = torch.from_numpy(rng.standard_normal((len(given), self.sizes.latent))).float()
+            with torch.no_grad():
+                drawn = self.static.decode(z, given)
+            made = placed(drawn, places.world_from_place, self.poses)
+            away = np.linalg.norm((made.world_from_agent - world_from_agent)[:, :3, 3], axis=1)
+            cost = sum(judge.fit_of(made)) + away
+            better = (cost < least)[:, None, None]
+            best = made if best is None else _chosen(better, made, best)
+            least = np.minimum(least, cost)
+        return best
+
+    def short_motions(self, start: Moving, end: Moving, scene: Surroundings, rng: np.random.Generator) -> list[Moving]:
+        """Return the 61 frames from each start body to its end body."""
+        root = np.stack([start.world_from_agent, end.world_from_agent], axis=1)
+        p = torch.stack([pose_channels(each.agent_from_bone, self.poses) for each in (start, end)], dim=1)
+        ends = encode_clips(root, p, np.zeros(len(root), int), [scene], self.sizes.points, rng)
+        made = self.between(ends.channels[:, 0], ends.channels[:, 1], ends.points)
+        return [decode_clip(channels, frame, self.poses) for channels, frame in zip(made, ends.world_from_clip, strict=True)]
+
+    def between(
+        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], points: Float[Tensor, "clip point 3"]
+    ) -> Float[Tensor, "clip frame channel"]:
+        """Return t, r, p between first and last frames, in the clips' frames."""
+        with torch.no_grad():
+            route = self.route(start, end, points)
+            return self.pose(start[:, ROOT:], end[:, ROOT:], route, points)
+
+    def long_motion(
+        self, world_from_agent: Float[np.ndarray, "body 4 4"], body: Body, scene: Surroundings, rng: np.random.Generator
+    ) -> tuple[Moving, Moving]:
+        """Return motion through a row of places, two seconds from one to the next, and the bodies at them."""
+        bodies = self.bodies(world_from_agent, body, scene, rng)
+        return joined(self.short_motions(bodies[:-1], bodies[1:], scene, rng)), bodies
+
+
+def placed(channels: Float[Tensor, "body channel"], world_from_place: Float[np.ndarray, "body 4 4"], poses: PoseSpace) -> Moving:
+    """Turn bodies drawn by the CVAE into bodies in the world."""
+    local = decode_clip(channels, np.eye(4), poses)
+    return Moving(world_from_place @ local.world_from_agent, local.agent_from_bone)
+
+
+def habits_of(stretches: list[Moving], scenes: list[Surroundings], *, moving_m: float = 0.3) -> Habits:
+    """Measure how a body moves; ``moving_m`` is the least way in two seconds that counts as travelling."""
+    clearance, pace = [], []
+    for stretch, scene in zip(stretches, scenes, strict=True):
+        root = tensors(stretch)[0][:, :3, 3]
+        if len(root) <= STEPS:
+            continue
+        way = (root[STEPS:] - root[:-STEPS])[:, [0, 2]].norm(dim=1).numpy()
+        travels = way > moving_m
+        pace.append(way[travels])
+        clearance.append(scene.distance.at(root[STEPS // 2 : len(root) - STEPS // 2]).numpy()[travels])
+    if not sum(map(len, pace)):
+        lowest = [
+            float(scene.distance.at(tensors(stretch)[0][:, :3, 3]).median()) for stretch, scene in zip(stretches, scenes, strict=True)
+        ]
+        return Habits(float(np.median(lowest)), moving_m)
+    return Habits(float(np.median(np.concatenate(clearance))), float(np.median(np.concatenate(pace))))
+
+
+def _chosen(first: np.ndarray, one: Moving, other: Moving) -> Moving:
+    roots = np.where(first, one.world_from_agent, other.world_from_agent)
+    return Moving(roots, np.where(first[..., None], one.agent_from_bone, other.agent_from_bone))

@@ -1,0 +1,152 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.models import ablated_motion, simulated_lives
+from pipeline.models.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
+from pipeline.models.contacts import find_contacts
+from pipeline.models.longterm import PointNet, PoseNet, RouteNet, Sizes, StaticBody
+from pipeline.models.longterm_examples import Cutting, bodies, cut, encoded, fitted_poses
+from pipeline.models.motion_synthesis import LongTerm, habits_of
+from pipeline.models.short_motions import STEPS
+from pipeline.models.subgoals import Floor, Subgoal, legs, preferred
+from tests.pipeline.models import strider
+
+SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
+
+
+@pytest.fixture(scope="module")
+def lives():
+    return strider.lives()
+
+
+@pytest.fixture(scope="module")
+def model(lives):
+    torch.manual_seed(0)
+    poses = fitted_poses(lives.stretches, lives.body.agent_from_bone_rest, SIZES.pose)
+    contacts = find_contacts(lives.body, list(lives.stretches), lives.distances)
+    habits = habits_of(list(lives.stretches), list(lives.scenes) * len(lives.stretches))
+    nets = (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES))
+    return LongTerm(SIZES, poses, contacts, habits, *(net.eval() for net in nets))
+
+
+@pytest.fixture(scope="module")
+def clips(lives, model):
+    rng = np.random.default_rng(0)
+    return encoded(lives, cut(lives, Cutting(stride=40), rng), model.poses, SIZES.points, rng)
+
+
+def test_channels_and_motion_are_each_others_inverse(lives, model):
+    part = lives.stretches[0][: STEPS + 1]
+    p = pose_channels(part.agent_from_bone, model.poses)[None]
+    coded = encode_clips(part.world_from_agent[None], p, np.zeros(1, int), lives.scenes, 16, np.random.default_rng(0))
+    back = decode_clip(coded.channels[0], coded.world_from_clip[0], model.poses)
+    np.testing.assert_allclose(back.world_from_agent, part.world_from_agent, atol=1e-5)
+    np.testing.assert_allclose(back.agent_from_bone, part.agent_from_bone, atol=3e-3)
+    ahead = coded.channels[0, -1, :3] - coded.channels[0, 0, :3]
+    assert float(ahead[2]) > 0.3 and abs(float(ahead[0])) < 1e-5
+
+
+def test_scene_points_lie_on_the_scene_near_the_clip(lives, clips):
+    world = torch.einsum("cij,cpj->cpi", torch.from_numpy(clips.world_from_clip[:, :3, :3]).float(), clips.points)
+    world = world + torch.from_numpy(clips.world_from_clip[:, None, :3, 3]).float()
+    assert lives.scenes[0].distance.at(world).abs().max() < 0.06
+    assert clips.points.norm(dim=-1).max() < 1.51
+
+
+@pytest.mark.parametrize("name", ["ours", *ablated_motion.KINDS])
+def test_short_motions_begin_and_end_as_given(model, clips, name):
+    torch.manual_seed(1)
+    made = model if name == "ours" else ablated_motion.build(ablated_motion.KINDS[name], SIZES)
+    frames = made.between(clips.channels[:, 0], clips.channels[:, -1], clips.points)
+    assert frames.shape == clips.channels.shape
+    torch.testing.assert_close(frames[:, [0, -1]], clips.channels[:, [0, -1]], atol=1e-5, rtol=0)
+    assert (frames[:, 30] - clips.channels[:, 30]).abs().max() > 1e-3
+
+
+def test_blind_networks_do_not_see_and_seeing_ones_do(clips):
+    torch.manual_seed(2)
+    moved = clips.points + 0.5
+    for name, differs in (("ours_no_scene", False), ("route_tr_pose", True), ("base", True), ("base_no_scene", False)):
+        net = ablated_motion.build(ablated_motion.KINDS[name], SIZES)
+        pair = [net.between(clips.channels[:, 0], clips.channels[:, -1], points) for points in (clips.points, moved)]
+        assert (not torch.equal(*pair)) == differs, name
+    assert not any(isinstance(p, torch.nn.Parameter) for p in PointNet(4, seeing=False).parameters())
+
+
+def test_a_saved_model_is_the_same_model(model, clips, tmp_path):
+    model.save(tmp_path)
+    again = LongTerm.load(tmp_path)
+    args = (clips.channels[:, 0], clips.channels[:, -1], clips.points)
+    torch.testing.assert_close(again.between(*args), model.between(*args))
+    torch.testing.assert_close(again.poses.basis, model.poses.basis)
+    assert again.habits == model.habits
+    np.testing.assert_array_equal(again.contacts.foot, model.contacts.foot)
+
+
+def test_habits_are_those_of_the_strider(lives, model):
+    assert model.habits.clearance_m == pytest.approx(strider.HIP_M, abs=0.01)
+    ends = [np.linalg.norm(s.world_from_agent[60, :3, 3] - s.world_from_agent[0, :3, 3]) for s in lives.stretches]
+    assert min(ends) - 0.05 < model.habits.pace_m < max(ends) + 0.05
+
+
+def test_clips_that_travel_are_kept_and_loose_places_are_level(lives, model):
+    rng = np.random.default_rng(0)
+    cuts = cut(lives, Cutting(stride=10, resting=0.0), rng)
+    ways = [np.linalg.norm((p.world_from_agent[-1] - p.world_from_agent[0])[:3, 3]) for p in cuts.parts(lives)]
+    assert min(ways) > 0.5
+    stills = bodies(lives, Cutting(level=1.0, most_bodies=50), model.poses, SIZES.points, rng)
+    assert len(stills.scene) <= 60
+    torch.testing.assert_close(
+        stills.places.place[:, 1:], torch.tensor([1.0, 0, 0, 0, 1, 0]).expand(len(stills.scene), -1), atol=1e-5, rtol=0
+    )
+    assert float(stills.truth[:, 1].std()) == pytest.approx(0.03, rel=0.4)
+
+
+def test_places_tell_the_clearance(lives):
+    root = np.tile(np.eye(4), (2, 1, 1))
+    root[:, :3, 3] = [[1.2, 0.3, 1.2], [0.0, 0.7, 0.0]]  # over the floor, over the block
+    told = encode_places(root, [0, 0], lives.scenes, 16, np.random.default_rng(0))
+    torch.testing.assert_close(told.place[:, 0], torch.tensor([0.3, 0.2]), atol=0.03, rtol=0)
+
+
+def test_legs_lead_around_the_block_and_are_on_time(lives, model):
+    ends = [
+        Subgoal(np.array([-1.2, np.nan, 0.0]), 0.0),
+        Subgoal(np.array([1.2, np.nan, 0.0]), np.pi, 20.0),
+        Subgoal(np.array([0.0, 0.7, 0.0])),
+    ]
+    places = legs(None, ends, lives.scenes[0], model.habits)
+    where = places.world_from_agent[:, :3, 3]
+    np.testing.assert_allclose(where[places.subgoal], [[-1.2, strider.HIP_M, 0], [1.2, strider.HIP_M, 0], [0, 0.7, 0]], atol=0.01)
+    assert places.subgoal[1] == 10  # 20 s are ten legs; what it does not need it rests
+    on_floor = np.abs(where[:, 1] - strider.HIP_M) < 0.05
+    assert (np.abs(where[on_floor][:, [0, 2]]).max(1) > 0.4).all()
+    np.testing.assert_allclose(places.world_from_agent[places.subgoal[1], :3, 2], [0, 0, -1], atol=1e-9)
+    assert np.linalg.norm(np.diff(where[:, [0, 2]], axis=0), axis=1).max() <= 1.36 * model.habits.pace_m
+    floor = Floor.of(lives.scenes[0], strider.HIP_M)
+    assert not floor.free[tuple(np.round((np.array([0.0, 0.0]) - floor.corner) / 0.08).astype(int))]
+
+
+def test_preferred_places_are_where_the_animal_was():
+    been = np.concatenate([np.tile([1.0, 0.2, 1.0], (300, 1)), np.tile([-1.0, 0.4, 0.5], (100, 1))])
+    drawn = np.array([goal.position_world for goal in preferred(been, 200, np.random.default_rng(0))])
+    assert set(map(tuple, np.round(drawn, 6))) == {(1.0, 0.2, 1.0), (-1.0, 0.4, 0.5)}
+    assert (np.abs(np.diff(drawn[:, 0])) > 1).all()  # neighbours are apart
+
+
+def test_a_long_motion_goes_through_its_places(lives, model):
+    places = legs(None, [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, 1.0]))], lives.scenes[0], model.habits)
+    moving, met = model.long_motion(places.world_from_agent, lives.body, lives.scenes[0], np.random.default_rng(0))
+    assert len(moving) == STEPS * (len(places.world_from_agent) - 1) + 1
+    np.testing.assert_allclose(moving.world_from_agent[::STEPS], met.world_from_agent, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.det(moving.world_from_agent[:, :3, :3]), 1, atol=1e-4)
+
+
+def test_simulated_lives_come_back(lives, tmp_path):
+    simulated_lives.save(tmp_path, lives.body, [strider.room()], lives.stretches, lives.scene_of, ["train", "held_out", "unseen"])
+    again, split = simulated_lives.load(tmp_path)
+    assert split == ["train", "held_out", "unseen"]
+    np.testing.assert_allclose(again.stretches[2].agent_from_bone, lives.stretches[2].agent_from_bone, atol=1e-6)
+    assert again.scenes[0].floor_m == pytest.approx(0.0, abs=0.01)
+    assert lives.some([2]).scene_of == (0,)
