@@ -1,30 +1,30 @@
-"""Run the behaviour model without a page: let the animal live beside a scripted observer and write the take.
+"""Run the behaviour model without a page, or let the animal travel through sub-goals for minutes; write the take.
 
-Writes `take.npz` and `take.csv`. In Python: `Simulator.reset(seed)` and `Simulator.step(observer)` of
-`stages.simulate.simulator`, ten steps a second.
+With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`. In Python: `Simulator.reset(seed)` and
+`Simulator.step(observer)` of `stages.simulate.simulator`, ten steps a second.
+With `--longterm` and `--subgoals FILE` (see `stages.simulate.subgoal_file`), or sub-goals that the recipe asks for:
+writes `take.npz` at 30 fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-import numpy as np
-
-from pipeline import cli, progress
-from pipeline.files import arrays
+from pipeline import cli, config, progress
+from pipeline.errors import InputError
 from pipeline.models import behavior
-from pipeline.models.perception import FeatureVolume
-from pipeline.models.planning import Sampler, TorchNetworks
-from pipeline.models.trajectories import BehaviorData
-from stages.simulate.observers import Script, scripted
-from stages.simulate.rollout import rollout, write_take
-from stages.simulate.simulator import Chaining, Simulator
+from pipeline.models.motion_optimization import Settings
+from stages.simulate import takes
+from stages.simulate.observers import Script
+from stages.simulate.simulator import Chaining
+from stages.simulate.subgoal_file import Written, subgoals_from_table
 
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of a rollout."""
+    """Settings of a take."""
 
     seconds: float = 30.0
-    """Length of the take."""
+    """Length of a take of the behaviour model."""
     observer: Script = "approach"
     """What the observer does."""
     observer_speed_m_s: float = 1.0
@@ -33,26 +33,41 @@ class Config:
     """How plans follow each other."""
     sampling: behavior.Sampling = field(default_factory=behavior.Sampling)
     """How plans are drawn; `guidance` is the interactivity."""
+    subgoals: Literal["file", "behavior", "visited", "none"] = "none"
+    """Where sub-goals come from: `--subgoals` (whatever this says), the behaviour model's goals one after the other, or
+    places drawn from where the animal has been; none: a take of the behaviour model."""
+    subgoal_count: int = 20
+    """How many, where they are not written in a file."""
+    optimise: bool = True
+    """Make the motion physical; a take of the behaviour model only where `--longterm` and `--reconstruction` are given."""
+    optimisation: Settings = field(default_factory=Settings)
+    """Weights and length of that."""
+    frames_hz: float = 10.0
+    """Pictures per second of long-term motion; 0 = none."""
     seed: int = 0
     """Seed of the beginning and of all noise."""
 
 
 def run(task: cli.Task) -> None:
-    """Roll out one take."""
+    """Make one take."""
     c: Config = task.config
-    model, source = task.input("behavior"), task.input("behavior_data")
-    architecture, nets, scaling, schedule, _ = behavior.load(model)
-    data, volume = BehaviorData.load(source), FeatureVolume.load(source / "volume.npz")
-    allowed = arrays.load(source / "volume.npz", ("allowed",))["allowed"]
-    sampler = Sampler(TorchNetworks(nets, task.device), schedule, scaling)
-    simulator = Simulator(sampler, data, volume, allowed, architecture.ego, sampling=c.sampling, chaining=c.chaining)
-    seen = np.concatenate([t.world_from_camera[t.valid, :3, 3] for t in data.trajectories.values()])
-    observer = scripted(c.observer, center=np.median(seen, axis=0), speed_m_s=c.observer_speed_m_s)
-    take = rollout(simulator, observer, seconds=c.seconds, seed=c.seed)
-    progress.log(f"{c.seconds:g} s, {float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space")
+    given = {name: task.input(name) for name in ("behavior", "behavior_data", "longterm", "reconstruction") if task.has(name)}
+    written = None
+    if task.has("subgoals"):
+        table = config.read_table(task.input("subgoals"))
+        rows = [config.from_table(Written, row, where=str(task.input("subgoals"))) for row in table.get("subgoal", ())]
+        written = subgoals_from_table(table, rows, task.input("subgoals"))
+    if written is None and c.subgoals == "file":
+        raise InputError("SIM-004", "which sub-goals?", task.stage, "give --subgoals file.toml")
+    if written is None and c.subgoals == "none":
+        take = takes.of_behavior(given, c, task.device)
+    else:
+        take = takes.through_subgoals(given, written, c, task.device)
+    progress.log(take.said)
     with task.create() as folder:
-        write_take(folder, take)
+        take.write(folder)
 
 
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, reads=("behavior", "behavior_data"))
+    optional = ("behavior", "longterm", "reconstruction", "subgoals")
+    cli.enter(__doc__, run, config=Config, reads=("behavior_data",), optional=optional)

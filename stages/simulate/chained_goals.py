@@ -1,0 +1,24 @@
+"""Sub-goals for minutes from the behaviour model: one goal after the other, each asked for where the last plan ended."""
+
+import numpy as np
+
+from pipeline.models.subgoals import Subgoal
+from pipeline.models.trajectories import FUTURE, RATE_HZ
+from stages.simulate.observers import Observer
+from stages.simulate.simulator import Simulator
+
+
+def chained_goals(simulator: Simulator, observer: Observer, count: int, seed: int) -> list[Subgoal]:
+    """Return the start and ``count`` goals, 5.6 s apart; the simulator must play each plan to its end."""
+    assert simulator.chaining.replan_frames == FUTURE, simulator.chaining
+    state = simulator.reset(seed)
+    found = [Subgoal(state.world_from_agent[:3, 3], _heading(state.world_from_agent), 0.0)]
+    for number in range(1, count + 1):
+        found.append(Subgoal(np.asarray(state.goal_world), None, number * FUTURE / RATE_HZ))
+        for _ in range(FUTURE + (number == 1)):  # the step after the last one of a plan asks for the next
+            state = simulator.step(observer(state.time_s, state.world_from_agent[:3, 3]))
+    return found
+
+
+def _heading(world_from_agent: np.ndarray) -> float:
+    return float(np.arctan2(world_from_agent[0, 2], world_from_agent[2, 2]))

@@ -1,0 +1,105 @@
+"""The files of a long-term take: motion, animated surface, frames for a video, and what it is worth."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.ndimage import gaussian_filter1d
+
+from pipeline import progress
+from pipeline.files import arrays, glb, images
+from pipeline.models.bodies import Body, PosedSurface
+from pipeline.models.contacts import tensors
+from pipeline.models.plausibility import Plausibility
+from pipeline.models.short_motions import RATE_HZ, Moving
+from pipeline.space import overview, rigid
+from pipeline.space.meshes import Mesh, RayCaster, render_view
+from stages.simulate.journey import Journey
+
+FOCAL = 0.9
+"""Focal length of the frames in units of their width."""
+
+
+def write_journey(folder: Path, journey: Journey, body: Body) -> None:
+    """Write `take.npz` (30 fps), `take.glb` and `take.json`."""
+    arrays.save(
+        folder / "take.npz",
+        timestamp_s=journey.timestamp_s,
+        world_from_agent=journey.moving.world_from_agent,
+        agent_from_bone=journey.moving.agent_from_bone.astype(np.float32),
+        subgoals_world=journey.subgoals_world,
+        arrival_s=journey.arrival_s.astype(np.float64),
+    )
+    skin = glb.Skin(*four_weights(body), body.agent_from_bone_rest, tuple(f"bone_{k:02d}" for k in range(len(body.agent_from_bone_rest))))
+    action = glb.Action("take", journey.timestamp_s, journey.moving.world_from_agent, journey.moving.agent_from_bone)
+    (folder / "take.glb").write_bytes(glb.skinned(body.mesh, skin, [action]))
+    about = {
+        "units": "metres, radians, seconds",
+        "up": [0, 1, 0],
+        "rate_hz": RATE_HZ,
+        "seconds": float(journey.timestamp_s[-1]),
+        "subgoals_world": journey.subgoals_world.tolist(),
+        "arrival_s": journey.arrival_s.tolist(),
+        "largest_seam_m": journey.largest_seam_m,
+    }
+    write_worth(folder, journey.before, journey.after, **about)
+
+
+def write_worth(folder: Path, before: Plausibility, after: Plausibility, **about: object) -> None:
+    """Write `take.json`: what a take is, and how physical it was before and after it was optimised."""
+    worth = {"before": _finite(before), "after": _finite(after)}
+    (folder / "take.json").write_text(json.dumps({**about, **worth}, indent=1, allow_nan=False) + "\n")
+
+
+def write_frames(folder: Path, moving: Moving, body: Body, scene: Mesh, *, rate_hz: float, width: int = 480, height: int = 360) -> None:
+    """Write `frames/%06d.jpg`: the scene and the animal, seen by a camera that follows it from above."""
+    (folder / "frames").mkdir()
+    caster, surface = RayCaster(scene), PosedSurface(body)
+    intrinsics = np.array([[FOCAL * width, 0, width / 2], [0, FOCAL * width, height / 2], [0, 0, 1.0]])
+    seen = following(moving.world_from_agent[:, :3, 3], np.median(scene.vertices, axis=0))
+    chosen = np.arange(0, len(moving), max(1, round(RATE_HZ / rate_hz)))
+    for number, frame in enumerate(progress.track(chosen, "frames", total=len(chosen))):
+        posed = surface(*tensors(moving[frame : frame + 1]))[0].numpy()
+        picture = drawn(caster, Mesh(posed, body.mesh.faces, body.mesh.color), seen[frame], intrinsics, height, width)
+        images.write_color(folder / "frames" / f"{number:06d}.jpg", picture)
+
+
+def following(roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "frame 4 4"]:
+    """Return a camera that looks down at the animal from the side of the room's centre, moving smoothly."""
+    target = gaussian_filter1d(roots_world, 12.0, axis=0, mode="nearest")
+    away = (centre - target) * [1.0, 0.0, 1.0]
+    away = gaussian_filter1d(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 0.3), 20.0, axis=0, mode="nearest")
+    eyes = target + 1.3 * away + [0.0, 1.4, 0.05]
+    up = np.array([0.0, 1.0, 0.0])
+    return np.stack([rigid.look_at(eye, at, up) for eye, at in zip(eyes, target, strict=True)])
+
+
+def drawn(
+    scene: RayCaster,
+    animal: Mesh,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    height: int,
+    width: int,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw the animal in its scene, each pixel by what is nearer; the animal is shaded by how it faces the camera."""
+    back, hits = render_view(scene, world_from_camera, intrinsics, height, width)
+    front, touched = render_view(RayCaster(animal), world_from_camera, intrinsics, height, width)
+    nearer = (front > 0) & ((back == 0) | (front < back))
+    facing = np.abs(touched.interpolate(animal, animal.vertex_normals()) @ world_from_camera[:3, 2])
+    fur = overview.shade(animal, touched) * (0.45 + 0.55 * facing[:, None])
+    picture = overview.shade(scene.mesh, hits).reshape(height, width, 3)
+    return np.where(nearer[..., None], fur.reshape(height, width, 3).astype(np.uint8), picture)
+
+
+def four_weights(body: Body) -> tuple[UInt8[np.ndarray, "vertex 4"], Float[np.ndarray, "vertex 4"]]:
+    """Keep each vertex's four strongest bones."""
+    joints = np.argsort(-body.weights, axis=1, kind="stable")[:, :4]
+    weights = np.take_along_axis(body.weights, joints, axis=1)
+    return joints.astype(np.uint8), (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+
+
+def _finite(worth: Plausibility) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in asdict(worth).items()}

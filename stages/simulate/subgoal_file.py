@@ -1,0 +1,45 @@
+"""Sub-goals as a user writes them: a TOML file of `[[subgoal]]` tables.
+
+[[subgoal]]
+position = [1.2, 0.8]        # x and z on the floor, or x, y, z of the body's centre (on furniture), metres, world
+heading_deg = 90             # optional: about +y, 0 looks along +z, 90 along +x
+time_s = 12.0                # optional: when to be there; not before the animal can be
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.models.subgoals import Subgoal
+
+
+@dataclass(frozen=True)
+class Written:
+    """One `[[subgoal]]`."""
+
+    position: tuple[float, ...]
+    heading_deg: float | None = None
+    time_s: float | None = None
+
+
+def subgoals_from_table(table: Mapping[str, Any], written: list[Written], path: Path) -> list[Subgoal]:
+    """Check what was written and return it as sub-goals. Raises InputError SIM-002."""
+    if set(table) != {"subgoal"} or not written:
+        raise InputError("SIM-002", "holds no sub-goals", str(path), "write one [[subgoal]] table per sub-goal, nothing else")
+    found, clock = [], 0.0
+    for number, each in enumerate(written, 1):
+        where = f"{path}: subgoal {number}"
+        if len(each.position) not in (2, 3) or not np.isfinite(each.position).all():
+            raise InputError("SIM-002", f"{each.position} is no position", where, "give [x, z] or [x, y, z] in metres")
+        if each.time_s is not None and each.time_s < clock:
+            raise InputError("SIM-002", f"time_s {each.time_s:g} is before the sub-goal ahead of it", where, "let times rise")
+        clock = each.time_s if each.time_s is not None else clock
+        x, *middle, z = each.position
+        position = np.array([x, middle[0] if middle else np.nan, z])
+        heading = None if each.heading_deg is None else float(np.radians(each.heading_deg))
+        found.append(Subgoal(position, heading, each.time_s))
+    return found

@@ -1,0 +1,105 @@
+"""Takes of both kinds, from finished artifacts to something that can be written."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.files import arrays, meshes
+from pipeline.models import behavior
+from pipeline.models.bodies import load_body
+from pipeline.models.motion_synthesis import LongTerm
+from pipeline.models.perception import FeatureVolume
+from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.subgoals import Subgoal, preferred
+from pipeline.models.surroundings import Surroundings
+from pipeline.models.trajectories import FUTURE, TRAIN, BehaviorData
+from stages.simulate import journey, journey_files
+from stages.simulate.chained_goals import chained_goals
+from stages.simulate.journey import World
+from stages.simulate.observers import Observer, scripted
+from stages.simulate.rollout import rollout, write_take
+from stages.simulate.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class Made:
+    """A take that is ready to be written."""
+
+    said: str
+    """One line about it."""
+    write: Callable[[Path], None]
+
+
+def of_behavior(given: Mapping[str, Path], c: Any, device: str) -> Made:
+    """Let the animal live beside a scripted observer; make the take physical where that is asked for and possible."""
+    data = BehaviorData.load(_needed(given, "behavior_data"))
+    simulator, observer = _simulator(given, data, c, c.chaining, device), _observer(data, c)
+    take = rollout(simulator, observer, seconds=c.seconds, seed=c.seed)
+    said = f"{c.seconds:g} s, {float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space"
+    if not (c.optimise and "longterm" in given and "reconstruction" in given):
+        return Made(said, lambda folder: write_take(folder, take))
+    take, before, after = journey.made_physical(_world(given, data), take, c.optimisation)
+    said += f"; deepest {100 * before.deepest_m:.1f} -> {100 * after.deepest_m:.1f} cm, slide {100 * before.slide_m_s:.1f} -> {100 * after.slide_m_s:.1f} cm/s"
+
+    def write(folder: Path) -> None:
+        write_take(folder, take)
+        journey_files.write_worth(folder, before, after, seconds=c.seconds)
+
+    return Made(said, write)
+
+
+def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c: Any, device: str) -> Made:
+    """Let the animal travel through sub-goals, given or drawn."""
+    data = BehaviorData.load(_needed(given, "behavior_data"))
+    world, rng = _world(given, data), np.random.default_rng(c.seed)
+    if written is not None:
+        subgoals = written
+    elif c.subgoals == "behavior":
+        simulator = _simulator(given, data, c, replace(c.chaining, replan_frames=FUTURE, fade_frames=0), device)
+        subgoals = chained_goals(simulator, _observer(data, c), c.subgoal_count, c.seed)
+    else:
+        learned = [data.trajectories[data.videos[video]] for video in np.unique(data.video[data.split == TRAIN])]
+        been = np.concatenate([trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in learned])
+        subgoals = preferred(been, c.subgoal_count + 1, rng)
+    made = journey.travel(world, subgoals, c.optimisation if c.optimise else None, rng)
+
+    def write(folder: Path) -> None:
+        journey_files.write_journey(folder, made, world.body)
+        if c.frames_hz > 0:
+            scene = meshes.read_ply(given["reconstruction"] / "scene.ply")
+            journey_files.write_frames(folder, made.moving, world.body, scene, rate_hz=c.frames_hz)
+
+    worth = made.after
+    said = f"{made.timestamp_s[-1]:.0f} s through {len(subgoals)} sub-goals; {worth.non_collision:.2%} free of collision, "
+    said += f"{worth.contact:.1%} in contact, feet slide {100 * worth.slide_m_s:.1f} cm/s, largest seam {100 * made.largest_seam_m:.1f} cm"
+    return Made(said, write)
+
+
+def _world(given: Mapping[str, Path], data: BehaviorData) -> World:
+    model, reconstruction = LongTerm.load(_needed(given, "longterm")), _needed(given, "reconstruction")
+    roots = np.concatenate([trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in data.trajectories.values()])
+    scene = Surroundings.for_motion(meshes.read_ply(reconstruction / "scene.ply"), roots)
+    return World(model, load_body(reconstruction), scene)
+
+
+def _simulator(given: Mapping[str, Path], data: BehaviorData, c: Any, chaining: Any, device: str) -> Simulator:
+    architecture, nets, scaling, schedule, _ = behavior.load(_needed(given, "behavior"))
+    sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
+    volume = FeatureVolume.load(given["behavior_data"] / "volume.npz")
+    allowed = arrays.load(given["behavior_data"] / "volume.npz", ("allowed",))["allowed"]
+    return Simulator(sampler, data, volume, allowed, architecture.ego, sampling=c.sampling, chaining=chaining)
+
+
+def _observer(data: BehaviorData, c: Any) -> Observer:
+    seen = np.concatenate([t.world_from_camera[t.valid, :3, 3] for t in data.trajectories.values()])
+    return scripted(c.observer, center=np.median(seen, axis=0), speed_m_s=c.observer_speed_m_s)
+
+
+def _needed(given: Mapping[str, Path], name: str) -> Path:
+    if name not in given:
+        raise InputError("SIM-004", f"this take needs {name}", "stages.simulate", f"give --{name.replace('_', '-')}")
+    return given[name]

@@ -1,0 +1,107 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline import config
+from pipeline.errors import InputError
+from pipeline.files import arrays
+from pipeline.models.contacts import find_contacts
+from pipeline.models.longterm import PoseNet, RouteNet, Sizes, StaticBody
+from pipeline.models.longterm_examples import fitted_poses
+from pipeline.models.motion_optimization import Settings
+from pipeline.models.motion_synthesis import LongTerm, habits_of
+from pipeline.models.subgoals import Subgoal
+from stages.simulate import journey, journey_files
+from stages.simulate.rollout import Take
+from stages.simulate.subgoal_file import Written, subgoals_from_table
+from tests.pipeline.models import strider
+
+SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
+SETTINGS = Settings(steps=15, vertices=30)
+
+
+@pytest.fixture(scope="module")
+def world():
+    lives = strider.lives()
+    torch.manual_seed(0)
+    poses = fitted_poses(lives.stretches, lives.body.agent_from_bone_rest, SIZES.pose)
+    contacts = find_contacts(lives.body, list(lives.stretches), lives.distances)
+    habits = habits_of(list(lives.stretches), list(lives.scenes) * len(lives.stretches))
+    nets = (net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES)))
+    return journey.World(LongTerm(SIZES, poses, contacts, habits, *nets), lives.body, lives.scenes[0])
+
+
+def read(path, text):
+    path.write_text(text)
+    table = config.read_table(path)
+    rows = [config.from_table(Written, row, where=str(path)) for row in table.get("subgoal", ())]
+    return subgoals_from_table(table, rows, path)
+
+
+def test_sub_goals_are_read(tmp_path):
+    text = "[[subgoal]]\nposition = [1.5, -1]\n[[subgoal]]\nposition = [1, 0.5, 2.0]\nheading_deg = 90\ntime_s = 12\n"
+    first, second = read(tmp_path / "goals.toml", text)
+    np.testing.assert_array_equal(first.position_world, [1.5, np.nan, -1.0])
+    assert first.heading_rad is None and first.time_s is None
+    assert second.heading_rad == pytest.approx(np.pi / 2)
+    assert second.time_s == 12.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "seed = 1\n",
+        "[[subgoal]]\nposition = [1]\n",
+        "[[subgoal]]\nposition = [1, inf]\n",
+        "[[subgoal]]\nposition = [1, 2]\ntime_s = 5\n[[subgoal]]\nposition = [2, 2]\ntime_s = 4\n",
+    ],
+)
+def test_bad_sub_goals_are_told(tmp_path, text):
+    with pytest.raises(InputError, match="SIM-002"):
+        read(tmp_path / "goals.toml", text)
+
+
+def test_a_journey_is_made_and_written(world, tmp_path):
+    goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, -1.0]))]
+    made = journey.travel(world, goals, SETTINGS, np.random.default_rng(0))
+    again = journey.travel(world, goals, SETTINGS, np.random.default_rng(0))
+    np.testing.assert_array_equal(made.moving.world_from_agent, again.moving.world_from_agent)
+    assert made.after.penetration_m <= made.before.penetration_m
+    np.testing.assert_allclose(made.subgoals_world[:, [0, 2]], [[-1.2, -1], [1.2, -1]], atol=1e-6)
+    assert made.arrival_s[-1] == pytest.approx(made.timestamp_s[-1])
+    journey_files.write_journey(tmp_path, made, world.body)
+    journey_files.write_frames(tmp_path, made.moving[:30], world.body, strider.room(), rate_hz=10.0, width=64, height=48)
+    take = arrays.load(tmp_path / "take.npz")
+    assert take["agent_from_bone"].shape == (len(made.moving), 5, 4, 4)
+    about = json.loads((tmp_path / "take.json").read_text())
+    assert about["rate_hz"] == 30 and len(about["subgoals_world"]) == 2 and about["after"]["contact"] <= 1
+    assert (tmp_path / "take.glb").read_bytes()[:4] == b"glTF"
+    assert len(list((tmp_path / "frames").glob("*.jpg"))) == 10
+
+
+def test_one_sub_goal_is_too_few(world):
+    with pytest.raises(InputError, match="SIM-001"):
+        journey.travel(world, [Subgoal(np.zeros(3))], None, np.random.default_rng(0))
+
+
+def test_a_take_of_the_behaviour_model_becomes_physical(world):
+    walk = strider.striding(np.array([[1.0, 0, -1.2], [1.0, 0, 1.2]]), 4.0)[::3]
+    root = walk.world_from_agent.copy()
+    root[:, 1, 3] -= 0.03  # all of it is in the floor
+    frames = len(root)
+    take = Take(
+        np.arange(frames) / 10,
+        root,
+        walk.agent_from_bone.astype(np.float32),
+        np.zeros((frames, 3)),
+        np.zeros((frames, 3)),
+        np.zeros(frames),
+    )
+    done, before, after = journey.made_physical(world, take, Settings(steps=60, vertices=30))
+    assert after.penetration_m < 0.5 * before.penetration_m
+    assert done.world_from_agent.shape == take.world_from_agent.shape
+    assert np.abs(done.world_from_agent[:, [0, 2], 3] - root[:, [0, 2], 3]).max() < 0.1
+    assert done.observer_world is take.observer_world
