@@ -336,8 +336,7 @@ def _rules(plan: Plan, all_jobs: list[Job]) -> str:
         lines += [f"{name}.{node}.redo:", f"\t@$(PLAN) redo {home} {node}", f"\t@$(MAKE) --no-print-directory {name}.{node}"]
     if not home.tables:
         pages = [f"{plan.home_of(node).folder}/{node}/index.html" for node in ("report", "simulator") if node in stamps]
-        wanted = (stamp for node, made in stamps.items() if not dag.NODES[node].aside for stamp in made)
-        lines += [f".PHONY: {name}", f"{name}: {' '.join(wanted)}"]
+        lines += [f".PHONY: {name}", f"{name}: {' '.join(job.stamp for job in all_jobs if not dag.NODES[job.artifact].aside)}"]
         lines += [f"\t@echo '[{home}] done.{' Open:' if pages else ''}'", *(f"\t@echo '  {page}'" for page in pages)]
         lines += [f"\t@echo 'Next: make {name}.<artifact>[.redo], make {name} VARIANT=no_scene, make new AGENT=<name>, make help'"]
     return "\n".join(lines) + "\n"
