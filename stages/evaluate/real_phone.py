@@ -17,7 +17,7 @@ from stages.evaluate.clicked import Clicked, all_cameras
 from stages.evaluate.heldout import NAMES, RANGE_M, Shot
 from stages.evaluate.reading import Folders
 
-LOCALIZED = 24
+LOCALIZED = 40
 """frames that vote where registration places the phone"""
 AGREE = (5.0, 0.2)
 """degrees and metres within which two frames mean the same place"""
