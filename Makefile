@@ -15,18 +15,25 @@ RUN    := $(PYTHON) -SE -m pipeline.run
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check annotate test doctor clean FORCE
+.PHONY: help new capture-check annotate behavior-tables behavior-benchmark test doctor clean FORCE
 
 help:
 	@sed 's/make cat/make $(or $(AGENT),cat)/' pipeline/help.txt
 	@echo 'agents: $(AGENTS)'
 
-include $(WANTED:%=build/%$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
+include $(WANTED:%=build/%$(if $(TABLES),/tables)$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
 build/%/plan/rules.mk: .venv/.ok FORCE
 	@$(PLAN) plan $* $(if $(MAKE_RESTARTS),>/dev/null)
 
 .venv/.ok: envs/cpu.txt envs/cuda.txt envs/setup
 	@envs/setup
+
+behavior-tables: .venv/.ok
+	@$(MAKE) --no-print-directory TABLES=1 $(or $(AGENT),cat).behavior_tables
+	@cat build/$(or $(AGENT),cat)/behavior_tables/tables.txt
+
+behavior-benchmark: .venv/.ok
+	@$(MAKE) --no-print-directory behavior-tables AGENT=benchmark
 
 new: .venv/.ok
 	@$(PLAN) new '$(AGENT)'

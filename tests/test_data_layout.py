@@ -55,7 +55,7 @@ def promised() -> dict[str, list[Row]]:
         for files, text in cells:
             for name in names:
                 told = [t for t in re.findall(r"`([^`]+)`", files) if "." in t or t.endswith("/")]
-                mine = [t.removeprefix(f"{name}/").removeprefix("<id>/" if dag.NODES[name].roles else "") for t in told
+                mine = [t.removeprefix(f"{name}/").removeprefix("<id>/" if dag.NODES[name].roles or dag.NODES[name].trials == "each" else "") for t in told
                         if not (t.split("/")[0] in names and t.split("/")[0] != name)]  # fmt: skip
                 if mine:
                     found[name].append(Row(tuple(map(pattern_of, mine)), text))

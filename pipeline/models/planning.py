@@ -144,6 +144,13 @@ class Sampler:
         path = self.paths(codes, goal, sampling, rng) if path is None else path
         return Plan(goal, path, self.bodies(codes, path, sampling, rng))
 
+    def course(
+        self, observation: Observation, sampling: Sampling, rng: np.random.Generator, *, count: int = 1
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw goals and paths as `plan` does and spare the body."""
+        codes = self.codes(observation, sampling, count)
+        return self.paths(codes, self.goals(codes, sampling, rng), sampling, rng)
+
     def codes(self, observation: Observation, sampling: Sampling, count: int = 1) -> Codes:
         """Encode what is perceived, with all that ``sampling`` keeps and without the observer, ``count`` times."""
         keep = np.tile(np.array([sampling.scene, sampling.observer, sampling.past], np.float32), (len(observation), 1))

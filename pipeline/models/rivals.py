@@ -50,23 +50,28 @@ class GaussianSampler(Sampler):
     ) -> Plan:
         """Draw plans; the means lead from level to level."""
         codes = self.codes(observation, sampling, count)
-        given_goal, given_path = goal, path
-        still = np.random.default_rng(0)
-        goal = self.goals(codes, sampling, rng) if given_goal is None else given_goal
-        towards = self._scaled(self._goal(codes), still, 0.0) * self.scaling.goal_std if given_goal is None else given_goal
-        path = self.paths(codes, towards, sampling, rng) if given_path is None else given_path
-        along = self._metres(self._scaled(self._path(codes, towards, sampling), still, 0.0)) if given_path is None else given_path
+        towards = self._goal(codes)[0] * self.scaling.goal_std if goal is None else goal
+        along = self._metres(self._path(codes, towards, sampling)[0]) if path is None else path
+        goal = self.goals(codes, sampling, rng) if goal is None else goal
+        path = self.paths(codes, towards, sampling, rng) if path is None else path
         return Plan(goal, path, self.bodies(codes, along, sampling, rng))
+
+    def course(
+        self, observation: Observation, sampling: Sampling, rng: np.random.Generator, *, count: int = 1
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw paths to the mean goal."""
+        codes = self.codes(observation, sampling, count)
+        return self.paths(codes, self._goal(codes)[0] * self.scaling.goal_std, sampling, rng)
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
-        return self._scaled(self._goal(codes), rng, 1.0) * self.scaling.goal_std
+        return self._drawn_from(self._goal(codes), rng) * self.scaling.goal_std
 
     def paths(
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to goals."""
-        return self._metres(self._scaled(self._path(codes, goal, sampling), rng, 1.0))
+        return self._metres(self._drawn_from(self._path(codes, goal, sampling), rng))
 
     def bodies(
         self, codes: Codes, path: Float[np.ndarray, "plan frame 3"], sampling: Sampling, rng: np.random.Generator
@@ -75,7 +80,7 @@ class GaussianSampler(Sampler):
         control = (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
         nothing = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         told = [self.networks.body(nothing, _step(nothing, t), codes.full, control, _kept(nothing, 1.0)) for t in (MEAN, SPREAD)]
-        return np.swapaxes(self._scaled(told, rng, 1.0), 1, 2) * self.scaling.body_std + self.scaling.body_mean
+        return np.swapaxes(self._drawn_from(told, rng), 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def _goal(self, codes: Codes) -> list[Array]:
         nothing = np.zeros((len(codes.full), 3), np.float32)
@@ -87,9 +92,9 @@ class GaussianSampler(Sampler):
         keep = _kept(nothing, float(sampling.goal))
         return [self.networks.path(nothing, _step(nothing, t), codes.full, control, keep) for t in (MEAN, SPREAD)]
 
-    def _scaled(self, told: list[Array], rng: np.random.Generator, spread: float) -> Array:
+    def _drawn_from(self, told: list[Array], rng: np.random.Generator) -> Array:
         mean, log_std = told
-        return mean + spread * np.exp(np.clip(log_std, *LOG_STD)) * rng.standard_normal(mean.shape, dtype=np.float32)
+        return mean + np.exp(np.clip(log_std, *LOG_STD)) * rng.standard_normal(mean.shape, dtype=np.float32)
 
     def _metres(self, path: Array) -> Float[np.ndarray, "plan frame 3"]:
         return np.swapaxes(path * self.scaling.path_std, 1, 2)
@@ -116,6 +121,12 @@ class OneStageSampler(Sampler):
         path = np.swapaxes(whole[:, :3] * self.scaling.path_std, 1, 2)
         body = np.swapaxes(whole[:, 3:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
         return Plan(path[:, -1], path, body)
+
+    def course(
+        self, observation: Observation, sampling: Sampling, rng: np.random.Generator, *, count: int = 1
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw whole plans and keep the paths."""
+        return self.plan(observation, sampling, rng, count=count).path
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw whole plans and keep where they end."""

@@ -134,13 +134,19 @@ class BehaviorData:
         split = np.where(np.isin(video, list(tested)), TEST, TRAIN).astype(np.uint8)
         return replace(self, video=video, start=np.concatenate(starts).astype(np.int32), split=split, future=future)
 
-    def windows(self, index: Int[np.ndarray, "window"]) -> tuple[Context, Future]:
-        """Gather windows by their number in the list."""
+    def windows(self, index: Int[np.ndarray, "window"], *, bones: bool = True) -> tuple[Context, Future]:
+        """Gather windows by their number in the list; without ``bones``, which take most of the memory, there are none."""
         frames = self.start[index][:, None] + np.arange(PAST + self.future)
-        gathered = {name: [] for name in ("world_from_agent", "agent_from_bone", "world_from_camera")}
-        for video, frame in zip(self.video[index], frames, strict=True):
-            for name, rows in gathered.items():
-                rows.append(getattr(self.trajectories[self.videos[video]], name)[frame])
-        agent, bone, camera = (np.stack(rows) for rows in gathered.values())
+
+        def gathered(name: str, part: slice = slice(None)) -> np.ndarray:
+            first = getattr(self.trajectories[self.videos[0]], name)[0][part]
+            whole = np.empty((*frames.shape, *first.shape), first.dtype)
+            for video in np.unique(self.video[index]):
+                mine = self.video[index] == video
+                whole[mine] = getattr(self.trajectories[self.videos[video]], name)[frames[mine]][:, :, part]
+            return whole
+
+        agent, camera = gathered("world_from_agent"), gathered("world_from_camera")
+        bone = gathered("agent_from_bone", slice(None) if bones else slice(0, 0))
         context = Context(agent[:, :PAST], bone[:, :PAST], camera[:, :PAST, :3, 3], self.video[index])
         return context, Future(agent[:, PAST:], bone[:, PAST:])

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.models.intervals import Interval, bootstrapped, episodes
 from pipeline.models.predictors import Ats, ConstantVelocity, LocationPrior, Predictor, Samples, StandStill
-from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData, Context, Future
-from pipeline.space import rigid
+from pipeline.models.scores import GOAL_SCORES, PLAN_SCORES, SCORES
+from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData, Context
 from stages.evaluate.figures import Figures
-from stages.evaluate.statistics import Interval, bootstrapped, episodes
 
 OURS = "ats"
 RIVALS = ("location_prior", "stand_still", "constant_velocity")
-GOAL_SCORES = ("goal_minde_m", "goal_energy_score_m")
-PLAN_SCORES = ("path_minade_m", "orientation_minade_rad", "joints_minade_rad")
 MOVING_M = 0.1
 
 
@@ -68,49 +66,9 @@ def moving_share(data: BehaviorData, index: Int[np.ndarray, "window"]) -> float:
     """Return the share of windows in whose future the animal gets further than 0.1 m from where it is."""
     if len(index) == 0:
         return float("nan")
-    context, future = data.windows(index)
+    context, future = data.windows(index, bones=False)
     away = np.linalg.norm(future.path_world - context.world_from_agent[:, -1:, :3, 3], axis=-1)
     return float((away.max(1) > MOVING_M).mean())
-
-
-def goal_minde(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return the distance of the best of the sampled goals, metres."""
-    return np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1).min(1)
-
-
-def goal_energy_score(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return E|X - y| - E|X - X'| / 2 (Gneiting & Raftery 2007), with the fair estimate of the second term."""
-    count = samples.goal.shape[1]
-    to_truth = np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1).mean(1)
-    among = np.linalg.norm(samples.goal[:, :, None] - samples.goal[:, None], axis=-1).sum((1, 2))
-    return to_truth - among / (2 * count * (count - 1))
-
-
-def path_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return the mean distance along the best of the sampled paths, metres."""
-    return np.linalg.norm(samples.path - future.path_world[:, None], axis=-1).mean(-1).min(1)
-
-
-def orientation_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return the mean geodesic angle of the root along the best sample, radians."""
-    true = np.broadcast_to(future.world_from_agent[:, None, :, :3, :3], samples.rotation.shape)
-    return rigid.rotation_angle(samples.rotation, true).mean(-1).min(1)
-
-
-def joints_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return the mean geodesic angle of the bones along the best sample, radians."""
-    true = np.broadcast_to(future.agent_from_bone[:, None], samples.agent_from_bone.shape)
-    angle = rigid.rotation_angle(samples.agent_from_bone[..., :3, :3], true[..., :3, :3])
-    return angle.mean((-1, -2)).min(1)
-
-
-_SCORE = {
-    "goal_minde_m": goal_minde,
-    "goal_energy_score_m": goal_energy_score,
-    "path_minade_m": path_minade,
-    "orientation_minade_rad": orientation_minade,
-    "joints_minade_rad": joints_minade,
-}
 
 
 def _scores(
@@ -121,12 +79,12 @@ def _scores(
     context, future = data.windows(test)
     goals = _goals(method, context, protocol.samples * protocol.trials, rng)
     trials = [Samples(part) for part in np.split(goals, protocol.trials, axis=1)]
-    found = {name: [_SCORE[name](trial, future) for trial in trials] for name in GOAL_SCORES}
+    found = {name: [SCORES[name](trial, future) for trial in trials] for name in GOAL_SCORES}
     context, future = data.windows(test[:: protocol.plan_stride])
     for _ in range(protocol.plan_trials):
         samples = method.sample(context, protocol.samples, rng)
         for name in PLAN_SCORES if samples.path is not None else ():
-            found.setdefault(name, []).append(_SCORE[name](samples, future))
+            found.setdefault(name, []).append(SCORES[name](samples, future))
     return {name: np.mean(values, axis=0) for name, values in found.items()}
 
 
@@ -146,13 +104,13 @@ def _report(
         return bootstrapped(values, np.unique(chosen, return_inverse=True)[1], protocol.draws, np.random.default_rng(protocol.seed))
 
     for method, of_method in scores.items():
-        for name in _SCORE:
+        for name in SCORES:
             if name in of_method:
                 _put(figures, f"behavior/{method}/{name}", interval(of_method[name]))
             else:
                 figures.skip([f"behavior/{method}/{name}"], "this method predicts goals only")
     for rival in RIVALS:
-        for name in _SCORE:
+        for name in SCORES:
             if name in scores[rival]:
                 difference = interval(scores[OURS][name] - scores[rival][name])
                 _put(figures, f"behavior/{OURS}_minus_{rival}/{name}", difference)
@@ -165,4 +123,4 @@ def _put(figures: Figures, name: str, interval: Interval) -> None:
 
 
 def _names() -> list[str]:
-    return [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in _SCORE]
+    return [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in SCORES]

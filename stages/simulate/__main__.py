@@ -1,7 +1,7 @@
 """Run the behaviour model without a page, or let the animal travel through sub-goals for minutes; write the take.
 
 With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`. In Python: `Simulator.reset(seed)` and
-`Simulator.step(observer)` of `stages.simulate.simulator`, ten steps a second.
+`Simulator.step(observer)` of `pipeline.models.simulator`, ten steps a second.
 With `--longterm` and `--subgoals FILE` (see `stages.simulate.subgoal_file`), or sub-goals that the recipe asks for:
 writes `take.npz` at 30 fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
 """
@@ -13,9 +13,9 @@ from pipeline import cli, config, progress
 from pipeline.errors import InputError
 from pipeline.models import behavior
 from pipeline.models.motion_optimization import Settings
+from pipeline.models.simulator import Chaining
 from stages.simulate import takes
 from stages.simulate.observers import Script
-from stages.simulate.simulator import Chaining
 from stages.simulate.subgoal_file import Written, subgoals_from_table
 
 

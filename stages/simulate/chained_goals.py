@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from pipeline.models.simulator import Simulator
 from pipeline.models.subgoals import Subgoal
 from pipeline.models.trajectories import FUTURE, RATE_HZ
 from stages.simulate.observers import Observer
-from stages.simulate.simulator import Simulator
 
 
 def chained_goals(simulator: Simulator, observer: Observer, count: int, seed: int) -> list[Subgoal]:

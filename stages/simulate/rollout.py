@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.files import arrays
+from pipeline.models.simulator import Simulator
 from pipeline.models.trajectories import RATE_HZ
 from pipeline.space import rigid
 from stages.simulate.observers import Observer
-from stages.simulate.simulator import Simulator
 
 
 @dataclass(frozen=True)

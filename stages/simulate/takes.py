@@ -14,6 +14,7 @@ from pipeline.models.bodies import load_body
 from pipeline.models.motion_synthesis import LongTerm
 from pipeline.models.perception import FeatureVolume
 from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.simulator import Simulator
 from pipeline.models.subgoals import Subgoal, preferred
 from pipeline.models.surroundings import Surroundings
 from pipeline.models.trajectories import FUTURE, TRAIN, BehaviorData
@@ -22,7 +23,6 @@ from stages.simulate.chained_goals import chained_goals
 from stages.simulate.journey import World
 from stages.simulate.observers import Observer, scripted
 from stages.simulate.rollout import rollout, write_take
-from stages.simulate.simulator import Simulator
 
 
 @dataclass(frozen=True)

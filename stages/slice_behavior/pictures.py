@@ -33,7 +33,7 @@ def checks(data: BehaviorData) -> list[Check]:
     """Judge the data."""
     train, test = data.indices(TRAIN), data.indices(TEST)
     shared = set(data.video[train]) & set(data.video[test])
-    context, future = data.windows(train)
+    context, future = data.windows(train, bones=False)
     moved = np.linalg.norm(future.goal_world - context.world_from_agent[:, -1, :3, 3], axis=-1) > MOVED_M
     valid = np.concatenate([trajectory.valid for trajectory in data.trajectories.values()])
     return [
@@ -77,7 +77,7 @@ def visitation(data: BehaviorData, volume: FeatureVolume) -> UInt8[np.ndarray, "
 
 def histograms(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
     """Draw speed, distance and displacement."""
-    context, future = data.windows(data.indices(TRAIN))
+    context, future = data.windows(data.indices(TRAIN), bones=False)
     position = future.path_world
     speed = np.linalg.norm(np.diff(position, axis=1), axis=-1)[:, ::7] * RATE_HZ
     distance = np.linalg.norm((context.observer_world - context.world_from_agent[..., :3, 3])[:, -1][:, ::2], axis=-1)

@@ -134,7 +134,7 @@ def _smoothed(volume: FeatureVolume, stride: int) -> Float[np.ndarray, "x y z ch
 
 def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture, scenes: Scenes) -> Windows:
     """Express windows in the ego frame of their current time."""
-    context, future = data.windows(index)
+    context, future = data.windows(index, bones=False)
     frame = world_from_ego(context.world_from_agent[:, -1], architecture.ego)
     ego_from_world = rigid.inverse(frame)
     agent = ego_from_world[:, None] @ np.concatenate([context.world_from_agent, future.world_from_agent], axis=1)

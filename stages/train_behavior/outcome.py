@@ -30,7 +30,7 @@ def architecture_for(settings: Mapping[str, Any], data: BehaviorData, scenes: Sc
 def write_trained(folder: Path, fitted: Fitted, architecture: Architecture, rest: Float[np.ndarray, "bone 4 4"]) -> None:
     """Write weights, contract and the losses of every step."""
     export.write_contract(folder, fitted.nets.cpu(), architecture, fitted.scaling, Schedule(), rest)
-    arrays.save(folder / "losses.npz", **fitted.record.terms)
+    arrays.save(folder / "losses.npz", **{f"loss/{name}": values for name, values in fitted.record.terms.items()})
 
 
 def write_exported(folder: Path, fitted: Fitted, architecture: Architecture, data: BehaviorData, scenes: Scenes, *, seed: int) -> None:

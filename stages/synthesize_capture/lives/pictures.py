@@ -5,6 +5,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
 from pipeline import figures
+from pipeline.models.flight import flees
 from pipeline.qa import Check, Picture
 from stages.synthesize_capture.lives.approaches import Approaches
 from stages.synthesize_capture.lives.lives import RATE_HZ, Life
@@ -12,7 +13,6 @@ from stages.synthesize_capture.policy import REASONS
 
 ROOT_CELLS = slice(3, 6)
 """Levels of the volume, 0.1 to 0.4 m, at which the animal walks."""
-FLED_M = 0.8
 
 
 def pictures(lived: dict[str, Life]) -> list[Picture]:
@@ -54,11 +54,10 @@ def checks(lived: dict[str, Life], met: Approaches | None) -> list[Check]:
 
 
 def fled(met: Approaches) -> tuple[float, float]:
-    """Return in which shares of approaches, and of their twins, the animal gets 0.8 m further off within 3 s."""
-    person = met.observer[:, :, -1:]
-    away = np.linalg.norm((met.world_from_agent[..., :3, 3] - person)[..., [0, 2]], axis=-1)
-    now = met.observer.shape[2] - 1
-    flight = (away[..., now : now + 31].max(-1) - away[..., now]) > FLED_M
+    """Return in which shares of approaches, and of their twins, the animal flees."""
+    past = met.observer.shape[2]
+    root = met.world_from_agent[..., :3, 3]
+    flight = flees(root[:, :, past:], root[:, :, past - 1], met.observer[:, :, -1])
     return float(flight[0].mean()), float(flight[1].mean())
 
 

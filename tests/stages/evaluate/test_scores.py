@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.models import scores
+from pipeline.models.intervals import bootstrapped, episodes
 from pipeline.models.predictors import Samples
 from pipeline.models.trajectories import TEST, TRAIN, BehaviorData, Future, Trajectory
 from pipeline.space import rigid
@@ -11,7 +13,6 @@ from stages.evaluate import behavior, heldout, registration, surfaces
 from stages.evaluate.alignment import constant_between, pose_errors
 from stages.evaluate.figures import Figures, median, percentile
 from stages.evaluate.heldout import Shot, View
-from stages.evaluate.statistics import bootstrapped, episodes
 
 
 def poses(count, seed=0, size_m=2.0):
@@ -205,8 +206,8 @@ def test_the_energy_score_is_smallest_for_the_right_distribution():
     truth = rng.normal(0, 1, (4000, 3))
     future = Future(np.tile(np.eye(4), (4000, 1, 1, 1)), np.zeros((4000, 1, 1, 4, 4)))
     future.world_from_agent[:, 0, :3, 3] = truth
-    scores = [behavior.goal_energy_score(Samples(rng.normal(0, std, (4000, 16, 3))), future).mean() for std in (0.01, 1, 3)]
-    assert scores[1] == min(scores)
+    energy = [scores.goal_energy_score(Samples(rng.normal(0, std, (4000, 16, 3))), future).mean() for std in (0.01, 1, 3)]
+    assert energy[1] == min(energy)
 
 
 def test_intervals_widen_when_windows_repeat_each_other():

@@ -4,10 +4,10 @@ import pytest
 from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.simulator import Chaining, Frames, Simulator, blocked_share, faded
 from pipeline.space import rigid
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
-from stages.simulate.simulator import Chaining, Frames, Simulator, blocked_share, faded
 from tests.pipeline.models.wandering import ARCHITECTURE, room, wandering
 
 

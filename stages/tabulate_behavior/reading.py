@@ -1,0 +1,47 @@
+"""Reading what `score_behavior` and `train_behavior` wrote of every trial."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.files import arrays
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The scores of one method."""
+
+    goal_window: Int[np.ndarray, "window 2"]
+    """recording and first frame of the windows on which goals are judged"""
+    plan_window: Int[np.ndarray, "window 2"]
+    """the same of paths and bodies"""
+    values: dict[str, Float[np.ndarray, "seed window"]]
+    """by `<protocol>/<score>`, `recorded/solid` and `flees/<condition>`; the last per approach"""
+
+    def windows_of(self, name: str) -> Int[np.ndarray, "window 2"]:
+        """Return the windows that a score belongs to; every approach is an episode of its own."""
+        if name.startswith("flees/"):
+            count = self.values[name].shape[1]
+            return np.stack([np.arange(count), np.zeros(count, int)], axis=1)
+        return self.goal_window if name.split("/")[1].startswith("goal") else self.plan_window
+
+
+def stacked(folders: Sequence[Path]) -> Scores:
+    """Read the trials of one method, which differ in their seed. Raises InputError ART-010 when damaged."""
+    read = [arrays.load(folder / "scores.npz") for folder in folders]
+    told = [name for name in read[0] if "/" in name]
+    return Scores(read[0]["goal_window"], read[0]["plan_window"], {name: np.stack([each[name] for each in read]) for name in told})
+
+
+def curves(folders: Sequence[Path]) -> dict[str, Float[np.ndarray, "seed step"]]:
+    """Read the losses of every step of the trials of one method."""
+    read = [arrays.load(folder / "losses.npz") for folder in folders]
+    return {name.removeprefix("loss/"): np.stack([each[name] for each in read]) for name in read[0]}
+
+
+def windows(found: Mapping[str, Scores]) -> dict[str, Int[np.ndarray, "window 2"]]:
+    """Return the exact windows of every method."""
+    return {f"{method}/{kind}": getattr(scores, kind) for method, scores in found.items() for kind in ("goal_window", "plan_window")}

@@ -1,0 +1,65 @@
+"""Means over windows and seeds, with intervals drawn over both: whole episodes, and whole trainings."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.models.intervals import Interval, episodes
+from pipeline.models.trajectories import FUTURE, PAST
+from stages.tabulate_behavior.reading import Scores
+
+PLAIN = "end_to_end"
+"""Its figures carry no prefix: they are those of Table 4."""
+
+
+def figures(found: Mapping[str, Scores], ours: str, *, draws: int, seed: int) -> dict[str, float]:
+    """Return all figures with their intervals, and those of the differences to ours where windows are the same."""
+    table: dict[str, float] = {}
+    for method, scores in found.items():
+        for name, values in scores.values.items():
+            window = scores.windows_of(name)
+            _put(table, f"behavior/{method}/{_figure(name)}", interval(values, window, draws, seed))
+            rival = found[ours].values.get(name)
+            if method != ours and rival is not None and np.array_equal(window, found[ours].windows_of(name)):
+                both = min(len(rival), len(values)) if min(len(rival), len(values)) > 1 else max(len(rival), len(values))
+                less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(values[:both], (both, values.shape[1]))
+                _put(table, f"behavior/{ours}_minus_{method}/{_figure(name)}", interval(less, window, draws, seed))
+        table[f"behavior/{method}/seeds"] = len(next(iter(scores.values.values())))
+    return table
+
+
+def interval(values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], draws: int, seed: int) -> Interval:
+    """Resample seeds and episodes of 6.4 s, both with replacement, and return the mean with percentiles 2.5 and 97.5."""
+    rng = np.random.default_rng(seed)
+    episode = episodes(window[:, 1], window[:, 0], PAST + FUTURE)
+    count = episode.max() + 1
+    total = np.stack([np.bincount(episode, row, count) for row in values])
+    size = np.bincount(episode, minlength=count)
+    means = np.empty(draws)
+    for draw in range(draws):
+        chosen, drawn = rng.integers(0, count, count), rng.integers(0, len(values), len(values))
+        means[draw] = total[drawn][:, chosen].sum() / (size[chosen].sum() * len(values))
+    return Interval(float(values.mean()), *(float(bound) for bound in np.percentile(means, (2.5, 97.5))))
+
+
+def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]]) -> dict[str, float]:
+    """Return by how much of itself each loss still fell from its last but one tenth to its last: near 0 is a plateau."""
+    table = {}
+    for method, terms in curves.items():
+        for name, loss in terms.items():
+            tenth = max(loss.shape[1] // 10, 1)
+            before, last = np.nanmean(loss[:, -2 * tenth : -tenth]), np.nanmean(loss[:, -tenth:])
+            table[f"behavior/{method}/{name}_loss_last_tenth"] = float(last)
+            table[f"behavior/{method}/{name}_loss_still_falls"] = float((before - last) / abs(before))
+    return table
+
+
+def _figure(name: str) -> str:
+    return name.removeprefix(f"{PLAIN}/").replace("/", "_")
+
+
+def _put(table: dict[str, float], name: str, found: Interval) -> None:
+    table[name] = found.mean
+    table[f"{name}_ci95_low"] = found.low
+    table[f"{name}_ci95_high"] = found.high
