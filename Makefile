@@ -15,7 +15,9 @@ RUN    := $(PYTHON) -SE -m pipeline.run
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check annotate behavior-tables behavior-benchmark test doctor clean FORCE
+.PHONY: help new capture-check annotate behavior-tables behavior-benchmark export simulate extras test doctor clean FORCE
+HOME_OF := build/$(or $(AGENT),cat)
+INPUTS = $(foreach a,$1,--$(subst _,-,$a) $(HOME_OF)/$a)
 
 help:
 	@sed 's/make cat/make $(or $(AGENT),cat)/' pipeline/help.txt
@@ -43,6 +45,22 @@ annotate: .venv/.ok
 
 capture-check: .venv/.ok
 	@$(PYTHON) -m stages.check_captures captures/$(or $(AGENT),cat)
+
+# One format for another program, after the simulator; with a take of `make simulate` as one motion more.
+export: .venv/.ok
+	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).simulator
+	@$(PYTHON) -m stages.export $(call INPUTS,simulator reconstruction splats behavior_data frames masks) --format $(or $(FORMAT),glb) \
+	  $(if $(wildcard $(HOME_OF)/take/manifest.json),--take $(HOME_OF)/take) \
+	  --videos $(HOME_OF)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
+	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); what is lost stands in its export.json'
+
+# The behaviour model without a page: half a minute beside a scripted observer.
+simulate: .venv/.ok
+	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).behavior
+	@$(PYTHON) -m stages.simulate $(call INPUTS,behavior behavior_data) --out $(HOME_OF)/take
+
+extras: .venv/.ok
+	@envs/extras
 
 test: .venv/.ok
 	@$(PYTHON) -m pytest tests

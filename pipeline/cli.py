@@ -9,6 +9,7 @@ import dataclasses
 import errno
 import os
 import sys
+import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -99,15 +100,20 @@ def enter(
     config: type,
     reads: tuple[str, ...] = (),
     optional: tuple[str, ...] = (),
+    options: tuple[str, ...] = (),
 ) -> None:
     """Run a stage program: parse the command line, build its `Task`, run it, and exit.
 
-    `doc` is the front's docstring and becomes `--help`; `reads` and `optional` name its inputs.
+    `doc` is the front's docstring and becomes `--help`; `reads` and `optional` name its inputs,
+    `options` those fields of its configuration that the command line may set as well.
     """
-    given = _parser(doc, reads, optional).parse_args()
+    parser = _parser(doc, reads, optional)
+    for name in options:
+        _add_option(parser, name, typing.get_type_hints(config)[name])
+    given = parser.parse_args()
     stage = Path(sys.argv[0]).parent.name
     try:
-        run(_task(given, stage, config, reads + optional))
+        run(_task(given, stage, config, reads + optional, options))
     except InputError as error:
         sys.exit(_told(error))
     except OSError as error:
@@ -138,6 +144,16 @@ def _parser(doc: str, reads: tuple[str, ...], optional: tuple[str, ...]) -> argp
     return parser
 
 
+def _add_option(parser: argparse.ArgumentParser, name: str, hint: Any) -> None:
+    option, told = f"--{name.replace('_', '-')}", f"the setting `{name}`"
+    if hint is bool:
+        parser.add_argument(option, dest=name, action="store_true", default=None, help=told)
+    elif typing.get_origin(hint) is typing.Literal:
+        parser.add_argument(option, dest=name, choices=typing.get_args(hint), help=told)
+    else:
+        parser.add_argument(option, dest=name, type=hint, metavar=hint.__name__.upper(), help=told)
+
+
 def _what(name: str) -> str:
     if name not in dag.NODES:
         return f"path of the {name}"
@@ -146,11 +162,13 @@ def _what(name: str) -> str:
     return f"finished artifact `{name}`{several}"
 
 
-def _task(given: argparse.Namespace, stage: str, config: type, names: tuple[str, ...]) -> Task:
+def _task(given: argparse.Namespace, stage: str, config: type, names: tuple[str, ...], options: tuple[str, ...]) -> Task:
     _limit_threads(given.threads)
+    table = configuration.read_table(given.config) if given.config else {}
+    table |= {name: value for name in options if (value := getattr(given, name)) is not None}
     return Task(
         stage=stage,
-        config=configuration.load(config, given.config) if given.config else config(),
+        config=configuration.from_table(config, table, where=str(given.config or stage)),
         out=given.out,
         video=given.video,
         videos=videos.read(given.videos) if given.videos else (),

@@ -141,7 +141,7 @@ def test_the_declaration_fits_the_program(node):
 
 def test_every_room_is_in_the_flow():
     """Every stage program has its place in the declaration; these stand beside it."""
-    assert {stage_of(path) for path in FRONTS} == {node.stage for node in dag.FLOW} | {"simulate", "check_captures", "annotate"}
+    assert {stage_of(path) for path in FRONTS} == {node.stage for node in dag.FLOW} | {"simulate", "check_captures", "annotate", "export"}
 
 
 def test_truth_is_for_evaluate_alone():

@@ -155,3 +155,53 @@ def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "v
 
 def _floats(values: np.ndarray) -> list[float]:
     return [float(value) for value in values]
+
+
+def read_static(data: bytes) -> Mesh:
+    """Read back what `static` made."""
+    document = _Opened(data)
+    return document.mesh()
+
+
+def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
+    """Read back what `skinned` made: colours to a level of 255, everything else to float32."""
+    document = _Opened(data)
+    attributes = document.file.meshes[0].primitives[0].attributes
+    table = document.file.skins[0]
+    matrices = document.values(table.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
+    names = tuple(document.file.nodes[joint].name for joint in table.joints)
+    skin = Skin(document.values(attributes.JOINTS_0), document.values(attributes.WEIGHTS_0), rigid.inverse(matrices), names)
+    return document.mesh(), skin, [document.action(animation, len(names)) for animation in document.file.animations]
+
+
+class _Opened:
+    """A glTF document that is read."""
+
+    def __init__(self, data: bytes) -> None:
+        self.file = gltf.GLTF2.load_from_bytes(data)
+        self.blob = self.file.binary_blob()
+
+    def values(self, index: int) -> np.ndarray:
+        accessor = self.file.accessors[index]
+        kind = {_FLOAT: "<f4", _U8: "u1", _U32: "<u4"}[accessor.componentType]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]
+        start = self.file.bufferViews[accessor.bufferView].byteOffset
+        return np.frombuffer(self.blob, kind, accessor.count * width, start).reshape(accessor.count, -1)
+
+    def mesh(self) -> Mesh:
+        primitive = self.file.meshes[0].primitives[0]
+        color = None
+        if primitive.attributes.COLOR_0 is not None:
+            linear = self.values(primitive.attributes.COLOR_0)[:, :3].astype(np.float64)
+            srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055)
+            color = np.rint(255 * srgb).astype(np.uint8)
+        faces = self.values(primitive.indices).reshape(-1, 3).astype(np.int32)
+        return Mesh(self.values(primitive.attributes.POSITION).copy(), faces, color)
+
+    def action(self, animation: gltf.Animation, bones: int) -> Action:
+        """Channels stand in the order in which `_Document.animation` writes them."""
+        outputs = [self.values(sampler.output) for sampler in animation.samplers]
+        places, turns = np.stack(outputs[::2], 1), np.roll(np.stack(outputs[1::2], 1), 1, axis=-1)
+        poses = rigid.make(rigid.rotation_from_quaternion(turns.astype(np.float64)), places.astype(np.float64))
+        assert poses.shape[1] == 1 + bones, poses.shape
+        return Action(animation.name, self.values(animation.samplers[0].input).ravel().astype(np.float64), poses[:, 0], poses[:, 1:])

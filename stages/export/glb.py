@@ -1,0 +1,22 @@
+"""glTF binary: the skinned animal with all motions as named actions, and the room."""
+
+import io
+from pathlib import Path
+
+import trimesh
+
+from pipeline.files import glb
+from stages.export.reading import Agent
+from stages.export.writing import Told, version
+
+
+def write(folder: Path, agent: Agent, scene: bytes) -> Told:
+    """Write `agent.glb` and `scene.glb`."""
+    data = glb.skinned(agent.mesh, agent.skin, agent.actions)
+    (folder / "agent.glb").write_bytes(data)
+    (folder / "scene.glb").write_bytes(scene)
+    for content in (data, scene):
+        opened = trimesh.load(io.BytesIO(content), file_type="glb")
+        assert len(opened.geometry) == 1, "one surface a file"
+    loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()}
+    return Told(version("pygltflib"), loss, version("trimesh"), "metres, +y up; joints are siblings under one root; one action per motion")

@@ -1,0 +1,148 @@
+"""Open what is exported: the skinned animal with its motions, sessions frame by frame, pictures with their cameras."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.files import arrays, images
+from pipeline.files import glb as gltf
+from pipeline.files.glb import Action, Skin
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh
+
+_COLUMNS = 62
+
+
+@dataclass(frozen=True)
+class Agent:
+    """The skinned animal, agent frame, metres; its motions, named."""
+
+    mesh: Mesh
+    skin: Skin
+    actions: list[Action]
+    skinning_loss_mm: dict[str, float]
+    """four linear weights against the reconstruction's dual quaternions"""
+
+
+@dataclass(frozen=True)
+class Session:
+    """One recording, frame by frame, as reconstructed."""
+
+    video: str
+    timestamp_s: Float[np.ndarray, " frame"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    """NaN where the animal was never recoverable"""
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+    confidence: Float[np.ndarray, " frame"]
+    visible: Bool[np.ndarray, " frame"]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture and its camera (OpenCV axes); files are read when they are written."""
+
+    video: str
+    index: int
+    world_from_camera: Float[np.ndarray, "4 4"]
+    intrinsics: Float[np.ndarray, "3 3"]
+    frames: Path
+    masks: Path | None
+
+    @property
+    def name(self) -> str:
+        """File name without ending, unique among all recordings."""
+        return f"{self.video}_{self.index:06d}"
+
+    @property
+    def jpeg(self) -> bytes:
+        """The picture as it is stored."""
+        return (self.frames / f"color/{self.index:06d}.jpg").read_bytes()
+
+    @property
+    def depth(self) -> Float[np.ndarray, "height width"]:
+        """Metres along z, 0 where unknown."""
+        return images.read_depth(self.frames / f"depth/{self.index:06d}.exr")
+
+    @property
+    def agent_mask(self) -> UInt8[np.ndarray, "height width"] | None:
+        """255 where the animal is or may be; None where there is no animal to mask."""
+        if self.masks is None:
+            return None
+        return np.where(images.read_gray(self.masks / f"{self.index:06d}.png") > 0, 255, 0).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Which voxels of the room are solid."""
+
+    solid: Bool[np.ndarray, "x y z"]
+    origin: Float[np.ndarray, "3"]
+    voxel_m: float
+
+
+def agent(simulator: Path, take: Path | None, rate_hz: float) -> Agent:
+    """Read the animal from `agent.glb`; a generated take becomes one motion more. Keys are resampled to `rate_hz`."""
+    mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
+    if take:
+        made = arrays.load(take, ("timestamp_s", "world_from_agent", "agent_from_bone"))
+        actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in made))]
+    about = json.loads((simulator / "simulator.json").read_bytes())
+    return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], about["agent"]["skinning_residual_mm"])
+
+
+def room(simulator: Path) -> Mesh:
+    """Read the room's surface, world frame."""
+    return gltf.read_static((simulator / "scene.glb").read_bytes())
+
+
+def sessions(reconstruction: Path) -> list[Session]:
+    """Read every session's motion, in id order."""
+    found = []
+    for file in sorted(reconstruction.glob("*/motion.npz")):
+        table = arrays.load(file)
+        keys = ("timestamp_s", "world_from_agent", "world_from_camera", "agent_from_bone", "confidence", "agent_visible")
+        found.append(Session(file.parent.name, *(table[key] for key in keys)))
+    return found
+
+
+def shots(reconstruction: Path, frames: dict[str, Path], masks: dict[str, Path], per_video: int) -> list[Shot]:
+    """Choose frames with a known camera from the walk-through and all sessions, evenly spread over each."""
+    found = []
+    for video, folder in frames.items():
+        motion = reconstruction / video / "motion.npz"
+        motion = motion if motion.exists() else reconstruction / "templates" / f"{video}.npz"
+        if not motion.exists() or (video in masks and motion.parent.name == "templates"):  # the turnaround has a world of its own
+            continue
+        cameras = arrays.load(motion, ("world_from_camera",))["world_from_camera"]
+        intrinsics = arrays.load(folder / "frames.npz", ("intrinsics",))["intrinsics"]
+        known = np.flatnonzero(np.isfinite(cameras).all((1, 2)))
+        chosen = known[np.unique(np.linspace(0, len(known) - 1, min(per_video, len(known))).round().astype(int))] if len(known) else known
+        found += [Shot(video, int(i), cameras[i], intrinsics[i], folder, masks.get(video)) for i in chosen]
+    return found
+
+
+def occupancy(behavior_data: Path) -> Occupancy:
+    """Read the room's solid voxels."""
+    volume = arrays.load(behavior_data / "volume.npz", ("occupancy", "origin", "voxel_m"))
+    return Occupancy(volume["occupancy"] == 1, volume["origin"], float(volume["voxel_m"]))
+
+
+def gaussians(splats: Path) -> dict[str, Float[np.ndarray, "point 62"]]:
+    """Read both clouds as standard rows."""
+    rows = {}
+    for name in ("scene", "agent"):
+        _, _, data = (splats / f"{name}.ply").read_bytes().partition(b"end_header\n")
+        rows[name] = np.frombuffer(data, "<f4").reshape(-1, _COLUMNS)
+    return rows
+
+
+def _resampled(action: Action, rate_hz: float) -> Action:
+    count = int(np.floor((action.time_s[-1] - action.time_s[0]) * rate_hz + 1e-4)) + 1
+    query_s = np.minimum(action.time_s[0] + np.arange(count) / rate_hz, action.time_s[-1])
+    bones = [rigid.interpolate(action.time_s, action.agent_from_bone[:, b], query_s) for b in range(action.agent_from_bone.shape[1])]
+    root = rigid.interpolate(action.time_s, action.world_from_agent, query_s)
+    return Action(action.name, query_s - query_s[0], root, np.stack(bones, 1))

@@ -1,0 +1,24 @@
+"""3D Gaussian files: 62 floats (248 bytes) a row, opacity as logit, scale as natural log, rotation wxyz."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.models import gaussians
+from stages.export.writing import Told
+
+_OPACITY, _ROTATION = 54, slice(58, 62)
+
+
+def write(folder: Path, clouds: dict[str, Float[np.ndarray, "point 62"]]) -> Told:
+    """Write `scene.ply` (world frame) and `agent.ply` (agent frame, at rest) without broken and invisible rows."""
+    for name, rows in clouds.items():
+        opacity = 1 / (1 + np.exp(-rows[:, _OPACITY].astype(np.float64)))
+        kept = rows[np.isfinite(rows).all(1) & (opacity >= 1 / 255)].copy()
+        kept[:, _ROTATION] /= np.linalg.norm(kept[:, _ROTATION], axis=1, keepdims=True)
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(kept)}"]
+        head += [*(f"property float {column}" for column in gaussians.COLUMNS), "end_header", ""]
+        (folder / f"{name}.ply").write_bytes("\n".join(head).encode() + kept.astype("<f4").tobytes())
+        assert len(gaussians.load_ply(folder / f"{name}.ply")) == len(kept)
+    return Told("own writer", {}, "the project's own reader; the layout is that of the 3DGS reference viewer", "metres, +y up")

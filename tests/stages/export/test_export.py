@@ -1,0 +1,213 @@
+"""Exports keep what they promise: motion, places and units survive in every format."""
+
+import importlib
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.files import arrays, glb, images
+from pipeline.files.glb import Action, Skin
+from pipeline.space import rigid
+from stages.export import bvh, cameras, mjcf, neuro, reading, splats, tables, usd, writing
+from stages.export import glb as glb_export
+from tests.stages.export_simulator import small_world
+
+RNG = np.random.default_rng(0)
+WEB = Path(__file__).parents[3] / "stages/export_simulator/web"
+
+
+@pytest.fixture(scope="module")
+def agent() -> reading.Agent:
+    """A tube of five bones with two motions."""
+    mesh, weights = small_world.tube()
+    joints = np.argsort(-weights, 1)[:, :4]
+    heaviest = np.take_along_axis(weights, joints, 1)
+    skin = Skin(
+        joints.astype(np.uint8),
+        (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32),
+        small_world.rest(),
+        tuple(f"bone_{bone:02d}" for bone in range(small_world.BONES)),
+    )
+    actions = [
+        Action(name, track.timestamp_s, track.world_from_agent, track.agent_from_bone.astype(np.float64))
+        for name, track in (("walk", small_world.trajectory(20, 0)), ("turn", small_world.trajectory(12, 1)))
+    ]
+    return reading.Agent(mesh, skin, actions, {"mean": 0.1, "max": 0.5})
+
+
+@pytest.fixture
+def session() -> reading.Session:
+    track = small_world.trajectory(15, 0)
+    agent = track.world_from_agent.copy()
+    agent[4] = np.nan
+    return reading.Session(
+        "v002", track.timestamp_s, agent, track.world_from_camera, track.agent_from_bone, np.full(15, 0.9), np.isfinite(agent).all((1, 2))
+    )
+
+
+def test_glb_comes_back_as_it_was(agent: reading.Agent) -> None:
+    mesh, skin, actions = glb.read_skinned(glb.skinned(agent.mesh, agent.skin, agent.actions))
+    np.testing.assert_array_equal(mesh.faces, agent.mesh.faces)
+    np.testing.assert_array_equal(mesh.color, agent.mesh.color)
+    np.testing.assert_array_equal(skin.joints, agent.skin.joints)
+    np.testing.assert_allclose(skin.agent_from_bone_rest, agent.skin.agent_from_bone_rest, atol=1e-6)
+    for found, truth in zip(actions, agent.actions, strict=True):
+        np.testing.assert_allclose(found.world_from_agent, truth.world_from_agent, atol=1e-6)
+        np.testing.assert_allclose(found.agent_from_bone, truth.agent_from_bone, atol=1e-6)
+    still = glb.read_static(glb.static(agent.mesh, "tube"))
+    np.testing.assert_array_equal(still.vertices, agent.mesh.vertices)
+
+
+def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
+    told = glb_export.write(tmp_path, agent, glb.static(small_world.room(), "scene"))
+    assert told.loss_mm == {"skinning_mean": 0.1, "skinning_max": 0.5}
+    if shutil.which("node") is None or not (WEB / "node_modules/gltf-validator").is_dir():
+        pytest.skip("needs node, and `npm ci` in stages/export_simulator/web")
+    script = (
+        "import v from 'gltf-validator'; import fs from 'fs';"
+        "for (const f of process.argv.slice(1)) {const r = await v.validateBytes(new Uint8Array(fs.readFileSync(f)));"
+        "console.log(JSON.stringify([r.issues.numErrors, r.issues.numWarnings, r.info.animationCount]))}"
+    )
+    files = [str(tmp_path / name) for name in ("agent.glb", "scene.glb")]
+    told_by_node = subprocess.run(
+        ["node", "--input-type=module", "-e", script, *files], cwd=WEB, capture_output=True, text=True, check=True
+    )
+    assert [json.loads(line) for line in told_by_node.stdout.splitlines()] == [[0, 0, 2], [0, 0, 0]]
+
+
+def test_flat_bvh_is_exact_and_its_tree_says_what_is_lost(agent: reading.Agent, tmp_path: Path) -> None:
+    told = bvh.write(tmp_path, agent)
+    assert told.loss_mm["flat_max"] < 0.01, "mm: six decimals"
+    assert told.loss_mm["flat_max"] < told.loss_mm["tree_mean"] < 40
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{kind}.bvh" for name in ("walk", "turn") for kind in ("flat", "tree")}
+
+
+def test_true_tree_loses_nothing(tmp_path: Path) -> None:
+    """A chain that truly turns about four pivots is found again."""
+    rest = small_world.rest()
+    pivots = (rest[1:, :3, 3] + rest[:-1, :3, 3]) / 2
+    motion = np.tile(np.eye(4), (60, 5, 1, 1))
+    for bone in range(1, 5):
+        turn = rigid.rotation_from_vector(RNG.normal(0, 0.4, (60, 3)))
+        about = rigid.make(turn, pivots[bone - 1] - turn @ pivots[bone - 1])
+        motion[:, bone] = motion[:, bone - 1] @ about
+    action = Action("bend", np.arange(60) / 10, small_world.trajectory(60, 2).world_from_agent, motion @ rest)
+    told = bvh.write(tmp_path, reading.Agent(mesh=None, skin=_skin(rest), actions=[action], skinning_loss_mm={}))
+    assert told.loss_mm["tree_max"] < 0.5, "mm"
+
+
+def _skin(rest: np.ndarray) -> Skin:
+    return Skin(np.zeros((0, 4), np.uint8), np.zeros((0, 4), np.float32), rest, tuple(f"b{bone}" for bone in range(len(rest))))
+
+
+def test_boxes_cover_what_is_solid_and_nothing_else() -> None:
+    solid = RNG.random((9, 7, 8)) < 0.4
+    solid[2:6, 1:4, 2:7] = True
+    found = mjcf.boxes(solid)
+    count = np.zeros(solid.shape, int)
+    for low, high in found:
+        count[tuple(slice(*pair) for pair in zip(low, high, strict=True))] += 1
+    np.testing.assert_array_equal(count, solid.astype(int))
+    assert len(found) < solid.sum()
+
+
+def test_splats_are_248_bytes_and_sound(tmp_path: Path) -> None:
+    rows = np.zeros((4, 62), np.float32)
+    rows[:, 58], rows[1, 0], rows[2, 54] = 2.0, np.nan, -9
+    told = splats.write(tmp_path, {"scene": rows, "agent": rows})
+    head, _, body = (tmp_path / "scene.ply").read_bytes().partition(b"end_header\n")
+    assert len(body) == 2 * 248 and b"element vertex 2" in head and told.loss_mm == {}
+    np.testing.assert_array_equal(np.frombuffer(body, "<f4").reshape(-1, 62)[:, 58], 1)
+
+
+def test_rows_of_a_session(session: reading.Session) -> None:
+    table = dict(zip(tables.COLUMNS, tables.rows(session).T, strict=True))
+    assert table["in_view"].sum() == 14 and np.isnan(table["x"][4]) and np.isnan(table["qw"][4])
+    np.testing.assert_allclose(table["speed_m_s"][7:], 0.6, atol=0.01, err_msg="1.2 m radius at 0.5 rad/s")
+    assert np.allclose(table["distance_m"][0], np.hypot(1.0, 0.0), atol=1e-6)
+
+
+@pytest.fixture
+def shots(tmp_path: Path) -> list[reading.Shot]:
+    """Three pictures of a session and one of the walk-through, with depth and masks."""
+    track = small_world.trajectory(3, 0)
+    for video, count in (("v000", 1), ("v002", 3)):
+        for name in ("color", "depth"):
+            (tmp_path / "frames" / video / name).mkdir(parents=True)
+        for index in range(count):
+            images.write_color(tmp_path / f"frames/{video}/color/{index:06d}.jpg", np.full((24, 32, 3), 120, np.uint8))
+            images.write_depth(tmp_path / f"frames/{video}/depth/{index:06d}.exr", np.full((12, 16), 1.234, np.float32))
+        camera = np.tile(np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), (count, 1, 1))
+        arrays.save(tmp_path / f"frames/{video}/frames.npz", intrinsics=camera)
+        motion = tmp_path / "reconstruction" / ("templates" if video == "v000" else video)
+        motion.mkdir(parents=True)
+        cameras_of = track.world_from_camera[:count].copy()
+        cameras_of[2:] = np.nan
+        arrays.save(motion / ("v000.npz" if video == "v000" else "motion.npz"), world_from_camera=cameras_of)
+    (tmp_path / "masks/v002").mkdir(parents=True)
+    for index in range(3):
+        images.write_gray(tmp_path / f"masks/v002/{index:06d}.png", np.pad(np.full((4, 4), 255, np.uint8), ((0, 20), (0, 28))))
+    frames = {video: tmp_path / "frames" / video for video in ("v000", "v002")}
+    return reading.shots(tmp_path / "reconstruction", frames, {"v002": tmp_path / "masks/v002"}, 10)
+
+
+def test_pictures_keep_their_cameras(shots: list[reading.Shot], tmp_path: Path) -> None:
+    assert [shot.name for shot in shots] == ["v000_000000", "v002_000000", "v002_000001"], "a camera that is unknown is left out"
+    for name in ("colmap", "nerfstudio"):
+        (tmp_path / name).mkdir()
+    told = cameras.write_colmap(tmp_path / "colmap", shots, small_world.room(), 50)
+    assert told.loss_mm["camera_places"] < 0.01, "mm"
+    cameras.write_nerfstudio(tmp_path / "nerfstudio", shots, small_world.room(), 50)
+    frame = json.loads((tmp_path / "nerfstudio/transforms.json").read_bytes())["frames"][1]
+    seen = np.linalg.inv(frame["transform_matrix"]) @ shots[1].world_from_camera @ np.array([0.1, 0.2, 1.0, 1.0])
+    np.testing.assert_allclose(seen[:3], [0.1, -0.2, -1.0], atol=1e-9, err_msg="OpenGL looks along -z, y is up")
+    mask = images.read_gray(tmp_path / "nerfstudio" / frame["mask_path"])
+    assert mask[0, 0] == 0 and mask[-1, -1] == 255
+
+
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", refuse)
+    with pytest.raises(InputError, match="make extras") as told:
+        writing.extra("pxr.Usd", "usd-core")
+    assert told.value.code == "EXP-010"
+
+
+def test_usd_opens_where_joints_belong(agent: reading.Agent, tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    assert usd.write(tmp_path, agent, small_world.room()).loss_mm["joints"] < 0.01, "mm"
+
+
+def test_mjcf_compiles_and_moves(agent: reading.Agent, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    occupancy = reading.Occupancy(np.pad(np.ones((20, 1, 20), bool), ((0, 0), (0, 5), (0, 0))), np.array([-1.0, -0.1, -1]), 0.1)
+    assert mjcf.write(tmp_path, agent, occupancy).loss_mm["bodies"] < 0.01, "mm"
+
+
+def test_science_reads_the_sessions_back(session: reading.Session, tmp_path: Path) -> None:
+    pytest.importorskip("h5netcdf")
+    pytest.importorskip("pynwb")
+    pytest.importorskip("pyarrow")
+    assert neuro.write_movement(tmp_path, [session]).loss_mm["largest"] < 1e-6, "mm"
+    assert neuro.write_nwb(tmp_path, [session]).loss_mm["largest"] < 1e-6, "mm"
+    tables.write(tmp_path, [session])
+    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 16
+
+
+def test_extras_agree_with_the_locks_and_hold_no_torch() -> None:
+    envs = Path(__file__).parents[3] / "envs"
+
+    def pinned(name: str) -> dict[str, str]:
+        lines = (line.split()[0].split("==") for line in (envs / name).read_text().splitlines() if "==" in line)
+        return {package: version for package, version in lines}
+
+    extras, core = pinned("extras.txt"), pinned("cuda.txt")
+    assert not {"torch", "torchvision", "triton"} & set(extras)
+    assert {package for package in extras if package in core and core[package] != extras[package]} == set()
