@@ -227,7 +227,7 @@ class Perception(nn.Module):
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
-        return self._joined(self.scene(scene_grid), observer_past, self.past(past), keep)
+        return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
 
     def training_code(
         self,
@@ -238,9 +238,9 @@ class Perception(nn.Module):
         bones_keep: Float[Tensor, "batch"],
     ) -> Float[Tensor, "batch condition"]:
         """Return the code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides remembered bones."""
-        return self._joined(self.scene.encode(pooled), observer_past, self.past(past, bones_keep), keep)
+        return self.join(self.scene.encode(pooled), observer_past, self.past(past, bones_keep), keep)
 
-    def _joined(
+    def join(
         self,
         scene: Float[Tensor, "batch code"],
         observer_past: Float[Tensor, "batch frame*3"],

@@ -86,7 +86,8 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
     """Train perception and goal network, briefly, to run from whoever is near; path network to go straight; the body only at random."""
     torch.manual_seed(0)
     nets, schedule = BehaviorNets(architecture), Schedule()
-    optimizer = torch.optim.Adam([*nets.perception.observer.parameters(), *nets.goal.parameters()], 3e-3)
+    (mind,) = nets.perception
+    optimizer = torch.optim.Adam([*mind.observer.parameters(), *nets.goal.parameters()], 3e-3)
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
         place = (torch.rand(128, 1, 3) * 2 - 1) * torch.tensor([3.0, 0.3, 3.0]) + torch.tensor([0.0, 1.2, 0.0])
@@ -96,7 +97,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
-        condition = nets.perception.join(elsewhere[0], observer.flatten(1), elsewhere[1], torch.ones(128, 3))
+        condition = mind.join(elsewhere[0], observer.flatten(1), elsewhere[1], torch.ones(128, 3))
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
         loss = (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise).square().mean()
@@ -160,7 +161,9 @@ def write(build: Path) -> None:
         origin=np.array([-2.2, -0.2, -2.2]),
         voxel_m=np.array(0.1),
     )
-    architecture = Architecture(bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1,), goal_hidden=64)
+    architecture = Architecture(
+        bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1,), goal_hidden=64, minds=1
+    )
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
