@@ -1,9 +1,9 @@
 """Localizers: one picture with depth -> where the camera is, relative to a map (the scene, or the agent).
 
-A bank holds patches of many rendered views: a descriptor and the point of the map under it. A query's
-patches find their nearest neighbours, and depth turns the matches into one rigid motion (RANSAC over
-closed forms); the share of patches that agree is calibrated to a probability. `load` opens a trained
-localizer, `Localizer.localize` answers. Views of the agent are brought to one scale by their depth.
+Three kinds answer: a bank of patches of rendered views, a network that tells each patch its point of
+the map (both solved by RANSAC over closed forms, since depth is there), and the paper's regressor of
+poses. The share of patches that agree is calibrated to a probability. `load` opens a trained
+localizer, `Localizer.localize` answers.
 """
 
 import json
@@ -11,29 +11,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, assert_never
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from safetensors.numpy import load_file, save_file
 
-from pipeline.space import align, cameras, rigid
+from pipeline.models.patch_bank import Bank
+from pipeline.models.pose_regressor import PoseNet
+from pipeline.models.scene_coordinates import CoordinateNet
+from pipeline.models.sight import Basis, Patches, Sight, see
+from pipeline.space import align, rigid
 
-Target = Literal["scene", "agent"]
-
-
-@dataclass(frozen=True)
-class Sight:
-    """How pictures are brought to the bank's scale and described."""
-
-    target: Target
-    focal_px: float
-    """Scene: pictures are resized to this focal length, pixels. Agent: crops are resized to so many pixels a metre."""
-    window_px: int
-    """Agent: edge of the square crop, pixels; scene: unused."""
-    stride_px: int
-    """Distance between patches in the resized picture, pixels."""
-    radii_px: tuple[int, ...]
-    """Radii of the DAISY descriptors that are concatenated, pixels."""
+Kind = Literal["bank", "coordinates", "regression"]
 
 
 @dataclass(frozen=True)
@@ -51,34 +39,13 @@ class Calibration:
 
 
 @dataclass(frozen=True)
-class Patches:
-    """Patches of one picture: descriptors and what is known of the points under them."""
-
-    descriptors: Float[np.ndarray, "patch channel"]
-    points_camera: Float[np.ndarray, "patch 3"]
-
-
-@dataclass(frozen=True)
-class Bank:
-    """All patches of all rendered views."""
-
-    descriptors: Float[np.ndarray, "patch 64"]
-    points_map: Float[np.ndarray, "patch 3"]
-    view: Int[np.ndarray, "patch"]
-    map_from_camera: Float[np.ndarray, "view 4 4"]
-    mean: Float[np.ndarray, "channel"]
-    components: Float[np.ndarray, "64 channel"]
-
-
-@dataclass(frozen=True)
 class Hypothesis:
     """One answer: the camera in the map, and how far to trust it."""
 
     map_from_camera: Float[np.ndarray, "4 4"]
     inlier_ratio: float
+    """Share of the patches that agree; of a regressed pose its own certainty, 0..1."""
     probability: float
-    nearest_view: int
-    """The bank's view that most of the agreeing patches come from."""
     points_map: Float[np.ndarray, "inlier 3"]
     points_camera: Float[np.ndarray, "inlier 3"]
 
@@ -88,93 +55,10 @@ class Hypothesis:
         return self.map_from_camera
 
 
-def describe(
-    picture: UInt8[np.ndarray, "height width 3"], sight: Sight
-) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
-    """Return DAISY descriptors on the grid of a resized picture and the pixels of their centres (Tola et al. 2010)."""
-    gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    offset = sight.stride_px // 2
-    y, x = np.mgrid[offset : gray.shape[0] : sight.stride_px, offset : gray.shape[1] : sight.stride_px]
-    pixel = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float32)
-    keypoints = [cv2.KeyPoint(float(column), float(row), 8) for column, row in pixel]
-    parts = [
-        cv2.xfeatures2d.DAISY_create(radius, 2, 6, 8, cv2.xfeatures2d.DAISY_NRM_PARTIAL).compute(gray, keypoints)[1]
-        for radius in sight.radii_px
-    ]
-    return np.concatenate(parts, axis=1), pixel + 0.5
-
-
-def see(
-    color: UInt8[np.ndarray, "height width 3"],
-    depth: Float[np.ndarray, "depth_height depth_width"],
-    depth_intrinsics: Float[np.ndarray, "3 3"],
-    intrinsics: Float[np.ndarray, "3 3"],
-    mask: Bool[np.ndarray, "height width"] | None,
-    sight: Sight,
-) -> Patches | None:
-    """Describe one picture at the bank's scale. The mask says where the target is; None means everywhere. None: too
-    little is seen.
-    """
-    match sight.target:
-        case "scene":
-            scale = sight.focal_px / intrinsics[0, 0]
-            size = (round(color.shape[1] * scale), round(color.shape[0] * scale))
-            picture, origin = cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.zeros(2)
-        case "agent":
-            crop = _crop(color, depth, depth_intrinsics, intrinsics, mask, sight)
-            if crop is None:
-                return None
-            picture, origin, scale = crop
-        case _:
-            assert_never(sight.target)
-    descriptors, pixel = describe(picture, sight)
-    pixel = pixel / scale + origin
-    points = _lift(pixel, depth, depth_intrinsics, intrinsics)
-    known = points[:, 2] > 0.1
-    if mask is not None:
-        column, row = np.clip(pixel.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        known &= mask[row, column] & (pixel >= 0).all(1) & (pixel < mask.shape[::-1]).all(1)
-    return Patches(descriptors[known], points[known]) if known.sum() >= 6 else None
-
-
-def _crop(color, depth, depth_intrinsics, intrinsics, mask, sight):
-    """Cut a square of fixed size in metres around the mask, grey outside it; None without depth in the mask."""
-    row, column = np.nonzero(mask)
-    if len(row) < 30:
-        return None
-    points = _lift(np.stack([column, row], 1)[:: max(1, len(row) // 400)] + 0.5, depth, depth_intrinsics, intrinsics)
-    known = points[:, 2] > 0.1
-    if known.sum() < 10:
-        return None
-    scale = sight.focal_px * float(np.median(points[known, 2])) / intrinsics[0, 0]
-    half = sight.window_px / 2 / scale
-    origin = np.array([(column.min() + column.max() + 1) / 2, (row.min() + row.max() + 1) / 2]) - half
-    warp = np.array([[scale, 0, -origin[0] * scale], [0, scale, -origin[1] * scale]])
-    filled = np.where(mask[..., None], color, np.uint8(128))
-    return (
-        cv2.warpAffine(filled, warp, (sight.window_px, sight.window_px), flags=cv2.INTER_LINEAR, borderValue=(128, 128, 128)),
-        origin,
-        scale,
-    )
-
-
-def _lift(pixel, depth, depth_intrinsics, intrinsics):
-    """Lift colour pixels to camera axes by the depth image, whose camera is the same; z = 0 where depth is unknown."""
-    ray = cameras.unproject(pixel, intrinsics)
-    target, _ = cameras.project(ray, depth_intrinsics)
-    column, row = np.floor(target).astype(int).T
-    inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
-    z = np.where(inside, depth[np.clip(row, 0, depth.shape[0] - 1), np.clip(column, 0, depth.shape[1] - 1)], 0)
-    return ray * z[:, None]
-
-
 @dataclass(frozen=True)
-class Localizer:
-    """A bank of patches and how to query it."""
+class Solver:
+    """How matches of patches become one motion."""
 
-    sight: Sight
-    bank: Bank
-    calibration: Calibration
     threshold_m: float
     """Patches within this of their match agree, metres."""
     spread_m: float
@@ -182,7 +66,18 @@ class Localizer:
     iterations: int
     """RANSAC triplets."""
     sectors: int
-    """Agent: the bank is asked once per sector of azimuth, so that front and back both answer."""
+    """Agent: a bank is asked once per sector of azimuth, so that front and back both answer."""
+
+
+@dataclass(frozen=True)
+class Localizer:
+    """What was learnt of a map, and how to query it."""
+
+    sight: Sight
+    basis: Basis
+    model: Bank | CoordinateNet | PoseNet
+    calibration: Calibration
+    solver: Solver
 
     def localize(
         self,
@@ -198,53 +93,44 @@ class Localizer:
 
     def match(self, patches: Patches) -> list[Hypothesis]:
         """Answer for patches that are described already."""
-        query = project(patches.descriptors, self.bank)
-        hypotheses = [self._answer(query, patches, part) for part in self._parts()]
-        return sorted((found for found in hypotheses if found is not None), key=lambda found: -found.inlier_ratio)
+        query = self.basis.project(patches.descriptors)
+        match self.model:
+            case Bank() as bank:
+                parts = [None] if self.sight.target == "scene" else bank.sectors(self.solver.sectors)
+                answers = [self._solve(patches, *bank.correspond(query, part)) for part in parts if part is None or len(part) >= 6]
+            case CoordinateNet() as net:
+                answers = [self._solve(patches, *net.correspond(query))]
+            case PoseNet() as net:
+                answers = [self._regressed(patches, *net.answer(query, patches.cell, self._anchor(patches)))]
+            case _:
+                assert_never(self.model)
+        return sorted((found for found in answers if found is not None), key=lambda found: -found.inlier_ratio)
 
-    def _parts(self) -> list[slice | Int[np.ndarray, "patch"]]:
-        if self.sight.target == "scene":
-            return [slice(None)]
-        forward = self.bank.map_from_camera[:, :3, 3]
-        sector = np.floor((np.arctan2(forward[:, 0], forward[:, 2]) / (2 * np.pi) + 0.5) * self.sectors).astype(int) % self.sectors
-        return [np.flatnonzero(sector[self.bank.view] == index) for index in range(self.sectors)]
-
-    def _answer(self, query, patches, part) -> Hypothesis | None:
-        descriptors, points, view = self.bank.descriptors[part], self.bank.points_map[part], self.bank.view[part]
-        if len(view) < 6:
-            return None
-        similarity = query @ descriptors.T
-        nearest = similarity.argmax(1)
-        weight = np.clip(similarity[np.arange(len(query)), nearest], 0.05, 1).astype(float)
-        matched = points[nearest].astype(float)
+    def _solve(self, patches, matched, weight) -> Hypothesis | None:
+        solver = self.solver
         map_from_camera, inlier = align.ransac_rigid(
             patches.points_camera,
             matched,
-            threshold_m=self.threshold_m,
-            iterations=self.iterations,
+            threshold_m=solver.threshold_m,
+            iterations=solver.iterations,
             rng=np.random.default_rng(0),
-            weights=weight**2,
-            spread_m=self.spread_m,
+            weights=weight,
+            spread_m=solver.spread_m,
         )
         if inlier.sum() < 4:
             return None
-        ratio = float(inlier.mean())
-        views, votes = np.unique(view[nearest[inlier]], return_counts=True)
-        probability = float(self.calibration.probability(ratio))
-        return Hypothesis(
-            map_from_camera,
-            ratio,
-            probability,
-            int(views[votes.argmax()]),
-            matched[inlier],
-            patches.points_camera[inlier],
-        )
+        return self._hypothesis(map_from_camera, float(inlier.mean()), matched[inlier], patches.points_camera[inlier])
 
+    def _anchor(self, patches) -> Float[np.ndarray, "3"]:
+        """Return the point whose place a regressor tells: the camera's centre, or the middle of the animal."""
+        return np.zeros(3) if self.sight.target == "scene" else np.median(patches.points_camera, axis=0)
 
-def project(descriptors: Float[np.ndarray, "patch channel"], bank: Bank) -> Float[np.ndarray, "patch 64"]:
-    """Project descriptors onto the bank's principal axes and normalise them."""
-    low = (descriptors.astype(np.float32) - bank.mean) @ bank.components.T
-    return low / np.maximum(np.linalg.norm(low, axis=1, keepdims=True), 1e-6)
+    def _regressed(self, patches, map_from_camera, certainty) -> Hypothesis:
+        some = patches.points_camera[:: max(1, len(patches.points_camera) // 60)]
+        return self._hypothesis(map_from_camera, certainty, rigid.apply(map_from_camera, some), some)
+
+    def _hypothesis(self, map_from_camera, ratio, points_map, points_camera) -> Hypothesis:
+        return Hypothesis(map_from_camera, ratio, float(self.calibration.probability(ratio)), points_map, points_camera)
 
 
 def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample"]) -> Calibration:
@@ -273,16 +159,19 @@ def errors(
 
 def save(folder: Path, localizer: Localizer, report: dict) -> None:
     """Write ``localizer.safetensors`` and ``localizer.json``; the report holds what training measured."""
-    bank = {name: np.ascontiguousarray(value) for name, value in vars(localizer.bank).items()}
-    bank["descriptors"] = bank["descriptors"].astype(np.float16)
-    save_file(bank, folder / "localizer.safetensors")
-    table = {name: value for name, value in vars(localizer).items() if name not in ("bank", "sight", "calibration")}
-    table |= {
-        "kind": "bank",
-        "sight": asdict(localizer.sight),
-        "calibration": asdict(localizer.calibration),
-        "held_out": report,
-    }
+    match localizer.model:
+        case Bank() as bank:
+            kind, shape, arrays = "bank", {}, bank.arrays()
+        case CoordinateNet() as net:
+            kind, shape, arrays = "coordinates", net.shape(), {name: value.numpy() for name, value in net.state_dict().items()}
+        case PoseNet() as net:
+            kind, shape, arrays = "regression", net.shape(), {name: value.numpy() for name, value in net.state_dict().items()}
+        case _:
+            assert_never(localizer.model)
+    basis = {f"basis.{name}": value for name, value in vars(localizer.basis).items()}
+    save_file({name: np.ascontiguousarray(value) for name, value in (arrays | basis).items()}, folder / "localizer.safetensors")
+    table = {"kind": kind, "shape": shape, "held_out": report}
+    table |= {name: asdict(getattr(localizer, name)) for name in ("sight", "solver", "calibration")}
     (folder / "localizer.json").write_text(json.dumps(table, indent=1) + "\n")
 
 
@@ -290,7 +179,16 @@ def load(folder: Path) -> Localizer:
     """Open a trained localizer."""
     table = json.loads((folder / "localizer.json").read_text())
     arrays = load_file(folder / "localizer.safetensors")
-    arrays["descriptors"] = arrays["descriptors"].astype(np.float32)
+    basis = Basis(arrays.pop("basis.mean"), arrays.pop("basis.components"))
+    kind: Kind = table["kind"]
+    match kind:
+        case "bank":
+            model = Bank.from_arrays(arrays)
+        case "coordinates":
+            model = CoordinateNet(**table["shape"]).with_weights(arrays)
+        case "regression":
+            model = PoseNet(**table["shape"]).with_weights(arrays)
+        case _:
+            assert_never(kind)
     sight = Sight(**{**table["sight"], "radii_px": tuple(table["sight"]["radii_px"])})
-    settings = {name: table[name] for name in ("threshold_m", "spread_m", "iterations", "sectors")}
-    return Localizer(sight=sight, bank=Bank(**arrays), calibration=Calibration(**table["calibration"]), **settings)
+    return Localizer(sight, basis, model, Calibration(**table["calibration"]), Solver(**table["solver"]))

@@ -1,8 +1,8 @@
 """Train a localizer from rendered random views of a template.
 
 target = "scene": the room's template and frames of the walk-through; target = "agent": the canonical
-animal from all around. Views are drawn with changing light, blur, noise and occluders; what the bank
-does not hold measures the error and calibrates the uncertainty. Writes localizer.safetensors and
+animal from all around. Views are drawn with changing light, blur, noise and occluders; what it
+has not seen measures the error and calibrates the uncertainty. Writes localizer.safetensors and
 localizer.json.
 """
 
@@ -26,10 +26,12 @@ class Config:
 
     target: Literal["scene", "agent"] = "scene"
     """What is localised against: the room or the animal."""
-    kind: Literal["bank"] = "bank"
-    """bank: nearest neighbours among patches of rendered views."""
+    kind: model.Kind = "bank"
+    """bank: nearest neighbours among patches of rendered views; coordinates: a network tells each patch its point of the
+    map; regression: a network tells the pose at once, as in the paper.
+    """
     scene: Options = field(default_factory=Options)
-    """The scene's localizer: size of the bank, scale of the pictures, how queries are answered."""
+    """The scene's localizer: number of views, scale of the pictures, how queries are answered."""
     agent: AgentOptions = field(default_factory=AgentOptions)
     """The same for the agent's."""
     seed: int = 0
@@ -44,10 +46,12 @@ def run(task: cli.Task) -> None:
         clip = Clip.open(next(iter(task.per_video("frames", roles=("walkthrough",)).values())))
         walk = arrays.load(template / "cameras.npz", ("world_from_camera",))["world_from_camera"]
         floor_m = json.loads((template / "world.json").read_text())["floor"]
-        found, held = training.train_scene(meshes.read_ply(template / "mesh.ply"), walk, floor_m, clip, task.config.scene, rng)
+        found, held = training.train_scene(
+            meshes.read_ply(template / "mesh.ply"), walk, floor_m, clip, task.config.scene, rng, task.config.kind
+        )
     else:
         mesh = meshes.read_ply(task.input("agent_template") / "agent.ply")
-        found, held = training.train_agent(mesh, task.config.agent, rng)
+        found, held = training.train_agent(mesh, task.config.agent, rng, task.config.kind)
     with task.create() as folder:
         model.save(folder, found, pictures.report(held, task.config.target))
         qa.write(

@@ -4,10 +4,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.models.localizer import Localizer, Target
+from pipeline.models.localizer import Localizer
+from pipeline.models.sight import Target
 from pipeline.qa import Check, Picture
 from pipeline.space import overview
-from stages.train_localizer.bank import GOOD, HeldOut
+from stages.train_localizer.describing import GOOD, HeldOut
 
 
 def report(held: HeldOut, target: Target) -> dict[str, float | int]:

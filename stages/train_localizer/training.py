@@ -1,6 +1,8 @@
 """From a template to a trained localizer: what the front calls."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import assert_never
 
 import cv2
 import numpy as np
@@ -8,23 +10,25 @@ from jaxtyping import Float
 
 from pipeline.files.clips import Clip
 from pipeline.models import localizer as model
+from pipeline.models.sight import Sight, Target
 from pipeline.progress import track
 from pipeline.space import cameras
 from pipeline.space.meshes import Mesh, RayCaster
-from stages.train_localizer import bank, views
+from stages.train_localizer import describing, networks, views
+from stages.train_localizer.networks import NetOptions
 from stages.train_localizer.views import Photograph, ViewOptions
 
 
 @dataclass(frozen=True)
 class Options:
-    """Size of the bank, scale of the pictures, and how queries are answered."""
+    """Number of views, scale of the pictures, and how queries are answered."""
 
     views: int = 500
-    """Rendered views in the bank."""
+    """Rendered views that are learnt."""
     held_out: int = 80
     """Further views that measure the error and calibrate the uncertainty."""
     frames: int = 60
-    """Scene: frames of the walk-through that join the bank."""
+    """Scene: frames of the walk-through that join them."""
     channels: int = 64
     """Principal axes of the descriptors that are kept."""
     focal_px: float = 120.0
@@ -43,6 +47,8 @@ class Options:
     """RANSAC: triplets."""
     sectors: int = 6
     """Agent: sectors of azimuth that answer separately."""
+    net: NetOptions = field(default_factory=NetOptions)
+    """Kinds that are networks: size and training."""
     view: ViewOptions = field(default_factory=ViewOptions)
     """Where cameras stand and how pictures are disturbed."""
 
@@ -52,7 +58,7 @@ class AgentOptions(Options):
     """The same for the agent, which is small, near and seen from all around."""
 
     views: int = 250
-    """Rendered views in the bank."""
+    """Rendered views that are learnt."""
     held_out: int = 60
     """Further views that measure the error and calibrate the uncertainty."""
     focal_px: float = 110.0
@@ -67,15 +73,23 @@ class AgentOptions(Options):
     """RANSAC: least side of a triplet, metres."""
 
 
-def train_scene(
+@dataclass(frozen=True)
+class Shown:
+    """What a localizer learns from, and where queries come from that it has not seen."""
+
+    pictures: list[Photograph]
+    draw_query: Callable[[], Photograph]
+
+
+def show_scene(
     mesh: Mesh,
     walk: Float[np.ndarray, "frame 4 4"],
     floor_m: float,
     clip: Clip,
     options: Options,
     rng: np.random.Generator,
-) -> tuple[model.Localizer, bank.HeldOut]:
-    """Train on random views of the scene and on frames of the walk-through with their template cameras."""
+) -> Shown:
+    """Render random views of the scene and add frames of the walk-through with their template cameras."""
     caster = RayCaster(mesh)
     scale = options.focal_px / float(np.median(clip.intrinsics[:, 0, 0]))
     size = (round(clip.color_size[0] * scale), round(clip.color_size[1] * scale))
@@ -94,11 +108,25 @@ def train_scene(
 
     pictures = [draw() for _ in track(range(options.views), "rendering views")]
     chosen = np.unique(np.linspace(0, len(clip) - 1, options.frames).astype(int)) if options.frames else []
-    pictures += [_frame(clip, int(frame), walk[frame], intrinsics, size) for frame in chosen]
-    return _finish(pictures, draw_query, options, "scene", rng)
+    return Shown(pictures + [_frame(clip, int(frame), walk[frame], intrinsics, size) for frame in chosen], draw_query)
 
 
-def train_agent(mesh: Mesh, options: Options, rng: np.random.Generator) -> tuple[model.Localizer, bank.HeldOut]:
+def train_scene(
+    mesh: Mesh,
+    walk: Float[np.ndarray, "frame 4 4"],
+    floor_m: float,
+    clip: Clip,
+    options: Options,
+    rng: np.random.Generator,
+    kind: model.Kind = "bank",
+) -> tuple[model.Localizer, describing.HeldOut]:
+    """Train on random views of the scene and on frames of the walk-through with their template cameras."""
+    return train(show_scene(mesh, walk, floor_m, clip, options, rng), options, kind, "scene", rng)
+
+
+def train_agent(
+    mesh: Mesh, options: Options, rng: np.random.Generator, kind: model.Kind = "bank"
+) -> tuple[model.Localizer, describing.HeldOut]:
     """Train on random views of the canonical agent, from all around."""
     caster = RayCaster(mesh)
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)).astype(float) / 2
@@ -112,22 +140,27 @@ def train_agent(mesh: Mesh, options: Options, rng: np.random.Generator) -> tuple
         return views.photograph(caster, camera, intrinsics, (size, size), options.view, rng)
 
     pictures = [draw() for _ in track(range(options.views), "rendering views")]
-    return _finish(pictures, lambda: views.with_depth_noise(draw(), rng), options, "agent", rng)
+    return train(Shown(pictures, lambda: views.with_depth_noise(draw(), rng)), options, kind, "agent", rng)
 
 
-def _finish(pictures, draw_query, options, target, rng):
-    sight = model.Sight(target, options.focal_px, options.window_px, options.stride_px, options.radii_px)
-    made = bank.make_bank(pictures, sight, options.channels, rng)
-    unsure = model.Localizer(
-        sight,
-        made,
-        model.Calibration(0.0, 0.0),
-        options.threshold_m,
-        options.spread_m,
-        options.iterations,
-        options.sectors,
-    )
-    held = bank.hold_out(unsure, draw_query, options.held_out)
+def train(
+    shown: Shown, options: Options, kind: model.Kind, target: Target, rng: np.random.Generator
+) -> tuple[model.Localizer, describing.HeldOut]:
+    """Learn what is shown, measure the error on fresh queries and calibrate the uncertainty with it."""
+    sight = Sight(target, options.focal_px, options.window_px, options.stride_px, options.radii_px)
+    described = describing.describe_views(shown.pictures, sight, options.channels, rng)
+    match kind:
+        case "bank":
+            made = described.bank()
+        case "coordinates":
+            made = networks.train_coordinates(described, options.net, int(rng.integers(2**31)))
+        case "regression":
+            made = networks.train_regressor(described, target, options.net, int(rng.integers(2**31)))
+        case _:
+            assert_never(kind)
+    solver = model.Solver(options.threshold_m, options.spread_m, options.iterations, options.sectors)
+    unsure = model.Localizer(sight, described.basis, made, model.Calibration(0.0, 0.0), solver)
+    held = describing.hold_out(unsure, shown.draw_query, options.held_out)
     return replace(unsure, calibration=model.calibrate(held.inlier_ratio, held.good)), held
 
 
