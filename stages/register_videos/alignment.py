@@ -37,7 +37,7 @@ class AlignOptions:
     last_reach_m: float = 0.04
     """Width in the last round, metres."""
     rounds: int = 8
-    """Gauss-Newton steps by depth and votes."""
+    """Gauss-Newton steps by depth and votes; 0: poses stay as votes and odometry give them."""
     picture_every_frames: int = 5
     """One frame in so many is compared with the rendered template; 0: none."""
     picture_rounds: int = 1
@@ -65,22 +65,15 @@ def align(
     masks: Masks,
     mesh: Mesh,
     world_from_camera: Float[np.ndarray, "frame 4 4"],
+    edges: relax.Relatives,
     votes: Votes,
     supports: Bool[np.ndarray, "vote"],
     options: AlignOptions,
 ) -> Aligned:
-    """Relax all frames: first depth, votes and odometry from coarse to fine, then pictures as well."""
+    """Relax all frames: first votes and motions, then depth from coarse to fine, then pictures as well."""
     place, frames = surface.Surface(mesh), np.arange(len(clip))
     scans = [_static_scan(clip, masks, int(frame), options) for frame in track(frames, "reading depth")]
     voted = _vote_contacts(votes, supports, options)
-    odometry = clip.odometry_from_camera if clip.odometry_from_camera is not None else world_from_camera
-    looseness = 1.0 if clip.odometry_from_camera is not None else 20.0
-    edges = relax.chain(
-        clip.timestamp_s,
-        odometry,
-        drift_rad_s=np.deg2rad(options.drift_deg_s) * looseness,
-        drift_m_s=options.drift_m_s * looseness,
-    )
 
     seen: list[relax.Contacts] = []
 
@@ -91,7 +84,11 @@ def align(
         return relax.Contacts.join(depth, *voted, *seen)
 
     reach = tuple(np.geomspace(options.first_reach_m, options.last_reach_m, options.rounds))
-    poses = relax.relax(world_from_camera, find, edges, reach_m=reach).world_from_camera
+    poses = world_from_camera
+    if options.rounds and voted:
+        poses = relax.relax(poses, lambda *_: relax.Contacts.join(*voted), edges, reach_m=(options.first_reach_m,) * 3).world_from_camera
+    if options.rounds:
+        poses = relax.relax(poses, find, edges, reach_m=reach).world_from_camera
     caster = RayCaster(mesh)
     for _ in range(options.picture_rounds if options.picture_every_frames else 0):
         chosen = frames[:: options.picture_every_frames]
@@ -103,6 +100,12 @@ def align(
         poses = relax.relax(poses, find, edges, reach_m=(options.last_reach_m,) * 3).world_from_camera
     gap, fit = measure_fit(place, scans, poses)
     return Aligned(poses, scans, gap, fit)
+
+
+def odometry_edges(clip: Clip, options: AlignOptions) -> relax.Relatives:
+    """Return the phone's own motions between neighbouring frames."""
+    drift_rad_s = np.deg2rad(options.drift_deg_s)
+    return relax.chain(clip.timestamp_s, clip.odometry_from_camera, drift_rad_s=drift_rad_s, drift_m_s=options.drift_m_s)
 
 
 def measure_fit(

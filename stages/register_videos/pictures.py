@@ -44,7 +44,7 @@ def checks(found: Registered | Refused) -> list[Check]:
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
-        Check("frame votes that agree", float(found.supports.mean()), "share", 0.5, 0.25, "higher"),
+        Check("frame votes that agree", float(found.supports.mean()) if len(found.supports) else None, "share", 0.5, 0.25, "higher"),
         Check("depth against the template", float(np.nanmedian(found.aligned.gap_m) * 100), "cm, median", 2.5, 6.0),
         Check("static depth within 5 cm", float(np.median(found.aligned.fit)), "share", 0.6, 0.35, "higher"),
         Check("camera confidence", float(found.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),

@@ -1,6 +1,7 @@
 """Register one recording: votes, agreement, alignment, confidence, agent roots, or the reason why it does not fit."""
 
 from dataclasses import dataclass, field
+from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,7 +11,8 @@ from pipeline.models.localizer import Localizer, calibrate
 from pipeline.progress import log
 from pipeline.space import rigid, surface
 from pipeline.space.meshes import Mesh, RayCaster
-from stages.register_videos import alignment
+from pipeline.space.visual_odometry import Followed, FollowOptions
+from stages.register_videos import alignment, following
 from stages.register_videos import votes as voting
 from stages.register_videos.agent_roots import RootOptions, Roots, find_roots
 from stages.register_videos.alignment import Aligned, AlignOptions
@@ -26,6 +28,8 @@ class GateOptions:
     """Median share of a frame's static depth that must lie within 5 cm of the template."""
     probes: int = 240
     """Disturbed poses that calibrate the confidence."""
+    adrift: float = 0.2
+    """Factor on the confidence of frames that no vote holds and that could not be followed from one that is held."""
     bridge_s: float = 0.25
     """Time constant with which confidence is averaged over neighbouring frames, seconds."""
 
@@ -34,8 +38,16 @@ class GateOptions:
 class Options:
     """How a recording is registered."""
 
+    begin: Literal["votes", "middle"] = "votes"
+    """votes: localised frames place the recording; middle: it begins in the middle of the room with the heading that its
+    odometry happens to have, and is never refused (the ablation without a localizer).
+    """
+    odometry: Literal["phone", "pictures"] = "phone"
+    """phone: its own poses where the recording has them; pictures: poses are always followed from picture to picture."""
     vote: VoteOptions = field(default_factory=VoteOptions)
     """Which frames vote, and when votes agree."""
+    follow: FollowOptions = field(default_factory=FollowOptions)
+    """How pictures are followed where the phone gave no odometry."""
     align: AlignOptions = field(default_factory=AlignOptions)
     """Weights, reach and rounds of the alignment."""
     gate: GateOptions = field(default_factory=GateOptions)
@@ -87,30 +99,76 @@ class Refused:
 
 def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.random.Generator) -> Registered | Refused:
     """Register one recording, or refuse it with a reason."""
-    votes = voting.collect(clip, masks, maps.scene_localizer, options.vote)
-    if clip.odometry_from_camera is None:
-        start, supports = voting.without_odometry(votes, clip.timestamp_s, options.vote)
-    else:
-        agreement = voting.agree(votes, clip.odometry_from_camera, clip.gravity_known, options.vote)
-        supports = agreement.supports if agreement else None
-        start = agreement.world_from_odometry @ clip.odometry_from_camera if agreement else None
-    reason = voting.refusal(votes, supports, options.vote)
-    if reason is not None:
-        return Refused(reason, votes)
-    log(f"{int(supports.sum())} of {votes.asked} localised frames agree")
-    aligned = alignment.align(clip, masks, maps.scene, start, votes, supports, options.align)
+    motion = _motion(clip, masks, options, rng)
+    match options.begin:
+        case "votes":
+            votes = voting.collect(clip, masks, maps.scene_localizer, options.vote)
+            start = _begin(clip, votes, motion, options.vote)
+            reason = voting.refusal(votes, start.supports if start else None, options.vote)
+            if reason is not None:
+                return Refused(reason, votes)
+        case "middle":
+            votes, start = voting.none_cast(), _in_the_middle(motion, maps.scene)
+        case _:
+            assert_never(options.begin)
+    log(f"{int(start.supports.sum())} of {votes.asked} localised frames agree")
+    aligned = alignment.align(clip, masks, maps.scene, start.world_from_camera, motion.relatives, votes, start.supports, options.align)
     fit = float(np.median(aligned.fit))
     log(f"static depth: {np.nanmedian(aligned.gap_m) * 100:.1f} cm from the template, {fit:.0%} within 5 cm")
-    if fit < options.gate.least_fit:
+    if options.begin == "votes" and fit < options.gate.least_fit:
         return Refused(
             f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken",
             votes,
         )
     confidence = camera_confidence(clip.timestamp_s, surface.Surface(maps.scene), aligned, options.gate, rng)
+    confidence = np.where(start.anchored, confidence, options.gate.adrift * confidence)
     ground = Ground(RayCaster(maps.scene), float(np.quantile(maps.scene.vertices[:, 1], 0.02)))
     roots = find_roots(clip, masks, maps.agent, ground, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
     log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
-    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, supports)
+    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, start.supports)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Where the alignment begins."""
+
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    supports: Bool[np.ndarray, "vote"]
+    anchored: Bool[np.ndarray, "frame"]
+    """False: no vote holds this frame, and nothing was followed to it."""
+
+
+def _motion(clip, masks, options, rng) -> Followed:
+    """Return the motions between neighbours: the phone's, or those that the pictures tell."""
+    if options.odometry == "phone" and clip.odometry_from_camera is not None:
+        return Followed(clip.odometry_from_camera, np.zeros(len(clip), bool), alignment.odometry_edges(clip, options.align))
+    followed = following.follow(clip, masks, options.follow, rng)
+    log(f"no odometry: {int(followed.torn.sum())} of {len(clip)} motions could not be followed from picture to picture")
+    return followed
+
+
+def _begin(clip, votes, motion, vote_options) -> _Start | None:
+    """Place the recording by its votes; None where none agree."""
+    if not len(votes.frame):
+        return None
+    if motion.odometry_from_camera is clip.odometry_from_camera:
+        found = voting.agree(votes, clip.odometry_from_camera, clip.gravity_known, vote_options)
+        everywhere = np.ones(len(clip), bool)
+        return _Start(found.world_from_odometry @ clip.odometry_from_camera, found.supports, everywhere) if found else None
+    supports = following.agree_nearby(votes, clip.timestamp_s, motion, vote_options)
+    if not supports.any():
+        return None
+    poses = following.carry(votes, supports, clip.timestamp_s, motion)
+    return _Start(poses, supports, following.anchored(votes, supports, motion))
+
+
+def _in_the_middle(motion, scene) -> _Start:
+    """Stand the recording in the middle of the room, a metre and a half above the floor, unturned."""
+    odometry = motion.odometry_from_camera
+    middle = (scene.vertices.min(0) + scene.vertices.max(0)) / 2
+    middle[1] = scene.vertices[:, 1].min() + 1.5
+    shift = rigid.make(np.eye(3), middle - odometry[:, :3, 3].mean(0))
+    return _Start(shift @ odometry, np.zeros(0, bool), np.ones(len(odometry), bool))
 
 
 def camera_confidence(

@@ -20,15 +20,15 @@ class VoteOptions:
     """Which frames vote, and when votes agree."""
 
     every_frames: int = 5
-    """One frame in so many votes (2 Hz) ..."""
-    every_frames_alone: int = 2
-    """... and where there is no odometry to carry poses from one to the next."""
+    """One frame in so many votes (2 Hz)."""
     least_probability: float = 0.2
     """Votes below this probability are not cast."""
     agree_deg: float = 8.0
     """Votes agree within this rotation, degrees ..."""
     agree_m: float = 0.3
     """... and this distance, metres; room for the odometry's drift."""
+    near_s: float = 6.0
+    """Without the phone's odometry votes must agree with others as near as this, seconds."""
     most_tilt_deg: float = 10.0
     """A vote that contradicts gravity by more than this is not cast, degrees."""
     least_votes: int = 3
@@ -68,10 +68,14 @@ class Agreement:
     supports: Bool[np.ndarray, "vote"]
 
 
+def none_cast() -> Votes:
+    """Return what there is where no frame was asked."""
+    return Votes(np.zeros(0, int), [], 0, None)
+
+
 def collect(clip: Clip, masks: Masks, localizer: Localizer, options: VoteOptions) -> Votes:
     """Localise every so many frames, with the agent masked out."""
-    every = options.every_frames if clip.odometry_from_camera is not None else options.every_frames_alone
-    asked = np.arange(every // 2, len(clip), every)
+    asked = np.arange(min(options.every_frames // 2, len(clip) - 1), len(clip), options.every_frames)
     frames, answers, nearest = [], [], None
     for frame in track(asked.tolist(), "localising frames"):
         found = localizer.localize(
@@ -104,7 +108,7 @@ def agree(
         tilt = np.arccos(np.clip(proposals[:, 1, 1], -1, 1))
         weight[tilt > np.deg2rad(options.most_tilt_deg)] = 0
         proposals = keep_upright(proposals, odometry[:, :3, 3], voted[:, :3, 3])
-    support = np.stack([_supports(proposal, odometry, voted, options) for proposal in proposals]) & (weight > 0)
+    support = np.stack([close(proposal @ odometry, voted, options) for proposal in proposals]) & (weight > 0)
     best = (support * weight).sum(1).argmax()
     chosen, supports = proposals[best], support[best]
     for _ in range(3):
@@ -113,7 +117,7 @@ def agree(
         rotation = rigid.mean_rotation(proposals[supports, :3, :3], weight[supports])
         offset = voted[supports, :3, 3] - odometry[supports, :3, 3] @ rotation.T
         chosen = rigid.make(rotation, np.average(offset, axis=0, weights=weight[supports]))
-        supports = _supports(chosen, odometry, voted, options) & (weight > 0)
+        supports = close(chosen @ odometry, voted, options) & (weight > 0)
     return Agreement(chosen, supports) if supports.any() else None
 
 
@@ -128,10 +132,12 @@ def keep_upright(
     return rigid.make(rotation, to_points - np.einsum("vij,vj->vi", rotation, from_points))
 
 
-def _supports(world_from_odometry, odometry, voted, options):
-    carried = world_from_odometry @ odometry
-    angle = np.rad2deg(rigid.rotation_angle(carried[:, :3, :3], voted[:, :3, :3]))
-    return (angle < options.agree_deg) & (np.linalg.norm(carried[:, :3, 3] - voted[:, :3, 3], axis=1) < options.agree_m)
+def close(
+    world_from_camera: Float[np.ndarray, "vote 4 4"], other: Float[np.ndarray, "*vote 4 4"], options: VoteOptions
+) -> Bool[np.ndarray, "vote"]:
+    """Tell which poses agree with others."""
+    angle = np.rad2deg(rigid.rotation_angle(world_from_camera[:, :3, :3], other[..., :3, :3]))
+    return (angle < options.agree_deg) & (np.linalg.norm(world_from_camera[:, :3, 3] - other[..., :3, 3], axis=-1) < options.agree_m)
 
 
 def refusal(votes: Votes, supports: Bool[np.ndarray, "vote"] | None, options: VoteOptions) -> str | None:
@@ -143,20 +149,3 @@ def refusal(votes: Votes, supports: Bool[np.ndarray, "vote"] | None, options: Vo
     if count < options.least_votes or count < options.least_share * len(votes.frame):
         return f"only {count} of {len(votes.frame)} recognised frames agree on where the recording lies"
     return None
-
-
-def without_odometry(
-    votes: Votes, timestamp_s: Float[np.ndarray, "frame"], options: VoteOptions, speed_m_s: float = 1.5
-) -> tuple[Float[np.ndarray, "frame 4 4"], Bool[np.ndarray, "vote"]]:
-    """Interpolate between votes that most of their neighbours in time can be reached from; for recordings without
-    odometry.
-    """
-    voted, time = votes.world_from_camera, timestamp_s[votes.frame]
-    supports = np.zeros(len(voted), bool)
-    for vote in range(len(voted)):
-        near = np.flatnonzero((np.abs(np.arange(len(voted)) - vote) <= 3) & (np.arange(len(voted)) != vote))
-        distance = np.linalg.norm(voted[near, :3, 3] - voted[vote, :3, 3], axis=1)
-        supports[vote] = len(near) > 0 and (distance < options.agree_m / 2 + speed_m_s * np.abs(time[near] - time[vote])).mean() > 0.5
-    if supports.sum() < 2:
-        return np.repeat(np.eye(4)[None], len(timestamp_s), axis=0), np.zeros(len(voted), bool)
-    return rigid.interpolate(time[supports], voted[supports], timestamp_s), supports
