@@ -15,7 +15,7 @@ RUN    := $(PYTHON) -SE -m pipeline.run
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check annotate behavior-tables behavior-benchmark export simulate extras test doctor clean FORCE
+.PHONY: help new capture-check annotate behavior-tables registration-tables behavior-benchmark export simulate extras test doctor clean FORCE
 HOME_OF := build/$(or $(AGENT),cat)
 INPUTS = $(foreach a,$1,--$(subst _,-,$a) $(HOME_OF)/$a)
 
@@ -36,6 +36,12 @@ behavior-tables: .venv/.ok
 
 behavior-benchmark: .venv/.ok
 	@$(MAKE) --no-print-directory behavior-tables AGENT=benchmark
+
+registration-tables: .venv/.ok
+	@set -e; for variant in no_localizer no_feature_metric no_odometry regression_only; do \
+	  $(MAKE) --no-print-directory $(or $(AGENT),cat).registration VARIANT=$$variant; done
+	@$(MAKE) --no-print-directory $(or $(AGENT),cat).registration_tables
+	@cat build/$(or $(AGENT),cat)/registration_tables/tables.txt
 
 new: .venv/.ok
 	@$(PLAN) new '$(AGENT)'

@@ -81,6 +81,11 @@ class Task:
         """Return the folder of `name` for every one of the trials, by id."""
         return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in trials}
 
+    def per_variant(self, name: str, variants: Sequence[str]) -> dict[str, Path]:
+        """Return the folder of `name` in every one of the agent's variants, by the variant's name."""
+        folder = self.input("variants")
+        return {variant: self._opened(folder / variant / name, f"{variant}/{name}") for variant in variants}
+
     @contextmanager
     def create(self) -> Iterator[Path]:
         """Yield the folder to fill; it becomes the artifact if, and only if, the block ends well."""

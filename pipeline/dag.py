@@ -19,6 +19,8 @@ VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
 AGENT: tuple[Role, ...] = ("turnaround", "session")
 """Roles in which the animal is meant to be seen."""
 BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
+REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only")
+"""Variants of an agent that Table 1 compares its registration with."""
 PLUMBING = ("errors", "config", "artifact", "cli", "processes", "progress", "videos", "dag")
 """Files of `pipeline/` whose change cannot change what a stage computes."""
 
@@ -35,6 +37,8 @@ class Need:
     """Subfolder that is read, where it is not the whole artifact."""
     option: str | None = None
     """Command line option without dashes; the artifact's name if None."""
+    variants: tuple[str, ...] = ()
+    """Variants of the agent whose artifact of this name is read as well; the folder of all variants is given as --variants."""
     flow: Flow | None = None
     """The flow in which it is an input; None: in all that the node is part of."""
 
@@ -125,6 +129,9 @@ FLOW: tuple[Node, ...] = (
           "agent_localizer", "registration", "reconstruction", "splats", "behavior_data", "behavior",
           Need("synthetic_capture", part="truth", option="truth")),
          sees=("session", "heldout"), gpu=1, beside=("clicks.json",)),
+    Node("registration_tables", "evaluate.registration_tables",
+         (Need("registration", variants=REGISTRATION_VARIANTS), "scene_template", *merging("frames", roles=("walkthrough", "session")),
+          Need("synthetic_capture", part="truth", option="truth")), aside=True),
     Node("report", "report",
          (*merging("frames", "flow", "masks"), "feature_basis", *merging("features"),
           "scene_template", "agent_template", "scene_localizer", "agent_localizer", *merging("video_poses"),

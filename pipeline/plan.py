@@ -266,9 +266,9 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
         inputs += found
         source = dag.NODES[need.artifact]
         several = (source.roles and not node.roles) or (source.trials == "each" and not trial)
-        together = plan.home_of(need.artifact).folder / need.artifact
-        path = together if several else Path(found[0].path, found[0].part or "")
+        path = plan.home_of(need.artifact).folder / need.artifact if several else Path(found[0].path, found[0].part or "")
         arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
+        arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
     named = f"{node.artifact}.{trial.id}" if trial else node.artifact
     arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
     arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
@@ -304,6 +304,8 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
     if not source.roles:
         inner = f"{need.part}/{part.file}" if need.part and isinstance(part, Video) else need.part
         yield Input(need.artifact, str(folder), inner)
+        others = [Home(plan.home.agent, variant) for variant in need.variants]
+        yield from (Input(f"{other}/{need.artifact}", str(other.folder / need.artifact), inner) for other in others)
         return
     for other in [part] if node.roles else plan.videos:
         if node.roles or (other.role in (need.roles or source.roles) and other.role in source.roles and other.split in need.splits):
@@ -346,14 +348,10 @@ def _json(value: Any) -> str:
     return json.dumps(value, indent=1, sort_keys=True) + "\n"
 
 
-def _cache_file(home: Home) -> Path:
-    return home.plan / "cache.json"
-
-
 def _cache(home: Home) -> sources.Cache:
     """Return what earlier runs of the planner read, by size and time of the files; lost, it only costs time."""
     try:
-        return sources.Cache(json.loads(_cache_file(home).read_text()))
+        return sources.Cache(json.loads((home.plan / "cache.json").read_text()))
     except (FileNotFoundError, ValueError):
         return sources.Cache()
 
@@ -365,7 +363,7 @@ def _plan(home: Home) -> None:
     with artifact.held(home.base.folder / "plan.lock"):
         for plan in planned:
             write(plan, cache)
-        artifact.write_if_changed(_cache_file(home), json.dumps(cache.fresh))
+        artifact.write_if_changed((home.plan / "cache.json"), json.dumps(cache.fresh))
     folder = Path("captures", home.agent)
     if planned[0].builtin:
         print(f"[{home}] nothing in {folder}/: building from the built-in synthetic capture")

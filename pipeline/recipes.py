@@ -55,7 +55,7 @@ def flow(table: Mapping[str, Any], where: str) -> Flow:
 def trials(table: Mapping[str, Any], cache: sources.Cache) -> Iterator[Trial]:
     """Yield every trained method of the tables with every seed; a method is a variant of that name."""
     settings = {**(sources.settings(TABLES_STAGE, cache) or {}), **table}
-    for method in settings["methods"]:
+    for method in settings.get("methods", ()):
         path = Path("agents", "variants", f"{method}.toml")
         overlay, _ = read(path, cache)
         config.refuse_unknown(overlay, (TRIED_TABLE,), where=f"{path}, a method of the tables", kind="table")

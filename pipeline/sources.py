@@ -22,6 +22,12 @@ class Source:
     """Local modules that it may import, dotted."""
     settings: dict[str, dict[str, Any]]
     """Per dataclass: its fields' defaults, None where they are no literals."""
+    bases: dict[str, list[str]]
+    """Per dataclass: what it inherits from, as written."""
+
+
+READER = 2
+"""Raise it when more is read of a file, so that what was read before is read again."""
 
 
 @dataclass
@@ -34,7 +40,7 @@ class Cache:
     def get(self, path: Path, read: Any) -> Any:
         """Return `read(path)`, a value of plain JSON types, or what it was last time."""
         stat = path.stat()
-        mark = [stat.st_size, stat.st_mtime_ns]
+        mark = [READER, stat.st_size, stat.st_mtime_ns]
         entry = self.fresh.get(str(path)) or self.known.get(str(path))
         if entry is None or entry["mark"] != mark:
             entry = {"mark": mark, "value": read(path)}
@@ -57,17 +63,25 @@ def digest(stage: str, cache: Cache) -> str:
 
 
 def settings(stage: str, cache: Cache) -> dict[str, Any] | None:
-    """Return the fields of the stage's `Config` and their literal defaults, or None if it cannot be told."""
-    modules = [f"stages.{stage}.__main__"]
-    while modules:
-        path = _path_of(modules.pop())
-        if path is None:
-            continue
-        source = Source(**cache.get(path, _read))
-        if "Config" in source.settings:
-            return source.settings["Config"]
-        modules += [name.removesuffix(".Config") for name in source.imports if name.endswith(".Config")]
-    return None
+    """Return the fields of the stage's `Config`, inherited ones included, and their literal defaults, or None if it
+    cannot be told.
+    """
+    return _fields(f"stages.{stage}.__main__", "Config", cache)
+
+
+def _fields(module: str, name: str, cache: Cache) -> dict[str, Any] | None:
+    """Return the fields of the class `name` that a module defines or imports; `room.Options` is looked up in `room`."""
+    path = _path_of(module)
+    if path is None:
+        return None
+    source = Source(**cache.get(path, _read))
+    if name in source.settings:
+        inherited = [_fields(module, base, cache) or {} for base in source.bases[name]]
+        return {key: value for fields in (*inherited, source.settings[name]) for key, value in fields.items()}
+    home, _, name = name.rpartition(".")
+    suffix = f".{home or name}"
+    found = (_fields(other if home else other.removesuffix(suffix), name, cache) for other in source.imports if other.endswith(suffix))
+    return next((fields for fields in found if fields is not None), None)
 
 
 @functools.cache
@@ -97,13 +111,14 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         tree = ast.parse(path.read_bytes(), str(path))
     except SyntaxError:  # breaks the stages that import it, when they run; not the plan of all the others
-        return asdict(Source(artifact.digest_of_file(path), (), {}))
+        return asdict(Source(artifact.digest_of_file(path), (), {}, {}))
     imports = {name for node in ast.walk(tree) for name in _imported(node) if name.startswith(("pipeline", "stages"))}
-    classes = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    bases = {cls.name: [ast.unparse(base) for base in cls.bases] for cls in classes}
     fields = {cls.name: {n.target.id: _literal(n.value) for n in cls.body if isinstance(n, ast.AnnAssign)} for cls in classes}
     for node in ast.walk(tree):
         _drop_docstrings(node)
-    return asdict(Source(artifact.digest_of(ast.dump(tree)), tuple(sorted(imports)), fields))
+    return asdict(Source(artifact.digest_of(ast.dump(tree)), tuple(sorted(imports)), fields, bases))
 
 
 def _imported(node: ast.AST) -> list[str]:

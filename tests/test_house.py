@@ -133,6 +133,7 @@ def test_the_declaration_fits_the_program(node):
     """What the flow hands to a program is what the program asks for, and nothing that it must have is left out."""
     usage = help_of(node.stage).split("\n\n")[0]
     handed = {f"--{need.option or need.artifact.replace('_', '-')}" for need in dag.needs_of(node)}
+    handed |= {"--variants" for need in dag.needs_of(node) if need.variants}
     known = set(re.findall(r"--[a-z-]+", usage))
     required = set(re.findall(r"--[a-z-]+", re.sub(r"\[[^\]]*\]", "", usage)))
     assert handed <= known, f"{node.stage} does not know {handed - known}"

@@ -1,9 +1,11 @@
 """The planner: roles, split, ids, keys, and refusals that change nothing."""
 
 import json
+from pathlib import Path
 
 import pytest
 
+from pipeline import sources
 from pipeline.captures import Remarks, assign, builtin
 from pipeline.errors import InputError
 from tests.pipeline import checkout
@@ -161,3 +163,11 @@ def test_clicks_are_read_by_the_evaluation_alone(house):
     readers = [job["id"] for job in jobs if "--clicks" in job["arguments"]]
     assert readers == ["evaluation"]
     assert all("beside.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)
+
+
+def test_inherited_settings_may_be_set(monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[2])
+    sources._path_of.cache_clear()
+    found = sources.settings("register_videos", sources.Cache())
+    assert {"seed", "vote", "align", "begin"} <= set(found)
+    assert found["begin"] == "votes"

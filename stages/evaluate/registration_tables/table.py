@@ -1,0 +1,144 @@
+"""Measure the registrations of several variants frame by frame, and compare them in pairs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files import arrays
+from pipeline.models.intervals import bootstrapped, episodes
+from pipeline.qa import Check
+from pipeline.videos import Video
+from stages.evaluate import registration
+from stages.evaluate.alignment import PoseErrors, constant_between, joined, pose_errors
+from stages.evaluate.figures import Figures
+from stages.evaluate.reading import read_registration
+from stages.evaluate.truth import Truth
+
+PAPER = {"ours": (6.35, 0.41), "no_localizer": (37.59, 0.83), "no_feature_metric": (22.47, 1.30)}
+"""Rotation (degrees) and translation (metres) on the paper's own cat videos (Table 1)"""
+NAMES = {
+    "ours": "ours",
+    "no_localizer": "without localizer",
+    "no_feature_metric": "without feature-metric alignment",
+    "no_odometry": "without odometry",
+    "regression_only": "regression only",
+}
+MOST_DEG, MOST_M = 180.0, 10.0
+"""A frame without a pose counts as this wrong where errors are averaged"""
+UNITS = {"rotation_deg": "degrees", "translation_m": "meters"}
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """How intervals are drawn."""
+
+    episode_s: float
+    draws: int
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True)
+class _Session:
+    id: str
+    camera: Float[np.ndarray, "frame 4 4"]
+    """true, in our world"""
+    timestamp_s: Float[np.ndarray, "frame"]
+
+
+def figures(
+    folders: Mapping[str, Path],
+    frames: Mapping[str, Path],
+    videos: Sequence[Video],
+    scene_template: Path,
+    truth: Path | None,
+    resampling: Resampling,
+) -> Figures:
+    """Return ``<variant>/<figure>`` of every variant, and what each changes against ours, with intervals."""
+    found = Figures()
+    if truth is None:
+        names = [f"{variant}/{unit}_{which}" for variant in folders for unit in UNITS for which in ("median", "p95")]
+        found.skip(names, "the true poses of this capture are not known")
+        return found
+    sessions = _sessions(frames, videos, scene_template, truth)
+    errors: dict[str, list[PoseErrors]] = {}
+    for variant, folder in folders.items():
+        poses = {session.id: read_registration(folder, session.id) for session in sessions}
+        errors[variant] = [pose_errors(_cameras(poses[session.id], session), session.camera) for session in sessions]
+        confidence = {session.id: _confidence(poses[session.id], session) for session in sessions}
+        named = {session.id: error for session, error in zip(sessions, errors[variant], strict=True)}
+        one = registration.camera_figures(named, confidence, sum(table is not None for table in poses.values()))
+        for there, here in ((one.values, found.values), (one.reasons, found.reasons)):
+            here.update({name.replace("registration", variant, 1): value for name, value in there.items()})
+    for variant in folders:
+        if variant != "ours":
+            _compare(found, variant, sessions, errors, resampling)
+    return found
+
+
+def _compare(found, variant, sessions, errors, resampling):
+    """Put the paired mean difference to ours with its 95 % interval; whole episodes are drawn again."""
+    start = np.concatenate([(session.timestamp_s / resampling.episode_s).astype(int) for session in sessions])
+    video = np.repeat(np.arange(len(sessions)), [len(session.timestamp_s) for session in sessions])
+    episode = episodes(start, video, 1)
+    both = joined(errors[variant]), joined(errors["ours"])
+    for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
+        theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
+        interval = bootstrapped(theirs - ours, episode, resampling.draws, resampling.rng)
+        found.put(f"{variant}/{unit}_more_than_ours", interval.mean)
+        found.put(f"{variant}/{unit}_more_than_ours_ci95_low", interval.low)
+        found.put(f"{variant}/{unit}_more_than_ours_ci95_high", interval.high)
+
+
+def _sessions(frames, videos, scene_template, truth) -> list[_Session]:
+    cameras = arrays.load(scene_template / "cameras.npz", ("world_from_camera", "registered"))
+    ours = np.where(cameras["registered"][:, None, None], cameras["world_from_camera"], np.nan)
+    tables = {id: arrays.load(folder / "frames.npz", ("source_index", "timestamp_s")) for id, folder in frames.items()}
+    true = {video.id: Truth.open(truth, Path(video.file).stem, tables[video.id]["source_index"]) for video in videos if video.id in tables}
+    walk = next(video.id for video in videos if video.role == "walkthrough")
+    world = constant_between(ours, true[walk].world_from_camera)
+    chosen = [video.id for video in videos if video.role == "session"]
+    return [_Session(id, world @ true[id].world_from_camera, tables[id]["timestamp_s"]) for id in chosen]
+
+
+def _cameras(poses, session):
+    return poses["world_from_camera"] if poses else np.full((len(session.camera), 4, 4), np.nan)
+
+
+def _confidence(poses, session):
+    return poses["confidence"] if poses else np.zeros(len(session.camera))
+
+
+def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
+    """Lay the figures out as Table 1, the paper's beside ours."""
+    lines = [
+        "Table 1: camera registration, all frames of all sessions (median; 95th percentile; mean difference to ours with 95 % interval)",
+        f"{'':34}{'rotation, deg':>20}{'translation, m':>20}{'videos':>9}{'to ours, deg':>28}{'paper':>16}",
+    ]
+    for variant in variants:
+        pairs = ["; ".join(_told(values.get(f"{variant}/{unit}_{which}")) for which in ("median", "p95")) for unit in UNITS]
+        videos = "/".join(_told(values.get(f"{variant}/videos_{which}"), "g") for which in ("registered", "total"))
+        name = f"{variant}/rotation_deg_more_than_ours"
+        change = [_told(values.get(f"{name}{end}")) for end in ("", "_ci95_low", "_ci95_high")]
+        against = "" if variant == "ours" else f"{change[0]} [{change[1]}, {change[2]}]"
+        paper = "{:g} / {:g}".format(*PAPER[variant]) if variant in PAPER else ""
+        lines.append(f"{NAMES.get(variant, variant):34}{pairs[0]:>20}{pairs[1]:>20}{videos:>9}{against:>28}{paper:>16}")
+    lines.append("paper: its own cat videos, degrees / metres; '-': more than half (a twentieth) of the frames has no pose.")
+    return "\n".join(lines) + "\n"
+
+
+def _told(value: float | None, form: str = ".3f") -> str:
+    return "-" if value is None else format(value, form)
+
+
+def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:
+    """Judge whether what the ablations leave out matters."""
+    ours = values.get("ours/rotation_deg_median")
+    without = values.get("no_localizer/rotation_deg_median")
+    ratio = None if ours is None else (without if without is not None else MOST_DEG) / max(ours, 1e-6)
+    found = [Check("rotation, ours", ours, "deg, median", 0.5, 2.0)]
+    if "no_localizer" in variants:
+        found.append(Check("rotation without localizer over ours", ratio, "", 3.0, None, "higher"))
+    return found
