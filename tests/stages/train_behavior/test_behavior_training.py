@@ -28,7 +28,7 @@ from stages.train_behavior.export import (
     signature,
     write_contract,
 )
-from stages.train_behavior.objective import Objective, losses
+from stages.train_behavior.objective import Objective, goal_error, losses
 from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.training import Optimization, Settings, initial_nets, train, two_cosines
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
@@ -210,3 +210,28 @@ def test_perception_and_goals_rest_in_the_second_part(data, windows):
         for part, learns in (("perception", goals), ("goal", goals), ("path", True), ("body", True)):
             moved = [parameter.grad is not None for parameter in getattr(nets, part).parameters()]
             assert any(moved) == learns, part
+
+
+class Asked:
+    """A goal network that notes which part of the future it is asked for, and knows the answer."""
+
+    def __init__(self, track):
+        self.goal, self.track, self.horizons = self, track, torch.zeros(0)
+
+    def apart(self, x, t, code, horizon):
+        self.horizons = horizon
+        clean = self.track[code[:, 0].long(), :, (horizon * self.track.shape[-1]).round().long() - 1]
+        share = torch.from_numpy(Schedule().alpha_bar).float()[t.long()][:, None]
+        return ((x - share.sqrt() * clean) / (1 - share).sqrt())[None]
+
+
+@pytest.mark.parametrize(("share", "lowest", "highest"), [(0.0, 1.0, 1.0), (1.0, 0.2, 0.5)])
+def test_goals_are_asked_for_earlier_times_as_often_as_told(windows, share, lowest, highest):
+    batch, _ = drawn(windows, PLAIN)
+    torch.testing.assert_close(batch.track[:, :, -1], batch.goal)
+    nets, number = Asked(batch.track), torch.arange(len(batch.goal), dtype=torch.float32)[:, None]
+    objective = Objective(earlier_share=share, earliest=0.2, goal_draws=4)
+    error = goal_error(nets, batch, number, Schedule(), objective, torch.Generator().manual_seed(0))
+    assert error.shape == (4 * len(batch.goal), 3)
+    assert error.abs().max() < 1e-3  # the right answer for the time asked for
+    assert lowest - 1e-6 <= nets.horizons.min() <= highest
