@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Literal, assert_never
 
 from pipeline import cli, progress
 from pipeline.files import arrays
@@ -16,6 +18,12 @@ GAPS = (1, 2, 4, 8)
 class Config:
     """Settings of flow estimation."""
 
+    backend: Literal["search", "raft"] = "search"
+    """Dense inverse search without weights, or RAFT with its authors' weights."""
+    weights: str = ""
+    """RAFT's weights (`raft-things.pth`)."""
+    updates: int = 20
+    """RAFT's iterations."""
     working_side_px: int = 320
     """Pictures are searched at this longer side, pixels."""
     patch_stride_px: int = 3
@@ -28,10 +36,8 @@ class Config:
 
 def run(task: cli.Task) -> None:
     """Estimate all gaps of one video."""
-    settings: Config = task.config
     clip = Clip.open(task.input("frames"))
-    search = Search(settings.working_side_px, settings.patch_stride_px, settings.iterations)
-    estimator = Estimator(clip.color_size, search, tolerance_px=settings.tolerance_px)
+    estimator = _estimator(task, clip.color_size)
     gray = lru_cache(maxsize=4096)(lambda frame: estimator.reduce(clip.color(frame)))
     reviews = []
     with task.create() as folder:
@@ -40,6 +46,22 @@ def run(task: cli.Task) -> None:
                 arrays.save(folder / f"flow_{gap}_{way}.npz", flow=part.flow, confidence=part.confidence)
             reviews.append(pictures.review(gap, forward, clip.color))
         pictures.report_quality(folder, reviews)
+
+
+def _estimator(task: cli.Task, color_size: tuple[int, int]) -> Estimator:
+    settings: Config = task.config
+    search = Search(settings.working_side_px, settings.patch_stride_px, settings.iterations)
+    match settings.backend:
+        case "search":
+            return Estimator(color_size, search, tolerance_px=settings.tolerance_px)
+        case "raft":
+            from pipeline.models import raft
+            from stages.estimate_flow.backends.raft import RaftEstimator
+
+            network = raft.load(Path(settings.weights or "raft-things.pth"), task.device)
+            return RaftEstimator(network, color_size, search, tolerance_px=settings.tolerance_px, iterations=settings.updates)
+        case _:
+            assert_never(settings.backend)
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ class Estimator:
 
     def chained(self, first: Gray, last: Gray, first_to_middle: Dense, middle_to_last: Dense) -> Dense:
         """Follow one flow, then the other; keep per place that or a search on the finest level from there."""
-        guess = first_to_middle + _sampled(middle_to_last, self._pixel + first_to_middle)
+        guess = chain(first_to_middle, middle_to_last)
         return self._better(first, last, [guess, self._searched(self._fine, first, last, guess)])
 
     def judged(self, flow: Dense, back: Dense) -> Flow:
@@ -128,6 +128,11 @@ def flows(gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimat
             judged.append((estimator.judged(there, back), estimator.judged(back, there)))
         before = now
         yield gap, *(_stacked([pair[way] for pair in judged], estimator) for way in (0, 1))
+
+
+def chain(first_to_middle: Dense, middle_to_last: Dense) -> Dense:
+    """Follow one flow, then the other."""
+    return first_to_middle + _sampled(middle_to_last, _index_grid(*first_to_middle.shape[:2]) + first_to_middle)
 
 
 def grid_centers(color_size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:

@@ -7,7 +7,8 @@ import numpy as np
 from pipeline import cli, progress
 from pipeline.files import arrays
 from pipeline.files.clips import Clip
-from pipeline.models.features import FeatureBasis, describe
+from pipeline.models.describers import Describer
+from pipeline.models.features import FeatureBasis
 from stages.extract_features import pictures
 
 
@@ -23,6 +24,7 @@ def run(task: cli.Task) -> None:
     """Extract one video's features."""
     settings: Config = task.config
     clip, basis = Clip.open(task.input("frames")), FeatureBasis.load(task.input("feature_basis"))
+    describe = Describer.load(task.input("feature_basis")).open(lambda: task.device)
     numbers = progress.track(range(len(clip)), "features: frames")
     features = np.stack([basis.project(describe(clip.color(i), settings.stride_px)).astype(np.float16) for i in numbers])
     with task.create() as folder:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from pipeline import cli, progress, qa
 from pipeline.files.clips import Clip
+from pipeline.models.describers import Backend, Describer
 from pipeline.models.features import fit_basis
 from stages.fit_feature_basis.sampling import sample_descriptors
 
@@ -12,6 +13,10 @@ from stages.fit_feature_basis.sampling import sample_descriptors
 class Config:
     """Settings of the feature basis."""
 
+    backend: Backend = "daisy"
+    """Descriptor of all features: `daisy` needs no weights, `dinov2` the extra `make foundation` and a checkpoint."""
+    weights: str = ""
+    """Folder of the checkpoint (`facebook/dinov2-small` and its like)."""
     frames_per_recording: int = 16
     """Frames described per recording, spread over its length."""
     stride_px: int = 16
@@ -25,10 +30,14 @@ def run(task: cli.Task) -> None:
     settings: Config = task.config
     folders = task.per_video("frames", roles=("walkthrough", "turnaround", "session"), splits=("train", "none"))
     clips = [Clip.open(folder) for folder in progress.track(folders.values(), "feature basis: recordings")]
-    raw = sample_descriptors(clips, frames_per_clip=settings.frames_per_recording, stride_px=settings.stride_px)
+    describer = Describer(settings.backend, settings.weights)
+    raw = sample_descriptors(
+        clips, describer.open(lambda: task.device), frames_per_clip=settings.frames_per_recording, stride_px=settings.stride_px
+    )
     basis = fit_basis(raw, whitening=settings.whitening)
     with task.create() as folder:
         basis.save(folder)
+        describer.save(folder)
         qa.write(
             folder,
             good="the 16 axes hold most of the variance",

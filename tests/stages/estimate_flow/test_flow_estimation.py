@@ -5,10 +5,13 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from pipeline import artifact, cli
 from pipeline.files import arrays, images
+from pipeline.models import raft
 from stages.estimate_flow import __main__ as front
+from stages.estimate_flow.backends.raft import RaftEstimator
 from stages.estimate_flow.estimation import Estimator, Search, flows, grid_centers
 
 SEARCH = Search(working_side_px=320, patch_stride_px=3, iterations=16)
@@ -118,3 +121,17 @@ def test_a_small_thing_that_moves_against_the_camera_is_seen():
     estimator = Estimator((200, 160), SEARCH, tolerance_px=1.5)
     forward, _ = both_ways(estimator, [estimator.reduce(picture) for picture in pictures])
     np.testing.assert_allclose(np.median(forward.flow[0][22:28, 17:21].astype(float), axis=(0, 1)), [4, 0], atol=1.0)
+
+
+def test_a_network_fills_the_same_gaps_and_grid():
+    torch.manual_seed(0)
+    network = raft.Raft().eval()
+    estimator = RaftEstimator(network, (64, 80), Search(80, 3, 12), tolerance_px=1.5, iterations=1)
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 255, (3, 64, 80, 3), dtype=np.uint8)
+    made = {gap: (forward, backward) for gap, forward, backward in flows(lambda i: estimator.reduce(pictures[i]), 3, (1, 2), estimator)}
+    assert made[1][0].flow.shape == (2, 16, 20, 2)
+    assert made[2][1].confidence.shape == (1, 16, 20)
+    expected = raft.flow_between(network, pictures[0], pictures[1], 1)
+    on_grid = cv2.resize(expected, (20, 16), interpolation=cv2.INTER_AREA)
+    np.testing.assert_allclose(made[1][0].flow[0].astype(np.float32), on_grid, atol=0.01 * np.abs(on_grid).max())

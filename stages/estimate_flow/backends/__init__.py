@@ -1,0 +1,1 @@
+"""Learned flow in place of search: same gaps, same grid, same confidence."""
