@@ -27,7 +27,7 @@ def library() -> ModuleType:
     try:
         import transformers
     except ImportError as error:
-        raise InputError("MOD-002", "this backend needs the package transformers", str(error), "make foundation") from error
+        raise InputError("MOD-002", "this backend needs the package transformers", str(error), "make extras") from error
     return transformers
 
 

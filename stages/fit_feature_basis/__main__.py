@@ -14,7 +14,7 @@ class Config:
     """Settings of the feature basis."""
 
     backend: Backend = "daisy"
-    """Descriptor of all features: `daisy` needs no weights, `dinov2` the extra `make foundation` and a checkpoint."""
+    """Descriptor of all features: `daisy` needs no weights, `dinov2` `make extras` and a checkpoint."""
     weights: str = ""
     """Folder of the checkpoint (`facebook/dinov2-small` and its like)."""
     frames_per_recording: int = 16

@@ -10,7 +10,7 @@ from pipeline.models import pretrained
 from pipeline.models.describers import Describer
 from pipeline.models.dinov2 import Dinov2
 
-NEEDS = "the extra is not installed (make foundation)"
+NEEDS = "the extra is not installed (make extras)"
 
 
 @pytest.fixture(scope="module")
@@ -66,4 +66,4 @@ def test_a_missing_library_is_told_with_its_remedy(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "transformers", None)
     with pytest.raises(InputError, match="MOD-002") as refused:
         pretrained.library()
-    assert refused.value.remedy == "make foundation"
+    assert refused.value.remedy == "make extras"
