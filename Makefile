@@ -15,7 +15,7 @@ RUN    := $(PYTHON) -SE -m pipeline.run
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check annotate behavior-tables registration-tables behavior-benchmark export simulate extras test doctor clean FORCE
+.PHONY: help new capture-check annotate behavior-tables registration-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
 HOME_OF := build/$(or $(AGENT),cat)
 INPUTS = $(foreach a,$1,--$(subst _,-,$a) $(HOME_OF)/$a)
 
@@ -60,10 +60,14 @@ export: .venv/.ok
 	  --videos $(HOME_OF)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
 	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); what is lost stands in its export.json'
 
-# The behaviour model without a page: half a minute beside a scripted observer.
+# The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
 simulate: .venv/.ok
 	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).behavior
 	@$(PYTHON) -m stages.simulate $(call INPUTS,behavior behavior_data) --out $(HOME_OF)/take
+
+serve: .venv/.ok
+	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).simulator
+	@$(PYTHON) -m stages.simulate $(call INPUTS,behavior behavior_data simulator) --serve --out $(HOME_OF)/take
 
 extras: .venv/.ok
 	@envs/extras

@@ -2,6 +2,7 @@
 
 With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`. In Python: `Simulator.reset(seed)` and
 `Simulator.step(observer)` of `pipeline.models.simulator`, ten steps a second.
+With `--serve`: live in a browser, computed here; a take of it is kept.
 With `--longterm` and `--subgoals FILE` (see `stages.simulate.subgoal_file`), or sub-goals that the recipe asks for:
 writes `take.npz` at 30 fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
 """
@@ -46,12 +47,16 @@ class Config:
     """Pictures per second of long-term motion; 0 = none."""
     seed: int = 0
     """Seed of the beginning and of all noise."""
+    serve: bool = False
+    """Show the animal live, on this machine alone, until interrupted; needs `--simulator` and viser (`make extras`)."""
+    port: int = 8080
+    """Where it is shown."""
 
 
 def run(task: cli.Task) -> None:
     """Make one take."""
     c: Config = task.config
-    given = {name: task.input(name) for name in ("behavior", "behavior_data", "longterm", "reconstruction") if task.has(name)}
+    given = {name: task.input(name) for name in ("behavior", "behavior_data", "simulator", "longterm", "reconstruction") if task.has(name)}
     written = None
     if task.has("subgoals"):
         table = config.read_table(task.input("subgoals"))
@@ -59,7 +64,9 @@ def run(task: cli.Task) -> None:
         written = subgoals_from_table(table, rows, task.input("subgoals"))
     if written is None and c.subgoals == "file":
         raise InputError("SIM-004", "which sub-goals?", task.stage, "give --subgoals file.toml")
-    if written is None and c.subgoals == "none":
+    if c.serve:
+        take = takes.live(given, c, task.device)
+    elif written is None and c.subgoals == "none":
         take = takes.of_behavior(given, c, task.device)
     else:
         take = takes.through_subgoals(given, written, c, task.device)
@@ -69,5 +76,5 @@ def run(task: cli.Task) -> None:
 
 
 if __name__ == "__main__":
-    optional = ("behavior", "longterm", "reconstruction", "subgoals")
-    cli.enter(__doc__, run, config=Config, reads=("behavior_data",), optional=optional)
+    optional = ("behavior", "simulator", "longterm", "reconstruction", "subgoals")
+    cli.enter(__doc__, run, config=Config, reads=("behavior_data",), optional=optional, options=("serve", "port", "seed", "seconds"))

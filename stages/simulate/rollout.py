@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.files import arrays
-from pipeline.models.simulator import Simulator
+from pipeline.models.simulator import Simulator, State
 from pipeline.models.trajectories import RATE_HZ
 from pipeline.space import rigid
 from stages.simulate.observers import Observer
@@ -36,6 +36,11 @@ def rollout(simulator: Simulator, observer: Observer, *, seconds: float, seed: i
         state = simulator.step(position)
         states.append(state)
         seen.append(position)
+    return take_of(states, seen)
+
+
+def take_of(states: list[State], seen: list[Float[np.ndarray, "3"]]) -> Take:
+    """Gather states and the observer's positions."""
     columns = {
         name: np.array([getattr(state, name) for state in states])
         for name in ("time_s", "world_from_agent", "agent_from_bone", "goal_world", "blocked")

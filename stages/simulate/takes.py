@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline import progress
 from pipeline.errors import InputError
-from pipeline.files import arrays, meshes
+from pipeline.files import arrays, glb, meshes
 from pipeline.models import behavior
 from pipeline.models.bodies import load_body
 from pipeline.models.motion_synthesis import LongTerm
@@ -21,6 +22,7 @@ from pipeline.models.trajectories import FUTURE, TRAIN, BehaviorData
 from stages.simulate import journey, journey_files
 from stages.simulate.chained_goals import chained_goals
 from stages.simulate.journey import World
+from stages.simulate.live import Live, Look
 from stages.simulate.observers import Observer, scripted
 from stages.simulate.rollout import rollout, write_take
 
@@ -50,6 +52,19 @@ def of_behavior(given: Mapping[str, Path], c: Any, device: str) -> Made:
         journey_files.write_worth(folder, before, after, seconds=c.seconds)
 
     return Made(said, write)
+
+
+def live(given: Mapping[str, Path], c: Any, device: str) -> Made:
+    """Let the animal live in a browser until interrupted."""
+    data, shown = BehaviorData.load(_needed(given, "behavior_data")), _needed(given, "simulator")
+    simulator = _simulator(given, data, c, c.chaining, device)
+    mesh, skin, _ = glb.read_skinned((shown / "agent.glb").read_bytes())
+    look = Look(mesh, skin, (shown / "scene.glb").read_bytes())
+    seen = np.concatenate([t.world_from_camera[t.valid, :3, 3] for t in data.trajectories.values()])
+    here = Live(simulator, look, np.median(seen, axis=0), seed=c.seed, port=c.port)
+    progress.log(f"open http://127.0.0.1:{here.port} and drag the person; Ctrl-C ends it and keeps the take")
+    take = here.run()
+    return Made(f"{take.timestamp_s[-1]:g} s lived", lambda folder: write_take(folder, take))
 
 
 def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c: Any, device: str) -> Made:

@@ -82,7 +82,7 @@ def trajectory(frames: int, seed: int) -> Trajectory:
     return Trajectory(time_s, world_from_agent, (rest() @ rigid.exp(wag)).astype(np.float32), camera, np.ones(frames, bool))
 
 
-def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[BehaviorNets, Scaling]:
+def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[BehaviorNets, Scaling]:
     """Train perception and goal network, briefly, to run from whoever is near; path network to go straight; the body only at random."""
     torch.manual_seed(0)
     nets, schedule = BehaviorNets(architecture), Schedule()
@@ -97,7 +97,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 400) -> tuple[Be
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
-        condition = mind.join(elsewhere[0], observer.flatten(1), elsewhere[1], torch.ones(128, 3))
+        condition = torch.cat([elsewhere[0], mind.observer(observer.flatten(1), torch.ones(128)), elsewhere[1]], dim=-1)
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
         loss = (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise).square().mean()

@@ -1,11 +1,18 @@
+import sys
+import urllib.request
+
 import numpy as np
 import pytest
 
+from pipeline.errors import InputError
+from pipeline.files import glb
 from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.simulator import Chaining, Frames, Simulator, blocked_share, faded
 from pipeline.space import rigid
+from pipeline.space.meshes import Mesh
+from stages.simulate.live import Live, Look
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
 from tests.pipeline.models.wandering import ARCHITECTURE, room, wandering
@@ -79,3 +86,30 @@ def test_take_is_written_completely(simulator, tmp_path):
     assert len(lines) == 1 + 11
     assert lines[0].startswith("time_s,x,y,z,qw")
     assert (tmp_path / "take.npz").stat().st_size > 1000
+
+
+def look():
+    """A triangle on three bones in a room of one triangle."""
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), None)
+    joints = np.tile(np.arange(4, dtype=np.uint8) % 3, (3, 1))
+    skin = glb.Skin(joints, np.full((3, 4), 0.25, np.float32), np.tile(np.eye(4), (3, 1, 1)), ("a", "b", "c"))
+    return Look(mesh, skin, glb.static(mesh, "room"))
+
+
+def test_live_view_answers_and_keeps_its_take(simulator):
+    pytest.importorskip("viser")
+    here = Live(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8117)
+    with urllib.request.urlopen(f"http://127.0.0.1:{here.port}", timeout=10) as answer:
+        assert answer.status == 200
+    here.interactivity.value = 0.25
+    here.person.position = (0.4, 1.3, 0.2)
+    take = here.run(stopped=lambda: len(here.states) >= 4)
+    assert len(take.timestamp_s) == 4 and simulator.sampling.guidance == 0.25
+    np.testing.assert_allclose(take.observer_world[-1], [0.4, 1.3, 0.2], atol=1e-6)
+    np.testing.assert_allclose(here.animal.position, take.world_from_agent[-1, :3, 3], atol=1e-6)
+
+
+def test_live_view_says_what_it_needs(simulator, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match="make extras"):
+        Live(simulator, look(), np.zeros(3), seed=1, port=8118)

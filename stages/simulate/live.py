@@ -1,0 +1,126 @@
+"""The animal live in a browser, computed here: for networks and machines that a page cannot hold (viser, an extra).
+
+The server listens on this machine alone. One visitor drags the person about; `run` goes on until it is told to stop,
+or is interrupted, and returns all that happened as a take.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.errors import InputError
+from pipeline.files.glb import Skin
+from pipeline.models.simulator import Simulator, State
+from pipeline.models.trajectories import RATE_HZ
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh
+from stages.simulate.rollout import Take, take_of
+
+_HOST = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is shown: the animal's surface and skin (agent frame), the room as binary glTF (world frame)."""
+
+    mesh: Mesh
+    skin: Skin
+    scene: bytes
+
+
+class Live:
+    """One animal, one room, one visitor."""
+
+    def __init__(self, simulator: Simulator, look: Look, observer: Float[np.ndarray, "3"], *, seed: int, port: int):
+        try:
+            import viser  # late: an extra
+        except ImportError as error:
+            raise InputError(
+                "SIM-010", f"the live view needs viser: {error}", "the Python environment", "install it: make extras"
+            ) from error
+        self.simulator, self.seed = simulator, seed
+        self.server = viser.ViserServer(host=_HOST, port=port, verbose=False)
+        self.server.scene.set_up_direction("+y")
+        self.server.scene.add_glb("/room", look.scene)
+        self.person = self.server.scene.add_transform_controls(
+            "/person", scale=0.5, active_axes=(True, False, True), disable_rotations=True, position=tuple(observer)
+        )
+        self.server.scene.add_icosphere("/person/head", 0.12, (47, 111, 159))
+        self.goal = self.server.scene.add_icosphere("/goal", 0.06, (200, 114, 43))
+        self.animal = self._add_animal(look)
+        self._add_controls()
+        self.reset()
+
+    @property
+    def port(self) -> int:
+        """Where a browser finds it."""
+        return self.server.get_port()
+
+    def reset(self) -> None:
+        """Begin again, at a recorded moment that the seed picks."""
+        self.states = [self.simulator.reset(self.seed)]
+        self.seen = [np.array(self.person.position, float)]
+        self._show(self.states[-1])
+
+    def run(self, stopped: Callable[[], bool] = lambda: False) -> Take:
+        """Let time pass until `stopped` or interrupted."""
+        due = time.monotonic()
+        try:
+            while not stopped():
+                if self.playing.value:
+                    self.step()
+                due = max(due + 1 / RATE_HZ, time.monotonic())
+                time.sleep(max(0.0, due - time.monotonic()))
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.server.stop()
+        return take_of(self.states, self.seen)
+
+    def step(self) -> None:
+        """Let 0.1 s pass with the person where the visitor has put it."""
+        self.simulator.sampling = replace(self.simulator.sampling, guidance=float(self.interactivity.value))
+        position = np.array(self.person.position, float)
+        self.states.append(self.simulator.step(position))
+        self.seen.append(position)
+        self._show(self.states[-1])
+
+    def _show(self, state: State) -> None:
+        turns = rigid.quaternion_from_rotation(state.agent_from_bone[:, :3, :3].astype(np.float64))
+        root = rigid.quaternion_from_rotation(state.world_from_agent[:3, :3])
+        with self.server.atomic():
+            self.animal.position, self.animal.wxyz = state.world_from_agent[:3, 3], root
+            for bone, handle in enumerate(self.animal.bones):
+                handle.position, handle.wxyz = state.agent_from_bone[bone, :3, 3], turns[bone]
+            self.goal.position = state.goal_world
+
+    def _add_animal(self, look: Look) -> Any:
+        weights = np.zeros((len(look.mesh.vertices), len(look.skin.bone_names)), np.float32)
+        np.add.at(weights, (np.arange(len(weights))[:, None], look.skin.joints), look.skin.weights)
+        rest = look.skin.agent_from_bone_rest
+        color = (150, 120, 90) if look.mesh.color is None else tuple(int(value) for value in look.mesh.color.mean(0))
+        return self.server.scene.add_mesh_skinned(
+            "/animal",
+            look.mesh.vertices.astype(np.float32),
+            look.mesh.faces,
+            bone_wxyzs=rigid.quaternion_from_rotation(rest[:, :3, :3]),
+            bone_positions=rest[:, :3, 3],
+            skin_weights=weights,
+            color=color,
+            side="double",
+        )
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        self.interactivity = gui.add_slider("interactivity", 0.0, 1.0, 0.05, float(np.clip(self.simulator.sampling.guidance, 0, 1)))
+        self.playing = gui.add_checkbox("time passes", True)
+        again = gui.add_button("start again, next seed")
+
+        @again.on_click
+        def _(_event: Any) -> None:
+            self.seed += 1
+            self.reset()
