@@ -56,7 +56,7 @@ def visitation(data: BehaviorData, volume: FeatureVolume) -> UInt8[np.ndarray, "
     """Draw heat maps of visits over the columns that hold surfaces."""
     figure = Figure(figsize=(9, 4.2), dpi=80, layout="constrained")
     axes = figure.subplots(1, 2)
-    solid = (volume.occupancy[:, 2:] == 1).mean(1)
+    solid = (volume.occupancy[:, min(2, volume.occupancy.shape[1] - 1) :] == 1).mean(1)
     low = volume.origin[[0, 2]]
     high = low + np.array(solid.shape) * volume.voxel_m
     bins = [np.arange(low[axis], high[axis] + 0.1, 0.1) for axis in (0, 1)]

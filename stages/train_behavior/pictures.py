@@ -108,7 +108,7 @@ class _Room:
     """The room from above, to draw on."""
 
     def __init__(self, volume: FeatureVolume):
-        self.solid = (volume.occupancy[:, 3:] == 1).mean(1)
+        self.solid = (volume.occupancy[:, min(3, volume.occupancy.shape[1] - 1) :] == 1).mean(1)
         self.low = volume.origin[[0, 2]]
         self.high = self.low + np.array(self.solid.shape) * volume.voxel_m
 

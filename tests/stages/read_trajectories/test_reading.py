@@ -1,0 +1,108 @@
+"""Tables of motion: what is written is read back, joints find their tree, and nonsense is refused by name."""
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.space import rigid
+from stages.read_trajectories import captured
+from stages.read_trajectories.captured import Skeleton
+from stages.read_trajectories.life import APART_S, NOBODY_M
+from stages.read_trajectories.reading import Reading, read
+
+READING = Reading(Skeleton(60.0, 0, 2), 0.1, 1.0)
+
+
+def table(path, rows, header="id,time,x,y,z,heading"):
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def test_a_table_becomes_poses_id_by_id(tmp_path):
+    rows = [f"{name},{0.1 * i},{i * 0.01},0.2,{-i * 0.02},{0.1 * i}" for name in ("b", "a") for i in range(5)]
+    life = read(table(tmp_path / "t.csv", rows), READING)
+    assert len(life.timestamp_s) == 10
+    assert life.timestamp_s[5] - life.timestamp_s[4] == pytest.approx(APART_S)
+    np.testing.assert_allclose(life.world_from_agent[4, :3, 3], [0.04, 0.2, -0.08])
+    np.testing.assert_allclose(life.world_from_agent[4, :3, 2], [np.sin(0.4), 0, np.cos(0.4)], atol=1e-12)
+    assert (life.world_from_camera[:, 0, 3] == NOBODY_M).all()
+
+
+def test_unseen_rows_and_observers_are_kept_apart(tmp_path):
+    rows = ["a,0.0,1,0,2,0,3,1,4", "a,0.1,,,,,3,1,4", "a,0.2,1,0,2,0,,,"]
+    life = read(table(tmp_path / "t.csv", rows, "id,time,x,y,z,heading,observer_x,observer_y,observer_z"), READING)
+    assert life.motion()["agent_visible"].tolist() == [True, False, True]
+    np.testing.assert_allclose(life.world_from_camera[0, :3, 3], [3, 1, 4])
+    assert life.world_from_camera[2, 0, 3] == NOBODY_M
+
+
+def test_an_obstacle_map_stands_where_it_says(tmp_path):
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    table(folder / "trajectory.csv", [f"a,{0.1 * i},{0.1 * i},0.25,0,1.57" for i in range(20)])
+    (folder / "obstacles.csv").write_text("x,z,bottom,top\n1.05,0.55,0,0.5\n")
+    volume = read(folder, READING).volume
+    for point, solid in (((1.05, 0.25, 0.55), 1), ((1.05, 0.65, 0.55), 0), ((1.05, 0.25, 0.05), 0), ((1.0, -0.1, 0.0), 1)):
+        voxel, inside = volume.voxel(np.array(point))
+        assert inside and volume.occupancy[tuple(voxel)] == solid, point
+    assert volume.features[:, volume.occupancy == 0].sum() == 0
+
+
+def skeleton_motion(frames=300):
+    """A pelvis that turns and walks, a two-joint spine ahead, a leg that swings: who hangs on whom is 0 -> 1 -> 2, 0 -> 3 -> 4."""
+    swing = 0.6 * np.sin(np.arange(frames) * 0.2)
+    leg = np.stack([0 * swing, -np.cos(swing), np.sin(swing)], axis=-1)
+    bent = np.stack([0 * swing, -np.cos(2 * swing), np.sin(2 * swing)], axis=-1)
+    nod = np.stack([0 * swing, 0.3 * np.sin(3 * swing), np.cos(0.3 * np.sin(3 * swing))], axis=-1)
+    spine = np.broadcast_to([0, 0.02, 0.3], leg.shape)
+    local = np.stack([0 * leg, spine, spine + 0.2 * nod, 0.2 * leg, 0.2 * leg + 0.15 * bent], axis=1)
+    yaw = np.linspace(0, 3, frames)
+    root = rigid.make(rigid.rotation_from_vector(np.stack([0 * yaw, yaw, 0 * yaw], -1)), np.stack([yaw, 0 * yaw + 0.5, 0.5 * yaw], -1))
+    return rigid.apply(root, local)
+
+
+def test_joints_find_the_tree_and_bones_turn_with_it():
+    joints = skeleton_motion()
+    parent = captured.parents(joints, 0)
+    assert parent.tolist() == [-1, 0, 1, 0, 3]
+    root = captured.root_from_joints(joints, Skeleton(60.0, 0, 1))
+    local = rigid.apply(rigid.inverse(root), joints)
+    bones, rest = captured.bones_from_joints(local, parent)
+    assert rest.shape == (5, 4, 4)
+    along = np.einsum("fij,j->fi", bones[:, 3, :3, :3], _unit((local[:, 4] - local[:, 3]) / 0.15).mean(0))
+    assert np.abs(np.cross(_unit(along), _unit(local[:, 4] - local[:, 3]))).max() < 1e-6
+
+
+def _unit(vector):
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+
+
+def test_clips_of_joints_stand_on_the_floor(tmp_path):
+    joints = skeleton_motion() + [0, 3.0, 0]
+    np.savez(tmp_path / "clip.npz", walk=joints, run=joints[:100])
+    life = read(tmp_path / "clip.npz", READING)
+    assert len(life.timestamp_s) == 400
+    lowest = rigid.apply(life.world_from_agent, life.agent_from_bone[:, :, :3, 3])[..., 1].min()
+    assert abs(lowest) < 0.02
+    np.testing.assert_allclose(np.linalg.det(life.world_from_agent[:, :3, :3]), 1, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("time,x\n0,1\n", "TRJ-001.*no column y, z, heading"),
+        ("id,time,x,y,z,heading\na,zero,0,0,0,0\n", "TRJ-001.*time is not numeric"),
+        ("id,time,x,y,z,heading\n", "TRJ-002"),
+        ("id,time,x,y,z,heading\na,0,,,,\n", "TRJ-002.*no position"),
+    ],
+)
+def test_nonsense_is_refused(tmp_path, text, code):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match=code):
+        read(tmp_path / "t.csv", READING)
+
+
+def test_arrays_that_are_no_joints_are_refused(tmp_path):
+    np.savez(tmp_path / "t.npz", depth=np.zeros((4, 5)))
+    with pytest.raises(InputError, match="TRJ-001.*no joint positions"):
+        read(tmp_path / "t.npz", READING)

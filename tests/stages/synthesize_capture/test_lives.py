@@ -1,0 +1,63 @@
+"""Lives without pictures: homes can be lived in, volumes agree with where the animal goes, approaches have twins."""
+
+import numpy as np
+import pytest
+
+from pipeline.models.flight import flees
+from pipeline.models.trajectories import PAST
+from stages.synthesize_capture import dwellings, voxels
+from stages.synthesize_capture.lives import approaches, lives
+
+
+@pytest.fixture(scope="module")
+def home():
+    return dwellings.furnish_otherwise(np.random.default_rng(3))
+
+
+def test_homes_differ(home):
+    other = dwellings.furnish_otherwise(np.random.default_rng(4))
+    where = {s.name: (s.x, s.z) for s in home.standing if s.name != "loose"}
+    there = {s.name: (s.x, s.z) for s in other.standing if s.name != "loose"}
+    assert where.keys() == there.keys()
+    assert np.median([np.hypot(*np.subtract(where[n], there[n])) for n in where]) > 0.5
+    assert {place.name for place in home.room.places} >= {"sofa", "cat tree", "bowl", "window"}
+
+
+def test_the_animal_never_walks_through_what_the_volume_calls_solid(home):
+    rng = np.random.default_rng(0)
+    life = lives.lived(home.rearranged(rng), rng, 30.0)
+    voxel, inside = life.volume.voxel(life.world_from_agent[:, :3, 3])
+    assert inside.all()
+    assert (life.volume.occupancy[tuple(voxel.T)] == 1).mean() < 0.01
+    assert (life.volume.occupancy[:, 3:6] == 1).mean() > 0.1
+    lengths = np.linalg.norm(life.volume.features.astype(float), axis=0)
+    np.testing.assert_allclose(lengths[life.volume.occupancy == 1], 1, atol=2e-3)
+    assert lengths[life.volume.occupancy == 0].max() == 0
+
+
+def test_the_same_thing_has_the_same_code_in_every_home(home):
+    volume = voxels.volume_of(home)
+    sofa = next(s for s in home.standing if s.name == "sofa")
+    voxel, _ = volume.voxel(np.array([sofa.x, 0.25, sofa.z]))
+    code = volume.features[(slice(None), *voxel)].astype(float)
+    assert code @ voxels.CODES[voxels.KINDS.index("sofa")] == pytest.approx(1, abs=1e-2)
+
+
+def test_approaches_and_their_twins_begin_alike_and_end_apart(home):
+    met = approaches.scripted(home, np.random.default_rng(0), 12)
+    root = met.world_from_agent[..., :3, 3]
+    walked = np.linalg.norm(met.observer[:, :, -1] - met.observer[:, :, 0], axis=-1)
+    assert walked[0].min() > 0.3
+    assert walked[1].max() < 1e-6
+    away = np.linalg.norm((root[0, :, PAST - 1] - met.observer[0, :, -1])[:, [0, 2]], axis=-1)
+    assert (away > 0.9).all()
+    fled = flees(root[:, :, PAST:], root[:, :, PAST - 1], met.observer[:, :, -1])
+    assert fled[0].mean() >= 0.6
+    assert fled[1].mean() < 0.3
+
+
+def test_the_same_seed_gives_the_same_life(home, tmp_path):
+    for name in ("a", "b"):
+        rng = np.random.default_rng(5)
+        lives.write(tmp_path / name, lives.lived(home.rearranged(rng), rng, 3.0))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()

@@ -1,0 +1,54 @@
+"""Tables: intervals know of seeds and of episodes, differences are paired, and text shows what the figures say."""
+
+import numpy as np
+import pytest
+
+from stages.tabulate_behavior import printing, tables, untrained
+from stages.tabulate_behavior.reading import Scores
+from tests.pipeline.models.wandering import wandering
+
+WINDOWS = np.stack([np.zeros(640, int), np.arange(640)], axis=1)
+
+
+def scores(values):
+    return Scores(WINDOWS, WINDOWS, {"end_to_end/goal_minde_m": values, "flees/seen": np.ones((len(values), 7))})
+
+
+def test_intervals_grow_with_what_seeds_disagree_about():
+    rng = np.random.default_rng(0)
+    windows = rng.normal(1, 0.01, (3, 640))
+    alike = tables.interval(windows, WINDOWS, 300, 0)
+    apart = tables.interval(windows + np.array([[-0.3], [0], [0.3]]), WINDOWS, 300, 0)
+    assert alike.mean == pytest.approx(apart.mean)
+    assert apart.high - apart.low > 10 * (alike.high - alike.low)
+
+
+def test_a_difference_is_taken_window_by_window():
+    rng = np.random.default_rng(1)
+    hard = np.repeat(rng.gamma(1, 1, 10), 64)[None] * np.ones((2, 1))
+    found = tables.figures({"ats": scores(hard), "rival": scores(hard + 0.1)}, "ats", draws=300, seed=0)
+    assert found["behavior/ats_minus_rival/goal_minde_m_ci95_high"] == pytest.approx(-0.1, abs=1e-9)
+    assert found["behavior/ats/goal_minde_m_ci95_high"] > found["behavior/rival/goal_minde_m_ci95_low"]
+    assert found["behavior/ats/flees_seen"] == 1
+    text = printing.tables(found, ("ats", "rival"))
+    assert f"{found['behavior/rival/goal_minde_m']:.3f}" in text
+
+
+def test_plateaus_tell_a_flat_curve_from_a_falling_one():
+    step = np.arange(200.0)
+    found = tables.plateaus({"a": {"goal": np.ones((2, 200))}, "b": {"goal": (300 - step)[None]}})
+    assert found["behavior/a/goal_loss_still_falls"] == 0
+    assert found["behavior/b/goal_loss_still_falls"] > 0.1
+
+
+def test_untrained_rivals_stand_on_the_same_windows():
+    data = wandering()
+    test = np.flatnonzero(data.split == 1)[::5]
+    like = Scores(np.stack([data.video[test], data.start[test]], 1), np.stack([data.video[test[::2]], data.start[test[::2]]], 1), {})
+    found = untrained.scores(data, like, samples=16, trials=2, seed=0)
+    assert found["stand_still"].values["end_to_end/path_minade_m"].shape == (1, len(test[::2]))
+    assert found["location_prior"].values["end_to_end/goal_minde_m"].shape == (1, len(test))
+    assert "end_to_end/path_minade_m" not in found["location_prior"].values
+    again = untrained.scores(data, like, samples=64, trials=2, seed=0)
+    better = [again[name].values["end_to_end/goal_minde_m"].mean() < found[name].values["end_to_end/goal_minde_m"].mean() for name in found]
+    assert all(better)
