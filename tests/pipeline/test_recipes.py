@@ -1,0 +1,46 @@
+"""Where a flow begins and which trials the tables want, as recipes say it."""
+
+import json
+
+import pytest
+
+from pipeline import recipes, sources
+from pipeline.errors import InputError
+from tests.pipeline import checkout
+
+
+def test_overlays_go_into_tables_and_leave_the_rest():
+    table = {"seed": 1, "training": {"steps": 5, "augmentation": {"turn": 0.5}}}
+    assert recipes.merged(table, {"training": {"augmentation": {"turn": 0.0}}}) == {
+        "seed": 1,
+        "training": {"steps": 5, "augmentation": {"turn": 0.0}},
+    }
+    assert table["training"]["augmentation"]["turn"] == 0.5
+
+
+@pytest.mark.parametrize("table", [{"begins_at": "pictures"}, {"begin": "recordings"}])
+def test_unknown_beginnings_are_refused(table):
+    with pytest.raises(InputError, match="REC-00"):
+        recipes.flow(table, "agents/cat.toml")
+
+
+def test_every_method_has_every_seed():
+    found = list(recipes.trials({"methods": ["ats", "world"], "seeds": 2}, sources.Cache()))
+    assert [trial.id for trial in found] == ["ats-0", "ats-1", "world-0", "world-1"]
+    assert found[0].overlay == {"seed": 0}
+    assert found[3].overlay["ego"] == "world" and found[3].overlay["seed"] == 1
+
+
+def test_tables_of_motion_need_no_recordings(tmp_path):
+    house = checkout.create(tmp_path)
+    house.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')
+    for name in ("a.csv", "b.npz", "ignored.txt"):
+        house.write(f"captures/dog/{name}", name)
+    told = house.python("pipeline.plan", "plan", "dog")
+    assert told.returncode == 0, told.stderr
+    assert "'ignored.txt'" in told.stdout
+    jobs = json.loads((tmp_path / "build/dog/plan/dag.json").read_text())
+    assert [job["id"] for job in jobs] == ["trajectories.v000", "trajectories.v001", "behavior_data", "behavior"]
+    assert "captures/dog/a.csv" in jobs[0]["arguments"]
+    videos = json.loads((tmp_path / "build/dog/plan/videos.json").read_text())
+    assert [(video["file"], video["split"]) for video in videos] == [("a.csv", "train"), ("b.npz", "test")]

@@ -1,0 +1,123 @@
+"""Scores of a trial: the truth scores nothing, every family goes through both protocols that it knows, scenes are its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.models import rivals
+from pipeline.models.behavior import BehaviorNets, Sampling, Scaling, channels_from_bones, rotation_to_6d
+from pipeline.models.diffusion import STANDARD
+from pipeline.models.perception import world_from_ego
+from pipeline.models.planning import Observation, TorchNetworks
+from pipeline.models.predictors import Ats
+from pipeline.models.scenes import Scenes
+from pipeline.space import rigid
+from stages.score_behavior import approaches, protocols
+from stages.score_behavior.approaches import Approaches
+from stages.score_behavior.protocols import Effort
+from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
+
+EFFORT = Effort(samples=4, trials=2, stride=20, plan_trials=1, plan_stride=30, seed=0)
+QUICK = Sampling(goal_steps=2, sequence_steps=2)
+
+
+def untrained(architecture):
+    channels = architecture.body_channels
+    scaling = Scaling(np.ones(3), np.ones((3, architecture.future)), np.zeros(channels), np.ones(channels))
+    sampler = rivals.sampler_of(architecture, TorchNetworks(BehaviorNets(architecture)), STANDARD, scaling)
+    return Ats(sampler, Scenes.of(room()), REST, architecture.ego, QUICK)
+
+
+class Oracle:
+    """A sampler that is told the future, to try the protocols on."""
+
+    def __init__(self, architecture, data, index):
+        context, future = data.windows(index)
+        ego = rigid.inverse(world_from_ego(context.world_from_agent[:, -1], architecture.ego))
+        root = ego[:, None] @ future.world_from_agent
+        bones = channels_from_bones(future.agent_from_bone, REST)
+        self.path, self.body = root[..., :3, 3], np.concatenate([rotation_to_6d(root[..., :3, :3]), bones], -1)
+
+    def codes(self, observation, sampling, count=1):
+        return count
+
+    def paths(self, count, goal, sampling, rng):
+        np.testing.assert_allclose(goal, np.repeat(self.path[:, -1], count, 0), atol=1e-9)
+        return np.repeat(self.path, count, axis=0)
+
+    def bodies(self, count, path, sampling, rng):
+        np.testing.assert_allclose(path, np.repeat(self.path, count, 0), atol=1e-9)
+        return np.repeat(self.body, count, axis=0)
+
+
+def test_a_sampler_that_knows_the_future_makes_no_error_when_fed_with_it():
+    data, index = wandering(), np.array([0, 30, 100])
+    context, future = data.windows(index)
+    ats = replace(untrained(ARCHITECTURE), sampler=Oracle(ARCHITECTURE, data, index))
+    samples = protocols.fed_with_truth(ats, context, future, 4, np.random.default_rng(0))
+    for name in protocols.PLAN_SCORES:
+        np.testing.assert_allclose(protocols.SCORES[name](samples, future), 0, atol=2e-3, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"family": "gaussian"}, {"family": "one_stage"}, {"control": "concatenation"}, {"ego": "world"}, {"future": 40}],
+    ids=lambda changes: "-".join(map(str, changes.values())) or "ats",
+)
+def test_every_method_goes_through_the_protocols_it_knows(changes):
+    architecture = replace(ARCHITECTURE, **changes)
+    data = wandering().with_horizon(architecture.future)
+    found = protocols.scores(untrained(architecture), data, architecture.family, EFFORT)
+    assert ("truth_fed/path_minade_m" in found) == (architecture.family != "one_stage")
+    assert len(found["goal_window"]) == len(found["end_to_end/goal_minde_m"]) > 1
+    assert len(found["plan_window"]) == len(found["end_to_end/path_minade_m"])
+    assert all(np.isfinite(value).all() for name, value in found.items() if "/" in name)
+    assert (found["goal_window"][:, 0] == 2).all()
+    again = protocols.scores(untrained(architecture), data, architecture.family, EFFORT)
+    assert found["recorded/solid"].tolist() == again["recorded/solid"].tolist()
+
+
+def test_windows_are_seen_in_their_own_scene():
+    data, open_room = wandering(), room()
+    walls = replace(open_room, occupancy=np.ones_like(open_room.occupancy), features=open_room.features * 0)
+    scenes = Scenes((open_room, walls), (open_room.occupancy != 1, walls.occupancy != 1), np.array([0, 0, 1]))
+    context, future = data.windows(np.array([0, len(data.start) - 1]))
+    assert scenes.inside_solid(future.path_world, context.video).mean(1).tolist() == [0, 1]
+    grids = scenes.around(context.world_from_agent[:, -1], context.video)
+    assert np.abs(grids[0]).max() > 0 and np.abs(grids[1]).max() == 0
+
+
+def test_flight_is_counted_as_the_animal_does_it():
+    steps = np.concatenate([np.zeros(8), np.linspace(0, 2, 56)])
+    poses = np.tile(np.eye(4), (2, 3, 64, 1, 1))
+    poses[0, :, :, 2, 3] = steps
+    observer = np.tile(np.array([0.0, 1.2, -1.0]), (2, 3, 8, 1))
+    met = Approaches(poses, np.tile(REST.astype(np.float32), (2, 3, 8, 1, 1, 1)), observer, Scenes.of(room()))
+    found = approaches.shares(untrained(ARCHITECTURE), met, 2, 0)
+    assert found["flees/true"].tolist() == [1, 1, 1]
+    assert found["flees/true_standing"].tolist() == [0, 0, 0]
+    assert found["flees/seen"].shape == (3,)
+
+
+def test_a_gaussian_draws_what_its_networks_tell():
+    class Told:
+        def perceive(self, grid, observer, past, keep):
+            return np.zeros((len(past), 1), np.float32)
+
+        def goal(self, x, t, condition):
+            return np.full_like(x, 2.0 if t[0] == rivals.MEAN else np.log(0.5))
+
+        def path(self, x, t, condition, control, keep):
+            return np.broadcast_to(control[:, :, None], x.shape) if t[0] == rivals.MEAN else np.full_like(x, -9)
+
+    sampler = rivals.GaussianSampler(Told(), STANDARD, Scaling(np.full(3, 3.0), np.ones((3, 56)), np.zeros(6), np.ones(6)))
+    codes = sampler.codes(behavior_observation(), Sampling(), 4000)
+    goals = sampler.goals(codes, Sampling(), np.random.default_rng(0))
+    np.testing.assert_allclose([goals.mean(), goals.std()], [6, 1.5], rtol=0.03)
+    course = sampler.course(behavior_observation(), Sampling(), np.random.default_rng(0), count=8)
+    np.testing.assert_allclose(course, 2.0, atol=0.05)
+
+
+def behavior_observation():
+    return Observation(np.zeros((1, 16, 64, 8, 64), np.float32), np.zeros((1, 24), np.float32), np.zeros((1, 8), np.float32))
