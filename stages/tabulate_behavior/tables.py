@@ -11,6 +11,12 @@ from stages.tabulate_behavior.reading import Scores
 
 PLAIN = "end_to_end"
 """Its figures carry no prefix: they are those of Table 4."""
+CONTRASTS = (
+    ("flees_seen_minus_true", "flees/seen", "flees/true"),
+    ("flees_seen_minus_unseen", "flees/seen", "flees/unseen"),
+    ("solid_minus_recorded", f"{PLAIN}/solid", "recorded/solid"),
+)
+"""Figure, and the two scores whose difference it is, approach by approach or window by window."""
 
 
 def figures(found: Mapping[str, Scores], ours: str, *, draws: int, seed: int) -> dict[str, float]:
@@ -25,8 +31,20 @@ def figures(found: Mapping[str, Scores], ours: str, *, draws: int, seed: int) ->
                 both = min(len(rival), len(values)) if min(len(rival), len(values)) > 1 else max(len(rival), len(values))
                 less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(values[:both], (both, values.shape[1]))
                 _put(table, f"behavior/{ours}_minus_{method}/{_figure(name)}", interval(less, window, draws, seed))
+        _contrast(table, method, scores, draws, seed)
         table[f"behavior/{method}/seeds"] = len(next(iter(scores.values.values())))
     return table
+
+
+def _contrast(table: dict[str, float], method: str, scores: Scores, draws: int, seed: int) -> None:
+    """Put what the bars ask of one method alone: flight against the animal's own and without the observer, and control."""
+    for name, first, second in CONTRASTS:
+        if first in scores.values and second in scores.values:
+            less = scores.values[first] - scores.values[second]
+            _put(table, f"behavior/{method}/{name}", interval(less, scores.windows_of(first), draws, seed))
+    fed, alone = (scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", PLAIN))
+    if fed is not None and alone is not None:
+        table[f"behavior/{method}/path_minade_truth_fed_share"] = float(fed.mean() / alone.mean())
 
 
 def interval(values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], draws: int, seed: int) -> Interval:

@@ -18,6 +18,7 @@ from stages.train_behavior.reactions import SIDES, Moments, Reactions, approach
 
 FAN = 64
 SHOWN = 4
+REACH_M = 3.0
 
 
 def pictures(sampler: Sampler, moments: Moments, scenes: Scenes, record: FitRecord, *, seed: int) -> list[Picture]:
@@ -126,7 +127,11 @@ class _Room:
         axis.plot(seen[:, 0], seen[:, 2], color="#55a868", linewidth=2)
         axis.scatter(*seen[-1, [0, 2]], color="#55a868", s=25)
         axis.quiver(*frame[[0, 2], 3], *(frame[[0, 2], 2] * [1, 1]), angles="xy", color="#3b6ea5", scale=8, width=0.02)
-        axis.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
+        axis.set(xticks=[], yticks=[])
+        if self.solid.size > 1:
+            axis.set(xlim=extent[:2], ylim=extent[2:])
+        else:  # nothing is known of the scene
+            axis.set(xlim=frame[0, 3] + [-REACH_M, REACH_M], ylim=frame[2, 3] + [REACH_M, -REACH_M])
 
     def lines(self, axis, frame: Float[np.ndarray, "4 4"], paths: Float[np.ndarray, "sample frame 3"]) -> None:
         for path in rigid.apply(frame, paths):

@@ -78,7 +78,7 @@ def _unit(vector):
 
 
 def test_clips_of_joints_stand_on_the_floor(tmp_path):
-    joints = skeleton_motion() + [0, 3.0, 0]
+    joints = skeleton_motion() + np.array([0, 3.0, 0])
     np.savez(tmp_path / "clip.npz", walk=joints, run=joints[:100])
     life = read(tmp_path / "clip.npz", READING)
     assert len(life.timestamp_s) == 400

@@ -34,6 +34,14 @@ def test_a_difference_is_taken_window_by_window():
     assert f"{found['behavior/rival/goal_minde_m']:.3f}" in text
 
 
+def test_flight_is_held_against_the_animals_own():
+    values = {"flees/seen": np.full((2, 40), 0.75), "flees/true": np.ones((2, 40)), "flees/unseen": np.tile([0.0, 1.0], (2, 20))}
+    found = tables.figures({"ats": Scores(WINDOWS, WINDOWS, values)}, "ats", draws=300, seed=0)
+    assert found["behavior/ats/flees_seen_minus_true_ci95_high"] == -0.25
+    assert found["behavior/ats/flees_seen_minus_unseen"] == 0.25
+    assert found["behavior/ats/flees_seen_minus_unseen_ci95_low"] < 0.2
+
+
 def test_plateaus_tell_a_flat_curve_from_a_falling_one():
     step = np.arange(200.0)
     found = tables.plateaus({"a": {"goal": np.ones((2, 200))}, "b": {"goal": (300 - step)[None]}})
