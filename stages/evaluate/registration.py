@@ -7,10 +7,13 @@ from jaxtyping import Float
 
 from stages.evaluate.alignment import PoseErrors, joined
 from stages.evaluate.figures import Figures, median, percentile
+from stages.evaluate.reliability import reliability_figures
 
 REFUSED = "more than half of the frames have no pose"
 GOOD = (2.0, 0.05)
 """degrees and metres within which a pose counts as right"""
+FLIPPED_DEG = 90.0
+"""a root turned by more than this has front and back confused"""
 COVERAGES = (0.5, 0.8)
 
 
@@ -23,6 +26,7 @@ def camera_figures(errors: Mapping[str, PoseErrors], confidence: Mapping[str, Fl
     right = (all_errors.degrees <= GOOD[0]) & (all_errors.meters <= GOOD[1])
     figures.put("registration/within_2deg_5cm_share", float(right.mean()) if len(right) else np.nan)
     certain = np.concatenate([confidence[id] for id in errors]) if errors else np.zeros(0)
+    figures.add(reliability_figures("registration", certain, right))
     order = np.argsort(-certain, kind="stable")
     for coverage in COVERAGES:
         kept = order[: round(coverage * len(order))]
@@ -38,6 +42,9 @@ def root_figures(name: str, errors: Sequence[PoseErrors]) -> Figures:
     figures.put(f"{name}/agent_root_m_median", median(all_errors.meters), REFUSED)
     figures.put(f"{name}/agent_root_deg_median", median(all_errors.degrees), REFUSED)
     figures.put(f"{name}/agent_root_m_p90", percentile(all_errors.meters, 90), "a tenth of the frames has no pose")
+    placed = np.isfinite(all_errors.degrees)
+    figures.put(f"{name}/agent_flips_share", float((all_errors.degrees[placed] > FLIPPED_DEG).mean()) if placed.any() else np.nan)
+    figures.put(f"{name}/agent_placed_share", float(placed.mean()) if len(placed) else np.nan)
     return figures
 
 
