@@ -82,21 +82,23 @@ def find_roots(
 ) -> Roots:
     """Find the animal's root in every frame that shows it."""
     body = bodies.make_body(mesh, options.fit, rng)
-    glimpses = [
-        glimpse
-        for frame in track(np.flatnonzero(masks.visible).tolist(), "looking at the animal")
-        if (glimpse := bodies.observe(clip, masks[frame], frame, world_from_camera[frame], body, ground, options.fit)) is not None
-    ]
     count = len(clip)
     roots = np.full((count, 4, 4), np.nan)
     cost, share, visible = np.full(count, np.nan), np.zeros(count), np.zeros(count, bool)
-    if not glimpses:
+
+    def look(frame: int) -> Glimpse | None:
+        return bodies.observe(clip, masks[frame], frame, world_from_camera[frame], body, ground, options.fit)
+
+    candidates, moments = [], []
+    for frame in track(np.flatnonzero(masks.visible).tolist(), "placing the animal"):
+        if (glimpse := look(frame)) is not None:
+            candidates.append(_candidates(clip, glimpse, body, localizer, len(candidates), options))
+            moments.append(Moment(frame, np.median(glimpse.points_world, axis=0), glimpse.world_from_camera[:3, 3]))
+    if not candidates:
         return Roots(roots, visible, cost, share)
-    candidates = [
-        _candidates(clip, glimpse, body, localizer, index, options) for index, glimpse in enumerate(track(glimpses, "placing the animal"))
-    ]
-    path = best_path(clip.timestamp_s, candidates, pace(clip.timestamp_s, glimpses, options.still_weight), options)
-    for glimpse, candidate, chosen in zip(glimpses, candidates, path, strict=True):
+    path = best_path(clip.timestamp_s, candidates, pace(clip.timestamp_s, moments, options.still_weight), options)
+    for candidate, chosen in track(list(zip(candidates, path, strict=True)), "refining the animal"):
+        glimpse = look(candidate.frame)
         placed = bodies.fit_fine(glimpse, body, candidate.world_from_agent[chosen][None], options.fit, tilt=True)
         roots[glimpse.frame], visible[glimpse.frame], share[glimpse.frame] = placed[0], True, glimpse.share
         cost[glimpse.frame] = bodies.cost(glimpse, body, placed, options.fit)[0]
@@ -141,6 +143,16 @@ def wrap(angle: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
 
 
 @dataclass(frozen=True)
+class Moment:
+    """What is kept of a glimpse: pictures are read again when they are needed again, so that memory stays small."""
+
+    frame: int
+    middle_world: Float[np.ndarray, "3"]
+    """Of the animal's seen points."""
+    eye_world: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
 class Pace:
     """How things moved around each glimpse."""
 
@@ -150,11 +162,11 @@ class Pace:
     """0..1: how much a glimpse shows that its neighbours did not; repeated views err alike."""
 
 
-def pace(timestamp_s: Float[np.ndarray, "frame"], glimpses: list[Glimpse], still_weight: float, span: int = 3) -> Pace:
+def pace(timestamp_s: Float[np.ndarray, "frame"], moments: list[Moment], still_weight: float, span: int = 3) -> Pace:
     """Measure motion over ``span`` glimpses before and after each."""
-    middle = np.stack([np.median(glimpse.points_world, axis=0) for glimpse in glimpses]) * (1, 0, 1)
-    phone = np.stack([glimpse.world_from_camera[:3, 3] for glimpse in glimpses])
-    time = timestamp_s[[glimpse.frame for glimpse in glimpses]]
+    middle = np.stack([moment.middle_world for moment in moments]) * (1, 0, 1)
+    phone = np.stack([moment.eye_world for moment in moments])
+    time = timestamp_s[[moment.frame for moment in moments]]
     before, after = np.maximum(np.arange(len(time)) - span, 0), np.minimum(np.arange(len(time)) + span, len(time) - 1)
     elapsed = np.maximum(time[after] - time[before], 1e-3)[:, None]
     velocity = (middle[after] - middle[before]) / elapsed
@@ -207,20 +219,21 @@ def smooth(
     visibility; twice, robustly.
     """
     known = np.flatnonzero(np.isfinite(cost_m))
-    result = world_from_agent.copy()
+    result, time, best = world_from_agent.copy(), timestamp_s[known], np.nanmin(cost_m, initial=np.inf)
+    low = np.searchsorted(time, time - 3 * options.smooth_s, side="right")
+    high = np.searchsorted(time, time + 3 * options.smooth_s)
     for _ in range(2):
         before = result.copy()
-        for frame in known:
-            gap = timestamp_s[known] - timestamp_s[frame]
-            near = np.abs(gap) < 3 * options.smooth_s
-            index, gap = known[near], gap[near]
+        for place, frame in enumerate(known):
+            index = known[low[place] : high[place]]
+            gap = timestamp_s[index] - timestamp_s[frame]
             offset = rigid.log(rigid.inverse(before[frame]) @ world_from_agent[index])
             strange = np.linalg.norm(offset / ([0.35] * 3 + [0.1] * 3), axis=1)
             weight = (
                 np.exp(-0.5 * (gap / options.smooth_s) ** 2)
                 * (0.05 + share[index])
                 / (1 + strange**2)
-                * np.exp(-(cost_m[index] - np.nanmin(cost_m)) / 0.02)
+                * np.exp(-(cost_m[index] - best) / 0.02)
             )
             moment = np.array([weight.sum(), (weight * gap).sum(), (weight * gap**2).sum() + 1e-4 * weight.sum()])
             slope = moment[2] - moment[1] * gap

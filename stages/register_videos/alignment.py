@@ -24,6 +24,8 @@ class AlignOptions:
 
     stride_px: int = 11
     """One depth pixel in so many, each way, takes part."""
+    most_points: int = 400_000
+    """Depth points of a recording that take part; scans of longer ones are thinned evenly, so that memory stays bounded."""
     depth_inflation: float = 8.0
     """Depth noise is multiplied by this, since neighbouring pixels err together and furniture moves."""
     vote_sigma_m: float = 0.15
@@ -72,7 +74,9 @@ def align(
 ) -> Aligned:
     """Relax all frames: first votes and motions, then depth from coarse to fine, then pictures as well."""
     place, frames = surface.Surface(mesh), np.arange(len(clip))
-    scans = [_static_scan(clip, masks, int(frame), options) for frame in track(frames, "reading depth")]
+    scans = [
+        _static_scan(clip, masks, int(frame), options, most=options.most_points // len(clip)) for frame in track(frames, "reading depth")
+    ]
     voted = _vote_contacts(votes, supports, options)
 
     seen: list[relax.Contacts] = []
@@ -124,16 +128,18 @@ def measure_fit(
     return gap, fit
 
 
-def _static_scan(clip, masks, frame, options):
+def _static_scan(clip, masks, frame, options, most):
     ignore = cv2.resize((masks[frame] > 0).astype(np.uint8), clip.depth_size[::-1], interpolation=cv2.INTER_NEAREST)
     ignore = cv2.dilate(ignore, np.ones((7, 7), np.uint8)) > 0
-    return surface.scan(
+    found = surface.scan(
         clip.depth(frame),
         clip.depth_intrinsics[frame],
         stride=options.stride_px,
         confidence=clip.confidence(frame),
         ignore=ignore,
     )
+    kept = np.unique(np.linspace(0, max(len(found.sigma_m) - 1, 0), min(most, len(found.sigma_m))).astype(int))
+    return surface.Scan(found.points_camera[kept], found.sigma_m[kept], found.pixel_index[kept])
 
 
 def _vote_contacts(votes, supports, options):
@@ -175,7 +181,7 @@ def picture_contacts(
     known = (rendered > 0) & ~hidden
     if known.mean() < 0.1:
         return None
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(_even(color, known), _even(real, known), None)
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(even(color, known), even(real, known), None)
     rows, columns = np.mgrid[4 : size[0] - 4 : options.picture_stride_px, 4 : size[1] - 4 : options.picture_stride_px].reshape(2, -1)
     start = np.stack([columns, rows], axis=-1) + 0.5
     end = start + flow[rows, columns]
@@ -204,7 +210,7 @@ def _sideways(frame, points_camera, points_map, world_from_camera, sigma_per_m):
     return relax.Contacts.join(*(relax.Contacts(first, second, points_camera, points_map, side, sigma) for side in sides))
 
 
-def _even(color: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+def even(color: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
     """Remove differences of light: grey values minus their local mean over their local spread, unknown pixels flat."""
     gray = cv2.cvtColor(color.astype(np.float32), cv2.COLOR_RGB2GRAY)
     weight = known.astype(np.float32)

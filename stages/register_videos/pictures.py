@@ -31,6 +31,7 @@ def status(found: Registered | Refused) -> dict:
         "votes_agreeing": int(found.supports.sum()),
         "depth_gap_m": float(np.nanmedian(found.aligned.gap_m)),
         "depth_fit": float(np.median(found.aligned.fit)),
+        "likeness": found.likeness,
         "confidence": float(found.confidence.mean()),
         "agent_frames": int(found.roots.visible.sum()),
         "agent_confidence": float(found.agent_confidence[found.roots.visible].mean()) if found.roots.visible.any() else 0.0,
@@ -47,6 +48,7 @@ def checks(found: Registered | Refused) -> list[Check]:
         Check("frame votes that agree", float(found.supports.mean()) if len(found.supports) else None, "share", 0.5, 0.25, "higher"),
         Check("depth against the template", float(np.nanmedian(found.aligned.gap_m) * 100), "cm, median", 2.5, 6.0),
         Check("static depth within 5 cm", float(np.median(found.aligned.fit)), "share", 0.6, 0.35, "higher"),
+        Check("likeness of frames and renderings", found.likeness, "correlation", 0.5, None, "higher"),
         Check("camera confidence", float(found.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(found.roots.visible.mean()), "share of frames", 0.4, None, "higher"),
     ]

@@ -17,6 +17,7 @@ from stages.register_videos import votes as voting
 from stages.register_videos.agent_roots import RootOptions, Roots, find_roots
 from stages.register_videos.alignment import Aligned, AlignOptions
 from stages.register_videos.body import Ground
+from stages.register_videos.likeness import likeness
 from stages.register_videos.votes import VoteOptions, Votes
 
 
@@ -28,6 +29,12 @@ class GateOptions:
     """Median share of a frame's static depth that must lie within 5 cm of the template."""
     probes: int = 240
     """Disturbed poses that calibrate the confidence."""
+    least_certainty: float = 0.5
+    """Where not even `least_votes` of the agreeing votes have this probability, ..."""
+    least_likeness: float = 0.6
+    """... the frames must resemble their renderings by this correlation: flats of one house have the same shape."""
+    likeness_frames: int = 20
+    """Frames that are compared with their rendering."""
     adrift: float = 0.2
     """Factor on the confidence of frames that no vote holds and that could not be followed from one that is held."""
     bridge_s: float = 0.25
@@ -77,6 +84,8 @@ class Registered:
     agent_confidence: Float[np.ndarray, "frame"]
     votes: Votes
     supports: Bool[np.ndarray, "vote"]
+    likeness: float | None
+    """Median correlation of frames with their rendering."""
 
     def tables(self) -> dict[str, np.ndarray]:
         """Return the arrays of ``poses.npz`` but the time."""
@@ -115,17 +124,16 @@ def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.ran
     aligned = alignment.align(clip, masks, maps.scene, start.world_from_camera, motion.relatives, votes, start.supports, options.align)
     fit = float(np.median(aligned.fit))
     log(f"static depth: {np.nanmedian(aligned.gap_m) * 100:.1f} cm from the template, {fit:.0%} within 5 cm")
-    if options.begin == "votes" and fit < options.gate.least_fit:
-        return Refused(
-            f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken",
-            votes,
-        )
+    alike = likeness(clip, masks, maps.scene, aligned.world_from_camera, frames=options.gate.likeness_frames)
+    reason = _strange(fit, alike, votes, start.supports, options) if options.begin == "votes" else None
+    if reason is not None:
+        return Refused(reason, votes)
     confidence = camera_confidence(clip.timestamp_s, surface.Surface(maps.scene), aligned, options.gate, rng)
     confidence = np.where(start.anchored, confidence, options.gate.adrift * confidence)
     ground = Ground(RayCaster(maps.scene), float(np.quantile(maps.scene.vertices[:, 1], 0.02)))
     roots = find_roots(clip, masks, maps.agent, ground, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
     log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
-    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, start.supports)
+    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, start.supports, alike)
 
 
 @dataclass(frozen=True)
@@ -162,6 +170,17 @@ def _begin(clip, votes, motion, vote_options) -> _Start | None:
     return _Start(poses, supports, following.anchored(votes, supports, motion))
 
 
+def _strange(fit: float, alike: float | None, votes: Votes, supports: Bool[np.ndarray, "vote"], options: Options) -> str | None:
+    """Say why an aligned recording is not believed, None when it is."""
+    if fit < options.gate.least_fit:
+        return f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken"
+    certain = (votes.probability[supports] >= options.gate.least_certainty).sum() >= options.vote.least_votes
+    if not certain and (alike is None or alike < options.gate.least_likeness):
+        told = "nothing could be compared" if alike is None else f"frames resemble its renderings by {alike:.2f} only"
+        return f"the room has the same shape but looks different: {told}, and hardly a frame was recognised with certainty"
+    return None
+
+
 def _in_the_middle(motion, scene) -> _Start:
     """Stand the recording in the middle of the room, a metre and a half above the floor, unturned."""
     odometry = motion.odometry_from_camera
@@ -189,8 +208,18 @@ def camera_confidence(
     good = (np.linalg.norm(twist[:, :3], axis=1) < np.deg2rad(2.0)) & (np.linalg.norm(twist[:, 3:], axis=1) < 0.05)
     _, fit = alignment.measure_fit(place, [aligned.scans[frame] for frame in frames], disturbed)
     raw = calibrate(fit, good).probability(aligned.fit)
-    near = np.exp(-0.5 * ((timestamp_s[:, None] - timestamp_s[None]) / gate.bridge_s) ** 2)
-    return (near @ raw) / near.sum(1)
+    return averaged(timestamp_s, raw, gate.bridge_s)
+
+
+def averaged(timestamp_s: Float[np.ndarray, "frame"], values: Float[np.ndarray, "frame"], sigma_s: float) -> Float[np.ndarray, "frame"]:
+    """Average over neighbours in time with a Gaussian's weights, cut at four sigma: time linear in the frames."""
+    low = np.searchsorted(timestamp_s, timestamp_s - 4 * sigma_s)
+    high = np.searchsorted(timestamp_s, timestamp_s + 4 * sigma_s, side="right")
+    result = np.empty(len(values))
+    for frame, (first, last) in enumerate(zip(low, high, strict=True)):
+        weight = np.exp(-0.5 * ((timestamp_s[first:last] - timestamp_s[frame]) / sigma_s) ** 2)
+        result[frame] = weight @ values[first:last] / weight.sum()
+    return result
 
 
 def agent_confidence(roots: Roots, scale_m: float = 0.012, enough: float = 0.15) -> Float[np.ndarray, "frame"]:

@@ -27,6 +27,8 @@ class VoteOptions:
     """Votes agree within this rotation, degrees ..."""
     agree_m: float = 0.3
     """... and this distance, metres; room for the odometry's drift."""
+    most_proposals: int = 400
+    """At most so many votes, spread evenly, propose where the recording lies; all judge."""
     near_s: float = 6.0
     """Without the phone's odometry votes must agree with others as near as this, seconds."""
     most_tilt_deg: float = 10.0
@@ -108,9 +110,10 @@ def agree(
         tilt = np.arccos(np.clip(proposals[:, 1, 1], -1, 1))
         weight[tilt > np.deg2rad(options.most_tilt_deg)] = 0
         proposals = keep_upright(proposals, odometry[:, :3, 3], voted[:, :3, 3])
-    support = np.stack([close(proposal @ odometry, voted, options) for proposal in proposals]) & (weight > 0)
+    heard = np.unique(np.linspace(0, len(proposals) - 1, options.most_proposals).astype(int))
+    support = np.stack([close(proposals[one] @ odometry, voted, options) for one in heard]) & (weight > 0)
     best = (support * weight).sum(1).argmax()
-    chosen, supports = proposals[best], support[best]
+    chosen, supports = proposals[heard[best]], support[best]
     for _ in range(3):
         if not supports.any():
             return None

@@ -1,5 +1,7 @@
 """A whole recording in a textured room: registered to a degree and centimetres, its confidence sane, a foreign room refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from pipeline.space import rigid
 from pipeline.space.meshes import Mesh, RayCaster
 from stages.register_videos import alignment, registration
 from stages.register_videos import votes as voting
+from stages.register_videos.likeness import likeness
 from stages.train_localizer import training
 from stages.train_localizer.views import ViewOptions
 from tests.stages.textured_room import MemoryClip, NoAgent, drifting, textured_room, walk
@@ -64,3 +67,18 @@ def test_votes_come_from_masked_frames_only(maps):
     votes = voting.collect(clip, hidden, maps.scene_localizer, voting.VoteOptions(every_frames=4))
     assert len(votes.frame) == 0
     assert votes.nearest is None
+
+
+def test_a_repainted_room_of_the_same_shape_is_refused(maps):
+    truth = walk(40, seed=7)
+    repainted = Mesh(maps.scene.vertices, maps.scene.faces, textured_room(seed=99).color)
+    clip = MemoryClip(RayCaster(repainted), truth, drifting(truth, 2))
+    assert likeness(clip, NoAgent(40), maps.scene, truth, frames=6) < 0.4
+    own = MemoryClip(RayCaster(maps.scene), truth, drifting(truth, 2))
+    assert likeness(own, NoAgent(40), maps.scene, truth, frames=6) > 0.8
+    votes = voting.collect(own, NoAgent(40), maps.scene_localizer, voting.VoteOptions())
+    doubtful = replace(votes, answers=[replace(answer, probability=0.3) for answer in votes.answers])
+    supports, options = np.ones(len(votes.frame), bool), registration.Options()
+    assert "looks different" in registration._strange(0.9, 0.3, doubtful, supports, options)
+    assert registration._strange(0.9, 0.8, doubtful, supports, options) is None
+    assert registration._strange(0.9, 0.3, votes, supports, options) is None, "recognised with certainty"
