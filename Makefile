@@ -15,7 +15,7 @@ RUN    := $(PYTHON) -SE -m pipeline.run
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check annotate behavior-tables registration-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
+.PHONY: help new capture-check annotate behavior-tables registration-tables longterm-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
 HOME_OF := build/$(or $(AGENT),cat)
 INPUTS = $(foreach a,$1,--$(subst _,-,$a) $(HOME_OF)/$a)
 
@@ -42,6 +42,10 @@ registration-tables: .venv/.ok
 	  $(MAKE) --no-print-directory $(or $(AGENT),cat).registration VARIANT=$$variant; done
 	@$(MAKE) --no-print-directory $(or $(AGENT),cat).registration_tables
 	@cat build/$(or $(AGENT),cat)/registration_tables/tables.txt
+
+longterm-tables: .venv/.ok
+	@$(MAKE) --no-print-directory $(or $(AGENT),cat).longterm_tables
+	@cat build/$(or $(AGENT),cat)/longterm_tables/tables.txt
 
 new: .venv/.ok
 	@$(PLAN) new '$(AGENT)'

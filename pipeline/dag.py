@@ -123,6 +123,8 @@ FLOW: tuple[Node, ...] = (
          ("behavior_data", "behavior_trials", Need("synthetic_lives", part="approaches", option="approaches", flow="trajectories")),
          flows=BOTH, trials="each"),
     Node("behavior_tables", "tabulate_behavior", ("behavior_data", "behavior_trials", "behavior_scores"), flows=BOTH, trials="all"),
+    Node("longterm_tables", "tabulate_longterm",
+         ("reconstruction", "behavior_data", "behavior", "longterm_ablations", "longterm_world", "longterm_study"), aside=True),
     Node("simulator", "export_simulator", ("reconstruction", "splats", "behavior", "behavior_data")),
     Node("evaluation", "evaluate",
          (*merging("frames", "masks", "flow"), "scene_template", "agent_template", "scene_localizer",

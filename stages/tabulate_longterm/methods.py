@@ -1,0 +1,72 @@
+"""Short motions between given bodies by every method that the tables compare."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.models.ablated_motion import Ablated
+from pipeline.models.clip_channels import Clips, decode_clip, encode_places
+from pipeline.models.longterm import ROOT
+from pipeline.models.longterm_examples import Lives
+from pipeline.models.motion_synthesis import LongTerm
+
+Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
+"""From clips, of which only first and last frames and the scene may be looked at, to all frames"""
+OPTIMISED = ("ours", "base", "route_cvae", "nearest")
+"""Methods that are also judged after the optimisation."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """All that was trained on one source of motion."""
+
+    ours: LongTerm
+    ablated: dict[str, Ablated]
+    bank: Clips
+    """the short motions that were learned from"""
+
+
+def methods(models: Models, lives: Lives, seed: int) -> dict[str, Method]:
+    """Return every method by its name in the tables."""
+
+    def by(net: LongTerm | Ablated) -> Method:
+        return lambda clips: net.between(clips.channels[:, 0], clips.channels[:, -1], clips.points)
+
+    trained = {"ours": by(models.ours)} | {name: by(net) for name, net in models.ablated.items()}
+    return trained | {
+        "route_cvae": lambda clips: route_cvae(models.ours, clips, lives, np.random.default_rng(seed)),
+        "nearest": lambda clips: nearest(models.bank, clips),
+    }
+
+
+def route_cvae(model: LongTerm, clips: Clips, lives: Lives, rng: np.random.Generator) -> Float[Tensor, "clip frame channel"]:
+    """Follow RouteNet's route with a body of the CVAE in every frame, one z per clip (Route + CVAE)."""
+    with torch.no_grad():
+        route = model.route(clips.channels[:, 0], clips.channels[:, -1], clips.points)
+        made = []
+        for index in range(len(clips)):
+            roots = decode_clip(_with_pose(route[index], model), clips.world_from_clip[index], model.poses).world_from_agent
+            places = encode_places(roots, np.full(len(roots), clips.scene[index]), lives.scenes, model.sizes.points, rng)
+            shape = torch.from_numpy(lives.body.shape).float().expand(len(roots), -1)
+            z = torch.from_numpy(rng.standard_normal(model.sizes.latent)).float().expand(len(roots), -1)
+            drawn = model.static.decode(z, model.static.given(places.place, shape, places.points))
+            made.append(torch.cat([route[index], drawn[:, ROOT:]], dim=-1))
+    return torch.stack(made)
+
+
+def nearest(bank: Clips, clips: Clips) -> Float[Tensor, "clip frame channel"]:
+    """Take from the memory bank the short motion whose ends are most alike, laid where the clip is (after HSNMS)."""
+
+    def ends(some: Clips) -> Float[Tensor, "clip channel"]:
+        both = some.channels[:, [0, -1]]
+        return torch.cat([both[..., :ROOT], 0.1 * both[..., ROOT:]], dim=-1).flatten(1)
+
+    return bank.channels[torch.cdist(ends(clips), ends(bank)).argmin(1)]
+
+
+def _with_pose(route: Float[Tensor, "frame 9"], model: LongTerm) -> Float[Tensor, "frame channel"]:
+    return torch.cat([route, route.new_zeros(len(route), model.sizes.pose)], dim=-1)

@@ -1,0 +1,70 @@
+"""Figures with intervals, and the tables as people read them."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.models.intervals import bootstrapped
+from stages.tabulate_longterm.scores import METRICS
+
+TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
+TABLE_2 = ("non_collision", "contact", "penetration_mm", "slide_m_s", "least_slide_m_s")
+TABLE_4 = ("neighbour_v2v_mm", "neighbour_v2v_share")
+
+
+def figures(
+    rows: Mapping[str, Float[np.ndarray, "clip metric"]], episode: Int[np.ndarray, "clip"], prefix: str, *, draws: int, seed: int
+) -> dict[str, float | None]:
+    """Return mean and 95 % interval (drawn over episodes) of every metric of every method; None where it cannot be measured."""
+    found: dict[str, float | None] = {}
+    for method, values in rows.items():
+        for metric, column in zip(METRICS, values.T, strict=True):
+            known, name = np.isfinite(column), f"{prefix}/{method}/{metric}"
+            if not known.any():
+                found |= {name: None, f"{name}_ci95_low": None, f"{name}_ci95_high": None}
+                continue
+            groups = np.unique(episode[: len(column)][known], return_inverse=True)[1]
+            told = bootstrapped(column[known], groups, draws, np.random.default_rng(seed))
+            found |= {name: told.mean, f"{name}_ci95_low": told.low, f"{name}_ci95_high": told.high}
+    return found
+
+
+def text(found: Mapping[str, float | None]) -> str:
+    """Return all tables of all sources of motion."""
+    parts = []
+    for prefix, title in (
+        ("longterm", "built-in world, held-out sessions and an unseen home"),
+        ("longterm_unseen", "built-in world, the unseen home alone"),
+        ("longterm_recorded", "reconstructed motion, test recording"),
+    ):
+        methods = dict.fromkeys(name.split("/")[1] for name in found if name.startswith(f"{prefix}/") and name.count("/") == 2)
+        for number, columns in ((1, TABLE_1), (2, TABLE_2), (4, TABLE_4)):
+            if methods:
+                parts.append(_table(f"Table {number}: {title}", prefix, list(methods), columns, found))
+    others = {name: value for name, value in found.items() if name.split("/")[0] in ("longterm_minutes", "longterm_samples")}
+    if others:
+        parts.append(
+            "\n".join(
+                ["Minutes of motion, and samples of the behaviour model", *(f"{name}  {_told(value)}" for name, value in others.items())]
+            )
+        )
+    return "\n\n".join(parts)
+
+
+def _table(title: str, prefix: str, methods: list[str], columns: tuple[str, ...], found: Mapping[str, float | None]) -> str:
+    rows = [["method", *columns]]
+    for method in methods:
+        cells = []
+        for column in columns:
+            name = f"{prefix}/{method}/{column}"
+            value = found.get(name)
+            bounds = f" [{_told(found[f'{name}_ci95_low'])} {_told(found[f'{name}_ci95_high'])}]" if value is not None else ""
+            cells.append(_told(value) + bounds)
+        rows.append([method, *cells])
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join([title, *("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)])
+
+
+def _told(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

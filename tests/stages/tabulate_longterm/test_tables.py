@@ -1,0 +1,93 @@
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.models import ablated_motion
+from pipeline.models.contacts import find_contacts
+from pipeline.models.longterm import PoseNet, RouteNet, Sizes, StaticBody
+from pipeline.models.longterm_examples import Cutting, cut, encoded, fitted_poses
+from pipeline.models.motion_optimization import Settings
+from pipeline.models.motion_synthesis import LongTerm, habits_of
+from pipeline.models.short_motions import Moving
+from stages.tabulate_longterm import comparison, methods, pictures, scores, tables
+from stages.tabulate_longterm.lengths import Length
+from stages.tabulate_longterm.methods import Models
+from stages.tabulate_longterm.reading import Source
+from tests.pipeline.models import strider
+
+SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
+
+
+@dataclass(frozen=True)
+class Small:
+    clips: int = 6
+    optimised_clips: int = 2
+    optimisation: Settings = field(default_factory=lambda: Settings(steps=5, vertices=30))
+    draws: int = 50
+    seed: int = 0
+
+
+@pytest.fixture(scope="module")
+def source():
+    train, held = strider.lives(count=2), strider.lives(seed=7, count=2)
+    torch.manual_seed(0)
+    poses = fitted_poses(train.stretches, train.body.agent_from_bone_rest, SIZES.pose)
+    contacts = find_contacts(train.body, list(train.stretches), train.distances)
+    habits = habits_of(list(train.stretches), list(train.scenes) * len(train.stretches))
+    model = LongTerm(SIZES, poses, contacts, habits, *(net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES))))
+    rng = np.random.default_rng(0)
+    bank = encoded(train, cut(train, Cutting(stride=20, resting=0.0), rng), poses, SIZES.points, rng)
+    ablated = {name: ablated_motion.build(kind, SIZES).eval() for name, kind in ablated_motion.KINDS.items()}
+    return Source(train, held, ("held_out", "unseen"), Models(model, ablated, bank))
+
+
+def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
+    lives, model = source.held_out, source.models.ours
+    part = lives.stretches[0][:61]
+    reference = scores.references([part], np.array([0]), lives, model)[0]
+    told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses), strict=True))
+    assert all(told[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:7])
+    assert told["contact"] == 1 and told["slide_m_s"] < 0.01
+    root = part.world_from_agent.copy()
+    root[:, :3, 3] += [0.03, 0.0, 0.04]
+    told = dict(zip(scores.METRICS, scores.score(Moving(root, part.agent_from_bone), reference, model.poses), strict=True))
+    assert told["translation"] == pytest.approx(100 * 0.07 / 3)
+    for name in ("mpjpe_mm", "mpvpe_mm", "neighbour_v2v_mm"):
+        assert told[name] == pytest.approx(50, abs=0.01)
+    assert told["neighbour_v2v_share"] == pytest.approx(0.05 / lives.body.length_m, rel=1e-3)
+    assert told["orientation"] == told["pose"] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_memory_bank_finds_itself(source):
+    found = methods.nearest(source.models.bank, source.models.bank)
+    torch.testing.assert_close(found, source.models.bank.channels)
+
+
+def test_route_and_cvae_keeps_the_route(source):
+    some = source.models.bank[np.arange(2)]
+    made = methods.route_cvae(source.models.ours, some, source.train, np.random.default_rng(0))
+    route = source.models.ours.route(some.channels[:, 0], some.channels[:, -1], some.points)
+    torch.testing.assert_close(made[..., :9], route)
+    assert made.shape == some.channels.shape
+
+
+def test_tables_hold_every_method_with_intervals(source):
+    found = comparison.figures("longterm", source, Small())
+    for method in ("truth", "ours", "ours_opt", "base", "base_opt", "route_cvae_opt", "nearest_opt", *ablated_motion.KINDS):
+        low, mean, high = (found[f"longterm/{method}/mpjpe_mm{end}"] for end in ("_ci95_low", "", "_ci95_high"))
+        assert low <= mean <= high, method
+    assert found["longterm/truth/mpjpe_mm"] == 0 < found["longterm/ours/mpjpe_mm"]
+    unseen = comparison.figures("longterm_unseen", source, Small(), only="unseen")
+    assert "longterm_unseen/ours/mpvpe_mm" in unseen and "longterm_unseen/ours_opt/mpvpe_mm" not in unseen
+    text = tables.text(found | unseen)
+    assert text.count("Table 1") == text.count("Table 4") == 2
+    assert len(pictures.pictures(found)) == 1 and len(pictures.checks(found)) > 10
+
+
+def test_minutes_are_measured(source):
+    found = comparison.minutes(source, Length(12.0, 3), Small())
+    assert found["longterm_minutes/seconds"] >= 12.0
+    assert found["longterm_minutes/subgoals"] == 3
+    assert found["longterm_minutes/outside_room_m"] < 0.05
