@@ -68,8 +68,10 @@ def find_contacts(body: Body, motions: list[Moving], scenes: list[SignedDistance
 
 
 def _feet(points: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"]) -> Int[np.ndarray, "vertex"]:
-    """Group close vertices; largest group first."""
+    """Group close vertices of the same bone, and those that nearly touch; largest group first."""
     pairs = cKDTree(points).query_pairs(FOOT_M, output_type="ndarray")
+    bone, apart = weights.argmax(1), np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    pairs = pairs[(bone[pairs[:, 0]] == bone[pairs[:, 1]]) | (apart < FOOT_M / 3)]
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
     _, label = connected_components(graph, directed=False)
     order = np.argsort(-np.bincount(label), kind="stable")
@@ -84,15 +86,17 @@ def planted(
     lifted_m: float = 0.03,
     rate_hz: float = RATE_HZ,
 ) -> Bool[np.ndarray, "frame foot"]:
-    """Tell when each foot stands: clearly slower than the body or hardly moving, and near the scene.
+    """Tell when each foot stands: near the scene, and hardly moving, or moving least of all feet and less than the body.
 
-    ``height_m`` is the foot's distance from the scene. The paper takes the foot that moves less between two frames for
-    the stable one; an animal has more than two, so each is judged by itself. Blinks under 0.1 s do not count.
+    ``height_m`` is the foot's distance from the scene. The paper lets the foot that moves less between two frames stand;
+    an animal has more than two, so others stand too that are clearly slower than the body. Blinks under 0.1 s do not count.
     """
     foot = _speed(centres_world, rate_hz)
     body = _speed(root_world[:, None], rate_hz)
-    slow = foot < np.maximum(0.4 * body, 0.08)
+    even = ndimage.uniform_filter1d(foot, max(1, round(rate_hz / 6)), axis=0, mode="nearest")
     low = height_m < np.percentile(height_m, 20, axis=0, keepdims=True).clip(-0.02, 0.02) + lifted_m
+    least = np.where(low, even, np.inf)
+    slow = (foot < np.maximum(0.4 * body, 0.08)) | ((least == least.min(1, keepdims=True)) & (even < 0.6 * body))
     both = ndimage.binary_closing(slow & low, np.ones((3, 1)))
     return ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
 

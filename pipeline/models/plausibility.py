@@ -35,6 +35,8 @@ class Plausibility:
     """deepest vertex of any frame, a positive number"""
     slide_m_s: float
     """median speed along the ground of feet while they stand; NaN where none does"""
+    least_slide_m_s: float
+    """median speed along the ground of the foot that moves least, of those near the scene: something should stand"""
 
 
 @dataclass(frozen=True)
@@ -68,13 +70,17 @@ class Judge:
         depth, touching = torch.cat(distance), torch.cat(points)
         centres = self.contacts.centres(touching).numpy()
         both = stance[1:] & stance[:-1]
-        slide = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1)[both] * rate_hz
+        speed = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1) * rate_hz
+        near = _lowest(depth[1:, self.contacts.vertices], self.contacts).numpy() < CONTACT_M
+        least = np.where(near, speed, np.inf).min(axis=1, initial=np.inf)
+        slide, least = speed[both], least[np.isfinite(least)]
         return Plausibility(
             non_collision=float((depth > -SOLID_M).float().mean()),
             contact=float((depth[:, self.contacts.vertices].min(1).values < CONTACT_M).float().mean()),
             penetration_m=float((-depth).clamp_min(0).mean()),
             deepest_m=float((-depth).clamp_min(0).max()),
             slide_m_s=float(np.median(slide)) if len(slide) else float("nan"),
+            least_slide_m_s=float(np.median(least)) if len(least) else float("nan"),
         )
 
 

@@ -12,11 +12,11 @@ from pipeline import progress
 from pipeline.files import arrays, glb, images
 from pipeline.models.bodies import Body, PosedSurface
 from pipeline.models.contacts import tensors
+from pipeline.models.journeys import Journey
 from pipeline.models.plausibility import Plausibility
 from pipeline.models.short_motions import RATE_HZ, Moving
 from pipeline.space import overview, rigid
 from pipeline.space.meshes import Mesh, RayCaster, render_view
-from stages.simulate.journey import Journey
 
 FOCAL = 0.9
 """Focal length of the frames in units of their width."""

@@ -10,18 +10,19 @@ import numpy as np
 from pipeline import progress
 from pipeline.errors import InputError
 from pipeline.files import arrays, glb, meshes
-from pipeline.models import behavior
+from pipeline.models import behavior, journeys
 from pipeline.models.bodies import load_body
+from pipeline.models.journeys import World
 from pipeline.models.motion_synthesis import LongTerm
 from pipeline.models.perception import FeatureVolume
 from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.short_motions import Moving
 from pipeline.models.simulator import Simulator
 from pipeline.models.subgoals import Subgoal, preferred
 from pipeline.models.surroundings import Surroundings
 from pipeline.models.trajectories import FUTURE, TRAIN, BehaviorData
-from stages.simulate import journey, journey_files
+from stages.simulate import journey_files
 from stages.simulate.chained_goals import chained_goals
-from stages.simulate.journey import World
 from stages.simulate.live import Live, Look
 from stages.simulate.observers import Observer, scripted
 from stages.simulate.rollout import rollout, write_take
@@ -44,7 +45,9 @@ def of_behavior(given: Mapping[str, Path], c: Any, device: str) -> Made:
     said = f"{c.seconds:g} s, {float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space"
     if not (c.optimise and "longterm" in given and "reconstruction" in given):
         return Made(said, lambda folder: write_take(folder, take))
-    take, before, after = journey.made_physical(_world(given, data), take, c.optimisation)
+    motion = Moving(take.world_from_agent, take.agent_from_bone.astype(np.float64))
+    motion, before, after = journeys.physical(_world(given, data), take.timestamp_s, motion, c.optimisation)
+    take = replace(take, world_from_agent=motion.world_from_agent, agent_from_bone=motion.agent_from_bone.astype(np.float32))
     said += f"; deepest {100 * before.deepest_m:.1f} -> {100 * after.deepest_m:.1f} cm, slide {100 * before.slide_m_s:.1f} -> {100 * after.slide_m_s:.1f} cm/s"
 
     def write(folder: Path) -> None:
@@ -80,7 +83,7 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
         learned = [data.trajectories[data.videos[video]] for video in np.unique(data.video[data.split == TRAIN])]
         been = np.concatenate([trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in learned])
         subgoals = preferred(been, c.subgoal_count + 1, rng)
-    made = journey.travel(world, subgoals, c.optimisation if c.optimise else None, rng)
+    made = journeys.travel(world, subgoals, c.optimisation if c.optimise else None, rng)
 
     def write(folder: Path) -> None:
         journey_files.write_journey(folder, made, world.body)

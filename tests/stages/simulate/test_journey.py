@@ -7,14 +7,15 @@ import torch
 from pipeline import config
 from pipeline.errors import InputError
 from pipeline.files import arrays
+from pipeline.models import journeys
 from pipeline.models.contacts import find_contacts
 from pipeline.models.longterm import PoseNet, RouteNet, Sizes, StaticBody
 from pipeline.models.longterm_examples import fitted_poses
 from pipeline.models.motion_optimization import Settings
 from pipeline.models.motion_synthesis import LongTerm, habits_of
+from pipeline.models.short_motions import Moving
 from pipeline.models.subgoals import Subgoal
-from stages.simulate import journey, journey_files
-from stages.simulate.rollout import Take
+from stages.simulate import journey_files
 from stages.simulate.subgoal_file import Written, subgoals_from_table
 from tests.pipeline.models import strider
 
@@ -30,7 +31,7 @@ def world():
     contacts = find_contacts(lives.body, list(lives.stretches), lives.distances)
     habits = habits_of(list(lives.stretches), list(lives.scenes) * len(lives.stretches))
     nets = (net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES)))
-    return journey.World(LongTerm(SIZES, poses, contacts, habits, *nets), lives.body, lives.scenes[0])
+    return journeys.World(LongTerm(SIZES, poses, contacts, habits, *nets), lives.body, lives.scenes[0])
 
 
 def read(path, text):
@@ -66,8 +67,8 @@ def test_bad_sub_goals_are_told(tmp_path, text):
 
 def test_a_journey_is_made_and_written(world, tmp_path):
     goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, -1.0]))]
-    made = journey.travel(world, goals, SETTINGS, np.random.default_rng(0))
-    again = journey.travel(world, goals, SETTINGS, np.random.default_rng(0))
+    made = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
+    again = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
     np.testing.assert_array_equal(made.moving.world_from_agent, again.moving.world_from_agent)
     assert made.after.penetration_m <= made.before.penetration_m
     np.testing.assert_allclose(made.subgoals_world[:, [0, 2]], [[-1.2, -1], [1.2, -1]], atol=1e-6)
@@ -84,24 +85,15 @@ def test_a_journey_is_made_and_written(world, tmp_path):
 
 def test_one_sub_goal_is_too_few(world):
     with pytest.raises(InputError, match="SIM-001"):
-        journey.travel(world, [Subgoal(np.zeros(3))], None, np.random.default_rng(0))
+        journeys.travel(world, [Subgoal(np.zeros(3))], None, np.random.default_rng(0))
 
 
 def test_a_take_of_the_behaviour_model_becomes_physical(world):
     walk = strider.striding(np.array([[1.0, 0, -1.2], [1.0, 0, 1.2]]), 4.0)[::3]
     root = walk.world_from_agent.copy()
     root[:, 1, 3] -= 0.03  # all of it is in the floor
-    frames = len(root)
-    take = Take(
-        np.arange(frames) / 10,
-        root,
-        walk.agent_from_bone.astype(np.float32),
-        np.zeros((frames, 3)),
-        np.zeros((frames, 3)),
-        np.zeros(frames),
-    )
-    done, before, after = journey.made_physical(world, take, Settings(steps=60, vertices=30))
+    given = Moving(root, walk.agent_from_bone)
+    done, before, after = journeys.physical(world, np.arange(len(root)) / 10, given, Settings(steps=60, vertices=30))
     assert after.penetration_m < 0.5 * before.penetration_m
-    assert done.world_from_agent.shape == take.world_from_agent.shape
+    assert done.world_from_agent.shape == root.shape
     assert np.abs(done.world_from_agent[:, [0, 2], 3] - root[:, [0, 2], 3]).max() < 0.1
-    assert done.observer_world is take.observer_world

@@ -1,4 +1,4 @@
-"""Long-term motion through sub-goals, made physical, and what it is worth before and after."""
+"""Long-term motion through sub-goals, and any other motion, made physical; and what it is worth before and after."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,6 @@ from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, resampled
 from pipeline.models.subgoals import Subgoal, legs
 from pipeline.models.surroundings import Surroundings
 from pipeline.space import rigid
-from stages.simulate.rollout import Take
 
 
 @dataclass(frozen=True)
@@ -66,16 +65,15 @@ def travel(world: World, subgoals: list[Subgoal], settings: Settings | None, rng
     )
 
 
-def made_physical(world: World, take: Take, settings: Settings) -> tuple[Take, Plausibility, Plausibility]:
-    """Optimise a take of the behaviour model at 30 fps and bring it back to its own frames; tell before and after."""
-    raw = resampled(take.timestamp_s, Moving(take.world_from_agent, take.agent_from_bone.astype(np.float64)))
+def physical(
+    world: World, timestamp_s: Float[np.ndarray, "frame"], given: Moving, settings: Settings
+) -> tuple[Moving, Plausibility, Plausibility]:
+    """Optimise motion of any rate at 30 fps and bring it back to its own frames; tell before and after."""
+    raw = resampled(timestamp_s, given)
     judge, stance = world.judge, world.judge.stance(raw)
     done = optimise(raw, world.model.physique(world.body), world.scene.distance, settings)
     when = np.arange(len(done)) / RATE_HZ
-    at = np.minimum(take.timestamp_s - take.timestamp_s[0], when[-1])
+    at = np.minimum(timestamp_s - timestamp_s[0], when[-1])
     bones = [rigid.interpolate(when, done.agent_from_bone[:, bone], at) for bone in range(done.agent_from_bone.shape[1])]
-    columns = vars(take) | {
-        "world_from_agent": rigid.interpolate(when, done.world_from_agent, at),
-        "agent_from_bone": np.stack(bones, axis=1).astype(np.float32),
-    }
-    return Take(**columns), judge.plausibility(raw, stance), judge.plausibility(done, stance)
+    back = Moving(rigid.interpolate(when, done.world_from_agent, at), np.stack(bones, axis=1))
+    return back, judge.plausibility(raw, stance), judge.plausibility(done, stance)
