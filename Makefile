@@ -66,8 +66,8 @@ export: .venv/.ok
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
 simulate: .venv/.ok
-	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).behavior
-	@$(PYTHON) -m stages.simulate $(call INPUTS,behavior behavior_data) --out $(HOME_OF)/take
+	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).$(if $(SUBGOALS),longterm,behavior)
+	@$(PYTHON) -m stages.simulate $(if $(SUBGOALS),$(call INPUTS,longterm reconstruction behavior_data) --subgoals $(SUBGOALS),$(call INPUTS,behavior behavior_data)) --out $(HOME_OF)/take
 
 serve: .venv/.ok
 	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).simulator
