@@ -20,6 +20,8 @@ class Config:
 
     name: str = "the animal"
     """what it calls the animal"""
+    share_safe: bool = False
+    """blur every picture that may show people or the home; figures stay"""
     warn_page_mb: float = 15.0
     """megabytes above which a page is too big to send"""
 
@@ -44,8 +46,8 @@ def told(task: Task, chapter: Chapter, roles: dict[str, str]) -> collect.Told:
     """Open the chapter's artifacts, by recording where there is one for each, and read their notes."""
     folders: dict[str | None, Path] = {**task.per_video(chapter.artifact)} if chapter.per_video else {None: task.input(chapter.artifact)}
     manifest = artifact.read_manifest(next(iter(folders.values()), task.out))
-    return collect.told(chapter, folders, roles, manifest.config if manifest else {})
+    return collect.told(chapter, folders, roles, manifest.config if manifest else {}, task.config.share_safe)
 
 
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, reads=tuple(chapter.artifact for chapter in CHAPTERS))
+    cli.enter(__doc__, run, config=Config, reads=tuple(chapter.artifact for chapter in CHAPTERS), options=("share_safe",))

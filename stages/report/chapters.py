@@ -12,6 +12,8 @@ class Chapter:
     sentence: str
     """what happened here, in plain words"""
     per_video: bool = False
+    drawn: bool = False
+    """whether its pictures are drawn from numbers alone and show no recorded or rendered view"""
 
 
 CHAPTERS = (
@@ -25,12 +27,12 @@ CHAPTERS = (
     Chapter("scene_localizer", "Finding the camera", "Views rendered from the map teach where a picture was taken."),
     Chapter("agent_localizer", "Finding the animal", "Views rendered from the body teach how the animal stands."),
     Chapter("video_poses", "Sessions on the map", "Each session's cameras and animal, placed on the map.", True),
-    Chapter("registration", "Registration", "All sessions together in one world; those that do not fit are named."),
+    Chapter("registration", "Registration", "All sessions together in one world; those that do not fit are named.", drawn=True),
     Chapter("reconstruction", "4D reconstruction", "Room, animal, bones and motion, fitted to all recordings at once."),
     Chapter("splats", "Gaussians", "The same world as 3D Gaussians, refined for looks and motion."),
-    Chapter("behavior_data", "Behaviour data", "The motion cut into windows of 6.4 s, split by recording."),
-    Chapter("behavior", "Behaviour model", "Goal, path and body diffusion, conditioned on room, observer and past."),
+    Chapter("behavior_data", "Behaviour data", "The motion cut into windows of 6.4 s, split by recording.", drawn=True),
+    Chapter("behavior", "Behaviour model", "Goal, path and body diffusion, conditioned on room, observer and past.", drawn=True),
     Chapter("longterm", "Long-term motion", "Bodies at sub-goals, routes between them and poses along routes, in two-second pieces."),
-    Chapter("simulator", "Simulator", "The page that lets the animal live, and files for other programs."),
+    Chapter("simulator", "Simulator", "The page that lets the animal live, and files for other programs.", drawn=True),
     Chapter("evaluation", "Evaluation", "Everything measured against what is known to be true."),
 )

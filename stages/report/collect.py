@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
+from jaxtyping import UInt8
 
 from pipeline.files import images
 from pipeline.videos import Video
@@ -16,6 +18,8 @@ from stages.report.chapters import Chapter
 LIGHTS = ("none", "ok", "warn", "fail")
 _PICTURE_BYTES = 10_000_000
 _SMALLEST_PX = 160
+_BLUR_PX = 24
+"""what lies within this distance becomes one colour"""
 _STRIP = 2.4
 """width over height of a picture that is a strip"""
 
@@ -75,13 +79,20 @@ def role(video: Video) -> str:
     return f"{video.role}, {video.split}" if video.role == "session" else video.role
 
 
-def told(chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str], settings: Mapping[str, Any]) -> Told:
-    """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all)."""
+def told(
+    chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str], settings: Mapping[str, Any], safe: bool = False
+) -> Told:
+    """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all).
+
+    With `safe` every picture that may show a recorded or rendered view is blurred beyond recognition as a whole: finders
+    of people miss some, and a room tells where somebody lives.
+    """
     raw = {video: _read(folder) for video, folder in folders.items()}
     files = [folder / entry["file"] for folder, qa in zip(folders.values(), raw.values(), strict=True) for entry in qa["pictures"]]
     total = sum(file.stat().st_size for file in files)
     shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
-    notes = [_note(video, roles.get(video or "", ""), folders[video], qa, shrink) for video, qa in raw.items()]
+    blurred = safe and not chapter.drawn
+    notes = [_note(video, roles.get(video or "", ""), folders[video], qa, shrink, blurred) for video, qa in raw.items()]
     return Told(chapter, notes, dict(settings))
 
 
@@ -90,17 +101,26 @@ def _read(folder: Path) -> dict[str, Any]:
     return json.loads(path.read_bytes()) if path.exists() else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
 
 
-def _note(video: str | None, about: str, folder: Path, qa: dict[str, Any], shrink: float) -> Note:
-    pictures = [_picture(folder / entry["file"], entry["caption"], shrink) for entry in qa["pictures"]]
+def _note(video: str | None, about: str, folder: Path, qa: dict[str, Any], shrink: float, blurred: bool) -> Note:
+    pictures = [_picture(folder / entry["file"], entry["caption"], shrink, blurred) for entry in qa["pictures"]]
     return Note(video, about, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures)
 
 
-def _picture(path: Path, caption: str, shrink: float) -> Picture:
+def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> Picture:
     """Embed a picture; where a page would grow too big to send, smaller."""
     color = images.read_color(path)
     kind, content = path.suffix[1:], path.read_bytes()
-    if shrink > 1:
+    if blurred:
+        kind, content = "jpeg", images.encode_jpeg(_beyond_recognition(color), 80)
+    elif shrink > 1:
         size = [max(_SMALLEST_PX, round(length / shrink)) for length in color.shape[1::-1]]
         kind, content = "jpeg", images.encode_jpeg(cv2.resize(color, size, interpolation=cv2.INTER_AREA), 85)
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     return Picture(source, caption, color.shape[1] > _STRIP * color.shape[0])
+
+
+def _beyond_recognition(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    """Keep one colour per 24 pixels: layout and light stay, faces, pictures and writing go."""
+    height, width, _ = color.shape
+    few = cv2.resize(color, (max(1, width // _BLUR_PX), max(1, height // _BLUR_PX)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(few, (width, height), interpolation=cv2.INTER_LINEAR)

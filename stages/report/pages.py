@@ -7,6 +7,7 @@ import jinja2
 
 from stages.report.bars import Judged
 from stages.report.collect import Told
+from stages.report.remedies import remedy
 
 WORDS = {"ok": "fine", "warn": "to look at", "fail": "not good", "none": "without a note"}
 MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
@@ -29,6 +30,7 @@ def render(
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["number"] = number
+    environment.globals["remedy"] = remedy
     shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": MARKS}
     index = environment.get_template("index.html").render(**shared, judged=judged, figures=figures, reasons=reasons)
     pages = {"index.html": index}

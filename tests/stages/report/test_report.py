@@ -1,5 +1,6 @@
 """The report judges honestly, shows every note and asks nothing of the network."""
 
+import base64
 import json
 import re
 from pathlib import Path
@@ -9,8 +10,9 @@ import pytest
 
 from pipeline import artifact, dag, qa
 from pipeline.cli import Task
+from pipeline.files import images
 from pipeline.videos import Video
-from stages.report import bars, pages
+from stages.report import bars, collect, pages, remedies
 from stages.report.__main__ import Config, run
 from stages.report.chapters import CHAPTERS
 
@@ -21,6 +23,7 @@ ROLES = (
     ("session", "test"),
     ("heldout", "none"),
 )
+RNG = np.random.default_rng(0)
 VIDEOS = tuple(Video(f"v{number:03d}", "a.r3d", role, split, None) for number, (role, split) in enumerate(ROLES))
 
 
@@ -86,3 +89,29 @@ def test_a_rival_must_be_beaten_and_all_videos_reached() -> None:
 )
 def test_numbers_are_readable(value: float | None, text: str) -> None:
     assert pages.number(value) == text
+
+
+def test_a_safe_report_shows_no_view(tmp_path: Path) -> None:
+    """Neighbouring pixels of a blurred picture tell nothing of the original; drawn figures stay as they are."""
+    sharp = RNG.integers(0, 255, (96, 240, 3), dtype=np.uint8)
+    for name in ("masks", "behavior"):
+        folder = tmp_path / name
+        (folder / "qa").mkdir(parents=True)
+        qa.write(folder, good="", bad="", checks=[], pictures=[qa.Picture("view", sharp, "a view")])
+        chapter = next(chapter for chapter in CHAPTERS if chapter.artifact == name)
+        shown = {safe: embedded(collect.told(chapter, {None: folder}, {}, {}, safe)) for safe in (False, True)}
+        detail = {safe: np.abs(np.diff(picture.astype(float), axis=1)).mean() for safe, picture in shown.items()}
+        assert shown[True].shape == sharp.shape
+        assert detail[True] < 0.1 * detail[False] if name == "masks" else detail[True] == detail[False]
+
+
+def embedded(told: collect.Told) -> np.ndarray:
+    """Decode the first picture of a chapter."""
+    return images.decode_color(base64.b64decode(told.notes[0].pictures[0].source.partition(",")[2]), "report")
+
+
+def test_worries_come_with_a_remedy(tmp_path: Path) -> None:
+    known = {(chapter.artifact, begin) for chapter in CHAPTERS for begin in remedies.REMEDIES.get(chapter.artifact, {})}
+    assert len(known) == sum(len(table) for table in remedies.REMEDIES.values()), "no remedy for an artifact without a page"
+    assert "walk once more" in remedies.remedy("scene_template", "keyframes registered by COLMAP")
+    assert remedies.remedy("scene_template", "unheard of") == ""
