@@ -1,0 +1,112 @@
+"""Does the cost of a registration stay linear? Repeat one session's frames and time the registration of each length.
+
+    python -m benchmarks.registration_scale cat --frames 200 600 1800 5000
+
+A session of a finished build is walked forth and back as often as needed, so that motions stay real. Seconds are CPU
+seconds of one process; peak memory is the process's own, each length in a process of its own.
+"""
+
+import argparse
+import json
+import multiprocessing
+import resource
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline.files import meshes
+from pipeline.files.clips import Clip, Masks
+from pipeline.models import localizer
+from stages.register_videos import registration
+
+
+@dataclass(frozen=True)
+class There:
+    """A clip, forth and back again: `Clip` as the registration reads it."""
+
+    clip: Clip
+    order: np.ndarray
+    """[frame] which frame of the clip is shown"""
+
+    def __getattr__(self, name: str):
+        value = getattr(self.clip, name)
+        return value[self.order] if isinstance(value, np.ndarray) and len(value) == len(self.clip) else value
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    @property
+    def timestamp_s(self) -> np.ndarray:
+        """Steady time."""
+        return np.arange(len(self.order)) * 0.1
+
+    def color(self, frame: int):
+        """Read a frame's colour."""
+        return self.clip.color(int(self.order[frame]))
+
+    def depth(self, frame: int):
+        """Read a frame's depth."""
+        return self.clip.depth(int(self.order[frame]))
+
+    def confidence(self, frame: int):
+        """Read a frame's depth confidence."""
+        return self.clip.confidence(int(self.order[frame]))
+
+
+@dataclass(frozen=True)
+class ThereMasks:
+    """The masks to it."""
+
+    masks: Masks
+    order: np.ndarray
+
+    @property
+    def visible(self) -> np.ndarray:
+        """Per frame."""
+        return self.masks.visible[self.order]
+
+    def __getitem__(self, frame: int):
+        return self.masks[int(self.order[frame])]
+
+
+def measure(build: Path, video: str, frames: int) -> tuple[float, float, bool]:
+    """Return CPU seconds, peak memory in MB, and whether the recording was registered."""
+    cv2.setNumThreads(1)
+    clip, masks = Clip.open(build / "frames" / video), Masks.open(build / "masks" / video)
+    period = 2 * len(clip) - 2
+    phase = np.arange(frames) % period
+    order = np.where(phase < len(clip), phase, period - phase)
+    maps = registration.Maps(
+        meshes.read_ply(build / "scene_template" / "mesh.ply"),
+        meshes.read_ply(build / "agent_template" / "agent.ply"),
+        localizer.load(build / "scene_localizer"),
+        localizer.load(build / "agent_localizer"),
+    )
+    start = time.process_time()
+    found = registration.register(There(clip, order), ThereMasks(masks, order), maps, registration.Options(), np.random.default_rng(0))
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return time.process_time() - start, peak_mb, isinstance(found, registration.Registered)
+
+
+def main() -> None:
+    """Print the table of one session of an agent's build."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("agent", help="whose build, for example cat")
+    parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
+    parser.add_argument("--frames", type=int, nargs="+", default=[200, 600, 1800, 5000], help="lengths")
+    given = parser.parse_args()
+    build = given.build / given.agent
+    videos = json.loads((build / "plan" / "videos.json").read_text())
+    video = next(video["id"] for video in videos if video["role"] == "session")
+    print("| frames | s | s / frame | peak MB | registered |\n|---|---|---|---|---|", flush=True)
+    for frames in given.frames:
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            seconds, peak_mb, registered = pool.apply(measure, (build, video, frames))
+        print(f"| {frames} | {seconds:.0f} | {seconds / frames:.3f} | {peak_mb:.0f} | {'yes' if registered else 'no'} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
