@@ -13,7 +13,7 @@ from pipeline.qa import Check
 from pipeline.videos import Video
 from stages.evaluate import registration
 from stages.evaluate.alignment import PoseErrors, constant_between, joined, pose_errors
-from stages.evaluate.figures import Figures
+from stages.evaluate.figures import Figures, median
 from stages.evaluate.reading import read_registration
 from stages.evaluate.truth import Truth
 
@@ -70,6 +70,9 @@ def figures(
         confidence = {session.id: _confidence(poses[session.id], session) for session in sessions}
         named = {session.id: error for session, error in zip(sessions, errors[variant], strict=True)}
         one = registration.camera_figures(named, confidence, sum(table is not None for table in poses.values()))
+        for id, error in named.items():
+            for unit in UNITS:
+                found.put(f"{variant}/{id}/{unit}_median", median(getattr(error, UNITS[unit])), registration.REFUSED)
         for there, here in ((one.values, found.values), (one.reasons, found.reasons)):
             here.update({name.replace("registration", variant, 1): value for name, value in there.items()})
     for variant in folders:
@@ -125,6 +128,11 @@ def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
         against = "" if variant == "ours" else f"{change[0]} [{change[1]}, {change[2]}]"
         paper = "{:g} / {:g}".format(*PAPER[variant]) if variant in PAPER else ""
         lines.append(f"{NAMES.get(variant, variant):34}{pairs[0]:>20}{pairs[1]:>20}{videos:>9}{against:>28}{paper:>16}")
+    sessions = sorted({name.split("/")[1] for name in values if name.count("/") == 2})
+    lines += ["", f"{'per session, median degrees':34}" + "".join(f"{id:>10}" for id in sessions)] if sessions else []
+    for variant in variants if sessions else ():
+        told = "".join(f"{_told(values.get(f'{variant}/{id}/rotation_deg_median')):>10}" for id in sessions)
+        lines.append(f"{NAMES.get(variant, variant):34}{told}")
     lines.append("paper: its own cat videos, degrees / metres; '-': more than half (a twentieth) of the frames has no pose.")
     return "\n".join(lines) + "\n"
 
