@@ -88,8 +88,9 @@ def agent(simulator: Path, take: Path | None, rate_hz: float) -> Agent:
     """Read the animal from `agent.glb`; a generated take becomes one motion more. Keys are resampled to `rate_hz`."""
     mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
     if take:
-        made = arrays.load(take, ("timestamp_s", "world_from_agent", "agent_from_bone"))
-        actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in made))]
+        names = ("timestamp_s", "world_from_agent", "agent_from_bone")
+        made = arrays.load(take, names)
+        actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in names))]
     about = json.loads((simulator / "simulator.json").read_bytes())
     return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], about["agent"]["skinning_residual_mm"])
 

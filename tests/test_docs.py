@@ -1,0 +1,85 @@
+"""The guides tell the truth: every command in them exists, with its options; every link and picture leads somewhere."""
+
+import re
+import shlex
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from pipeline import dag
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+BLOCK = re.compile(r"^```\n(.*?)^```", re.MULTILINE | re.DOTALL)
+AGENTS = {path.stem for path in (ROOT / "agents").glob("*.toml")} | {"luna"}
+TARGETS = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+
+
+def commands() -> list[tuple[str, str]]:
+    """Every line of a code block that is meant to be typed."""
+    found = []
+    for page in PAGES:
+        for block in BLOCK.findall(page.read_text()):
+            lines = (line.partition("#")[0].strip() for line in block.splitlines())
+            found += [(page.name, line) for line in lines if line.split(" ")[0] in ("make", "python", "snakemake", ".venv/bin/python")]
+    return found
+
+
+@cache
+def help_of(module: str) -> str:
+    told = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+    return told.stdout
+
+
+def check_make(words: list[str]) -> None:
+    """Targets and variants exist; variables are ones that the Makefile reads."""
+    makefile = (ROOT / "Makefile").read_text()
+    for word in words:
+        if word in ("|",) or re.fullmatch(r"-j\d*", word):
+            continue
+        if "=" in word:
+            name, value = word.split("=")
+            assert f"$({name})" in makefile or f"$(or $({name})" in makefile or f"$(if $({name})" in makefile, word
+            if name == "VARIANT":
+                assert (ROOT / f"agents/variants/{value}.toml").exists(), word
+            if name == "FORMAT":
+                assert f"\"{value}\"" in (ROOT / "stages/export/__main__.py").read_text(), word
+            continue
+        agent, *rest = word.split(".")
+        assert word in TARGETS or agent in AGENTS, word
+        if rest:
+            assert rest[0] in dag.NODES and rest[1:] in ([], ["redo"]), word
+
+
+@pytest.mark.parametrize(("page", "line"), commands(), ids=lambda text: text)
+def test_every_command_exists(page: str, line: str) -> None:
+    program, *words = shlex.split(line)
+    match program:
+        case "make":
+            check_make(words)
+        case "snakemake":
+            assert (ROOT / "Snakefile").exists() and (ROOT / "profiles/local/config.yaml").exists()
+        case _:
+            assert words[0] == "-m", line
+            if words[1] == "http.server":
+                assert "--directory" in help_of("http.server")
+            elif words[1].startswith("benchmarks"):
+                assert (ROOT / (words[1].replace(".", "/") + ".py")).exists(), line
+            else:
+                assert {word for word in words[2:] if word.startswith("--")} <= set(re.findall(r"--[a-z-]+", help_of(words[1]))), line
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        assert target.startswith("http") or (page.parent / target).exists(), target
+    for key in re.findall(r"`(layout|scene_splats|scene_faces|fitted_poses)", page.read_text()):
+        assert key in (ROOT / "stages/export_simulator/__main__.py").read_text(), key
+
+
+def test_pictures_are_small() -> None:
+    assert sum(path.stat().st_size for path in (ROOT / "docs/pictures").iterdir()) < 400_000, "bytes in all"
