@@ -14,7 +14,10 @@ from pipeline.space.meshes import Mesh, RayCaster
 from stages.evaluate.figures import Figures, median, percentile
 
 RANGE_M = 5.0
-SAMPLES = 20_000
+SAMPLES = 300_000
+"""points on a room's surface: about a centimetre apart, so that distances between clouds are those between surfaces"""
+QUERIES = 20_000
+"""of these whose nearest neighbour is looked up"""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,8 @@ def track_figures(distances: Sequence[Float[np.ndarray, "point"]]) -> Figures:
 
 
 def chamfer(ours: Float[np.ndarray, "point 3"], true: Float[np.ndarray, "vertex 3"]) -> float:
-    """Return the mean of both directions' mean distances, metres."""
-    return float((KDTree(true).query(ours)[0].mean() + KDTree(ours).query(true)[0].mean()) / 2)
+    """Return the mean of both directions' mean distances, metres; of long arrays in random order, their beginnings ask."""
+    return float((KDTree(true).query(ours[:QUERIES])[0].mean() + KDTree(ours).query(true[:QUERIES])[0].mean()) / 2)
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:

@@ -111,6 +111,15 @@ def test_chamfer_measures_the_distance_of_surfaces():
     assert surfaces.chamfer(plane, plane + np.array([0, 0, 0.3])) == pytest.approx(0.3)
 
 
+def test_two_clouds_of_one_room_are_nearer_than_any_error_worth_telling():
+    """A room has about 120 square metres of surface; what remains is the clouds' own spacing."""
+    corners = np.array([[0, 0, 0], [12, 0, 0], [12, 0, 10], [0, 0, 10]], np.float32)
+    floor = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    first, second = (surfaces.sample_surface(floor, surfaces.SAMPLES, np.random.default_rng(seed)) for seed in (0, 1))
+    assert surfaces.chamfer(first, second) < 0.012, "metres; the bar for a scene is 0.025"
+    assert surfaces.chamfer(first, second + np.array([0, 0.03, 0])) == pytest.approx(0.03, abs=0.004)
+
+
 def test_only_what_cameras_see_is_seen():
     corner = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
