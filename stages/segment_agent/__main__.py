@@ -1,4 +1,4 @@
-"""Segment the animal in one recording: masks 255 agent, 0 not, 128 unknown, without any trained weights.
+"""Segment the animal in one recording: masks 255 agent, 0 not, 128 unknown; by default without any trained weights.
 
 Sessions: the animal is what lies in space that other frames saw through, tracked over the whole recording, so that it
 is kept while it rests. Turnaround: it is what stands on the ground where all cameras look. No map is used.
@@ -7,8 +7,8 @@ is kept while it rests. Turnaround: it is what stands on the ground where all ca
     python -m stages.segment_agent --frames build/cat/frames/v002 --flow build/cat/flow/v002 --out build/cat/masks/v002
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, assert_never
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from pipeline import cli, qa
 from pipeline.files.clips import Clip
 from pipeline.progress import log, track
 from stages.segment_agent import pictures, prompt, writing
+from stages.segment_agent.backends import foundation
+from stages.segment_agent.backends.foundation import Foundation
 from stages.segment_agent.masks import Options, segment
 
 
@@ -23,6 +25,10 @@ from stages.segment_agent.masks import Options, segment
 class Config(Options):
     """Options of this stage."""
 
+    backend: Literal["weightless", "foundation"] = "weightless"
+    """By motion and space, or by Grounding DINO and SAM 2 (`make extras`, and their checkpoints)."""
+    foundation: Foundation = field(default_factory=Foundation)
+    """Options of the latter."""
     role: Literal["turnaround", "session"] = "session"
     """Role of the recording where the list of recordings does not tell it."""
     seed: int = 0
@@ -34,13 +40,20 @@ def run(task: cli.Task) -> None:
     clip, flow = Clip.open(task.input("frames")), task.input("flow")
     role = next((video.role for video in task.videos if video.id == task.video), task.config.role)
     hint = prompt.parse(task.input("prompt"), clip) if task.has("prompt") else None
-    if clip.odometry_from_camera is None:
-        log("no usable odometry: the motion comes from depth and flow, which drifts more")
-    masks, path = segment(clip, flow, role, hint, task.config, np.random.default_rng(task.config.seed))
-    log(f"poses: {path.alignments} alignments of depth pictures agree within {1000 * path.residual_m:.0f} mm")
+    match task.config.backend:
+        case "weightless":
+            if clip.odometry_from_camera is None:
+                log("no usable odometry: the motion comes from depth and flow, which drifts more")
+            masks, path = segment(clip, flow, role, hint, task.config, np.random.default_rng(task.config.seed))
+            log(f"poses: {path.alignments} alignments of depth pictures agree within {1000 * path.residual_m:.0f} mm")
+            residual_m = path.residual_m
+        case "foundation":
+            masks, residual_m = foundation.segment(clip, hint, task.config.foundation, task.device), np.nan
+        case _:
+            assert_never(task.config.backend)
     with task.create() as folder:
         summary = writing.write(folder, track(masks, "masks", len(clip)), len(clip))
-        checks, shown = pictures.report(clip, summary.shown, np.array(summary.area), np.array(summary.visible), path.residual_m)
+        checks, shown = pictures.report(clip, summary.shown, np.array(summary.area), np.array(summary.visible), residual_m)
         qa.write(
             folder,
             good="the green outline hugs the animal in every frame, resting frames too",

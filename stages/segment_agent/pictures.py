@@ -61,8 +61,9 @@ def report(
     checks = [
         Check("agent visible", 100 * float(visible.mean()), "%", warn=30, fail=2, better="higher"),
         Check("flicker", 100 * flicker(area, visible), "%", warn=15, fail=40),
-        Check("agreement of depth pictures", 1000 * residual_m, "mm", warn=25, fail=60),
     ]
+    if np.isfinite(residual_m):
+        checks.append(Check("agreement of depth pictures", 1000 * residual_m, "mm", warn=25, fail=60))
     pictures = [
         Picture("overlay", contact_sheet(clip, labels), "masks over frames: outline green, unknown blue"),
         Picture("area", area_strip(area, visible), "share of the picture over time, red where the agent is out of view"),

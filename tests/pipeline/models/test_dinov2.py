@@ -1,6 +1,5 @@
 """DINOv2 as a backend gives what transformers gives, on a small checkpoint with random weights."""
 
-import json
 
 import numpy as np
 import pytest
@@ -9,22 +8,12 @@ from pipeline.errors import InputError
 from pipeline.models import pretrained
 from pipeline.models.describers import Describer
 from pipeline.models.dinov2 import Dinov2
-
-NEEDS = "the extra is not installed (make extras)"
+from tests.pipeline.models import small_checkpoints
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    transformers = pytest.importorskip("transformers", reason=NEEDS)
-    import torch
-
-    torch.manual_seed(0)
-    folder = tmp_path_factory.mktemp("dinov2")
-    config = transformers.Dinov2Config(hidden_size=24, num_hidden_layers=2, num_attention_heads=2, patch_size=14, image_size=70)
-    transformers.Dinov2Model(config).save_pretrained(folder)
-    table = dict(image_mean=[0.4, 0.5, 0.6], image_std=[0.2, 0.3, 0.25], resample=3, size={"shortest_edge": 256})
-    (folder / "preprocessor_config.json").write_text(json.dumps(table))
-    return folder
+    return small_checkpoints.dinov2(tmp_path_factory.mktemp("dinov2"))
 
 
 def test_it_equals_transformers_preprocessing_included(checkpoint):

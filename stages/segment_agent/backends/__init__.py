@@ -1,0 +1,1 @@
+"""Learned segmentation in place of motion and space: the same masks."""

@@ -1,0 +1,105 @@
+"""Grounding DINO finds the animal by its name in some frames, SAM 2 follows it from the most certain one to both ends.
+
+A user's hint takes the place of the detector. Masks are made as they are asked for; those before the first frame are
+kept compressed, so that memory hardly grows with the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.errors import InputError
+from pipeline.files.clips import Clip
+from stages.segment_agent.prompt import Prompt
+
+if TYPE_CHECKING:
+    from pipeline.models.grounding_dino import GroundingDino
+    from pipeline.models.sam2 import Sam2
+
+
+@dataclass(frozen=True)
+class Foundation:
+    """Which models, and what they look for."""
+
+    detector: str = ""
+    """Folder of a Grounding DINO checkpoint; not needed where a prompt points at the animal."""
+    tracker: str = ""
+    """Folder of a SAM 2 checkpoint."""
+    description: str = "a cat."
+    """What the animal is called."""
+    threshold: float = 0.3
+    """Score from which a detection counts, 0..1."""
+    looked_at: int = 16
+    """Frames in which it is looked for."""
+    unsure: float = 1.0
+    """Log-odds on both sides of even within which a pixel is unknown."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """One frame's result at colour resolution, as the other backend gives it."""
+
+    labels: UInt8[np.ndarray, "height width"]
+    visible: bool
+    confidence: float
+
+
+def segment(clip: Clip, hint: Prompt | None, options: Foundation, device: str) -> Iterator[Followed]:
+    """Return one mask per frame, in order. Raises MSK-004 where the animal is not found, MOD-001..003 without models."""
+    from pipeline.models.grounding_dino import GroundingDino
+    from pipeline.models.sam2 import Sam2
+
+    tracker = Sam2(options.tracker, device)
+    if hint is None:
+        frame, box_px = _find(clip, GroundingDino(options.detector, device), options)
+    else:
+        frame, box_px = hint.frame, widened(hint, clip.color_size)
+    return _follow(clip, tracker, frame, box_px, options)
+
+
+def _find(clip: Clip, detector: GroundingDino, options: Foundation) -> tuple[int, Float[np.ndarray, 4]]:
+    """Return the frame and box of the most certain detection."""
+    best: tuple[float, int, np.ndarray] | None = None
+    for frame in np.unique(np.linspace(0, len(clip) - 1, options.looked_at).round().astype(int)).tolist():
+        found = detector.find(clip.color(frame), options.description, options.threshold)
+        if len(found.score) and (best is None or found.score[0] > best[0]):
+            best = (float(found.score[0]), frame, found.boxes_px[0])
+    if best is None:
+        what = f"{options.description!r} was found in none of {options.looked_at} frames"
+        raise InputError("MSK-004", what, str(clip.folder), "describe the animal otherwise, or point at it with a prompt")
+    return best[1], best[2]
+
+
+def widened(hint: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[np.ndarray, 4]:
+    """Return a hint's box (x0, y0, x1, y1, pixels); a click becomes a small one around it."""
+    x0, y0, x1, y1 = hint.box_px
+    grow = np.maximum(least * max(size) - np.array([x1 - x0, y1 - y0]), 0) / 2
+    low, high = np.array([x0, y0]) - grow, np.array([x1, y1]) + grow
+    return np.concatenate([np.maximum(low, 0), np.minimum(high, size[::-1])])
+
+
+def _follow(clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, 4], options: Foundation) -> Iterator[Followed]:
+    before: list[tuple[bytes, bool, float]] = []
+    for log_odds, presence in tracker.track(clip.color, range(start, -1, -1), box_px):
+        mask = labelled(log_odds, presence, options.unsure)
+        before.append((cv2.imencode(".png", mask.labels)[1].tobytes(), mask.visible, mask.confidence))
+    while len(before) > 1:
+        png, visible, confidence = before.pop()
+        yield Followed(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), visible, confidence)
+    for log_odds, presence in tracker.track(clip.color, range(start, len(clip)), box_px):
+        yield labelled(log_odds, presence, options.unsure)
+
+
+def labelled(log_odds: Float[np.ndarray, "height width"], presence: float, unsure: float) -> Followed:
+    """Turn log-odds into 255 agent, 0 not, 128 unknown; nothing where the animal is rather out of view."""
+    labels = np.where(log_odds > unsure, 255, np.where(log_odds < -unsure, 0, 128)).astype(np.uint8)
+    inside = labels == 255
+    if presence <= 0 or not inside.any():
+        return Followed(np.zeros(labels.shape, np.uint8), False, float(1 / (1 + np.exp(presence))))
+    return Followed(labels, True, float((1 / (1 + np.exp(-log_odds[inside]))).mean()))
