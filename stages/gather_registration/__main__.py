@@ -5,7 +5,7 @@ and why.
 import json
 from dataclasses import dataclass
 
-from pipeline import cli, qa
+from pipeline import cli, progress, qa
 from pipeline.errors import InputError
 from pipeline.files import arrays
 from stages.gather_registration import gather
@@ -23,19 +23,23 @@ def run(task: cli.Task) -> None:
     """Copy the poses of registered recordings and write the summary. Raises InputError REG-001 when too few are
     registered.
     """
-    outcomes = []
+    outcomes, names = [], {video.id: video.file for video in task.videos}
     for video, folder in task.per_video("video_poses").items():
         status = json.loads((folder / "status.json").read_text())
-        outcomes.append(gather.Outcome(video, status, arrays.load(folder / "poses.npz") if status["registered"] else None))
+        poses = arrays.load(folder / "poses.npz") if status["registered"] else None
+        outcomes.append(gather.Outcome(video, status, poses, names[video]))
     summary = gather.summarise(outcomes)
     if summary["registered"] < task.config.least_registered:
-        reasons = "; ".join(f"{outcome.video}: {outcome.status['reason']}" for outcome in outcomes)
+        reasons = "; ".join(outcome.told for outcome in outcomes if outcome.poses is None)
         raise InputError(
             "REG-001",
             f"{summary['registered']} of {summary['total']} sessions fit the walk-through ({reasons})",
             str(task.out),
             "record a walk-through that shows the whole room, or sessions in that room",
         )
+    for outcome in outcomes:
+        if outcome.poses is None:
+            progress.log(f"refused {outcome.told}")
     with task.create() as folder:
         for outcome in outcomes:
             if outcome.poses is not None:

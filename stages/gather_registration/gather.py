@@ -19,6 +19,15 @@ class Outcome:
     video: str
     status: dict
     poses: dict[str, Float[np.ndarray, "frame ..."]] | None
+    file: str = ""
+    """Name of the recording in the capture folder."""
+
+    @property
+    def told(self) -> str:
+        """Say why a recording was refused, and what it resembles most."""
+        nearest = self.status.get("nearest_view")
+        view = f"; its nearest view is the walk-through at {nearest['walkthrough_s']:.1f} s" if nearest else ""
+        return f"{self.file or self.video}: {self.status['reason']}{view}"
 
 
 def summarise(outcomes: list[Outcome]) -> dict:
@@ -26,7 +35,7 @@ def summarise(outcomes: list[Outcome]) -> dict:
     return {
         "registered": sum(outcome.poses is not None for outcome in outcomes),
         "total": len(outcomes),
-        "videos": {outcome.video: outcome.status for outcome in outcomes},
+        "videos": {outcome.video: {"file": outcome.file, **outcome.status} for outcome in outcomes},
     }
 
 

@@ -35,11 +35,14 @@ def run(task: cli.Task) -> None:
         scene_localizer=localizer.load(task.input("scene_localizer")),
         agent_localizer=localizer.load(task.input("agent_localizer")),
     )
+    walk = arrays.load(task.input("scene_template") / "cameras.npz", ("timestamp_s", "world_from_camera"))
     found = registration.register(clip, masks, maps, task.config, np.random.default_rng(task.config.seed))
     with task.create() as folder:
         if isinstance(found, Registered):
             arrays.save(folder / "poses.npz", timestamp_s=clip.timestamp_s, **found.tables())
-        (folder / "status.json").write_text(json.dumps(pictures.status(found), indent=1) + "\n")
+        (folder / "status.json").write_text(
+            json.dumps(pictures.status(found, walk["timestamp_s"], walk["world_from_camera"]), indent=1) + "\n"
+        )
         qa.write(
             folder, good="template edges lie on the frames' edges, the animal's outline fits, paths stay in free space",
             bad="edges are shifted, paths cross walls, the animal faces backwards",

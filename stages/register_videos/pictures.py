@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.files.clips import Clip
 from pipeline.qa import Check, Picture
@@ -13,8 +14,8 @@ from stages.register_videos.registration import Maps, Refused, Registered
 EDGE, PHONE, ANIMAL, HEAD = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
 
 
-def status(found: Registered | Refused) -> dict:
-    """Describe the outcome for ``status.json``."""
+def status(found: Registered | Refused, walk_time_s: Float[np.ndarray, "walk"], walk: Float[np.ndarray, "walk 4 4"]) -> dict:
+    """Describe the outcome for ``status.json``; the nearest view is told as a moment of the walk-through as well."""
     votes = found.votes
     figures = {"frames_localized": votes.asked, "votes": len(votes.frame)}
     nearest = (
@@ -22,6 +23,7 @@ def status(found: Registered | Refused) -> dict:
         if votes.nearest is None
         else {
             "inlier_ratio": votes.nearest.inlier_ratio,
+            "walkthrough_s": float(walk_time_s[nearest_frame(walk, votes.nearest.map_from_camera)]),
             "world_from_camera": votes.nearest.map_from_camera.round(6).tolist(),
         }
     )
@@ -37,6 +39,12 @@ def status(found: Registered | Refused) -> dict:
         "agent_confidence": float(found.agent_confidence[found.roots.visible].mean()) if found.roots.visible.any() else 0.0,
     }
     return {"registered": True, "reason": None, "nearest_view": nearest, "figures": figures}
+
+
+def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[np.ndarray, "4 4"]) -> int:
+    """Return the frame of the walk-through that was taken most nearly from there: a metre counts as much as a radian."""
+    away = np.linalg.norm(walk[:, :3, 3] - world_from_camera[:3, 3], axis=1)
+    return int(np.argmin(away + rigid.rotation_angle(walk[:, :3, :3], world_from_camera[:3, :3])))
 
 
 def checks(found: Registered | Refused) -> list[Check]:

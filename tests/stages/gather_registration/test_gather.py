@@ -23,3 +23,9 @@ def test_nothing_registered_is_told_without_a_fault():
     outcomes = [gather.Outcome("v002", REFUSED, None)]
     assert gather.checks(outcomes)[0].status == "fail"
     assert gather.paths(outcomes).shape == (560, 560, 3)
+
+
+def test_a_refusal_is_told_by_name_with_its_nearest_view():
+    refused = gather.Outcome("v003", {**REFUSED, "nearest_view": {"walkthrough_s": 12.34}}, None, "b.r3d")
+    assert refused.told == "b.r3d: no overlap; its nearest view is the walk-through at 12.3 s"
+    assert gather.summarise([refused])["videos"]["v003"]["file"] == "b.r3d"

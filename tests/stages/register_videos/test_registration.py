@@ -8,7 +8,7 @@ import pytest
 from pipeline.models import localizer as model
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh, RayCaster
-from stages.register_videos import alignment, registration
+from stages.register_videos import alignment, pictures, registration
 from stages.register_videos import votes as voting
 from stages.register_videos.likeness import likeness
 from stages.train_localizer import training
@@ -82,3 +82,8 @@ def test_a_repainted_room_of_the_same_shape_is_refused(maps):
     assert "looks different" in registration._strange(0.9, 0.3, doubtful, supports, options)
     assert registration._strange(0.9, 0.8, doubtful, supports, options) is None
     assert registration._strange(0.9, 0.3, votes, supports, options) is None, "recognised with certainty"
+
+
+def test_a_refusal_names_the_nearest_moment_of_the_walk():
+    path = walk(30)
+    assert pictures.nearest_frame(path, path[17] @ rigid.exp(np.array([0.02, 0, 0, 0.01, 0, 0]))) == 17
