@@ -5,6 +5,7 @@ finds from them which parts of the body touch the scene. `stages.simulate --subg
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from pipeline import cli, progress, qa
 from pipeline.models.longterm import Sizes
@@ -35,6 +36,10 @@ class Config:
     """Train also the networks that the tables compare with."""
     point_net: str | None = None
     """Weights (safetensors, as `longterm.safetensors` names them: `layers.0.weight` ...) that every PointNet starts from."""
+    smplx_model: str | None = None
+    """Learn people instead: a model file of SMPL-X (needs the package smplx)."""
+    smplx_motions: str | None = None
+    """With it: a folder with `scene.ply` and recorded SMPL-X parameters (see `stages.train_longterm.sources.people`)."""
     seed: int = 0
     """Seed of weights, examples and batches."""
 
@@ -42,7 +47,9 @@ class Config:
 def run(task: cli.Task) -> None:
     """Read, train, show."""
     c: Config = task.config
-    if task.has("longterm_world"):
+    if c.smplx_model is not None:
+        lives = sources.people(Path(c.smplx_model), Path(c.smplx_motions or ""))
+    elif task.has("longterm_world"):
         lives = sources.simulated(task.input("longterm_world"))
     else:
         lives = sources.recorded(task.input("reconstruction"), task.input("behavior_data"))

@@ -1,6 +1,6 @@
 """From motion to a model: what the body touches, its pose space, and all networks in their order."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ class Learned:
 def learn(lives: Lives, settings: Any, *, resume: Path | None = None) -> Learned:
     """Train everything on some motion; ``settings`` are the stage's."""
     rng = np.random.default_rng(settings.seed)
+    settings = replace(settings, sizes=replace(settings.sizes, shape=len(lives.body.shape)))
     poses = fitted_poses(lives.stretches, lives.body.agent_from_bone_rest, settings.sizes.pose)
     contacts = find_contacts(lives.body, list(lives.stretches), lives.distances)
     clips = encoded(lives, cut(lives, settings.cutting, rng), poses, settings.sizes.points, rng)
