@@ -93,6 +93,7 @@ class Job:
     gpu: int
     memory_mb: int
     resumable: bool
+    aside: bool
 
     @property
     def stamp(self) -> str:
@@ -290,6 +291,7 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
         gpu=node.gpu,
         memory_mb=node.memory_mb,
         resumable=node.resumable,
+        aside=node.aside,
     )
 
 

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[2]
 SETTINGS = {
     "synthesize_capture": "    session_count: int = 2\n    heldout_of: int = 1\n",
     "train_localizer": "    target: str = ''\n",
+    "train_longterm": "    ablations: bool = False\n",
 }
 STAGE = '''"""Hash the inputs."""
 
@@ -100,10 +101,11 @@ def create(folder: Path) -> Checkout:
         made.write(name, "")
     made.write("agents/variants/other.toml", "[train_behavior]\nseed = 7\n")
     for stage in {node.stage for node in dag.nodes_of("recordings")}:
-        needs = [need for node in dag.FLOW if node.stage == stage for need in dag.needs_of(node, "recordings")]
-        names = tuple(dict.fromkeys(need.option or need.artifact for need in needs))
-        optional = names if stage == "train_localizer" else tuple(name for name in names if name == "truth")
-        reads = tuple(name for name in names if name not in optional)
+        of_nodes = [dag.needs_of(node, "recordings") for node in dag.FLOW if node.stage == stage]
+        options = [[need.option or need.artifact for need in needs] for needs in of_nodes]
+        names = tuple(dict.fromkeys(name for each in options for name in each))
+        reads = tuple(name for name in names if name != "truth" and all(name in each for each in options))
+        optional = tuple(name for name in names if name not in reads)
         settings = SETTINGS.get(stage, "")
         made.write(f"stages/{stage}/__init__.py", "")
         made.write(f"stages/{stage}/__main__.py", STAGE.format(stage=stage, settings=settings, reads=reads, optional=optional))
