@@ -47,7 +47,7 @@ def check_make(words: list[str]) -> None:
             if name == "VARIANT":
                 assert (ROOT / f"agents/variants/{value}.toml").exists(), word
             if name == "FORMAT":
-                assert f"\"{value}\"" in (ROOT / "stages/export/__main__.py").read_text(), word
+                assert f'"{value}"' in (ROOT / "stages/export/__main__.py").read_text(), word
             continue
         agent, *rest = word.split(".")
         assert word in TARGETS or agent in AGENTS, word

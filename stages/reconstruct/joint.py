@@ -27,7 +27,7 @@ class JointLoss:
         self.first = problem.runs(self.run_frames).to(problem.device)
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
-        problem, batches, probability = self.problem, self.batches, swap_probability(step / self.steps)
+        problem, batches, probability = self.problem, self.batches, swap_probability(step / self.steps, self.batches)
         start = self.first[pick(len(self.first), batches.runs, generator, problem.device)]
         frame = (start[:, None] + torch.arange(self.run_frames, device=problem.device)).flatten()
         pose = Pose.of(problem, frame)

@@ -20,9 +20,9 @@ BEHIND_M = 0.06
 EIKONAL_STEP_M = 0.04
 
 
-def swap_probability(progress: float, last: float = 0.05) -> float:
-    """Return how often codes are swapped: from 1 to ``last``, linearly (paper 001, scene annealing)."""
-    return 1 + (last - 1) * progress
+def swap_probability(progress: float, batches: Batches) -> float:
+    """Return how often codes are swapped, linearly from first to last (paper 001, scene annealing)."""
+    return batches.swap_first + (batches.swap_last - batches.swap_first) * progress
 
 
 def swap(video: Int[Tensor, "ray"], videos: int, probability: float, generator: Generator) -> Int[Tensor, "ray"]:
@@ -133,7 +133,7 @@ class SceneLoss:
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
         return losses.weighted(
-            self.terms(self.batches.scene_rays, swap_probability(step / self.steps), generator)
+            self.terms(self.batches.scene_rays, swap_probability(step / self.steps, self.batches), generator)
             | drift_term(self.problem.motion, self.weights)
         )
 

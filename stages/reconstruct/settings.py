@@ -87,6 +87,10 @@ class Batches:
     """samples of a ray near its measured depth"""
     free: int = 3
     """samples of a ray in the free space before it"""
+    swap_first: float = 1.0
+    """how often a ray takes another video's code as a phase begins (scene annealing)"""
+    swap_last: float = 0.05
+    """and as it ends"""
 
 
 @dataclass(frozen=True)

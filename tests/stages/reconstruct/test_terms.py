@@ -9,6 +9,7 @@ from pipeline.models.render import Layer, composite
 from pipeline.models.surfaces import zero_level
 from pipeline.space import rigid
 from stages.reconstruct import losses, results, scene
+from stages.reconstruct.settings import Batches
 
 
 def layer(value: torch.Tensor, color: tuple[float, float, float]) -> Layer:
@@ -45,7 +46,8 @@ def test_eikonal_is_zero_on_a_distance_field_and_not_on_a_scaled_one():
 def test_codes_are_swapped_as_often_as_asked():
     video = torch.zeros(20000, dtype=torch.int64)
     generator = torch.Generator().manual_seed(0)
-    assert scene.swap_probability(0.0) == 1.0 and abs(scene.swap_probability(1.0) - 0.05) < 1e-9
+    assert scene.swap_probability(0.0, Batches()) == 1.0 and abs(scene.swap_probability(1.0, Batches()) - 0.05) < 1e-9
+    assert scene.swap_probability(0.5, Batches(swap_first=0.0, swap_last=0.0)) == 0, "no annealing"
     assert (scene.swap(video, 4, 0.0, generator) == 0).all()
     changed = (scene.swap(video, 4, 0.4, generator) != 0).float().mean()
     assert abs(changed - 0.4 * 3 / 4) < 0.02, "a swap may draw the same video again"
