@@ -1,6 +1,7 @@
 """One walk, written in every format, comes back the same: upright, metric, with its poses, whatever the app stores."""
 
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -233,3 +234,27 @@ def test_up_may_be_any_axis():
     np.testing.assert_allclose(turned[:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(extraction._y_up_from((0.0, -1.0, 0.0))[:3, :3] @ [0, -1, 0], [0, 1, 0], atol=1e-12)
     assert rigid.rotation_angle(np.eye(3), extraction._y_up_from((0.0, 1.0, 0.0))[:3, :3]) < 1e-12
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_the_rotation_tag_of_a_video_makes_it_upright(tmp_path, turns):
+    """Phones store landscape and write into the track header how players are to turn it."""
+    stored, upright = walk(8, quarter_turns=-turns % 4), walk(8)
+    path = made_formats.video_and_depth(tmp_path / "a", stored)
+    _turn_track(path / "clip.mov", turns)
+    recording, plan = _understand(path)
+    assert recording.quarter_turns == plan.quarter_turns == turns
+    np.testing.assert_allclose(plan.intrinsics[0], upright.intrinsics, atol=1e-6)
+    np.testing.assert_allclose(plan.odometry_from_camera[0], upright.world_from_camera[plan.chosen[0]], atol=1e-5)
+    frame = _frames(recording, plan)[2]
+    assert np.abs(frame.color.astype(int) - upright.color(plan.chosen[2])).mean() < 4
+
+
+def _turn_track(path, turns):
+    """Write clockwise quarter turns into the display matrix (16.16 fixed point) of the track header."""
+    cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][turns]
+    data = bytearray(path.read_bytes())
+    at = data.find(b"tkhd") + 4 + 40
+    for place, value in ((0, cosine), (1, sine), (3, -sine), (4, cosine)):
+        struct.pack_into(">i", data, at + 4 * place, value << 16)
+    path.write_bytes(data)
