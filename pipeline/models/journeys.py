@@ -1,6 +1,6 @@
 """Long-term motion through sub-goals, and any other motion, made physical; and what it is worth before and after."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -53,16 +53,16 @@ def travel(world: World, subgoals: list[Subgoal], settings: Settings | None, rng
     """Make motion through sub-goals; ``settings`` None leaves it as the networks made it."""
     places = legs(None, subgoals, world.scene, world.model.habits)
     raw, _ = world.model.long_motion(places.world_from_agent, world.body, world.scene, rng)
+    made = stayed(world, raw, settings)
+    return replace(made, subgoals_world=places.world_from_agent[places.subgoal, :3, 3], arrival_s=places.subgoal * STEPS / RATE_HZ)
+
+
+def stayed(world: World, raw: Moving, settings: Settings | None) -> Journey:
+    """Make any motion at 30 fps physical where ``settings`` are given; it has no sub-goals."""
     judge, stance = world.judge, world.judge.stance(raw)
     moving = raw if settings is None else optimise(raw, world.model.physique(world.body), world.scene.distance, settings)
-    return Journey(
-        moving,
-        places.world_from_agent[places.subgoal, :3, 3],
-        places.subgoal * STEPS / RATE_HZ,
-        judge.plausibility(raw, stance),
-        judge.plausibility(moving, stance),
-        float(seams(world.body, moving, STEPS).max(initial=0.0)),
-    )
+    before, after = (judge.plausibility(each, stance) for each in (raw, moving))
+    return Journey(moving, np.zeros((0, 3)), np.zeros(0), before, after, float(seams(world.body, moving, STEPS).max(initial=0.0)))
 
 
 def physical(

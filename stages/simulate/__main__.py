@@ -1,17 +1,15 @@
 """Run the behaviour model without a page, or let the animal travel through sub-goals for minutes; write the take.
 
 With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`. In Python: `Simulator.reset(seed)` and
-`Simulator.step(observer)` of `pipeline.models.simulator`, ten steps a second.
-With `--serve`: live in a browser, computed here; a take of it is kept.
-With `--longterm` and `--subgoals FILE` (see `stages.simulate.subgoal_file`), or sub-goals that the recipe asks for:
-writes `take.npz` at 30 fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
+`Simulator.step(observer)` of `pipeline.models.simulator`. With `--serve`: live in a browser, computed here; kept too.
+With `--longterm` and `--subgoals FILE` (see `stages.simulate.subgoal_file`), or sub-goals or a recording that the recipe
+asks for: writes `take.npz` at 30 fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
 """
 
 from dataclasses import dataclass, field
 from typing import Literal
 
 from pipeline import cli, config, progress
-from pipeline.errors import InputError
 from pipeline.models import behavior
 from pipeline.models.motion_optimization import Settings
 from pipeline.models.simulator import Chaining
@@ -43,6 +41,8 @@ class Config:
     """Make the motion physical; a take of the behaviour model only where `--longterm` and `--reconstruction` are given."""
     optimisation: Settings = field(default_factory=Settings)
     """Weights and length of that."""
+    recording: str | None = None
+    """Take the reconstructed motion of this session, its longest stretch, instead."""
     frames_hz: float = 10.0
     """Pictures per second of long-term motion; 0 = none."""
     seed: int = 0
@@ -62,10 +62,10 @@ def run(task: cli.Task) -> None:
         table = config.read_table(task.input("subgoals"))
         rows = [config.from_table(Written, row, where=str(task.input("subgoals"))) for row in table.get("subgoal", ())]
         written = subgoals_from_table(table, rows, task.input("subgoals"))
-    if written is None and c.subgoals == "file":
-        raise InputError("SIM-004", "which sub-goals?", task.stage, "give --subgoals file.toml")
     if c.serve:
         take = takes.live(given, c, task.device)
+    elif c.recording is not None:
+        take = takes.of_recording(given, c)
     elif written is None and c.subgoals == "none":
         take = takes.of_behavior(given, c, task.device)
     else:

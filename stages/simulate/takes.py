@@ -16,7 +16,7 @@ from pipeline.models.journeys import World
 from pipeline.models.motion_synthesis import LongTerm
 from pipeline.models.perception import FeatureVolume
 from pipeline.models.planning import Sampler, TorchNetworks
-from pipeline.models.short_motions import Moving
+from pipeline.models.short_motions import RATE_HZ, Moving, stretches
 from pipeline.models.simulator import Simulator
 from pipeline.models.subgoals import Subgoal, preferred
 from pipeline.models.surroundings import Surroundings
@@ -57,6 +57,22 @@ def of_behavior(given: Mapping[str, Path], c: Any, device: str) -> Made:
     return Made(said, write)
 
 
+def of_recording(given: Mapping[str, Path], c: Any) -> Made:
+    """Make reconstructed motion physical: the longest stretch of a session, at most as long as a take."""
+    data = BehaviorData.load(_needed(given, "behavior_data"))
+    if c.recording not in data.trajectories:
+        raise InputError(
+            "SIM-005", f"there is no motion of {c.recording!r}", str(given["behavior_data"]), f"known: {', '.join(data.videos)}"
+        )
+    found = stretches(data.trajectories[c.recording], shortest_s=0.5)
+    if not found:
+        raise InputError("SIM-005", f"{c.recording} holds no uninterrupted motion", str(given["behavior_data"]), "take another session")
+    world, raw = _world(given, data), max(found, key=len)[: round(c.seconds * RATE_HZ) + 1]
+    made = journeys.stayed(world, raw, c.optimisation if c.optimise else None)
+    said = f"{c.recording}: {made.timestamp_s[-1]:.1f} s; penetration {1000 * made.before.penetration_m:.2f} -> {1000 * made.after.penetration_m:.2f} mm"
+    return Made(said, lambda folder: journey_files.write_journey(folder, made, world.body))
+
+
 def live(given: Mapping[str, Path], c: Any, device: str) -> Made:
     """Let the animal live in a browser until interrupted."""
     data, shown = BehaviorData.load(_needed(given, "behavior_data")), _needed(given, "simulator")
@@ -76,6 +92,8 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
     world, rng = _world(given, data), np.random.default_rng(c.seed)
     if written is not None:
         subgoals = written
+    elif c.subgoals == "file":
+        raise InputError("SIM-004", "which sub-goals?", "stages.simulate", "give --subgoals file.toml")
     elif c.subgoals == "behavior":
         simulator = _simulator(given, data, c, replace(c.chaining, replan_frames=FUTURE, fade_frames=0), device)
         subgoals = chained_goals(simulator, _observer(data, c), c.subgoal_count, c.seed)

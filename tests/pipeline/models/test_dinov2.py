@@ -1,6 +1,5 @@
 """DINOv2 as a backend gives what transformers gives, on a small checkpoint with random weights."""
 
-
 import numpy as np
 import pytest
 

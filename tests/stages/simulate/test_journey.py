@@ -97,3 +97,15 @@ def test_a_take_of_the_behaviour_model_becomes_physical(world):
     assert after.penetration_m < 0.5 * before.penetration_m
     assert done.world_from_agent.shape == root.shape
     assert np.abs(done.world_from_agent[:, [0, 2], 3] - root[:, [0, 2], 3]).max() < 0.1
+
+
+def test_recorded_motion_becomes_physical(world, tmp_path):
+    walk = strider.striding(np.array([[1.0, 0, -1.2], [1.0, 0, 1.2]]), 2.0)
+    root = walk.world_from_agent.copy()
+    root[:, 1, 3] -= 0.03
+    made = journeys.stayed(world, Moving(root, walk.agent_from_bone), Settings(steps=40, vertices=30))
+    assert made.after.penetration_m < 0.5 * made.before.penetration_m
+    journey_files.write_journey(tmp_path, made, world.body)
+    assert json.loads((tmp_path / "take.json").read_text())["subgoals_world"] == []
+    left = journeys.stayed(world, walk, None)
+    assert left.moving is walk and left.before == left.after
