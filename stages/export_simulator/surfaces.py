@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from pipeline.space.meshes import Mesh
 
 _SPLAT_ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+_STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not compress
 _BAND_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
@@ -95,7 +96,8 @@ def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> In
 
 def _packed(gaussians: Float[np.ndarray, "point 62"]) -> bytes:
     rows = np.zeros(len(gaussians), _SPLAT_ROW)
-    rows["position"], rows["scale"] = gaussians[:, :3], np.exp(gaussians[:, 55:58].astype(np.float64))
+    rows["position"] = np.rint(gaussians[:, :3] * _STEPS) / _STEPS
+    rows["scale"] = np.maximum(np.rint(np.exp(gaussians[:, 55:58].astype(np.float64)) * _STEPS), 1) / _STEPS
     rows["color"] = _bytes(np.concatenate([gaussians[:, 6:9] * _BAND_0 + 0.5, _opacity(gaussians)[:, None]], 1) * 255)
     rotation = gaussians[:, 58:62] / np.linalg.norm(gaussians[:, 58:62], axis=1, keepdims=True)
     rows["rotation"] = _bytes(rotation * 128 + 128)
