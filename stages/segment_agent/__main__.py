@@ -1,7 +1,9 @@
 """Segment the animal in one recording: masks 255 agent, 0 not, 128 unknown; by default without any trained weights.
 
 Sessions: the animal is what lies in space that other frames saw through, tracked over the whole recording, so that it
-is kept while it rests. Turnaround: it is what stands on the ground where all cameras look. No map is used.
+is kept while it rests; a small network then learns its looks and finds it where it never moved. Turnaround: it is what
+stands on the ground where all cameras look. No map is used.
+A recording without depth needs a hint and is followed from there by colour and flow.
 `--prompt FILE` (TOML: `frame = 12` and `box = [x0, y0, x1, y1]` or `click = [x, y]`, colour pixels) points at it.
 
     python -m stages.segment_agent --frames build/cat/frames/v002 --flow build/cat/flow/v002 --out build/cat/masks/v002
@@ -45,8 +47,9 @@ def run(task: cli.Task) -> None:
             if clip.odometry_from_camera is None:
                 log("no usable odometry: the motion comes from depth and flow, which drifts more")
             masks, path = segment(clip, flow, role, hint, task.config, np.random.default_rng(task.config.seed))
-            log(f"poses: {path.alignments} alignments of depth pictures agree within {1000 * path.residual_m:.0f} mm")
-            residual_m = path.residual_m
+            if path is not None:
+                log(f"poses: {path.alignments} alignments of depth pictures agree within {1000 * path.residual_m:.0f} mm")
+            residual_m = np.nan if path is None else path.residual_m
         case "foundation":
             masks, residual_m = foundation.segment(clip, hint, task.config.foundation, task.device), np.nan
         case _:

@@ -4,7 +4,8 @@
 animal that rests for a while is told by the times when its place was empty. Votes cost O(references) a frame.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numba
@@ -70,6 +71,16 @@ def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], option
     )
     color = np.stack([soft_color(clip.color(frame), clip.depth_size) for frame in frames])
     return References(rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames], depth, nearest, color, frames)
+
+
+def without(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]], free: FreeSpace) -> References:
+    """Forget what references saw where ``hidden`` (at any resolution) says so: there, they no longer know a surface."""
+    size = references.depth.shape[1:][::-1]
+    depth = references.depth.copy()
+    for row, frame in enumerate(references.frame):
+        depth[row][cv2.resize(hidden(int(frame)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0] = 0
+    nearest = [_nearest(picture, k[0, 0], free) for picture, k in zip(depth, references.intrinsics, strict=True)]
+    return replace(references, depth=depth, nearest=np.stack(nearest))
 
 
 def soft_color(color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "new_height new_width 3"]:

@@ -1,23 +1,31 @@
 """Masks of one recording from its pictures alone: the steps of this room in order."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, assert_never
 
+import cv2
 import numpy as np
+from jaxtyping import Bool
 
+from pipeline.errors import InputError
 from pipeline.files.clips import Clip
 from pipeline.space.straightening import Straightening
 from stages.segment_agent import free_space
 from stages.segment_agent import prompt as prompts
-from stages.segment_agent.free_space import FreeSpace
+from stages.segment_agent.appearance import Appearance, Example, Learning, learn
+from stages.segment_agent.evidence import Judge, Weighing, judge_motion
+from stages.segment_agent.follow import Following, Footage, follow
+from stages.segment_agent.free_space import FreeSpace, References
+from stages.segment_agent.locate import find_mover
 from stages.segment_agent.movers import Hint, Mover
+from stages.segment_agent.painting import Mask, Painter, learn_palette
 from stages.segment_agent.prompt import Prompt
-from stages.segment_agent.refine import Refinement
-from stages.segment_agent.segment import Mask, Weighing, find_mover, judge_motion, learn_palette, paint
+from stages.segment_agent.refine import Palette, Refinement
 from stages.segment_agent.trajectory import Trajectory, steady
 from stages.segment_agent.turnaround import Turnaround, find_standing, meeting_point
+from stages.segment_agent.windows import Sphere, working_picture
 
 
 @dataclass(frozen=True)
@@ -34,27 +42,80 @@ class Options:
     """What observations of a session are worth."""
     turnaround: Turnaround = field(default_factory=Turnaround)
     """How a standing animal is told from its ground."""
+    learning: Learning = field(default_factory=Learning)
+    """How the animal's looks are learnt from first masks."""
+    following: Following = field(default_factory=Following)
+    """How an animal is followed in a recording without depth."""
     refinement: Refinement = field(default_factory=Refinement)
     """How evidence becomes a mask."""
 
 
 def segment(
     clip: Clip, flow: Path, role: Literal["turnaround", "session"], hint: Prompt | None, options: Options, rng: np.random.Generator
-) -> tuple[Iterator[Mask], Trajectory]:
-    """Return one mask per frame, made as they are asked for, and the poses they rest on. ``flow`` is the recording's flow folder."""
+) -> tuple[Iterator[Mask], Trajectory | None]:
+    """Return one mask per frame, made as they are asked for, and the poses they rest on. ``flow`` is the recording's flow folder.
+
+    A recording without any depth is followed from its hint, with no poses; raises InputError MSK-004 without a hint.
+    """
+    if not _has_depth(clip):
+        if hint is None:
+            raise InputError(
+                "MSK-004",
+                "there is no depth, so motion alone does not tell the animal from the room",
+                str(clip.folder),
+                "give a hint: one box around the animal in one frame (--prompt)",
+            )
+        footage = Footage(clip, flow, options.refinement.height_px)
+        return follow(footage, hint, options.following, options.learning, rng), None
     path = steady(clip, flow, options.straightening, rng)
     poses = path.world_from_camera
     place = None if hint is None else prompts.position(hint, clip, poses)
     match role:
         case "turnaround":
             balls, judge = find_standing(clip, poses, options.turnaround, meeting_point(poses) if place is None else place)
+            looks = learn_palette(Painter(clip, poses, balls, judge, options.refinement, Palette()))
         case "session":
+            mark = None if place is None else Hint(hint.frame, place)
             references = free_space.gather(clip, poses, options.free_space)
-            balls = find_mover(
-                clip, poses, references, options.free_space, options.mover, None if place is None else Hint(hint.frame, place)
-            )
-            judge = judge_motion(references, options.free_space, options.mover, options.weighing)
+            balls, judge = _locate(clip, poses, references, options, mark, None)
+            network = _learn(Painter(clip, poses, balls, judge, options.refinement, Palette()), options, rng)
+            looks = Palette() if network is None else network
+            if network is not None:
+                room = free_space.without(references, lambda frame: _hidden(clip, frame, network, options), options.free_space)
+                balls, judge = _locate(clip, poses, room, options, mark, network)
         case _:
             assert_never(role)
-    palette = learn_palette(clip, poses, balls, judge, options.refinement)
-    return paint(clip, poses, balls, judge, palette, options.refinement), path
+    painter = Painter(clip, poses, balls, judge, options.refinement, looks)
+    return painter.masks(range(len(clip))), path
+
+
+def _has_depth(clip: Clip, probes: int = 12) -> bool:
+    return any((clip.depth(frame) > 0).any() for frame in np.unique(np.linspace(0, len(clip) - 1, probes).astype(int)).tolist())
+
+
+def _locate(
+    clip: Clip, poses: np.ndarray, references: References, options: Options, hint: Hint | None, network: Appearance | None
+) -> tuple[list[Sphere | None], Judge]:
+    """Track the animal of a session by its motion, and by its looks when they are known."""
+    height_px = options.refinement.height_px
+    looks = None if network is None else (lambda frame: network.log_odds(working_picture(clip, frame, height_px)))
+    balls = find_mover(clip, poses, references, options.free_space, options.mover, hint, looks)
+    return balls, judge_motion(references, options.free_space, options.mover, options.weighing)
+
+
+def _learn(painter: Painter, options: Options, rng: np.random.Generator) -> Appearance | None:
+    """Learn the animal's looks from first masks of frames spread over the recording; None where it is never seen."""
+    first = replace(painter, looks=learn_palette(painter))
+    seen = np.array([frame for frame, ball in enumerate(painter.balls) if ball is not None and not ball.presumed])
+    if not len(seen):
+        return None
+    chosen = seen[np.unique(np.linspace(0, len(seen) - 1, options.learning.examples).round().astype(int))]
+    height_px = painter.options.height_px
+    examples = [Example(working_picture(painter.clip, frame, height_px), first.working_mask(frame).labels) for frame in chosen.tolist()]
+    return learn(examples, options.learning, rng)
+
+
+def _hidden(clip: Clip, frame: int, network: Appearance, options: Options) -> Bool[np.ndarray, "height width"]:
+    """Tell where the animal, by its looks and with a rim, hides the room."""
+    like = network.log_odds(working_picture(clip, frame, options.refinement.height_px)) > 0
+    return cv2.dilate(like.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0

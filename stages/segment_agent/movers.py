@@ -36,6 +36,10 @@ class Mover:
     """groups kept per frame"""
     presumed_s: float = 3.0
     """how long the animal is looked for around where it was last or will next be seen"""
+    motion: float = 2.0
+    """log-odds by which motion speaks for a point and a surface that others saw against it, once the looks are known"""
+    looks_limit: float = 3.0
+    """largest log-odds of the looks there"""
     appear_cost: float = 1.5
     """cost of leaving or entering the view, in units of a convincing candidate"""
 
@@ -49,6 +53,8 @@ class Candidate:
     radius_m: float
     """distance from the centre that holds 95 % of the points"""
     depth_m: float
+    conviction: float = 1.0
+    """mean probability of its points"""
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,7 @@ def moving(votes: Votes, options: Mover) -> Bool[np.ndarray, "*shape"]:
 
 def candidates(
     is_moving: Bool[np.ndarray, "height width"],
+    probability: Float[np.ndarray, "height width"],
     points_world: Float[np.ndarray, "height width 3"],
     area_m2: Float[np.ndarray, "height width"],
     options: Mover,
@@ -83,7 +90,7 @@ def candidates(
         centre = np.median(points, axis=0)
         radius = float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95))
         if radius < options.largest_m:
-            found.append(Candidate(centre, area, radius, float(np.sqrt(np.median(area_m2[own])))))
+            found.append(Candidate(centre, area, radius, float(np.sqrt(np.median(area_m2[own]))), float(probability[own].mean())))
     return sorted(found, key=lambda candidate: -candidate.area_m2)[: options.candidates]
 
 
@@ -119,7 +126,7 @@ def track(
 
 def _score(candidate: Candidate, options: Mover) -> float:
     """Reward area up to a convincing one; halve what is larger than an animal."""
-    reward = min(candidate.area_m2 / options.likely_area_m2, 1.0) ** 0.5
+    reward = candidate.conviction * min(candidate.area_m2 / options.likely_area_m2, 1.0) ** 0.5
     return reward * (0.5 if candidate.radius_m > options.largest_m / 2 else 1.0)
 
 

@@ -17,6 +17,16 @@ class Refinement:
 
     color_weight: float = 0.7
     """log-odds per unit of the colours' log-ratio"""
+    looks_weight: float = 0.5
+    """weight of the learnt looks' log-odds"""
+    looks_for: float = 0.5
+    """largest log-odds by which the learnt looks speak for the animal where geometry is sure: its edges are sharper"""
+    looks_alone: float = 3.0
+    """the same where geometry knows nothing"""
+    looks_against: float = 4.0
+    """largest log-odds by which they speak against it"""
+    sure: float = 1.0
+    """log-odds from which on a pixel is surely animal, beside the learnt looks"""
     radius_px: int = 2
     """reach of the edge-preserving filter at working resolution"""
     edge: float = 0.1

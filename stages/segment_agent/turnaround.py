@@ -16,8 +16,8 @@ from pipeline.files.clips import Clip
 from pipeline.space import rigid
 from pipeline.space.depth_alignment import depth_view
 from pipeline.space.ground import Ground, fit_ground
+from stages.segment_agent.evidence import Evidence, Judge
 from stages.segment_agent.free_space import usable_depth
-from stages.segment_agent.segment import Evidence, Judge
 from stages.segment_agent.windows import Sphere, Window
 
 

@@ -41,9 +41,17 @@ def working_size(clip: Clip, height_px: int) -> tuple[int, int]:
     return round(height * scale), round(width * scale)
 
 
-def cut(clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, height_px: int) -> Window | None:
-    """Read the rectangle around a ball with a rim of 8 px; None when it is out of view."""
-    size = working_size(clip, height_px)
+def working_picture(clip: Clip, frame: int, height_px: int) -> UInt8[np.ndarray, "height width 3"]:
+    """Read a frame's colours at working resolution."""
+    color, size = clip.color(frame), working_size(clip, height_px)
+    return color if size == clip.color_size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
+
+
+def cut(
+    clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, color: UInt8[np.ndarray, "height width 3"]
+) -> Window | None:
+    """Read the rectangle around a ball with a rim of 8 px out of a working picture; None when it is out of view."""
+    size = color.shape[:2]
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     centre = rigid.apply(rigid.inverse(world_from_camera), ball.centre_world[None])[0]
     pixel, depth = cameras.project(centre, intrinsics)
@@ -55,9 +63,6 @@ def cut(clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], bal
     if (high - low).min() < 4:
         return None
     rows, columns = slice(low[1], high[1]), slice(low[0], high[0])
-    color = clip.color(frame)
-    if size != clip.color_size:
-        color = cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
     grid = cameras.pixel_grid(*size)[rows, columns]
     at = np.floor(grid * [clip.depth_size[1] / size[1], clip.depth_size[0] / size[0]]).astype(int)
     z = clip.depth(frame)[at[..., 1], at[..., 0]]

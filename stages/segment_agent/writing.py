@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.files import arrays, images
-from stages.segment_agent.segment import Mask
+from stages.segment_agent.painting import Mask
 
 
 @dataclass

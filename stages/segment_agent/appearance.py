@@ -1,0 +1,147 @@
+"""What the animal of one recording looks like: a small network that learns it from the recording's own first masks.
+
+First masks rest on geometry and miss an animal that never leaves its place, or leak where depth is poor; such errors
+differ from frame to frame while the animal's looks stay, so the network, too small to learn the errors by heart, keeps
+the looks. `learn` trains one on examples; `Appearance.log_odds` judges a picture of any size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+ALIGNED_PX = 16
+"""pictures are widened to a multiple of it"""
+GAIN = 4.0
+"""of the last layer, so that a short training reaches sure answers"""
+LIMIT = 8.0
+"""largest log-odds of a pixel"""
+
+
+@dataclass(frozen=True)
+class Learning:
+    """How the animal's looks are learnt."""
+
+    examples: int = 150
+    """frames to learn from"""
+    steps: int = 200
+    """training steps"""
+    batch: int = 6
+    """crops per step"""
+    crop_px: int = 144
+    """side of a crop at working resolution, pixels"""
+    rate: float = 5e-3
+    """highest learning rate"""
+    trusting: float = 0.5
+    """share of the steps in which every label counts"""
+    doubt: float = 4.0
+    """log-odds by which the network must contradict a label to ignore it later"""
+    at_animal: float = 0.7
+    """share of crops that show the animal"""
+    least_px: int = 60
+    """animal pixels that an example needs"""
+
+
+@dataclass(frozen=True)
+class Example:
+    """A picture at working resolution and its labels: 255 animal, 0 not, 128 unknown."""
+
+    color: UInt8[np.ndarray, "height width 3"]
+    labels: UInt8[np.ndarray, "height width"]
+
+
+class Appearance(nn.Module):
+    """A U-shaped convolutional network of 80,000 weights from colours to log-odds of showing the animal."""
+
+    def __init__(self, widths: tuple[int, int, int, int] = (16, 24, 32, 48)) -> None:
+        super().__init__()
+        first, second, third, fourth = widths
+        self.down = nn.ModuleList(
+            [
+                _block(3, first, 2),
+                nn.Sequential(_block(first, second, 2), _block(second, second)),
+                nn.Sequential(_block(second, third, 2), _block(third, third)),
+                nn.Sequential(_block(third, fourth, 2), _block(fourth, fourth)),
+            ]
+        )
+        self.up = nn.ModuleList([_block(fourth + third, third), _block(third + second, second), _block(second + first, first)])
+        self.out = nn.Sequential(nn.Conv2d(first, 4, 3, 1, 1), nn.PixelShuffle(2))
+
+    def forward(self, color: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch height width"]:
+        """Return log-odds of pictures whose colours are -1..1 and whose sides are multiples of 16."""
+        levels = []
+        for down in self.down:
+            color = down(color)
+            levels.append(color)
+        deep = levels.pop()
+        for up in self.up:
+            level = levels.pop()
+            deep = up(torch.cat([F.interpolate(deep, size=level.shape[-2:], mode="bilinear", align_corners=False), level], 1))
+        return GAIN * self.out(deep)[:, 0]
+
+    @torch.no_grad()
+    def log_odds(self, color: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+        """Judge every pixel of a picture at working resolution, within +-8."""
+        height, width = color.shape[:2]
+        padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
+        found = self.eval()(_normalised(padded)[None])[0, :height, :width]
+        return found.clamp(-LIMIT, LIMIT).numpy()
+
+
+def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generator, known: Appearance | None = None) -> Appearance | None:
+    """Train a network on examples, ``known`` further if given; None (or ``known``) when none of them shows the animal."""
+    showing = [example for example in examples if (example.labels == 255).sum() >= options.least_px]
+    if not showing:
+        return known
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(rng.integers(2**31)))
+        network = known or Appearance()
+    optimizer = torch.optim.AdamW(network.parameters(), options.rate, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.rate, total_steps=options.steps)
+    network.train()
+    for step in range(options.steps):
+        crops = [_crop(showing[rng.integers(len(showing))], options, rng) for _ in range(options.batch)]
+        color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
+        found = network(color)
+        loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
+        contradicted = torch.where(labels == 255, -found, found) > options.doubt
+        counted = (labels != 128) & ~(contradicted & (step > options.trusting * options.steps))
+        weight = counted.float()
+        optimizer.zero_grad()
+        ((loss * weight).sum() / weight.sum().clamp(min=1)).backward()
+        optimizer.step()
+        schedule.step()
+    return network.eval()
+
+
+def _crop(example: Example, options: Learning, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Cut a square, mostly around a pixel of the animal; flip it, change its exposure and contrast."""
+    height, width = example.labels.shape
+    side = options.crop_px
+    if rng.random() < options.at_animal:
+        inside = np.flatnonzero(example.labels == 255)
+        row, column = divmod(int(inside[rng.integers(len(inside))]), width)
+        top, left = row - int(rng.integers(side // 8, side - side // 8)), column - int(rng.integers(side // 8, side - side // 8))
+    else:
+        top, left = int(rng.integers(height)) - side // 2, int(rng.integers(width)) - side // 2
+    top, left = int(np.clip(top, 0, max(height - side, 0))), int(np.clip(left, 0, max(width - side, 0)))
+    rows, columns = slice(top, top + side), slice(left, left + side)
+    color, labels = example.color[rows, columns], example.labels[rows, columns]
+    short = [(0, side - labels.shape[0]), (0, side - labels.shape[1])]
+    color, labels = np.pad(color, [*short, (0, 0)], mode="edge"), np.pad(labels, short, constant_values=128)
+    if rng.random() < 0.5:
+        color, labels = color[:, ::-1], labels[:, ::-1]
+    shown = _normalised(color) * (1 + 0.2 * rng.normal()) + 0.15 * rng.normal()
+    return shown.float(), torch.from_numpy(labels.copy())
+
+
+def _normalised(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "3 height width"]:
+    return torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1))).float() / 127.5 - 1
+
+
+def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.LeakyReLU(0.1))

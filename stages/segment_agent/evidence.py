@@ -1,0 +1,84 @@
+"""What the points of a window say about showing the animal: geometry first, colour where a known surface looks otherwise.
+
+`judge_motion` serves sessions; `turnaround` makes the judge of the other recordings.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from stages.segment_agent import free_space, movers
+from stages.segment_agent.free_space import FreeSpace, References, Votes
+from stages.segment_agent.movers import Mover
+from stages.segment_agent.windows import Sphere, Window
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a window's points say: log-odds of showing the animal, how much to trust them, and which are beyond doubt."""
+
+    log_odds: Float[np.ndarray, "height width"]
+    certainty: Float[np.ndarray, "height width"]
+    animal: Bool[np.ndarray, "height width"]
+    room: Bool[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Log-odds that observations of a session are worth."""
+
+    moving: float = 3.0
+    """a point in space that is free at other times"""
+    room: float = 3.0
+    """a point on a surface that other frames saw"""
+    step_m: float = 0.022
+    """step in front of that surface that speaks neither way"""
+    step_spread_m: float = 0.008
+    """step that is worth one more"""
+    recolored: float = 1.0
+    """each time the noise by which such a surface's colour differs"""
+    distrusted: float = 0.5
+    """certainty of depth of low confidence or at a step; 1 is that of all other depth"""
+
+
+Judge = Callable[[int, Window, Sphere], Evidence]
+
+
+def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing: Weighing) -> Judge:
+    """Evidence for sessions: free at other times is animal; on a surface that others saw is room.
+
+    On such a surface a step towards the camera or another colour than the others saw there speaks for the animal: paws
+    and tails are too thin for the depth sensor.
+    """
+
+    def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
+        known = np.isfinite(window.points_world[..., 0])
+        near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
+        votes = free_space.vote(references, np.where(near[..., None], window.points_world, np.nan), free, frame)
+        animal = movers.moving(votes, mover)
+        settled = known & ~animal & (votes.occupied > 0)
+        step = np.clip((votes.gap_m - weighing.step_m) / weighing.step_spread_m, -weighing.room, 1)
+        log_odds = np.where(animal, weighing.moving, np.where(settled, step + weighing.recolored * recolored(window, votes, settled), 0.0))
+        log_odds[known & ~near] = -weighing.room
+        certainty = np.where(animal | settled | (known & ~near), np.where(window.trusted, 1.0, weighing.distrusted), 0.05)
+        return Evidence(log_odds, certainty, animal & window.trusted, log_odds <= -0.66 * weighing.room)
+
+    return judge
+
+
+def recolored(window: Window, votes: Votes, settled: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Return by how many times the noise (0..6) a surface shows another colour than at other times, shadows taken out.
+
+    A shadow or a changed exposure scales all channels alike, and a shadow only darkens.
+    """
+    if settled.sum() < 50:
+        return np.zeros(settled.shape)
+    now = cv2.GaussianBlur(window.color, (5, 5), 1.2).astype(np.float32)
+    before = votes.color * np.median((now[settled] + 4) / (votes.color[settled] + 4), axis=0)
+    scale = np.clip((now * before).sum(-1) / np.maximum((before**2).sum(-1), 1), 0.5, 1.0)
+    difference = np.linalg.norm(now - scale[..., None] * before, axis=-1)
+    noise = max(float(np.median(difference[settled])), 3.0)
+    return np.where(settled, np.clip(difference / noise - 3, 0, 6), 0)

@@ -1,0 +1,221 @@
+"""Masks of a recording without depth, from one box: colour and flow only.
+
+GrabCut cuts the animal out of the hinted frame and a network learns its looks; it is followed both ways from there
+(`_followed`) as what looks like it near where flow carries the last mask. That loses sides of the animal never seen
+before, so the network learns again from the whole recording, where what moves against the background beside the
+followed part counts too, and the animal is followed once more. What moves elsewhere is some other mover.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.files import arrays
+from pipeline.files.clips import Clip
+from stages.segment_agent.appearance import Appearance, Example, Learning, learn
+from stages.segment_agent.painting import Mask
+from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.windows import working_picture, working_size
+
+SURE = 4.0
+"""log-odds of a mask that is carried on"""
+MOTION_GAP = 4
+
+
+@dataclass(frozen=True)
+class Following:
+    """How an animal is followed without depth; pixels are those of the working picture."""
+
+    first_steps: int = 80
+    """training steps on the hinted frame"""
+    steps: int = 160
+    """training steps on the whole recording"""
+    hinted_share: float = 0.17
+    """share of the hinted frame among those examples"""
+    reach_px: int = 12
+    """how far from the carried mask the animal is looked for"""
+    beside_px: int = 25
+    """how far from the followed part something moving belongs to the animal"""
+    halo_px: int = 7
+    """how far flow smears motion beyond the edge of what moves"""
+    carried: float = 2.0
+    """largest log-odds of the carried mask at first; half of it counts when the looks are known better"""
+    moving: float = 4.0
+    """times the typical residual from which on a point moves against the background"""
+    still: float = 2.5
+    """times the typical residual up to which a point does not"""
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Working pictures and flow at their size."""
+
+    clip: Clip
+    flow: Path
+    height_px: int
+
+    def color(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        """Read a working picture."""
+        return working_picture(self.clip, frame, self.height_px)
+
+    def to(self, frame: int, other: int) -> Float[np.ndarray, "height width 2"] | None:
+        """Read the flow from a frame to another, working pixels; None where none is stored."""
+        first, gap = min(frame, other), abs(other - frame)
+        table = arrays.open_lazily(self.flow / f"flow_{gap}_{'fw' if other > frame else 'bw'}.npz", "flow")
+        if not 0 <= first < len(table):
+            return None
+        size = working_size(self.clip, self.height_px)
+        scale = size[0] / self.clip.color_size[0]
+        return scale * cv2.resize(table[first].astype(np.float32), size[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def follow(footage: Footage, hint: Prompt, options: Following, learning: Learning, rng: np.random.Generator) -> Iterator[Mask]:
+    """Return one mask per frame at colour resolution."""
+    count = len(footage.clip)
+    hinted = cut_out(footage, hint, rng)
+    shown = Example(footage.color(hint.frame), hinted.astype(np.uint8) * 255)
+    network = learn([shown], replace(learning, steps=options.first_steps, least_px=1), rng)
+    rough = _followed(footage, hint.frame, hinted, network, options.reach_px, options.carried)
+    chosen = np.unique(np.linspace(0, count - 1, learning.examples).round().astype(int)).tolist()
+    examples = [_example(footage, frame, _unpacked(rough[frame]), options) for frame in chosen if frame != hint.frame]
+    repeated = [shown] * max(1, round(options.hinted_share * len(examples)))
+    network = learn(repeated + examples, replace(learning, steps=options.steps), rng)
+    allowed = _allowed(rough, options)
+    found = _followed(footage, hint.frame, hinted, network, options.reach_px + 3, options.carried / 2, allowed)
+    for mask in map(_unpacked, found):
+        labels = cv2.resize(mask.astype(np.uint8) * 255, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR)
+        yield Mask(np.where(labels > 127, 255, 0).astype(np.uint8), bool(mask.any()), 0.5)
+
+
+def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
+    """Cut the animal out of the hinted frame by GrabCut (Rother et al. 2004); a click stands for a box around it."""
+    color = footage.color(hint.frame)
+    height, width = color.shape[:2]
+    x0, y0, x1, y1 = np.array(hint.box_px) * height / footage.clip.color_size[0]
+    if min(x1 - x0, y1 - y0) < 4:
+        x0, y0, x1, y1 = x0 - 0.2 * height, y0 - 0.2 * height, x1 + 0.2 * height, y1 + 0.2 * height
+    low = np.clip(np.floor([x0, y0]), 1, [width - 8, height - 8]).astype(int)
+    size = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1]) - low
+    marks = np.zeros((height, width), np.uint8)
+    cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
+    cv2.grabCut(color, marks, (*low.tolist(), *size.tolist()), np.zeros((1, 65)), np.zeros((1, 65)), 8, cv2.GC_INIT_WITH_RECT)
+    inside = (marks == cv2.GC_FGD) | (marks == cv2.GC_PR_FGD)
+    if not inside.any():
+        inside[low[1] : low[1] + size[1], low[0] : low[0] + size[0]] = True
+    return inside
+
+
+def residual(footage: Footage, frame: int) -> Float[np.ndarray, "height width"]:
+    """Return how far a point moves against the background, in typical residuals, mean of both directions of time.
+
+    The background moves as most of the picture does, by a homography.
+    """
+    parts = []
+    for other in (frame - MOTION_GAP, frame + MOTION_GAP):
+        moved = footage.to(frame, other)
+        if moved is None:
+            continue
+        pixel = np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in moved.shape[1::-1])), -1)
+        sparse = pixel[::8, ::8].reshape(-1, 2)
+        matrix, _ = cv2.findHomography(sparse, sparse + moved[::8, ::8].reshape(-1, 2), cv2.RHO, 2.0)
+        if matrix is not None:
+            expected = cv2.perspectiveTransform(pixel.reshape(1, -1, 2), matrix).reshape(pixel.shape)
+            error = np.linalg.norm(expected - pixel - moved, axis=-1)
+            parts.append(error / max(float(np.median(error)), 0.5))
+    return np.mean(parts, axis=0) if parts else np.zeros(working_size(footage.clip, footage.height_px))
+
+
+def _example(footage: Footage, frame: int, rough: Bool[np.ndarray, "height width"], options: Following) -> Example:
+    """Label a frame: what was followed or moves beside it is animal, what is far or still is not, the rest is unknown."""
+    moves = residual(footage, frame)
+    beside = _grown(rough, options.beside_px)
+    inner = _grown(~((moves > options.moving) | rough), options.halo_px)
+    labels = np.full(rough.shape, 128, np.uint8)
+    labels[~beside | ((moves < options.still) & ~rough)] = 0
+    labels[beside & ~inner] = 255
+    labels[rough & (moves > options.still)] = 255
+    return Example(footage.color(frame), labels)
+
+
+def _followed(
+    footage: Footage,
+    start: int,
+    mask: Bool[np.ndarray, "height width"],
+    network: Appearance,
+    reach_px: int,
+    carried: float,
+    allowed: Callable[[int], Bool[np.ndarray, "height width"]] | None = None,
+) -> list[bytes]:
+    """Follow a mask both ways; entries are packed. A lost animal is looked for in the whole picture."""
+    found = [b""] * len(footage.clip)
+    found[start] = _packed(mask)
+    for step in (1, -1):
+        before, size = np.where(mask, SURE, -SURE).astype(np.float32), int(mask.sum())
+        for frame in range(start + step, len(footage.clip) if step > 0 else -1, step):
+            prior = _carried(footage, frame, frame - step, before)
+            lost = not (prior > 0).any()
+            near = np.ones_like(mask) if lost else _grown(prior > 0, reach_px)
+            if allowed is not None:
+                near &= allowed(frame)
+            log_odds = network.log_odds(footage.color(frame)) + (0 if lost else np.clip(prior, -carried, carried))
+            log_odds[~near] = -SURE
+            kept = _kept(log_odds > 0, prior > 0, least_px=0.3 * size if lost else 0.0)
+            before = np.where(kept, np.clip(log_odds, 1, SURE), np.clip(log_odds, -SURE, -1)).astype(np.float32)
+            size = int(kept.sum()) or size
+            found[frame] = _packed(kept)
+    return found
+
+
+def _carried(footage: Footage, frame: int, other: int, log_odds: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Carry log-odds of another frame to this one along the flow."""
+    moved = footage.to(frame, other)
+    columns, rows = (np.arange(side, dtype=np.float32) for side in log_odds.shape[::-1])
+    return cv2.remap(
+        log_odds,
+        moved[..., 0] + columns,
+        moved[..., 1] + rows[:, None],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=-SURE,
+    )
+
+
+def _kept(
+    inside: Bool[np.ndarray, "height width"], prior: Bool[np.ndarray, "height width"], least_px: float
+) -> Bool[np.ndarray, "height width"]:
+    """Keep the parts that meet the carried mask; with none carried, the largest part if it is large enough."""
+    count, part, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8))
+    if count == 1:
+        return inside
+    met = np.bincount(part[prior], minlength=count) if prior.any() else stats[:, cv2.CC_STAT_AREA] * 1.0
+    met[0] = 0
+    if not prior.any():
+        return (part == met.argmax()) & (met.max() >= least_px)
+    return ((met > 0.1 * met.max()) & (met > 0))[part]
+
+
+def _allowed(rough: list[bytes], options: Following) -> Callable[[int], Bool[np.ndarray, "height width"]]:
+    """Tell where the animal may be: near the followed part, anywhere where that was lost."""
+
+    def allowed(frame: int) -> Bool[np.ndarray, "height width"]:
+        followed = _unpacked(rough[frame])
+        return _grown(followed, options.beside_px + 5) if followed.any() else ~followed
+
+    return allowed
+
+
+def _grown(mask: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
+    return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))) > 0
+
+
+def _packed(mask: Bool[np.ndarray, "height width"]) -> bytes:
+    """Compress a mask, so that a long recording fits in memory."""
+    return cv2.imencode(".png", mask.astype(np.uint8))[1].tobytes()
+
+
+def _unpacked(packed: bytes) -> Bool[np.ndarray, "height width"]:
+    return cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_GRAYSCALE) > 0

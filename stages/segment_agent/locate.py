@@ -1,0 +1,81 @@
+"""Where the animal of a session is: a ball per frame, from what moves and, once that is learnt, from what looks like it."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files.clips import Clip
+from pipeline.space import cameras, rigid
+from stages.segment_agent import free_space, movers
+from stages.segment_agent.free_space import FreeSpace, References
+from stages.segment_agent.movers import Candidate, Hint, Mover
+from stages.segment_agent.windows import Sphere
+
+STRIDE = 3
+"""depth pixels between the points that candidates are made of"""
+
+Looks = Callable[[int], Float[np.ndarray, "height width"]]
+"""log-odds of showing the animal by its looks, of one frame at any resolution"""
+
+
+def find_mover(
+    clip: Clip,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    references: References,
+    free: FreeSpace,
+    mover: Mover,
+    hint: Hint | None,
+    looks: Looks | None = None,
+) -> list[Sphere | None]:
+    """Track the animal of a session: a ball per frame, None where it is out of view."""
+    found = [_candidates(clip, frame, world_from_camera[frame], references, free, mover, looks) for frame in range(len(clip))]
+    choice = movers.track(found, clip.timestamp_s, mover, hint)
+    chosen = [group[index] if index >= 0 else None for group, index in zip(found, choice, strict=True)]
+    radii = [candidate.radius_m for candidate in chosen if candidate]
+    radius = float(np.clip(1.8 * np.quantile(radii, 0.9), 0.15, mover.largest_m)) if radii else 0.0
+    return presume([Sphere(candidate.centre_world, radius) if candidate else None for candidate in chosen], clip.timestamp_s, mover)
+
+
+def presume(balls: list[Sphere | None], timestamp_s: Float[np.ndarray, "frame"], mover: Mover) -> list[Sphere | None]:
+    """Fill short gaps of a track between its ends, and a while before and after it, by where the animal may still be."""
+    seen = np.array([frame for frame, ball in enumerate(balls) if ball is not None])
+    if not len(seen):
+        return balls
+    centres = np.stack([balls[frame].centre_world for frame in seen])
+    guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], centres[:, axis]) for axis in range(3)], axis=1)
+    wait = np.abs(timestamp_s[:, None] - timestamp_s[seen]).min(1)
+    radius = balls[seen[0]].radius_m
+    return [
+        ball or (Sphere(guess[frame], radius, presumed=True) if wait[frame] < mover.presumed_s else None)
+        for frame, ball in enumerate(balls)
+    ]
+
+
+def _candidates(
+    clip: Clip,
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    references: References,
+    free: FreeSpace,
+    mover: Mover,
+    looks: Looks | None,
+) -> list[Candidate]:
+    """Group the points of one frame that move or, where its looks are known, look more like the animal than like the room."""
+    chosen = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+    depth = free_space.usable_depth(clip, frame)[chosen]
+    rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)[chosen]
+    points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
+    points[depth == 0] = np.nan
+    votes = free_space.vote(references, points, free, frame)
+    area = (depth * STRIDE) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
+    moving = movers.moving(votes, mover)
+    if looks is None:
+        return movers.candidates(moving, np.ones(depth.shape), points, area, mover)
+    like = looks(frame)
+    row, column = ((np.arange(0, size)[chosen[0]] + 0.5) / size for size in clip.depth_size)
+    like = like[np.ix_((row * like.shape[0]).astype(int), (column * like.shape[1]).astype(int))]
+    settled = (votes.occupied > 0) & ~moving
+    both = np.clip(like, -mover.looks_limit, mover.looks_limit) + mover.motion * (moving.astype(float) - settled)
+    both[depth == 0] = -mover.looks_limit
+    return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, mover)

@@ -1,0 +1,131 @@
+"""A real dog (DAVIS): masks from one box without weights or depth, and flow beside OpenCV's own."""
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.files import arrays, images
+from pipeline.files.clips import Clip
+from stages.estimate_flow.__main__ import Config as FlowConfig
+from stages.estimate_flow.estimation import STRIDE_PX, Estimator, Search, flows
+from stages.segment_agent.follow import Following, Footage, follow
+from stages.segment_agent.masks import Options
+from stages.segment_agent.prompt import Prompt
+
+DOG = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata")) / "davis_dog"
+FRAMES = 60
+
+
+@pytest.fixture(scope="module")
+def dog(tmp_path_factory):
+    """The frames as an artifact without depth, true masks, and our flow of gaps 1 and 4."""
+    if not DOG.exists():
+        pytest.skip(f"no real recordings at {DOG.parent} (set ATS_REALDATA)")
+    folder = tmp_path_factory.mktemp("dog")
+    for name in ("color", "depth", "confidence"):
+        (folder / name).mkdir()
+    for frame in range(FRAMES):
+        (folder / "color" / f"{frame:06d}.jpg").write_bytes((DOG / "rgb" / f"{frame:05d}.jpg").read_bytes())
+    images.write_depth(folder / "depth" / "000000.exr", np.zeros((60, 107)))
+    eye = np.tile(np.eye(3), (FRAMES, 1, 1))
+    table = dict(timestamp_s=np.arange(FRAMES) / 24, intrinsics=eye, depth_intrinsics=eye, quality=np.ones(FRAMES, np.float32))
+    arrays.save(folder / "frames.npz", gravity_known=np.array(False), **table)
+    clip, settings = Clip.open(folder), FlowConfig()
+    estimator = Estimator(
+        clip.color_size,
+        Search(settings.working_side_px, settings.patch_stride_px, settings.iterations),
+        tolerance_px=settings.tolerance_px,
+    )
+    gray = [estimator.reduce(clip.color(frame)) for frame in range(FRAMES)]
+    found = {}
+    for gap, *both in flows(gray.__getitem__, FRAMES, (1, 2, 4), estimator):
+        for way, part in zip(("fw", "bw"), both, strict=True):
+            arrays.save(folder / f"flow_{gap}_{way}.npz", flow=part.flow, confidence=part.confidence)
+            found[gap, way] = part.flow
+    masks = np.stack([cv2.imread(str(DOG / "mask" / f"{frame:05d}.png"), cv2.IMREAD_GRAYSCALE) > 127 for frame in range(FRAMES)])
+    return folder, clip, masks, found
+
+
+def test_masks_from_one_box(dog):
+    folder, clip, truth, _ = dog
+    rows, columns = np.nonzero(truth[0])
+    hint = Prompt(0, (columns.min(), rows.min(), columns.max() + 1.0, rows.max() + 1.0))
+    footage = Footage(clip, folder, Options().refinement.height_px)
+    found = list(follow(footage, hint, Following(), Options().learning, np.random.default_rng(0)))
+    iou = [((m.labels == 255) & t).sum() / ((m.labels == 255) | t).sum() for m, t in zip(found, truth, strict=True)]
+    print(f"DAVIS dog: mean IoU {np.mean(iou):.3f}, worst {np.min(iou):.3f}")
+    assert np.mean(iou) >= 0.70
+
+
+def _opencv_medium(clip, first, second):
+    gray = [cv2.cvtColor(clip.color(frame), cv2.COLOR_RGB2GRAY) for frame in (first, second)]
+    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*gray, None)
+
+
+def _dense(flow, size):
+    """Ours at every pixel."""
+    return cv2.resize(flow.astype(np.float32), size[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def _joint_hits(move, joints, masks, pairs):
+    """Share of joints carried to within 0.2 sqrt(area) of where they truly go (BADJA)."""
+    hits = []
+    for first, second in pairs:
+        both = joints[first][1] & joints[second][1]
+        start, end = joints[first][0][both], joints[second][0][both]
+        at = np.clip(start.astype(int), 0, np.array(masks.shape[:0:-1]) - 1)
+        error = np.linalg.norm(start + move(first, second)[at[:, 1], at[:, 0]] - end, axis=-1)
+        hits.append(error < 0.2 * np.sqrt(masks[second].sum()))
+    return float(np.concatenate(hits).mean())
+
+
+def test_flow_is_not_below_opencv(dog):
+    _, clip, masks, found = dog
+    size = masks.shape[1:]
+    joints = {}
+    for entry in json.loads((DOG / "dog.json").read_text()):
+        position = np.array(entry["joints"], float)[:, ::-1] * [size[1] / 1920, size[0] / 1080]
+        joints[int(Path(entry["image_path"]).stem)] = position, np.array(entry["visibility"], bool)
+
+    def chained(step):
+        def move(first, second):
+            whole, pixel = np.zeros((*size, 2), np.float32), np.stack(np.meshgrid(*map(np.arange, size[::-1])), -1).astype(np.float32)
+            for frame in range(first, second):
+                at = pixel + whole
+                whole = whole + cv2.remap(step(frame), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            return whole
+
+        return move
+
+    rivals = {
+        "ours": chained(lambda frame: _dense(found[1, "fw"][frame], size)),
+        "opencv": chained(lambda frame: _opencv_medium(clip, frame, frame + 1)),
+        "zero": lambda first, second: np.zeros((*size, 2), np.float32),
+    }
+
+    def warped_iou(move):
+        pixel = np.stack(np.meshgrid(*map(np.arange, size[::-1])), -1).astype(np.float32)
+        scores = []
+        for first in range(0, FRAMES - 5, 9):
+            inside = (pixel + move(first, first + 5))[masks[first]].round().astype(int)
+            inside = inside[((inside >= 0) & (inside < size[::-1])).all(1)]
+            landed = np.zeros(size, np.uint8)
+            landed[inside[:, 1], inside[:, 0]] = 1
+            landed = cv2.morphologyEx(landed, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+            scores.append((landed & masks[first + 5]).sum() / (landed | masks[first + 5]).sum())
+        return float(np.mean(scores))
+
+    known = sorted(joints)
+    pairs = list(zip(known[:-1:2], known[1::2], strict=False))
+    hits = {name: _joint_hits(move, joints, masks, pairs) for name, move in rivals.items()}
+    print("DAVIS dog: PCK@0.2", {name: round(value, 3) for name, value in hits.items()}, f"{len(pairs)} pairs, stride {STRIDE_PX}")
+    warps = {name: warped_iou(move) for name, move in rivals.items()}
+    print("DAVIS dog: 5-frame mask-warp IoU", {name: round(value, 3) for name, value in warps.items()})
+    assert warps["ours"] >= warps["opencv"] - 0.005
+    assert warps["ours"] > warps["zero"] + 0.1
+    assert hits["ours"] >= hits["opencv"] - 0.005
+    assert hits["ours"] > hits["zero"] + 0.1
