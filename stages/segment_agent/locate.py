@@ -76,6 +76,6 @@ def _candidates(
     row, column = ((np.arange(0, size)[chosen[0]] + 0.5) / size for size in clip.depth_size)
     like = like[np.ix_((row * like.shape[0]).astype(int), (column * like.shape[1]).astype(int))]
     settled = (votes.occupied > 0) & ~moving
-    both = np.clip(like, -mover.looks_limit, mover.looks_limit) + mover.motion * (moving.astype(float) - settled)
+    both = np.clip(like, -mover.looks_limit, mover.looks_limit) + mover.motion * moving - mover.settled * settled
     both[depth == 0] = -mover.looks_limit
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, mover)

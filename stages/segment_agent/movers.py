@@ -37,10 +37,12 @@ class Mover:
     presumed_s: float = 3.0
     """how long the animal is looked for around where it was last or will next be seen"""
     motion: float = 2.0
-    """log-odds by which motion speaks for a point and a surface that others saw against it, once the looks are known"""
+    """log-odds by which motion speaks for a point once the looks are known"""
+    settled: float = 1.0
+    """log-odds by which a surface that other frames saw speaks against it then"""
     looks_limit: float = 3.0
     """largest log-odds of the looks there"""
-    appear_cost: float = 1.5
+    appear_cost: float = 1.0
     """cost of leaving or entering the view, in units of a convincing candidate"""
 
 
