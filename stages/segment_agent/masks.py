@@ -112,7 +112,14 @@ def _learn(painter: Painter, options: Options, rng: np.random.Generator) -> Appe
     chosen = seen[np.unique(np.linspace(0, len(seen) - 1, options.learning.examples).round().astype(int))]
     height_px = painter.options.height_px
     examples = [Example(working_picture(painter.clip, frame, height_px), first.working_mask(frame).labels) for frame in chosen.tolist()]
-    return learn(examples, options.learning, rng)
+    network = learn(examples, options.learning, rng)
+    return network if network is not None and _knows(network, examples[:: max(1, len(examples) // 12)]) else None
+
+
+def _knows(network: Appearance, examples: list[Example], least: float = 0.6) -> bool:
+    """Tell whether a network finds most of the animal that it was shown; one that has not learnt enough would only veto."""
+    shown = [(network.log_odds(each.color)[each.labels == 255] > 0).mean() for each in examples if (each.labels == 255).any()]
+    return bool(shown) and float(np.mean(shown)) > least
 
 
 def _hidden(clip: Clip, frame: int, network: Appearance, options: Options) -> Bool[np.ndarray, "height width"]:
