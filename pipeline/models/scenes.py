@@ -63,10 +63,12 @@ class Scenes:
     def inside_solid(
         self, points_world: Float[np.ndarray, "window *some 3"], video: Int[np.ndarray, "window"] | None
     ) -> Bool[np.ndarray, "window *some"]:
-        """Tell which points lie inside something solid or outside the mapped space."""
+        """Tell which points lie inside something solid or outside the mapped space; none where nothing was mapped."""
         number = self.number(video, len(points_world))
         solid = np.zeros(points_world.shape[:-1], bool)
         for scene in np.unique(number):
+            if (self.volumes[scene].occupancy == 2).all():
+                continue
             voxel, inside = self.volumes[scene].voxel(points_world[number == scene])
             solid[number == scene] = ~(self.allowed[scene][tuple(np.moveaxis(voxel, -1, 0))] & inside)
         return solid

@@ -84,6 +84,8 @@ def test_windows_are_seen_in_their_own_scene():
     scenes = Scenes((open_room, walls), (open_room.occupancy != 1, walls.occupancy != 1), np.array([0, 0, 1]))
     context, future = data.windows(np.array([0, len(data.start) - 1]))
     assert scenes.inside_solid(future.path_world, context.video).mean(1).tolist() == [0, 1]
+    unknown = Scenes.of(replace(open_room, occupancy=np.full_like(open_room.occupancy, 2)))
+    assert not unknown.inside_solid(future.path_world + 100, None).any()
     grids = scenes.around(context.world_from_agent[:, -1], context.video)
     assert np.abs(grids[0]).max() > 0 and np.abs(grids[1]).max() == 0
 
