@@ -66,7 +66,7 @@ def test_template_is_metric_without_odometry(kitchen: Kitchen):
 
 def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitchen):
     made, walk, clip = kitchen.made, kitchen.walk.clip, kitchen.session.clip
-    options = training.Options(views=200, held_out=40)
+    options = training.Options(held_out=40)
     localizer, _ = training.train_scene(made.mesh, made.world_from_camera, made.floor_m, walk, options, np.random.default_rng(0))
     hide = [np.zeros(clip.color_size, bool)] * len(clip)
     ours = pose_errors(localizing.placed_by_localizer(localizer, clip, FRAMES, hide), kitchen.truth)
