@@ -17,8 +17,9 @@ from playwright.sync_api import Browser, Page
 
 from pipeline import artifact
 from pipeline.cli import Task
+from pipeline.models.trajectories import BehaviorData
 from stages.export_simulator.__main__ import Config, run
-from tests.stages.export_simulator import browser, reaction, small_world
+from tests.stages.export_simulator import browser, reaction, small_world, twins
 
 pytestmark = pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
@@ -53,6 +54,7 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
         _check_golden(golden, page.evaluate("golden => ats.golden(golden)", golden))
         page.evaluate("ats.pause()")
         _check_reaction(page)
+        _check_it_reacts_as_python_does(page, simulator.parent)
         page.evaluate("ats.play()")
         _check_the_person_is_carried(page)
         page.wait_for_function(f"ats.state().tick > {before['tick'] + 5}", timeout=30_000)
@@ -95,6 +97,19 @@ def _check_reaction(page: Page) -> None:
     page.locator("[data-sense=observer]").locator("xpath=..").click()
     assert np.abs(reaction.goals(page, near) - far).max() > 0.3, "metres: aware again"
     page.click("#panel-toggle")
+
+
+def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
+    """Of 200 approaches as many drive goals away as in Python, with the same noise; the goals themselves agree as well."""
+    met = twins.approaches(BehaviorData.load(build / "behavior_data"), 200, np.random.default_rng(0))
+    here, there = twins.asked_of_the_page(page, met, 5), twins.asked_of_python(build, build / "simulator", met, 5)
+    assert there.rate(met.side) > 0.9 and 0.2 < there.rate(met.side, 0.4) < 0.8, "most goals shift away, not all of them far"
+    for further_m in (0.1, 0.3, 0.4, 0.5):
+        assert abs(here.rate(met.side, further_m) - there.rate(met.side, further_m)) < 0.03
+    assert np.median(np.abs(here.near - there.near)) < 1e-3, "metres"
+    for answers in (here, there):
+        assert np.abs(answers.opposite - answers.far[:5]).max() < 1e-5, "a far observer does not matter"
+        assert np.abs(answers.ignored - answers.far[:5]).max() < 1e-5, "nor does one it is told to ignore"
 
 
 def _check_the_person_is_carried(page: Page) -> None:

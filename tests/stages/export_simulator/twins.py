@@ -1,0 +1,146 @@
+"""The same approaches, met by the page and by Python: twins of recorded moments, with the same noise for both samplers.
+
+`approaches` scripts them, `asked_of_the_page` and `asked_of_python` sample a goal for each, `Answers.away_m` says how
+far it shifts away from who comes near.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from playwright.sync_api import Page
+
+from pipeline.models.behavior import Sampling
+from pipeline.models.perception import FeatureVolume
+from pipeline.models.predictors import Ats
+from pipeline.models.trajectories import PAST, RATE_HZ, BehaviorData, Context, window_starts
+from pipeline.space import rigid
+from tests.stages.export_simulator.reaction import FAR_M
+
+STEPS = 10
+ASK = """async (text) => {
+  const goals = [];
+  for (const question of JSON.parse(text)) goals.push((await ats.sampleGoals(question))[0]);
+  return goals;
+}"""
+
+
+@dataclass(frozen=True)
+class Approaches:
+    """Recorded moments, and where the observer of each has been in the last 0.8 s: near, far, or far on the other side."""
+
+    context: Context
+    """its observers are nobody's"""
+    side: Float[np.ndarray, "plan 2"]
+    """from the animal to the observer, over the floor"""
+    near: Float[np.ndarray, "plan 8 2"]
+    far: Float[np.ndarray, "plan 8 2"]
+    opposite: Float[np.ndarray, "plan 8 2"]
+    seed: Int[np.ndarray, "plan"]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Goals of the same plans, metres over the floor, by where the observer is; and with interactivity 0."""
+
+    near: Float[np.ndarray, "plan 2"]
+    far: Float[np.ndarray, "plan 2"]
+    opposite: Float[np.ndarray, "plan 2"]
+    ignored: Float[np.ndarray, "plan 2"]
+
+    def away_m(self, side: Float[np.ndarray, "plan 2"]) -> Float[np.ndarray, "plan"]:
+        """Return how far each goal shifts away from the observer that comes near."""
+        return -((self.near - self.far) * side).sum(-1)
+
+    def rate(self, side: Float[np.ndarray, "plan 2"], further_m: float = 0.1) -> float:
+        """Return the share of plans whose goal shifts away, further than this."""
+        return float((self.away_m(side) > further_m).mean())
+
+
+class PageNoise:
+    """The page's generator, one stream per plan: mulberry32 and Box-Muller (`noise.js`)."""
+
+    def __init__(self, seeds: Int[np.ndarray, "plan"]):
+        self.streams = [_uniforms(int(seed)) for seed in seeds]
+
+    def standard_normal(self, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+        """Draw for every plan, which is the first axis, what the page would draw."""
+        count = 2 * int(np.prod(shape[1:]))
+        draws = np.array([[next(stream) for _ in range(count)] for stream in self.streams]).reshape(len(self.streams), -1, 2)
+        return (np.sqrt(-2 * np.log(1 - draws[..., 0])) * np.cos(2 * np.pi * draws[..., 1])).reshape(shape).astype(dtype)
+
+
+def _uniforms(seed: int) -> Iterator[float]:
+    state, mask = seed, 0xFFFFFFFF
+    while True:
+        state = (state + 0x6D2B79F5) & mask
+        mixed = ((state ^ (state >> 15)) * (state | 1)) & mask
+        mixed ^= (mixed + (mixed ^ (mixed >> 7)) * (mixed | 61)) & mask
+        yield (mixed ^ (mixed >> 14)) / 2**32
+
+
+def approaches(data: BehaviorData, count: int, rng: np.random.Generator) -> Approaches:
+    """Let somebody walk straight at the animal in random recorded moments, ending 0.4 to 2.4 m away, at 0.3 to 1.2 m/s."""
+    moments = [(track, start) for track in data.trajectories.values() for start in window_starts(track.valid, PAST)]
+    drawn = [moments[i] for i in rng.integers(len(moments), size=count)]
+    agent = np.stack([track.world_from_agent[start : start + PAST] for track, start in drawn])
+    bones = np.stack([track.agent_from_bone[start : start + PAST] for track, start in drawn]).astype(np.float64)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    side = np.stack([np.cos(angle), np.sin(angle)], -1)
+    before_s = np.arange(PAST - 1, -1, -1) / RATE_HZ
+    distance_m = rng.uniform(0.4, 2.4, (count, 1)) + rng.uniform(0.3, 1.2, (count, 1)) * before_s
+    here = agent[:, -1:, :3, 3][..., [0, 2]]
+    stand = np.full((1, PAST, 1), FAR_M)
+    return Approaches(
+        Context(agent, bones, np.zeros((count, PAST, 3))),
+        side,
+        here + distance_m[..., None] * side[:, None],
+        here + stand * side[:, None],
+        here - stand * side[:, None],
+        rng.integers(2**20, size=count),
+    )
+
+
+def asked_of_the_page(page: Page, met: Approaches, checks: int) -> Answers:
+    """Sample in an open page; the last two for the first ``checks`` plans only."""
+    past = np.concatenate([_rows(met.context.world_from_agent[:, :, None]), _rows(met.context.agent_from_bone)], axis=2)
+    past = past.reshape(*past.shape[:2], -1)
+
+    def goals(observer: np.ndarray, **more: object) -> np.ndarray:
+        told = [
+            {"past": rows.tolist(), "observer": places.tolist(), "seed": int(seed), "K": 1, "steps": STEPS, "interactivity": 1, **more}
+            for rows, places, seed in zip(past[: len(observer)], observer, met.seed[: len(observer)], strict=True)
+        ]
+        return np.array(page.evaluate(ASK, json.dumps(told)))[:, [0, 2]]
+
+    few = slice(checks)
+    return Answers(goals(met.near), goals(met.far), goals(met.opposite[few]), goals(met.near[few], interactivity=0))
+
+
+def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) -> Answers:
+    """Sample with the planner of `pipeline/models`; the last two for the first ``checks`` plans only."""
+    contract = json.loads((simulator / "simulator.json").read_bytes())
+    eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
+    told = contract["behavior"]["sampling"]
+    volume = FeatureVolume.load(build / "behavior_data" / "volume.npz")
+
+    def goals(observer: np.ndarray, guidance: float = 1.0) -> np.ndarray:
+        count = len(observer)
+        sampling = Sampling(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance)
+        ats = Ats.load(build / "behavior", volume, sampling)
+        eyes = np.stack([observer[..., 0], np.full(observer.shape[:2], eyes_m), observer[..., 1]], -1)
+        parts = []
+        for some in np.array_split(np.arange(count), -(-count // 32)):  # a plan a window: noise follows the plan
+            context = Context(met.context.world_from_agent[some], met.context.agent_from_bone[some], eyes[some])
+            parts.append(ats.goals(context, 1, PageNoise(met.seed[some])).goal[:, 0])
+        return np.concatenate(parts)[:, [0, 2]]
+
+    few = slice(checks)
+    return Answers(goals(met.near), goals(met.far), goals(met.opposite[few]), goals(met.near[few], guidance=0.0))
+
+
+def _rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
+    return np.concatenate([a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1)
