@@ -22,6 +22,8 @@ class Config:
     """Recordings of the animal's life; the last is the test video."""
     session_s: float = 60.0
     """Length of a session, seconds."""
+    test_session_s: float = 120.0
+    """Length of the last session, seconds: longer, since a minute holds too few independent lives of 5.6 s to compare by."""
     walkthrough_s: float = 45.0
     """Length of the walk through the empty room, seconds."""
     turnaround_s: float = 20.0

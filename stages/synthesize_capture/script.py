@@ -24,6 +24,7 @@ class Plan:
     seed: int
     session_count: int
     session_s: float
+    test_session_s: float
     walkthrough_s: float
     turnaround_s: float
     heldout_of: int
@@ -88,10 +89,11 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
     out.append(_script(plan, rng, "turnaround", room, day, camera_motion.turnaround(course, rng), plan.turnaround_s, course=course))
     for number in range(1, plan.session_count + 1):
         rng = next(streams)
+        seconds = plan.test_session_s if number == plan.session_count else plan.session_s
         arranged = room.arranged(rng)
         dim = number == plan.dim_session
         lit = light.light_of_session(rng, dim=dim)
-        lived = session.simulate_session(arranged, rng, plan.session_s)
+        lived = session.simulate_session(arranged, rng, seconds)
         path = camera_motion.filming(lived, rng)
         turns = 1 if number == plan.sideways_session else 0
         out.append(
@@ -102,7 +104,7 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
                 arranged,
                 lit,
                 path,
-                plan.session_s,
+                seconds,
                 course=lived.animal,
                 lived=lived,
                 dim=dim,
@@ -112,7 +114,7 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
         rng = next(streams)
         if number == plan.heldout_of:
             path = camera_motion.bystanding(lived, arranged, rng)
-            out.append(_script(plan, rng, "heldout", arranged, lit, path, plan.session_s, course=lived.animal, dim=dim))
+            out.append(_script(plan, rng, "heldout", arranged, lit, path, seconds, course=lived.animal, dim=dim))
     return out
 
 

@@ -16,6 +16,7 @@ PLAN = script.Plan(
     seed=4,
     session_count=2,
     session_s=0.8,
+    test_session_s=1.2,
     walkthrough_s=0.5,
     turnaround_s=0.5,
     heldout_of=1,
