@@ -18,7 +18,7 @@ class Config:
 
     name: str = "the animal"
     """what the page calls it"""
-    scene_faces: int = 60_000
+    scene_faces: int = 40_000
     """triangles kept of the room"""
     agent_faces: int = 12_000
     """triangles kept of the animal"""

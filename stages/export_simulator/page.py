@@ -14,13 +14,13 @@ from stages.export_simulator.actions import Motion
 from stages.export_simulator.contract import rigid_rows
 
 _BUNDLE = "web/dist"
-_STEPS = 8192.0
+_STEPS = 4096.0
 
 
 def clip_rows(motions: list[Motion]) -> bytes:
     """Write all frames of all clips as float32 rows: root, bones, camera; place and quaternion wxyz each.
 
-    Numbers are rounded to 1/8192 (0.06 mm): the rest is noise that would not compress.
+    Numbers are rounded to 1/4096 (0.12 mm): the rest is noise that would not compress.
     """
     frames = []
     for motion in motions:
