@@ -2,7 +2,7 @@
 # build/<agent>/plan/rules.mk, which is included here for the agents named on the command line.
 SHELL := /bin/sh
 MAKEFLAGS += --no-builtin-rules --no-builtin-variables
-ifeq ($(filter -j%,$(MAKEFLAGS)),)
+ifndef NESTED
 MAKEFLAGS += -j$(shell nproc 2>/dev/null || echo 2)
 endif
 .SUFFIXES:
@@ -18,6 +18,8 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 .PHONY: help new capture-check annotate behavior-tables registration-tables longterm-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
 HOME_OF := build/$(or $(AGENT),cat)
 INPUTS = $(foreach a,$1,--$(subst _,-,$a) $(HOME_OF)/$a)
+# Called by a recipe, make shares the caller's jobs: as many at once as -j allows in all.
+NESTING := --no-print-directory NESTED=1
 
 help:
 	@sed 's/make cat/make $(or $(AGENT),cat)/' pipeline/help.txt
@@ -31,20 +33,20 @@ build/%/plan/rules.mk: .venv/.ok FORCE
 	@envs/setup
 
 behavior-tables: .venv/.ok
-	@$(MAKE) --no-print-directory TABLES=1 $(or $(AGENT),cat).behavior_tables
+	@$(MAKE) $(NESTING) TABLES=1 $(or $(AGENT),cat).behavior_tables
 	@cat build/$(or $(AGENT),cat)/behavior_tables/tables.txt
 
 behavior-benchmark: .venv/.ok
-	@$(MAKE) --no-print-directory behavior-tables AGENT=benchmark
+	@$(MAKE) $(NESTING) behavior-tables AGENT=benchmark
 
 registration-tables: .venv/.ok
 	@set -e; for variant in no_localizer no_feature_metric no_odometry regression_only; do \
-	  $(MAKE) --no-print-directory $(or $(AGENT),cat).registration VARIANT=$$variant; done
-	@$(MAKE) --no-print-directory $(or $(AGENT),cat).registration_tables
+	  $(MAKE) $(NESTING) $(or $(AGENT),cat).registration VARIANT=$$variant; done
+	@$(MAKE) $(NESTING) $(or $(AGENT),cat).registration_tables
 	@cat build/$(or $(AGENT),cat)/registration_tables/tables.txt
 
 longterm-tables: .venv/.ok
-	@$(MAKE) --no-print-directory $(or $(AGENT),cat).longterm_tables
+	@$(MAKE) $(NESTING) $(or $(AGENT),cat).longterm_tables
 	@cat build/$(or $(AGENT),cat)/longterm_tables/tables.txt
 
 new: .venv/.ok
@@ -58,7 +60,8 @@ capture-check: .venv/.ok
 
 # One format for another program, after the simulator; with a take of `make simulate` as one motion more.
 export: .venv/.ok
-	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).simulator
+	@$(PYTHON) -m stages.export --format $(or $(FORMAT),glb) --help >/dev/null
+	@$(MAKE) $(NESTING) $(notdir $(HOME_OF)).simulator
 	@$(PYTHON) -m stages.export $(call INPUTS,simulator reconstruction splats behavior_data frames masks) --format $(or $(FORMAT),glb) \
 	  $(if $(wildcard $(HOME_OF)/take/manifest.json),--take $(HOME_OF)/take) \
 	  --videos $(HOME_OF)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
@@ -66,11 +69,12 @@ export: .venv/.ok
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
 simulate: .venv/.ok
-	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).$(if $(SUBGOALS),longterm,behavior)
+	@test -z '$(SUBGOALS)' || test -f '$(SUBGOALS)' || { echo "error: SIM-004 $(SUBGOALS): there is no such file" >&2; exit 2; }
+	@$(MAKE) $(NESTING) $(notdir $(HOME_OF)).$(if $(SUBGOALS),longterm,behavior)
 	@$(PYTHON) -m stages.simulate $(if $(SUBGOALS),$(call INPUTS,longterm reconstruction behavior_data) --subgoals $(SUBGOALS),$(call INPUTS,behavior behavior_data)) --out $(HOME_OF)/take
 
 serve: .venv/.ok
-	@$(MAKE) --no-print-directory $(notdir $(HOME_OF)).simulator
+	@$(MAKE) $(NESTING) $(notdir $(HOME_OF)).simulator
 	@$(PYTHON) -m stages.simulate $(call INPUTS,behavior behavior_data simulator) --serve --out $(HOME_OF)/take
 
 extras: .venv/.ok
@@ -84,3 +88,7 @@ doctor: .venv/.ok
 
 clean:
 	rm -rf build .snakemake
+
+.DEFAULT:
+	@echo "error: REC-007 nobody knows how to make '$@'" >&2
+	@echo "  -> agents: $(AGENTS); a new one: make new AGENT=<name>; artifacts and all else: make help" >&2; exit 2

@@ -337,7 +337,7 @@ def _rules(plan: Plan, all_jobs: list[Job]) -> str:
         lines += [f"{job.stamp}: {' '.join(needed)}", f"\t@$(RUN) {home} {job.id}"]
     for node, made in stamps.items():
         lines += [f".PHONY: {name}.{node} {name}.{node}.redo", f"{name}.{node}: {' '.join(made)}"]
-        lines += [f"{name}.{node}.redo:", f"\t@$(PLAN) redo {home} {node}", f"\t@$(MAKE) --no-print-directory {name}.{node}"]
+        lines += [f"{name}.{node}.redo:", f"\t@$(PLAN) redo {home} {node}", f"\t@$(MAKE) $(NESTING) {name}.{node}"]
     if not home.tables:
         pages = [f"{plan.home_of(node).folder}/{node}/index.html" for node in ("report", "simulator") if node in stamps]
         lines += [f".PHONY: {name}", f"{name}: {' '.join(job.stamp for job in all_jobs if not dag.NODES[job.artifact].aside)}"]
