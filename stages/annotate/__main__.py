@@ -39,6 +39,12 @@ def main(arguments: list[str]) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(
+            f"error: {InputError('SYS-002', f'port {given.port}: {error.strerror}', serving.HOST, 'give another with --port')}",
+            file=sys.stderr,
+        )
+        return 2
     print(f"open http://{serving.HOST}:{server.server_address[1]} ; clicks go to {given.clicks}; Ctrl-C ends", flush=True)
     try:
         server.serve_forever()
