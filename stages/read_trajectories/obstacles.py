@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.errors import InputError
 from pipeline.models.perception import FeatureVolume
 from stages.read_trajectories.tables import columns, numbers
 
@@ -13,6 +14,7 @@ FLOOR, OBSTACLE = 0, 1
 """Channels that are 1 in the floor's and in obstacles' voxels."""
 MARGIN_M = 1.0
 HEADROOM_M = 1.0
+MOST_VOXELS = 10_000_000
 
 
 def no_scene() -> FeatureVolume:
@@ -24,16 +26,23 @@ def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: f
     """Read occupied cells (x, z, optionally bottom and top) around the animal's ways. Raises TRJ-001 as `columns` does."""
     table = columns(path, ("x", "z"))
     x, z = numbers(path, table, "x"), numbers(path, table, "z")
+    if not (np.isfinite(x).all() and np.isfinite(z).all()):
+        raise InputError("TRJ-001", "has cells without x or z", str(path), "give both of every occupied cell, metres")
     floor = float(np.nanmin(visited[:, 1])) if len(visited) else 0.0
     floor = 0.0 if 0.0 <= floor < HEADROOM_M else floor
-    bottom = numbers(path, table, "bottom") if "bottom" in table else np.full(len(x), floor)
-    top = numbers(path, table, "top") if "top" in table else np.full(len(x), floor + top_m)
+    told = {name: numbers(path, table, name) if name in table else np.full(len(x), np.nan) for name in ("bottom", "top")}
+    bottom = np.where(np.isfinite(told["bottom"]), told["bottom"], floor)
+    top = np.where(np.isfinite(told["top"]), told["top"], floor + top_m)
     corners = np.concatenate([np.stack([x, bottom, z], -1), np.stack([x, top, z], -1), visited])
     around = np.array([MARGIN_M, 0.0, MARGIN_M])
     low = np.floor((np.nanmin(corners, axis=0) - around) / cell_m) * cell_m
     low[1] = floor - 2 * cell_m
     high = np.nanmax(corners, axis=0) + around + [0.0, HEADROOM_M, 0.0]
-    shape = np.ceil((high - low) / cell_m).astype(int)
+    size = np.ceil((high - low) / cell_m)
+    if size.prod() > MOST_VOXELS:
+        what = f"ways and obstacles span {' x '.join(f'{metres:g}' for metres in high - low)} m, too much for cells of {cell_m:g} m"
+        raise InputError("TRJ-001", what, str(path), "write metres; or set cell_m in the recipe")
+    shape = size.astype(int)
     kind = np.full(shape, -1)
     kind[:, :2] = FLOOR
     column = np.floor((np.stack([x, z], -1) - low[[0, 2]]) / cell_m).astype(int)

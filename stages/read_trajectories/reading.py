@@ -56,12 +56,15 @@ def _from_life(stored: dict[str, np.ndarray]) -> Life:
 
 def _from_joints(path: Path, stored: dict[str, np.ndarray], skeleton: Skeleton) -> Life:
     """Put the clips of a motion capture one after another; the lowest joint touches the floor at y = 0."""
-    clips = [np.asarray(clip, float) for clip in stored.values()]
-    if not all(clip.ndim == 3 and clip.shape[1:] == clips[0].shape[1:] and clip.shape[2] == 3 for clip in clips):
+    clips = [np.asarray(clip, float) if clip.dtype.kind in "fiu" else np.zeros(0) for clip in stored.values()]
+    fitting = [clip.ndim == 3 and clip.shape[1:] == clips[0].shape[1:] and clip.shape[2] == 3 and len(clip) > 0 for clip in clips]
+    if not clips or not all(fitting):
         what = f"arrays {', '.join(f'{name} {value.shape}' for name, value in stored.items())} are no joint positions"
         raise InputError("TRJ-001", what, str(path), "store [frame joint 3] in metres, +y up, one array per clip")
     joints = np.concatenate(clips)
-    if max(skeleton.root, skeleton.front) >= joints.shape[1]:
+    if not np.isfinite(joints).all():
+        raise InputError("TRJ-001", "some joints are not finite", str(path), "leave out frames in which a joint is not known")
+    if skeleton.root == skeleton.front or not {skeleton.root, skeleton.front} <= set(range(joints.shape[1])):
         raise InputError("TRJ-001", f"has {joints.shape[1]} joints", str(path), "set root_joint and front_joint in the recipe")
     joints = joints - [0.0, np.quantile(joints[..., 1].min(1), FLOOR_QUANTILE), 0.0]
     agent = captured.root_from_joints(joints, skeleton)

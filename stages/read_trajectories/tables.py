@@ -49,19 +49,24 @@ def motion_from_csv(
     Rows without a position are frames in which the animal was not seen (NaN).
     """
     table = columns(path, NEEDED)
-    value = {name: numbers(path, table, name) for name in (*NEEDED, *(OBSERVER if OBSERVER[0] in table else ()))}
+    observed = any(name in table for name in OBSERVER)
+    if observed:
+        columns(path, OBSERVER)
+    value = {name: numbers(path, table, name) for name in (*NEEDED, *(OBSERVER if observed else ()))}
     if not np.isfinite(value["time"]).all() or not len(value["time"]):
         raise InputError("TRJ-002", "has rows without a time, or no rows", str(path), "give every row its time in seconds")
     names = table.get("id", [""] * len(value["time"]))
     rows = [np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)]
     rows = [mine[np.argsort(value["time"][mine], kind="stable")] for mine in rows]
+    if any((np.diff(value["time"][mine]) <= 0).any() for mine in rows):
+        raise InputError("TRJ-001", "two rows of one id have the same time", str(path), "give each animal or clip an id of its own")
     order = np.concatenate(rows)
     turn = np.zeros((len(order), 3))
     turn[:, 1] = value["heading"][order]
     agent = rigid.make(rigid.rotation_from_vector(np.nan_to_num(turn)), np.stack([value[axis][order] for axis in "xyz"], axis=-1))
     agent[~np.isfinite(turn[:, 1])] = np.nan
     camera = nobody(len(order))
-    if OBSERVER[0] in table:
+    if observed:
         seen = np.stack([value[name][order] for name in OBSERVER], axis=-1)
         camera[:, :3, 3] = np.where(np.isfinite(seen), seen, NOBODY_M)
     return one_after_another([value["time"][mine] for mine in rows]), agent, camera

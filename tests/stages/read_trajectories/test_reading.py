@@ -94,6 +94,8 @@ def test_clips_of_joints_stand_on_the_floor(tmp_path):
         ("id,time,x,y,z,heading\na,zero,0,0,0,0\n", "TRJ-001.*time is not numeric"),
         ("id,time,x,y,z,heading\n", "TRJ-002"),
         ("id,time,x,y,z,heading\na,0,,,,\n", "TRJ-002.*no position"),
+        ("id,time,x,y,z,heading\na,1,0,0,0,0\na,1,1,0,0,0\n", "TRJ-001.*same time"),
+        ("time,x,y,z,heading,observer_x\n0,0,0,0,0,0\n", "TRJ-001.*no column observer_y, observer_z"),
     ],
 )
 def test_nonsense_is_refused(tmp_path, text, code):
@@ -102,7 +104,24 @@ def test_nonsense_is_refused(tmp_path, text, code):
         read(tmp_path / "t.csv", READING)
 
 
-def test_arrays_that_are_no_joints_are_refused(tmp_path):
-    np.savez(tmp_path / "t.npz", depth=np.zeros((4, 5)))
+@pytest.mark.parametrize("stored", [{"depth": np.zeros((4, 5))}, {}, {"a": np.zeros((0, 5, 3))}, {"a": np.array(["x"])}])
+def test_arrays_that_are_no_joints_are_refused(tmp_path, stored):
+    np.savez(tmp_path / "t.npz", **stored)
     with pytest.raises(InputError, match="TRJ-001.*no joint positions"):
         read(tmp_path / "t.npz", READING)
+
+
+def test_joints_that_are_not_known_are_refused(tmp_path):
+    joints = skeleton_motion()
+    joints[7, 2] = np.nan
+    np.savez(tmp_path / "t.npz", walk=joints)
+    with pytest.raises(InputError, match="TRJ-001.*not finite"):
+        read(tmp_path / "t.npz", READING)
+
+
+@pytest.mark.parametrize("cells", ["x,z\n,1\n", "x,z\n1e5,1e5\n"])
+def test_obstacle_maps_that_cannot_be_are_refused(tmp_path, cells):
+    (tmp_path / "trajectory.csv").write_text("time,x,y,z,heading\n0,0,0,0,0\n1,1,0,0,0\n")
+    (tmp_path / "obstacles.csv").write_text(cells)
+    with pytest.raises(InputError, match="TRJ-001"):
+        read(tmp_path, READING)
