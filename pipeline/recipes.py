@@ -55,11 +55,14 @@ def flow(table: Mapping[str, Any], where: str) -> Flow:
 def trials(table: Mapping[str, Any], cache: sources.Cache) -> Iterator[Trial]:
     """Yield every trained method of the tables with every seed; a method is a variant of that name."""
     settings = {**(sources.settings(TABLES_STAGE, cache) or {}), **table}
-    for method in settings.get("methods", ()):
+    count, methods = _count(settings, "seeds", TABLES_STAGE), settings.get("methods", ())
+    if not isinstance(methods, list | tuple) or not all(isinstance(method, str) for method in methods):
+        raise InputError("REC-002", f"{methods!r} is no list of methods", f"[{TABLES_STAGE}]: methods", 'write ["ats", ...]')
+    for method in methods:
         path = Path("agents", "variants", f"{method}.toml")
         overlay, _ = read(path, cache)
         config.refuse_unknown(overlay, (TRIED_TABLE,), where=f"{path}, a method of the tables", kind="table")
-        for seed in range(settings["seeds"]):
+        for seed in range(count):
             yield Trial(f"{method}-{seed}", {**overlay.get(TRIED_TABLE, {}), "seed": seed})
 
 
@@ -74,11 +77,17 @@ def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], cache: sources.Cach
     node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
     settings = {**(sources.settings(node.stage, cache) or {}), **recipe.get(dag.table_of(node), {})}
     if begins == "recordings":
-        said = captures.builtin(settings["session_count"], settings["heldout_of"])
+        said = captures.builtin(*(_count(settings, key, where) for key in ("session_count", "heldout_of")))
     else:
-        said = captures.builtin_lives(settings["homes"], settings["sessions_per_home"])
+        said = captures.builtin_lives(*(_count(settings, key, where) for key in ("homes", "sessions_per_home")))
     config.refuse_unknown(overrides, said, where=f"{where}: [videos]", kind="recording")
     given = {name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()}
     return {
         name: config.from_table(captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]") for name in said
     }
+
+
+def _count(settings: Mapping[str, Any], key: str, where: str) -> int:
+    if type(settings[key]) is not int or settings[key] < 0:
+        raise InputError("REC-002", f"{settings[key]!r} is no count", f"{where}: {key}", "give a whole number")
+    return settings[key]

@@ -45,8 +45,12 @@ class FolderContainer:
 
     def read(self, name: str, max_bytes: int) -> bytes:
         """Read one file of at most ``max_bytes``."""
-        with open(self.path(name), "rb") as file:
-            return _within(file.read(max_bytes + 1), max_bytes, f"{self.where}/{name}")
+        where = f"{self.where}/{name}"
+        try:
+            with open(self.path(name), "rb") as file:
+                return _within(file.read(max_bytes + 1), max_bytes, where)
+        except OSError as error:
+            raise damaged(where, error.strerror or str(error)) from error
 
 
 class ZipContainer:

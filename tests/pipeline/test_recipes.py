@@ -31,6 +31,17 @@ def test_every_method_has_every_seed():
     assert found[3].overlay["ego"] == "world" and found[3].overlay["seed"] == 1
 
 
+@pytest.mark.parametrize("table", [{"seeds": "3"}, {"seeds": 1.5}, {"methods": "ats"}, {"methods": [1]}])
+def test_trials_of_the_wrong_type_are_refused(table):
+    with pytest.raises(InputError, match="REC-002"):
+        list(recipes.trials(table, sources.Cache()))
+
+
+def test_a_count_of_recordings_of_the_wrong_type_is_refused():
+    with pytest.raises(InputError, match="REC-002.*session_count"):
+        recipes.builtin_remarks("recordings", {"synthesize_capture": {"session_count": "two"}}, sources.Cache(), "agents/toy.toml")
+
+
 def test_tables_of_motion_need_no_recordings(tmp_path):
     house = checkout.create(tmp_path)
     house.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')
