@@ -21,12 +21,14 @@ EPISODE_FRAMES = 300
 
 
 def figures(prefix: str, source: Source, c: Any, *, only: str | None = None) -> dict[str, float | None]:
-    """Measure every method on held-out short motions, or on those of one split."""
+    """Measure every method on held-out short motions, or on those of one split; nothing where there are none."""
     lives, model = source.held_out, source.models.ours
     rng = np.random.default_rng(c.seed)
     cuts = cut(lives, Cutting(stride=10, resting=0.0), rng)
-    wanted = [index for index, stretch in enumerate(cuts.stretch) if only in (None, source.split[stretch])]
-    wanted = np.array(wanted)[np.unique(np.linspace(0, len(wanted) - 1, min(c.clips, len(wanted))).astype(int))]
+    wanted = np.array([index for index, stretch in enumerate(cuts.stretch) if only in (None, source.split[stretch])], int)
+    if not len(wanted):
+        return {}
+    wanted = wanted[np.unique(np.linspace(0, len(wanted) - 1, min(c.clips, len(wanted))).astype(int))]
     cuts = Cuts(cuts.stretch[wanted], cuts.start[wanted])
     clips = encoded(lives, cuts, model.poses, model.sizes.points, rng)
     known = scores.references(cuts.parts(lives), clips.scene, lives, model)
