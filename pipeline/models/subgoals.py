@@ -68,7 +68,7 @@ class Floor:
         points = np.stack(np.meshgrid(x, levels, z, indexing="ij"), axis=-1)
         above = grid.at(torch.from_numpy(points).float()).numpy()
         beneath = grid.at(torch.from_numpy(points[:, 0] * [1, 0, 1] + [0, floor, 0]).float()).numpy()
-        clearance = (above - 0.0).min(1)
+        clearance = above.min(1)
         free = (clearance > np.minimum(breadth_m / 2, 0.6 * root_m)) & (np.abs(beneath) < 0.1)
         return cls(free, clearance, low[[0, 2]], floor)
 
@@ -79,6 +79,14 @@ class Floor:
             raise InputError("SIM-003", "there is no free floor in this scene", "", "give sub-goals in a scene that shows its floor")
         off = self.corner + CELL_M * cells - np.asarray(position)[[0, 2]]
         return tuple(int(v) for v in cells[np.argmin((off**2).sum(1))])
+
+    def refuse_outside(self, position: Float[np.ndarray, "3"]) -> None:
+        """Raise SIM-003 for a position beyond the scene's edge."""
+        low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
+        place = np.asarray(position)[[0, 2]]
+        if np.any(place < low) or np.any(place > high):
+            room = f"x {low[0]:.1f} .. {high[0]:.1f} m, z {low[1]:.1f} .. {high[1]:.1f} m"
+            raise InputError("SIM-003", "a sub-goal lies outside the scene", f"x {place[0]:g}, z {place[1]:g}", f"the scene: {room}")
 
     def way(self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "point 2"]:
         """Return a way over the ground from near one position to near another, smooth, away from furniture."""
@@ -93,6 +101,8 @@ def legs(start: Float[np.ndarray, "4 4"] | None, subgoals: list[Subgoal], scene:
     if len(subgoals) < (1 if start is not None else 2):
         raise InputError("SIM-001", "too few sub-goals", f"{len(subgoals)}", "give at least two, or a start and one")
     floor = Floor.of(scene, habits.clearance_m)
+    for goal in subgoals:
+        floor.refuse_outside(goal.position_world)
     root_m = floor.height_m + habits.clearance_m
     here = subgoals[0].position_world if start is None else start[:3, 3]
     points, headings, marks, clock = [_grounded(here, root_m)], [subgoals[0].heading_rad if start is None else _heading(start)], [0], 0.0

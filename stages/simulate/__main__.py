@@ -13,9 +13,8 @@ from pipeline import cli, config, progress
 from pipeline.models import behavior
 from pipeline.models.motion_optimization import Settings
 from pipeline.models.simulator import Chaining
-from stages.simulate import takes
+from stages.simulate import subgoal_file, takes
 from stages.simulate.observers import Script
-from stages.simulate.subgoal_file import Written, subgoals_from_table
 
 
 @dataclass(frozen=True)
@@ -59,9 +58,9 @@ def run(task: cli.Task) -> None:
     given = {name: task.input(name) for name in ("behavior", "behavior_data", "simulator", "longterm", "reconstruction") if task.has(name)}
     written = None
     if task.has("subgoals"):
-        table = config.read_table(task.input("subgoals"))
-        rows = [config.from_table(Written, row, where=str(task.input("subgoals"))) for row in table.get("subgoal", ())]
-        written = subgoals_from_table(table, rows, task.input("subgoals"))
+        path = task.input("subgoals")
+        tables = subgoal_file.tables(config.read_table(path), path)
+        written = subgoal_file.subgoals([config.from_table(subgoal_file.Written, each, where=str(path)) for each in tables], path)
     if c.serve:
         take = takes.live(given, c, task.device)
     elif c.recording is not None:

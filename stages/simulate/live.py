@@ -7,6 +7,7 @@ or is interrupted, and returns all that happened as a take.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,10 @@ class Live:
         due = time.monotonic()
         try:
             while not stopped():
+                if self.again.is_set():
+                    self.again.clear()
+                    self.seed += 1
+                    self.reset()
                 if self.playing.value:
                     self.step()
                 due = max(due + 1 / RATE_HZ, time.monotonic())
@@ -118,9 +123,5 @@ class Live:
         gui = self.server.gui
         self.interactivity = gui.add_slider("interactivity", 0.0, 1.0, 0.05, float(np.clip(self.simulator.sampling.guidance, 0, 1)))
         self.playing = gui.add_checkbox("time passes", True)
-        again = gui.add_button("start again, next seed")
-
-        @again.on_click
-        def _(_event: Any) -> None:
-            self.seed += 1
-            self.reset()
+        self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
+        gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())

@@ -16,6 +16,9 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.models.subgoals import Subgoal
 
+LONGEST_S = 3600.0
+"""Latest time of a sub-goal, seconds."""
+
 
 @dataclass(frozen=True)
 class Written:
@@ -26,15 +29,23 @@ class Written:
     time_s: float | None = None
 
 
-def subgoals_from_table(table: Mapping[str, Any], written: list[Written], path: Path) -> list[Subgoal]:
-    """Check what was written and return it as sub-goals. Raises InputError SIM-002."""
-    if set(table) != {"subgoal"} or not written:
+def tables(table: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
+    """Return the `[[subgoal]]` tables of a file. Raises InputError SIM-002."""
+    rows = table.get("subgoal")
+    if set(table) != {"subgoal"} or not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
         raise InputError("SIM-002", "holds no sub-goals", str(path), "write one [[subgoal]] table per sub-goal, nothing else")
+    return rows
+
+
+def subgoals(written: list[Written], path: Path) -> list[Subgoal]:
+    """Check what was written and return it as sub-goals. Raises InputError SIM-002."""
     found, clock = [], 0.0
     for number, each in enumerate(written, 1):
         where = f"{path}: subgoal {number}"
         if len(each.position) not in (2, 3) or not np.isfinite(each.position).all():
             raise InputError("SIM-002", f"{each.position} is no position", where, "give [x, z] or [x, y, z] in metres")
+        if not np.isfinite(each.heading_deg or 0.0) or not (each.time_s or 0.0) <= LONGEST_S:
+            raise InputError("SIM-002", f"heading_deg or time_s is no number up to {LONGEST_S:g} s", where, "correct it")
         if each.time_s is not None and each.time_s < clock:
             raise InputError("SIM-002", f"time_s {each.time_s:g} is before the sub-goal ahead of it", where, "let times rise")
         clock = each.time_s if each.time_s is not None else clock

@@ -15,8 +15,7 @@ from pipeline.models.motion_optimization import Settings
 from pipeline.models.motion_synthesis import LongTerm, habits_of
 from pipeline.models.short_motions import Moving
 from pipeline.models.subgoals import Subgoal
-from stages.simulate import journey_files
-from stages.simulate.subgoal_file import Written, subgoals_from_table
+from stages.simulate import journey_files, subgoal_file
 from tests.pipeline.models import strider
 
 SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
@@ -36,9 +35,8 @@ def world():
 
 def read(path, text):
     path.write_text(text)
-    table = config.read_table(path)
-    rows = [config.from_table(Written, row, where=str(path)) for row in table.get("subgoal", ())]
-    return subgoals_from_table(table, rows, path)
+    tables = subgoal_file.tables(config.read_table(path), path)
+    return subgoal_file.subgoals([config.from_table(subgoal_file.Written, each, where=str(path)) for each in tables], path)
 
 
 def test_sub_goals_are_read(tmp_path):
@@ -57,6 +55,12 @@ def test_sub_goals_are_read(tmp_path):
         "seed = 1\n",
         "[[subgoal]]\nposition = [1]\n",
         "[[subgoal]]\nposition = [1, inf]\n",
+        "[subgoal]\nposition = [1, 2]\n",
+        "subgoal = 3\n",
+        "subgoal = [1, 2]\n",
+        "[[subgoal]]\nposition = [1, 2]\nheading_deg = nan\n",
+        "[[subgoal]]\nposition = [1, 2]\ntime_s = nan\n",
+        "[[subgoal]]\nposition = [1, 2]\ntime_s = 1e12\n",
         "[[subgoal]]\nposition = [1, 2]\ntime_s = 5\n[[subgoal]]\nposition = [2, 2]\ntime_s = 4\n",
     ],
 )
@@ -86,6 +90,12 @@ def test_a_journey_is_made_and_written(world, tmp_path):
 def test_one_sub_goal_is_too_few(world):
     with pytest.raises(InputError, match="SIM-001"):
         journeys.travel(world, [Subgoal(np.zeros(3))], None, np.random.default_rng(0))
+
+
+def test_a_sub_goal_outside_the_scene_is_refused(world):
+    goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([100.0, np.nan, -1.0]))]
+    with pytest.raises(InputError, match="SIM-003"):
+        journeys.travel(world, goals, None, np.random.default_rng(0))
 
 
 def test_a_take_of_the_behaviour_model_becomes_physical(world):

@@ -109,6 +109,24 @@ def test_live_view_answers_and_keeps_its_take(simulator):
     np.testing.assert_allclose(here.animal.position, take.world_from_agent[-1, :3, 3], atol=1e-6)
 
 
+def test_starting_again_in_the_middle_of_a_step_keeps_the_take_whole(simulator):
+    pytest.importorskip("viser")
+    here = Live(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8119)
+    step, clicked = simulator.step, []
+
+    def stepping(position):
+        if not clicked:
+            clicked.append(here.again.set())
+        return step(position)
+
+    simulator.step = stepping
+    try:
+        take = here.run(stopped=lambda: here.seed == 2 and len(here.states) >= 3)
+    finally:
+        simulator.step = step
+    assert len(take.observer_world) == len(take.timestamp_s) == 3
+
+
 def test_live_view_says_what_it_needs(simulator, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match="make extras"):
