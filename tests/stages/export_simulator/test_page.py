@@ -1,5 +1,6 @@
 """The page in headless Chromium, from a file: it lives, asks nobody, samples as Python does, and obeys hands."""
 
+import base64
 import functools
 import http.server
 import json
@@ -17,11 +18,18 @@ from playwright.sync_api import Browser, Page
 
 from pipeline import artifact
 from pipeline.cli import Task
+from pipeline.files import arrays
 from pipeline.models.trajectories import BehaviorData
+from pipeline.space import rigid
 from stages.export_simulator.__main__ import Config, run
 from tests.stages.export_simulator import browser, reaction, small_world, twins
 
 pytestmark = pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
+DROP = """text => {
+  const data = new DataTransfer();
+  data.items.add(new File([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], 'dropped.npz'));
+  dispatchEvent(new DragEvent('drop', { dataTransfer: data, cancelable: true }));
+}"""
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
 
 
@@ -51,6 +59,7 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
     golden = json.loads((simulator.parent / "golden.json").read_bytes())
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
         before = page.evaluate("ats.state()")
+        assert 0 < before["marks_s"]["animal"] < before["marks_s"]["plan"], "seconds after opening: the animal is seen, then plans"
         _check_golden(golden, page.evaluate("golden => ats.golden(golden)", golden))
         page.evaluate("ats.pause()")
         _check_reaction(page)
@@ -69,6 +78,7 @@ def test_goals_and_paths_are_obeyed_and_takes_are_kept(simulator: Path, chromium
         _check_a_drawn_path(page)
         _check_downloads(page, tmp_path)
         _check_a_clip_beside(page)
+        _check_an_opened_take(page, tmp_path)
         assert wrong == []
 
 
@@ -187,6 +197,30 @@ def _check_a_clip_beside(page: Page) -> None:
     truth = small_world.trajectory(120, 0).world_from_agent[state["replay"]["tick"], :3, 3]
     np.testing.assert_allclose(state["replay"]["place"], truth, atol=1e-4)
     assert np.linalg.norm(np.array(state["animal"])[[0, 2]] - truth[[0, 2]]) < 1.5, "metres: it began there"
+
+
+def _check_an_opened_take(page: Page, folder: Path) -> None:
+    """A take of `stages.simulate` at 30 Hz, chosen or dropped, plays beside; that of another body is refused in words."""
+    time_s = np.arange(181) / 30
+    place = np.stack([0.5 * np.cos(time_s), np.full(181, 0.1), 0.5 * np.sin(time_s)], -1)
+    motion = {"world_from_agent": rigid.make(np.tile(np.eye(3), (181, 1, 1)), place), "arrival_s": np.zeros(1)}
+    bones = np.tile(small_world.rest(), (181, 1, 1, 1)).astype(np.float32)
+    arrays.save(folder / "journey.npz", timestamp_s=time_s, agent_from_bone=bones, **motion)
+    arrays.save(folder / "dropped.npz", timestamp_s=time_s, agent_from_bone=bones, **motion, compress=True)
+    arrays.save(folder / "other.npz", timestamp_s=time_s, agent_from_bone=bones[:, :3], **motion)
+    page.set_input_files("#open-file", folder / "journey.npz")
+    _check_it_plays(page, "journey", place)
+    dropped = base64.b64encode((folder / "dropped.npz").read_bytes()).decode()
+    page.evaluate(DROP, dropped)
+    _check_it_plays(page, "dropped", place)
+    page.set_input_files("#open-file", folder / "other.npz")
+    page.wait_for_function("document.querySelector('#help').textContent.includes('it has 3 bones, this animal has 5')", timeout=10_000)
+
+
+def _check_it_plays(page: Page, name: str, place: np.ndarray) -> None:
+    page.wait_for_function(f"ats.state().replay?.name === '{name}' && ats.state().tick > 2", timeout=20_000)
+    replay = page.evaluate("ats.state().replay")
+    np.testing.assert_allclose(replay["place"], place[3 * (replay["tick"] % 61)], atol=1e-5)  # metres
 
 
 def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> None:

@@ -21,6 +21,7 @@ export function api(simulator) {
         replay: simulator.replaying && { name: simulator.replaying.name, tick: simulator.replayTick, place: [...simulator.clips.frame(simulator.replaying, simulator.replayTick).slice(0, 3)] },
         take_s: simulator.take.seconds,
         software: room.software,
+        marks_s: Object.fromEntries(performance.getEntriesByType('mark').map((mark) => [mark.name, mark.startTime / 1000])),
         pixelRatio: room.renderer.getPixelRatio(),
         settings: { ...simulator.state },
       };

@@ -7,6 +7,7 @@ import { Clips } from './clips.js';
 import { Controls } from './controls.js';
 import { Film } from './film.js';
 import { Minimap } from './minimap.js';
+import { arrays } from './npz.js';
 import { Observer } from './observer.js';
 import { Overlays } from './overlays.js';
 import * as panel from './panel.js';
@@ -80,6 +81,7 @@ class Simulator {
       glb: () => save(this.take.glb(this.model), `${this.fileName}.glb`),
       film: () => this.shoot(),
       link: () => this.copyLink(),
+      open: (file) => this.openTake(file),
     });
     panel.showFilm(false, Film.possible);
     this.controls = new Controls(this.room, this.observer, {
@@ -200,6 +202,19 @@ class Simulator {
     }
   }
 
+  // A take of `stages.simulate` plays beside, as a recorded clip does.
+  async openTake(file) {
+    try {
+      const clip = this.clips.add(file.name.replace(/\.npz$/, ''), await arrays(new Uint8Array(await file.arrayBuffer())));
+      panel.addClip(clip.name);
+      this.state.replay = clip.name;
+      this.panel.refresh();
+      this.changed('replay');
+    } catch (error) {
+      panel.help(`${file.name} cannot be played here: ${error.message}.`, 8);
+    }
+  }
+
   frame() {
     const time = performance.now();
     const seconds = Math.min(0.25, (time - this.last) / 1000);
@@ -264,6 +279,7 @@ class Simulator {
     this.timeline.follow(start, plan.frames, this.now);
     this.overlays.show(plan);
     this.ghost.pose(plan.frames.at(-1), this.contract.scene.floor_m);
+    if (!this.milliseconds) performance.mark('plan');
     this.milliseconds = plan.milliseconds;
     panel.status(`planned ${(plan.frames.length * TICK_S).toFixed(1)} s ahead in ${(plan.milliseconds / 1000).toFixed(2)} s`);
     if (this.route?.finished) this.aimAt(null);
@@ -311,13 +327,14 @@ class Simulator {
     this.frames = (this.frames ?? 0) + 1;
     if (this.frames % (this.room.software ? 6 : 3) === 0) this.drawMap(root, recorded);
     this.room.render();
+    if (this.frames === 1) performance.mark('animal');
     this.drawTags(root, recorded);
   }
 
   drawTags(root, recorded) {
     const above = (x, y, z, lift) => this.room.orbit.target.clone().set(x, y + lift, z);
     this.tags.put('simulated', recorded ? 'simulated' : '', above(root[0], root[1], root[2], 0.2));
-    this.tags.put('recorded', recorded ? 'recorded' : '', recorded ? above(recorded[0], recorded[1], recorded[2], 0.2) : null);
+    this.tags.put('recorded', recorded ? (this.replaying.opened ? 'take' : 'recorded') : '', recorded ? above(recorded[0], recorded[1], recorded[2], 0.2) : null);
     this.tags.put('observer', this.state.view === 'you' ? '' : 'you', above(this.observer.place[0], this.contract.scene.floor_m, this.observer.place[1], this.observer.eye + 0.1));
   }
 

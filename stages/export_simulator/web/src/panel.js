@@ -38,7 +38,17 @@ export function buildPanel(state, clips, on) {
   at('seed-next').addEventListener('click', () => change('seed', (state.seed + 1) % 1000000));
   sync.push(() => { at('seed').value = state.seed; });
 
-  for (const clip of clips) at('replay').append(Object.assign(document.createElement('option'), { value: clip.name, textContent: clip.name }));
+  for (const clip of clips) addClip(clip.name);
+  at('open').addEventListener('click', () => at('open-file').click());
+  at('open-file').addEventListener('change', (event) => {
+    if (event.target.files.length) on.open(event.target.files[0]);
+    event.target.value = '';
+  });
+  addEventListener('dragover', (event) => event.preventDefault());
+  addEventListener('drop', (event) => {
+    event.preventDefault();
+    if (event.dataTransfer.files.length) on.open(event.dataTransfer.files[0]);
+  });
   at('replay').addEventListener('change', (event) => change('replay', event.target.value));
   sync.push(() => { at('replay').value = state.replay; });
 
@@ -62,6 +72,10 @@ export function buildPanel(state, clips, on) {
   if (innerWidth < 720) at('panel').classList.add('closed');
   sync.forEach((update) => update());
   return { refresh: () => sync.forEach((update) => update()) };
+}
+
+export function addClip(name) {
+  at('replay').append(Object.assign(document.createElement('option'), { value: name, textContent: name }));
 }
 
 export function showPlaying(playing) {
