@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.files import glb
-from pipeline.files.glb import Action, Skin
-from pipeline.space import rigid
-from tests.stages.export_simulator import browser, small_world
+from tests.stages.export import moving_tube
+from tests.stages.export_simulator import browser
 
 WEB = Path(__file__).parents[3] / "stages/export_simulator/web"
 ENTRY = """
@@ -39,23 +37,12 @@ window.moved = async (text, seconds) => {
     reason="needs node, and `npm ci` in stages/export_simulator/web",
 )
 def test_three_opens_the_animal_and_moves_it_alike() -> None:
-    mesh, weights = small_world.tube()
-    joints = np.argsort(-weights, 1)[:, :4]
-    kept = np.take_along_axis(weights, joints, 1)
-    kept = (kept / kept.sum(1, keepdims=True)).astype(np.float32)
-    names = tuple(f"bone_{bone:02d}" for bone in range(small_world.BONES))
-    skin = Skin(joints.astype(np.uint8), kept, small_world.rest(), names)
-    track = small_world.trajectory(20, 0)
-    motion = track.agent_from_bone.astype(np.float64)
-    model = glb.skinned(mesh, skin, [Action("walk", track.timestamp_s, track.world_from_agent, motion)])
+    model, places = moving_tube.model()
     bundler = ["node_modules/.bin/esbuild", "--bundle", "--format=iife", "--log-level=error"]
     script = subprocess.run(bundler, cwd=WEB, input=ENTRY, capture_output=True, text=True, check=True).stdout
     with browser.chromium() as opened:
         page = opened.new_page()
         page.add_script_tag(content=script)
-        told = page.evaluate("([text, seconds]) => moved(text, seconds)", [base64.b64encode(model).decode(), 1.2])
+        told = page.evaluate("([text, seconds]) => moved(text, seconds)", [base64.b64encode(model).decode(), moving_tube.SECONDS])
     assert told["names"] == ["walk"]
-    agent_from_agent = motion[12] @ rigid.inverse(small_world.rest())
-    corners = np.einsum("vk,vkij->vij", kept, agent_from_agent[joints])
-    at = np.einsum("vij,vj->vi", corners[:, :3, :3], mesh.vertices) + corners[:, :3, 3]
-    np.testing.assert_allclose(told["places"], rigid.apply(track.world_from_agent[12], at), atol=2e-5)  # metres
+    np.testing.assert_allclose(told["places"], places, atol=2e-5)  # metres

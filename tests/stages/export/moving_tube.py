@@ -1,0 +1,30 @@
+"""A skinned, animated tube as glTF, and where its corners are at one moment, for tests that open it elsewhere."""
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.files import glb
+from pipeline.files.glb import Action, Skin
+from pipeline.space import rigid
+from tests.stages.export_simulator import small_world
+
+SECONDS = 1.2
+"""A key of the animation."""
+
+
+def model() -> tuple[bytes, Float[np.ndarray, "corner 3"]]:
+    """Return the file with the action `walk`, and its corners in the world at `SECONDS`, metres."""
+    mesh, weights = small_world.tube()
+    joints = np.argsort(-weights, 1)[:, :4]
+    kept = np.take_along_axis(weights, joints, 1)
+    kept = (kept / kept.sum(1, keepdims=True)).astype(np.float32)
+    names = tuple(f"bone_{bone:02d}" for bone in range(small_world.BONES))
+    skin = Skin(joints.astype(np.uint8), kept, small_world.rest(), names)
+    track = small_world.trajectory(20, 0)
+    motion = track.agent_from_bone.astype(np.float64)
+    frame = int(np.argmin(np.abs(track.timestamp_s - SECONDS)))
+    agent_from_agent = motion[frame] @ rigid.inverse(small_world.rest())
+    corners = np.einsum("vk,vkij->vij", kept, agent_from_agent[joints])
+    at = np.einsum("vij,vj->vi", corners[:, :3, :3], mesh.vertices) + corners[:, :3, 3]
+    actions = [Action("walk", track.timestamp_s, track.world_from_agent, motion)]
+    return glb.skinned(mesh, skin, actions), rigid.apply(track.world_from_agent[frame], at)
