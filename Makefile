@@ -40,7 +40,7 @@ behavior-benchmark: .venv/.ok
 	@$(MAKE) $(NESTING) behavior-tables AGENT=benchmark
 
 registration-tables: .venv/.ok
-	@set -e; for variant in no_localizer no_feature_metric no_odometry regression_only; do \
+	@set -e; for variant in $$($(PYTHON) -SE -c 'from pipeline import dag; print(*dag.REGISTRATION_VARIANTS)'); do \
 	  $(MAKE) $(NESTING) $(or $(AGENT),cat).registration VARIANT=$$variant; done
 	@$(MAKE) $(NESTING) $(or $(AGENT),cat).registration_tables
 	@cat build/$(or $(AGENT),cat)/registration_tables/tables.txt
