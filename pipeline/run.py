@@ -22,7 +22,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from pipeline import artifact, plan, processes
+from pipeline import artifact, jobs, processes
 from pipeline.errors import InputError
 
 LEAST_FREE_BYTES = 1 << 29
@@ -43,9 +43,9 @@ def run(home: str, job_id: str) -> int:
     job = _job(home, job_id)
     out, stamp = Path(job["out"]), Path(job["stamp"])
     resume = Path("build", job["home"], "resume", job_id)
-    redo = plan.redo_mark(job["home"], job_id)
+    redo = jobs.redo_mark(job["home"], job_id)
     waiting = f"[{job_id}] is being made by another build; waiting for it"
-    with artifact.held(plan.lock_file(job["home"], job_id), waiting):
+    with artifact.held(jobs.lock_file(job["home"], job_id), waiting):
         artifact.clean(out, _record(job))
         key = _key(job)
         made = artifact.read_manifest(out)
@@ -62,13 +62,13 @@ def run(home: str, job_id: str) -> int:
 
 
 def _job(home: str, job_id: str) -> dict[str, Any]:
-    path = plan.Home.parse(home).plan / "dag.json"
+    path = jobs.Home.parse(home).plan / "dag.json"
     if not path.is_file():
         raise InputError("RUN-001", "is not planned yet", home, f"run `make {home}`")
-    jobs = json.loads(path.read_text())
-    for number, job in enumerate(jobs, start=1):
+    planned = json.loads(path.read_text())
+    for number, job in enumerate(planned, start=1):
         if job["id"] == job_id:
-            return job | {"place": f"{number} of {len(jobs)}"}
+            return job | {"place": f"{number} of {len(planned)}"}
     raise InputError("RUN-001", f"has no job {job_id!r}", home, f"see {path}")
 
 
