@@ -90,18 +90,33 @@ def relax(
     free = np.ones(len(poses), bool) if held is None else ~held
     for reach in reach_m:
         contacts = find(poses, reach)
-        jacobian, residual = _contact_rows(poses, contacts)
-        robust = (reach**2 / (reach**2 + residual**2)) ** 2
-        weight = robust / contacts.sigma_m**2
-        normal = (jacobian.T @ sparse.diags_array(weight) @ jacobian).tocsc()
-        gradient = jacobian.T @ (weight * residual)
-        if relatives is not None and len(relatives.first):
-            edge_jacobian, edge_residual = _edge_rows(poses, relatives)
-            normal = normal + edge_jacobian.T @ edge_jacobian
-            gradient = gradient + edge_jacobian.T @ edge_residual
-        poses = poses @ rigid.exp(_solve(normal, gradient, free))
+        poses = poses @ rigid.exp(_solve(*_normal_equations(poses, contacts, relatives, reach), free))
     contacts = find(poses, reach_m[-1])
     return Relaxed(poses, contacts, residuals(poses, contacts))
+
+
+def spread(
+    world_from_camera: Float[np.ndarray, "frame 4 4"], contacts: Contacts, relatives: Relatives, reach_m: float
+) -> Float[np.ndarray, "frame 6 6"]:
+    """Return the marginal covariance of each camera's right-hand twist (rotation in radians, translation in metres).
+
+    Inverse of the Gauss-Newton matrix; contacts must touch the map and motions join neighbours, so that it is block
+    tridiagonal and its diagonal blocks follow from one pass forth and one back.
+    """
+    normal, _ = _normal_equations(world_from_camera, contacts, relatives, reach_m)
+    blocks = sparse.bsr_array(normal, blocksize=(6, 6))
+    row = np.repeat(np.arange(len(world_from_camera)), np.diff(blocks.indptr))
+    assert (np.abs(row - blocks.indices) <= 1).all(), "contacts between cameras"
+    own, next_to = np.zeros((2, len(world_from_camera), 6, 6))
+    own[row[row == blocks.indices]] = blocks.data[row == blocks.indices]
+    next_to[row[row + 1 == blocks.indices]] = blocks.data[row + 1 == blocks.indices]
+    own = own + 1e-9 * np.eye(6)
+    past, future = own.copy(), own.copy()
+    for frame in range(1, len(own)):
+        past[frame] -= next_to[frame - 1].T @ np.linalg.solve(past[frame - 1], next_to[frame - 1])
+        back = len(own) - 1 - frame
+        future[back] -= next_to[back] @ np.linalg.solve(future[back + 1], next_to[back].T)
+    return np.linalg.inv(past + future - own)
 
 
 def residuals(world_from_camera: Float[np.ndarray, "frame 4 4"], contacts: Contacts) -> Float[np.ndarray, "contact"]:
@@ -110,6 +125,20 @@ def residuals(world_from_camera: Float[np.ndarray, "frame 4 4"], contacts: Conta
         world_from_camera, contacts.second, contacts.points_second
     )
     return np.einsum("ci,ci->c", gap, contacts.direction_world)
+
+
+def _normal_equations(poses, contacts, relatives, reach):
+    """Return matrix and gradient of one Gauss-Newton step."""
+    jacobian, residual = _contact_rows(poses, contacts)
+    robust = (reach**2 / (reach**2 + residual**2)) ** 2
+    weight = robust / contacts.sigma_m**2
+    normal = (jacobian.T @ sparse.diags_array(weight) @ jacobian).tocsc()
+    gradient = jacobian.T @ (weight * residual)
+    if relatives is not None and len(relatives.first):
+        edge_jacobian, edge_residual = _edge_rows(poses, relatives)
+        normal = normal + edge_jacobian.T @ edge_jacobian
+        gradient = gradient + edge_jacobian.T @ edge_residual
+    return normal, gradient
 
 
 def _world(world_from_camera, index, points):

@@ -14,7 +14,9 @@ from pipeline.progress import track
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.register_videos import body as bodies
+from stages.register_videos import headings
 from stages.register_videos.body import Body, FitOptions, Glimpse, Ground
+from stages.register_videos.headings import Candidates, HeadingOptions, heading, wrap
 
 
 @dataclass(frozen=True)
@@ -33,20 +35,10 @@ class RootOptions:
     """A placement worse by this costs one unit."""
     localizer_weight: float = 8.0
     """Units that a certain answer of the localizer is worth."""
-    motion_weight: float = 8.0
-    """Units for walking tail first at half a metre a second or more."""
-    turn_deg: float = 20.0
-    """A turn by this in a tenth of a second costs one unit ..."""
-    flip_cost: float = 40.0
-    """... up to so many units."""
-    still_weight: float = 0.06
-    """Weight of a frame in which neither animal nor phone moves, against one that shows something new."""
-    step_m: float = 0.08
-    """A step of this in a tenth of a second, beyond what its points did, costs one unit."""
+    path: HeadingOptions = field(default_factory=HeadingOptions)
+    """How one of them is chosen over time."""
     smooth_s: float = 0.15
     """Time constant of the smoothing, seconds."""
-    gap_s: float = 0.5
-    """Gaps in sight up to this are bridged, seconds."""
 
 
 @dataclass(frozen=True)
@@ -59,15 +51,6 @@ class Roots:
     """How badly the placement explains what was seen, metres; NaN where not visible."""
     share: Float[np.ndarray, "frame"]
     """Visible area over the area in full view, 0..1."""
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Placements of one frame and what each costs, in units."""
-
-    frame: int
-    world_from_agent: Float[np.ndarray, "candidate 4 4"]
-    cost: Float[np.ndarray, "candidate"]
 
 
 def find_roots(
@@ -89,14 +72,13 @@ def find_roots(
     def look(frame: int) -> Glimpse | None:
         return bodies.observe(clip, masks[frame], frame, world_from_camera[frame], body, ground, options.fit)
 
-    candidates, moments = [], []
+    candidates = []
     for frame in track(np.flatnonzero(masks.visible).tolist(), "placing the animal"):
         if (glimpse := look(frame)) is not None:
             candidates.append(_candidates(clip, glimpse, body, localizer, len(candidates), options))
-            moments.append(Moment(frame, np.median(glimpse.points_world, axis=0), glimpse.world_from_camera[:3, 3]))
     if not candidates:
         return Roots(roots, visible, cost, share)
-    path = best_path(clip.timestamp_s, candidates, pace(clip.timestamp_s, moments, options.still_weight), options)
+    path = headings.choose(clip.timestamp_s, candidates, options.path)
     for candidate, chosen in track(list(zip(candidates, path, strict=True)), "refining the animal"):
         glimpse = look(candidate.frame)
         placed = bodies.fit_fine(glimpse, body, candidate.world_from_agent[chosen][None], options.fit, tilt=True)
@@ -124,88 +106,22 @@ def _candidates(clip: Clip, glimpse: Glimpse, body: Body, localizer: Localizer, 
     for answer in answers:
         turned = wrap(heading(placed) - heading(glimpse.world_from_camera @ rigid.inverse(answer.map_from_camera)))
         bonus = np.maximum(bonus, answer.probability * np.exp(-((turned / np.deg2rad(30)) ** 2)))
-    return Candidates(glimpse.frame, placed, cost - options.localizer_weight * bonus)
-
-
-def heading(world_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:
-    """Return the angle of the head's direction (+z) about +y, radians."""
-    return np.arctan2(world_from_agent[..., 0, 2], world_from_agent[..., 2, 2])
+    points = glimpse.points_world
+    return Candidates(
+        frame=glimpse.frame,
+        world_from_agent=placed,
+        cost=cost - options.localizer_weight * bonus,
+        least_misfit=float(cost.min()),
+        share=glimpse.share,
+        middle_world=np.median(points, axis=0),
+        extent_m=float(np.hypot(*points[:, [0, 2]].std(axis=0))),
+        eye_world=glimpse.world_from_camera[:3, 3],
+    )
 
 
 def upright(world_from_agent: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Keep the heading and the place, drop the tilt."""
     return rigid.make(rigid.rotation_from_vector(heading(world_from_agent) * bodies.UP), world_from_agent[:3, 3])
-
-
-def wrap(angle: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """Bring angles to -pi..pi."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-@dataclass(frozen=True)
-class Moment:
-    """What is kept of a glimpse: pictures are read again when they are needed again, so that memory stays small."""
-
-    frame: int
-    middle_world: Float[np.ndarray, "3"]
-    """Of the animal's seen points."""
-    eye_world: Float[np.ndarray, "3"]
-
-
-@dataclass(frozen=True)
-class Pace:
-    """How things moved around each glimpse."""
-
-    velocity: Float[np.ndarray, "glimpse 3"]
-    """Horizontal velocity of the seen points' middle, m/s; zero across gaps."""
-    novelty: Float[np.ndarray, "glimpse"]
-    """0..1: how much a glimpse shows that its neighbours did not; repeated views err alike."""
-
-
-def pace(timestamp_s: Float[np.ndarray, "frame"], moments: list[Moment], still_weight: float, span: int = 3) -> Pace:
-    """Measure motion over ``span`` glimpses before and after each."""
-    middle = np.stack([moment.middle_world for moment in moments]) * (1, 0, 1)
-    phone = np.stack([moment.eye_world for moment in moments])
-    time = timestamp_s[[moment.frame for moment in moments]]
-    before, after = np.maximum(np.arange(len(time)) - span, 0), np.minimum(np.arange(len(time)) + span, len(time) - 1)
-    elapsed = np.maximum(time[after] - time[before], 1e-3)[:, None]
-    velocity = (middle[after] - middle[before]) / elapsed
-    moved = np.linalg.norm(velocity, axis=1) + 0.5 * np.linalg.norm((phone[after] - phone[before]) / elapsed, axis=1)
-    velocity[(elapsed[:, 0] > 1.2) | (elapsed[:, 0] < 0.15)] = 0
-    novelty = still_weight + (1 - still_weight) * np.minimum(moved / 0.4, 1.0)
-    return Pace(velocity, novelty)
-
-
-def best_path(timestamp_s: Float[np.ndarray, "frame"], candidates: list[Candidates], moves: Pace, options: RootOptions) -> list[int]:
-    """Choose one candidate per glimpse by dynamic programming: fit, walking head first, no sudden turns or jumps."""
-    totals, back = [_own_cost(candidates[0], moves, 0, options)], []
-    for index in range(1, len(candidates)):
-        elapsed = timestamp_s[candidates[index].frame] - timestamp_s[candidates[index - 1].frame]
-        step = totals[-1][:, None] + _link_cost(candidates[index - 1], candidates[index], moves.velocity[index], elapsed, options)
-        back.append(step.argmin(0))
-        totals.append(step.min(0) + _own_cost(candidates[index], moves, index, options))
-    path = [int(totals[-1].argmin())]
-    for pointers in reversed(back):
-        path.append(int(pointers[path[-1]]))
-    return path[::-1]
-
-
-def _own_cost(candidates, moves, index, options):
-    velocity, cost = moves.velocity[index], moves.novelty[index] * (candidates.cost - candidates.cost.min())
-    speed = np.linalg.norm(velocity)
-    if speed < 0.2:
-        return cost
-    ahead = np.cos(heading(candidates.world_from_agent) - np.arctan2(velocity[0], velocity[2]))
-    return cost + options.motion_weight * min(speed / 0.5, 1.0) * (1 - ahead) / 2
-
-
-def _link_cost(before, after, velocity, elapsed, options):
-    tenths = max(elapsed / 0.1, 1.0)
-    turn = wrap(heading(before.world_from_agent)[:, None] - heading(after.world_from_agent)[None])
-    jump = after.world_from_agent[None, :, :3, 3] - before.world_from_agent[:, None, :3, 3] - velocity * elapsed
-    turned = (turn / (np.deg2rad(options.turn_deg) * np.sqrt(tenths))) ** 2
-    jumped = (np.linalg.norm(jump, axis=-1) / (options.step_m * tenths)) ** 2
-    return np.minimum(turned, options.flip_cost / np.sqrt(tenths)) + np.minimum(jumped, 6.0)
 
 
 def smooth(

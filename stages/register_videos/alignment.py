@@ -55,6 +55,8 @@ class Aligned:
     """The aligned cameras and how well each frame's depth fits."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
+    spread: Float[np.ndarray, "frame 6 6"]
+    """Covariance of each camera's right-hand twist (rotation in radians, translation in metres)."""
     scans: list[surface.Scan]
     gap_m: Float[np.ndarray, "frame"]
     """Median distance of the static depth from the surface; NaN where nothing was in reach."""
@@ -102,8 +104,8 @@ def align(
             if (tie := picture_contacts(clip, masks, caster, int(frame), poses[frame], options)) is not None
         ]
         poses = relax.relax(poses, find, edges, reach_m=(options.last_reach_m,) * 3).world_from_camera
-    gap, fit = measure_fit(place, scans, poses)
-    return Aligned(poses, scans, gap, fit)
+    spread = relax.spread(poses, find(poses, options.last_reach_m), edges, options.last_reach_m)
+    return Aligned(poses, spread, scans, *measure_fit(place, scans, poses))
 
 
 def odometry_edges(clip: Clip, options: AlignOptions) -> relax.Relatives:

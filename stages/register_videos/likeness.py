@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from pipeline.files.clips import Clip, Masks
 from pipeline.space import cameras
-from pipeline.space.meshes import Mesh, RayCaster, render_view
+from pipeline.space.meshes import RayCaster, render_view
 from stages.register_videos.alignment import even
 
 FITS_M = 0.05
@@ -16,19 +16,11 @@ LEAST_SHARE = 0.1
 
 
 def likeness(
-    clip: Clip, masks: Masks, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], *, frames: int, blur_px: float = 1.5
-) -> float | None:
-    """Return the median correlation, -1..1, of frames with their rendering, free of light: 1 is the same; None where
-    nothing can be compared.
+    clip: Clip, masks: Masks, caster: RayCaster, frame: int, world_from_camera: Float[np.ndarray, "4 4"], blur_px: float = 1.5
+) -> float:
+    """Return the correlation, -1..1, of one frame with its rendering, free of light: 1 is the same; NaN where too little can
+    be compared.
     """
-    caster = RayCaster(mesh)
-    chosen = np.unique(np.linspace(0, len(clip) - 1, frames).astype(int))
-    found = [_correlation(clip, masks, caster, int(frame), world_from_camera[frame], blur_px) for frame in chosen]
-    found = [value for value in found if value is not None]
-    return float(np.median(found)) if found else None
-
-
-def _correlation(clip, masks, caster, frame, world_from_camera, blur_px) -> float | None:
     size = (clip.color_size[0] // 2, clip.color_size[1] // 2)
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     rendered, hits = render_view(caster, world_from_camera, intrinsics, *size)
@@ -39,7 +31,7 @@ def _correlation(clip, masks, caster, frame, world_from_camera, blur_px) -> floa
     known = (rendered > 0) & free
     same = known & (np.abs(depth - rendered) < FITS_M)
     if same.mean() < LEAST_SHARE:
-        return None
+        return np.nan
     pair = [cv2.GaussianBlur(even(picture, known).astype(np.float64), (0, 0), blur_px)[same] for picture in (color, real)]
     first, second = (values - values.mean() for values in pair)
     return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), 1e-9))

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.files.clips import Clip, Masks
-from pipeline.models.localizer import Localizer, calibrate
+from pipeline.models.localizer import Localizer
 from pipeline.progress import log
-from pipeline.space import rigid, surface
+from pipeline.space import rigid
 from pipeline.space.meshes import Mesh, RayCaster
 from pipeline.space.visual_odometry import Followed, FollowOptions
 from stages.register_videos import alignment, following
@@ -17,28 +17,20 @@ from stages.register_videos import votes as voting
 from stages.register_videos.agent_roots import RootOptions, Roots, find_roots
 from stages.register_videos.alignment import Aligned, AlignOptions
 from stages.register_videos.body import Ground
-from stages.register_videos.likeness import likeness
+from stages.register_videos.confidence import ConfidenceOptions, agent_confidence, camera_confidence, compare
 from stages.register_videos.votes import VoteOptions, Votes
 
 
 @dataclass(frozen=True)
 class GateOptions:
-    """When an aligned recording is believed, and how confidence is calibrated."""
+    """When an aligned recording is believed."""
 
     least_fit: float = 0.35
     """Median share of a frame's static depth that must lie within 5 cm of the template."""
-    probes: int = 240
-    """Disturbed poses that calibrate the confidence."""
     least_certainty: float = 0.5
     """Where not even `least_votes` of the agreeing votes have this probability, ..."""
     least_likeness: float = 0.6
     """... the frames must resemble their renderings by this correlation: flats of one house have the same shape."""
-    likeness_frames: int = 20
-    """Frames that are compared with their rendering."""
-    adrift: float = 0.2
-    """Factor on the confidence of frames that no vote holds and that could not be followed from one that is held."""
-    bridge_s: float = 0.25
-    """Time constant with which confidence is averaged over neighbouring frames, seconds."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +50,9 @@ class Options:
     align: AlignOptions = field(default_factory=AlignOptions)
     """Weights, reach and rounds of the alignment."""
     gate: GateOptions = field(default_factory=GateOptions)
-    """When a recording is believed, and its confidence."""
+    """When a recording is believed."""
+    confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
+    """How sure each frame's pose is."""
     root: RootOptions = field(default_factory=RootOptions)
     """How the animal is placed."""
 
@@ -124,16 +118,16 @@ def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.ran
     aligned = alignment.align(clip, masks, maps.scene, start.world_from_camera, motion.relatives, votes, start.supports, options.align)
     fit = float(np.median(aligned.fit))
     log(f"static depth: {np.nanmedian(aligned.gap_m) * 100:.1f} cm from the template, {fit:.0%} within 5 cm")
-    alike = likeness(clip, masks, maps.scene, aligned.world_from_camera, frames=options.gate.likeness_frames)
-    reason = _strange(fit, alike, votes, start.supports, options) if options.begin == "votes" else None
+    caster = RayCaster(maps.scene)
+    alike = compare(clip, masks, caster, aligned.world_from_camera, options.confidence, rng)
+    reason = _strange(fit, alike.usual, votes, start.supports, options) if options.begin == "votes" else None
     if reason is not None:
         return Refused(reason, votes)
-    confidence = camera_confidence(clip.timestamp_s, surface.Surface(maps.scene), aligned, options.gate, rng)
-    confidence = np.where(start.anchored, confidence, options.gate.adrift * confidence)
-    ground = Ground(RayCaster(maps.scene), float(np.quantile(maps.scene.vertices[:, 1], 0.02)))
+    confidence = camera_confidence(clip.timestamp_s, aligned.spread, alike, start.anchored, options.confidence, rng)
+    ground = Ground(caster, float(np.quantile(maps.scene.vertices[:, 1], 0.02)))
     roots = find_roots(clip, masks, maps.agent, ground, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
     log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
-    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, start.supports, alike)
+    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, start.supports, alike.usual)
 
 
 @dataclass(frozen=True)
@@ -188,46 +182,3 @@ def _in_the_middle(motion, scene) -> _Start:
     middle[1] = scene.vertices[:, 1].min() + 1.5
     shift = rigid.make(np.eye(3), middle - odometry[:, :3, 3].mean(0))
     return _Start(shift @ odometry, np.zeros(0, bool), np.ones(len(odometry), bool))
-
-
-def camera_confidence(
-    timestamp_s: Float[np.ndarray, "frame"],
-    place: surface.Surface,
-    aligned: Aligned,
-    gate: GateOptions,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "frame"]:
-    """Calibrate P(within 2 deg and 5 cm) on how much worse depth fits when poses are disturbed on purpose, then
-    average in time.
-    """
-    frames = rng.integers(0, len(aligned.scans), gate.probes)
-    size = np.exp(rng.uniform(np.log(0.1), np.log(8.0), gate.probes))[:, None]
-    direction = rng.normal(size=(gate.probes, 6)) / np.sqrt(3)
-    twist = direction * size * np.array([np.deg2rad(2.0)] * 3 + [0.05] * 3)
-    disturbed = aligned.world_from_camera[frames] @ rigid.exp(twist)
-    good = (np.linalg.norm(twist[:, :3], axis=1) < np.deg2rad(2.0)) & (np.linalg.norm(twist[:, 3:], axis=1) < 0.05)
-    _, fit = alignment.measure_fit(place, [aligned.scans[frame] for frame in frames], disturbed)
-    raw = calibrate(fit, good).probability(aligned.fit)
-    return averaged(timestamp_s, raw, gate.bridge_s)
-
-
-def averaged(timestamp_s: Float[np.ndarray, "frame"], values: Float[np.ndarray, "frame"], sigma_s: float) -> Float[np.ndarray, "frame"]:
-    """Average over neighbours in time with a Gaussian's weights, cut at four sigma: time linear in the frames."""
-    low = np.searchsorted(timestamp_s, timestamp_s - 4 * sigma_s)
-    high = np.searchsorted(timestamp_s, timestamp_s + 4 * sigma_s, side="right")
-    result = np.empty(len(values))
-    for frame, (first, last) in enumerate(zip(low, high, strict=True)):
-        weight = np.exp(-0.5 * ((timestamp_s[first:last] - timestamp_s[frame]) / sigma_s) ** 2)
-        result[frame] = weight @ values[first:last] / weight.sum()
-    return result
-
-
-def agent_confidence(roots: Roots, scale_m: float = 0.012, enough: float = 0.15) -> Float[np.ndarray, "frame"]:
-    """Score each root 0..1: full for the video's usual fit in good view, less where it fits worse or little is seen;
-    0 unseen.
-    """
-    if not roots.visible.any():
-        return np.zeros(len(roots.visible))
-    usual = np.nanquantile(roots.cost_m, 0.3)
-    worse = np.maximum(np.nan_to_num(roots.cost_m, nan=1.0) - usual, 0) / scale_m
-    return np.where(roots.visible, np.exp(-0.5 * worse**2) * np.minimum(roots.share / enough, 1.0), 0.0)

@@ -73,3 +73,17 @@ def test_gross_outliers_do_not_move_the_answer():
     start = truth @ rigid.exp(rng.normal(0, 0.02, (FRAMES, 6)))
     found = relax.relax(start, lambda *_: contacts, None, reach_m=(0.2,) * 4 + (0.05,) * 4)
     assert rigid.rotation_angle(found.world_from_camera[:, :3, :3], truth[:, :3, :3]).max() < np.deg2rad(0.3)
+
+
+def test_spread_is_the_diagonal_of_the_inverse_and_grows_away_from_contacts():
+    rng = np.random.default_rng(3)
+    time, truth, points, normals = corridor(rng)
+    contacts = plane_contacts(truth, points[:40], normals[:40], np.array([0, 1, 2]))
+    edges = relax.chain(time, truth, drift_rad_s=0.05, drift_m_s=0.05)
+    found = relax.spread(truth, contacts, edges, 0.5)
+    normal, _ = relax._normal_equations(truth, contacts, edges, 0.5)
+    whole = np.linalg.inv(normal.toarray() + 1e-9 * np.eye(6 * FRAMES))
+    dense = np.stack([whole[6 * frame : 6 * frame + 6, 6 * frame : 6 * frame + 6] for frame in range(FRAMES)])
+    assert np.abs(found - dense).max() < 1e-6 * np.abs(dense).max()
+    size = np.sqrt(found[:, range(3, 6), range(3, 6)].sum(1))
+    assert (np.diff(size[2:]) > 0).all(), "metres: what odometry alone carries drifts"

@@ -1,0 +1,62 @@
+"""Front and back are told apart by walking, and kept while the animal is hardly seen, while it rests, while it turns."""
+
+import numpy as np
+import pytest
+
+from pipeline.space import rigid
+from stages.register_videos import headings
+from stages.register_videos.headings import Candidates, HeadingOptions
+
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def seen(frame: int, yaw_deg: float, place, advantage: float, *, share: float = 1.0, misfit: float = 5.0, eye=(2.0, 1, 0)) -> Candidates:
+    """Return a front and a back placement; the wrong one looks better by ``advantage`` units."""
+    yaw, place = np.deg2rad([yaw_deg, yaw_deg + 180]), np.asarray(place, float)
+    poses = rigid.make(rigid.rotation_from_vector(yaw[:, None] * UP), np.repeat(place[None], 2, axis=0))
+    return Candidates(frame, poses, np.array([advantage, 0.0]), misfit, share, place, 0.15, np.asarray(eye, float))
+
+
+def chosen(sights: list[Candidates]) -> list[int]:
+    return headings.choose(np.arange(len(sights)) * 0.1, sights, HeadingOptions())
+
+
+def test_animals_walk_head_first():
+    assert chosen([seen(frame, 0.0, (0, 0, 0.05 * frame), 1.5) for frame in range(30)]) == [0] * 30
+
+
+def test_what_was_learned_walking_is_kept_at_rest():
+    z = np.minimum(np.arange(40), 15) * 0.05
+    assert chosen([seen(frame, 0.0, (0, 0, z[frame]), 1.0 if frame > 18 else -1.0) for frame in range(40)]) == [0] * 40
+
+
+@pytest.mark.parametrize("spoilt", [{"share": 0.02}, {"misfit": 60.0}])
+def test_frames_that_show_little_or_fit_badly_do_not_turn_it_round(spoilt):
+    sights = [seen(frame, 0.0, (0, 0, 0), -2.0, eye=(2, 1, 0.1 * frame)) for frame in range(40)]
+    for frame in range(15, 25):
+        sights[frame] = seen(frame, 0.0, (0, 0, 0), 6.0, eye=(2, 1, 0.1 * frame), **spoilt)
+    assert chosen(sights) == [0] * 40
+
+
+def test_noise_of_single_placements_is_no_turn():
+    rng = np.random.default_rng(0)
+    yaw = 1.5 * np.arange(60) + rng.normal(0, 20, 60)
+    sights = [seen(frame, yaw[frame], (0, 0, 0), rng.normal(-0.5, 1.5), eye=(2, 1, 0.1 * frame)) for frame in range(60)]
+    assert chosen(sights) == [0] * 60
+    faced = headings.path(np.arange(60) * 0.1, sights, HeadingOptions())
+    assert np.abs(np.rad2deg(headings.wrap(faced - np.deg2rad(1.5 * np.arange(60))))).mean() < 15, "degrees, of 20 in single frames"
+
+
+def test_an_animal_may_turn_round_in_a_second():
+    yaw = np.clip((np.arange(40) - 15) * 20.0, 0, 180)
+    sights = [seen(frame, yaw[frame], (0, 0, 0), -2.0, eye=(2, 1, 0.1 * frame)) for frame in range(40)]
+    assert chosen(sights) == [0] * 40
+
+
+def test_walking_around_a_resting_animal_is_no_walk():
+    """The middle of what is seen goes round with the phone, at 0.3 m/s."""
+    angle = np.arange(20) * 0.25
+    around = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
+    sights = [seen(frame, 90.0, 0.12 * around[frame], -0.3, eye=2 * around[frame]) for frame in range(20)]
+    assert np.linalg.norm(headings.pace(np.arange(20) * 0.1, sights, 0.06).velocity, axis=1).max() < 0.05, "m/s"
+    assert chosen(sights) == [0] * 20
