@@ -15,7 +15,7 @@ RUN    := $(PYTHON) -SE -m pipeline.run
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check annotate behavior-tables registration-tables longterm-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
+.PHONY: help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
 HOME_OF := build/$(or $(AGENT),cat)
 INPUTS = $(foreach a,$1,--$(subst _,-,$a) $(HOME_OF)/$a)
 # Called by a recipe, make shares the caller's jobs: as many at once as -j allows in all.
@@ -39,11 +39,13 @@ behavior-tables: .venv/.ok
 behavior-benchmark: .venv/.ok
 	@$(MAKE) $(NESTING) behavior-tables AGENT=benchmark
 
-registration-tables: .venv/.ok
-	@set -e; for variant in $$($(PYTHON) -SE -c 'from pipeline import dag; print(*dag.REGISTRATION_VARIANTS)'); do \
-	  $(MAKE) $(NESTING) $(or $(AGENT),cat).registration VARIANT=$$variant; done
-	@$(MAKE) $(NESTING) $(or $(AGENT),cat).registration_tables
-	@cat build/$(or $(AGENT),cat)/registration_tables/tables.txt
+registration-tables reconstruction-tables: %-tables: .venv/.ok
+	@set -e; for variant in $$($(PYTHON) -SE -c 'from pipeline import dag; print(*dag.VARIANTS["$*"])'); do \
+	  $(MAKE) $(NESTING) $(or $(AGENT),cat).$* VARIANT=$$variant; done
+	@$(MAKE) $(NESTING) $(or $(AGENT),cat).$*_tables
+	@cat build/$(or $(AGENT),cat)/$*_tables/tables.txt
+
+ablations: registration-tables reconstruction-tables
 
 longterm-tables: .venv/.ok
 	@$(MAKE) $(NESTING) $(or $(AGENT),cat).longterm_tables

@@ -21,6 +21,9 @@ AGENT: tuple[Role, ...] = ("turnaround", "session")
 BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
 REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only")
 """Variants of an agent that Table 1 compares its registration with."""
+RECONSTRUCTION_VARIANTS = ("no_localizer", "no_feature_loss", "no_annealing", "mlp_fields", "totalrecon", "totalrecon_single")
+"""Variants of an agent that Table 3 compares its reconstruction with."""
+VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}
 PLUMBING = ("errors", "config", "artifact", "cli", "processes", "progress", "videos", "dag")
 """Files of `pipeline/` whose change cannot change what a stage computes."""
 
@@ -103,7 +106,7 @@ FLOW: tuple[Node, ...] = (
     Node("reconstruction", "reconstruct",
          ("registration", *merging("frames", roles=VIEWED), *merging("masks", "flow", "features"),
           "scene_template", "agent_template"),
-         threads=2, gpu=1, memory_mb=6000, resumable=True),
+         sees=("heldout",), threads=2, gpu=1, memory_mb=6000, resumable=True),
     Node("splats", "refine_gaussians",
          ("reconstruction", *merging("frames", roles=VIEWED), *merging("masks", "flow")),
          gpu=1, memory_mb=6000, resumable=True),
@@ -133,6 +136,9 @@ FLOW: tuple[Node, ...] = (
          sees=("session", "heldout"), gpu=1, beside=("clicks.json",)),
     Node("registration_tables", "evaluate.registration_tables",
          (Need("registration", variants=REGISTRATION_VARIANTS), "scene_template", *merging("frames", roles=("walkthrough", "session")),
+          Need("synthetic_capture", part="truth", option="truth")), aside=True),
+    Node("reconstruction_tables", "evaluate.reconstruction_tables",
+         (Need("reconstruction", variants=RECONSTRUCTION_VARIANTS), "scene_template", "agent_template", *merging("frames"),
           Need("synthetic_capture", part="truth", option="truth")), aside=True),
     Node("report", "report",
          (*merging("frames", "flow", "masks"), "feature_basis", *merging("features"),

@@ -1,15 +1,18 @@
 """The canonical structure T: what is where in the scene and on the agent (paper 001, Eqs. 1-2).
 
-`Field` maps points to signed distance, colour and feature: a multi-resolution dense grid and two small heads,
-with a learnable code per video for the scene. Where the scene was fused beforehand (`fused`), the heads learn the rest. `density` turns signed distance into the density of volume
+`Field` maps points to signed distance, colour and feature: a multi-resolution dense grid, or a network of waves of
+the point's place, and two small heads, with a learnable code per video for the scene. Where the scene was fused beforehand (`fused`), the heads learn the rest. `density` turns signed distance into the density of volume
 rendering. `Body` skins the agent's field with Gaussian bones. `Reconstruction` holds all of it; `save` and `load`
 move it to and from a folder. Points and distances are in metres, inside and outside.
 """
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import Literal, assert_never
 
 import torch
 from jaxtyping import Float, Int
@@ -43,6 +46,8 @@ class FieldShape:
     code_channels: int = 8
     truncation_m: float | None = None
     """signed distances saturate here; None = never"""
+    encoding: Literal["grid", "mlp"] = "grid"
+    """what places are read from: grids, or a network that knows details as fine as the grids' cells (the paper's)"""
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,38 @@ class DenseGrid(nn.Module):
         return torch.cat(found).t()
 
 
+class WaveNetwork(nn.Module):
+    """Waves of the place, from the box's size down to twice ``finest_m``, through a plain network (paper 001, Sec. 3.1)."""
+
+    def __init__(self, low_m: Sequence[float], high_m: Sequence[float], finest_m: float, width: int, layers: int = 3):
+        super().__init__()
+        low, high = torch.tensor(low_m, dtype=torch.float32), torch.tensor(high_m, dtype=torch.float32)
+        self.register_buffer("middle", (low + high) / 2, persistent=False)
+        longest = float((high - low).max())
+        octaves = max(1, math.ceil(math.log2(longest / finest_m)))
+        self.register_buffer("frequency", math.pi / longest * 2.0 ** torch.arange(octaves), persistent=False)
+        sizes = [3 + 6 * octaves] + [width] * layers
+        self.network = nn.Sequential(*(part for pair in pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU())))
+        self.channels = width
+
+    def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
+        """Return what the network makes of points."""
+        place = points - self.middle
+        phase = (place[:, :, None] * self.frequency).flatten(1)
+        return self.network(torch.cat([place, phase.sin(), phase.cos()], dim=1))
+
+
+def encoding_of(shape: FieldShape) -> nn.Module:
+    """Return what a field reads places from."""
+    match shape.encoding:
+        case "grid":
+            return DenseGrid(shape.low_m, shape.high_m, shape.voxel_m, shape.grid_channels)
+        case "mlp":
+            return WaveNetwork(shape.low_m, shape.high_m, min(shape.voxel_m), shape.width)
+        case other:
+            assert_never(other)
+
+
 class Field(nn.Module):
     """Signed distance, colour and feature at points (paper 001, Eqs. 1 and 2)."""
 
@@ -85,7 +122,7 @@ class Field(nn.Module):
         """``free_m`` is the signed distance that an untrained field gives where nothing is fused."""
         super().__init__()
         self.shape, self.fused = shape, fused
-        self.grid = DenseGrid(shape.low_m, shape.high_m, shape.voxel_m, shape.grid_channels)
+        self.grid = encoding_of(shape)
         self.codes = nn.Embedding(max(shape.videos, 1), shape.code_channels) if shape.videos else None
         inputs = self.grid.channels + (shape.code_channels if shape.videos else 0) + (FUSED_CHANNELS if fused else 0)
         self.geometry = None if fused else nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 1))

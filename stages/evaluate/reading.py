@@ -18,22 +18,28 @@ from stages.evaluate.truth import Truth
 
 
 @dataclass(frozen=True)
-class Folders:
-    """Where finished artifacts stand; per-recording ones by id."""
+class Reconstructed:
+    """Where a reconstruction stands and what it is compared with; frames by the recording's id."""
 
     frames: Mapping[str, Path]
-    masks: Mapping[str, Path]
-    flow: Mapping[str, Path]
     scene_template: Path
     agent_template: Path
+    reconstruction: Path
+    truth: Path | None
+    """None for a user's own recordings"""
+
+
+@dataclass(frozen=True)
+class Folders(Reconstructed):
+    """Where all finished artifacts stand; per-recording ones by id."""
+
+    masks: Mapping[str, Path]
+    flow: Mapping[str, Path]
     scene_localizer: Path
     registration: Path
-    reconstruction: Path
     splats: Path
     behavior_data: Path
     behavior: Path
-    truth: Path | None
-    """None for a user's own recordings"""
     clicks: Path | None = None
     """file of clicked correspondences, where there is one"""
 
@@ -68,7 +74,7 @@ class Frames:
         return self.world_from_true_world @ truth.world_from_agent @ rigid.inverse(self.agent_from_true_agent)
 
 
-def recorded(folders: Folders, videos: tuple[Video, ...]) -> list[Recorded]:
+def recorded(folders: Reconstructed, videos: tuple[Video, ...]) -> list[Recorded]:
     """Open every recording whose truth there is, in id order."""
     found = []
     for video in videos:
@@ -81,7 +87,7 @@ def recorded(folders: Folders, videos: tuple[Video, ...]) -> list[Recorded]:
     return found
 
 
-def frames_of_truth(folders: Folders, walkthrough: Recorded, turnaround: Recorded) -> Frames:
+def frames_of_truth(folders: Reconstructed, walkthrough: Recorded, turnaround: Recorded) -> Frames:
     """Fit how truth lies in our frames."""
     true_agent_from_camera = rigid.inverse(turnaround.truth.world_from_agent) @ turnaround.truth.world_from_camera
     ours = _template_cameras(folders.scene_template, "world_from_camera")

@@ -17,7 +17,7 @@ from stages.evaluate import heldout, reading, surfaces
 from stages.evaluate.alignment import PoseErrors, pose_errors
 from stages.evaluate.figures import Figures
 from stages.evaluate.heldout import Shot, View
-from stages.evaluate.reading import Folders, Frames, Recorded
+from stages.evaluate.reading import Folders, Frames, Reconstructed, Recorded
 from stages.evaluate.registration import root_figures
 from stages.evaluate.surfaces import Skin
 from stages.evaluate.truth import read_depth
@@ -46,10 +46,10 @@ def reconstruction_figures(
     figures = Figures()
     sessions = [each for each in known if each.video.role == "session"]
     motions = {each.video.id: reading.read_motion(folders.reconstruction, each.video.id) for each in sessions}
-    roots = [_root_errors(motions[each.video.id], each, frames) for each in sessions]
+    roots = [root_errors(motions[each.video.id], each, frames) for each in sessions]
     figures.add(root_figures("reconstruction", roots))
     turnaround = next(each for each in known if each.video.role == "turnaround")
-    figures.add(_tracks(folders, sessions, motions, turnaround, frames))
+    figures.add(surfaces.track_figures(track_distances(folders, sessions, motions, turnaround, frames)))
     figures.add(_agent_chamfer(folders, sessions, motions, frames, effort))
     walkthrough = next(each for each in known if each.video.role == "walkthrough")
     figures.add(_scene_chamfer(folders, walkthrough, frames, rng))
@@ -59,7 +59,7 @@ def reconstruction_figures(
 
 def _held_out(folders: Folders, phones: Sequence[Recorded], frames: Frames, effort: Effort, device: str) -> Figures:
     """Compare with what the held-out phones truly saw."""
-    seen = [(phone.video.synchronized_with, _shots(folders, phone, frames, effort.heldout_frames)) for phone in phones]
+    seen = [(phone.video.synchronized_with, shots_of(folders, phone, frames, effort.heldout_frames)) for phone in phones]
     return held_out_figures(folders, seen, device)
 
 
@@ -70,7 +70,7 @@ def held_out_figures(folders: Folders, seen: Sequence[tuple[str | None, Sequence
         motion = None if session is None else reading.read_motion(folders.reconstruction, session)
         if motion is None:
             continue
-        by_fields += _drawn_by_fields(folders, session, motion, shots, device)
+        by_fields += drawn_by_fields(folders, session, motion, shots, device)
         by_splats += _drawn_by_splats(folders, reading.read_motion(folders.splats, session) or motion, shots)
     if by_fields:
         figures.add(heldout.view_figures(by_fields))
@@ -84,12 +84,13 @@ def held_out_figures(folders: Folders, seen: Sequence[tuple[str | None, Sequence
     return figures
 
 
-def _root_errors(motion: Motion | None, each: Recorded, frames: Frames) -> PoseErrors:
+def root_errors(motion: Motion | None, each: Recorded, frames: Frames) -> PoseErrors:
+    """Compare the agent's root with truth in the frames that truly show the agent."""
     ours = np.full((len(each.clip), 4, 4), np.nan) if motion is None else motion.world_from_agent
     return pose_errors(ours, frames.roots(each.truth))[each.truth.agent_visible]
 
 
-def _shots(folders: Folders, phone: Recorded, frames: Frames, count: int) -> list[Shot]:
+def shots_of(folders: Reconstructed, phone: Recorded, frames: Frames, count: int) -> list[Shot]:
     """Return what the held-out phone saw, at its depth's resolution."""
     true, cameras, shots = read_depth(folders.truth, phone.name, phone.source_index), frames.cameras(phone.truth), []
     for frame in np.unique(np.linspace(0, len(phone.clip) - 1, count).astype(int)).tolist():
@@ -101,7 +102,7 @@ def _shots(folders: Folders, phone: Recorded, frames: Frames, count: int) -> lis
     return shots
 
 
-def _drawn_by_fields(folders: Folders, session: str, motion: Motion, shots: Sequence[Shot], device: str) -> list[View]:
+def drawn_by_fields(folders: Reconstructed, session: str, motion: Motion, shots: Sequence[Shot], device: str) -> list[View]:
     """Draw the reconstruction as the synchronized session saw it."""
     renderer, views = Renderer(fields.load(folders.reconstruction, device), session), []
     for shot in shots:
@@ -129,7 +130,7 @@ def _drawn_by_splats(folders: Folders, motion: Motion, shots: Sequence[Shot]) ->
     return views
 
 
-def _skin(folders: Folders) -> tuple[Mesh, Skin]:
+def _skin(folders: Reconstructed) -> tuple[Mesh, Skin]:
     mesh, table = (
         meshes.read_ply(folders.reconstruction / "agent.ply"),
         arrays.load(folders.reconstruction / "skin.npz"),
@@ -137,8 +138,10 @@ def _skin(folders: Folders) -> tuple[Mesh, Skin]:
     return mesh, Skin(mesh.vertices, table["weights"], table["agent_from_bone_rest"])
 
 
-def _tracks(folders: Folders, sessions: Sequence[Recorded], motions: dict, turnaround: Recorded, frames: Frames) -> Figures:
-    """Follow surface points that are matched to truth once, in the turnaround's middle frame."""
+def track_distances(
+    folders: Reconstructed, sessions: Sequence[Recorded], motions: dict, turnaround: Recorded, frames: Frames
+) -> list[np.ndarray]:
+    """Follow surface points that are matched to truth once, in the turnaround's middle frame; return distances per visible frame, metres."""
     skin = _skin(folders)[1].only(arrays.load(folders.reconstruction / "tracks.npz")["vertex_index"])
     middle = len(turnaround.clip) // 2
     true_agent_from_world = rigid.inverse(turnaround.truth.world_from_agent[middle])
@@ -151,7 +154,7 @@ def _tracks(folders: Folders, sessions: Sequence[Recorded], motions: dict, turna
             true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame)[partner])
             ours = _posed(skin, motion, frame)
             distances.append(np.full(len(partner), np.inf) if ours is None else np.linalg.norm(ours - true, axis=1))
-    return surfaces.track_figures(distances)
+    return distances
 
 
 def _posed(skin: Skin, motion: Motion | None, frame: int) -> np.ndarray | None:

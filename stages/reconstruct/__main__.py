@@ -35,6 +35,9 @@ class Config:
     """of the losses"""
     rates: Rates = Rates()
     """of learning"""
+    sessions: Literal["all", "filmed_twice"] = "all"
+    """what is reconstructed together: all registered sessions and the walk-through, or alone the first session that a
+    held-out phone filmed too (single-video baselines)"""
     ground: Literal["fused", "none"] = "fused"
     """what the scene's field learns on: fused depth, or nothing (baselines)"""
     fusion: Fusion = Fusion()
@@ -53,7 +56,8 @@ def run(task: cli.Task) -> None:
     per_video = {name: task.per_video(name, roles.get(name)) for name in names}
     folders = reading.Folders(**per_video, **{name: task.input(name) for name in ("registration", "scene_template", "agent_template")})
     by_role = {video.role: video.id for video in task.videos}
-    videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed)
+    twice = [video.synchronized_with for video in task.videos if video.role == "heldout"] if config.sessions == "filmed_twice" else None
+    videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed, twice)
     fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion) if config.ground == "fused" else None
     problem = assemble.build(videos, reading.read_template(folders.agent_template), config.shapes, config.seed, task.device, fused)
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(problem.store.scene)} scene rays, {len(problem.store.agent)} agent rays")

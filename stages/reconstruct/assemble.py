@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -57,6 +58,10 @@ class Shapes:
     """cells of the agent's grids"""
     grid_channels: int = 4
     """channels of each grid"""
+    encoding: Literal["grid", "mlp"] = "grid"
+    """what the fields read places from: grids, or the paper's plain network"""
+    code_channels: int = 8
+    """numbers of each video's code of the scene; 0 = one scene for all videos, without codes (baselines)"""
     width: int = 64
     """units of each head's hidden layer"""
     truncation_m: float = 0.08
@@ -86,8 +91,10 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
             shapes.scene_voxel_m,
             shapes.grid_channels,
             shapes.width,
-            sum(v.has_scene for v in videos),
+            sum(v.has_scene for v in videos) if shapes.code_channels else 0,
+            shapes.code_channels,
             truncation_m=fused.truncation_m if fused else shapes.truncation_m,
+            encoding=shapes.encoding,
         ),
         free_m=-0.03,
         fused=fused,
@@ -96,7 +103,7 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     low, high = (
         tuple(float(x) for x in corner) for corner in (vertices.min(0) - shapes.agent_margin_m, vertices.max(0) + shapes.agent_margin_m)
     )
-    agent_shape = FieldShape(low, high, shapes.agent_voxel_m, shapes.grid_channels, shapes.width)
+    agent_shape = FieldShape(low, high, shapes.agent_voxel_m, shapes.grid_channels, shapes.width, encoding=shapes.encoding)
     rest = torch.from_numpy(template.agent_from_bone_rest).float()
     by_frame = RaysByFrame.of(store.agent, len(camera))
     usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]

@@ -49,7 +49,7 @@ def rendered_terms(problem: Problem, pose: Pose, number: int, probability: float
     points_camera = rays.direction[:, None] * depth[..., None]
     world = rigid_torch.apply(pose.world_from_camera, points_camera.view(frames, -1, 3)).view(len(rays), samples, 3)
     has_scene = problem.has_scene[rays.frame]
-    video = problem.video[rays.frame].clamp_max(problem.scene.shape.videos - 1)
+    video = torch.where(has_scene, problem.video[rays.frame], 0)
     scene = scene_layer(problem, world, video, swap(video, problem.scene.shape.videos, probability, generator))
     scene = Layer(scene.density * has_scene[:, None], scene.color, scene.feature)
     points_agent = rigid_torch.apply(pose.agent_from_camera, points_camera.view(frames, -1, 3))

@@ -114,8 +114,9 @@ class _Learned(nn.Module):
 
 
 def _field_groups(field: nn.Module, rates: Rates) -> list[dict]:
-    grid = list(field.grid.parameters())
-    heads = [parameter for name, parameter in field.named_parameters() if not name.startswith("grid.")]
+    """Grids learn fast; whatever is a network, the encoding too where it is one, learns like the heads."""
+    heads = [parameter for name, parameter in field.named_parameters() if not name.startswith("grid.levels.")]
+    grid = [parameter for name, parameter in field.named_parameters() if name.startswith("grid.levels.")]
     return [
         {"params": grid, "lr": rates.grid, "weight_decay": 0.0, "betas": (0.9, 0.99)},
         {"params": heads, "lr": rates.heads, "weight_decay": 1e-4},

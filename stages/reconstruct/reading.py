@@ -1,6 +1,6 @@
 """Open what the stage reads: the recordings with their poses, and the agent template."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,14 +29,19 @@ class Folders:
     agent_template: Path
 
 
-def read_videos(folders: Folders, walkthrough: str, turnaround: str, sampling: Sampling, seed: int) -> list[Video]:
+def read_videos(
+    folders: Folders, walkthrough: str, turnaround: str, sampling: Sampling, seed: int, only: Collection[str | None] | None = None
+) -> list[Video]:
     """Read the walk-through, the turnaround and every registered session once into rays with their poses.
 
+    With ``only``, the first registered one of these sessions stands alone, with the turnaround that made its template.
     Raises `InputError` RCN-001 when no session was registered.
     """
-    sessions = [id for id in sorted(folders.frames) if (folders.registration / id / "poses.npz").exists()]
+    sessions = [id for id in sorted(folders.frames) if (folders.registration / id / "poses.npz").exists() and (only is None or id in only)]
     if not sessions:
         raise InputError("RCN-001", "no session was registered", str(folders.registration), "see registration/summary.json for the reasons")
+    if only is not None:
+        return [_turnaround(turnaround, folders, sampling, seed), _session(sessions[0], folders, sampling, seed)]
     videos = [_walkthrough(walkthrough, folders, sampling, seed), _turnaround(turnaround, folders, sampling, seed)]
     return videos + [_session(id, folders, sampling, seed) for id in progress.track(sessions, "reading sessions")]
 

@@ -26,7 +26,9 @@ def swap_probability(progress: float, batches: Batches) -> float:
 
 
 def swap(video: Int[Tensor, "ray"], videos: int, probability: float, generator: Generator) -> Int[Tensor, "ray"]:
-    """Replace the code's index by another video's with some probability (paper 001, scene annealing)."""
+    """Replace the code's index by another video's with some probability (paper 001, scene annealing); without codes nothing changes."""
+    if not videos:
+        return video
     other = torch.randint(videos, video.shape, generator=generator).to(video.device)
     return torch.where((torch.rand(video.shape, generator=generator) < probability).to(video.device), other, video)
 

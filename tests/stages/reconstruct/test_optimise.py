@@ -1,5 +1,7 @@
 """A ball in a box, seen by a moving camera: the phases find both, and a killed run ends with the same bits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -79,7 +81,7 @@ def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
     return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
 
 
-def problem():
+def problem(shapes: Shapes = SHAPES):
     rng = np.random.default_rng(0)
     videos = [film("v002", 12, True, rng), film("v001", 6, False, rng, UPRIGHT)]
     ball = trimesh.creation.icosphere(2, RADIUS_M)
@@ -88,7 +90,7 @@ def problem():
     feature[:, 0] = 1
     rest = rigid.make(np.tile(np.eye(3), (6, 1, 1)), 0.1 * np.concatenate([np.eye(3), -np.eye(3)]))
     template = Template(mesh, feature, rest, np.full((6, 3), 0.1))
-    return assemble.build(videos, template, SHAPES, 0, "cpu"), videos
+    return assemble.build(videos, template, shapes, 0, "cpu"), videos
 
 
 def plan(resume=None, **steps) -> optimise.Plan:
@@ -136,6 +138,18 @@ def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
     torch.testing.assert_close(back.agent(points).color, found.agent(points).color.detach())
     torch.testing.assert_close(back.body.weights(points), found.body.weights(points).detach())
     assert back.videos == ("v002",) and back.video_code(None) == -1
+
+
+def test_plain_networks_without_codes_learn_and_come_back(tmp_path):
+    """The rivals of Table 3 take the same way: waves of the place instead of grids, one scene for all videos."""
+    found, videos = problem(replace(SHAPES, encoding="mlp", code_channels=0))
+    records = optimise.optimise(found, plan(template=30, scene=30, body=2, joint=2))
+    total = records["scene"].total()
+    assert np.isfinite(records["joint"].total()).all() and total[-5:].mean() < 0.6 * total[:3].mean()
+    assert found.scene.codes is None and not hasattr(found.scene.grid, "levels")
+    fields.save(tmp_path, Reconstruction(found.scene, found.agent, found.body, assemble.scene_ids(videos)))
+    points = torch.rand(20, 3)
+    torch.testing.assert_close(fields.load(tmp_path).scene(points).signed_distance, found.scene(points).signed_distance.detach())
 
 
 def test_volume_tells_free_surface_and_unseen(solved):
