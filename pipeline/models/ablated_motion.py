@@ -22,8 +22,8 @@ class Kind:
     """see the scene"""
     route_turns: bool = True
     """RouteNet predicts orientations; else PoseNet does"""
-    route_blind: bool = False
-    """RouteNet sees positions and orientations only, as in the paper"""
+    paper: bool = False
+    """RouteNet sees positions and orientations only; PoseNet has no `Strides` and learns along RouteNet's routes"""
     follows: bool = True
     """PoseNet is given the route"""
     one: bool = False
@@ -32,7 +32,7 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     "ours_no_scene": Kind(seeing=False),
-    "ours_route_blind": Kind(route_blind=True),
+    "as_paper": Kind(paper=True),
     "route_t_pose": Kind(route_turns=False, follows=False),
     "route_t_pose_no_scene": Kind(seeing=False, route_turns=False, follows=False),
     "route_tr_pose": Kind(follows=False),
@@ -68,8 +68,9 @@ def build(kind: Kind, sizes: Sizes) -> Ablated:
     """Make untrained networks."""
     if kind.one:
         return Ablated(None, None, BaseNet(sizes, seeing=kind.seeing))
-    route = RouteNet(sizes, seeing=kind.seeing, turns=kind.route_turns, blind=kind.route_blind)
-    return Ablated(route, PoseNet(sizes, seeing=kind.seeing, follows=kind.follows, turns=not kind.route_turns), None)
+    route = RouteNet(sizes, seeing=kind.seeing, turns=kind.route_turns, blind=kind.paper)
+    pose = PoseNet(sizes, seeing=kind.seeing, follows=kind.follows, turns=not kind.route_turns, strides=not kind.paper)
+    return Ablated(route, pose, None)
 
 
 def load(path: Path, kind: Kind, sizes: Sizes) -> Ablated:

@@ -82,10 +82,24 @@ def encode_clips(
     return Clips(world_from_clip, torch.cat([root, p], dim=-1), seen, scene)
 
 
-def decode_clip(channels: Float[Tensor, "frame channel"], world_from_clip: Float[np.ndarray, "4 4"], poses: PoseSpace) -> Moving:
-    """Turn channels of one clip, or of one body, into motion in the world."""
+def decode_clip(
+    channels: Float[Tensor, "frame channel"],
+    world_from_clip: Float[np.ndarray, "4 4"],
+    poses: PoseSpace,
+    ends: Float[np.ndarray, "2 bone 4 4"] | None = None,
+) -> Moving:
+    """Turn channels of one clip, or of one body, into motion in the world.
+
+    What p leaves out of the given poses ``ends`` is added, from the first's to the last's, so that the motion begins and
+    ends in just these.
+    """
     with torch.no_grad():
-        bones = poses.bones(poses.decode(channels[..., ROOT:]))
+        posed = poses.decode(channels[..., ROOT:])
+        if ends is not None:
+            given = torch.from_numpy(channels_from_bones(np.asarray(ends, np.float64), poses.rest.double().numpy())).float()
+            left = given - poses.decode(poses.encode(given))
+            posed = posed + torch.lerp(left[0], left[1], torch.linspace(0, 1, len(channels))[:, None])
+        bones = poses.bones(posed)
         clip_from_agent = rigid_torch.make(rigid_torch.rotation_from_6d(channels[..., 3:ROOT]), channels[..., :3])
     return Moving(world_from_clip @ clip_from_agent.double().numpy(), bones.double().numpy())
 

@@ -83,6 +83,7 @@ def planted(
     height_m: Float[np.ndarray, "frame foot"],
     root_world: Float[np.ndarray, "frame 3"],
     *,
+    treading: bool = False,
     lifted_m: float = 0.03,
     rate_hz: float = RATE_HZ,
 ) -> Bool[np.ndarray, "frame foot"]:
@@ -90,13 +91,17 @@ def planted(
 
     ``height_m`` is the foot's distance from the scene. The paper lets the foot that moves less between two frames stand;
     an animal has more than two, so others stand too that are clearly slower than the body. Blinks under 0.1 s do not count.
+    ``treading`` tells instead which feet should stand, in motion that glides: of those near the scene the one that moves
+    least, however fast, as in the paper, and any that falls behind the body.
     """
     foot = _speed(centres_world, rate_hz)
     body = _speed(root_world[:, None], rate_hz)
     even = ndimage.uniform_filter1d(foot, max(1, round(rate_hz / 6)), axis=0, mode="nearest")
     low = height_m < np.percentile(height_m, 20, axis=0, keepdims=True).clip(-0.02, 0.02) + lifted_m
     least = np.where(low, even, np.inf)
-    slow = (foot < np.maximum(0.4 * body, 0.08)) | ((least == least.min(1, keepdims=True)) & (even < 0.6 * body))
+    least = least == least.min(axis=1, keepdims=True)
+    slow = foot < np.maximum(0.4 * body, 0.08)
+    slow |= (least | (even < 0.8 * body)) if treading else (least & (even < 0.6 * body))
     both = ndimage.binary_closing(slow & low, np.ones((3, 1)))
     return ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
 

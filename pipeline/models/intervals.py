@@ -1,4 +1,4 @@
-"""Intervals for means over overlapping windows: whole episodes are drawn again, not single windows."""
+"""Intervals for means and medians over overlapping windows: whole episodes are drawn again, not single windows."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its 95 % interval."""
+    """A mean, or a median, and its 95 % interval."""
 
     mean: float
     low: float
@@ -20,11 +20,16 @@ def episodes(start: Int[np.ndarray, "window"], video: Int[np.ndarray, "window"],
     return np.unique(np.stack([video, start // frames], axis=1), axis=0, return_inverse=True)[1].ravel()
 
 
-def bootstrapped(values: Float[np.ndarray, "window"], episode: Int[np.ndarray, "window"], draws: int, rng: np.random.Generator) -> Interval:
-    """Resample episodes with replacement and return the mean with its percentiles 2.5 and 97.5."""
+def bootstrapped(
+    values: Float[np.ndarray, "window"], episode: Int[np.ndarray, "window"], draws: int, rng: np.random.Generator, *, median: bool = False
+) -> Interval:
+    """Resample episodes with replacement and return the mean, or the median, with its percentiles 2.5 and 97.5."""
     count = episode.max() + 1
-    total = np.bincount(episode, values, count)
-    size = np.bincount(episode, minlength=count)
     chosen = rng.integers(0, count, (draws, count))
-    means = total[chosen].sum(1) / size[chosen].sum(1)
-    return Interval(float(values.mean()), *(float(bound) for bound in np.percentile(means, (2.5, 97.5))))
+    if median:
+        parts = [values[episode == number] for number in range(count)]
+        drawn = [np.median(np.concatenate([parts[number] for number in row])) for row in chosen]
+    else:
+        drawn = np.bincount(episode, values, count)[chosen].sum(1) / np.bincount(episode, minlength=count)[chosen].sum(1)
+    middle = float(np.median(values) if median else values.mean())
+    return Interval(middle, *(float(bound) for bound in np.percentile(drawn, (2.5, 97.5))))

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.models.short_motions import STEPS
+from pipeline.models.bodies import LEVER_M
+from pipeline.models.short_motions import RATE_HZ, STEPS
 from pipeline.space import rigid_torch
 
 ROOT = 9
@@ -22,6 +23,9 @@ REACH_M = 1.5
 """scene points of a clip come from this far around the middle between start and end"""
 BODY_REACH_M = 0.8
 """scene points of a static body come from this far around it"""
+
+IDLE_M_S = 0.1
+"""a body slower than this hardly counts as on the move"""
 
 
 @dataclass(frozen=True)
@@ -126,11 +130,12 @@ class Between(nn.Module):
         parts = [line, both, share, 4 * share * (1 - share)] + ([] if extra is None else [extra])
         features, _ = self.lstm(torch.cat(parts, dim=-1))
         code = self.point_net(points)[:, None].expand(-1, STEPS + 1, -1)
-        return line + _ends_open(share) * self.out(torch.cat([features, code], dim=-1))
+        return line + ends_open(line) * self.out(torch.cat([features, code], dim=-1))
 
 
-def _ends_open(share: Float[Tensor, "batch frame 1"]) -> Float[Tensor, "batch frame 1"]:
-    """A factor that is 0 at both ends and near 1 from a tenth of a second on."""
+def ends_open(like: Float[Tensor, "batch frame channel"]) -> Float[Tensor, "frame 1"]:
+    """Return a factor for every frame of a short motion that is 0 at both ends and near 1 from a tenth of a second on."""
+    share = torch.linspace(0, 1, STEPS + 1, dtype=like.dtype, device=like.device)[:, None]
     return torch.tanh(STEPS / 3 * share) * torch.tanh(STEPS / 3 * (1 - share))
 
 
@@ -164,13 +169,50 @@ class RouteNet(nn.Module):
         return rotations_of(route)
 
 
-class PoseNet(nn.Module):
-    """Poses between start and end along a route (Eq. 2); blind to the route, or also turning the body, as variants."""
+class Strides(nn.Module):
+    """The poses of both ends, each taken along the route as a gait takes it: around and around with the way and the time on the move.
 
-    def __init__(self, sizes: Sizes, *, seeing: bool = True, follows: bool = True, turns: bool = False):
+    A pose is read as ``waves`` complex numbers that turn at learned rates; products of pose and phase are what an LSTM learns
+    slowly, and without them feet glide between the ends.
+    """
+
+    def __init__(self, pose: int, waves: int = 16):
+        super().__init__()
+        self.code = nn.Linear(pose, 2 * waves)
+        step = torch.linspace(0, 1, waves)
+        self.rate = nn.Parameter(2 * torch.pi * torch.stack([0.4 + 2 * step, 0.4 + 2 * ((7 * step) % 1), 0 * step], dim=-1))
+
+    @property
+    def channels(self) -> int:
+        """How many numbers a frame gets."""
+        return 2 * self.code.out_features
+
+    def forward(
+        self, start: Float[Tensor, "batch pose"], end: Float[Tensor, "batch pose"], route: Float[Tensor, "batch frame 9"]
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return start turned forward and end turned backward."""
+        phase = gait_way(route) @ self.rate.T
+        return torch.cat([self._turned(start, phase), self._turned(end, phase - phase[:, -1:])], dim=-1)
+
+    def _turned(self, pose: Float[Tensor, "batch pose"], phase: Float[Tensor, "batch frame wave"]) -> Float[Tensor, "batch frame channel"]:
+        real, imaginary = self.code(pose)[:, None].chunk(2, dim=-1)
+        cosine, sine = torch.cos(phase), torch.sin(phase)
+        return torch.cat([real * cosine - imaginary * sine, real * sine + imaginary * cosine], dim=-1)
+
+
+class PoseNet(nn.Module):
+    """Poses between start and end along a route (Eq. 2); blind to the route, or also turning the body, as variants.
+
+    Beyond the paper it carries the poses of both ends along the route (`Strides`); not where ``strides`` is false.
+    """
+
+    def __init__(self, sizes: Sizes, *, seeing: bool = True, follows: bool = True, turns: bool = False, strides: bool = True):
         super().__init__()
         self.follows, self.turns = follows, turns
-        self.between = Between(sizes.pose + (6 if turns else 0), 2 * ROOT if follows else 0, sizes, seeing)
+        self.strides = Strides(sizes.pose) if follows and strides else None
+        extra = 2 * ROOT * follows + (self.strides.channels if self.strides is not None else 0)
+        self.between = Between(sizes.pose + (6 if turns else 0), extra, sizes, seeing)
+        self.short = nn.Linear(self.strides.channels, sizes.pose) if self.strides is not None else None
 
     def forward(
         self,
@@ -182,7 +224,12 @@ class PoseNet(nn.Module):
         """Return t, r and p of all frames: the route's, with the poses and, as a variant, the turns."""
         if self.turns:
             start, end = torch.cat([route[:, 0, 3:], start], -1), torch.cat([route[:, -1, 3:], end], -1)
-        made = self.between(start, end, points, along(route) if self.follows else None)
+        if self.strides is None:
+            made = self.between(start, end, points, along(route) if self.follows else None)
+        else:
+            carried = self.strides(start, end, route)
+            made = self.between(start, end, points, torch.cat([along(route), carried], dim=-1))
+            made = made + ends_open(made) * self.short(carried)
         if self.turns:
             return rotations_of(torch.cat([route[..., :3], made], dim=-1))
         return torch.cat([route, made], dim=-1)
@@ -193,6 +240,16 @@ def along(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 1
     rate = functional.pad(route[:, 1:] - route[:, :-1], (0, 0, 0, 1), mode="replicate") * (STEPS / 20)
     own = rigid_torch.rotation_from_6d(route[..., 3:]).transpose(-1, -2)
     return torch.cat([route, (own @ rate[..., :3, None])[..., 0], rate[..., 3:]], dim=-1)
+
+
+def gait_way(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 3"]:
+    """Return how far a gait has come since the start: metres gone, seconds on the move, and turns of the heading."""
+    gone = (route[:, 1:, :3] - route[:, :-1, :3])[..., [0, 2]].norm(dim=-1)
+    ahead = rigid_torch.rotation_from_6d(route[..., 3:])[..., 2]
+    turned = (ahead[:, 1:] - ahead[:, :-1]).norm(dim=-1)
+    drive = RATE_HZ * (gone + LEVER_M * turned)
+    steps = torch.stack([gone, drive / (drive + IDLE_M_S) / RATE_HZ, turned], dim=-1)
+    return functional.pad(steps.cumsum(1), (0, 0, 1, 0))
 
 
 class BaseNet(nn.Module):

@@ -1,4 +1,4 @@
-"""Make a motion physical: feet that stand do not slide, nothing is inside furniture, what touches keeps touching.
+"""Make a motion physical: feet that stand or should do not slide, nothing is inside furniture, what touches keeps touching.
 
 `optimise` moves positions, orientations and poses of all frames at once by Adam (Wang et al. 2021, Sec. 3.4). The same
 function with the same `Settings` serves long-term motion, samples of the behaviour model and reconstructed motion.
@@ -29,7 +29,7 @@ class Settings:
     """steps of Adam"""
     rate: float = 0.004
     """learning rate, metres and radians a step; falls to a tenth"""
-    foot: float = 40.0
+    foot: float = 120.0
     """a standing foot stays where it stands on average"""
     collision: float = 20.0
     """nothing is inside the scene"""
@@ -87,7 +87,7 @@ def optimise(
     held: Bool[np.ndarray, "frame"] | None = None,
 ) -> Moving:
     """Return the motion with all constraints weighed against each other; ``held`` frames stay as they are."""
-    stance = Judge(physique.body, physique.contacts, scene).stance(moving, rate_hz)
+    stance = Judge(physique.body, physique.contacts, scene).stance(moving, rate_hz, treading=True)
     chosen = physique.body.spread(settings.vertices)
     count = len(chosen)
     surface = PosedSurface(physique.body, np.concatenate([chosen, physique.contacts.vertices]))

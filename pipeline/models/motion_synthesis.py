@@ -120,7 +120,9 @@ class LongTerm:
         p = torch.stack([pose_channels(each.agent_from_bone, self.poses) for each in (start, end)], dim=1)
         ends = encode_clips(root, p, np.zeros(len(root), int), [scene], self.sizes.points, rng)
         made = self.between(ends.channels[:, 0], ends.channels[:, 1], ends.points)
-        return [decode_clip(channels, frame, self.poses) for channels, frame in zip(made, ends.world_from_clip, strict=True)]
+        bones = np.stack([start.agent_from_bone, end.agent_from_bone], axis=1)
+        parts = zip(made, ends.world_from_clip, bones, strict=True)
+        return [decode_clip(channels, frame, self.poses, given) for channels, frame, given in parts]
 
     def between(
         self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], points: Float[Tensor, "clip point 3"]

@@ -47,11 +47,11 @@ class Judge:
     contacts: Contacts
     scene: SignedDistance
 
-    def stance(self, motion: Moving, rate_hz: float = RATE_HZ) -> Bool[np.ndarray, "frame foot"]:
-        """Tell which feet stand when."""
+    def stance(self, motion: Moving, rate_hz: float = RATE_HZ, *, treading: bool = False) -> Bool[np.ndarray, "frame foot"]:
+        """Tell which feet stand when, or with ``treading`` which should."""
         points = PosedSurface(self.body, self.contacts.vertices)(*tensors(motion))
         centres, height = self.contacts.centres(points), _lowest(self.scene.at(points), self.contacts)
-        return planted(centres.numpy(), height.numpy(), motion.world_from_agent[:, :3, 3], rate_hz=rate_hz)
+        return planted(centres.numpy(), height.numpy(), motion.world_from_agent[:, :3, 3], treading=treading, rate_hz=rate_hz)
 
     def fit_of(self, motion: Moving) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
         """Return, per frame, the gap between the body and the scene, and its deepest vertex inside the scene, metres."""

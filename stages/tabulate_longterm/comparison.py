@@ -38,12 +38,13 @@ def figures(prefix: str, source: Source, c: Any, *, only: str | None = None) -> 
     found = tables.figures(rows, episode, prefix, draws=c.draws, seed=c.seed)
     for name, method in methods.methods(source.models, lives, c.seed).items():
         made = method(clips)
-        plain = scores.scores(made, clips, known, model, None)
+        rows[name] = plain = scores.scores(made, clips, known, model, None)
         found |= tables.figures({name: plain}, episode, prefix, draws=c.draws, seed=c.seed)
         if name in methods.OPTIMISED and only is None:
             done = scores.scores(made[some], clips[some], [known[index] for index in some], model, c.optimisation)
             found |= tables.figures({f"{name}_opt": done, f"{name}_same": plain[some]}, episode[some], prefix, draws=c.draws, seed=c.seed)
-    return found
+    more = {f"{name}_beyond_ours": rows[name] - rows["ours"] for name in methods.RIVALS}
+    return found | tables.figures(more, episode, prefix, draws=c.draws, seed=c.seed)
 
 
 def minutes(source: Source, length: Length, c: Any) -> dict[str, float | None]:

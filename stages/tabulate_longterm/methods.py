@@ -18,6 +18,8 @@ Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """From clips, of which only first and last frames and the scene may be looked at, to all frames"""
 OPTIMISED = ("ours", "base", "route_cvae", "nearest")
 """Methods that are also judged after the optimisation."""
+RIVALS = ("base", "route_cvae", "nearest", "ours_no_scene")
+"""Methods whose errors beyond ours are told clip by clip, with intervals."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ QUALITY = {
     "bad": "a rival ahead, feet that slide, bodies inside furniture",
 }
 RIVALS = ("base", "route_cvae", "nearest")
+TRUE = "truth"
 
 
 def checks(figures: Mapping[str, float | None]) -> list[Check]:
@@ -33,7 +34,10 @@ def checks(figures: Mapping[str, float | None]) -> list[Check]:
         Check("contact, optimised", of("longterm/ours_opt/contact"), "share", 0.97, better="higher"),
         Check("foot slide, optimised", of("longterm/ours_opt/slide_m_s"), "m/s", 0.01),
         Check("MPVPE, optimised against not", ratio("longterm/ours_opt/mpvpe_mm", "longterm/ours_same/mpvpe_mm"), "", 1.2),
-        Check("neighbour v2v, optimised", of("longterm/ours_opt/neighbour_v2v_share"), "of body length", 0.006),
+        Check("distance of the ends from the given bodies, optimised", of("longterm/ours_opt/end_v2v_share"), "of body length", 0.006),
+        Check(
+            "neighbour v2v against true motion's", ratio("longterm/ours_opt/neighbour_v2v_mm", f"longterm/{TRUE}/neighbour_v2v_mm"), "", 1.0
+        ),
         Check("samples: penetration left", ratio("longterm_samples/penetration_m", "longterm_samples/penetration_before_m"), "", 0.5),
         Check("samples: slide left", ratio("longterm_samples/slide_m_s", "longterm_samples/slide_before_m_s"), "", 0.5),
         Check(

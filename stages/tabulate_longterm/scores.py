@@ -17,13 +17,20 @@ from pipeline.models.plausibility import Judge
 from pipeline.models.short_motions import Moving
 
 METRICS = (
-    "translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm", "neighbour_v2v_mm", "neighbour_v2v_share",
-    "non_collision", "contact", "penetration_mm", "slide_m_s", "least_slide_m_s",
+    "translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm", "end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share",
+    "non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "least_slide_m_s",
 )  # fmt: skip
 """translation, orientation, pose: L1 x 100 of root position (m), of its rotation's first two columns, of the bones' channels
-(rad, m). MPJPE: origins of the bones. MPVPE: all vertices. neighbour v2v: distance of the first and last mesh from the
-given ones; its share of the body's length. Slide: median speed of
-standing feet in that clip; least slide: of the foot that moves least."""
+(rad, m). MPJPE: origins of the bones. MPVPE: all vertices. end v2v: distance of the first and last mesh from the given ones,
+where one short motion joins the next. neighbour v2v: distance from the given ends to the made meshes one frame further in, which
+the true motion has too, as it moves (the paper says the first and, by its figure for true motion, measures the second). Share:
+of the body's length. Slide: median speed of standing
+feet in that clip; planted: share of frames in which any foot stands; least slide: speed of the foot that moves least."""
+MEDIANS = ("slide_m_s", "least_slide_m_s")
+"""Metrics of which the tables give the median over clips, not the mean."""
+
+
+ENDS, NEXT_TO_ENDS = np.array([0, -1]), np.array([1, -2])
 
 
 @dataclass(frozen=True)
@@ -38,9 +45,10 @@ class Reference:
 def score(made: Moving, reference: Reference, poses: PoseSpace) -> Float[np.ndarray, "metric"]:
     """Measure one short motion; the feet that stand are those of the made motion itself."""
     body, truth = reference.judge.body, reference.truth
-    worth = reference.judge.plausibility(made, reference.judge.stance(made))
+    stance = reference.judge.stance(made)
+    worth = reference.judge.plausibility(made, stance)
     apart = _apart(made, truth, body)
-    ends = float(apart[[0, -1]].mean())
+    beside = float(_apart(made[NEXT_TO_ENDS], truth[ENDS], body).mean())
     turn = np.abs(made.world_from_agent - truth.world_from_agent)[:, :3, :2].mean()
     joints = [each.world_from_agent[:, None] @ each.agent_from_bone for each in (made, truth)]
     rest = poses.rest.double().numpy()
@@ -52,12 +60,14 @@ def score(made: Moving, reference: Reference, poses: PoseSpace) -> Float[np.ndar
             100 * pose,
             1000 * np.linalg.norm((joints[0] - joints[1])[..., :3, 3], axis=-1).mean(),
             1000 * float(apart.mean()),
-            1000 * ends,
-            ends / body.length_m,
+            float(apart[ENDS].mean()) / body.length_m,
+            1000 * beside,
+            beside / body.length_m,
             worth.non_collision,
             worth.contact,
             1000 * worth.penetration_m,
             worth.slide_m_s,
+            stance.any(axis=1).mean(),
             worth.least_slide_m_s,
         ]
     )
@@ -66,12 +76,13 @@ def score(made: Moving, reference: Reference, poses: PoseSpace) -> Float[np.ndar
 def scores(
     channels: Float[Tensor, "clip frame channel"], clips: Clips, references: list[Reference], model: LongTerm, settings: Settings | None
 ) -> Float[np.ndarray, "clip metric"]:
-    """Measure the motions of one method on all clips, after the optimisation where ``settings`` are given."""
+    """Measure the motions of one method on all clips, after the optimisation of all but the ends where ``settings`` are given."""
     rows = []
     for made, frame, reference in zip(channels, clips.world_from_clip, references, strict=True):
-        moving = decode_clip(made, frame, model.poses)
+        moving = decode_clip(made, frame, model.poses, reference.truth[ENDS].agent_from_bone)
         if settings is not None:
-            moving = optimise(moving, model.physique(reference.judge.body), reference.judge.scene, settings)
+            held = np.isin(np.arange(len(moving)), (0, len(moving) - 1))
+            moving = optimise(moving, model.physique(reference.judge.body), reference.judge.scene, settings, held=held)
         rows.append(score(moving, reference, model.poses))
     return np.array(rows).reshape(-1, len(METRICS))
 

@@ -6,17 +6,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.models.intervals import bootstrapped
-from stages.tabulate_longterm.scores import METRICS
+from stages.tabulate_longterm.scores import MEDIANS, METRICS
 
 TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
-TABLE_2 = ("non_collision", "contact", "penetration_mm", "slide_m_s", "least_slide_m_s")
-TABLE_4 = ("neighbour_v2v_mm", "neighbour_v2v_share")
+TABLE_2 = ("non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "least_slide_m_s")
+TABLE_4 = ("end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share")
 
 
 def figures(
     rows: Mapping[str, Float[np.ndarray, "clip metric"]], episode: Int[np.ndarray, "clip"], prefix: str, *, draws: int, seed: int
 ) -> dict[str, float | None]:
-    """Return mean and 95 % interval (drawn over episodes) of every metric of every method; None where it cannot be measured."""
+    """Return mean (of `MEDIANS` the median) and 95 % interval, drawn over episodes, of every metric of every method.
+
+    None where it cannot be measured.
+    """
     found: dict[str, float | None] = {}
     for method, values in rows.items():
         for metric, column in zip(METRICS, values.T, strict=True):
@@ -25,7 +28,7 @@ def figures(
                 found |= {name: None, f"{name}_ci95_low": None, f"{name}_ci95_high": None}
                 continue
             groups = np.unique(episode[: len(column)][known], return_inverse=True)[1]
-            told = bootstrapped(column[known], groups, draws, np.random.default_rng(seed))
+            told = bootstrapped(column[known], groups, draws, np.random.default_rng(seed), median=metric in MEDIANS)
             found |= {name: told.mean, f"{name}_ci95_low": told.low, f"{name}_ci95_high": told.high}
     return found
 

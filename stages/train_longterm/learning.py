@@ -48,7 +48,7 @@ def learn(lives: Lives, settings: Any, *, resume: Path | None = None) -> Learned
     records = {
         "static": training.fit_body(nets["static"], stills, lives, contacts, trainer, settings.body),
         "route": training.fit_route(nets["route"], clips, trainer, settings.route),
-        "pose": training.fit_pose(nets["pose"], nets["route"], clips, trainer, settings.pose),
+        "pose": training.fit_pose(nets["pose"], training.true_routes(clips), clips, trainer, settings.pose),
     }
     scenes = [lives.scenes[index] for index in lives.scene_of]
     model = LongTerm(settings.sizes, poses, contacts, habits_of(list(lives.stretches), scenes), **nets)
@@ -64,12 +64,13 @@ def learn_ablations(clips: Clips, trainer: Trainer, settings: Any, route: RouteN
         if made.base is not None:
             training.fit_base(made.base, clips, trainer, settings.pose, name)
         else:
-            key = (kind.seeing, kind.route_turns, kind.route_blind)
+            key = (kind.seeing, kind.route_turns, kind.paper)
             if key not in routes:
                 training.fit_route(made.route, clips, trainer, settings.route, f"{name}_route")
                 routes[key] = made.route
             made.route.load_state_dict(routes[key].state_dict())
-            training.fit_pose(made.pose, made.route, clips, trainer, settings.pose, f"{name}_pose")
+            along = training.made_routes(made.route, clips) if kind.paper else training.true_routes(clips)
+            training.fit_pose(made.pose, along, clips, trainer, settings.pose, f"{name}_pose")
         trained[name] = made.eval()
     return trained
 

@@ -1,4 +1,4 @@
-"""Fit the networks of long-term motion one after the other: static bodies, routes, then poses with the routes held."""
+"""Fit the networks of long-term motion one after the other: static bodies, routes, then poses along routes that are held."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,13 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor, nn
 
 from pipeline.fit import FitRecord, fit
 from pipeline.models.bodies import PosedSurface, PoseSpace
 from pipeline.models.clip_channels import Clips
 from pipeline.models.contacts import Contacts
-from pipeline.models.longterm import ROOT, BaseNet, PoseNet, RouteNet, StaticBody
+from pipeline.models.longterm import ROOT, BaseNet, PoseNet, RouteNet, StaticBody, rotations_of
 from pipeline.models.longterm_examples import Bodies, Lives
 from stages.train_longterm import objectives
 
@@ -92,16 +94,29 @@ def fit_route(net: RouteNet, clips: Clips, trainer: Trainer, pace: Pace, name: s
     return trainer.fitted(name, net, pace, loss, len(clips))
 
 
-def fit_pose(net: PoseNet, route_net: RouteNet, clips: Clips, trainer: Trainer, pace: Pace, name: str = "pose") -> FitRecord:
-    """Fit a PoseNet along the routes of a RouteNet that is held (Eq. 4)."""
-    w, lever = trainer.weights, objectives.lever_of(trainer.poses)
+def made_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:
+    """Return the routes that a RouteNet makes, which the paper's PoseNet learns along."""
     with torch.no_grad():
         ends, batches = clips.channels[:, [0, -1]], torch.arange(len(clips)).split(256)
-        route = torch.cat([route_net(ends[rows, 0], ends[rows, 1], clips.points[rows]) for rows in batches])
+        return torch.cat([net(ends[rows, 0], ends[rows, 1], clips.points[rows]) for rows in batches])
+
+
+def true_routes(clips: Clips, smooth_frames: float = 4.0) -> Float[Tensor, "clip frame 9"]:
+    """Return the true routes, as smooth as made ones: along routes that are off, poses that fit none of them would be learned."""
+    route = clips.channels[..., :ROOT]
+    even = torch.from_numpy(gaussian_filter1d(route.numpy(), smooth_frames, axis=1, mode="nearest"))
+    return rotations_of(torch.cat([route[:, :1], even[:, 1:-1], route[:, -1:]], dim=1))
+
+
+def fit_pose(
+    net: PoseNet, routes: Float[Tensor, "clip frame 9"], clips: Clips, trainer: Trainer, pace: Pace, name: str = "pose"
+) -> FitRecord:
+    """Fit a PoseNet along routes that are held (Eq. 4)."""
+    w, lever = trainer.weights, objectives.lever_of(trainer.poses)
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
-        made = net(truth[:, 0, ROOT:], truth[:, -1, ROOT:], route[index], clips.points[index])
+        made = net(truth[:, 0, ROOT:], truth[:, -1, ROOT:], routes[index], clips.points[index])
         terms = {"pose": w.pose * objectives.pose_error(made[..., ROOT:], truth[..., ROOT:], lever)}
         return terms | ({"rotation": w.rotation * objectives.route_error(made[..., :ROOT], truth[..., :ROOT])[1]} if net.turns else {})
 

@@ -20,7 +20,7 @@ class Config:
 
     seed: int = 0
     """Decides everything: homes, the animal's life, the person's walks."""
-    homes: int = 5
+    homes: int = 9
     """Homes, differently furnished; the last one is unseen in training."""
     sessions_per_home: int = 3
     """Sessions in each home, with its loose things elsewhere each time; the last of each is held out."""

@@ -5,7 +5,7 @@ import torch
 from pipeline.models import ablated_motion, simulated_lives
 from pipeline.models.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
 from pipeline.models.contacts import find_contacts
-from pipeline.models.longterm import PointNet, PoseNet, RouteNet, Sizes, StaticBody
+from pipeline.models.longterm import PointNet, PoseNet, RouteNet, Sizes, StaticBody, Strides, gait_way
 from pipeline.models.longterm_examples import Cutting, bodies, cut, encoded, fitted_poses
 from pipeline.models.motion_synthesis import LongTerm, habits_of
 from pipeline.models.short_motions import STEPS
@@ -62,6 +62,19 @@ def test_short_motions_begin_and_end_as_given(model, clips, name):
     assert frames.shape == clips.channels.shape
     torch.testing.assert_close(frames[:, [0, -1]], clips.channels[:, [0, -1]], atol=1e-5, rtol=0)
     assert (frames[:, 30] - clips.channels[:, 30]).abs().max() > 1e-3
+
+
+def test_strides_carry_a_pose_around_with_the_way_and_back_again(clips):
+    torch.manual_seed(3)
+    strides, route, p = Strides(SIZES.pose), clips.channels[..., :9], clips.channels[:, 0, 9:]
+    carried = strides(p, p, route)
+    forward, back = carried.chunk(2, dim=-1)
+    torch.testing.assert_close(forward[:, 0], back[:, -1])
+    torch.testing.assert_close(forward.square().sum(-1), forward[:, :1].square().sum(-1).expand(-1, STEPS + 1), rtol=1e-3, atol=1e-4)
+    still = strides(p, p, route[:, :1].expand(-1, STEPS + 1, -1))
+    torch.testing.assert_close(still, still[:, :1].expand_as(still))
+    gone = (route[:, 1:, [0, 2]] - route[:, :-1, [0, 2]]).norm(dim=-1).sum(1)
+    torch.testing.assert_close(gait_way(route)[:, -1, 0], gone)
 
 
 def test_blind_networks_do_not_see_and_seeing_ones_do(clips):

@@ -64,6 +64,19 @@ def test_a_shaken_motion_becomes_physical_and_stays_near(lives, physique):
     assert error[1] < 1.1 * error[0]
 
 
+def test_a_gliding_motion_gets_feet_that_stand(lives, physique):
+    walk = lives.stretches[0][:90]
+    mean = np.repeat(walk.agent_from_bone.mean(0, keepdims=True), len(walk), axis=0)
+    mean[..., :3, :3] = walk.agent_from_bone[0, :, :3, :3]
+    gliding = Moving(walk.world_from_agent, 0.85 * mean + 0.15 * walk.agent_from_bone)
+    scene = lives.scenes[0].distance
+    judge = Judge(lives.body, physique.contacts, scene)
+    done = optimise(gliding, physique, scene, SETTINGS)
+    before, after = (judge.plausibility(each, judge.stance(each)).least_slide_m_s for each in (gliding, done))
+    assert before > 0.1 and after < 0.3 * before
+    assert not judge.stance(gliding).any() and judge.stance(done).any(axis=1).mean() > 0.6
+
+
 def test_held_frames_stay(lives, physique):
     moving, held = lives.stretches[1][:30], np.arange(30) % 29 == 0
     lifted = Moving(moving.world_from_agent + np.eye(4)[:, 3] * 0 + _lift(0.03), moving.agent_from_bone)

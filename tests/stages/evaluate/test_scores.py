@@ -228,3 +228,5 @@ def test_intervals_widen_when_windows_repeat_each_other():
     narrow = bootstrapped(values, start, 500, np.random.default_rng(0))
     assert wide.high - wide.low > 3 * (narrow.high - narrow.low)
     assert wide.low <= wide.mean <= wide.high
+    skewed = bootstrapped(np.append(values, 1e6), np.append(blocks, 0), 500, np.random.default_rng(0), median=True)
+    assert wide.low - 0.5 < skewed.low <= skewed.mean <= skewed.high < wide.high + 0.5

@@ -48,15 +48,17 @@ def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
     part = lives.stretches[0][:61]
     reference = scores.references([part], np.array([0]), lives, model)[0]
     told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses), strict=True))
-    assert all(told[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:7])
-    assert told["contact"] == 1 and told["slide_m_s"] < 0.01
+    assert all(told[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
+    assert told["contact"] == 1 and told["slide_m_s"] < 0.01 and told["planted"] > 0.5
+    step = np.linalg.norm(np.diff(part.world_from_agent[:, :3, 3], axis=0)[[0, -1]], axis=1).mean()
+    assert told["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
     root = part.world_from_agent.copy()
     root[:, :3, 3] += [0.03, 0.0, 0.04]
     told = dict(zip(scores.METRICS, scores.score(Moving(root, part.agent_from_bone), reference, model.poses), strict=True))
     assert told["translation"] == pytest.approx(100 * 0.07 / 3)
-    for name in ("mpjpe_mm", "mpvpe_mm", "neighbour_v2v_mm"):
+    for name in ("mpjpe_mm", "mpvpe_mm"):
         assert told[name] == pytest.approx(50, abs=0.01)
-    assert told["neighbour_v2v_share"] == pytest.approx(0.05 / lives.body.length_m, rel=1e-3)
+    assert told["end_v2v_share"] == pytest.approx(0.05 / lives.body.length_m, rel=1e-3)
     assert told["orientation"] == told["pose"] == pytest.approx(0, abs=1e-6)
 
 
@@ -79,6 +81,10 @@ def test_tables_hold_every_method_with_intervals(source):
         low, mean, high = (found[f"longterm/{method}/mpjpe_mm{end}"] for end in ("_ci95_low", "", "_ci95_high"))
         assert low <= mean <= high, method
     assert found["longterm/truth/mpjpe_mm"] == 0 < found["longterm/ours/mpjpe_mm"]
+    apart = found["longterm/base/mpjpe_mm"] - found["longterm/ours/mpjpe_mm"]
+    assert found["longterm/base_beyond_ours/mpjpe_mm"] == pytest.approx(apart)
+    for method in ("ours", "ours_opt", "base_opt"):
+        assert found[f"longterm/{method}/end_v2v_share"] < 1e-4, "given ends are kept, by the networks and by the optimisation"
     unseen = comparison.figures("longterm_unseen", source, Small(), only="unseen")
     assert "longterm_unseen/ours/mpvpe_mm" in unseen and "longterm_unseen/ours_opt/mpvpe_mm" not in unseen
     text = tables.text(found | unseen)
