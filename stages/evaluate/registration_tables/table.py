@@ -82,17 +82,17 @@ def figures(
 
 
 def _compare(found, variant, sessions, errors, resampling):
-    """Put the paired mean difference to ours with its 95 % interval; whole episodes are drawn again."""
-    start = np.concatenate([(session.timestamp_s / resampling.episode_s).astype(int) for session in sessions])
-    video = np.repeat(np.arange(len(sessions)), [len(session.timestamp_s) for session in sessions])
-    episode = episodes(start, video, 1)
-    both = joined(errors[variant]), joined(errors["ours"])
-    for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
-        theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
-        interval = bootstrapped(theirs - ours, episode, resampling.draws, resampling.rng)
-        found.put(f"{variant}/{unit}_more_than_ours", interval.mean)
-        found.put(f"{variant}/{unit}_more_than_ours_ci95_low", interval.low)
-        found.put(f"{variant}/{unit}_more_than_ours_ci95_high", interval.high)
+    """Put the paired mean differences to ours with 95 % intervals, over all sessions and over each."""
+    chosen = {variant: list(range(len(sessions)))} | {f"{variant}/{session.id}": [index] for index, session in enumerate(sessions)}
+    for name, part in chosen.items():
+        start = np.concatenate([(sessions[index].timestamp_s / resampling.episode_s).astype(int) for index in part])
+        video = np.repeat(part, [len(sessions[index].timestamp_s) for index in part])
+        both = [joined([errors[which][index] for index in part]) for which in (variant, "ours")]
+        for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
+            theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
+            interval = bootstrapped(theirs - ours, episodes(start, video, 1), resampling.draws, resampling.rng)
+            for end, value in (("", interval.mean), ("_ci95_low", interval.low), ("_ci95_high", interval.high)):
+                found.put(f"{name}/{unit}_more_than_ours{end}", value)
 
 
 def _sessions(frames, videos, scene_template, truth) -> list[_Session]:
@@ -123,18 +123,25 @@ def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
     for variant in variants:
         pairs = ["; ".join(_told(values.get(f"{variant}/{unit}_{which}")) for which in ("median", "p95")) for unit in UNITS]
         videos = "/".join(_told(values.get(f"{variant}/videos_{which}"), "g") for which in ("registered", "total"))
-        name = f"{variant}/rotation_deg_more_than_ours"
-        change = [_told(values.get(f"{name}{end}")) for end in ("", "_ci95_low", "_ci95_high")]
-        against = "" if variant == "ours" else f"{change[0]} [{change[1]}, {change[2]}]"
+        against = "" if variant == "ours" else _interval(values, f"{variant}/rotation_deg_more_than_ours", ".3f")
         paper = "{:g} / {:g}".format(*PAPER[variant]) if variant in PAPER else ""
         lines.append(f"{NAMES.get(variant, variant):34}{pairs[0]:>20}{pairs[1]:>20}{videos:>9}{against:>28}{paper:>16}")
     sessions = sorted({name.split("/")[1] for name in values if name.count("/") == 2})
-    lines += ["", f"{'per session, median degrees':34}" + "".join(f"{id:>10}" for id in sessions)] if sessions else []
+    lines += ["", f"{'per session: median deg':34}" + "".join(f"{id:>26}" for id in sessions)] if sessions else []
     for variant in variants if sessions else ():
-        told = "".join(f"{_told(values.get(f'{variant}/{id}/rotation_deg_median')):>10}" for id in sessions)
+        told = "".join(f"{_told(values.get(f'{variant}/{id}/rotation_deg_median')):>26}" for id in sessions)
+        lines.append(f"{NAMES.get(variant, variant):34}{told}")
+    lines += ["", "per session: mean difference to ours, mm"] if sessions else []
+    for variant in [each for each in variants if each != "ours"] if sessions else ():
+        told = "".join(f"{_interval(values, f'{variant}/{id}/translation_m_more_than_ours', '.1f', 1000):>26}" for id in sessions)
         lines.append(f"{NAMES.get(variant, variant):34}{told}")
     lines.append("paper: its own cat videos, degrees / metres; '-': more than half (a twentieth) of the frames has no pose.")
     return "\n".join(lines) + "\n"
+
+
+def _interval(values: Mapping[str, float | None], name: str, form: str, scale: float = 1.0) -> str:
+    mean, low, high = (None if values.get(name + end) is None else scale * values[name + end] for end in ("", "_ci95_low", "_ci95_high"))
+    return f"{_told(mean, form)} [{_told(low, form)}, {_told(high, form)}]"
 
 
 def _told(value: float | None, form: str = ".3f") -> str:

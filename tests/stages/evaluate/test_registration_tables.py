@@ -54,6 +54,7 @@ def test_ablations_are_compared_frame_by_frame(capture):
     assert values["worse/rotation_deg_more_than_ours"] == pytest.approx((2.0 + table.MOST_DEG - 1.0) / 2, abs=1e-3)
     low, high = (values[f"worse/rotation_deg_more_than_ours_ci95_{end}"] for end in ("low", "high"))
     assert low < values["worse/rotation_deg_more_than_ours"] < high
+    assert values["worse/v001/rotation_deg_more_than_ours"] == pytest.approx(2.0, abs=1e-6)
     assert values["worse/v001/rotation_deg_median"] == pytest.approx(3.0, abs=1e-6)
     assert values["worse/v002/rotation_deg_median"] is None
     told = table.text(values, ("ours", "worse"))
