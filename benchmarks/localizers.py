@@ -137,10 +137,12 @@ def main() -> None:
     parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
     parser.add_argument("--queries", type=int, default=60, help="fresh renders that are asked")
     parser.add_argument("--frames", type=int, default=12, help="frames of each session that are asked")
+    parser.add_argument("--most-steps", type=int, default=8000, help="networks that learn for longer are left out")
     given = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    for line in rows(given.build / given.agent, given.queries, given.frames, SETTINGS):
+    settings = tuple(setting for setting in SETTINGS if setting.steps <= given.most_steps)
+    for line in rows(given.build / given.agent, given.queries, given.frames, settings):
         print(line, flush=True)
 
 

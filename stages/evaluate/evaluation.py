@@ -19,6 +19,7 @@ from stages.evaluate.alignment import PoseErrors, joined, pose_errors
 from stages.evaluate.behavior import Protocol
 from stages.evaluate.figures import Figures
 from stages.evaluate.reading import Folders, Frames, Recorded
+from stages.evaluate.reliability import reliability_figures
 from stages.evaluate.truth import read_flow
 
 NO_TRUTH = "the true poses of this capture are not known"
@@ -128,17 +129,16 @@ def _single_frames(folders: Folders, walkthrough: Recorded, sessions: Sequence[R
     ours = localizers.load(folders.scene_localizer)
     sift = localizing.sift_map(walkthrough.clip, table["world_from_camera"], mapped)
     pictures = localizing.gallery(walkthrough.clip, table["world_from_camera"], mapped)
-    errors: dict[str, list[PoseErrors]] = {
-        "localizer/": [],
-        "localizer/sift_only_": [],
-        "localizer/retrieval_only_": [],
-    }
+    errors: dict[str, list[PoseErrors]] = {name: [] for name in ("localizer/", "localizer/sift_only_", "localizer/retrieval_only_")}
+    told = []
     for each in sessions:
         chosen = np.unique(np.linspace(0, len(each.clip) - 1, effort.localizer_frames).astype(int)).tolist()
         masks = Masks.open(folders.masks[each.video.id])
         hidden = [masks[frame] > 0 for frame in chosen]
+        answers, probability = localizing.placed_by_localizer(ours, each.clip, chosen, hidden)
+        told.append(probability)
         placed = {
-            "localizer/": localizing.placed_by_localizer(ours, each.clip, chosen, hidden),
+            "localizer/": answers,
             "localizer/sift_only_": localizing.placed_by_sift(sift, each.clip, chosen),
             "localizer/retrieval_only_": localizing.placed_by_retrieval(pictures, each.clip, chosen),
         }
@@ -147,6 +147,8 @@ def _single_frames(folders: Folders, walkthrough: Recorded, sessions: Sequence[R
     figures = Figures()
     for name, parts in errors.items():
         figures.add(localizing.figures_of(name, joined(parts)))
+    right = registration.is_right(joined(errors["localizer/"]))
+    figures.add(reliability_figures("localizer", np.concatenate(told) if told else np.zeros(0), right))
     return figures
 
 

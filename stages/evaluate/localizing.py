@@ -49,14 +49,19 @@ def figures_of(name: str, errors: PoseErrors) -> Figures:
     return figures
 
 
-def placed_by_localizer(localizer: Localizer, clip: Clip, frames: Sequence[int], hide: Sequence[np.ndarray]) -> np.ndarray:
-    """Return ``world_from_camera [frame 4 4]``, NaN where not placed; ``hide`` marks the agent's pixels."""
-    found = []
+def placed_by_localizer(
+    localizer: Localizer, clip: Clip, frames: Sequence[int], hide: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``world_from_camera [frame 4 4]``, NaN where not placed, and the probabilities told with it (0 where not placed);
+    ``hide`` marks the agent's pixels.
+    """
+    found, told = [], []
     for frame, hidden in zip(frames, hide, strict=True):
         camera = (clip.depth_intrinsics[frame], clip.intrinsics[frame])
         answers = localizer.localize(clip.color(frame), clip.depth(frame), *camera, ~hidden)
         found.append(answers[0].world_from_camera if answers else np.full((4, 4), np.nan))
-    return np.array(found).reshape(-1, 4, 4)
+        told.append(answers[0].probability if answers else 0.0)
+    return np.array(found).reshape(-1, 4, 4), np.array(told)
 
 
 def sift_map(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> SiftMap:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from stages.evaluate.alignment import PoseErrors, joined
 from stages.evaluate.figures import Figures, median, percentile
@@ -23,7 +23,7 @@ def camera_figures(errors: Mapping[str, PoseErrors], confidence: Mapping[str, Fl
     _summarise(figures, "registration", all_errors)
     figures.put("registration/videos_registered", registered)
     figures.put("registration/videos_total", len(errors))
-    right = (all_errors.degrees <= GOOD[0]) & (all_errors.meters <= GOOD[1])
+    right = is_right(all_errors)
     figures.put("registration/within_2deg_5cm_share", float(right.mean()) if len(right) else np.nan)
     certain = np.concatenate([confidence[id] for id in errors]) if errors else np.zeros(0)
     figures.add(reliability_figures("registration", certain, right))
@@ -34,6 +34,11 @@ def camera_figures(errors: Mapping[str, PoseErrors], confidence: Mapping[str, Fl
         figures.put(f"{name}_rotation_deg_median", median(all_errors.degrees[kept]), REFUSED)
         figures.put(f"{name}_translation_m_median", median(all_errors.meters[kept]), REFUSED)
     return figures
+
+
+def is_right(errors: PoseErrors) -> Bool[np.ndarray, "frame"]:
+    """Tell which poses are what probabilities are given for."""
+    return (errors.degrees <= GOOD[0]) & (errors.meters <= GOOD[1])
 
 
 def root_figures(name: str, errors: Sequence[PoseErrors]) -> Figures:

@@ -25,7 +25,9 @@ class AlignOptions:
     stride_px: int = 11
     """One depth pixel in so many, each way, takes part."""
     most_points: int = 400_000
-    """Depth points of a recording that take part; scans of longer ones are thinned evenly, so that memory stays bounded."""
+    """Depth points of a recording that take part; scans of longer ones are thinned evenly, so that memory stays bounded ..."""
+    least_points: int = 40
+    """... but a scan keeps so many."""
     depth_inflation: float = 8.0
     """Depth noise is multiplied by this, since neighbouring pixels err together and furniture moves."""
     vote_sigma_m: float = 0.15
@@ -76,9 +78,8 @@ def align(
 ) -> Aligned:
     """Relax all frames: first votes and motions, then depth from coarse to fine, then pictures as well."""
     place, frames = surface.Surface(mesh), np.arange(len(clip))
-    scans = [
-        _static_scan(clip, masks, int(frame), options, most=options.most_points // len(clip)) for frame in track(frames, "reading depth")
-    ]
+    most = max(options.most_points // len(clip), options.least_points)
+    scans = [_static_scan(clip, masks, int(frame), options, most) for frame in track(frames, "reading depth")]
     voted = _vote_contacts(votes, supports, options)
 
     seen: list[relax.Contacts] = []

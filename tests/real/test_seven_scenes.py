@@ -69,7 +69,7 @@ def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitc
     options = training.Options(held_out=40)
     localizer, _ = training.train_scene(made.mesh, made.world_from_camera, made.floor_m, walk, options, np.random.default_rng(0))
     hide = [np.zeros(clip.color_size, bool)] * len(clip)
-    ours = pose_errors(localizing.placed_by_localizer(localizer, clip, FRAMES, hide), kitchen.truth)
+    ours = pose_errors(localizing.placed_by_localizer(localizer, clip, FRAMES, hide)[0], kitchen.truth)
     points = localizing.sift_map(walk, made.world_from_camera, FRAMES)
     sift = pose_errors(localizing.placed_by_sift(points, clip, FRAMES), kitchen.truth)
     pictures = localizing.gallery(walk, made.world_from_camera, FRAMES)
