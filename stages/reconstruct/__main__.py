@@ -44,7 +44,7 @@ class Config:
     """how depth is fused"""
     agent_step_m: float = 0.015
     """resolution of the extracted agent, metres"""
-    longest_gap_s: float = 1.0
+    longest_gap_s: float = 2.0
     """the agent's pose is interpolated over gaps up to this long, seconds"""
 
 

@@ -36,6 +36,20 @@ class Video:
     store: Store
     source: Source | None = None
     """its pictures; None where all that is wanted of them stands in the store"""
+    agent_confidence: Float[np.ndarray, "frame"] | None = None
+    """that the agent's root is right, 0..1; None: certain"""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What is done with frames in which registration doubts the agent's root: mostly their masks are wrong too."""
+
+    least_confidence: float = 0.4
+    """roots that are less certain are not taken over where others are near in time"""
+    longest_gap_s: float = 3.0
+    """roots are interpolated over gaps up to this long"""
+    trust: float = 0.05
+    """how much the masks of such frames still count"""
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,8 @@ class Shapes:
     """space kept around the agent template"""
     knot_frames: int = 10
     """frames between the knots of camera corrections"""
+    doubt: Doubt = Doubt()
+    """of the agent's roots"""
 
 
 def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int, device: str, fused: Fused | None = None) -> Problem:
@@ -81,8 +97,10 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     store = join([usable(video) for video in videos])
     lengths = [len(video.timestamp_s) for video in videos]
     camera = np.concatenate([filled(video.timestamp_s, video.world_from_camera) for video in videos])
-    agent = np.concatenate([filled(video.timestamp_s, video.world_from_agent) for video in videos])
-    rooted = torch.from_numpy(np.concatenate([np.isfinite(video.world_from_agent).all((1, 2)) for video in videos]))
+    roots = [believed_roots(video, shapes.doubt) for video in videos]
+    agent = np.concatenate([filled(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)])
+    rooted = torch.from_numpy(np.concatenate([np.isfinite(root).all((1, 2)) for root in roots]))
+    trust = np.concatenate([np.where(certain(video, shapes.doubt), 1.0, shapes.doubt.trust) for video in videos])
     low, high = measured_box(videos, shapes.scene_margin_m)
     scene = Field(
         FieldShape(
@@ -121,6 +139,7 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
         surface=Surface.of(template.mesh, template.feature, np.random.default_rng(seed)),
         agent_frames=usable_frames,
         agent_rays=by_frame,
+        trust=torch.from_numpy(trust).float(),
     )
     return problem if device == "cpu" else _moved(problem, device)
 
@@ -140,6 +159,27 @@ def usable(video: Video, least_confidence: float = 0.1) -> Store:
     good = torch.from_numpy(np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= least_confidence))
     store = video.store
     return Store(*(rays.at(torch.nonzero(good[rays.frame])[:, 0]) for rays in (store.scene, store.agent)), store.views)
+
+
+def certain(video: Video, doubt: Doubt) -> Bool[np.ndarray, "frame"]:
+    """Tell in which frames the agent's root is known and believed."""
+    known = np.isfinite(video.world_from_agent).all((1, 2))
+    return known if video.agent_confidence is None else known & (video.agent_confidence > doubt.least_confidence)
+
+
+def believed_roots(video: Video, doubt: Doubt) -> Float[np.ndarray, "frame 4 4"]:
+    """Return the agent's roots (NaN where unknown), interpolated between believed ones where those are near in time."""
+    believed = certain(video, doubt)
+    when, found = video.timestamp_s, video.world_from_agent.copy()
+    if not believed.any():
+        return found
+    known_s = when[believed]
+    after = np.searchsorted(known_s, when).clip(1, max(len(known_s) - 1, 1))
+    before_s, after_s = known_s[after - 1], known_s[np.minimum(after, len(known_s) - 1)]
+    between = ~believed & (when > before_s) & (when < after_s) & (after_s - before_s <= doubt.longest_gap_s)
+    if between.any():
+        found[between] = rigid.interpolate(known_s, found[believed], when[between])
+    return found
 
 
 def filled(timestamp_s: Float[np.ndarray, "frame"], a_from_b: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 4 4"]:
@@ -171,5 +211,5 @@ def _moved(problem: Problem, device: str) -> Problem:
         module.to(device)
     store = Store(problem.store.scene.to(device), problem.store.agent.to(device), problem.store.views.to(device))
     by_frame = RaysByFrame(problem.agent_rays.start.to(device), problem.agent_rays.count.to(device))
-    moved = {name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "agent_frames")}
+    moved = {name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "agent_frames", "trust")}
     return Problem(store=store, **problem.modules(), agent_rays=by_frame, **moved)

@@ -62,7 +62,7 @@ def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, g
     target = (rays.depth[:, None] - depth) * rays.slope[:, None]
     color, feature = problem.agent.look(encoded.view(len(rays), 1 + near, -1)[:, 0])
     good = (rays.label == AGENT) & (rays.depth > 0)
-    trust = 1 / (1 + distance[:, 0].detach().abs() / OUTLIER_M)
+    trust = problem.trust[rays.frame] / (1 + distance[:, 0].detach().abs() / OUTLIER_M)
     at_depth = points.view(frames, number, 1 + near, 3)[:, :, 0]
     back = problem.body.pose(rest.view(frames, number, 1 + near, 3)[:, :, 0], pose.agent_from_bone)
     cycle = (back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2
@@ -89,10 +89,11 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
         hidden = (measured > 0) & (measured < depth - MARGIN_M)
     outside_m = outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None]
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
+    trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
     return {
-        "outside": (weights.outside, (outside_m / DECIMETRE)[in_view & ~hidden]),
-        "in front": (weights.in_front, (before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
+        "outside": (weights.outside, (trust * outside_m / DECIMETRE)[in_view & ~hidden]),
+        "in front": (weights.in_front, (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
     }
 
 

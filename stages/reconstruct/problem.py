@@ -32,6 +32,8 @@ class Problem:
     agent_frames: Int[Tensor, "frame"]
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
+    trust: Float[Tensor, "frame"]
+    """how much a frame's mask counts for the agent, 0..1: what registration thought of the root that it found there"""
 
     @property
     def device(self) -> torch.device:
@@ -43,11 +45,13 @@ class Problem:
         return {"scene": self.scene, "agent": self.agent, "body": self.body, "motion": self.motion}
 
     def runs(self, length: int) -> Int[Tensor, "run"]:
-        """Return first frames of stretches of usable frames of one video; single frames when there are none."""
-        usable = torch.zeros(len(self.video) + length, dtype=torch.bool)
-        usable[self.agent_frames.cpu()] = True
-        video = torch.cat([self.video.cpu(), torch.full((length,), -1)])
+        """Return first frames of stretches of usable frames of one video that are trusted, as far as any is."""
         first = self.agent_frames.cpu()
+        trusted = self.trust.cpu()[first] == 1
+        first = first[trusted] if trusted.any() else first
+        usable = torch.zeros(len(self.video) + length, dtype=torch.bool)
+        usable[first] = True
+        video = torch.cat([self.video.cpu(), torch.full((length,), -1)])
         good = torch.stack([usable[first + k] & (video[first + k] == video[first]) for k in range(length)]).all(0)
         return first[good]
 

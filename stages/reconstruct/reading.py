@@ -90,6 +90,7 @@ def _session(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
         has_scene=True,
         store=store,
         source=source,
+        agent_confidence=table["agent_confidence"],
     )
 
 

@@ -81,9 +81,9 @@ def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
     return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
 
 
-def problem(shapes: Shapes = SHAPES):
+def problem(shapes: Shapes = SHAPES, videos=None):
     rng = np.random.default_rng(0)
-    videos = [film("v002", 12, True, rng), film("v001", 6, False, rng, UPRIGHT)]
+    videos = videos or [film("v002", 12, True, rng), film("v001", 6, False, rng, UPRIGHT)]
     ball = trimesh.creation.icosphere(2, RADIUS_M)
     mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), np.full((len(ball.vertices), 3), [200, 40, 40], np.uint8))
     feature = np.zeros((len(mesh.vertices), 16), np.float32)
