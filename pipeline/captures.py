@@ -25,6 +25,8 @@ _NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
     ),
     "trajectories": (("session", "one or more tables of its motion, CSV or NPZ"),),
 }
+MOST_TELLING = 3
+"""Sessions that are asked for metres; each costs half a minute."""
 TABLES = (".csv", ".npz")
 """Kinds of files that hold motion."""
 
@@ -57,6 +59,19 @@ def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
         set(find(folder, flow)) | {f"{name}{SIDECAR}" for name in find(folder, flow)} | {name for node in dag.FLOW for name in node.beside}
     )
     return sorted(path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith("."))
+
+
+def telling_meters(folder: Path, video: Video, videos: Iterable[Video]) -> list[Video]:
+    """Return the recordings whose depth may tell metres to `video`: for a walk-through without depth some training sessions."""
+    if video.role != "walkthrough" or _has_depth(folder / video.file):
+        return []
+    sessions = (other for other in videos if other.role == "session" and other.split == "train")
+    return [other for other in sessions if _has_depth(folder / other.file)][:MOST_TELLING]
+
+
+def _has_depth(path: Path) -> bool:
+    found = format_of(path)
+    return found is not None and found.has_depth
 
 
 def beside(agent: str, names: Sequence[str]) -> list[Path]:
@@ -121,10 +136,12 @@ def missing_roles(roles: Sequence[Role], flow: Flow = "recordings") -> list[tupl
     return [(role, what) for role, what in _NEEDED[flow] if role not in roles]
 
 
-def builtin(session_count: int, heldout_of: int) -> dict[str, Remarks]:
+def builtin(session_count: int, heldout_of: int, foreign_sessions: int = 0) -> dict[str, Remarks]:
     """Return the recordings that `synthesize_capture` writes; `heldout_of` counts sessions from 1, 0 is none."""
-    sessions = [f"session-{i}.r3d" for i in range(1, session_count + 1)]
+    sessions = [f"session-{i}.r3d" for i in range(1, session_count + foreign_sessions + 1)]
     plain = dict.fromkeys(("walkthrough.r3d", "turnaround.r3d", *sessions), Remarks())
+    if foreign_sessions:  # the test video stays the last one that is filmed at home
+        plain |= {name: Remarks(split="test" if name == sessions[session_count - 1] else "train") for name in sessions}
     if not heldout_of:
         return plain
     return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}

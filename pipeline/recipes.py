@@ -77,7 +77,7 @@ def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], cache: sources.Cach
     node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
     settings = {**(sources.settings(node.stage, cache) or {}), **recipe.get(dag.table_of(node), {})}
     if begins == "recordings":
-        said = captures.builtin(*(_count(settings, key, where) for key in ("session_count", "heldout_of")))
+        said = captures.builtin(*(_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions")))
     else:
         said = captures.builtin_lives(*(_count(settings, key, where) for key in ("homes", "sessions_per_home")))
     config.refuse_unknown(overrides, said, where=f"{where}: [videos]", kind="recording")

@@ -36,6 +36,10 @@ class Config:
     """Session (from 1) filmed in the evening; 0 = none."""
     sideways_session: int = 4
     """Session (from 1) filmed with the phone held sideways; 0 = none."""
+    harsh_session: int = 0
+    """Session (from 1) in low red sun from one side, overexposed, with another white balance; 0 = none."""
+    foreign_sessions: int = 0
+    """Sessions more, after the others, each filmed in another home: they fit nowhere and are to be refused."""
     color_height: int = 320
     """Pixels of the stored portrait canvas."""
     color_width: int = 240

@@ -4,7 +4,7 @@
 Only `lives` needs them: behaviour must be learned in some homes and judged in one that it has never seen.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import label
@@ -12,7 +12,7 @@ from scipy.ndimage import label
 from stages.synthesize_capture import furniture, sheets
 from stages.synthesize_capture.furniture import Piece
 from stages.synthesize_capture.navigation import floor_for
-from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Footprint, Movable, Place, Room
+from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, WINDOW_CORNER, Footprint, Movable, Place, Room, shell
 from stages.synthesize_capture.session import ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M, PERSON_BREADTH_M, PERSON_HEIGHT_M
 
 GAP_M = 0.06
@@ -83,6 +83,12 @@ def furnish_otherwise(rng: np.random.Generator, attempts: int = 2000) -> Dwellin
         if _livable(home.room):
             return home
     raise AssertionError(f"no livable home in {attempts} attempts")
+
+
+def filmed_elsewhere(rng: np.random.Generator) -> Room:
+    """Draw a home with walls, window and prints of its own, to be filmed."""
+    home = furnish_otherwise(rng).room
+    return replace(home, fixed=(*shell(rng), *home.fixed), window=WINDOW_CORNER)
 
 
 def _arranged(pieces: dict[str, Piece], rng: np.random.Generator) -> tuple[Standing, ...] | None:

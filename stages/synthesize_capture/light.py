@@ -6,6 +6,7 @@ Radiance is relative: 1.0 is a white wall in good light.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from stages.synthesize_capture.sheets import Sheet, triangles
 LIGHT_CELL_M = 0.09
 AMBIENT_REACH_M = 1.1
 Rgb = Float[np.ndarray, "3"]
+Hour = Literal["day", "evening", "sunset"]
 
 
 @dataclass(frozen=True)
@@ -31,15 +33,18 @@ class Light:
     """World direction in which the window is brightest."""
 
 
-def light_of_session(rng: np.random.Generator, *, dim: bool) -> Light:
-    """Draw a light: by day the window rules; a dim session is an evening by the lamp."""
+def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
+    """Draw a light: by day the window rules, in the evening the lamp, at sunset one low red sun and hardly anything else."""
     warm, cool = np.array([1.0, 0.82, 0.6]), np.array([0.9, 0.98, 1.08])
-    if dim:
+    if hour == "evening":
         window, lamp, ambient = 0.10 * cool, rng.uniform(0.75, 0.95) * warm, 0.16 * np.array([1.0, 0.9, 0.78])
     else:
         window, lamp = rng.uniform(1.3, 2.2) * (cool + rng.uniform(-0.06, 0.06, 3)), rng.uniform(0.0, 0.25) * warm
         ambient = rng.uniform(0.42, 0.55) * (1.0 + rng.uniform(-0.05, 0.05, 3))
     sun = np.array([1.0, rng.uniform(0.3, 0.7), rng.uniform(-0.8, 0.8)])
+    if hour == "sunset":  # as many draws as by day, so that life goes on as it would have
+        red = np.array([1.3, 0.7, 0.4])
+        window, lamp, ambient, sun[1:] = 3.0 * window * red, 0.0 * warm, 0.4 * ambient * red, sun[1:] * (0.2, 1.5)
     return Light(window, lamp, ambient, sun / np.linalg.norm(sun))
 
 

@@ -15,6 +15,8 @@ from stages.synthesize_capture import furniture, sheets, texture
 from stages.synthesize_capture.sheets import Sheet
 
 WIDTH_M, DEPTH_M, HEIGHT_M = 6.0, 4.8, 2.5
+WINDOW_CORNER = np.array([[WIDTH_M / 2 - 0.02, 2.1, -0.75], [0, 0, 1.5], [0, -1.2, 0]], float)
+"""top left corner of the window, its right edge and its down edge"""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def furnish(rng: np.random.Generator) -> Room:
         for name, (px, pz, yaw) in stands.items()
     }
     pieces = {name: furniture.MAKERS[name](rng) for name in stands}
-    fixed = [*_shell(rng), *_window(rng), *_prints(rng)]
+    fixed = shell(rng)
     fixed += [sheet.moved(sheets.upright(*stands[name])) for name, piece in pieces.items() for sheet in piece.sheets]
     standing = tuple(
         Footprint((px, pz), pieces[name].size, yaw, pieces[name].bottom, pieces[name].top)
@@ -121,9 +123,8 @@ def furnish(rng: np.random.Generator) -> Room:
     movables = tuple(
         Movable(tuple(piece.sheets), piece.size, piece.top, home) for piece, home in zip(furniture.loose_things(rng), _HOMES, strict=True)
     )
-    window = np.array([[x - 0.02, 2.1, -0.75], [0, 0, 1.5], [0, -1.2, 0]], float)
     lamp = (stands["lamp"][0], 1.62, stands["lamp"][1])
-    return Room(tuple(fixed), movables, np.array(_HOMES, float), standing, _places(stands), window, lamp)
+    return Room(tuple(fixed), movables, np.array(_HOMES, float), standing, _places(stands), WINDOW_CORNER, lamp)
 
 
 _HOMES = (
@@ -149,6 +150,11 @@ def _places(stands: dict[str, tuple[float, float, float]]) -> tuple[Place, ...]:
         Place("cat tree", (tree[0] - 0.06, 0.5, tree[1] + 0.1), -0.6, (tree[0] - 0.54, tree[1] + 0.54)),
         Place("shelf", (shelf[0] + 0.55, 0.0, shelf[1]), np.pi / 2, (shelf[0] + 0.55, shelf[1])),
     )
+
+
+def shell(rng: np.random.Generator) -> list[Sheet]:
+    """Build floor, ceiling and walls with their window and prints."""
+    return [*_shell(rng), *_window(rng), *_prints(rng)]
 
 
 def _shell(rng: np.random.Generator) -> list[Sheet]:

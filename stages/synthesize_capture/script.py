@@ -3,15 +3,16 @@
 `scripts` decides everything random apart from sensor noise, so that recordings can be filmed in any order.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.space import cameras, rigid
-from stages.synthesize_capture import camera_motion, gait, light, sensor, session
+from stages.synthesize_capture import camera_motion, dwellings, gait, light, sensor, session
 from stages.synthesize_capture.gait import Motion
-from stages.synthesize_capture.light import Light
+from stages.synthesize_capture.light import Hour, Light
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.sensor import Exposure
 from stages.synthesize_capture.session import AnimalCourse, SessionTrajectories
@@ -31,6 +32,8 @@ class Plan:
     record_fps: float
     dim_session: int
     sideways_session: int
+    harsh_session: int
+    foreign_sessions: int
     color_height: int
     color_width: int
     depth_height: int
@@ -70,8 +73,8 @@ MOVING_M_S = 0.15
 
 def scripts(plan: Plan, room: Room) -> list[Script]:
     """Write all scripts: walk-through, turnaround, sessions, and the second phone of one session."""
-    streams = iter(np.random.default_rng([plan.seed, 1]).spawn(4 * plan.session_count + 16))
-    day = light.light_of_session(next(streams), dim=False)
+    streams = iter(np.random.default_rng([plan.seed, 1]).spawn(4 * plan.session_count + 16 + plan.foreign_sessions))
+    day = light.light_of_session(next(streams), "day")
     rng = next(streams)
     out = [
         _script(
@@ -91,8 +94,8 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
         rng = next(streams)
         seconds = plan.test_session_s if number == plan.session_count else plan.session_s
         arranged = room.arranged(rng)
-        dim = number == plan.dim_session
-        lit = light.light_of_session(rng, dim=dim)
+        hour: Hour = {plan.dim_session: "evening", plan.harsh_session: "sunset"}.get(number, "day")
+        lit = light.light_of_session(rng, hour)
         lived = session.simulate_session(arranged, rng, seconds)
         path = camera_motion.filming(lived, rng)
         turns = 1 if number == plan.sideways_session else 0
@@ -107,15 +110,25 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
                 seconds,
                 course=lived.animal,
                 lived=lived,
-                dim=dim,
+                hour=hour,
                 turns=turns,
             )
         )
         rng = next(streams)
         if number == plan.heldout_of:
             path = camera_motion.bystanding(lived, arranged, rng)
-            out.append(_script(plan, rng, "heldout", arranged, lit, path, seconds, course=lived.animal, dim=dim))
-    return out
+            out.append(_script(plan, rng, "heldout", arranged, lit, path, seconds, course=lived.animal, hour=hour))
+    return [*out, *_foreign(plan, streams)]
+
+
+def _foreign(plan: Plan, streams: Iterator[np.random.Generator]) -> Iterator[Script]:
+    """Write the sessions of other homes; those of this one are the same with and without them."""
+    for number in range(plan.session_count + 1, plan.session_count + plan.foreign_sessions + 1):
+        rng = next(streams)
+        home = dwellings.filmed_elsewhere(rng)
+        lived = session.simulate_session(home, rng, plan.session_s)
+        lit, path = light.light_of_session(rng, "day"), camera_motion.filming(lived, rng)
+        yield _script(plan, rng, f"session-{number}", home, lit, path, plan.session_s, course=lived.animal, lived=lived)
 
 
 def _script(
@@ -129,13 +142,13 @@ def _script(
     *,
     course: AnimalCourse | None = None,
     lived: SessionTrajectories | None = None,
-    dim: bool = False,
+    hour: Hour = "day",
     turns: int = 0,
 ) -> Script:
     timestamp_s = sensor.timestamps(rng, duration_s, plan.record_fps)
     upright = rigid.interpolate(np.arange(len(path)) * session.STEP_S, path, timestamp_s)
     stored = cameras.turn_camera(upright, -turns)
-    exposure = sensor.exposure_of_recording(rng, dim=dim)
+    exposure = sensor.exposure_of_recording(rng, hour)
     moving = np.zeros(len(timestamp_s), bool)
     if course is not None:
         moving = np.interp(timestamp_s, course.timestamp_s, course.speed()) > MOVING_M_S

@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter1d
 
 from pipeline.space import rigid
+from stages.synthesize_capture.light import Hour
 
 DEPTH_REACH_M = 5.0
 _TONE = (np.clip(1.06 * (1 - np.exp(-1.9 * np.linspace(0, 2.5, 4096))), 0, 1) ** (1 / 2.2) * 255).astype(np.float32)
@@ -27,11 +28,13 @@ class Exposure:
     shutter_s: float
 
 
-def exposure_of_recording(rng: np.random.Generator, *, dim: bool) -> Exposure:
-    """Draw an exposure; a dim session is lifted by gain, stays darker, noisier and more blurred."""
+def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
+    """Draw an exposure; the evening is lifted by gain, stays darker, noisier and more blurred, the sunset is overexposed."""
     balance = 1.0 + rng.uniform(-0.07, 0.07, 3)
     balance[1] = 1.0
-    if dim:
+    if hour == "sunset":
+        return Exposure(rng.uniform(1.35, 1.55), 0.16, balance * np.array([1.12, 1.0, 0.86]), 0.016, 1 / 110)
+    if hour == "evening":
         return Exposure(rng.uniform(0.95, 1.15), 0.06, balance, 0.03, 1 / 45)
     return Exposure(rng.uniform(0.85, 1.12), 0.10, balance, 0.012, 1 / 110)
 

@@ -12,7 +12,7 @@ from pipeline import dag
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {
-    "synthesize_capture": "    session_count: int = 2\n    heldout_of: int = 1\n",
+    "synthesize_capture": "    session_count: int = 2\n    heldout_of: int = 1\n    foreign_sessions: int = 0\n",
     "train_localizer": "    target: str = ''\n",
     "train_longterm": "    ablations: bool = False\n",
 }

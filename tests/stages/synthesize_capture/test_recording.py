@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from dataclasses import replace
 
 import cv2
 import lzfse
@@ -23,6 +24,8 @@ PLAN = script.Plan(
     record_fps=15.0,
     dim_session=0,
     sideways_session=2,
+    harsh_session=0,
+    foreign_sessions=0,
     color_height=160,
     color_width=120,
     depth_height=128,
@@ -88,3 +91,27 @@ def test_true_flow_moves_depth_onto_depth(scripts):
     known = np.isfinite(flow[..., 0])
     assert known.mean() > 0.5
     assert np.nanmax(np.abs(film.true_flow(stage, 1, 1))) < 1e-2, "no time, no flow"
+
+
+def test_a_session_of_another_home_changes_no_other(scripts, made, tmp_path):
+    more = script.scripts(replace(PLAN, foreign_sessions=1), room.furnish(np.random.default_rng(4)))
+    assert [part.name for part in more] == [*(part.name for part in scripts), "session-3"]
+    elsewhere = more[-1]
+    here = np.array([f.center for f in scripts[0].room.standing])
+    assert len(elsewhere.room.standing) != len(here) or not np.allclose([f.center for f in elsewhere.room.standing], here, atol=0.3)
+    produce.produce(more[2:], CREATURE, tmp_path, tmp_path, workers=1)
+    for name in ("session-1.r3d", "session-2.r3d"):
+        assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
+    assert (tmp_path / "session-3.r3d").exists()
+
+
+def test_harsh_light_changes_pictures_and_nothing_else(scripts, made, tmp_path):
+    harsh = script.scripts(replace(PLAN, harsh_session=1), room.furnish(np.random.default_rng(4)))[2]
+    produce.record(harsh, CREATURE, tmp_path, tmp_path)
+    pictures = []
+    for folder in (made, tmp_path):
+        with zipfile.ZipFile(folder / "session-1.r3d") as archive:
+            pictures.append(cv2.imdecode(np.frombuffer(archive.read("rgbd/3.jpg"), np.uint8), cv2.IMREAD_COLOR).astype(float))
+    ratio = [np.median(pictures[1][..., channel] / np.maximum(pictures[0][..., channel], 8)) for channel in range(3)]
+    assert max(ratio) / min(ratio) > 1.2, "colours shift, not only brightness"
+    assert np.abs(pictures[1] - pictures[0]).mean() > 15
