@@ -156,12 +156,15 @@ def lock_file(home: str, job_id: str) -> Path:
 def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     home, video, trial = plan.home_of(node.artifact), part if isinstance(part, Video) else None, part if isinstance(part, Trial) else None
     out = home.folder / node.artifact / (part.id if part else "")
+    folder, deciding = Path("captures", plan.home.agent), [video.id] if video else []
     inputs: list[Input] = []
     arguments: list[str] = []
     for need in dag.needs_of(node, plan.flow):
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:
-                arguments += [f"--{need.option}", f"captures/{plan.home.agent}/{video.file}"]
+                telling = captures.telling_meters(folder, video, plan.videos)
+                arguments += [f"--{need.option}", f"{folder}/{video.file}", *(["--captures", str(folder)] if telling else [])]
+                deciding += [other.id for other in telling]
             continue
         found = list(_inputs(plan, need, node, part))
         inputs += found
@@ -173,7 +176,7 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     named = f"{node.artifact}.{trial.id}" if trial else node.artifact
     arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
     arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
-    keys = [str(home.plan / f"keys/{named}.json"), *([str(home.base.plan / f"keys/video.{video.id}.json")] if video else [])]
+    keys = [str(home.plan / f"keys/{named}.json"), *(str(home.base.plan / f"keys/video.{id}.json") for id in deciding)]
     for file in captures.beside(plan.home.agent, node.beside):
         keys, arguments = [*keys, str(home.base.plan / f"keys/beside.{file.name}")], [*arguments, f"--{file.stem}", str(file)]
     return Job(

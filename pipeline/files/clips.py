@@ -27,6 +27,8 @@ class Clip:
     """(height, width) in pixels"""
     depth_size: tuple[int, int]
     """(height, width) in pixels"""
+    scale: str = "measured"
+    """what makes its lengths metres: its own depth, the id of another recording whose depth does, or nothing: `relative`"""
 
     @classmethod
     def open(cls, folder: Path) -> "Clip":
@@ -42,6 +44,7 @@ class Clip:
             quality=table["quality"],
             color_size=images.read_color(folder / "color" / "000000.jpg").shape[:2],
             depth_size=images.read_depth(folder / "depth" / "000000.exr").shape,
+            scale=str(table.get("scale", "measured")),
         )
 
     def __len__(self) -> int:

@@ -16,7 +16,7 @@ from pipeline.recordings import conventions
 from pipeline.recordings.conventions import SelfCheck
 from pipeline.recordings.recording import Picture, Recording, broken_metadata, no_depth
 from pipeline.recordings.selection import choose_frames
-from pipeline.recordings.upright import quarter_turns_from_gravity
+from pipeline.recordings.upright import quarter_turns_from_gravity, quarter_turns_from_room
 from pipeline.space import cameras, rigid
 
 JPEG = b"\xff\xd8"
@@ -24,6 +24,9 @@ MAX_DEPTH_SIDE_PX = 640
 """larger depth was enlarged by the app; it is sampled down again"""
 LEAST_TRACKED = 0.8
 """share of frames with a device pose below which device poses are not used at all"""
+MEASURED, RELATIVE = "measured", "relative"
+UPRIGHT_VIEWS = 12
+"""frames whose depth tells what is up where no sensor did"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
 """mean brightness (0..1) below which a picture loses quality"""
@@ -45,6 +48,8 @@ class Plan:
     quarter_turns: int
     """clockwise, stored to upright"""
     self_check: SelfCheck
+    scale: str = MEASURED
+    """`measured` by the recording's own depth, `relative`, or the id of the recording whose depth told the metres"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,7 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
     Raises InputError CAP-006 for a recording without depth.
     """
     if recording.depth_size is None or recording.intrinsics is None:
-        raise no_depth(recording.where, f"{recording.kind}; without metres neither room nor animal can be measured")
+        raise no_depth(recording.where, f"{recording.kind}; an animal moves, so that pictures alone do not tell how far away it is")
     depth_size = reduced_size(recording.depth_size, MAX_DEPTH_SIDE_PX)
     depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, depth_size)
     used, pose, lost = _tracked(recording)
@@ -90,6 +95,10 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
         if recording.up is not None:
             odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
             turns = quarter_turns_from_gravity(odometry_from_camera)
+        elif not turns:
+            looked_at = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
+            views = [view(int(frame)) for frame in np.searchsorted(used, chosen[looked_at])]
+            turns = quarter_turns_from_room(odometry_from_camera, [(each.depth, each.intrinsics) for each in views])
         odometry_from_camera = cameras.turn_camera(odometry_from_camera, turns)
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)

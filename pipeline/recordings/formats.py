@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 MOVIES = (".mp4", ".mov", ".m4v", ".mkv")
 UNDERSTOOD = (
     "Record3D .r3d or EXR + JPG folder, Stray Scanner, Polycam raw data, NeRFCapture stream, TUM or 7-Scenes folder, "
-    "a folder with a video, depth/ and intrinsics.txt"
+    "a folder with a video, depth/ and intrinsics.txt, a video alone for the walk-through"
 )
 
 
@@ -32,6 +32,7 @@ class Format:
     """whether a path is one, by names alone"""
     open: Callable[[Path], Recording]
     """reads what the pictures' frames need, no pictures; raises InputError"""
+    has_depth: bool = True
 
 
 def _record3d(path: Path) -> Recording:
@@ -100,7 +101,8 @@ FORMATS: tuple[Format, ...] = (
     Format("NeRFCapture", lambda path: _is_file(".zip")(path) or _holds("transforms.json")(path), _nerfcapture),
     Format("TUM RGB-D", _holds("rgb.txt", "depth.txt"), _tum),
     Format("7-Scenes RGB-D", _holds_seven_scenes, _seven_scenes),
-    Format("video and depth", lambda path: _is_file(*MOVIES)(path) or _holds_movie(path), _plain_video),
+    Format("video and depth", _holds_movie, _plain_video),
+    Format("video alone", _is_file(*MOVIES), _plain_video, has_depth=False),
 )
 
 

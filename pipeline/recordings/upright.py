@@ -1,15 +1,25 @@
-"""Find how many quarter turns make a recording upright, from the direction of gravity in its pictures."""
+"""Find how many quarter turns make a recording upright: from gravity, or without it from how it was held and the room."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.space import cameras
+from pipeline.space import cameras, surface
+from pipeline.space.ground import floor_direction
+
+ROLL = 4.0
+"""what a mean squared sine of roll counts against a share of level surface"""
+MARGIN = 0.15
+"""by which the best of the four directions must be ahead of the others"""
+LEAST_POINTS = 100
+"""points with a surface direction that the room must show"""
 
 
 def quarter_turns_from_gravity(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     *,
-    up_odometry: tuple[float, float, float] = (0.0, 1.0, 0.0),
+    up_odometry: tuple[float, float, float] | Float[np.ndarray, "3"] = (0.0, 1.0, 0.0),
     margin: float = 0.1,
 ) -> int:
     """Return the clockwise quarter turns (0..3) after which up in the world points up in the pictures on average.
@@ -20,3 +30,43 @@ def quarter_turns_from_gravity(
     up_in_picture = [-(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean() for turns in range(4)]
     best = int(np.argmax(up_in_picture))
     return best if up_in_picture[best] > up_in_picture[0] + margin else 0
+
+
+def up_from_room(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
+) -> Float[np.ndarray, "3"] | None:
+    """Return the direction that points up where no sensor told it, or None where the room does not tell either.
+
+    Each of the four sides of the pictures may be up. It is sharpened by the room's planes (Manhattan) and judged by
+    what people film: more level surface is seen from above (floor, seats, tables) than from below, and one side of
+    the pictures stays level while they turn. ``views`` are (depth in metres, intrinsics) of frames spread evenly.
+    """
+    seen = np.linspace(0, len(odometry_from_camera) - 1, len(views)).round().astype(int)
+    normals = []
+    for (depth, intrinsics), odometry in zip(views, odometry_from_camera[seen], strict=True):
+        normal = surface.image_normals(depth, intrinsics)
+        normals.append(normal[np.abs(normal).sum(-1) > 0][::5] @ odometry[:3, :3].T)
+    towards_camera = np.concatenate(normals)
+    if len(towards_camera) < LEAST_POINTS:
+        return None
+    directions, scores = [], []
+    for turns in range(4):
+        turned = cameras.turn_camera(odometry_from_camera, turns)
+        guess = -turned[:, :3, 1].mean(0)
+        up = floor_direction(towards_camera, guess / np.linalg.norm(guess), within_deg=35.0)
+        facing = towards_camera @ up
+        roll = float(((turned[:, :3, 0] @ up) ** 2).mean())
+        directions.append(up)
+        scores.append(float((facing > 0.95).mean() - (facing < -0.95).mean()) - ROLL * roll)
+    best, second = np.argsort(scores)[::-1][:2]
+    return directions[best] if scores[best] > scores[second] + MARGIN else None
+
+
+def quarter_turns_from_room(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
+) -> int:
+    """Return the clockwise quarter turns (0..3) that make pictures upright where no sensor told up; 0 where nothing tells."""
+    up = up_from_room(odometry_from_camera, views)
+    return 0 if up is None else quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)

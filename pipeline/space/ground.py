@@ -1,9 +1,16 @@
-"""The level surface under something that stands on it, in a world with +y up."""
+"""The level surface under something that stands on it, in a world with +y up; and where up is, by the planes of a room."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+
+from pipeline.space import align
+
+VOTERS, CANDIDATES = 2000, 1500
+"""surface directions that vote, and directions that they vote on"""
+VOTE_DEG = 6.0
+"""a surface votes for directions that it is square to or along within about this, degrees"""
 
 
 @dataclass(frozen=True)
@@ -31,3 +38,37 @@ def fit_ground(points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarr
         solution = np.linalg.lstsq(design, height[close] * weight[close], rcond=None)[0]
         slope, offset = solution[:2], solution[2]
     return Ground(float(offset), slope)
+
+
+def floor_direction(
+    normals_world: Float[np.ndarray, "point 3"], guess: Float[np.ndarray, "3"], within_deg: float = 40.0
+) -> Float[np.ndarray, "3"]:
+    """Return the direction within so many degrees of a guess of up that most of a room's surfaces are square to or along.
+
+    Floors and tables vote in full, walls by half; the winner of the vote is sharpened by least squares.
+    """
+    voters = np.ascontiguousarray(normals_world[:: max(1, len(normals_world) // VOTERS)])
+    candidates = _cap(guess, np.deg2rad(within_deg), CANDIDATES)
+    cosine2 = (voters @ candidates.T) ** 2
+    width2 = np.sin(np.deg2rad(VOTE_DEG)) ** 2
+    votes = np.exp((cosine2 - 1) / width2).sum(0) + 0.5 * np.exp(-cosine2 / width2).sum(0)
+    up = candidates[votes.argmax()]
+    for limit_deg in (6.0, 4.0):
+        cosine = normals_world @ up
+        along = np.abs(cosine) > np.cos(np.deg2rad(limit_deg))
+        across = np.abs(cosine) < np.sin(np.deg2rad(limit_deg))
+        if along.sum() + across.sum() < 10:
+            break
+        scatter = normals_world[across].T @ normals_world[across] - normals_world[along].T @ normals_world[along]
+        axis = np.linalg.eigh(scatter)[1][:, 0]
+        up = axis * np.sign(axis @ guess)
+    return up
+
+
+def _cap(centre: Float[np.ndarray, "3"], radius_rad: float, count: int) -> Float[np.ndarray, "direction 3"]:
+    """Return directions spread evenly within an angle of a centre (a spiral), the centre first."""
+    share = np.arange(count) / count
+    cosine, turn = 1 - share * (1 - np.cos(radius_rad)), np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    sine = np.sqrt(1 - cosine**2)
+    around_z = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1)
+    return around_z @ align.rotation_between(np.array([0.0, 0.0, 1.0]), centre).T

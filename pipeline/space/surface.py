@@ -29,6 +29,33 @@ def depth_noise(depth_m: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]
     return 0.008 + 0.004 * depth_m
 
 
+def image_normals(
+    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4
+) -> Float[np.ndarray, "height width 3"]:
+    """Return unit normals towards the camera from central differences over ``span_px``; zero at edges and unknown
+    depth.
+    """
+    points = cameras.back_project(depth, intrinsics)
+    normals = np.zeros_like(points)
+    inner = slice(span_px, -span_px)
+    right = points[inner, 2 * span_px :] - points[inner, : -2 * span_px]
+    down = points[2 * span_px :, inner] - points[: -2 * span_px, inner]
+    cross = np.cross(down, right)
+    length = np.linalg.norm(cross, axis=-1)
+    centre = depth[inner, inner]
+    limit = 0.05 + 0.06 * centre
+    known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
+    for shifted in (
+        depth[inner, 2 * span_px :],
+        depth[inner, : -2 * span_px],
+        depth[2 * span_px :, inner],
+        depth[: -2 * span_px, inner],
+    ):
+        known &= shifted > 0
+    normals[inner, inner] = np.where(known[..., None], cross / np.maximum(length, 1e-9)[..., None], 0)
+    return normals
+
+
 def scan(
     depth: Float[np.ndarray, "height width"],
     intrinsics: Float[np.ndarray, "3 3"],

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.files.clips import Clip
-from pipeline.space import align, cameras, rigid
+from pipeline.space import align, cameras, ground, rigid
+from pipeline.space.sparse import Sparse
 from stages.build_scene_template.matches import points_under
 from stages.build_scene_template.refine import Keyframe
-from stages.build_scene_template.sfm import Sparse
 
 
 @dataclass(frozen=True)
@@ -160,23 +160,6 @@ def upright(
         how = "gravity of the phone"
     else:
         guess = -world_from_camera[:, :3, 1].mean(0)
-        up, how = floor_direction(normals_world, guess / np.linalg.norm(guess)), "dominant planes"
+        up, how = ground.floor_direction(normals_world, guess / np.linalg.norm(guess)), "dominant planes"
     rotation = align.rotation_between(up, np.array([0.0, 1.0, 0.0]))
     return rigid.make(rotation, -rotation @ points_world.mean(0)), how
-
-
-def floor_direction(
-    normals_world: Float[np.ndarray, "point 3"], guess: Float[np.ndarray, "3"], within_deg: float = 40.0
-) -> Float[np.ndarray, "3"]:
-    """Sharpen a guess of up: the direction near it that most surface normals lie along or across (Manhattan)."""
-    up = guess
-    for limit_deg in (within_deg, 15.0, 8.0, 5.0):
-        cosine = normals_world @ up
-        along = np.abs(cosine) > np.cos(np.deg2rad(limit_deg))
-        across = np.abs(cosine) < np.sin(np.deg2rad(limit_deg))
-        if along.sum() + across.sum() < 10:
-            break
-        scatter = normals_world[across].T @ normals_world[across] - normals_world[along].T @ normals_world[along]
-        axis = np.linalg.eigh(scatter)[1][:, 0]
-        up = axis * np.sign(axis @ guess)
-    return up

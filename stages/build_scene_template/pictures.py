@@ -68,9 +68,19 @@ def checks(template: Template) -> list[Check]:
             "relative difference",
             0.05,
         ),
+        Check("metres known", float(template.scale != "relative"), "", 0.5, better="higher"),
         Check("depth against the surface", float(np.nanmedian(template.gap_m) * 100), "cm, median", 2.0, 5.0),
         Check("frames that fit the surface", float(template.registered.mean()), "share", 0.95, 0.5, "higher"),
     ]
+
+
+def _scale(template: Template) -> str:
+    """Say in words what makes lengths metres."""
+    if template.scale == "relative":
+        return "relative: from pictures alone, lengths are no metres"
+    if template.scale != "measured":
+        return f"pictures alone, metres from the depth of {template.scale}"
+    return "depth under COLMAP's tracks" if template.start.source == "colmap" else "odometry and depth"
 
 
 def world(template: Template) -> dict:
@@ -80,7 +90,7 @@ def world(template: Template) -> dict:
     return {
         "up": [0.0, 1.0, 0.0],
         "gravity": template.gravity,
-        "scale": "depth under COLMAP's tracks" if start.source == "colmap" else "odometry and depth",
+        "scale": _scale(template),
         "poses": start.source,
         "colmap_refuted": start.reason or None,
         "bounds": [low.round(4).tolist(), high.round(4).tolist()],

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, relax, rigid, surface
+from pipeline.space.sparse import Sparse
 from stages.build_scene_template.matches import points_under
-from stages.build_scene_template.sfm import Sparse
 
 
 @dataclass(frozen=True)
@@ -49,34 +49,7 @@ def load_keyframe(clip: Clip, frame: int, stride_px: int) -> Keyframe:
     """Read one frame's depth, its thinned points and its normals (camera axes, zero where unknown)."""
     depth, intrinsics = clip.depth(frame), clip.depth_intrinsics[frame]
     depth = np.where(clip.confidence(frame) >= 1, depth, 0)
-    return Keyframe(surface.scan(depth, intrinsics, stride=stride_px), depth, image_normals(depth, intrinsics), intrinsics)
-
-
-def image_normals(
-    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4
-) -> Float[np.ndarray, "height width 3"]:
-    """Return unit normals towards the camera from central differences over ``span_px``; zero at edges and unknown
-    depth.
-    """
-    points = cameras.back_project(depth, intrinsics)
-    normals = np.zeros_like(points)
-    inner = slice(span_px, -span_px)
-    right = points[inner, 2 * span_px :] - points[inner, : -2 * span_px]
-    down = points[2 * span_px :, inner] - points[: -2 * span_px, inner]
-    cross = np.cross(down, right)
-    length = np.linalg.norm(cross, axis=-1)
-    centre = depth[inner, inner]
-    limit = 0.05 + 0.06 * centre
-    known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
-    for shifted in (
-        depth[inner, 2 * span_px :],
-        depth[inner, : -2 * span_px],
-        depth[2 * span_px :, inner],
-        depth[: -2 * span_px, inner],
-    ):
-        known &= shifted > 0
-    normals[inner, inner] = np.where(known[..., None], cross / np.maximum(length, 1e-9)[..., None], 0)
-    return normals
+    return Keyframe(surface.scan(depth, intrinsics, stride=stride_px), depth, surface.image_normals(depth, intrinsics), intrinsics)
 
 
 def depth_contacts(

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from pipeline.files.clips import Clip
 from pipeline.progress import log
 from pipeline.space import rigid
+from pipeline.space.sparse import Sparse, sparse_from_model
 from stages.build_scene_template.matches import ConfirmOptions, confirm
 
 
@@ -45,21 +46,6 @@ class SfmOptions:
     """At most this many loop candidates a keyframe."""
     confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
     """When depth confirms matches."""
-
-
-@dataclass(frozen=True)
-class Sparse:
-    """The largest model: registered keyframes, points in the model's frame (arbitrary scale) and what sees them."""
-
-    frame: Int[np.ndarray, "key"]
-    model_from_camera: Float[np.ndarray, "key 4 4"]
-    points_model: Float[np.ndarray, "point 3"]
-    observed_point: Int[np.ndarray, "observation"]
-    observed_key: Int[np.ndarray, "observation"]
-    observed_pixel: Float[np.ndarray, "observation 2"]
-    reprojection_px: float
-    reconstruction: pycolmap.Reconstruction
-    """COLMAP's own model, for its text files."""
 
 
 def choose_keyframes(clip: Clip, options: SfmOptions) -> Int[np.ndarray, "key"]:
@@ -127,7 +113,7 @@ def reconstruct(clip: Clip, options: SfmOptions, workspace: Path, seed: int) -> 
     if not models:
         return None
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return _sparse(largest) if largest.num_reg_images() >= 3 else None
+    return sparse_from_model(largest) if largest.num_reg_images() >= 3 else None
 
 
 def _extract(clip, names, database, pictures, options):
@@ -139,26 +125,3 @@ def _extract(clip, names, database, pictures, options):
     extraction.sift.first_octave = options.first_octave
     extraction.sift.peak_threshold = options.peak_threshold
     pycolmap.extract_features(database, pictures, names, pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu)
-
-
-def _sparse(model):
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
-    key_of = {image.image_id: key for key, image in enumerate(images)}
-    camera_from_model = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
-    identifiers = sorted(model.points3D)
-    rows = [
-        (point, key_of[element.image_id], *model.images[element.image_id].points2D[element.point2D_idx].xy)
-        for point, identifier in enumerate(identifiers)
-        for element in model.points3D[identifier].track.elements
-    ]
-    table = np.array(rows).reshape(-1, 4)
-    return Sparse(
-        frame=np.array([int(image.name[:6]) for image in images]),
-        model_from_camera=rigid.inverse(camera_from_model),
-        points_model=np.array([model.points3D[identifier].xyz for identifier in identifiers]).reshape(-1, 3),
-        observed_point=table[:, 0].astype(int),
-        observed_key=table[:, 1].astype(int),
-        observed_pixel=table[:, 2:],
-        reprojection_px=float(model.compute_mean_reprojection_error()),
-        reconstruction=model,
-    )

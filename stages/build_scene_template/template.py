@@ -12,6 +12,7 @@ from pipeline.files.clips import Clip
 from pipeline.progress import log
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
+from pipeline.space.sparse import Sparse
 from stages.build_scene_template import anchor, fuse, refine, sfm
 
 
@@ -31,6 +32,8 @@ class Template:
     gravity: str
     floor_m: float
     """Height of the floor, world y."""
+    scale: str
+    """What makes lengths metres (`Clip.scale`)."""
 
 
 def build(
@@ -43,7 +46,7 @@ def build(
     fusion: fuse.FuseOptions,
     workspace: Path,
     seed: int,
-) -> tuple[Template, sfm.Sparse | None]:
+) -> tuple[Template, Sparse | None]:
     """Build the template; the sparse model comes back in the world, ready to be written. Raises InputError MAP-001
     and MAP-002.
     """
@@ -71,16 +74,11 @@ def build(
     upright_from_world, gravity = anchor.upright(clip, poses, points[known], normals[known])
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, fusion)
     if len(mesh.faces) < 100:
-        raise InputError(
-            "MAP-002",
-            "depth fused to no surface",
-            str(clip.folder),
-            "check that the recording has LiDAR depth within 4 m",
-        )
+        raise InputError("MAP-002", "depth fused to no surface", str(clip.folder), "check that the recording has LiDAR depth within 4 m")
     poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, fusion, weights)
     mesh = fuse.clean(fuse.fuse(clip, np.arange(len(clip)), poses, fusion), workspace, fusion.island_faces)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
-    template = Template(
+    made = Template(
         mesh=mesh,
         features=fuse.vertex_features(clip, features, mesh, poses, fusion.feature_frames),
         world_from_camera=poses,
@@ -91,8 +89,9 @@ def build(
         reprojection_px=None if sparse is None else sparse.reprojection_px,
         gravity=gravity,
         floor_m=floor_height(mesh),
+        scale=clip.scale,
     )
-    return template, sparse
+    return made, sparse
 
 
 def floor_height(mesh: Mesh) -> float:
@@ -101,7 +100,7 @@ def floor_height(mesh: Mesh) -> float:
     return float(np.quantile(mesh.vertices[up, 1], 0.05)) if up.any() else float(mesh.vertices[:, 1].min())
 
 
-def write_model(sparse: sfm.Sparse | None, world_from_camera: Float[np.ndarray, "frame 4 4"], folder: Path) -> None:
+def write_model(sparse: Sparse | None, world_from_camera: Float[np.ndarray, "frame 4 4"], folder: Path) -> None:
     """Write COLMAP's model as text, moved into the world by the similarity that best takes its camera centres there."""
     folder.mkdir()
     if sparse is None:

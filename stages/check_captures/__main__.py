@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> int:
         return 2
     unusable = 0
     for verdict in checking.check(files, settings.samples, np.random.default_rng(settings.seed)):
-        unusable += verdict.seen is None or verdict.seen.look.plan is None
+        unusable += not verdict.usable
         print(f"{verdict.text}\n", flush=True)
     for name in captures.not_understood(given.folder):
         print(f"{name}  left alone: not a recording of a known format (CAP-003)\n")

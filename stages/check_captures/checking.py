@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.recordings.formats import open_recording
 from pipeline.videos import Role
-from stages.check_captures import looking, movers, overlap, poses, telling
+from stages.check_captures import looking, movers, overlap, parallax, poses, telling
 from stages.check_captures.overlap import Described
 from stages.check_captures.problems import Problem, Seen, problems
 
@@ -26,6 +26,11 @@ class Verdict:
     """None where it cannot be used"""
     problems: tuple[Problem, ...]
     text: str
+
+    @property
+    def usable(self) -> bool:
+        """Tell whether a build goes on with it: a walk-through is mapped without depth, nothing else is."""
+        return self.seen is not None and (self.seen.look.plan is not None or self.role == "walkthrough")
 
 
 def check(files: Sequence[tuple[Path, Role]], samples: int, rng: np.random.Generator) -> Iterator[Verdict]:
@@ -46,7 +51,7 @@ def check(files: Sequence[tuple[Path, Role]], samples: int, rng: np.random.Gener
 def _seen(look: looking.Look, role: Role, room: list[Described], rng: np.random.Generator) -> Seen:
     """Measure what a role asks for; a walk-through's described frames are added to ``room``."""
     if look.plan is None:
-        return Seen(look)
+        return Seen(look, parallax=parallax.parallax(look.shots) if role == "walkthrough" else None)
     drift_m = poses.drift_m(look.shots)
     if role == "walkthrough":
         room += overlap.describe(look.shots)

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.videos import Role
 from stages.check_captures.looking import Look
 from stages.check_captures.movers import Moving
+from stages.check_captures.parallax import Parallax
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Seen:
     moving: Moving | None = None
     placed: float | None = None
     """share of frames found in the walk-through, 0..1"""
+    parallax: Parallax | None = None
+    """of a walk-through without depth"""
 
 
 SHORTEST_S: dict[Role, float] = {"walkthrough": 30.0, "turnaround": 8.0, "session": 15.0, "heldout": 5.0}
@@ -38,6 +41,7 @@ MOST_DARK, MOST_BLURRED, LEAST_DEPTH, MOST_BEYOND, MOST_DAMAGED = 0.2, 0.25, 0.5
 MOST_DRIFT_M = 0.10
 LEAST_PLACED = 0.05
 LEAST_SEEN = 0.25
+LEAST_LINKED, LEAST_TELLING = 0.6, 0.3
 MOST_SEVERAL = 0.5
 LONGEST_GAP_S = 1.0
 SPARSE_HZ = 5.0
@@ -45,7 +49,7 @@ SPARSE_HZ = 5.0
 
 def problems(seen: Seen, role: Role) -> list[Problem]:
     """Return what is wrong with a recording in its role, worst first."""
-    return [*_of_pictures(seen.look, role), *_of_depth(seen.look), *_of_poses(seen), *_of_content(seen, role)]
+    return [*_of_pictures(seen.look, role), *_of_depth(seen, role), *_of_poses(seen), *_of_content(seen, role)]
 
 
 def _of_pictures(look: Look, role: Role) -> list[Problem]:
@@ -67,10 +71,10 @@ def _of_pictures(look: Look, role: Role) -> list[Problem]:
     return found
 
 
-def _of_depth(look: Look) -> list[Problem]:
+def _of_depth(seen: Seen, role: Role) -> list[Problem]:
+    look = seen.look
     if look.plan is None:
-        what = "there is no depth: the build stops at this file (CAP-006)"
-        return [Problem("CAP-036", what, "record with a LiDAR phone, or add a depth picture per frame")]
+        return _of_pictures_alone(seen.parallax) if role == "walkthrough" else [_NO_DEPTH]
     found = []
     if look.depth_valid < LEAST_DEPTH:
         found.append(
@@ -84,6 +88,22 @@ def _of_depth(look: Look) -> list[Problem]:
         found.append(
             Problem("CAP-038", f"{look.beyond:.0%} of the depth is beyond the sensor's range", "stay within 4 m of floor, walls and animal")
         )
+    return found
+
+
+_NO_DEPTH = Problem(
+    "CAP-036",
+    "there is no depth: the build stops at this file (CAP-006)",
+    "record with a LiDAR phone, or add a depth picture per frame",
+)
+
+
+def _of_pictures_alone(parallax: Parallax | None) -> list[Problem]:
+    what = "there is no depth: the room is mapped from pictures; without a session that has depth its scale is relative"
+    found = [Problem("CAP-039", what, "record it with a LiDAR phone, or let a session with depth go where it went")]
+    if parallax is not None and (parallax.linked < LEAST_LINKED or parallax.telling < LEAST_TELLING):
+        what = f"{parallax.linked:.0%} of neighbouring pictures show the same things, {parallax.telling:.0%} of these from elsewhere"
+        found.append(Problem("CAP-056", what, "walk sideways instead of turning on the spot, slowly, along things with a pattern"))
     return found
 
 

@@ -1,15 +1,20 @@
 """Turn one phone recording into upright frames at 10 Hz with metric depth, intrinsics and odometry.
 
 Reads Record3D (`.r3d`, EXR + JPG), Stray Scanner, Polycam raw data, NeRFCapture streams, TUM and 7-Scenes folders, and
-video with depth pictures. Checks on the depth what the device poses mean.
+video with depth pictures. Checks on the depth what the device poses mean. A walk-through that is a video alone is mapped
+from its pictures; sessions with depth tell it metres, otherwise its scale is relative.
 """
 
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
 
-from pipeline import cli, progress
+from pipeline import captures, cli, progress
 from pipeline.recordings import extraction
 from pipeline.recordings.formats import open_recording
-from stages.extract_frames import writing
+from pipeline.recordings.recording import Recording
+from pipeline.videos import Video
+from stages.extract_frames import photogrammetry, writing
 
 
 @dataclass(frozen=True)
@@ -28,21 +33,28 @@ class Config:
     """Pairs of frames on which device poses are checked against depth."""
     jpeg_quality: int = 95
     """JPEG quality 1..100 of pictures that were turned or reduced; the others keep the phone's bytes."""
+    without_depth: photogrammetry.PhotogrammetryOptions = field(default_factory=photogrammetry.PhotogrammetryOptions)
+    """How a walk-through is mapped that has no depth."""
 
 
 def run(task: cli.Task) -> None:
     """Extract one recording."""
     settings: Config = task.config
     recording = open_recording(task.input("recording"))
-    plan = extraction.understand(
-        recording,
-        rate_hz=settings.rate_hz,
-        max_depth_m=settings.max_depth_m,
-        pairs=settings.check_pairs,
-        max_side_px=settings.max_side_px,
-    )
-    progress.log(extraction.sentence(recording, plan))
-    frames = extraction.frames(recording, plan, max_depth_m=settings.max_depth_m, jpeg_quality=settings.jpeg_quality)
+    sizes = {"rate_hz": settings.rate_hz, "max_depth_m": settings.max_depth_m, "max_side_px": settings.max_side_px}
+    mine = next((video for video in task.videos if video.id == task.video), None)
+    if recording.depth_size is None and (mine is None or mine.role == "walkthrough"):
+        measured = _telling_meters(task, mine)
+        with tempfile.TemporaryDirectory() as workspace:
+            mapped = photogrammetry.map_pictures(
+                recording, measured, settings.without_depth, **sizes, jpeg_quality=settings.jpeg_quality, workspace=Path(workspace)
+            )
+        plan, frames, told = mapped.plan, mapped.frames, mapped.told
+    else:
+        plan = extraction.understand(recording, **sizes, pairs=settings.check_pairs)
+        frames = extraction.frames(recording, plan, max_depth_m=settings.max_depth_m, jpeg_quality=settings.jpeg_quality)
+        told = extraction.sentence(recording, plan)
+    progress.log(told)
     frames = progress.track(frames, "frames", total=len(plan.chosen))
     with task.create() as folder:
         written = writing.write_frames(
@@ -52,5 +64,13 @@ def run(task: cli.Task) -> None:
         writing.report_quality(folder, plan, written, rate_hz=settings.rate_hz)
 
 
+def _telling_meters(task: cli.Task, mine: Video | None) -> dict[str, Recording]:
+    """Open the recordings whose depth may tell metres to one without."""
+    if mine is None or not task.has("captures"):
+        return {}
+    folder = task.input("captures")
+    return {video.id: open_recording(folder / video.file) for video in captures.telling_meters(folder, mine, task.videos)}
+
+
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, reads=("recording",))
+    cli.enter(__doc__, run, config=Config, reads=("recording",), optional=("captures",))

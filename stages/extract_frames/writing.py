@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline import qa
 from pipeline.errors import InputError
 from pipeline.files import arrays, images
-from pipeline.recordings.extraction import DARK, Frame, Plan, quality_of
+from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, Frame, Plan, quality_of
 from pipeline.recordings.recording import Recording
 
 MOST_LOST = 0.5
@@ -78,6 +78,7 @@ def write_table(folder: Path, recording: Recording, plan: Plan, written: Written
         depth_intrinsics=plan.depth_intrinsics[kept],
         **odometry,
         gravity_known=np.array(plan.gravity_known),
+        scale=np.array(plan.scale),
         source_index=recording.index[plan.chosen][kept].astype(np.int64),
         quarter_turns=np.array(plan.quarter_turns, np.int64),
         sharpness=written.sharpness.astype(np.float32),
@@ -93,8 +94,6 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
     median_sharpness = max(float(np.median(written.sharpness)), 1e-6)
     missing = 1 - len(timestamp_s) / max(round(duration_s * rate_hz) + 1, 1)
-    check = plan.self_check
-    residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None
     checks = [
         qa.Check("duration", duration_s, "s", warn=5.0, better="higher"),
         qa.Check("frames", float(len(timestamp_s)), "", warn=50, fail=2, better="higher"),
@@ -106,7 +105,7 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
         qa.Check("damaged frames", 100 * written.lost, "%", warn=0.0),
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
         qa.Check("device poses usable", float(plan.odometry_from_camera is not None), "", warn=0.5, better="higher"),
-        qa.Check(f"device poses against depth ({check.reason})", residual_mm, "mm", warn=1000 * check.tolerance_m),
+        _check_of_poses(plan),
     ]
     pictures = [
         qa.Picture("contact_sheet", written.color_strip, "frames spread over the recording, as understood"),
@@ -119,6 +118,16 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
         checks=checks,
         pictures=pictures,
     )
+
+
+def _check_of_poses(plan: Plan) -> qa.Check:
+    """Say how well device poses fit the depth; where both were made from pictures, what its lengths are worth."""
+    check = plan.self_check
+    if plan.scale != MEASURED:
+        told = "relative: lengths are no metres" if plan.scale == RELATIVE else f"metres from the depth of {plan.scale}"
+        return qa.Check(f"scale known ({check.reason}; {told})", float(plan.scale != RELATIVE), "", warn=0.5, better="higher")
+    residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None
+    return qa.Check(f"device poses against depth ({check.reason})", residual_mm, "mm", warn=1000 * check.tolerance_m)
 
 
 def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:

@@ -64,6 +64,7 @@ class MemoryClip:
     color_size: tuple[int, int] = SIZE
     depth_size: tuple[int, int] = SIZE
     cache: dict = field(default_factory=dict)
+    scale: str = "measured"
 
     def __len__(self) -> int:
         return len(self.truth)

@@ -5,8 +5,9 @@ import pycolmap
 import pytest
 
 from pipeline.files import meshes as mesh_files
-from pipeline.space import rigid, tsdf
+from pipeline.space import ground, rigid, tsdf
 from pipeline.space.meshes import Mesh, RayCaster
+from pipeline.space.sparse import Sparse
 from stages.build_scene_template import anchor, fuse, matches, refine, sfm, template
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
@@ -52,7 +53,7 @@ def test_wrong_structure_is_refuted_by_depth(clip):
     key, pixel = rows % len(frames), np.random.default_rng(0).uniform(20, 100, (len(rows), 2))
     points = np.stack([matches.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)])
     world = np.stack([rigid.apply(bent[k], p[None])[0] for k, p in zip(key, points, strict=True)])
-    sparse = sfm.Sparse(frames, bent, world, rows, key, pixel, 0.5, None)
+    sparse = Sparse(frames, bent, world, rows, key, pixel, 0.5, None)
     start = anchor.choose_start(clip, frames, keyframes, sparse, anchor.AnchorOptions())
     assert start.source == "odometry"
     assert "depth" in start.reason
@@ -80,7 +81,7 @@ def test_floor_direction_is_found_from_normals():
     walls = np.concatenate([np.repeat(np.eye(3), 200, axis=0), -np.repeat(np.eye(3), 100, axis=0)]) @ turn.T
     normals = np.concatenate([walls, rng.normal(size=(200, 3))])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    up = anchor.floor_direction(normals, np.array([0.0, 1.0, 0.0]))
+    up = ground.floor_direction(normals, np.array([0.0, 1.0, 0.0]))
     assert np.rad2deg(np.arccos(up @ turn[:, 1])) < 1.0, "degrees"
 
 

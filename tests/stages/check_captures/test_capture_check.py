@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +11,7 @@ from pipeline.space import cameras, rigid
 from pipeline.space.meshes import RayCaster, render_view
 from pipeline.videos import Role
 from stages.check_captures import __main__ as front
-from stages.check_captures import looking, movers, overlap, poses, problems
+from stages.check_captures import looking, movers, overlap, parallax, poses, problems
 from stages.check_captures.looking import Shot
 from tests.pipeline.recordings import made_formats
 from tests.stages import textured_room
@@ -106,6 +107,7 @@ def test_damaged_pictures_and_missing_depth_are_told(tmp_path):
     made = _made()
     made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(60)])
     assert "CAP-036" in _codes(tmp_path / "a.mp4")
+    assert "CAP-039" in _codes(tmp_path / "a.mp4", "walkthrough")
     data = bytearray((tmp_path / "a.mp4").read_bytes())
     middle = len(data) // 2
     data[middle - 20_000 : middle + 20_000] = bytes(40_000)
@@ -195,3 +197,25 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
     told = capsys.readouterr().out
     for expected in ("Record3D .r3d", "CAP-031", "CAP-001", "notes.txt", "CAP-003", "CAP-040", "turnaround"):
         assert expected in told, told
+
+
+def _layers(near_step_px: int) -> list[Shot]:
+    """Pictures of a far and a near layer of blobs; per picture the far one moves by 4 pixels, the near one by its own step."""
+    rng, nothing = np.random.default_rng(0), np.zeros((0, 0), np.float32)
+    far, near = (cv2.normalize(cv2.GaussianBlur(rng.normal(size=(240, 600)), (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX) for _ in range(2))
+    shots = []
+    for number in range(8):
+        picture = far[:, 4 * number : 4 * number + 320].copy()
+        picture[120:] = near[120:, near_step_px * number : near_step_px * number + 320]
+        shots.append(Shot(float(number), picture.astype(np.uint8), np.eye(3), nothing, np.eye(3), None, 20.0, 0.5, 0.0))
+    return shots
+
+
+def test_a_video_that_turns_on_the_spot_tells_no_depth():
+    walked, turned = parallax.parallax(_layers(16)), parallax.parallax(_layers(4))
+    assert min(walked.linked, turned.linked) > 0.8
+    assert walked.telling > 0.8
+    assert turned.telling < 0.2
+    look = looking.Look(None, None, [], 0.0)
+    assert [each.code for each in problems._of_depth(problems.Seen(look, parallax=turned), "walkthrough")] == ["CAP-039", "CAP-056"]
+    assert [each.code for each in problems._of_depth(problems.Seen(look, parallax=walked), "walkthrough")] == ["CAP-039"]

@@ -1,0 +1,209 @@
+"""Depth from posed pictures: a plane sweep, smoothed along eight paths, kept where other pictures agree.
+
+Everything is in the units of the poses. `neighbours` picks the pictures that each one is compared with, `sweep` makes
+one picture's depth, `agreement` counts how many others confirm it.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numba import njit
+
+from pipeline.space import cameras, rigid
+from pipeline.space.sparse import Sparse
+
+PATHS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """How depth is made from posed pictures."""
+
+    side_px: int = 224
+    """Longer side of the depth pictures."""
+    planes: int = 112
+    """Distances that are tried, evenly spaced in 1 / distance."""
+    sources: int = 6
+    """Pictures that each one is compared with."""
+    angle_deg: tuple[float, float] = (2.0, 25.0)
+    """Angles between rays to a shared point that pictures are chosen for, degrees."""
+    window_px: int = 7
+    """Side of the compared patches."""
+    texture: float = 3.0
+    """Grey levels (of 255) of contrast below which a patch says little."""
+    small_step: float = 0.04
+    """Cost of a step of one plane between neighbouring pixels, in correlation."""
+    large_step: float = 0.5
+    """Cost of a larger step."""
+    agree_share: float = 0.03
+    """Relative difference of depth within which another picture agrees."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed picture, at the size of its depth."""
+
+    gray: Float[np.ndarray, "height width"]
+    """0..255"""
+    intrinsics: Float[np.ndarray, "3 3"]
+    world_from_camera: Float[np.ndarray, "4 4"]
+
+
+def neighbours(sparse: Sparse, options: SweepOptions) -> list[Int[np.ndarray, "source"]]:
+    """Pick for each key the others that share the most points under a good angle, best first."""
+    count = len(sparse.frame)
+    seen = np.zeros((count, len(sparse.points_model)), bool)
+    seen[sparse.observed_key, sparse.observed_point] = True
+    centres = sparse.model_from_camera[:, :3, 3]
+    low, high = options.angle_deg
+    chosen = []
+    for key in range(count):
+        shared = seen & seen[key]
+        score = np.zeros(count)
+        for other in np.flatnonzero(shared.sum(1) >= 8):
+            if other != key:
+                points = sparse.points_model[shared[other]]
+                angle = _angle_deg(centres[key] - points, centres[other] - points)
+                score[other] = np.clip(np.minimum(angle / low, high / np.maximum(angle, 1e-6)), 0, 1).sum()
+        order = np.argsort(-score, kind="stable")
+        chosen.append(order[score[order] > 0][: options.sources])
+    return chosen
+
+
+def depth_range(sparse: Sparse, key: int) -> tuple[float, float]:
+    """Return the (nearest, furthest) distance worth trying for a key: that of the points it sees, and some more."""
+    points = sparse.points_model[sparse.observed_point[sparse.observed_key == key]]
+    z = rigid.apply(rigid.inverse(sparse.model_from_camera[key]), points)[:, 2]
+    near, far = np.quantile(z[z > 0], [0.01, 0.99])
+    return 0.6 * float(near), 1.6 * float(far)
+
+
+def sweep(view: View, others: list[View], reach: tuple[float, float], options: SweepOptions) -> Float[np.ndarray, "height width"]:
+    """Return the depth at which the patches of a picture look most alike in the others, smooth but for edges."""
+    distances = 1 / np.linspace(1 / reach[1], 1 / reach[0], options.planes)
+    alike = np.stack([_correlation(view, other, distances, options) for other in others])
+    cost = _combined(alike)
+    total = np.zeros_like(cost)
+    for down, right in PATHS:
+        _add_path(cost, total, down, right, np.float32(options.small_step), np.float32(options.large_step), view.gray)
+    return _between(total, distances)
+
+
+def _correlation(view: View, other: View, distances: np.ndarray, options: SweepOptions) -> Float[np.ndarray, "plane height width"]:
+    """Return the normalised correlation of patches, plane by plane; -1 where the other picture does not reach."""
+    height, width = view.gray.shape
+    window = (options.window_px, options.window_px)
+
+    def mean(picture):
+        return cv2.boxFilter(picture, cv2.CV_32F, window)
+
+    relative = rigid.inverse(other.world_from_camera) @ view.world_from_camera
+    centred = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    to_pixel, from_pixel = centred @ other.intrinsics, np.linalg.inv(centred @ view.intrinsics)
+    own_mean = mean(view.gray)
+    own_variance = np.maximum(mean(view.gray**2) - own_mean**2, 0)
+    inside, alike = np.full(other.gray.shape, 255, np.uint8), np.empty((len(distances), height, width), np.float32)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    for plane, distance in enumerate(distances):
+        through = relative[:3, :3].copy()
+        through[:, 2] += relative[:3, 3] / distance
+        homography = to_pixel @ through @ from_pixel
+        warped = cv2.warpPerspective(other.gray, homography, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        known = cv2.warpPerspective(inside, homography, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+        their_mean = mean(warped)
+        variance = np.maximum(mean(warped**2) - their_mean**2, 0)
+        together = mean(warped * view.gray) - their_mean * own_mean
+        alike[plane] = np.where(known > 0, together / (np.sqrt(own_variance * variance) + options.texture**2), -1)
+    return alike
+
+
+@njit(cache=True, nogil=True)
+def _combined(alike):
+    """Average 1 - correlation over the better half of the pictures that reach a pixel; 1 where none does."""
+    sources, planes, height, width = alike.shape
+    cost = np.ones((planes, height, width), np.float32)
+    best = np.empty(sources, np.float32)
+    for plane in range(planes):
+        for row in range(height):
+            for column in range(width):
+                count = 0
+                for source in range(sources):
+                    value = alike[source, plane, row, column]
+                    if value > -1:
+                        place = count
+                        while place > 0 and best[place - 1] < value:
+                            best[place] = best[place - 1]
+                            place -= 1
+                        best[place] = value
+                        count += 1
+                half = (count + 1) // 2
+                if half:
+                    total = np.float32(0)
+                    for source in range(half):
+                        total += 1 - best[source]
+                    cost[plane, row, column] = total / half
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def _add_path(cost, total, down, right, small, large, gray):
+    """Add one direction of semi-global matching (Hirschmueller 2008); large steps are cheaper across edges."""
+    planes, height, width = cost.shape
+    path = np.zeros((height, width, planes), np.float32)
+    for step_row in range(height):
+        row = step_row if down >= 0 else height - 1 - step_row
+        for step_column in range(width):
+            column = step_column if right >= 0 else width - 1 - step_column
+            before_row, before_column = row - down, column - right
+            if before_row < 0 or before_column < 0 or before_row >= height or before_column >= width:
+                for plane in range(planes):
+                    path[row, column, plane] = cost[plane, row, column]
+            else:
+                before = path[before_row, before_column]
+                least = before.min()
+                jump = least + large / (1 + abs(gray[row, column] - gray[before_row, before_column]) / 12)
+                for plane in range(planes):
+                    value = min(before[plane], jump)
+                    if plane > 0:
+                        value = min(value, before[plane - 1] + small)
+                    if plane + 1 < planes:
+                        value = min(value, before[plane + 1] + small)
+                    path[row, column, plane] = cost[plane, row, column] + value - least
+            for plane in range(planes):
+                total[plane, row, column] += path[row, column, plane]
+
+
+def _between(total: Float[np.ndarray, "plane height width"], distances: np.ndarray) -> Float[np.ndarray, "height width"]:
+    """Return the distance of least cost, between planes by a parabola; 0 at the ends of the range."""
+    best = total.argmin(0)
+    inner = np.clip(best, 1, len(distances) - 2)
+    before, at, after = (np.take_along_axis(total, (inner + shift)[None], 0)[0] for shift in (-1, 0, 1))
+    bend = before - 2 * at + after
+    shift = np.where(bend > 1e-6, np.clip(0.5 * (before - after) / np.maximum(bend, 1e-6), -0.5, 0.5), 0)
+    inverse = 1 / distances[0] + (inner + shift) * (1 / distances[1] - 1 / distances[0])
+    return np.where(best == inner, 1 / inverse, 0).astype(np.float32)
+
+
+def agreement(
+    depth: Float[np.ndarray, "height width"],
+    view: View,
+    others: list[tuple[Float[np.ndarray, "height width"], View]],
+    options: SweepOptions,
+) -> UInt8[np.ndarray, "height width"]:
+    """Count, per pixel, the other pictures whose depth there says the same."""
+    points_world = rigid.apply(view.world_from_camera, cameras.back_project(depth, view.intrinsics).reshape(-1, 3))
+    count = np.zeros(depth.size, np.uint8)
+    for theirs, other in others:
+        pixel, z = cameras.project(rigid.apply(rigid.inverse(other.world_from_camera), points_world), other.intrinsics)
+        inside = np.flatnonzero((depth.ravel() > 0) & (z > 0) & (pixel >= 0).all(1) & (pixel < theirs.shape[::-1]).all(1))
+        column, row = np.floor(pixel[inside]).astype(int).T
+        met = theirs[row, column]
+        count[inside] += (met > 0) & (np.abs(met - z[inside]) < options.agree_share * z[inside])
+    return count.reshape(depth.shape)
+
+
+def _angle_deg(first: Float[np.ndarray, "ray 3"], second: Float[np.ndarray, "ray 3"]) -> Float[np.ndarray, "ray"]:
+    cosine = (first * second).sum(1) / np.maximum(np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1), 1e-12)
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
