@@ -1,10 +1,14 @@
-"""Assemble the page: one HTML file that holds its script, its worker, the WebAssembly runtime and every asset."""
+"""Assemble the page: one HTML file that holds its scripts, the WebAssembly runtime and every asset, compressed.
+
+Arrays are stored byte by byte of their records (first all first bytes, then all second ones), which compresses better.
+"""
 
 import base64
 import gzip
 import html
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
@@ -14,7 +18,16 @@ from stages.export_simulator.actions import Motion
 from stages.export_simulator.contract import rigid_rows
 
 _BUNDLE = "web/dist"
+_BUNDLED = {"page": "page.js.gz", "worker": "worker.js.gz", "ort.wasm": "ort.wasm.gz"}
 _STEPS = 4096.0
+
+
+@dataclass(frozen=True)
+class Asset:
+    """What differs between builds: some content, and how many bytes its records have."""
+
+    content: bytes
+    record: int = 1
 
 
 def clip_rows(motions: list[Motion]) -> bytes:
@@ -29,35 +42,42 @@ def clip_rows(motions: list[Motion]) -> bytes:
     return (np.rint(np.concatenate(frames) * _STEPS) / _STEPS).astype("<f4").tobytes()
 
 
-def page(*, contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> str:
-    """Return the page with everything in it; `assets` are what differs between builds, by the names the script asks for."""
-    content = compressed(contract, assets)
-    tags = [f'<script type="application/octet-stream" id="asset-{name}">{_text(file)}</script>' for name, file in content.items()]
+def page(*, contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> str:
+    """Return the page with everything in it; `assets` go by the names that the script asks for."""
+    files = compressed(contract, assets)
+    tags = [_tag(name, assets, content=base64.b64encode(file).decode()) for name, file in files.items()]
     return _assembled(contract, tags, connect="")
 
 
-def light_page(*, contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> tuple[str, dict[str, bytes]]:
+def light_page(*, contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> tuple[str, dict[str, bytes]]:
     """Return a page that loads its assets from beside it, and these files by name; it wants a static host."""
-    files = {f"assets/{name}.gz": file for name, file in compressed(contract, assets).items()}
-    tags = [f'<script type="application/octet-stream" id="asset-{file[7:-3]}" data-file="{file}"></script>' for file in files]
-    return _assembled(contract, tags, connect="'self'"), files
+    files = compressed(contract, assets)
+    tags = [_tag(name, assets, f' data-file="assets/{name}.gz"') for name in files]
+    return _assembled(contract, tags, connect="'self'"), {f"assets/{name}.gz": file for name, file in files.items()}
 
 
-def compressed(contract: Mapping[str, Any], assets: Mapping[str, bytes]) -> dict[str, bytes]:
-    """Compress all that the page needs beside its script; the same content always gives the same bytes."""
+def compressed(contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> dict[str, bytes]:
+    """Compress all that the page unpacks; the same content always gives the same bytes."""
     bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
-    files = {name: gzip.compress(content, 9, mtime=0) for name, content in assets.items()}
+    files = {name: bundle.joinpath(file).read_bytes() for name, file in _BUNDLED.items()}
     files["simulator"] = gzip.compress(json.dumps(contract).encode(), 9, mtime=0)
-    return files | {name: bundle.joinpath(f"{file}.gz").read_bytes() for name, file in (("worker", "worker.js"), ("ort.wasm", "ort.wasm"))}
+    return files | {name: gzip.compress(planes(asset), 9, mtime=0) for name, asset in assets.items()}
 
 
-def _text(content: bytes) -> str:
-    return base64.b64encode(content).decode()
+def planes(asset: Asset) -> bytes:
+    """Sort the content by the place of each byte in its record; what is left over stays at the end."""
+    whole = len(asset.content) // asset.record * asset.record
+    records = np.frombuffer(asset.content, np.uint8, whole).reshape(-1, asset.record)
+    return records.T.tobytes() + asset.content[whole:]
+
+
+def _tag(name: str, assets: Mapping[str, Asset], more: str = "", content: str = "") -> str:
+    record = assets[name].record if name in assets else 1
+    return f'<script type="application/octet-stream" id="asset-{name}" data-record="{record}"{more}>{content}</script>'
 
 
 def _assembled(contract: Mapping[str, Any], tags: list[str], connect: str) -> str:
     bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
-    script = gzip.decompress(bundle.joinpath("page.js.gz").read_bytes()).decode()
     name = html.escape(str(contract["name"]))
     pieces = {
         "@@TITLE@@": f"{name}: a behaviour simulator",
@@ -66,7 +86,7 @@ def _assembled(contract: Mapping[str, Any], tags: list[str], connect: str) -> st
         "@@NOTICES@@": bundle.joinpath("NOTICES.txt").read_text(),
         "@@STYLE@@": bundle.joinpath("style.css").read_text(),
         "@@ASSETS@@": "\n".join(tags),
-        "@@SCRIPT@@": script.replace("</script", "<\\/script").replace("<!--", "<\\!--"),
+        "@@SCRIPT@@": bundle.joinpath("boot.js").read_text(),
     }
     text = bundle.joinpath("page.html").read_text()
     for mark, piece in pieces.items():

@@ -23,6 +23,8 @@ from stages.train_behavior.batches import (
 from stages.train_behavior.objective import Objective, losses
 from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
 
+_STEPS = 2.0**12
+
 
 @dataclass(frozen=True)
 class Optimization:
@@ -112,7 +114,16 @@ def train(
         clip_norm=1.0,
         after_step=after_step,
     )
-    return Fitted(average.eval(), statistics.scaling, record)
+    return Fitted(rounded(average.eval()), statistics.scaling, record)
+
+
+def rounded(nets: BehaviorNets) -> BehaviorNets:
+    """Round weights to 12 significant bits: nearly half of what a page sends of them, and far finer than training can tell."""
+    with torch.no_grad():
+        for weight in nets.parameters():
+            mantissa, exponent = torch.frexp(weight)
+            weight.copy_(torch.ldexp((mantissa * _STEPS).round() / _STEPS, exponent))
+    return nets
 
 
 def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Statistics, seed: int) -> BehaviorNets:

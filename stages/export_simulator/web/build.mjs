@@ -11,8 +11,9 @@ const store = (name, bytes) => writeFileSync(`${folder}/${name}.gz`, gzipSync(by
 const folder = process.argv[2] ?? 'dist';
 mkdirSync(folder, { recursive: true });
 const bundle = async (entry) => (await build({ ...shared, entryPoints: [entry], define: { 'import.meta.url': '"blob:null/"' } })).outputFiles[0].text;
-// The libraries start WebAssembly as they load: the page first makes sure that there is any.
-store('page.js', `${await bundle('src/able.js')}\nif (window.able) {\n${await bundle('src/main.js')}}\n`);
+// The libraries start WebAssembly as they load: the first script makes sure that there is any, and unpacks the rest.
+writeFileSync(`${folder}/boot.js`, await bundle('src/boot.js'));
+store('page.js', await bundle('src/main.js'));
 store('worker.js', await bundle('src/worker.js'));
 store('ort.wasm', readFileSync('node_modules/onnxruntime-web/dist/ort-wasm-simd-threaded.wasm'));
 // The notices that the bundled libraries ask to be kept; the page carries them as a comment.

@@ -16,12 +16,13 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page
 
-from pipeline import artifact
+from pipeline import artifact, config
 from pipeline.cli import Task
 from pipeline.files import arrays
 from pipeline.models.trajectories import BehaviorData
 from pipeline.space import rigid
 from stages.export_simulator.__main__ import Config, run
+from stages.simulate.subgoal_file import Written, subgoals, tables
 from tests.stages.export_simulator import browser, reaction, small_world, twins
 
 pytestmark = pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
@@ -75,6 +76,7 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
 def test_goals_and_paths_are_obeyed_and_takes_are_kept(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
     with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(900, 760), accept_downloads=True) as (page, wrong):
         _check_a_clicked_goal(page)
+        _check_goals_in_turn(page, tmp_path)
         _check_a_drawn_path(page)
         _check_downloads(page, tmp_path)
         _check_a_clip_beside(page)
@@ -145,11 +147,39 @@ def _check_a_clicked_goal(page: Page) -> None:
     page.wait_for_function("ats.state().aim === null", timeout=10_000)
 
 
+def _check_goals_in_turn(page: Page, folder: Path) -> None:
+    """Goals clicked one after the other are kept in the address and as a file, and visited in this order."""
+    goals = np.array([[0.6, -0.4], [0.5, 0.6], [-0.4, 0.5]])
+    page.click("#pins")
+    for x, z in goals[:2]:
+        page.mouse.click(*page.evaluate("p => ats.screen(p)", [x, 0, z]))
+    page.click("#pins")
+    page.keyboard.down("Shift")
+    page.mouse.click(*page.evaluate("p => ats.screen(p)", [goals[2, 0], 0, goals[2, 1]]))
+    page.keyboard.up("Shift")
+    np.testing.assert_allclose(page.evaluate("ats.state().stops"), goals, atol=0.05)  # metres
+    assert page.evaluate("new URLSearchParams(location.hash.slice(1)).get('aim').split(';').length") == 3
+    begin = page.evaluate("ats.state().animal")
+    with page.expect_download() as download:
+        page.click("#toml")
+    download.value.save_as(folder / "goals.toml")
+    written = [config.from_table(Written, each, where="") for each in tables(config.read_table(folder / "goals.toml"), folder)]
+    journey = subgoals(written, folder)
+    assert np.linalg.norm(journey[0].position_world - begin[:3]) < 0.5 and journey[0].heading_rad is not None, (
+        "metres: it begins where it was"
+    )
+    np.testing.assert_allclose([stop.position_world[[0, 2]] for stop in journey[1:]], goals, atol=0.05)
+    for left in (2, 1, 0):
+        page.wait_for_function(f"ats.state().stops.length === {left}", timeout=30_000)
+        place = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
+        assert np.linalg.norm(place - goals[2 - left]) < 0.6, "metres: it is at the stop that is next in turn"
+
+
 def _check_a_drawn_path(page: Page) -> None:
     """A stroke of the pen over the floor is walked within 0.1 m, to its end."""
     angle = np.linspace(np.pi, 0.2, 12)
     stroke = np.stack([0.1 + 0.7 * np.cos(angle), 0 * angle, 0.1 + 0.7 * np.sin(angle)], -1)
-    page.click("#draw")
+    page.click("#pen")
     page.mouse.move(*page.evaluate("p => ats.screen(p)", stroke[0].tolist()))
     page.mouse.down()
     for point in stroke[1:]:

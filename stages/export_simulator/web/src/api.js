@@ -16,7 +16,8 @@ export function api(simulator) {
         observer: [...observer.place],
         plans: simulator.turnNumber,
         milliseconds: simulator.milliseconds,
-        aim: simulator.aim,
+        aim: simulator.stops.next,
+        stops: simulator.stops.left,
         route: simulator.route && { points: simulator.route.points, done: simulator.route.done, length: simulator.route.length },
         replay: simulator.replaying && { name: simulator.replaying.name, tick: simulator.replayTick, place: [...simulator.clips.frame(simulator.replaying, simulator.replayTick).slice(0, 3)] },
         take_s: simulator.take.seconds,
@@ -40,7 +41,7 @@ export function api(simulator) {
     pause: () => { if (simulator.playing) simulator.play(); },
     play: () => { if (!simulator.playing) simulator.play(); },
     reset: () => simulator.reset(),
-    aimAt: (point) => simulator.aimAt(point),
+    visit: (points) => simulator.visit(points),
     moveObserver: (place) => { observer.place = [...place]; observer.target = null; simulator.taken = true; },
     // A point of the world, or a mesh's place, in pixels of the window.
     screen: (point) => {

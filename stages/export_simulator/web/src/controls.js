@@ -1,5 +1,5 @@
 // Hands on the scene: keys walk the observer and turn the view, a drag on the figure carries it, a click on the floor
-// is a goal, a stroke with the pen (or with shift) is a path.
+// is a goal, one more with the pins (or with shift), a stroke with the pen (or with shift) is a path.
 
 const KEYS = { w: [0, 1], arrowup: [0, 1], s: [0, -1], arrowdown: [0, -1], a: [-1, 0], arrowleft: [-1, 0], d: [1, 0], arrowright: [1, 0] };
 const TURNS = { q: [-1, 0], e: [1, 0], '+': [0, -1], '=': [0, -1], '-': [0, 1] };
@@ -8,7 +8,7 @@ const STROKE_M = 0.03;
 
 export class Controls {
   constructor(room, observer, on) {
-    Object.assign(this, { room, observer, on, down: new Set(), press: null, dragging: false, drawing: false, stroke: null });
+    Object.assign(this, { room, observer, on, down: new Set(), press: null, dragging: false, tool: null, stroke: null });
     addEventListener('keydown', (event) => this.key(event, true));
     addEventListener('keyup', (event) => this.key(event, false));
     addEventListener('blur', () => this.down.clear());
@@ -39,7 +39,8 @@ export class Controls {
       event.preventDefault();
     } else if (pressed && key === 'r') this.on.reset();
     else if (pressed && key === 'c') this.on.aim([...this.observer.place]);
-    else if (pressed && (key === 'p' || (key === 'escape' && this.drawing))) this.on.draw();
+    else if (pressed && (key === 'p' || key === 'g')) this.on.hold(key === 'p' ? 'pen' : 'pins');
+    else if (pressed && key === 'escape' && this.tool) this.on.hold(null);
   }
 
   overObserver(event) {
@@ -50,8 +51,8 @@ export class Controls {
     if (!event.isPrimary) return this.cancel();
     this.press = { x: event.clientX, y: event.clientY, moved: false };
     if (event.button !== 0) return;
-    if (this.drawing || event.shiftKey) this.stroke = [];
-    else if (this.overObserver(event)) this.dragging = true;
+    if (this.tool === 'pen' || event.shiftKey) this.stroke = [];
+    else if (this.tool !== 'pins' && this.overObserver(event)) this.dragging = true;
     else return;
     this.room.orbit.enabled = false;
     this.room.canvas.setPointerCapture(event.pointerId);
@@ -90,10 +91,11 @@ export class Controls {
     const { stroke, press, dragging } = this;
     this.cancel();
     if (event.type !== 'pointerup') return;
-    if (stroke) this.on.drawn(stroke);
-    else if (press && !press.moved && !dragging && event.button === 0) {
+    const click = press && !press.moved && !dragging && event.button === 0;
+    if (stroke && !(click && event.shiftKey)) this.on.drawn(stroke);
+    else if (click) {
       const point = this.room.floorPoint(event);
-      if (point) this.on.aim(point);
+      if (point) this.on.aim(point, event.shiftKey || this.tool === 'pins');
     }
   }
 }

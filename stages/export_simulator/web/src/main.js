@@ -15,14 +15,15 @@ import { Planner } from './planner.js';
 import { rotate } from './rigid.js';
 import { Room } from './room.js';
 import { Route } from './route.js';
-import { readPoint, readRoute, readState, writeState } from './state.js';
+import { readPlaces, readPoint, readState, writeState } from './state.js';
+import { Stops, metres, placesText } from './stops.js';
 import { Tags } from './tags.js';
 import { Take, save } from './take.js';
 import { Timeline, rootOf } from './timeline.js';
 
 const TICK_S = 0.1;
 const REPLAN_TICKS = 7;
-const ARRIVED_M = 0.25;
+const MOST_STOPS = 9;
 
 class Simulator {
   async open() {
@@ -41,7 +42,7 @@ class Simulator {
     this.observer = new Observer(this.contract);
     this.room.scene.add(this.observer.figure);
     this.overlays = new Overlays(this.room.scene, this.contract.scene.floor_m, this.contract.agent.root_height_m[0] - this.contract.scene.floor_m);
-    this.tags = new Tags(this.room.camera, ['simulated', 'recorded', 'observer']);
+    this.tags = new Tags(this.room.camera);
     this.film = new Film(this.room.canvas);
     this.map = new Minimap(document.getElementById('minimap'), this.room.picture(256));
     this.clips.each((frame, camera) => {
@@ -75,11 +76,12 @@ class Simulator {
       change: (key) => this.changed(key),
       play: () => this.play(),
       reset: () => this.reset(),
-      free: () => this.aimAt(null),
-      draw: () => this.takePen(!this.controls.drawing),
+      free: () => this.visit([]),
+      hold: (tool) => this.hold(tool),
       csv: () => save(this.take.csv(), `${this.fileName}.csv`),
       glb: () => save(this.take.glb(this.model), `${this.fileName}.glb`),
       film: () => this.shoot(),
+      toml: () => save(this.stops.toml, `${this.fileName}_subgoals.toml`),
       link: () => this.copyLink(),
       open: (file) => this.openTake(file),
     });
@@ -87,9 +89,9 @@ class Simulator {
     this.controls = new Controls(this.room, this.observer, {
       play: () => this.play(),
       reset: () => this.reset(),
-      aim: (point) => this.aimAt(point),
-      draw: () => this.takePen(!this.controls.drawing),
-      stroke: (points) => this.overlays.ask(points, null),
+      aim: (point, further) => this.visit(further ? [...this.stops.left, point] : [point]),
+      hold: (tool) => this.hold(tool),
+      stroke: (points) => this.overlays.ask(points),
       drawn: (points) => this.follow(points),
       carry: (point) => { this.observer.target = point; this.taken = true; },
     });
@@ -137,43 +139,48 @@ class Simulator {
     this.observer.place = readPoint(this.state.at) ?? [moment.observer[0], moment.observer[2]];
     this.observer.target = null;
     this.observer.settle();
-    const route = readRoute(this.state.route);
-    this.route = route && new Route([[this.observer.animal[0], this.observer.animal[2]], ...route]);
-    this.aim = this.route ? null : readPoint(this.state.aim);
+    const route = readPlaces(this.state.route);
+    this.route = route.length > 1 ? new Route([[this.observer.animal[0], this.observer.animal[2]], ...route]) : null;
+    this.stops = new Stops(this.route ? [] : readPlaces(this.state.aim), rootOf(this.timeline.base));
     this.showWishes();
     if (this.state.view !== 'room') this.room.look(this.state.view, this.eyes(), this.observer.animal);
     this.epoch = (this.epoch ?? 0) + 1;
   }
 
-  aimAt(point) {
+  // Go to one place after the other, [[x, z], ...]; with none it chooses for itself. What a journey has seen, it keeps.
+  visit(points) {
+    if (points.length > MOST_STOPS) return panel.help(`${MOST_STOPS} goals at most.`, 4);
+    if (this.stops.next && points.length > 1) this.stops.continue(points);
+    else this.stops = new Stops(points, rootOf(this.timeline.at(this.now)));
     this.route = null;
-    this.aim = point;
     this.showWishes();
     this.urgent = true;
   }
 
   // Walk along a stroke of points [x, z]; a dot is a goal.
   follow(points) {
-    this.takePen(false);
-    if (points.length < 3) return points.length ? this.aimAt(points.at(-1)) : this.showWishes();
-    this.aim = null;
+    this.hold(null);
+    if (points.length < 3) return points.length ? this.visit(points.slice(-1)) : this.showWishes();
+    this.stops = new Stops();
     this.route = new Route([[this.observer.animal[0], this.observer.animal[2]], ...points]);
     this.showWishes();
     this.urgent = true;
   }
 
-  takePen(drawing) {
-    this.controls.drawing = drawing;
-    panel.showDrawing(drawing);
+  // Take a tool in hand, 'pen' or 'pins', or put away the one that is held.
+  hold(tool) {
+    this.controls.tool = this.controls.tool === tool ? null : tool;
+    panel.showTool(this.controls.tool);
   }
 
-  // The visitor's goal or path: on the floor, in the address, and as a way out of it.
+  // The visitor's goals or path: on the floor, in the address, and as a way out of it.
   showWishes() {
-    this.state.aim = this.aim ? this.aim.map((value) => value.toFixed(2)).join(',') : '';
-    this.state.route = this.route ? this.route.text : '';
+    const { left, points } = this.stops;
+    this.state.aim = placesText(left);
+    this.state.route = this.route ? placesText(this.route.corners) : '';
     writeState(this.state);
-    panel.showFree(Boolean(this.aim || this.route));
-    this.overlays.ask(this.route?.points ?? null, this.aim);
+    panel.showWishes(Boolean(left.length || this.route), points.length);
+    this.overlays.ask(this.route?.points ?? null, left);
   }
 
   get fileName() {
@@ -241,11 +248,17 @@ class Simulator {
       this.map.visit('observer', ...this.observer.place);
       this.replayTick += 1;
       this.take.add(this.timeline.at(tick + 1), this.observer.pose(), this.overlays.plan?.goals[this.overlays.plan.chosen]);
+      if (this.stops.visit(this.observer.animal)) this.arrive();
       if (this.replaying && !this.taken) this.followPerson();
       if (this.moved && tick % 10 === 0) this.rememberPlace();
     }
     this.timeline.record(this.now);
     this.plan();
+  }
+
+  arrive() {
+    this.showWishes();
+    this.urgent = true;
   }
 
   // Beside a clip the observer walks as the person did.
@@ -256,7 +269,7 @@ class Simulator {
   }
 
   rememberPlace() {
-    this.state.at = this.observer.place.map((value) => value.toFixed(2)).join(',');
+    this.state.at = this.observer.place.map(metres).join(',');
     writeState(this.state);
     this.moved = false;
   }
@@ -282,8 +295,7 @@ class Simulator {
     if (!this.milliseconds) performance.mark('plan');
     this.milliseconds = plan.milliseconds;
     panel.status(`planned ${(plan.frames.length * TICK_S).toFixed(1)} s ahead in ${(plan.milliseconds / 1000).toFixed(2)} s`);
-    if (this.route?.finished) this.aimAt(null);
-    if (this.aim && Math.hypot(this.aim[0] - this.observer.animal[0], this.aim[1] - this.observer.animal[2]) < ARRIVED_M) this.aimAt(null);
+    if (this.route?.finished) this.visit([]);
   }
 
   // What the mind is asked: the shown past, the observer's past, and the visitor's settings.
@@ -297,7 +309,7 @@ class Simulator {
       interactivity: state.interactivity,
       samples: state.samples,
       steps: state.steps,
-      aim: this.aim ? [this.aim[0], this.observer.animal[1], this.aim[1]] : null,
+      aim: this.stops.next && [this.stops.next[0], this.observer.animal[1], this.stops.next[1]],
       path: this.route && this.ahead(this.contract.behavior.future_frames),
       ...changes,
     };
@@ -333,9 +345,11 @@ class Simulator {
 
   drawTags(root, recorded) {
     const above = (x, y, z, lift) => this.room.orbit.target.clone().set(x, y + lift, z);
-    this.tags.put('simulated', recorded ? 'simulated' : '', above(root[0], root[1], root[2], 0.2));
+    this.tags.put('simulated', recorded ? 'simulated' : this.contract.name, above(root[0], root[1], root[2], 0.2));
     this.tags.put('recorded', recorded ? (this.replaying.opened ? 'take' : 'recorded') : '', recorded ? above(recorded[0], recorded[1], recorded[2], 0.2) : null);
     this.tags.put('observer', this.state.view === 'you' ? '' : 'you', above(this.observer.place[0], this.contract.scene.floor_m, this.observer.place[1], this.observer.eye + 0.1));
+    const { left } = this.stops;
+    for (let i = 0; i < MOST_STOPS; i++) this.tags.put(`stop ${i + 1}`, left.length > 1 && i < left.length ? String(i + 1) : '', left[i] && above(left[i][0], this.contract.scene.floor_m, left[i][1], 0.08));
   }
 
   drawMap(root, recorded) {
@@ -348,7 +362,7 @@ class Simulator {
       goals: this.state.goals ? plan?.goals : null,
       chosen: plan?.chosen,
       path: this.state.path ? plan?.path : null,
-      wish: this.aim ?? this.route?.at(this.route.length),
+      wishes: this.route ? [this.route.at(this.route.length)] : this.stops.left,
       recorded,
     });
   }

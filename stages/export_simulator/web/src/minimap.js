@@ -40,7 +40,7 @@ export class Minimap {
     this.stale = true;
   }
 
-  draw({ animal, observer, goals, chosen, path, recorded, wish }) {
+  draw({ animal, observer, goals, chosen, path, recorded, wishes }) {
     const { pen, size } = this;
     if (this.stale) for (const who of ['observer', 'animal']) paintHeat(this.layers[who], this.heat[who], COLORS[who]);
     this.stale = false;
@@ -52,7 +52,7 @@ export class Minimap {
     for (const who of ['observer', 'animal']) pen.drawImage(this.layers[who], 0, 0, size, size);
     if (path) this.line(path);
     for (const [i, goal] of (goals ?? []).entries()) this.dot(goal[0], goal[2], i === chosen ? 5 : 3, i === chosen ? 1 : 0.45);
-    if (wish) this.cross(wish);
+    for (const wish of wishes) this.cross(wish);
     if (recorded) this.dot(recorded[0], recorded[2], 7, 0.9, '#6d675e');
     this.wedge(animal, '#c8722b', false);
     this.wedge(observer, '#2f6f9f', true);

@@ -27,8 +27,8 @@ export class Overlays {
     this.fan.frustumCulled = false;
     this.ribbon = ribbon();
     this.route = ribbon(0xc8722b);
-    this.wish = wish();
-    for (const node of [this.goals, this.chosen, this.fan, this.ribbon, this.route, this.wish]) {
+    this.wishes = new THREE.Group();
+    for (const node of [this.goals, this.chosen, this.fan, this.ribbon, this.route, this.wishes]) {
       node.renderOrder = 3;
       node.visible = false;
       scene.add(node);
@@ -52,16 +52,20 @@ export class Overlays {
     this.refresh();
   }
 
-  // A path that the visitor draws or has drawn, [[x, z], ...] or null; and a goal, [x, z] or null.
-  ask(route, aim) {
+  // A path that the visitor draws or has drawn, [[x, z], ...] or null; and goals, [[x, z], ...].
+  ask(route, goals = []) {
     const height = this.floor + LIFT_M;
     this.route.visible = Boolean(route && route.length > 1);
     if (this.route.visible) {
       const every = Math.ceil(route.length / 250);
       fillRibbon(this.route, route.filter((_, i) => i % every === 0 || i === route.length - 1).map(([x, z]) => [x, this.floor, z]), () => height + 0.003, 0);
     }
-    this.wish.visible = Boolean(aim);
-    if (aim) this.wish.position.set(aim[0], height + 0.004, aim[1]);
+    while (this.wishes.children.length < goals.length) this.wishes.add(wish());
+    this.wishes.visible = goals.length > 0;
+    this.wishes.children.forEach((node, i) => {
+      node.visible = i < goals.length;
+      if (node.visible) node.position.set(goals[i][0], height + 0.004, goals[i][1]);
+    });
   }
 
   // Keep the fan rooted in the moving animal.

@@ -1,6 +1,10 @@
 // The controls: they read and write the state and call back; they know nothing of the room.
 
 const at = (id) => document.getElementById(id);
+const TOOLS = {
+  pen: 'Draw on the floor with one stroke; it walks there.',
+  pins: 'Click one place after the other; it visits them in this order.',
+};
 
 export function buildPanel(state, clips, on) {
   const sync = [];
@@ -57,8 +61,8 @@ export function buildPanel(state, clips, on) {
     sync.push(() => button.setAttribute('aria-pressed', state.view === button.dataset.view));
   }
 
-  for (const name of ['csv', 'glb', 'film', 'link']) at(name).addEventListener('click', on[name]);
-  at('draw').addEventListener('click', on.draw);
+  for (const name of ['csv', 'glb', 'film', 'toml', 'link']) at(name).addEventListener('click', on[name]);
+  for (const tool of Object.keys(TOOLS)) at(tool).addEventListener('click', () => on.hold(tool));
   at('play').addEventListener('click', on.play);
   at('reset').addEventListener('click', on.reset);
   at('free').addEventListener('click', on.free);
@@ -82,14 +86,16 @@ export function showPlaying(playing) {
   at('play').textContent = playing ? 'pause' : 'go on';
 }
 
-export function showFree(visible) {
-  at('free').hidden = !visible;
+// Whether there is a wish that can be taken back, and how many goals a journey has that can be kept.
+export function showWishes(any, goals) {
+  at('free').hidden = !any;
+  at('toml').hidden = goals === 0;
 }
 
-export function showDrawing(drawing) {
-  at('draw').setAttribute('aria-pressed', drawing);
-  at('view').classList.toggle('drawing', drawing);
-  help(drawing ? 'Draw on the floor with one stroke; it walks there.' : '');
+export function showTool(held) {
+  for (const tool of Object.keys(TOOLS)) at(tool).setAttribute('aria-pressed', tool === held);
+  at('view').classList.toggle('drawing', Boolean(held));
+  help(TOOLS[held] ?? '');
 }
 
 export function showFilm(running, possible) {

@@ -51,8 +51,9 @@ export class Route {
     });
   }
 
-  get text() {
-    return this.points.filter((_, i) => i % 4 === 0 || i === this.points.length - 1).map((point) => point.map((value) => value.toFixed(2)).join(',')).join(';');
+  // Some of its points, enough to draw it again.
+  get corners() {
+    return this.points.filter((_, i) => i % 4 === 0 || i === this.points.length - 1);
   }
 }
 

@@ -29,10 +29,10 @@ export function writeState(state) {
   history.replaceState(null, '', hash ? `#${hash}` : location.pathname + location.search);
 }
 
-// 'x,z;x,z;...' in metres to a list of points, or null.
-export function readRoute(text) {
+// 'x,z;x,z;...' in metres to a list of points; none where it is something else.
+export function readPlaces(text) {
   const points = text.split(';').map(readPoint);
-  return points.length > 1 && points.every(Boolean) ? points : null;
+  return points.every(Boolean) ? points : [];
 }
 
 // 'x,z' in metres to two numbers, or null.

@@ -1,18 +1,22 @@
 // Words beside what is drawn, so that nothing is told by colour alone.
 
 export class Tags {
-  constructor(camera, names) {
+  constructor(camera) {
     this.camera = camera;
-    this.labels = Object.fromEntries(names.map((name) => {
-      const label = Object.assign(document.createElement('span'), { className: `tag ${name}`, hidden: true });
-      document.body.append(label);
-      return [name, label];
-    }));
+    this.labels = {};
   }
 
-  // point: a THREE.Vector3 in the world, which is overwritten; text: null hides the word.
+  label(name) {
+    if (this.labels[name]) return this.labels[name];
+    this.labels[name] = Object.assign(document.createElement('span'), { className: `tag ${name}`, hidden: true });
+    document.body.append(this.labels[name]);
+    return this.labels[name];
+  }
+
+  // point: a THREE.Vector3 in the world, which is overwritten; an empty text hides the word.
   put(name, text, point) {
-    const label = this.labels[name];
+    if (!text && !this.labels[name]) return;
+    const label = this.label(name);
     label.hidden = !text;
     if (!text) return;
     if (label.textContent !== text) label.textContent = text;

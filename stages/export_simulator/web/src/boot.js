@@ -1,5 +1,6 @@
-// Before anything is unpacked: can this browser show the page at all? Sets `window.able`, which the page's script asks.
+// Before anything is unpacked: can this browser show the page at all? Then unpack the page's script and run it.
 
+import * as assets from './assets.js';
 import { sorry } from './sorry.js';
 
 function missing() {
@@ -10,6 +11,12 @@ function missing() {
   return null;
 }
 
+async function start() {
+  const script = document.createElement('script');
+  script.src = URL.createObjectURL(new Blob([await assets.bytes('page')], { type: 'text/javascript' }));
+  document.head.append(script);
+}
+
 const lack = missing();
 if (lack) sorry(...lack);
-window.able = !lack;
+else start().catch((error) => sorry(`This page cannot be unpacked: ${error.message}`, 'Copy it again as a whole; a folder needs its `assets` beside `index.html`.'));

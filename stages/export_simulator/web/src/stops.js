@@ -1,0 +1,49 @@
+// Goals that the visitor clicked, visited one after the other; also as the file that
+// `python -m stages.simulate --subgoals` reads.
+
+import { rotate } from './rigid.js';
+
+const ARRIVED_M = 0.25;
+
+export class Stops {
+  // points: [[x, z], ...] on the floor, metres; from: the root's row where the journey begins.
+  constructor(points = [], from = null) {
+    Object.assign(this, { points, from, reached: 0 });
+  }
+
+  get left() {
+    return this.points.slice(this.reached);
+  }
+
+  // Where to go now, [x, z], or null.
+  get next() {
+    return this.points[this.reached] ?? null;
+  }
+
+  // Leave what was reached as it is, then go on through other points.
+  continue(points) {
+    this.points = [...this.points.slice(0, this.reached), ...points];
+  }
+
+  // Note where the animal is; true when a stop has just been reached.
+  visit([x, , z]) {
+    const near = this.next && Math.hypot(this.next[0] - x, this.next[1] - z) < ARRIVED_M;
+    if (near) this.reached += 1;
+    return Boolean(near);
+  }
+
+  // The whole journey, with where it begins: metres, world frame; 0 degrees looks along +z, 90 along +x.
+  get toml() {
+    const [x, y, z, ...turn] = this.from;
+    const nose = rotate(turn, [0, 0, 1]);
+    const heading = (Math.atan2(nose[0], nose[2]) * 180) / Math.PI;
+    const begin = `# where it stood\n[[subgoal]]\nposition = [${[x, y, z].map(metres).join(', ')}]\nheading_deg = ${heading.toFixed(1)}\n`;
+    const stops = this.points.map((point) => `[[subgoal]]\nposition = [${point.map(metres).join(', ')}]\n`);
+    return new Blob([[begin, ...stops].join('\n')], { type: 'application/toml' });
+  }
+}
+
+export const metres = (value) => value.toFixed(2);
+
+// Places on the floor as they stand in the address: 'x,z;x,z'.
+export const placesText = (points) => points.map((point) => point.map(metres).join(',')).join(';');
