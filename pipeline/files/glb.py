@@ -20,10 +20,10 @@ _ROOT_NODE, _MESH_NODE, _FIRST_JOINT = 0, 1, 2
 
 @dataclass(frozen=True)
 class Skin:
-    """Four influences a vertex; `agent_from_bone_rest` are the bones in the pose of the surface."""
+    """Four or eight influences a vertex; `agent_from_bone_rest` are the bones in the pose of the surface."""
 
-    joints: UInt8[np.ndarray, "vertex 4"]
-    weights: Float32[np.ndarray, "vertex 4"]
+    joints: UInt8[np.ndarray, "vertex influence"]
+    weights: Float32[np.ndarray, "vertex influence"]
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     bone_names: tuple[str, ...]
 
@@ -95,8 +95,10 @@ class _Document:
         if mesh.color is not None:
             attributes.COLOR_0 = self.add(_linear_rgba(mesh.color), "VEC4", _FLOAT, **vertex)
         if skin is not None:
-            attributes.JOINTS_0 = self.add(skin.joints, "VEC4", _U8, **vertex)
-            attributes.WEIGHTS_0 = self.add(skin.weights, "VEC4", _FLOAT, **vertex)
+            for number in range(skin.joints.shape[1] // 4):
+                four = slice(4 * number, 4 * number + 4)
+                setattr(attributes, f"JOINTS_{number}", self.add(skin.joints[:, four], "VEC4", _U8, **vertex))
+                setattr(attributes, f"WEIGHTS_{number}", self.add(skin.weights[:, four], "VEC4", _FLOAT, **vertex))
         indices = self.add(mesh.faces.astype(np.uint32).reshape(-1), "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER)
         matte = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)
         self.file.materials = [gltf.Material(name="surface", doubleSided=True, pbrMetallicRoughness=matte)]
@@ -170,7 +172,11 @@ def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
     table = document.file.skins[0]
     matrices = document.values(table.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
     names = tuple(document.file.nodes[joint].name for joint in table.joints)
-    skin = Skin(document.values(attributes.JOINTS_0), document.values(attributes.WEIGHTS_0), rigid.inverse(matrices), names)
+    joints, weights = (
+        np.concatenate([document.values(getattr(attributes, f"{kind}_{n}")) for n in (0, 1) if hasattr(attributes, f"{kind}_{n}")], 1)
+        for kind in ("JOINTS", "WEIGHTS")
+    )
+    skin = Skin(joints, weights, rigid.inverse(matrices), names)
     return document.mesh(), skin, [document.action(animation, len(names)) for animation in document.file.animations]
 
 

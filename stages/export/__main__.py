@@ -24,6 +24,8 @@ class Config:
     """one of the formats above"""
     rate_hz: float = 30.0
     """keys of animations"""
+    influences: reading.Influences = "4"
+    """bones that move a vertex in glb and usd: four, which every player blends, or eight, a little nearer"""
     pictures_per_video: int = 150
     """frames of each recording that nerfstudio and colmap get, evenly spread; these two formats alone hold pictures"""
     colmap_points: int = 20_000
@@ -62,7 +64,7 @@ def run(task: Task) -> None:
 
 def _agent(task: Task) -> reading.Agent:
     take = task.input("take") / "take.npz" if task.has("take") else None
-    return reading.agent(task.input("simulator"), take, task.config.rate_hz)
+    return reading.agent(task.input("simulator"), take, task.config.rate_hz, task.config.influences)
 
 
 def _sessions(task: Task) -> list[reading.Session]:
@@ -75,4 +77,4 @@ def _shots(task: Task) -> list[reading.Shot]:
 
 if __name__ == "__main__":
     reads = ("simulator", "reconstruction", "splats", "behavior_data", "frames", "masks")
-    cli.enter(__doc__, run, config=Config, reads=reads, optional=("take",), options=("format", "rate_hz"))
+    cli.enter(__doc__, run, config=Config, reads=reads, optional=("take",), options=("format", "rate_hz", "influences"))

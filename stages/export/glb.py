@@ -19,4 +19,5 @@ def write(folder: Path, agent: Agent, scene: bytes) -> Told:
         opened = trimesh.load(io.BytesIO(content), file_type="glb")
         assert len(opened.geometry) == 1, "one surface a file"
     loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()}
-    return Told(version("pygltflib"), loss, version("trimesh"), "metres, +y up; joints are siblings under one root; one action per motion")
+    remark = f"metres, +y up; joints are siblings under one root; {agent.skin.joints.shape[1]} influences a vertex; one action per motion"
+    return Told(version("pygltflib"), loss, version("trimesh"), remark)

@@ -1,8 +1,9 @@
 """Open what is exported: the skinned animal with its motions, sessions frame by frame, pictures with their cameras."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -13,6 +14,7 @@ from pipeline.files.glb import Action, Skin
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 
+Influences = Literal["4", "8"]
 _COLUMNS = 62
 
 
@@ -24,7 +26,7 @@ class Agent:
     skin: Skin
     actions: list[Action]
     skinning_loss_mm: dict[str, float]
-    """four linear weights against the reconstruction's dual quaternions"""
+    """linear weights against the reconstruction's dual quaternions"""
 
 
 @dataclass(frozen=True)
@@ -84,15 +86,18 @@ class Occupancy:
     voxel_m: float
 
 
-def agent(simulator: Path, take: Path | None, rate_hz: float) -> Agent:
+def agent(simulator: Path, take: Path | None, rate_hz: float, influences: Influences = "4") -> Agent:
     """Read the animal from `agent.glb`; a generated take becomes one motion more. Keys are resampled to `rate_hz`."""
     mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
     if take:
         names = ("timestamp_s", "world_from_agent", "agent_from_bone")
         made = arrays.load(take, names)
         actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in names))]
+    loss = "skinning_residual_mm"
+    if influences == "8":
+        skin, loss = replace(skin, **arrays.load(simulator / "skin_8.npz", ("joints", "weights"))), "skinning_residual_8_mm"
     about = json.loads((simulator / "simulator.json").read_bytes())
-    return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], about["agent"]["skinning_residual_mm"])
+    return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], about["agent"][loss])
 
 
 def room(simulator: Path) -> Mesh:

@@ -73,8 +73,12 @@ def _write_agent(pxr: Any, path: Path, agent: Agent, action: Action) -> None:
     surface = _mesh(pxr, stage, "/agent/surface", agent.mesh)
     binding = pxr.UsdSkel.BindingAPI.Apply(surface.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    binding.CreateJointIndicesPrimvar(False, 4).Set(pxr.Vt.IntArray.FromNumpy(agent.skin.joints.reshape(-1).astype(np.int32) + 1))
-    binding.CreateJointWeightsPrimvar(False, 4).Set(pxr.Vt.FloatArray.FromNumpy(agent.skin.weights.reshape(-1).astype(np.float32)))
+    binding.CreateJointIndicesPrimvar(False, agent.skin.joints.shape[1]).Set(
+        pxr.Vt.IntArray.FromNumpy(agent.skin.joints.reshape(-1).astype(np.int32) + 1)
+    )
+    binding.CreateJointWeightsPrimvar(False, agent.skin.joints.shape[1]).Set(
+        pxr.Vt.FloatArray.FromNumpy(agent.skin.weights.reshape(-1).astype(np.float32))
+    )
     binding.CreateGeomBindTransformAttr(pxr.Gf.Matrix4d(1))
     animation = pxr.UsdSkel.Animation.Define(stage, "/agent/motion")
     _keys(pxr, animation, joints, action)

@@ -1,5 +1,6 @@
 """Say in one table what the page and every other player of the simulator must know: `simulator.json`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,14 +31,13 @@ def contract(
     setting: Setting,
     motions: list[Motion],
     skin: Skin,
-    skinning_residual_m: Float[np.ndarray, "frame vertex"],
+    residuals_m: Mapping[str, Float[np.ndarray, "frame vertex"]],
     volume: dict[str, Any],
 ) -> dict[str, Any]:
-    """Assemble the table; `behavior` is the sampler's own contract, passed on unchanged."""
+    """Assemble the table; `behavior` is the sampler's own contract, passed on unchanged; `residuals_m` go by their key."""
     observers = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions])
     heights = np.concatenate([motion.world_from_agent[:, 1, 3] for motion in motions])
     starts = np.cumsum([0] + [len(motion.timestamp_s) for motion in motions])
-    residual_mm = skinning_residual_m * 1000
     return {
         "version": VERSION,
         "name": name,
@@ -56,11 +56,7 @@ def contract(
             "rest": np.round(rigid_rows(skin.agent_from_bone_rest), 6).tolist(),
             **gait(motions),
             "root_height_m": [round(float(height), 4) for height in np.percentile(heights, [0.5, 99.5])],
-            "skinning_residual_mm": {
-                "mean": round(float(residual_mm.mean()), 3),
-                "p99": round(float(np.percentile(residual_mm, 99)), 3),
-                "max": round(float(residual_mm.max()), 3),
-            },
+            **{key: loss_mm(residual_m) for key, residual_m in residuals_m.items()},
         },
         "clips": [
             {"name": motion.name, "start": int(start), "count": len(motion.timestamp_s)}
@@ -69,6 +65,13 @@ def contract(
         "volume": volume,
         "behavior": behavior,
     }
+
+
+def loss_mm(residual_m: Float[np.ndarray, "frame vertex"]) -> dict[str, float]:
+    """Sum up distances, in millimetres."""
+    residual_mm = residual_m * 1000
+    values = {"mean": residual_mm.mean(), "p99": np.percentile(residual_mm, 99), "max": residual_mm.max()}
+    return {name: round(float(value), 3) for name, value in values.items()}
 
 
 def rigid_rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:

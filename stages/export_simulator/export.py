@@ -25,6 +25,9 @@ class Made:
     skin: Skin
     residual_m: Float[np.ndarray, "frame vertex"]
     """distance of the four-weight linear blend from dual-quaternion blending, poses that were not fitted"""
+    eight: refit.Influences
+    """the same surface with eight weights, for players that can"""
+    eight_residual_m: Float[np.ndarray, "frame vertex"]
     actions: list[Action]
     scene: Mesh
     splat_rows: bytes
@@ -43,14 +46,17 @@ def simulator(
     """Thin the surfaces, fit the weights, resample the motion; `limits` are the stage's settings."""
     agent, kept = surfaces.thin(body.mesh, limits.agent_faces)
     thinned = Body(agent, body.weights[kept], body.agent_from_bone_rest)
-    skin, residual_m = fitted_skin(thinned, motions, limits.fitted_poses)
+    four, eight = fitted(thinned, motions, limits.fitted_poses)
+    names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
     room, _ = surfaces.thin(scene, limits.scene_faces)
     inside = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions]).mean(0)
     positions = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     return Made(
         agent=agent,
-        skin=skin,
-        residual_m=residual_m,
+        skin=Skin(four.blend.joints, four.blend.weights, body.agent_from_bone_rest, names),
+        residual_m=four.residual_m,
+        eight=eight.blend,
+        eight_residual_m=eight.residual_m,
         actions=[action(motion, limits.action_rate_hz) for motion in motions],
         scene=surfaces.facing(room, inside),
         splat_rows=surfaces.splat_rows(gaussians.scene, limits.scene_splats),
@@ -60,8 +66,16 @@ def simulator(
     )
 
 
-def fitted_skin(body: Body, motions: list[Motion], poses: int) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
-    """Fit four weights a vertex to recorded poses that differ most; also return what is lost in others, metres."""
+@dataclass(frozen=True)
+class Fitted:
+    """Weights of a linear blend, and what is lost with them in poses that were not fitted."""
+
+    blend: refit.Influences
+    residual_m: Float[np.ndarray, "frame vertex"]
+
+
+def fitted(body: Body, motions: list[Motion], poses: int) -> tuple[Fitted, Fitted]:
+    """Fit four and eight weights a vertex to recorded poses that differ most."""
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
     chosen = refit.different_poses(recorded, poses)
     others = np.setdiff1d(np.arange(len(recorded)), chosen)
@@ -71,9 +85,8 @@ def fitted_skin(body: Body, motions: list[Motion], poses: int) -> tuple[Skin, Fl
         refit.Poses(recorded[at] @ rigid.inverse(rest), refit.blend_dual_quaternions(vertices, body.weights, recorded[at], rest))
         for at in (chosen, judged)
     )
-    joints, weights = refit.refit_weights(vertices, body.weights, fit)
-    names = tuple(f"bone_{bone:02d}" for bone in range(len(rest)))
-    return Skin(joints, weights, rest, names), refit.residual_m(vertices, joints, weights, held)
+    four, eight = refit.refit_weights(vertices, body.weights, fit)
+    return Fitted(four, refit.residual_m(vertices, four, held)), Fitted(eight, refit.residual_m(vertices, eight, held))
 
 
 def action(motion: Motion, rate_hz: float) -> Action:

@@ -1,7 +1,7 @@
-"""Four linear-blend weights a vertex that imitate dual-quaternion blending with many.
+"""Four, or eight, linear-blend weights a vertex that imitate dual-quaternion blending with many.
 
 `blend_dual_quaternions` poses the surface as the reconstruction does; `refit_weights` finds, per vertex, the best four
-bones and convex weights for linear blending over a set of poses; `residual_m` says what is lost.
+and the best eight bones and convex weights for linear blending over a set of poses; `residual_m` says what is lost.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from pipeline.models import skinning
 
-_CANDIDATES = 8
+FOUR, EIGHT = 4, 8
 _DESCENT_STEPS = 150
 
 
@@ -25,6 +25,14 @@ class Poses:
     """motion of each bone"""
     posed: Float[np.ndarray, "frame vertex 3"]
     """the surface that is to be met"""
+
+
+@dataclass(frozen=True)
+class Influences:
+    """Bones of each vertex and their convex weights, heaviest first."""
+
+    joints: UInt8[np.ndarray, "vertex influence"]
+    weights: Float32[np.ndarray, "vertex influence"]
 
 
 def different_poses(agent_from_bone: Float[np.ndarray, "frame bone 4 4"], count: int) -> Int[np.ndarray, " chosen"]:
@@ -57,37 +65,43 @@ def refit_weights(
     vertices: Float[np.ndarray, "vertex 3"],
     weights: Float[np.ndarray, "vertex bone"],
     poses: Poses,
-) -> tuple[UInt8[np.ndarray, "vertex 4"], Float32[np.ndarray, "vertex 4"]]:
-    """Return bones and convex weights whose linear blend is nearest, in squares, to the posed surface."""
-    count = min(_CANDIDATES, weights.shape[1])
-    candidates = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+) -> tuple[Influences, Influences]:
+    """Return the four and the eight bones, with convex weights, whose linear blend is nearest, in squares, to the posed surface."""
+    candidates = np.argsort(-weights, axis=1, kind="stable")[:, : min(EIGHT, weights.shape[1])]
     gram = _gram(vertices, candidates, poses)
     start = np.take_along_axis(weights, candidates, 1)
     descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
-    kept = np.argsort(-descended, axis=1, kind="stable")[:, : min(4, count)]
-    gram = np.take_along_axis(np.take_along_axis(gram, kept[:, :, None], 1), kept[:, None, :], 2)
-    best = _best_on_simplex(gram)
-    order = np.argsort(-best, axis=1, kind="stable")
-    joints, best = (
-        np.take_along_axis(np.take_along_axis(candidates, kept, 1), order, 1),
-        np.take_along_axis(best, order, 1),
-    )
-    padding = ((0, 0), (0, 4 - best.shape[1]))
-    joints, best = np.pad(np.where(best > 0, joints, 0), padding), np.pad(best, padding)
-    return joints.astype(np.uint8), best.astype(np.float32)
+    kept = np.argsort(-descended, axis=1, kind="stable")[:, :FOUR]
+    best = np.zeros_like(descended)
+    np.put_along_axis(best, kept, _best_on_simplex(_chosen(gram, kept)), 1)
+    nearer = _cost(gram, best) < _cost(gram, descended)
+    return _influences(candidates, best, FOUR), _influences(candidates, np.where(nearer[:, None], best, descended), EIGHT)
 
 
-def residual_m(
-    vertices: Float[np.ndarray, "vertex 3"],
-    joints: UInt8[np.ndarray, "vertex 4"],
-    weights: Float[np.ndarray, "vertex 4"],
-    poses: Poses,
-) -> Float[np.ndarray, "frame vertex"]:
+def _influences(candidates: Int[np.ndarray, "vertex k"], weights: Float[np.ndarray, "vertex k"], count: int) -> Influences:
+    """Order by weight and keep, or fill up to, `count`; bones without weight become bone 0, as glTF asks."""
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+    heaviest, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(candidates, order, 1)
+    padding = ((0, 0), (0, count - order.shape[1]))
+    joints, heaviest = np.pad(np.where(heaviest > 0, joints, 0), padding), np.pad(heaviest, padding)
+    return Influences(joints.astype(np.uint8), (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32))
+
+
+def _chosen(gram: Float[np.ndarray, "vertex k k"], kept: Int[np.ndarray, "vertex n"]) -> Float[np.ndarray, "vertex n n"]:
+    return np.take_along_axis(np.take_along_axis(gram, kept[:, :, None], 1), kept[:, None, :], 2)
+
+
+def _cost(gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]) -> Float[np.ndarray, " vertex"]:
+    """Return w' G w."""
+    return np.einsum("vi,vij,vj->v", weights, gram, weights)
+
+
+def residual_m(vertices: Float[np.ndarray, "vertex 3"], blend: Influences, poses: Poses) -> Float[np.ndarray, "frame vertex"]:
     """Return the distance between the linear blend and the posed surface."""
     distance = np.empty(poses.posed.shape[:2])
     for frame, bones in enumerate(poses.posed_from_rest):
-        each = np.einsum("vkij,vj->vki", bones[joints][..., :3, :3], vertices) + bones[joints][..., :3, 3]
-        distance[frame] = np.linalg.norm(np.einsum("vk,vki->vi", weights, each) - poses.posed[frame], axis=1)
+        each = np.einsum("vkij,vj->vki", bones[blend.joints][..., :3, :3], vertices) + bones[blend.joints][..., :3, 3]
+        distance[frame] = np.linalg.norm(np.einsum("vk,vki->vi", blend.weights, each) - poses.posed[frame], axis=1)
     return distance
 
 
@@ -128,7 +142,7 @@ def _best_on_simplex(gram: Float[np.ndarray, "vertex k k"]) -> Float[np.ndarray,
             total = solved.sum(1, keepdims=True)
             trial = np.zeros_like(best)
             trial[:, support] = solved / np.where(total == 0, 1, total)
-            cost = np.einsum("vi,vij,vj->v", trial, gram, trial)
+            cost = _cost(gram, trial)
             better = (trial >= 0).all(1) & (total[:, 0] > 0) & (cost < best_cost)
             best[better], best_cost[better] = trial[better], cost[better]
     return best

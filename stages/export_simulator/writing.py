@@ -6,11 +6,12 @@ from typing import Any, Literal, assert_never
 
 import numpy as np
 
-from pipeline.files import glb
+from pipeline.files import arrays, glb
 from pipeline.qa import Check, Picture
 from stages.export_simulator import page, pictures
 from stages.export_simulator.contract import contract
 from stages.export_simulator.export import Made
+from stages.export_simulator.page import Asset
 from stages.export_simulator.reading import Minds
 
 Layout = Literal["file", "folder"]
@@ -24,29 +25,30 @@ def write_simulator(folder: Path, made: Made, minds: Minds, name: str, layout: L
         setting=made.setting,
         motions=made.motions,
         skin=made.skin,
-        skinning_residual_m=made.residual_m,
+        residuals_m={"skinning_residual_mm": made.residual_m, "skinning_residual_8_mm": made.eight_residual_m},
         volume=minds.volume,
     )
     room = glb.static(made.scene, "scene")
     assets = {
-        "room": room,
-        "agent": glb.skinned(made.agent, made.skin, []),
-        "clips": page.clip_rows(made.motions),
-        "splats": made.splat_rows,
-        "agent-splats": made.agent_splats.rows,
-        "agent-skin": made.agent_splats.skin,
-        "volume": minds.features,
-        "allowed": minds.allowed,
-        **minds.networks,
+        "room": Asset(room, 4),
+        "agent": Asset(glb.skinned(made.agent, made.skin, []), 4),
+        "clips": Asset(page.clip_rows(made.motions), 4),
+        "splats": Asset(made.splat_rows, 32),
+        "agent-splats": Asset(made.agent_splats.rows, 32),
+        "agent-skin": Asset(made.agent_splats.skin, 8),
+        "volume": Asset(minds.features, 2),
+        "allowed": Asset(minds.allowed),
+        **{name: Asset(network, 4) for name, network in minds.networks.items()},
     }
     size = _write_page(folder, about, assets, layout)
     (folder / "agent.glb").write_bytes(glb.skinned(made.agent, made.skin, made.actions))
     (folder / "scene.glb").write_bytes(room)
+    arrays.save(folder / "skin_8.npz", joints=made.eight.joints, weights=made.eight.weights)
     (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
     return size / 1e6
 
 
-def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, bytes], layout: Layout) -> int:
+def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], layout: Layout) -> int:
     match layout:
         case "file":
             text, files = page.page(contract=about, assets=assets), {}

@@ -23,10 +23,17 @@ WEB = Path(__file__).parents[3] / "stages/export_simulator/web"
 
 @pytest.fixture(scope="module")
 def agent() -> reading.Agent:
-    """A tube of five bones with two motions."""
+    """A tube of five bones with two motions, four influences a vertex."""
+    return tube(4)
+
+
+def tube(influences: int) -> reading.Agent:
+    """The same with any number of influences; those beyond the five bones weigh nothing."""
     mesh, weights = small_world.tube()
-    joints = np.argsort(-weights, 1)[:, :4]
+    joints = np.argsort(-weights, 1)[:, :influences]
     heaviest = np.take_along_axis(weights, joints, 1)
+    padding = ((0, 0), (0, influences - joints.shape[1]))
+    joints, heaviest = np.pad(joints, padding), np.pad(heaviest, padding)
     skin = Skin(
         joints.astype(np.uint8),
         (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32),
@@ -50,11 +57,14 @@ def session() -> reading.Session:
     )
 
 
-def test_glb_comes_back_as_it_was(agent: reading.Agent) -> None:
+@pytest.mark.parametrize("influences", [4, 8])
+def test_glb_comes_back_as_it_was(influences: int) -> None:
+    agent = tube(influences)
     mesh, skin, actions = glb.read_skinned(glb.skinned(agent.mesh, agent.skin, agent.actions))
     np.testing.assert_array_equal(mesh.faces, agent.mesh.faces)
     np.testing.assert_array_equal(mesh.color, agent.mesh.color)
     np.testing.assert_array_equal(skin.joints, agent.skin.joints)
+    np.testing.assert_array_equal(skin.weights, agent.skin.weights)
     np.testing.assert_allclose(skin.agent_from_bone_rest, agent.skin.agent_from_bone_rest, atol=1e-6)
     for found, truth in zip(actions, agent.actions, strict=True):
         np.testing.assert_allclose(found.world_from_agent, truth.world_from_agent, atol=1e-6)
@@ -64,6 +74,7 @@ def test_glb_comes_back_as_it_was(agent: reading.Agent) -> None:
 
 
 def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
+    (tmp_path / "agent_8.glb").write_bytes(glb.skinned(agent.mesh, tube(8).skin, agent.actions))
     told = glb_export.write(tmp_path, agent, glb.static(small_world.room(), "scene"))
     assert told.loss_mm == {"skinning_mean": 0.1, "skinning_max": 0.5}
     if shutil.which("node") is None or not (WEB / "node_modules/gltf-validator").is_dir():
@@ -73,11 +84,11 @@ def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
         "for (const f of process.argv.slice(1)) {const r = await v.validateBytes(new Uint8Array(fs.readFileSync(f)));"
         "console.log(JSON.stringify([r.issues.numErrors, r.issues.numWarnings, r.info.animationCount]))}"
     )
-    files = [str(tmp_path / name) for name in ("agent.glb", "scene.glb")]
+    files = [str(tmp_path / name) for name in ("agent.glb", "scene.glb", "agent_8.glb")]
     told_by_node = subprocess.run(
         ["node", "--input-type=module", "-e", script, *files], cwd=WEB, capture_output=True, text=True, check=True
     )
-    assert [json.loads(line) for line in told_by_node.stdout.splitlines()] == [[0, 0, 2], [0, 0, 0]]
+    assert [json.loads(line) for line in told_by_node.stdout.splitlines()] == [[0, 0, 2], [0, 0, 0], [0, 0, 2]]
 
 
 def test_flat_bvh_is_exact_and_its_tree_says_what_is_lost(agent: reading.Agent, tmp_path: Path) -> None:
