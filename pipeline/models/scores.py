@@ -16,22 +16,32 @@ GOAL_SCORES = ("goal_minde_m", "goal_energy_score_m")
 PLAN_SCORES = ("path_minade_m", "orientation_minade_rad", "joints_minade_rad")
 
 
+def goal_distances(samples: Samples, future: Future) -> Float[np.ndarray, "window sample"]:
+    """Return the distance of every sampled goal, metres."""
+    return np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1)
+
+
+def path_distances(samples: Samples, future: Future) -> Float[np.ndarray, "window sample"]:
+    """Return the mean distance along every sampled path, metres."""
+    return np.linalg.norm(samples.path - future.path_world[:, None], axis=-1).mean(-1)
+
+
 def goal_minde(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
     """Return the distance of the best of the sampled goals, metres."""
-    return np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1).min(1)
+    return goal_distances(samples, future).min(1)
 
 
 def goal_energy_score(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
     """Return E|X - y| - E|X - X'| / 2 (Gneiting & Raftery 2007), with the fair estimate of the second term."""
     count = samples.goal.shape[1]
-    to_truth = np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1).mean(1)
+    to_truth = goal_distances(samples, future).mean(1)
     among = np.linalg.norm(samples.goal[:, :, None] - samples.goal[:, None], axis=-1).sum((1, 2))
     return to_truth - among / (2 * count * (count - 1))
 
 
 def path_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
     """Return the mean distance along the best of the sampled paths, metres."""
-    return np.linalg.norm(samples.path - future.path_world[:, None], axis=-1).mean(-1).min(1)
+    return path_distances(samples, future).min(1)
 
 
 def orientation_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:

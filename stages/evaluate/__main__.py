@@ -34,6 +34,8 @@ class Config:
     """Frames of the held-out phone that are drawn."""
     surface_frames: int = 12
     """Frames per session on which the agent's surface is compared."""
+    physical_windows: int = 16
+    """Test windows in which penetration and foot slide are measured, of recorded and of generated motion."""
     samples: int = 16
     """Samples per window, the best of which counts."""
     trials: int = 12
@@ -56,7 +58,7 @@ def run(task: cli.Task) -> None:
         **{name: task.input(name) for name in ARTIFACTS},
         **{name: task.input(name) if task.has(name) else None for name in ("truth", "clicks")},
     )
-    effort = evaluation.Effort(c.localizer_frames, c.map_frames, c.heldout_frames, c.surface_frames, c.time_plans)
+    effort = evaluation.Effort(c.localizer_frames, c.map_frames, c.heldout_frames, c.surface_frames, c.physical_windows, c.time_plans)
     protocol = Protocol(c.samples, c.trials, c.plan_trials, c.plan_stride, c.bootstrap_draws, c.seed)
     rng = np.random.default_rng(c.seed)
     figures = evaluation.evaluate(folders, task.videos, effort, protocol, rng, task.device)

@@ -13,13 +13,15 @@ from jaxtyping import Float, Int
 
 from pipeline.models.intervals import Interval, bootstrapped, episodes
 from pipeline.models.predictors import Ats, ConstantVelocity, LocationPrior, Predictor, Samples, StandStill
-from pipeline.models.scores import GOAL_SCORES, PLAN_SCORES, SCORES
+from pipeline.models.scores import GOAL_SCORES, PLAN_SCORES, SCORES, goal_distances, path_distances
 from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData, Context
+from stages.evaluate import best_of
 from stages.evaluate.figures import Figures
 
 OURS = "ats"
 RIVALS = ("location_prior", "stand_still", "constant_velocity")
 MOVING_M = 0.1
+CURVES = "Error of the best of K sampled goals and paths on the test windows against K: ours and the simple rivals."
 
 
 @dataclass(frozen=True)
@@ -57,8 +59,9 @@ def behavior_figures(data: BehaviorData, ours: Predictor, protocol: Protocol) ->
         figures.skip(_names(), reason)
         return figures
     episode = episodes(data.start[test], data.video[test], PAST + FUTURE)
-    scores = {name: _scores(method, data, test, protocol) for name, method in ({OURS: ours} | rivals(data)).items()}
-    _report(figures, scores, episode, protocol)
+    judged = {name: _judged(method, data, test, protocol) for name, method in ({OURS: ours} | rivals(data)).items()}
+    _report(figures, {name: each.scores for name, each in judged.items()}, episode, protocol)
+    figures.charts[CURVES] = best_of.drawn({name: each.distances for name, each in judged.items()})
     return figures
 
 
@@ -71,21 +74,32 @@ def moving_share(data: BehaviorData, index: Int[np.ndarray, "window"]) -> float:
     return float((away.max(1) > MOVING_M).mean())
 
 
-def _scores(
-    method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], protocol: Protocol
-) -> dict[str, Float[np.ndarray, "window"]]:
-    """Return per score its value per window, averaged over trials; plans are judged on every ``plan_stride``-th."""
+@dataclass(frozen=True)
+class _Judged:
+    """One method on the test windows."""
+
+    scores: dict[str, Float[np.ndarray, "window"]]
+    """averaged over trials"""
+    distances: dict[str, Float[np.ndarray, "window sample"]]
+    """of every sampled goal and path, metres"""
+
+
+def _judged(method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], protocol: Protocol) -> _Judged:
+    """Judge one method; plans are judged on every ``plan_stride``-th window."""
     rng = np.random.default_rng(protocol.seed)
     context, future = data.windows(test)
     goals = _goals(method, context, protocol.samples * protocol.trials, rng)
     trials = [Samples(part) for part in np.split(goals, protocol.trials, axis=1)]
     found = {name: [SCORES[name](trial, future) for trial in trials] for name in GOAL_SCORES}
+    distances = {"goal": goal_distances(Samples(goals), future)}
     context, future = data.windows(test[:: protocol.plan_stride])
     for _ in range(protocol.plan_trials):
         samples = method.sample(context, protocol.samples, rng)
         for name in PLAN_SCORES if samples.path is not None else ():
             found.setdefault(name, []).append(SCORES[name](samples, future))
-    return {name: np.mean(values, axis=0) for name, values in found.items()}
+        if samples.path is not None:
+            distances["path"] = path_distances(samples, future)
+    return _Judged({name: np.mean(values, axis=0) for name, values in found.items()}, distances)
 
 
 def _goals(method: Predictor, context: Context, count: int, rng: np.random.Generator) -> Float[np.ndarray, "window sample 3"]:

@@ -14,7 +14,19 @@ from pipeline.models.perception import FeatureVolume
 from pipeline.models.predictors import Ats
 from pipeline.models.trajectories import BehaviorData
 from pipeline.videos import Video
-from stages.evaluate import behavior, clicked, heldout, localizing, perception, reading, real_phone, reconstruction, registration, speed
+from stages.evaluate import (
+    behavior,
+    clicked,
+    heldout,
+    localizing,
+    perception,
+    physical,
+    reading,
+    real_phone,
+    reconstruction,
+    registration,
+    speed,
+)
 from stages.evaluate.alignment import PoseErrors, joined, pose_errors
 from stages.evaluate.behavior import Protocol
 from stages.evaluate.figures import Figures
@@ -38,6 +50,7 @@ class Effort:
     map_frames: int
     heldout_frames: int
     surface_frames: int
+    physical_windows: int
     time_plans: bool
 
 
@@ -56,6 +69,8 @@ def evaluate(folders: Folders, videos: Sequence, effort: Effort, protocol: Proto
     progress.log("evaluate: behaviour")
     data, ours = _predictor(folders, device)
     figures.add(behavior.behavior_figures(data, ours, protocol))
+    progress.log("evaluate: penetration and foot slide")
+    figures.add(physical.physical_figures(data, ours, folders.reconstruction, windows=effort.physical_windows, seed=protocol.seed))
     figures.add(speed.plan_figures(data, ours, protocol.seed, measure=effort.time_plans))
     return figures
 

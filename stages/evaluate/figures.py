@@ -15,7 +15,9 @@ class Figures:
     values: dict[str, float | None] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
     pictures: dict[str, UInt8[np.ndarray, "height width 3"]] = field(default_factory=dict)
-    """by caption"""
+    """views of what was recorded and reconstructed, by caption"""
+    charts: dict[str, UInt8[np.ndarray, "height width 3"]] = field(default_factory=dict)
+    """drawn from numbers alone, by caption"""
 
     def put(self, name: str, value: float, why_unknown: str = "too few frames could be measured") -> None:
         """Record a figure; what is not finite becomes nothing with the reason given."""
@@ -37,6 +39,7 @@ class Figures:
         self.values.update(other.values)
         self.reasons.update(other.reasons)
         self.pictures.update(other.pictures)
+        self.charts.update(other.charts)
 
 
 def median(errors: np.ndarray) -> float:

@@ -26,6 +26,6 @@ def report_quality(folder: Path, figures: Figures) -> None:
     ]
     good = "errors of a few centimetres and of less than a degree, and all simple rivals clearly worse"
     bad = "a simple rival as good as ours: then the capture is too easy, or the model has learned nothing"
-    shown = enumerate(figures.pictures.items())
-    pictures = [qa.Picture(f"picture_{number}", image, caption) for number, (caption, image) in shown]
+    named = (("chart", figures.charts), ("view", figures.pictures))
+    pictures = [qa.Picture(f"{kind}_{n}", image, caption) for kind, shown in named for n, (caption, image) in enumerate(shown.items())]
     qa.write(folder, good=good, bad=bad, checks=checks, pictures=pictures)

@@ -16,7 +16,7 @@ def reliability_figures(name: str, probability: Float[np.ndarray, "frame"], righ
     figures.put(f"{name}/confidence_mean", float(probability.mean()) if len(probability) else np.nan)
     figures.put(f"{name}/calibration_error", float((count * np.abs(claimed - met)).sum() / count.sum()) if count.sum() else np.nan)
     if count.sum():
-        figures.pictures[f"{name}: share of right poses (up) against the probability given to them (right); area: frames"] = _drawn(
+        figures.charts[f"{name}: share of right poses (up) against the probability given to them (right); area: frames"] = _drawn(
             claimed, met, count
         )
     return figures

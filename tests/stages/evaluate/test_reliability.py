@@ -14,7 +14,7 @@ def test_honest_and_boasting_probabilities():
     boasting = reliability_figures("x", np.full(1000, 0.95), np.arange(1000) % 2 == 0)
     assert boasting.values["x/calibration_error"] == pytest.approx(0.45)
     assert boasting.values["x/confidence_mean"] == pytest.approx(0.95)
-    (picture,) = boasting.pictures.values()
+    (picture,) = boasting.charts.values()
     assert (picture.min(-1) < 200).any()
 
 

@@ -134,15 +134,8 @@ def write(build: Path) -> None:
     """Write the four artifacts that `export_simulator` reads (without manifests)."""
     for name in ("reconstruction", "splats", "behavior_data", "behavior"):
         (build / name).mkdir(parents=True)
+    write_surfaces(build / "reconstruction")
     body, weights = tube()
-    meshes.write_ply(build / "reconstruction/agent.ply", body)
-    meshes.write_ply(build / "reconstruction/scene.ply", room())
-    arrays.save(
-        build / "reconstruction/skin.npz",
-        weights=weights.astype(np.float32),
-        agent_from_bone_rest=rest().astype(np.float32),
-        bone_scale_m=np.full((BONES, 3), 0.06, np.float32),
-    )
     write_gaussians(build / "splats/scene.ply", room())
     write_gaussians(build / "splats/agent.ply", body)
     arrays.save(build / "splats/splats.npz", agent_weights=weights.astype(np.float32), agent_from_bone_rest=rest().astype(np.float32))
@@ -167,6 +160,19 @@ def write(build: Path) -> None:
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
+
+
+def write_surfaces(reconstruction: Path) -> None:
+    """Write the tube, its skin and the room."""
+    body, weights = tube()
+    meshes.write_ply(reconstruction / "agent.ply", body)
+    meshes.write_ply(reconstruction / "scene.ply", room())
+    arrays.save(
+        reconstruction / "skin.npz",
+        weights=weights.astype(np.float32),
+        agent_from_bone_rest=rest().astype(np.float32),
+        bone_scale_m=np.full((BONES, 3), 0.06, np.float32),
+    )
 
 
 def write_gaussians(path: Path, mesh: Mesh) -> None:
