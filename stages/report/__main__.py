@@ -21,7 +21,7 @@ class Config:
     name: str = "the animal"
     """what it calls the animal"""
     share_safe: bool = False
-    """blur every picture that may show people or the home; figures stay"""
+    """blur every picture that people or the home can be in; drawn ones, the animal alone and figures stay"""
     warn_page_mb: float = 15.0
     """megabytes above which a page is too big to send"""
 

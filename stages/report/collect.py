@@ -2,8 +2,9 @@
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -84,14 +85,17 @@ def told(
 ) -> Told:
     """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all).
 
-    With `safe` every picture that may show a recorded or rendered view is blurred beyond recognition as a whole: finders
-    of people miss some, and a room tells where somebody lives.
+    With `safe` every picture that a person or the home can be in is blurred beyond recognition as a whole: where people
+    stand in it is not known, finders of people miss some, and a room tells where somebody lives.
     """
     raw = {video: _read(folder) for video, folder in folders.items()}
     files = [folder / entry["file"] for folder, qa in zip(folders.values(), raw.values(), strict=True) for entry in qa["pictures"]]
     total = sum(file.stat().st_size for file in files)
     shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
-    blurred = safe and not chapter.drawn
+
+    def blurred(file: str) -> bool:
+        return safe and not any(fnmatch(Path(file).stem, name) for name in chapter.nobody_in)
+
     notes = [_note(video, roles.get(video or "", ""), folders[video], qa, shrink, blurred) for video, qa in raw.items()]
     return Told(chapter, notes, dict(settings))
 
@@ -101,8 +105,8 @@ def _read(folder: Path) -> dict[str, Any]:
     return json.loads(path.read_bytes()) if path.exists() else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
 
 
-def _note(video: str | None, about: str, folder: Path, qa: dict[str, Any], shrink: float, blurred: bool) -> Note:
-    pictures = [_picture(folder / entry["file"], entry["caption"], shrink, blurred) for entry in qa["pictures"]]
+def _note(video: str | None, about: str, folder: Path, qa: dict[str, Any], shrink: float, blurred: Callable[[str], bool]) -> Note:
+    pictures = [_picture(folder / entry["file"], entry["caption"], shrink, blurred(entry["file"])) for entry in qa["pictures"]]
     return Note(video, about, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures)
 
 

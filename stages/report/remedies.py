@@ -9,6 +9,8 @@ REMEDIES: dict[str, dict[str, str]] = {
         "known depth": "stay between 0.3 and 4 m of what is recorded; glass and black surfaces give no depth",
         "frames dropped": "use a phone with LiDAR, the rear camera, and Record3D's LiDAR mode",
         "scale known": "record one session with a LiDAR phone where the walk-through went: its depth tells the metres",
+        "frames": "the recording is too short, or most of it could not be used: see the checks below",
+        "damaged": "copy the recording from the phone again",
         "device poses": "hold the phone still for a second at the start; poses are then found from pictures alone, more slowly",
     },
     "flow": {"both directions": "more light and slower motion of the phone; look at the pair of pictures with the least agreement"},
@@ -18,7 +20,10 @@ REMEDIES: dict[str, dict[str, str]] = {
         "agreement": "look at the overlay: shadows and people that walk along are taken for the animal",
     },
     "features": {"likeness": "pictures jump: the phone was moved too fast"},
-    "feature_basis": {"variance": "record more of the room; one basis serves all recordings"},
+    "feature_basis": {
+        "descriptors": "record more: too few pictures for a basis",
+        "variance": "record more of the room; one basis serves all recordings",
+    },
     "scene_template": {
         "keyframes": "walk once more, slowly, with the phone turned to textured things; every place from two sides",
         "reprojection": "blurred or moving things in the walk-through: record it without the animal and without people",
@@ -40,6 +45,7 @@ REMEDIES: dict[str, dict[str, str]] = {
         "registered": "begin the session with a slow look at the room, so that it overlaps with the walk-through",
         "frame votes": "furniture was moved since the walk-through, or the light is very different: record the walk-through again",
         "depth": "furniture was moved since the walk-through: record it again",
+        "likeness": "the light is very different from the walk-through's: record that again in the usual light",
         "static": "furniture was moved since the walk-through: record it again",
         "camera": "begin the session with a slow look at the room",
         "animal": "keep the whole animal in view, 0.5-3 m away",
@@ -64,10 +70,22 @@ REMEDIES: dict[str, dict[str, str]] = {
         "training fell": "look at the losses; a smaller learning rate (`[train_behavior]`) helps",
         "": "record more sessions; minutes of behaviour are learned by heart, hours are not",
     },
+    "longterm": {
+        "l1": "record more and longer sessions with walks from place to place; then more steps (`[train_longterm]` in the recipe)",
+        "bodies": "look at the agent in the reconstruction: where it sinks into what it stands on, long-term bodies do so too",
+        "contact": "look at the agent in the reconstruction: its feet must come near the floor",
+        "spread": "give the pose space more components (`[train_longterm]` in the recipe)",
+    },
     "simulator": {
         "size": 'lower `scene_splats` or `scene_faces`, or set `layout = "folder"` (`[export_simulator]` in the recipe)',
-        "skinning": "raise `fitted_poses`; where bones twist by more than a right angle four linear weights cannot follow",
+        "skinning": "raise `fitted_poses`; where bones twist by more than a right angle four linear weights cannot follow, eight (`--influences 8`) a little",
         "sessions": "a session counts when it shows the animal for 1.6 s without a break",
+    },
+    "evaluation": {
+        "registration": "look at Sessions on the map: which recording is off, and what its page says",
+        "masks": "look at the masks' overlays; a box or a click on the animal (`python -m stages.segment_agent --prompt`) helps",
+        "reconstruction": "look at 4D reconstruction; a GPU and more steps (`[reconstruct]` in the recipe) help",
+        "behavior": "record more sessions: a rival that predicts as well means that the model has learned little from these",
     },
 }
 

@@ -1,5 +1,6 @@
 """The report judges honestly, shows every note and asks nothing of the network."""
 
+import ast
 import base64
 import json
 import re
@@ -12,10 +13,12 @@ from pipeline import artifact, dag, qa
 from pipeline.cli import Task
 from pipeline.files import images
 from pipeline.videos import Video
+from stages.evaluate.judging import LIMITS
 from stages.report import bars, collect, pages, remedies
 from stages.report.__main__ import Config, run
 from stages.report.chapters import CHAPTERS
 
+ROOT = Path(__file__).parents[3]
 ROLES = (
     ("walkthrough", "none"),
     ("turnaround", "none"),
@@ -108,6 +111,26 @@ def test_a_safe_report_shows_no_view(tmp_path: Path) -> None:
 def embedded(told: collect.Told) -> np.ndarray:
     """Decode the first picture of a chapter."""
     return images.decode_color(base64.b64decode(told.notes[0].pictures[0].source.partition(",")[2]), "report")
+
+
+def judged_checks() -> list[tuple[str, str]]:
+    """Artifact and name of every check with a threshold that the stages' code spells out."""
+    found = []
+    for chapter in CHAPTERS:
+        for file in (ROOT / "stages" / dag.NODES[chapter.artifact].stage).glob("*.py"):
+            for call in ast.walk(ast.parse(file.read_text())):
+                if not isinstance(call, ast.Call) or ast.unparse(call.func) not in ("Check", "qa.Check") or not call.args:
+                    continue
+                name = call.args[0].values[0] if isinstance(call.args[0], ast.JoinedStr) else call.args[0]
+                if isinstance(name, ast.Constant) and (len(call.args) > 3 or {key.arg for key in call.keywords} & {"warn", "fail"}):
+                    found.append((chapter.artifact, str(name.value)))
+    return found
+
+
+def test_every_threshold_has_a_remedy() -> None:
+    checks = judged_checks() + [("evaluation", name) for name, *_ in LIMITS]
+    assert len(checks) > 50
+    assert [each for each in checks if not remedies.remedy(*each)] == []
 
 
 def test_worries_come_with_a_remedy(tmp_path: Path) -> None:
