@@ -16,13 +16,15 @@ AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
 .PHONY: help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
-HOME_OF := build/$(or $(AGENT),cat)
-INPUTS = $(foreach a,$1,--$(subst _,-,$a) $(HOME_OF)/$a)
+# Where an agent's, or its variant's, own things stand; what a variant does not touch is its agent's (`INPUTS` knows).
+ANIMAL := $(or $(AGENT),cat)
+HOME_OF := build/$(ANIMAL)$(if $(VARIANT),/variants/$(VARIANT))
+INPUTS = inputs=$$($(PLAN) inputs $(HOME_OF:build/%=%) $1)
 # Called by a recipe, make shares the caller's jobs: as many at once as -j allows in all.
 NESTING := --no-print-directory NESTED=1
 
 help:
-	@sed 's/make cat/make $(or $(AGENT),cat)/' pipeline/help.txt
+	@sed 's/make cat/make $(ANIMAL)/' pipeline/help.txt
 	@echo 'agents: $(AGENTS)'
 
 include $(WANTED:%=build/%$(if $(TABLES),/tables)$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
@@ -33,51 +35,53 @@ build/%/plan/rules.mk: .venv/.ok FORCE
 	@envs/setup
 
 behavior-tables: .venv/.ok
-	@$(MAKE) $(NESTING) TABLES=1 $(or $(AGENT),cat).behavior_tables
-	@cat build/$(or $(AGENT),cat)/behavior_tables/tables.txt
+	@$(MAKE) $(NESTING) TABLES=1 $(ANIMAL).behavior_tables
+	@cat build/$(ANIMAL)/behavior_tables/tables.txt
 
 behavior-benchmark: .venv/.ok
 	@$(MAKE) $(NESTING) behavior-tables AGENT=benchmark
 
 registration-tables reconstruction-tables: %-tables: .venv/.ok
 	@set -e; for variant in $$($(PYTHON) -SE -c 'from pipeline import dag; print(*dag.VARIANTS["$*"])'); do \
-	  $(MAKE) $(NESTING) $(or $(AGENT),cat).$* VARIANT=$$variant; done
-	@$(MAKE) $(NESTING) $(or $(AGENT),cat).$*_tables
-	@cat build/$(or $(AGENT),cat)/$*_tables/tables.txt
+	  $(MAKE) $(NESTING) $(ANIMAL).$* VARIANT=$$variant; done
+	@$(MAKE) $(NESTING) $(ANIMAL).$*_tables
+	@cat build/$(ANIMAL)/$*_tables/tables.txt
 
 ablations: registration-tables reconstruction-tables
 
 longterm-tables: .venv/.ok
-	@$(MAKE) $(NESTING) $(or $(AGENT),cat).longterm_tables
-	@cat build/$(or $(AGENT),cat)/longterm_tables/tables.txt
+	@$(MAKE) $(NESTING) $(ANIMAL).longterm_tables
+	@cat build/$(ANIMAL)/longterm_tables/tables.txt
 
 new: .venv/.ok
 	@$(PLAN) new '$(AGENT)'
 
 annotate: .venv/.ok
-	@$(PYTHON) -m stages.annotate build/$(or $(AGENT),cat) --clicks captures/$(or $(AGENT),cat)/clicks.json
+	@$(PYTHON) -m stages.annotate build/$(ANIMAL) --clicks captures/$(ANIMAL)/clicks.json
 
 capture-check: .venv/.ok
-	@$(PYTHON) -m stages.check_captures captures/$(or $(AGENT),cat)
+	@$(PYTHON) -m stages.check_captures captures/$(ANIMAL)
 
 # One format for another program, after the simulator; with a take of `make simulate` as one motion more.
 export: .venv/.ok
 	@$(PYTHON) -m stages.export --format $(or $(FORMAT),glb) --help >/dev/null
-	@$(MAKE) $(NESTING) $(notdir $(HOME_OF)).simulator
-	@$(PYTHON) -m stages.export $(call INPUTS,simulator reconstruction splats behavior_data frames masks) --format $(or $(FORMAT),glb) \
+	@$(MAKE) $(NESTING) $(ANIMAL).simulator
+	@$(call INPUTS,simulator reconstruction splats behavior_data frames masks) && \
+	$(PYTHON) -m stages.export $$inputs --format $(or $(FORMAT),glb) $(if $(INFLUENCES),--influences $(INFLUENCES)) \
 	  $(if $(wildcard $(HOME_OF)/take/manifest.json),--take $(HOME_OF)/take) \
-	  --videos $(HOME_OF)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
+	  --videos build/$(ANIMAL)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
 	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); what is lost stands in its export.json'
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
 simulate: .venv/.ok
 	@test -z '$(SUBGOALS)' || test -f '$(SUBGOALS)' || { echo "error: SIM-004 $(SUBGOALS): there is no such file" >&2; exit 2; }
-	@$(MAKE) $(NESTING) $(notdir $(HOME_OF)).$(if $(SUBGOALS),longterm,behavior)
-	@$(PYTHON) -m stages.simulate $(if $(SUBGOALS),$(call INPUTS,longterm reconstruction behavior_data) --subgoals $(SUBGOALS),$(call INPUTS,behavior behavior_data)) --out $(HOME_OF)/take
+	@$(MAKE) $(NESTING) $(ANIMAL).$(if $(SUBGOALS),longterm,behavior)
+	@$(call INPUTS,$(if $(SUBGOALS),longterm reconstruction,behavior) behavior_data) && \
+	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals $(SUBGOALS)) --out $(HOME_OF)/take
 
 serve: .venv/.ok
-	@$(MAKE) $(NESTING) $(notdir $(HOME_OF)).simulator
-	@$(PYTHON) -m stages.simulate $(call INPUTS,behavior behavior_data simulator) --serve --out $(HOME_OF)/take
+	@$(MAKE) $(NESTING) $(ANIMAL).simulator
+	@$(call INPUTS,behavior behavior_data simulator) && $(PYTHON) -m stages.simulate $$inputs --serve --out $(HOME_OF)/take
 
 extras: .venv/.ok
 	@envs/extras

@@ -2,6 +2,7 @@
 
     python -SE -m pipeline.plan plan HOME             HOME is an agent, <agent>/variants/<name>, or <agent>/tables
     python -SE -m pipeline.plan redo HOME ARTIFACT    have one artifact made again
+    python -SE -m pipeline.plan inputs HOME ARTIFACT...   the options that name these artifacts to a stage run by hand
     python -SE -m pipeline.plan new AGENT             a recipe and a capture folder for a new animal
 
 Every check of the user's input happens before anything is written; a file is rewritten only when its content
@@ -10,7 +11,7 @@ changes, so that its age tells Make what is to be looked at. Standard library on
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,16 @@ def mark_redo(home: Home, name: str) -> None:
     for job in marked:
         artifact.write_if_changed(redo_mark(job["home"], job["id"]), "made again by the next build\n")
         Path(job["stamp"]).unlink(missing_ok=True)
+
+
+def inputs(home: Home, names: Sequence[str]) -> str:
+    """Return `--name path` of finished artifacts, each where a variant or the agent it stands on has it."""
+    known = {job["artifact"]: Path(job["out"]) for job in json.loads((home.plan / "dag.json").read_text())}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError("REC-007", f"no artifact {unknown[0]!r}", str(home), f"artifacts: {', '.join(known)}")
+    several = {name for name in names if dag.NODES[name].roles}
+    return " ".join(f"--{name.replace('_', '-')} {known[name].parent if name in several else known[name]}" for name in names)
 
 
 def new_agent(name: str) -> None:
@@ -184,6 +195,8 @@ def main(arguments: list[str]) -> int:
                 _plan(Home.parse(home))
             case ["redo", home, name]:
                 mark_redo(Home.parse(home), name)
+            case ["inputs", home, *names]:
+                print(inputs(Home.parse(home), names))
             case ["new", name]:
                 new_agent(name)
             case _:

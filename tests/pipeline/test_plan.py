@@ -116,6 +116,18 @@ def test_refusals_change_nothing(house, arguments, files, code):
     assert house.tree() == before
 
 
+def test_what_a_variant_does_not_touch_is_its_agents(house):
+    house.write("agents/variants/other.toml", "[train_behavior]\nseed = 3\n")
+    for home, own in (("toy", "build/toy"), ("toy/variants/other", "build/toy/variants/other")):
+        house.python("pipeline.plan", "plan", home)
+        told = house.python("pipeline.plan", "inputs", home, "simulator", "behavior_data", "frames")
+        assert told.stdout.split() == [
+            "--simulator", f"{own}/simulator", "--behavior-data", "build/toy/behavior_data", "--frames", "build/toy/frames",
+        ]  # fmt: skip
+    refused = house.python("pipeline.plan", "inputs", "toy", "simulators")
+    assert refused.returncode == 2 and refused.stderr.startswith("error: REC-007 ")
+
+
 def key_files(house):
     folder = house.folder / "build/toy/plan/keys"
     return {path.name: path.read_text() for path in folder.iterdir()}
