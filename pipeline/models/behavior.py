@@ -14,6 +14,7 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
+from pipeline.models.bodily import TOLD, BodyDenoiser
 from pipeline.models.concatenation import ConcatenationUNet
 from pipeline.models.denoisers import ControlUNet, GoalMLP
 from pipeline.models.diffusion import STANDARD, Schedule
@@ -68,8 +69,8 @@ class Architecture:
 
     @property
     def condition(self) -> int:
-        """Length of the perception code of all minds."""
-        return 3 * self.code * self.minds
+        """Length of the perception code of all minds and of the posture that is held now."""
+        return 3 * self.code * self.minds + self.body_channels
 
     @property
     def goal_condition(self) -> int:
@@ -124,6 +125,8 @@ class Sampling:
     """remember the past"""
     goal: bool = True
     """let the goal steer the path"""
+    clear: bool = True
+    """move goals and paths out of what is solid while they are denoised, where a map is given and the scene perceived"""
 
 
 class BehaviorNets(nn.Module):
@@ -138,12 +141,13 @@ class BehaviorNets(nn.Module):
         match a.control:
             case "unet":
                 self.path = ControlUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
-                self.body = ControlUNet(body, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                along = ControlUNet(body, TOLD, a.condition, a.unet_width, a.unet_multipliers, schedule)
             case "concatenation":
                 self.path = ConcatenationUNet(3, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
-                self.body = ConcatenationUNet(body, 3 * a.future, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                along = ConcatenationUNet(body, TOLD * a.future, a.condition, a.unet_width, a.unet_multipliers, schedule)
             case _:
                 assert_never(a.control)
+        self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
 
 
 def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:

@@ -4,10 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.models.denoisers import TIME_CHANNELS, NoiseFromVelocity, UNet, time_embedding
+from pipeline.models.denoisers import EMBEDDING, Embedding, NoiseFromVelocity, UNet
 from pipeline.models.diffusion import STANDARD, Schedule
-
-EMBEDDING = 128
 
 
 class ConcatenationUNet(nn.Module):
@@ -22,11 +20,11 @@ class ConcatenationUNet(nn.Module):
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
     ):
-        """``control`` counts the numbers of the whole control: 3 of a goal, 3 per frame of a path."""
+        """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of what is told of a path."""
         super().__init__()
         self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
-        self.time = nn.Sequential(nn.Linear(TIME_CHANNELS, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
-        self.condition = nn.Sequential(nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
+        read = nn.Sequential(nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
+        self.embedding = Embedding(read)
         self.main = UNet(channels, widths, EMBEDDING)
         self.out = nn.Conv1d(widths[0], channels, 1)
 
@@ -39,5 +37,4 @@ class ConcatenationUNet(nn.Module):
         keep: Float[Tensor, "batch 1"],
     ) -> Float[Tensor, "batch channel frame"]:
         code = torch.cat([condition, control.flatten(1) * keep, keep], dim=-1)
-        embedding = nn.functional.silu(self.time(time_embedding(t)) + self.condition(code))
-        return self.noise(x, self.out(self.main(x, embedding)[-1]), t)
+        return self.noise(x, self.out(self.main(x, self.embedding(t, code))[-1]), t)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pipeline.models.diffusion import STANDARD, Schedule
 
-TIME_CHANNELS, HORIZON_CHANNELS = 64, 8
+TIME_CHANNELS, HORIZON_CHANNELS, EMBEDDING = 64, 8, 128
 
 
 def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
@@ -83,6 +83,18 @@ def goal_stack(condition: int, hidden: int, layers: int) -> nn.Sequential:
     sizes = [3 + TIME_CHANNELS + HORIZON_CHANNELS + condition] + [hidden] * (layers - 1)
     inner = [layer for i, o in pairwise(sizes) for layer in (nn.Linear(i, o), nn.SiLU())]
     return nn.Sequential(*inner, nn.Linear(hidden, 3))
+
+
+class Embedding(nn.Module):
+    """Step and code as one vector, which every block of a UNet is told; ``read`` makes so many numbers of the code."""
+
+    def __init__(self, read: nn.Module):
+        super().__init__()
+        self.time = nn.Sequential(nn.Linear(TIME_CHANNELS, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
+        self.read = read
+
+    def forward(self, t: Float[Tensor, "batch"], code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch 128"]:
+        return nn.functional.silu(self.time(time_embedding(t)) + self.read(code))
 
 
 class Block(nn.Module):
@@ -153,11 +165,10 @@ class ControlUNet(nn.Module):
     ):
         super().__init__()
         self.noise = NoiseFromVelocity(schedule)
-        widths, embedding = tuple(width * m for m in multipliers), 128
-        self.time = nn.Sequential(nn.Linear(TIME_CHANNELS, embedding), nn.SiLU(), nn.Linear(embedding, embedding))
-        self.condition = nn.Linear(condition, embedding)
-        self.main = UNet(channels, widths, embedding)
-        self.side = UNet(control, widths, embedding)
+        widths = tuple(width * m for m in multipliers)
+        self.embedding = Embedding(nn.Linear(condition, EMBEDDING))
+        self.main = UNet(channels, widths, EMBEDDING)
+        self.side = UNet(control, widths, EMBEDDING)
         self.inject = nn.ModuleList(nn.Conv1d(w, w, 1) for w in self.main.block_widths)
         self.out = nn.Conv1d(widths[0], channels, 1)
         for zero in self.inject:
@@ -172,7 +183,7 @@ class ControlUNet(nn.Module):
         control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
         keep: Float[Tensor, "batch 1"],
     ) -> Float[Tensor, "batch channel frame"]:
-        embedding = nn.functional.silu(self.time(time_embedding(t)) + self.condition(condition))
+        embedding = self.embedding(t, condition)
         control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
         side = self.side(control, embedding)
         added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]

@@ -72,22 +72,25 @@ def sample(
     method: Literal["ddpm", "ddim"],
     count: int,
     draw: Callable[[], Array] | None = None,
+    correct: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Turn ``noise`` into a sample in ``count`` steps.
 
     ``denoise(x, t)`` predicts the noise. DDIM is deterministic; DDPM adds fresh noise from ``draw`` at each step but
-    the last, with the posterior variance of the steps visited (exact ancestral sampling when all are).
+    the last, with the posterior variance of the steps visited (exact ancestral sampling when all are). ``correct`` is
+    applied to the clean estimates of the steps at which most of the variance is clean, the last one among them.
     """
     x, steps, alpha_bar = noise, schedule.visited(count), schedule.alpha_bar
     for position, t in enumerate(steps):
         now = float(alpha_bar[t])
         epsilon = denoise(x, float(t))
         clean = ((x - (1 - now) ** 0.5 * epsilon) / now**0.5).clip(-schedule.clip, schedule.clip)
+        epsilon = (x - now**0.5 * clean) / (1 - now) ** 0.5
+        clean = correct(clean) if correct and now > 0.5 else clean
         if position == len(steps) - 1:
             return clean
         later = float(alpha_bar[steps[position + 1]])
         variance = (1 - later) / (1 - now) * (1 - now / later) if method == "ddpm" else 0.0
-        epsilon = (x - now**0.5 * clean) / (1 - now) ** 0.5
         x = later**0.5 * clean + max(1 - later - variance, 0.0) ** 0.5 * epsilon
         if method == "ddpm":
             x = x + variance**0.5 * draw()

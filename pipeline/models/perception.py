@@ -24,6 +24,8 @@ Blind = Literal["nothing", "scene", "observer", "past"]
 CONDITIONS: tuple[Blind, ...] = ("scene", "observer", "past")
 GRID_SHAPE = (64, 8, 64)
 GRID_CELL_M = 0.1
+POSITION = 3
+"""leading channels of a past frame, which tell the root's position; root rotation and bones follow"""
 UPRIGHT = 0.2
 """shortest horizontal part of the head's direction that still tells the heading"""
 
@@ -256,7 +258,10 @@ class Perception(nn.Module):
 
 
 class Minds(nn.Module):
-    """Several perceptions side by side; the code of the whole is the codes of all, one after another."""
+    """Several perceptions side by side; the code of the whole is the codes of all, one after another, and the posture."""
+
+    HELD_FRAMES = 3
+    """last frames whose mean is the posture"""
 
     def __init__(self, size: PerceptionSize, count: int):
         super().__init__()
@@ -273,4 +278,12 @@ class Minds(nn.Module):
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
-        return torch.cat([mind(scene_grid, observer_past, past, keep) for mind in self.minds], dim=-1)
+        frames = past.unflatten(1, (self.minds[0].past.frames, -1))[:, -self.HELD_FRAMES :, POSITION:]
+        codes = [mind(scene_grid, observer_past, past, keep) for mind in self.minds]
+        return torch.cat([*codes, self.posture(frames, keep[:, 2])], dim=-1)
+
+    def posture(self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]) -> Float[Tensor, "batch channel"]:
+        """Return the posture held in the last ``frames``, in scaled numbers; zeros where the past is not remembered."""
+        mind = self.minds[0]
+        scaled = (frames.mean(1) - mind.past.mean[POSITION:]) / mind.past.std[POSITION:]
+        return scaled * (keep * mind.sees[2])[:, None]

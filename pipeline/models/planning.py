@@ -24,7 +24,7 @@ from pipeline.models.behavior import (
 )
 from pipeline.models.diffusion import Schedule, guided, sample
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
-from pipeline.models.scenes import Scenes
+from pipeline.models.scenes import Ground, Scenes
 from pipeline.models.trajectories import Context
 from pipeline.space import rigid
 
@@ -77,10 +77,13 @@ class Observation:
     scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
     observer_past: Float[np.ndarray, "batch frame*3"]
     past: Float[np.ndarray, "batch frame*channel"]
+    ground: Ground | None = None
+    """where the agents may be, for samplers that keep to it"""
 
     def __getitem__(self, index: slice | np.ndarray) -> "Observation":
         """Return some of the batch."""
-        return Observation(self.scene_grid[index], self.observer_past[index], self.past[index])
+        ground = None if self.ground is None else self.ground[index]
+        return Observation(self.scene_grid[index], self.observer_past[index], self.past[index], ground)
 
     def __len__(self) -> int:
         return len(self.past)
@@ -106,8 +109,8 @@ def observe(context: Context, scenes: FeatureVolume | Scenes, rest: Float[np.nda
     ego_from_world = rigid.inverse(frame)
     observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
     past = past_channels(ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest))
-    grid = scenes.around(frame, context.video) if isinstance(scenes, Scenes) else scenes.around(frame)
-    return Observation(grid, observer, past)
+    scenes = scenes if isinstance(scenes, Scenes) else Scenes.of(scenes)
+    return Observation(scenes.around(frame, context.video), observer, past, Ground(scenes, frame, context.video))
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,8 @@ class Codes:
     """of everything that is kept"""
     blind: Float[np.ndarray, "plan condition"]
     """of the same without the observer"""
+    ground: Ground | None
+    """where goals and paths are kept to"""
 
 
 @dataclass(frozen=True)
@@ -139,16 +144,22 @@ class Sampler:
         path: Float[np.ndarray, "plan 56 3"] | None = None,
     ) -> Plan:
         """Draw ``count`` plans for each row, those of a row together; a given goal or path replaces its level."""
-        codes = self.codes(observation, sampling, count)
-        goal = self.goals(codes, sampling, rng) if goal is None else goal
-        path = self.paths(codes, goal, sampling, rng) if path is None else path
-        return Plan(goal, path, self.bodies(codes, path, sampling, rng))
+        return self.planned(self.codes(observation, sampling, count), sampling, rng, goal, path)
 
     def course(
         self, observation: Observation, sampling: Sampling, rng: np.random.Generator, *, count: int = 1
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw goals and paths as `plan` does and spare the body."""
-        codes = self.codes(observation, sampling, count)
+        return self.led(self.codes(observation, sampling, count), sampling, rng)
+
+    def planned(self, codes: Codes, sampling: Sampling, rng: np.random.Generator, goal: Array | None, path: Array | None) -> Plan:
+        """Draw one plan per code, each level on its own where it is not given."""
+        goal = self.goals(codes, sampling, rng) if goal is None else goal
+        path = self.paths(codes, goal, sampling, rng) if path is None else path
+        return Plan(goal, path, self.bodies(codes, path, sampling, rng))
+
+    def led(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw one path per code, towards a goal of its own."""
         return self.paths(codes, self.goals(codes, sampling, rng), sampling, rng)
 
     def codes(self, observation: Observation, sampling: Sampling, count: int = 1) -> Codes:
@@ -159,7 +170,7 @@ class Sampler:
         if sampling.guidance != 1:
             keep[:, 1] = 0
             blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
-        return Codes(full, blind)
+        return Codes(full, blind, observation.ground if sampling.clear and sampling.scene else None)
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
@@ -168,7 +179,8 @@ class Sampler:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
         pair = denoise(codes.full), denoise(codes.blind)
-        return self._drawn(*pair, (len(codes.full), 3), sampling, sampling.goal_steps, rng) * self.scaling.goal_std
+        x = self._drawn(*pair, (len(codes.full), 3), sampling, sampling.goal_steps, rng, lambda x: self.goals_cleared(codes, x))
+        return x * self.scaling.goal_std
 
     def paths(
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
@@ -180,7 +192,8 @@ class Sampler:
             return lambda x, t: self.networks.path(x, _filled(len(x), t), code, control, _filled((len(x), 1), keep))
 
         pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
-        path = self._drawn(*pair, (len(goal), *self.scaling.path_std.shape), sampling, sampling.sequence_steps, rng)
+        shape = len(goal), *self.scaling.path_std.shape
+        path = self._drawn(*pair, shape, sampling, sampling.sequence_steps, rng, lambda x: self.paths_cleared(codes, x))
         return np.swapaxes(path * self.scaling.path_std, 1, 2)
 
     def bodies(
@@ -196,6 +209,18 @@ class Sampler:
         body = self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
+    def goals_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
+        """Move scaled goals to where the agent may be."""
+        if codes.ground is None:
+            return scaled
+        return codes.ground.cleared((scaled * self.scaling.goal_std)[:, None])[:, 0] / self.scaling.goal_std
+
+    def paths_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 3 frame"]) -> Float[np.ndarray, "plan 3 frame"]:
+        """Move scaled paths to where the agent may be."""
+        if codes.ground is None:
+            return scaled
+        return np.swapaxes(codes.ground.cleared(np.swapaxes(scaled * self.scaling.path_std, 1, 2)), 1, 2) / self.scaling.path_std
+
     def _drawn(
         self,
         full: Callable[[Array, float], Array],
@@ -204,12 +229,13 @@ class Sampler:
         sampling: Sampling,
         count: int,
         rng: np.random.Generator,
+        correct: Callable[[Array], Array] | None = None,
     ) -> Array:
         def draw() -> Array:
             return rng.standard_normal(shape, dtype=np.float32)
 
         denoise = guided(full, blind, sampling.guidance)
-        x = sample(denoise, draw(), self.schedule, method=sampling.method, count=count, draw=draw)
+        x = sample(denoise, draw(), self.schedule, method=sampling.method, count=count, draw=draw, correct=correct)
         return x.astype(np.float32)
 
 

@@ -4,7 +4,8 @@
 fitted on the training windows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -144,7 +145,8 @@ class Ats:
         """Read a trained model (`behavior/`)."""
         architecture, nets, scaling, schedule, rest = behavior.load(model)
         sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
-        return cls(sampler, volume, rest, architecture.ego, sampling)
+        knows = architecture.blind_to != "scene"
+        return cls(sampler, volume, rest, architecture.ego, replace(sampling, clear=sampling.clear and knows))
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` plans for each window; goal and path are each as sampled."""
@@ -169,8 +171,13 @@ class Ats:
         split = (len(context), count)
         return Samples(*(a.reshape(*split, *a.shape[1:]) for a in (goal, root[..., :3, 3], root[..., :3, :3], bones)))
 
+    @cached_property
+    def scenes(self) -> Scenes:
+        """The map as scenes, of which there may be one."""
+        return self.volume if isinstance(self.volume, Scenes) else Scenes.of(self.volume)
+
     def _observe(self, context: Context) -> Observation:
-        return observe(context, self.volume, self.agent_from_bone_rest, self.ego)
+        return observe(context, self.scenes, self.agent_from_bone_rest, self.ego)
 
 
 def _chunks(context: Context) -> list[Context]:

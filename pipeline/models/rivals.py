@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from pipeline.models.behavior import Architecture, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
-from pipeline.models.planning import Array, Codes, Networks, Observation, Plan, Sampler
+from pipeline.models.planning import Array, Codes, Networks, Plan, Sampler
 
 MEAN, SPREAD = 0.0, 1.0
 """Steps at which a Gaussian's networks, shown no sample, tell its mean and the logarithm of its standard deviation."""
@@ -38,40 +38,27 @@ def sampler_of(architecture: Architecture, networks: Networks, schedule: Schedul
 class GaussianSampler(Sampler):
     """Draws from Gaussians, each number on its own."""
 
-    def plan(
-        self,
-        observation: Observation,
-        sampling: Sampling,
-        rng: np.random.Generator,
-        *,
-        count: int = 1,
-        goal: Float[np.ndarray, "plan 3"] | None = None,
-        path: Float[np.ndarray, "plan frame 3"] | None = None,
-    ) -> Plan:
+    def planned(self, codes: Codes, sampling: Sampling, rng: np.random.Generator, goal: Array | None, path: Array | None) -> Plan:
         """Draw plans; the means lead from level to level."""
-        codes = self.codes(observation, sampling, count)
         towards = self._goal(codes)[0] * self.scaling.goal_std if goal is None else goal
         along = self._metres(self._path(codes, towards, sampling)[0]) if path is None else path
         goal = self.goals(codes, sampling, rng) if goal is None else goal
         path = self.paths(codes, towards, sampling, rng) if path is None else path
         return Plan(goal, path, self.bodies(codes, along, sampling, rng))
 
-    def course(
-        self, observation: Observation, sampling: Sampling, rng: np.random.Generator, *, count: int = 1
-    ) -> Float[np.ndarray, "plan frame 3"]:
+    def led(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to the mean goal."""
-        codes = self.codes(observation, sampling, count)
         return self.paths(codes, self._goal(codes)[0] * self.scaling.goal_std, sampling, rng)
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
-        return self._drawn_from(self._goal(codes), rng) * self.scaling.goal_std
+        return self.goals_cleared(codes, self._drawn_from(self._goal(codes), rng)) * self.scaling.goal_std
 
     def paths(
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to goals."""
-        return self._metres(self._drawn_from(self._path(codes, goal, sampling), rng))
+        return self._metres(self.paths_cleared(codes, self._drawn_from(self._path(codes, goal, sampling), rng)))
 
     def bodies(
         self, codes: Codes, path: Float[np.ndarray, "plan frame 3"], sampling: Sampling, rng: np.random.Generator
@@ -104,29 +91,17 @@ class GaussianSampler(Sampler):
 class OneStageSampler(Sampler):
     """Draws path and body together; the goal is where the path ends."""
 
-    def plan(
-        self,
-        observation: Observation,
-        sampling: Sampling,
-        rng: np.random.Generator,
-        *,
-        count: int = 1,
-        goal: Float[np.ndarray, "plan 3"] | None = None,
-        path: Float[np.ndarray, "plan frame 3"] | None = None,
-    ) -> Plan:
+    def planned(self, codes: Codes, sampling: Sampling, rng: np.random.Generator, goal: Array | None, path: Array | None) -> Plan:
         """Draw plans. A given goal or path cannot steer a model without stages."""
         assert goal is None and path is None, "a one-stage model takes no goal and no path"
-        codes = self.codes(observation, sampling, count)
         whole = self._whole(codes, sampling, rng)
         path = np.swapaxes(whole[:, :3] * self.scaling.path_std, 1, 2)
         body = np.swapaxes(whole[:, 3:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
         return Plan(path[:, -1], path, body)
 
-    def course(
-        self, observation: Observation, sampling: Sampling, rng: np.random.Generator, *, count: int = 1
-    ) -> Float[np.ndarray, "plan frame 3"]:
+    def led(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
         """Draw whole plans and keep the paths."""
-        return self.plan(observation, sampling, rng, count=count).path
+        return self.planned(codes, sampling, rng, None, None).path
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw whole plans and keep where they end."""
@@ -139,8 +114,11 @@ class OneStageSampler(Sampler):
         def denoise(code: Array):
             return lambda x, t: self.networks.body(x, _step(x, t), code, control, _kept(x, 0.0))
 
+        def correct(x: Array) -> Array:
+            return np.concatenate([self.paths_cleared(codes, x[:, :3]), x[:, 3:]], axis=1)
+
         shape = (len(codes.full), 3 + len(self.scaling.body_mean), frames)
-        return self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng)
+        return self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng, correct)
 
 
 def _step(x: Array, t: float) -> Array:

@@ -5,13 +5,19 @@ the window's `Context.scene` names.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
 
 from pipeline.files import arrays
 from pipeline.models.perception import GRID_SHAPE, FeatureVolume
+from pipeline.space import rigid
+
+WITHIN = 0.01
+"""how far inside an allowed voxel a point is put, in edges of the voxel"""
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,8 @@ class Scenes:
     ) -> Float[np.ndarray, "window channel 64 8 64"]:
         """Sample the ego grid of every window in its own scene."""
         number = self.number(video, len(ego))
+        if (number == number[:1]).all() and len(number):
+            return self.volumes[number[0]].around(ego)
         grid = np.zeros((len(ego), self.channels, *GRID_SHAPE), np.float32)
         for scene in np.unique(number):
             grid[number == scene] = self.volumes[scene].around(ego[number == scene])
@@ -67,8 +75,55 @@ class Scenes:
         number = self.number(video, len(points_world))
         solid = np.zeros(points_world.shape[:-1], bool)
         for scene in np.unique(number):
-            if (self.volumes[scene].occupancy == 2).all():
+            if self.nearest_allowed[scene] is None:
                 continue
             voxel, inside = self.volumes[scene].voxel(points_world[number == scene])
             solid[number == scene] = ~(self.allowed[scene][tuple(np.moveaxis(voxel, -1, 0))] & inside)
         return solid
+
+    @cached_property
+    def nearest_allowed(self) -> tuple[Int[np.ndarray, "3 x y z"] | None, ...]:
+        """Per volume, the allowed voxel nearest to each voxel; None where nothing was mapped or nothing is allowed."""
+        return tuple(
+            distance_transform_edt(~allowed, return_distances=False, return_indices=True)
+            if allowed.any() and not (volume.occupancy == 2).all()
+            else None
+            for volume, allowed in zip(self.volumes, self.allowed, strict=True)
+        )
+
+    def cleared(
+        self, points_world: Float[np.ndarray, "window *some 3"], video: Int[np.ndarray, "window"] | None
+    ) -> Float[np.ndarray, "window *some 3"]:
+        """Move points that `inside_solid` finds to the nearest voxel where the agent's root may be."""
+        number, moved = self.number(video, len(points_world)), np.array(points_world)
+        for scene in np.unique(number):
+            nearest, volume, mine = self.nearest_allowed[scene], self.volumes[scene], number == scene
+            if nearest is None:
+                continue
+            voxel, inside = volume.voxel(moved[mine])
+            target = np.moveaxis(nearest[:, voxel[..., 0], voxel[..., 1], voxel[..., 2]], 0, -1)
+            low = volume.origin + (target + WITHIN) * volume.voxel_m
+            free = (target == voxel).all(-1) & inside
+            pushed = np.clip(moved[mine], low, low + (1 - 2 * WITHIN) * volume.voxel_m)
+            moved[mine] = np.where(free[..., None], moved[mine], pushed)
+        return moved
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where some agents may be, each in its own ego frame."""
+
+    scenes: Scenes
+    world_from_ego: Float[np.ndarray, "agent 4 4"]
+    video: Int[np.ndarray, "agent"] | None
+
+    def __getitem__(self, index: slice | np.ndarray) -> "Ground":
+        """Return some of the agents."""
+        return Ground(self.scenes, self.world_from_ego[index], None if self.video is None else self.video[index])
+
+    def cleared(self, points_ego: Float[np.ndarray, "plan point 3"]) -> Float[np.ndarray, "plan point 3"]:
+        """Move points out of what is solid; as many plans per agent as there are, those of an agent together."""
+        count = len(points_ego) // len(self.world_from_ego)
+        frame = np.repeat(self.world_from_ego, count, axis=0)
+        video = None if self.video is None else np.repeat(self.video, count)
+        return rigid.apply(rigid.inverse(frame), self.scenes.cleared(rigid.apply(frame, points_ego), video))

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels, channels_from_bones
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
 from pipeline.models.planning import Sampler, observe
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Context
 from pipeline.space import rigid
 
@@ -67,6 +68,7 @@ class Simulator:
         chaining: Chaining,
     ):
         self.sampler, self.data, self.volume, self.allowed, self.ego = sampler, data, volume, allowed, ego
+        self.scenes = Scenes((volume,), (allowed,), np.zeros(1, int))
         self.sampling, self.chaining, self.rest = sampling, chaining, data.agent_from_bone_rest
 
     def reset(self, seed: int, observer: Float[np.ndarray, "3"] | None = None) -> State:
@@ -98,7 +100,7 @@ class Simulator:
         """Draw candidates and take the first of those that are blocked least."""
         root = np.concatenate([frame.root for frame in self.past])
         bones = bones_from_channels(np.concatenate([frame.bones for frame in self.past]), self.rest)
-        observation = observe(Context(root[None], bones[None], np.array(self.observer)[None]), self.volume, self.rest, self.ego)
+        observation = observe(Context(root[None], bones[None], np.array(self.observer)[None]), self.scenes, self.rest, self.ego)
         frame = world_from_ego(root[-1:], self.ego)
         codes = self.sampler.codes(observation, self.sampling, self.chaining.candidates)
         goals = self.sampler.goals(codes, self.sampling, self.rng)

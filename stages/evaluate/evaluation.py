@@ -10,8 +10,8 @@ from pipeline.files import arrays
 from pipeline.files.clips import Masks
 from pipeline.models import localizer as localizers
 from pipeline.models.behavior import Sampling
-from pipeline.models.perception import FeatureVolume
 from pipeline.models.predictors import Ats
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import BehaviorData
 from pipeline.videos import Video
 from stages.evaluate import (
@@ -183,5 +183,4 @@ def _perception(folders: Folders, sessions: Sequence[Recorded], turnaround: Reco
 def _predictor(folders: Folders, device: str) -> tuple[BehaviorData, Ats]:
     """Open the behaviour model as a predictor on its own windows."""
     data = BehaviorData.load(folders.behavior_data)
-    volume = FeatureVolume.load(folders.behavior_data / "volume.npz")
-    return data, Ats.load(folders.behavior, volume, Sampling(), device=device)
+    return data, Ats.load(folders.behavior, Scenes.load(folders.behavior_data, data.videos), Sampling(), device=device)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.files import arrays
+from pipeline.models.behavior import Sampling
 from pipeline.models.flight import flees
 from pipeline.models.perception import FeatureVolume, world_from_ego
 from pipeline.models.planning import observe
@@ -18,6 +19,9 @@ from pipeline.models.predictors import WINDOWS_AT_ONCE, Ats
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, Context
 from pipeline.space import rigid
+
+TRUE = ("true", "true_standing")
+"""names of what the animal itself did, by twin"""
 
 
 @dataclass(frozen=True)
@@ -39,30 +43,29 @@ def read(folder: Path) -> Approaches:
 def shares(ats: Ats, met: Approaches, count: int, seed: int) -> dict[str, Float[np.ndarray, "approach"]]:
     """Return per approach the share of ``count`` plans that flee, by what is perceived, and whether the animal fled."""
     ats = replace(ats, volume=met.scene)
-    unaware = replace(ats, sampling=replace(ats.sampling, observer=False))
+    unaware = replace(ats.sampling, observer=False)
+    asked = ({"seen": ats.sampling, "unseen": unaware}, {"standing": ats.sampling})
     found = {}
-    for name, model, twin in (("seen", ats, 0), ("unseen", unaware, 0), ("standing", ats, 1)):
+    for twin, samplings in enumerate(asked):
         context = Context(met.world_from_agent[twin, :, :PAST], met.agent_from_bone[twin], met.observer[twin])
-        found[f"flees/{name}"] = _fled(model, context, count, np.random.default_rng(seed))
-    for name, twin in (("true", 0), ("true_standing", 1)):
+        fled = _fled(ats, context, samplings, count, seed)
         root = met.world_from_agent[twin, :, :, :3, 3]
-        found[f"flees/{name}"] = flees(root[:, PAST:], root[:, PAST - 1], met.observer[twin, :, -1]).astype(float)
+        true = flees(root[:, PAST:], root[:, PAST - 1], met.observer[twin, :, -1]).astype(float)
+        found |= {f"flees/{name}": share for name, share in fled.items()} | {f"flees/{TRUE[twin]}": true}
     return found
 
 
-def _fled(ats: Ats, context: Context, count: int, rng: np.random.Generator) -> Float[np.ndarray, "approach"]:
-    parts = []
+def _fled(ats: Ats, context: Context, samplings: dict[str, Sampling], count: int, seed: int) -> dict[str, Float[np.ndarray, "approach"]]:
+    """Return per approach the share of plans that flee, for several ways of sampling that begin with the same noise."""
+    rngs = {name: np.random.default_rng(seed) for name in samplings}
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in samplings}
     for begin in range(0, len(context), WINDOWS_AT_ONCE):
         some = context[begin : begin + WINDOWS_AT_ONCE]
-        path = _paths(ats, some, count, rng)
+        observation = observe(some, ats.volume, ats.agent_from_bone_rest, ats.ego)
+        frame = np.repeat(world_from_ego(some.world_from_agent[:, -1], ats.ego), count, axis=0)
         now, person = some.world_from_agent[:, -1:, :3, 3], some.observer_world[:, -1:]
-        parts.append(flees(path, np.repeat(now, count, axis=1), np.repeat(person, count, axis=1)).mean(1))
-    return np.concatenate(parts)
-
-
-def _paths(ats: Ats, context: Context, count: int, rng: np.random.Generator) -> Float[np.ndarray, "window sample frame 3"]:
-    """Sample paths without bodies, where the model knows them apart."""
-    observation = observe(context, ats.volume, ats.agent_from_bone_rest, ats.ego)
-    path = ats.sampler.course(observation, ats.sampling, rng, count=count)
-    frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], ats.ego), count, axis=0)
-    return rigid.apply(frame, path).reshape(len(context), count, -1, 3)
+        for name, sampling in samplings.items():
+            course = ats.sampler.course(observation, sampling, rngs[name], count=count)
+            path = rigid.apply(frame, course).reshape(len(some), count, -1, 3)
+            parts[name].append(flees(path, np.repeat(now, count, axis=1), np.repeat(person, count, axis=1)).mean(1))
+    return {name: np.concatenate(each) for name, each in parts.items()}

@@ -13,10 +13,13 @@ from scipy.ndimage import convolve1d
 from torch import Tensor
 
 from pipeline.models.behavior import Architecture, Scaling, channels_from_bones, rotation_to_6d
-from pipeline.models.perception import FeatureVolume, grid_points_ego, world_from_ego
+from pipeline.models.perception import FeatureVolume, Minds, grid_points_ego, world_from_ego
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, BehaviorData
 from pipeline.space import rigid, rigid_torch
+
+ENOUGH = 8192
+"""Windows that tell means and spreads."""
 
 
 @dataclass(frozen=True)
@@ -43,21 +46,35 @@ class Augmentation:
 
 
 @dataclass(frozen=True)
-class Windows:
-    """All training windows in their own ego frames."""
+class Tracks:
+    """What animal and observer do in some windows, each in its own ego frame."""
 
-    world_from_ego: Float[Tensor, "window 4 4"]
     root: Float[Tensor, "window 64 3"]
     rotation: Float[Tensor, "window 64 3 3"]
     observer: Float[Tensor, "window 8 3"]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """All training windows: every frame once, and which frames each window holds."""
+
+    world_from_agent: Float[Tensor, "frame 4 4"]
+    observer_world: Float[Tensor, "frame 3"]
     bones: Float[Tensor, "frame channel"]
+    world_from_ego: Float[Tensor, "window 4 4"]
     frame: Int[Tensor, "window 64"]
-    """rows of ``bones``"""
     scene: Int[Tensor, "window"]
     """number of the window's feature volume"""
 
     def __len__(self) -> int:
-        return len(self.root)
+        return len(self.frame)
+
+    def tracks(self, index: Int[Tensor, "some"]) -> Tracks:
+        """Express some windows in the ego frames of their current times."""
+        ego_from_world = rigid_torch.inverse(self.world_from_ego[index])
+        ego_from_agent = ego_from_world[:, None] @ self.world_from_agent[self.frame[index]]
+        observer = rigid_torch.apply(ego_from_world, self.observer_world[self.frame[index, :PAST]])
+        return Tracks(ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], observer)
 
 
 @dataclass(frozen=True)
@@ -78,6 +95,8 @@ class Batch:
     scene: Float[Tensor, "batch channel x y z"]
     observer_past: Float[Tensor, "batch frame*3"]
     past: Float[Tensor, "batch frame*channel"]
+    held: Float[Tensor, "batch frame channel"]
+    """root rotation and bones of the frames that tell the posture, as they were"""
     bones_keep: Float[Tensor, "batch"]
     mirrored: Bool[Tensor, "batch"]
     goal: Float[Tensor, "batch 3"]
@@ -133,46 +152,48 @@ def _smoothed(volume: FeatureVolume, stride: int) -> Float[np.ndarray, "x y z ch
 
 
 def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture, scenes: Scenes) -> Windows:
-    """Express windows in the ego frame of their current time."""
-    context, future = data.windows(index, bones=False)
-    frame = world_from_ego(context.world_from_agent[:, -1], architecture.ego)
-    ego_from_world = rigid.inverse(frame)
-    agent = ego_from_world[:, None] @ np.concatenate([context.world_from_agent, future.world_from_agent], axis=1)
-    lengths = [len(data.trajectories[video].timestamp_s) for video in data.videos]
-    first = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    bones = np.concatenate(
-        [channels_from_bones(data.trajectories[video].agent_from_bone, data.agent_from_bone_rest) for video in data.videos]
-    )
-    rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(agent.shape[1])
-    observer = rigid.apply(ego_from_world, context.observer_world)
-    arrays = (frame, agent[..., :3, 3], agent[..., :3, :3], observer, bones)
-    number = scenes.number(context.video, len(index))
-    return Windows(*(torch.from_numpy(array.astype(np.float32)) for array in arrays), torch.from_numpy(rows), torch.from_numpy(number))
+    """Put the frames of all recordings in one row and tell where in it each window lies."""
+    tracks = [data.trajectories[video] for video in data.videos]
+    agent = np.concatenate([track.world_from_agent for track in tracks])
+    observer = np.concatenate([track.world_from_camera[:, :3, 3] for track in tracks])
+    bones = np.concatenate([channels_from_bones(track.agent_from_bone, data.agent_from_bone_rest) for track in tracks])
+    first = np.cumsum([0, *(len(track.timestamp_s) for track in tracks[:-1])])
+    rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(PAST + data.future)
+    frame = world_from_ego(agent[rows[:, PAST - 1]], architecture.ego)
+    number = scenes.number(data.video[index], len(index))
+    tables = (torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, bones, frame))
+    return Windows(*tables, torch.from_numpy(rows), torch.from_numpy(number))
 
 
 def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
-    """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past.
+    """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past to at most 8,192 windows.
 
-    The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way.
+    The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is remembered of
+    a body is scaled as the body is.
     """
-    future = windows.root[:, PAST:].double().numpy()
+    some = torch.arange(0, len(windows), -(-len(windows) // ENOUGH))
+    tracks, rows = windows.tracks(some), windows.frame[some]
+    future = tracks.root[:, PAST:].double().numpy()
     level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(0.02)
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
-    scaling = Scaling(path_std[:, -1], path_std, *body_statistics(windows, slice(PAST, None), turn_rad))
-    mean, std = (torch.from_numpy(a).float() for a in body_statistics(windows, slice(0, PAST), turn_rad))
-    position = windows.root[:, :PAST].std().clip(0.05).expand(3)
+    whole = body_statistics(tracks.rotation[:, PAST:], windows.bones[rows[:, PAST:].unique()], turn_rad)
+    scaling = Scaling(path_std[:, -1], path_std, *whole)
+    mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
+    position = tracks.root[:, :PAST].std().clip(0.05).expand(3)
     return Statistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 
-def body_statistics(windows: Windows, frames: slice, turn_rad: float) -> tuple[Float[np.ndarray, "channel"], Float[np.ndarray, "channel"]]:
-    """Return mean and standard deviation, with floors, of root rotation and bones over some frames of all windows."""
+def body_statistics(
+    rotation: Float[Tensor, "window frame 3 3"], bones: Float[Tensor, "row channel"], turn_rad: float
+) -> tuple[Float[np.ndarray, "channel"], Float[np.ndarray, "channel"]]:
+    """Return mean and standard deviation, with floors, of root rotation and bones."""
     turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, turn_rad, 0])
-    root = rotation_to_6d(turns[:, None, None] @ windows.rotation[::4, frames][:, ::4].double().numpy()).reshape(-1, 6)
-    bones = windows.bones[windows.frame[:, frames].unique()].double().numpy()
-    floor = np.concatenate([np.full(6, 0.1), np.tile([0.05] * 3 + [0.01] * 3, bones.shape[-1] // 6)])
-    std = np.concatenate([root.std(0), bones.std(0)])
-    return np.concatenate([root.mean(0), bones.mean(0)]), np.maximum(std, floor)
+    root = rotation_to_6d(turns[:, None, None] @ rotation[::4, ::4].double().numpy()).reshape(-1, 6)
+    posed = bones.double().numpy()
+    floor = np.concatenate([np.full(6, 0.1), np.tile([0.05] * 3 + [0.01] * 3, posed.shape[-1] // 6)])
+    std = np.concatenate([root.std(0), posed.std(0)])
+    return np.concatenate([root.mean(0), posed.mean(0)]), np.maximum(std, floor)
 
 
 def body_channels(rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch c"]:
@@ -201,10 +222,11 @@ def draw_batch(
     turn = rigid_torch.so3_exp(torch.stack([torch.zeros(size), yaw, torch.zeros(size)], dim=-1))
     flip = torch.diag_embed(torch.stack([side, torch.ones(size), torch.ones(size)], dim=-1))
     new_from_old = flip @ turn.mT
-    root = windows.root[index] @ new_from_old.mT
-    rotation = new_from_old[:, None] @ windows.rotation[index] @ flip[:, None]
+    tracks = windows.tracks(index)
+    root = tracks.root @ new_from_old.mT
+    rotation = new_from_old[:, None] @ tracks.rotation @ flip[:, None]
     shift = torch.randn(size, 1, 3, generator=generator) * augmentation.observer_m
-    observer = (windows.observer[index] + shift) @ new_from_old.mT
+    observer = (tracks.observer + shift) @ new_from_old.mT
     frames = windows.frame[index]
     remembered = body_channels(rotation[:, :PAST], windows.bones[frames[:, :PAST]])
     past = torch.cat([root[:, :PAST], remembered], dim=-1)
@@ -216,6 +238,7 @@ def draw_batch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
         observer.flatten(1),
         past.flatten(1),
+        remembered[:, -Minds.HELD_FRAMES :],
         ((uniform(size) >= augmentation.hide_bones) & (side > 0)).float(),
         side < 0,
         root[:, -1] / goal_std,

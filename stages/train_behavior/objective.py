@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from pipeline.models.behavior import BehaviorNets
+from pipeline.models.behavior import ROOT_CHANNELS, BehaviorNets
 from pipeline.models.diffusion import Schedule, noised
 from stages.train_behavior.batches import Batch
 
@@ -28,6 +28,8 @@ class Objective:
     weighting: Literal["noise", "velocity"] = "velocity"
     """which error counts evenly at all steps: that of the noise, as in the paper, or that of the velocity, which gives
     the noisy steps, where the outline is decided, their share"""
+    sequence_share: float = 0.5
+    """share of a batch's windows from which path and body, whose networks cost the most, learn in a step"""
     goal_draws: int = 8
     """noise levels drawn per window for the goal, whose network is small"""
     earlier_share: float = 0.7
@@ -57,19 +59,37 @@ def losses(
     def error(denoise: Denoise, clean: Tensor) -> Tensor:
         return squared_error(denoise, clean, schedule, objective.weighting, generator)
 
+    path_rows, body_rows, known = sequence_rows(batch, objective.sequence_share)
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
-    path = error(lambda x, t: nets.path(x, t, code, batch.goal, steered), batch.path)
-    known = ~batch.mirrored
-    along = batch.path[known]
-    body = error(lambda x, t: nets.body(x, t, code[known], along, steered[known]), batch.body[known])
-    return {"goal": goal.mean(), "path": path.mean(), "body": body.sum() / max(body.numel(), 1)}
+    towards, along = batch.goal[path_rows], batch.path[body_rows]
+    path = error(lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows])
+    body = error(lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows])
+    return {"goal": goal.mean(), "path": path.mean(), "body": mean_of_known(body, known)}
+
+
+def sequence_rows(batch: Batch, share: float) -> tuple[Int[Tensor, "path"], Int[Tensor, "body"], Bool[Tensor, "body"]]:
+    """Return the windows from which paths learn, those from which bodies learn, and which of the latter tell true bones.
+
+    Both are always as many, for kernels are made anew for every size. Mirrored windows, whose bones nobody knows, come
+    last among the bodies.
+    """
+    count = max(round(len(batch.goal) * share), 1)
+    body = torch.argsort(batch.mirrored.int(), stable=True)[:count]
+    return torch.arange(count, device=body.device), body, ~batch.mirrored[body]
+
+
+def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor, "row"]) -> Float[Tensor, ""]:
+    """Return the mean over the rows that are known (0 where none is), in which root and bones count for a half each."""
+    each = (error[:, :ROOT_CHANNELS].mean((1, 2)) + error[:, ROOT_CHANNELS:].mean((1, 2))) / 2
+    return (each * known).sum() / known.sum().clamp_min(1)
 
 
 def perceive(nets: BehaviorNets, batch: Batch, objective: Objective, generator: torch.Generator) -> Float[Tensor, "batch condition"]:
     """Encode a batch, dropping scene, observer and past independently, for every mind alike."""
     keep = kept(len(batch.goal), 3, objective.drop, generator).to(batch.goal.device)
     codes = [mind.training_code(batch.scene, batch.observer_past, batch.past, keep, batch.bones_keep) for mind in nets.perception]
-    return nn.functional.dropout(torch.cat(codes, dim=-1), objective.code_dropout)
+    code = nn.functional.dropout(torch.cat(codes, dim=-1), objective.code_dropout)
+    return torch.cat([code, nets.perception.posture(batch.held, keep[:, 2])], dim=-1)
 
 
 def goal_error(

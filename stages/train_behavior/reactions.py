@@ -71,7 +71,7 @@ def measure(
     speed_m_s: float = 1.0,
 ) -> Reactions:
     """Sample goals of some windows under scripted observers, always with the same noise."""
-    sampling = Sampling()
+    sampling = Sampling(clear=False)
 
     def mean_goals(observer: Float[np.ndarray, "frame*3"], sampling: Sampling) -> Float[np.ndarray, "window 3"]:
         seen = replace(observation, observer_past=np.tile(observer, (len(observation), 1)))

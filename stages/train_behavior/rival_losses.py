@@ -11,7 +11,7 @@ from pipeline.models.behavior import BehaviorNets
 from pipeline.models.diffusion import Schedule
 from pipeline.models.rivals import LOG_STD, MEAN, SPREAD
 from stages.train_behavior.batches import Batch
-from stages.train_behavior.objective import Denoise, Objective, kept, perceive, squared_error
+from stages.train_behavior.objective import Denoise, Objective, kept, mean_of_known, perceive, sequence_rows, squared_error
 
 
 def gaussian_losses(
@@ -22,12 +22,12 @@ def gaussian_losses(
     with contextlib.nullcontext() if goals else torch.no_grad():
         code = perceive(nets, batch, objective, generator)
         goal = negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal)
+    path_rows, body_rows, known = sequence_rows(batch, objective.sequence_share)
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
-    path = negative_log_likelihood(lambda x, t: nets.path(x, t, code, batch.goal, steered), batch.path)
-    known = ~batch.mirrored
-    along = batch.path[known]
-    body = negative_log_likelihood(lambda x, t: nets.body(x, t, code[known], along, steered[known]), batch.body[known])
-    return {"goal": goal.mean(), "path": path.mean(), "body": body.sum() / max(body.numel(), 1)}
+    towards, along = batch.goal[path_rows], batch.path[body_rows]
+    path = negative_log_likelihood(lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows])
+    body = negative_log_likelihood(lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows])
+    return {"goal": goal.mean(), "path": path.mean(), "body": mean_of_known(body, known)}
 
 
 def negative_log_likelihood(tell: Denoise, clean: Float[Tensor, "batch ..."]) -> Float[Tensor, "batch ..."]:

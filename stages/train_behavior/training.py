@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from pipeline.fit import FitRecord, fit
-from pipeline.models.behavior import Architecture, BehaviorNets, Scaling
+from pipeline.models.behavior import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN, BehaviorData
@@ -133,6 +133,10 @@ def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Sta
         nets = BehaviorNets(architecture, schedule)
     for mind in nets.perception:
         mind.past.mean[:], mind.past.std[:] = statistics.past_mean, statistics.past_std
+    scaling, body = statistics.scaling, nets.body
+    told = (scaling.path_std, scaling.body_mean[:ROOT_CHANNELS], scaling.body_std[:ROOT_CHANNELS])
+    for buffer, numbers in zip((body.path_std, body.root_mean, body.root_std), told, strict=True):
+        buffer[:] = torch.from_numpy(numbers)
     return nets
 
 

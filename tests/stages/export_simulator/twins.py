@@ -129,7 +129,7 @@ def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) 
 
     def goals(observer: np.ndarray, guidance: float = 1.0) -> np.ndarray:
         count = len(observer)
-        sampling = Sampling(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance)
+        sampling = Sampling(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance, clear=False)
         ats = Ats.load(build / "behavior", volume, sampling)
         eyes = np.stack([observer[..., 0], np.full(observer.shape[:2], eyes_m), observer[..., 1]], -1)
         parts = []

@@ -57,15 +57,16 @@ def drawn(windows, augmentation, seed=0):
 def test_targets_have_unit_scale(windows):
     index = torch.arange(len(windows))
     scaling = statistics_from_windows(windows, 0.0).scaling
-    goal = windows.root[index, -1].numpy() / scaling.goal_std
+    goal = windows.tracks(index).root[:, -1].numpy() / scaling.goal_std
     assert np.sqrt((goal[:, [0, 2]] ** 2).mean()) == pytest.approx(1, abs=1e-3)
-    path = windows.root[:, 8:].numpy().swapaxes(1, 2) / scaling.path_std
+    path = windows.tracks(index).root[:, 8:].numpy().swapaxes(1, 2) / scaling.path_std
     np.testing.assert_allclose(np.sqrt((path[:, [0, 2]] ** 2).mean((0, 1)))[5:], 1, atol=1e-3)
 
 
 def test_windows_begin_at_the_origin_facing_forward(windows):
-    assert windows.root[:, 7].abs().max() < 1e-5
-    torch.testing.assert_close(windows.rotation[:, 7], torch.eye(3).expand(len(windows), 3, 3), atol=1e-5, rtol=0)
+    tracks = windows.tracks(torch.arange(len(windows)))
+    assert tracks.root[:, 7].abs().max() < 1e-5
+    torch.testing.assert_close(tracks.rotation[:, 7], torch.eye(3).expand(len(windows), 3, 3), atol=1e-5, rtol=0)
 
 
 def test_turning_and_mirroring_move_everything_together(windows):
