@@ -150,24 +150,6 @@ class BehaviorNets(nn.Module):
         self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
 
 
-def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:
-    """Return the first two columns (x axis, then y axis)."""
-    return np.concatenate([rotation[..., 0], rotation[..., 1]], axis=-1)
-
-
-def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15); parallel columns give one of many."""
-    first = _normalized(columns[..., :3])
-    second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
-    parallel = np.linalg.norm(second, axis=-1, keepdims=True) < 1e-4
-    second = _normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + np.array([0.3, 0.2, 0.1])), second))
-    return np.stack([first, second, np.cross(first, second)], axis=-1)
-
-
-def _normalized(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True).clip(1e-9)
-
-
 def channels_from_bones(
     agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
 ) -> Float[np.ndarray, "*batch channel"]:
@@ -189,7 +171,7 @@ def past_channels(
     ego_from_agent: Float[np.ndarray, "batch 8 4 4"], bones: Float[np.ndarray, "batch 8 channel"]
 ) -> Float[np.ndarray, "batch 8*channel"]:
     """Return per past frame: root position, root rotation (6), bones; oldest frame first."""
-    root = np.concatenate([ego_from_agent[..., :3, 3], rotation_to_6d(ego_from_agent[..., :3, :3])], axis=-1)
+    root = np.concatenate([ego_from_agent[..., :3, 3], rigid.rotation_to_6d(ego_from_agent[..., :3, :3])], axis=-1)
     return np.concatenate([root, bones], axis=-1).reshape(len(root), -1).astype(np.float32)
 
 

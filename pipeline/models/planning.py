@@ -20,7 +20,6 @@ from pipeline.models.behavior import (
     Scaling,
     channels_from_bones,
     past_channels,
-    rotation_from_6d,
 )
 from pipeline.models.diffusion import Schedule, guided, sample
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
@@ -99,7 +98,7 @@ class Plan:
 
     def world_from_agent(self, world_from_ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch 56 4 4"]:
         """Return the root's poses."""
-        ego_from_agent = rigid.make(rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
+        ego_from_agent = rigid.make(rigid.rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
         return world_from_ego[:, None] @ ego_from_agent
 
 

@@ -77,6 +77,24 @@ def rotation_from_quaternion(quaternion: Float[np.ndarray, "*batch 4"]) -> Float
     return Rotation.from_quat(xyzw).as_matrix().reshape(*quaternion.shape[:-1], 3, 3)
 
 
+def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:
+    """Return the first two columns (x axis, then y axis)."""
+    return np.concatenate([rotation[..., 0], rotation[..., 1]], axis=-1)
+
+
+def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15); parallel columns give one of many."""
+    first = _normalized(columns[..., :3])
+    second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
+    parallel = np.linalg.norm(second, axis=-1, keepdims=True) < 1e-4
+    second = _normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + np.array([0.3, 0.2, 0.1])), second))
+    return np.stack([first, second, np.cross(first, second)], axis=-1)
+
+
+def _normalized(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True).clip(1e-9)
+
+
 def interpolate(
     timestamp_s: Float[np.ndarray, "frame"], a_from_b: Float[np.ndarray, "frame 4 4"], query_s: Float[np.ndarray, "sample"]
 ) -> Float[np.ndarray, "sample 4 4"]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.behavior import ROOT_CHANNELS, bones_from_channels, rotation_from_6d
+from pipeline.models.behavior import ROOT_CHANNELS, bones_from_channels
 from pipeline.models.perception import world_from_ego
 from pipeline.models.planning import observe
 from pipeline.models.predictors import Ats, Samples
@@ -66,7 +66,7 @@ def _fed(ats: Ats, context: Context, future: Future, count: int, rng: np.random.
     world = np.repeat(frame, count, axis=0)
     paths = ats.sampler.paths(codes, np.repeat(true[:, -1], count, axis=0), ats.sampling, rng)
     bodies = ats.sampler.bodies(codes, np.repeat(true, count, axis=0), ats.sampling, rng)
-    rotation = world[:, None, :3, :3] @ rotation_from_6d(bodies[..., :ROOT_CHANNELS])
+    rotation = world[:, None, :3, :3] @ rigid.rotation_from_6d(bodies[..., :ROOT_CHANNELS])
     bones = bones_from_channels(bodies[..., ROOT_CHANNELS:], ats.agent_from_bone_rest).astype(np.float32)
     path = rigid.apply(world, paths)
     return Samples(*(a.reshape(len(context), count, *a.shape[1:]) for a in (path[:, -1], path, rotation, bones)))

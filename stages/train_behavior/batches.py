@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import convolve1d
 from torch import Tensor
 
-from pipeline.models.behavior import Architecture, Scaling, channels_from_bones, rotation_to_6d
+from pipeline.models.behavior import Architecture, Scaling, channels_from_bones
 from pipeline.models.perception import FeatureVolume, Minds, grid_points_ego, world_from_ego
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, BehaviorData
@@ -189,7 +189,7 @@ def body_statistics(
 ) -> tuple[Float[np.ndarray, "channel"], Float[np.ndarray, "channel"]]:
     """Return mean and standard deviation, with floors, of root rotation and bones."""
     turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, turn_rad, 0])
-    root = rotation_to_6d(turns[:, None, None] @ rotation[::4, ::4].double().numpy()).reshape(-1, 6)
+    root = rigid.rotation_to_6d(turns[:, None, None] @ rotation[::4, ::4].double().numpy()).reshape(-1, 6)
     posed = bones.double().numpy()
     floor = np.concatenate([np.full(6, 0.1), np.tile([0.05] * 3 + [0.01] * 3, posed.shape[-1] // 6)])
     std = np.concatenate([root.std(0), posed.std(0)])

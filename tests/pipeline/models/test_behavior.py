@@ -7,7 +7,6 @@ from pipeline.models.behavior import (
     Scaling,
     bones_from_channels,
     channels_from_bones,
-    rotation_to_6d,
 )
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Plan, Sampler, TorchNetworks, observe
@@ -42,7 +41,7 @@ def test_plan_returns_to_the_world(data):
     _, future = data.windows(np.array([5]))
     frame = rigid.make(rigid.rotation_from_vector(np.array([[0, 0.4, 0]])), np.array([[1.0, 0, 2]]))
     ego = rigid.inverse(frame)[:, None] @ future.world_from_agent
-    body = np.concatenate([rotation_to_6d(ego[..., :3, :3]), channels_from_bones(future.agent_from_bone, REST)], axis=-1)
+    body = np.concatenate([rigid.rotation_to_6d(ego[..., :3, :3]), channels_from_bones(future.agent_from_bone, REST)], axis=-1)
     plan = Plan(ego[:, -1, :3, 3], ego[..., :3, 3], body)
     np.testing.assert_allclose(plan.world_from_agent(frame), future.world_from_agent, atol=1e-9)
 

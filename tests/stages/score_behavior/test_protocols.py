@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.models import rivals
-from pipeline.models.behavior import BehaviorNets, Sampling, Scaling, channels_from_bones, rotation_to_6d
+from pipeline.models.behavior import BehaviorNets, Sampling, Scaling, channels_from_bones
 from pipeline.models.diffusion import STANDARD
 from pipeline.models.perception import world_from_ego
 from pipeline.models.planning import Observation, TorchNetworks
@@ -37,7 +37,7 @@ class Oracle:
         ego = rigid.inverse(world_from_ego(context.world_from_agent[:, -1], architecture.ego))
         root = ego[:, None] @ future.world_from_agent
         bones = channels_from_bones(future.agent_from_bone, REST)
-        self.path, self.body = root[..., :3, 3], np.concatenate([rotation_to_6d(root[..., :3, :3]), bones], -1)
+        self.path, self.body = root[..., :3, 3], np.concatenate([rigid.rotation_to_6d(root[..., :3, :3]), bones], -1)
 
     def codes(self, observation, sampling, count=1):
         return count
