@@ -75,7 +75,7 @@ class Scenes:
         number = self.number(video, len(points_world))
         solid = np.zeros(points_world.shape[:-1], bool)
         for scene in np.unique(number):
-            if self.nearest_allowed[scene] is None:
+            if (self.volumes[scene].occupancy == 2).all():
                 continue
             voxel, inside = self.volumes[scene].voxel(points_world[number == scene])
             solid[number == scene] = ~(self.allowed[scene][tuple(np.moveaxis(voxel, -1, 0))] & inside)

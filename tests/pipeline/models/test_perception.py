@@ -61,12 +61,20 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
     assert (encode(near, torch.ones(1)) - none).abs().max() > 1e-3
 
 
+def alike(code: torch.Tensor) -> list[bool]:
+    """Tell of scene, observer and past whether two agents' codes are alike; the posture must be so where the past is."""
+    minds, posture = code.split([code.shape[1] - ARCHITECTURE.body_channels, ARCHITECTURE.body_channels], dim=1)
+    parts = minds.unflatten(1, (ARCHITECTURE.minds, 3, -1))
+    same = ((parts[0] - parts[1]).abs().amax((0, 2)) < 1e-7).tolist()
+    assert bool((posture[0] == posture[1]).all()) == same[2]
+    return same
+
+
 def test_a_blind_model_never_sees_its_condition():
     inputs = [torch.randn(2, 16, 64, 8, 64), torch.rand(2, 24), torch.randn(2, 8 * (9 + 18)), torch.ones(2, 3)]
     for number, blind in enumerate(("scene", "observer", "past")):
-        code = BehaviorNets(replace(ARCHITECTURE, blind_to=blind)).perception(*inputs).unflatten(1, (ARCHITECTURE.minds, 3, -1))
-        same = (code[0] - code[1]).abs().amax((0, 2)) < 1e-7
-        assert same.tolist() == [k == number for k in range(3)]
+        whole = BehaviorNets(replace(ARCHITECTURE, blind_to=blind)).perception(*inputs)
+        assert alike(whole) == [k == number for k in range(3)]
 
 
 def test_dropped_conditions_do_not_reach_the_code():
@@ -77,6 +85,4 @@ def test_dropped_conditions_do_not_reach_the_code():
     for number in range(3):
         keep = torch.zeros(2, 3)
         keep[:, number] = 1
-        code = nets.perception(*inputs, keep).unflatten(1, (ARCHITECTURE.minds, 3, -1))
-        same = (code[0] - code[1]).abs().amax((0, 2)) < 1e-7
-        assert same.tolist() == [k != number for k in range(3)]
+        assert alike(nets.perception(*inputs, keep)) == [k != number for k in range(3)]
