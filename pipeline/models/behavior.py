@@ -14,7 +14,7 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
-from pipeline.models.bodily import TOLD, BodyDenoiser
+from pipeline.models.body_denoiser import TOLD, BodyDenoiser
 from pipeline.models.concatenation import ConcatenationUNet
 from pipeline.models.denoisers import ControlUNet, GoalMLP
 from pipeline.models.diffusion import STANDARD, Schedule

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from pipeline.models.bodily import BodyDenoiser, turned
+from pipeline.models.body_denoiser import BodyDenoiser, turned
 from pipeline.models.diffusion import Schedule
 from pipeline.space import rigid_torch
 
