@@ -47,7 +47,7 @@ class Architecture:
     code: int = 64
     observer_radius_m: float = 4.0
     blind_to: Blind = "nothing"
-    unet_width: int = 32
+    unet_width: int = 16
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
     goal_from: Literal["scene_observer", "all"] = "all"
     goal_hidden: int = 128

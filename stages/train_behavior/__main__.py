@@ -44,7 +44,7 @@ class Config:
     """What goals depend on; the paper's `all` includes the past."""
     observer_radius_m: float = 4.0
     """Horizontal distance in metres from which on an observer is as good as none."""
-    unet_width: int = 32
+    unet_width: int = 16
     """Channels of the UNets' finest level."""
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
     """Widths of the UNets' levels, in units of the finest."""

@@ -30,13 +30,13 @@ _STEPS = 2.0**12
 class Optimization:
     """How long and how fast."""
 
-    steps: int = 1200
-    goal_steps: int = 300
+    steps: int = 900
+    goal_steps: int = 200
     """first steps, in which perception and goals are trained too; then both rest, for they learn minutes of video by heart
     long before path and body are good"""
     batch: int = 64
     """windows per step"""
-    rate: float = 1e-3
+    rate: float = 2e-3
     """peak learning rate of AdamW"""
     weight_decay: float = 0.05
     average: float = 0.995
