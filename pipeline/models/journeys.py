@@ -1,4 +1,7 @@
-"""Long-term motion through sub-goals, and any other motion, made physical; and what it is worth before and after."""
+"""Long-term motion through sub-goals, and any other motion, made physical; and what it is worth before and after.
+
+Both are judged by the same feet: those that should stand in the motion as it was given.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -59,7 +62,7 @@ def travel(world: World, subgoals: list[Subgoal], settings: Settings | None, rng
 
 def stayed(world: World, raw: Moving, settings: Settings | None) -> Journey:
     """Make any motion at 30 fps physical where ``settings`` are given; it has no sub-goals."""
-    judge, stance = world.judge, world.judge.stance(raw)
+    judge, stance = world.judge, world.judge.stance(raw, treading=True)
     moving = raw if settings is None else optimise(raw, world.model.physique(world.body), world.scene.distance, settings)
     before, after = (judge.plausibility(each, stance) for each in (raw, moving))
     return Journey(moving, np.zeros((0, 3)), np.zeros(0), before, after, float(seams(world.body, moving, STEPS).max(initial=0.0)))
@@ -70,7 +73,7 @@ def physical(
 ) -> tuple[Moving, Plausibility, Plausibility]:
     """Optimise motion of any rate at 30 fps and bring it back to its own frames; tell before and after."""
     raw = resampled(timestamp_s, given)
-    judge, stance = world.judge, world.judge.stance(raw)
+    judge, stance = world.judge, world.judge.stance(raw, treading=True)
     done = optimise(raw, world.model.physique(world.body), world.scene.distance, settings)
     when = np.arange(len(done)) / RATE_HZ
     at = np.minimum(timestamp_s - timestamp_s[0], when[-1])

@@ -34,7 +34,7 @@ class Plausibility:
     deepest_m: float
     """deepest vertex of any frame, a positive number"""
     slide_m_s: float
-    """median speed along the ground of feet while they stand; NaN where none does"""
+    """median speed along the ground of feet while they stand, or should; NaN where none does"""
     least_slide_m_s: float
     """median speed along the ground of the foot that moves least, of those near the scene: something should stand"""
 
