@@ -31,9 +31,10 @@ def agree_nearby(
     """Tell which votes most of the others near in time confirm, carried along by what was followed."""
     voted, time, piece = votes.world_from_camera, timestamp_s[votes.frame], np.cumsum(followed.torn)[votes.frame]
     odometry, supports = followed.odometry_from_camera[votes.frame], np.zeros(len(voted), bool)
+    first, last = np.searchsorted(time, time - options.near_s, side="right"), np.searchsorted(time, time + options.near_s)
     for vote in range(len(voted)):
-        near = (np.abs(time - time[vote]) < options.near_s) & (piece == piece[vote])
-        near[vote] = False
+        near = np.arange(first[vote], last[vote])
+        near = near[(piece[near] == piece[vote]) & (near != vote)]
         carried = voted[near] @ rigid.inverse(odometry[near]) @ odometry[vote]
         agreeing = close(carried, voted[vote], options)
         supports[vote] = agreeing.any() and (agreeing * votes.probability[near]).sum() >= 0.5 * votes.probability[near].sum()
