@@ -46,8 +46,10 @@ class AlignOptions:
     """One frame in so many is compared with the rendered template; 0: none."""
     picture_rounds: int = 1
     """Passes of rendering, flow and relaxation."""
-    picture_px: float = 8.0
-    """Standard deviation of the flow between rendering and picture, pixels at half size."""
+    picture_px: float = 16.0
+    """Standard deviation of the flow between rendering and picture, pixels at half size; neighbouring pixels err together."""
+    picture_return_px: float = 1.0
+    """Flow there and back must return to within this, pixels at half size: mirrors and moved things do not."""
     picture_stride_px: int = 9
     """One pixel of the half-size picture in so many, each way, takes part."""
 
@@ -184,7 +186,7 @@ def picture_contacts(
     known = (rendered > 0) & ~hidden
     if known.mean() < 0.1:
         return None
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(even(color, known), even(real, known), None)
+    flow, astray_px = _flow(even(color, known), even(real, known))
     rows, columns = np.mgrid[4 : size[0] - 4 : options.picture_stride_px, 4 : size[1] - 4 : options.picture_stride_px].reshape(2, -1)
     start = np.stack([columns, rows], axis=-1) + 0.5
     end = start + flow[rows, columns]
@@ -199,11 +201,21 @@ def picture_contacts(
         & (pixel < limit).all(1)
         & (np.abs(z - rendered[rows, columns]) < 0.12)
         & (np.abs(flow[rows, columns]).max(1) < 12)
+        & (astray_px[rows, columns] < options.picture_return_px)
     )
     if good.sum() < 20:
         return None
     mapped = rigid.apply(world_from_camera, (cameras.unproject(start, intrinsics) * rendered[rows, columns][:, None])[good])
     return _sideways(frame, ray[good] * z[good, None], mapped, world_from_camera, options.picture_px / intrinsics[0, 0])
+
+
+def _flow(first, second):
+    """Return optical flow and how far from its start it ends there and back, pixels; far outside the picture."""
+    dense = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    there, back = dense.calc(first, second, None), dense.calc(second, first, None)
+    row, column = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
+    returned = cv2.remap(back, column + there[..., 0], row + there[..., 1], cv2.INTER_LINEAR, borderValue=(1e3, 1e3))
+    return there, np.linalg.norm(there + returned, axis=-1)
 
 
 def _sideways(frame, points_camera, points_map, world_from_camera, sigma_per_m):
