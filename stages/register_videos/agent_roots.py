@@ -106,15 +106,13 @@ def _candidates(clip: Clip, glimpse: Glimpse, body: Body, localizer: Localizer, 
     for answer in answers:
         turned = wrap(heading(placed) - heading(glimpse.world_from_camera @ rigid.inverse(answer.map_from_camera)))
         bonus = np.maximum(bonus, answer.probability * np.exp(-((turned / np.deg2rad(30)) ** 2)))
-    points = glimpse.points_world
     return Candidates(
         frame=glimpse.frame,
         world_from_agent=placed,
         cost=cost - options.localizer_weight * bonus,
         least_misfit=float(cost.min()),
         share=glimpse.share,
-        middle_world=np.median(points, axis=0),
-        extent_m=float(np.hypot(*points[:, [0, 2]].std(axis=0))),
+        middle_world=np.median(glimpse.points_world, axis=0),
         eye_world=glimpse.world_from_camera[:3, 3],
     )
 

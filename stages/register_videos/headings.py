@@ -21,7 +21,9 @@ class HeadingOptions:
     most_cost: float = 12.0
     """... and one frame speaks against a heading by at most this."""
     motion_weight: float = 4.0
-    """Units for walking tail first at half a metre a second or more."""
+    """Units for walking tail first ..."""
+    walking_m_s: tuple[float, float] = (0.25, 0.6)
+    """... counting from the first speed, fully from the second, m/s: an animal that turns on the spot shows other sides."""
     turn_deg: float = 30.0
     """A turn by this in a tenth of a second costs one unit ..."""
     flip_cost: float = 40.0
@@ -46,9 +48,7 @@ class Candidates:
     share: float
     """Visible area over the area in full view, 0..1."""
     middle_world: Float[np.ndarray, "3"]
-    """Middle of the points that were seen ..."""
-    extent_m: float
-    """... and their horizontal spread."""
+    """Middle of the points that were seen."""
     eye_world: Float[np.ndarray, "3"]
 
 
@@ -57,7 +57,7 @@ class Pace:
     """How things moved around each frame."""
 
     velocity: Float[np.ndarray, "glimpse 3"]
-    """Horizontal velocity of the seen points' middle beyond what walking around it explains, m/s; zero across gaps."""
+    """Horizontal velocity of the seen points' middle, m/s; zero across gaps."""
     novelty: Float[np.ndarray, "glimpse"]
     """0..1: how much a frame shows that its neighbours did not; repeated views err alike."""
 
@@ -102,20 +102,9 @@ def pace(timestamp_s: Float[np.ndarray, "frame"], candidates: list[Candidates], 
     before, after = np.maximum(np.arange(len(time)) - span, 0), np.minimum(np.arange(len(time)) + span, len(time) - 1)
     elapsed = np.maximum(time[after] - time[before], 1e-3)[:, None]
     velocity = (middle[after] - middle[before]) / elapsed
-    speed = np.linalg.norm(velocity, axis=1)
-    moved = speed + 0.5 * np.linalg.norm((phone[after] - phone[before]) / elapsed, axis=1)
-    velocity *= np.maximum(
-        1 - _shown_by_walking_around(middle, phone, candidates, before, after) / elapsed[:, 0] / np.maximum(speed, 1e-6), 0
-    )[:, None]
+    moved = np.linalg.norm(velocity, axis=1) + 0.5 * np.linalg.norm((phone[after] - phone[before]) / elapsed, axis=1)
     velocity[(elapsed[:, 0] > 1.2) | (elapsed[:, 0] < 0.15)] = 0
     return Pace(velocity, still_weight + (1 - still_weight) * np.minimum(moved / 0.4, 1.0))
-
-
-def _shown_by_walking_around(middle, phone, candidates, before, after):
-    """Return how far the seen side's middle wanders because the phone goes round a resting animal, metres."""
-    away = middle - phone * (1, 0, 1)
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
-    return np.linalg.norm(away[after] - away[before], axis=1) * np.array([each.extent_m for each in candidates])
 
 
 def heading(world_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:
@@ -139,7 +128,6 @@ def _own_cost(candidates, grid, moves, index, options):
     seen = _turned_cost(candidates, grid[:, None], options).min(1)
     cost = moves.novelty[index] * np.minimum(seen - seen.min(), options.most_cost)
     x, _, z = moves.velocity[index]
-    speed = np.hypot(x, z)
-    if speed < 0.2:
-        return cost
-    return cost + options.motion_weight * min(speed / 0.5, 1.0) * (1 - np.cos(grid - np.arctan2(x, z))) / 2
+    slow, fast = options.walking_m_s
+    walking = np.clip((np.hypot(x, z) - slow) / (fast - slow), 0, 1)
+    return cost + options.motion_weight * walking * (1 - np.cos(grid - np.arctan2(x, z))) / 2

@@ -14,7 +14,7 @@ def seen(frame: int, yaw_deg: float, place, advantage: float, *, share: float = 
     """Return a front and a back placement; the wrong one looks better by ``advantage`` units."""
     yaw, place = np.deg2rad([yaw_deg, yaw_deg + 180]), np.asarray(place, float)
     poses = rigid.make(rigid.rotation_from_vector(yaw[:, None] * UP), np.repeat(place[None], 2, axis=0))
-    return Candidates(frame, poses, np.array([advantage, 0.0]), misfit, share, place, 0.15, np.asarray(eye, float))
+    return Candidates(frame, poses, np.array([advantage, 0.0]), misfit, share, place, np.asarray(eye, float))
 
 
 def chosen(sights: list[Candidates]) -> list[int]:
@@ -22,11 +22,11 @@ def chosen(sights: list[Candidates]) -> list[int]:
 
 
 def test_animals_walk_head_first():
-    assert chosen([seen(frame, 0.0, (0, 0, 0.05 * frame), 1.5) for frame in range(30)]) == [0] * 30
+    assert chosen([seen(frame, 0.0, (0, 0, 0.06 * frame), 1.5) for frame in range(30)]) == [0] * 30
 
 
 def test_what_was_learned_walking_is_kept_at_rest():
-    z = np.minimum(np.arange(40), 15) * 0.05
+    z = np.minimum(np.arange(40), 15) * 0.06
     assert chosen([seen(frame, 0.0, (0, 0, z[frame]), 1.0 if frame > 18 else -1.0) for frame in range(40)]) == [0] * 40
 
 
@@ -51,12 +51,3 @@ def test_an_animal_may_turn_round_in_a_second():
     yaw = np.clip((np.arange(40) - 15) * 20.0, 0, 180)
     sights = [seen(frame, yaw[frame], (0, 0, 0), -2.0, eye=(2, 1, 0.1 * frame)) for frame in range(40)]
     assert chosen(sights) == [0] * 40
-
-
-def test_walking_around_a_resting_animal_is_no_walk():
-    """The middle of what is seen goes round with the phone, at 0.3 m/s."""
-    angle = np.arange(20) * 0.25
-    around = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
-    sights = [seen(frame, 90.0, 0.12 * around[frame], -0.3, eye=2 * around[frame]) for frame in range(20)]
-    assert np.linalg.norm(headings.pace(np.arange(20) * 0.1, sights, 0.06).velocity, axis=1).max() < 0.05, "m/s"
-    assert chosen(sights) == [0] * 20
