@@ -99,6 +99,6 @@ clean:
 .DEFAULT:
 	@case '$@' in build/*/variants/*) \
 	  set -- $(subst /, ,$@); echo "error: REC-007 '$@' belongs to variant $$4 of $$2 and is not there yet" >&2; \
-	  echo "  -> one variant: make $$2.$$5 VARIANT=$$4; a table with all it compares: make registration-tables AGENT=$$2" >&2; exit 2;; esac
+	  echo "  -> one variant: make $$2.$$5 VARIANT=$$4; a table with all it compares: make $$5-tables AGENT=$$2" >&2; exit 2;; esac
 	@echo "error: REC-007 nobody knows how to make '$@'" >&2
 	@echo "  -> agents: $(AGENTS); a new one: make new AGENT=<name>; artifacts and all else: make help" >&2; exit 2
