@@ -55,9 +55,8 @@ def find(folder: Path, flow: Flow = "recordings") -> list[str]:
 
 def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
     """Return the names of whatever else lies there."""
-    known = (
-        set(find(folder, flow)) | {f"{name}{SIDECAR}" for name in find(folder, flow)} | {name for node in dag.FLOW for name in node.beside}
-    )
+    found, kinds = find(folder, flow), {"", *(f".{kind}" for node in dag.FLOW for kind in node.sidecars)}
+    known = {*found, *(f"{name}{kind}{SIDECAR}" for name in found for kind in kinds)} | {name for node in dag.FLOW for name in node.beside}
     return sorted(path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith("."))
 
 
@@ -77,6 +76,12 @@ def _has_depth(path: Path) -> bool:
 def beside(agent: str, names: Sequence[str]) -> list[Path]:
     """Return those files beside an agent's recordings that exist."""
     return [path for path in (Path("captures", agent, name) for name in names) if path.is_file()]
+
+
+def sidecars(agent: str, file: str, names: Sequence[str]) -> dict[str, Path]:
+    """Return, by name, those files that tell something of one recording and exist."""
+    paths = {name: Path("captures", agent, f"{file}.{name}{SIDECAR}") for name in names}
+    return {name: path for name, path in paths.items() if path.is_file()}
 
 
 def remarks(folder: Path, names: Sequence[str], overrides: Mapping[str, Any], where: str) -> dict[str, Remarks]:

@@ -70,6 +70,8 @@ class Node:
     """Owns a folder for checkpoints that survives a kill."""
     beside: tuple[str, ...] = ()
     """Files in the capture folder that it reads where they exist, each as `--<stem>`."""
+    sidecars: tuple[str, ...] = ()
+    """The same per recording: `<recording>.<name>.toml`, as `--<name>`."""
     flows: tuple[Flow, ...] = ("recordings",)
     """The flows that it is part of."""
     trials: Literal["none", "each", "all"] = "none"
@@ -91,7 +93,7 @@ FLOW: tuple[Node, ...] = (
     Node("frames", "extract_frames", (Need("synthetic_capture", part="recordings", option="recording"),),
          roles=("walkthrough", "turnaround", "session", "heldout")),
     Node("flow", "estimate_flow", ("frames",), roles=AGENT),
-    Node("masks", "segment_agent", ("frames", "flow"), roles=AGENT),
+    Node("masks", "segment_agent", ("frames", "flow"), roles=AGENT, sidecars=("prompt",)),
     Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, splits=("train", "none")),)),
     Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
     Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),

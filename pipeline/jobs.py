@@ -179,6 +179,8 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     keys = [str(home.plan / f"keys/{named}.json"), *(str(home.base.plan / f"keys/video.{id}.json") for id in deciding)]
     for file in captures.beside(plan.home.agent, node.beside):
         keys, arguments = [*keys, str(home.base.plan / f"keys/beside.{file.name}")], [*arguments, f"--{file.stem}", str(file)]
+    for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items() if video else ():
+        keys, arguments = [*keys, str(home.base.plan / f"keys/{name}.{video.id}.json")], [*arguments, f"--{name}", str(file)]
     return Job(
         id=f"{node.artifact}.{part.id}" if part else node.artifact,
         artifact=node.artifact,

@@ -56,6 +56,9 @@ def write(plan: Plan, cache: sources.Cache) -> None:
         artifact.write_if_changed(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
     for file in (file for node in dag.FLOW for file in captures.beside(plan.home.agent, node.beside)):
         artifact.write_if_changed(base / f"keys/beside.{file.name}", _json({"sha256": cache.get(file, artifact.digest_of_file)}))
+    for node, video in ((node, video) for node in dag.FLOW for video in plan.videos):
+        for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items():
+            artifact.write_if_changed(base / f"keys/{name}.{video.id}.json", _json({"sha256": cache.get(file, artifact.digest_of_file)}))
     for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(plan.home)}:
         node, table = dag.NODES[name], plan.tables[name]
         overlay = next((each.overlay for each in plan.trials if each.id == trial), {})

@@ -4,7 +4,8 @@ Sessions: the animal is what lies in space that other frames saw through, tracke
 is kept while it rests; a small network then learns its looks and finds it where it never moved. Turnaround: it is what
 stands on the ground where all cameras look. No map is used.
 A recording without depth needs a hint and is followed from there by colour and flow.
-`--prompt FILE` (TOML: `frame = 12` and `box = [x0, y0, x1, y1]` or `click = [x, y]`, colour pixels) points at it.
+`--prompt FILE` points at it, in TOML: `frame = 12` or `time_s = 1.2`, and `box = [x0, y0, x1, y1]` or `click = [x, y]`,
+in pixels of the stored picture or in shares (0..1) of it. `make` gives `captures/<agent>/<recording>.prompt.toml`.
 
     python -m stages.segment_agent --frames build/cat/frames/v002 --flow build/cat/flow/v002 --out build/cat/masks/v002
 """
@@ -65,7 +66,7 @@ def run(task: cli.Task) -> None:
             pictures=shown,
         )
     if not any(summary.visible):
-        log("the animal was never seen: does it move in this recording? A hint (--prompt) helps")
+        log("the animal was never seen: does it move in this recording? A hint (<recording>.prompt.toml) helps")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A user's hint where the animal is: one box or one click in one frame, read from a small TOML file."""
+"""A user's hint where the animal is: one box or one click in one frame, read from `<recording>.prompt.toml`."""
 
 import tomllib
 from dataclasses import dataclass
@@ -22,20 +22,29 @@ class Prompt:
 
 
 def parse(path: Path, clip: Clip) -> Prompt:
-    """Read ``frame`` and ``box = [x0, y0, x1, y1]`` or ``click = [x, y]`` (colour pixels). Raises InputError MSK-001."""
+    """Read ``frame`` or ``time_s`` (since the first frame), and ``box = [x0, y0, x1, y1]`` or ``click = [x, y]``.
+
+    Places are pixels of the stored picture, or shares of it where none is above 1. Raises InputError MSK-001.
+    """
     try:
         table = tomllib.loads(path.read_text())
-        frame = int(table.pop("frame"))
-        box = [float(value) for value in table["box"]] if "box" in table else [float(value) for value in table["click"] * 2]
-        x0, y0, x1, y1 = box
+        unknown = table.keys() - {"frame", "time_s", "box", "click"}
+        if unknown or ("frame" in table) == ("time_s" in table) or ("box" in table) == ("click" in table):
+            raise ValueError(f"either frame or time_s, either box or click, and nothing else: {', '.join(table)}")
+        passed_s = clip.timestamp_s - clip.timestamp_s[0]
+        frame = int(table["frame"]) if "frame" in table else int(np.abs(passed_s - float(table["time_s"])).argmin())
+        if "time_s" in table and not -0.5 <= float(table["time_s"]) <= passed_s[-1] + 0.5:
+            raise ValueError(f"time_s = {table['time_s']} of a recording of {passed_s[-1]:.1f} s")
+        box = np.array(table["box"] if "box" in table else table["click"] * 2, float)
+        x0, y0, x1, y1 = (box * np.tile(clip.color_size[::-1], 2) if box.max() <= 1 else box).tolist()
         if not (0 <= frame < len(clip) and 0 <= x0 <= x1 <= clip.color_size[1] and 0 <= y0 <= y1 <= clip.color_size[0]):
-            raise ValueError(f"frame {frame}, box {box} is not inside the recording")
+            raise ValueError(f"frame {frame}, box {box.tolist()} is not inside the recording")
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(
             "MSK-001",
             f"not a usable hint: {error}",
             str(path),
-            "give `frame = 12` and `box = [x0, y0, x1, y1]` or `click = [x, y]` in colour pixels",
+            "give `frame = 12` or `time_s = 1.2`, and `box = [x0, y0, x1, y1]` or `click = [x, y]` in pixels or in shares of the picture",
         ) from error
     return Prompt(frame, (x0, y0, x1, y1))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import sources
+from pipeline import captures, sources
 from pipeline.captures import Remarks, assign, builtin
 from pipeline.errors import InputError
 from tests.pipeline import checkout
@@ -175,6 +175,23 @@ def test_clicks_are_read_by_the_evaluation_alone(house):
     readers = [job["id"] for job in jobs if "--clicks" in job["arguments"]]
     assert readers == ["evaluation"]
     assert all("beside.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)
+
+
+def test_a_prompt_beside_a_recording_reaches_its_masks_alone(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.plan", "plan", "toy")
+    before = key_files(house)
+    house.write("captures/toy/b.r3d.prompt.toml", "time_s = 2\nclick = [0.5, 0.5]")
+    house.python("pipeline.plan", "plan", "toy")
+    after = key_files(house)
+    assert {name for name in after if before.get(name) != after[name]} == {"prompt.v003.json"}
+    jobs = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
+    told = {job["id"]: job for job in jobs if "--prompt" in job["arguments"]}
+    assert list(told) == ["masks.v003"], "b.r3d"
+    assert "captures/toy/b.r3d.prompt.toml" in told["masks.v003"]["arguments"]
+    assert any(key.endswith("keys/prompt.v003.json") for key in told["masks.v003"]["keys"])
+    assert captures.not_understood(house.folder / "captures/toy") == []
 
 
 def test_inherited_settings_may_be_set(monkeypatch):

@@ -96,7 +96,16 @@ def test_a_hint_decides_between_two_movers():
 
 
 @pytest.mark.parametrize(
-    "text", ["frame = 999\nclick = [3, 4]", "frame = 0", "frame = 0\nbox = [5, 5, 900, 9]", "frame = [", "frame = 0\nclick = 'x'"]
+    "text",
+    [
+        "frame = 999\nclick = [3, 4]",
+        "time_s = 99\nclick = [3, 4]",
+        "frame = 0",
+        "frame = 0\nbox = [5, 5, 900, 9]",
+        "frame = 0\nclick = [3, 4]\nbox = [3, 4, 5, 6]",
+        "frame = [",
+        "frame = 0\nclick = 'x'",
+    ],
 )
 def test_a_wrong_hint_is_refused(tmp_path, text):
     poses, agent = scenery.turnaround(2)
@@ -104,6 +113,17 @@ def test_a_wrong_hint_is_refused(tmp_path, text):
     (tmp_path / "hint.toml").write_text(text)
     with pytest.raises(InputError, match="MSK-001"):
         prompt.parse(tmp_path / "hint.toml", Clip.open(tmp_path / "frames"))
+
+
+def test_a_hint_speaks_in_seconds_and_shares_too(tmp_path):
+    poses, agent = scenery.turnaround(3)
+    scenery.record(tmp_path / "frames", poses, agent, poses)
+    clip = Clip.open(tmp_path / "frames")
+    passed_s = clip.timestamp_s[2] - clip.timestamp_s[0]
+    (tmp_path / "hint.toml").write_text(f"time_s = {passed_s}\nbox = [0.1, 0.25, 0.5, 1]")
+    hint = prompt.parse(tmp_path / "hint.toml", clip)
+    height, width = clip.color_size
+    assert hint == prompt.Prompt(2, (0.1 * width, 0.25 * height, 0.5 * width, height))
 
 
 def test_a_click_finds_the_surface(tmp_path):
