@@ -1,11 +1,14 @@
 """NPZ files: written with fixed timestamps so that equal arrays give equal bytes, read without pickle.
 
-`save` writes, `load` reads everything after checking each header, `open_lazily` maps big uncompressed members.
+`save` writes, `Rows` writes what does not fit into memory, `load` reads everything after checking each header,
+`open_lazily` maps big uncompressed members.
 """
 
+import shutil
+import tempfile
 import zipfile
 from pathlib import Path
-from typing import IO
+from typing import IO, Self
 
 import numpy as np
 
@@ -26,6 +29,43 @@ def save(path: Path, *, compress: bool = False, **arrays: np.ndarray) -> None:
             info.compress_type = method
             with archive.open(info, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+class Rows:
+    """Arrays written row by row, for as long as a ``with`` block lasts; the file is the one that `save` would write."""
+
+    def __init__(self, path: Path, **arrays: tuple[tuple[int, ...], type]) -> None:
+        """Begin a file of arrays of these shapes and dtypes; the first axis of a shape tells how many rows will come."""
+        self._path = path
+        self._kinds = {name: (shape, np.dtype(kind)) for name, (shape, kind) in arrays.items()}
+        self._parts = {name: tempfile.TemporaryFile(dir=path.parent) for name in arrays}
+
+    def append(self, **rows: np.ndarray) -> None:
+        """Add one row to each of the named arrays."""
+        for name, row in rows.items():
+            (_, *shape), dtype = self._kinds[name]
+            assert row.shape == tuple(shape) and row.dtype == dtype, (name, row.shape, row.dtype)
+            self._parts[name].write(row.tobytes())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, failed: type | None, *_: object) -> None:
+        if not failed:
+            self._finish()
+        for part in self._parts.values():
+            part.close()
+
+    def _finish(self) -> None:
+        with zipfile.ZipFile(self._path, "w") as archive:
+            for name, (shape, dtype) in self._kinds.items():
+                part = self._parts[name]
+                assert part.tell() == int(np.prod(shape)) * dtype.itemsize, (name, part.tell(), shape)
+                part.seek(0)
+                with archive.open(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), "w", force_zip64=True) as member:
+                    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(member, header)
+                    shutil.copyfileobj(part, member, 1 << 20)
 
 
 def load(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:

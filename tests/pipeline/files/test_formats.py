@@ -10,6 +10,20 @@ from pipeline.files import arrays, images, meshes
 from pipeline.space.meshes import Mesh
 
 
+def test_rows_give_the_file_that_save_gives(tmp_path):
+    rng = np.random.default_rng(0)
+    flow, flags = rng.normal(size=(5, 4, 3, 2)).astype(np.float16), rng.integers(0, 255, (5, 4), dtype=np.uint8)
+    arrays.save(tmp_path / "whole.npz", flow=flow, flags=flags)
+    with arrays.Rows(tmp_path / "rows.npz", flow=(flow.shape, np.float16), flags=(flags.shape, np.uint8)) as table:
+        for one, other in zip(flow, flags, strict=True):
+            table.append(flow=one, flags=other)
+    assert (tmp_path / "rows.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+    with arrays.Rows(tmp_path / "none.npz", flow=((0, 4, 3, 2), np.float16)):
+        pass
+    assert arrays.open_lazily(tmp_path / "none.npz", "flow").shape == (0, 4, 3, 2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["none.npz", "rows.npz", "whole.npz"]
+
+
 def test_depth_survives_as_half_metres(tmp_path):
     depth = np.random.default_rng(0).uniform(0.2, 5, (64, 48)).astype(np.float32)
     depth[:5] = 0
