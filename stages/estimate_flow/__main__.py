@@ -1,9 +1,12 @@
 """Estimate the optical flow of one video between frames 1, 2, 4 and 8 apart, forward and backward, with confidence."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal, assert_never
+
+import numpy as np
 
 from pipeline import cli, progress
 from pipeline.files import arrays
@@ -24,11 +27,11 @@ class Config:
     """RAFT's weights (`raft-things.pth`)."""
     updates: int = 20
     """RAFT's iterations."""
-    working_side_px: int = 320
-    """Pictures are searched at this longer side, pixels."""
+    working_side_px: int = 1280
+    """Pictures with a longer side are searched at this one, pixels; reducing further is faster and blurs outlines."""
     patch_stride_px: int = 3
     """Distance between patches, reduced pixels."""
-    iterations: int = 12
+    iterations: int = 50
     """Descent steps per patch."""
     tolerance_px: float = 1.5
     """Forward-backward error at which confidence is 1/e, reduced pixels."""
@@ -38,14 +41,20 @@ def run(task: cli.Task) -> None:
     """Estimate all gaps of one video."""
     clip = Clip.open(task.input("frames"))
     estimator = _estimator(task, clip.color_size)
-    gray = lru_cache(maxsize=4096)(lambda frame: estimator.reduce(clip.color(frame)))
-    reviews = []
+    gray = lru_cache(maxsize=2 * GAPS[-1])(lambda frame: estimator.reduce(clip.color(frame)))
+    pairs = sum(max(len(clip) - gap, 0) for gap in GAPS)
     with task.create() as folder:
-        for gap, forward, backward in progress.track(flows(gray, len(clip), GAPS, estimator), "flow: gaps", len(GAPS)):
-            for way, part in (("fw", forward), ("bw", backward)):
-                arrays.save(folder / f"flow_{gap}_{way}.npz", flow=part.flow, confidence=part.confidence)
-            reviews.append(pictures.review(gap, forward, clip.color))
-        pictures.report_quality(folder, reviews)
+        with ExitStack() as stack:
+            tables = {(gap, way): stack.enter_context(_table(folder, gap, way, clip, estimator)) for gap in GAPS for way in ("fw", "bw")}
+            for gap, forward, backward in progress.track(flows(gray, len(clip), GAPS, estimator), "flow: pairs", pairs):
+                tables[gap, "fw"].append(flow=forward.flow, confidence=forward.confidence)
+                tables[gap, "bw"].append(flow=backward.flow, confidence=backward.confidence)
+        pictures.report_quality(folder, [pictures.review(folder, gap, clip.color) for gap in GAPS])
+
+
+def _table(folder: Path, gap: int, way: str, clip: Clip, estimator: Estimator) -> arrays.Rows:
+    shape = (max(len(clip) - gap, 0), *estimator.grid_px.shape[:2])
+    return arrays.Rows(folder / f"flow_{gap}_{way}.npz", flow=((*shape, 2), np.float16), confidence=(shape, np.uint8))
 
 
 def _estimator(task: cli.Task, color_size: tuple[int, int]) -> Estimator:

@@ -3,7 +3,7 @@
 Coarse-to-fine search loses small things that move against the camera, so neighbouring frames are searched twice, from
 coarse levels and on the finest level only, and each place keeps what matches better. Search fails altogether when the
 picture moves far, so longer gaps chain two flows of half the gap and search again on the finest level from there.
-Make one `Estimator` per video; `flows` yields the gaps one after the other.
+Make one `Estimator` per video; `flows` yields pair after pair and keeps no more than the longest gap needs.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -41,10 +41,10 @@ class Search:
 
 @dataclass(frozen=True)
 class Flow:
-    """Flow of several pairs of frames, in colour pixels, at the cell centres (4j + 2, 4i + 2)."""
+    """Flow of one pair of frames, in colour pixels, at the cell centres (4j + 2, 4i + 2)."""
 
-    flow: Float[np.ndarray, "frame height width 2"]
-    confidence: UInt8[np.ndarray, "frame height width"]
+    flow: Float[np.ndarray, "height width 2"]
+    confidence: UInt8[np.ndarray, "height width"]
     """255 = the other direction leads exactly back"""
 
 
@@ -59,7 +59,8 @@ class Estimator:
         self._color_size = color_size
         self._color_per_dense = (np.array(color_size) / self.dense_size)[::-1].astype(np.float32)
         self._tolerance_px = tolerance_px / scale
-        self._coarse, self._fine = _search(search, fine_only=False), _search(search, fine_only=True)
+        # A search that was given a guess remembers it in later ones: so one of its own for those.
+        self._coarse, self._fine, self._guided = (_search(search, fine_only=fine) for fine in (False, True, True))
         self._pixel = _index_grid(*self.dense_size)
 
     def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> Gray:
@@ -76,7 +77,7 @@ class Estimator:
     def chained(self, first: Gray, last: Gray, first_to_middle: Dense, middle_to_last: Dense) -> Dense:
         """Follow one flow, then the other; keep per place that or a search on the finest level from there."""
         guess = chain(first_to_middle, middle_to_last)
-        return self._better(first, last, [guess, self._searched(self._fine, first, last, guess)])
+        return self._better(first, last, [guess, self._searched(self._guided, first, last, guess)])
 
     def judged(self, flow: Dense, back: Dense) -> Flow:
         """Bring one flow to the stored grid, with exp(-error / tolerance) as confidence.
@@ -88,7 +89,7 @@ class Estimator:
         error_px = np.linalg.norm(flow_px + _sampled(back_px, target_px / STRIDE_PX - 0.5), axis=-1)
         inside = ((target_px >= 0) & (target_px <= np.array(self._color_size[::-1]))).all(-1)
         confidence = np.where(inside, np.exp(-error_px / self._tolerance_px), 0)
-        return Flow(flow_px[None].astype(np.float16), np.rint(255 * confidence)[None].astype(np.uint8))
+        return Flow(flow_px.astype(np.float16), np.rint(255 * confidence).astype(np.uint8))
 
     def _better(self, first: Gray, second: Gray, candidates: Sequence[Dense]) -> Dense:
         """Keep the first candidate but where the second one clearly makes the pictures look more alike."""
@@ -110,24 +111,27 @@ class Estimator:
 def flows(gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimator: Estimator) -> Iterator[tuple[int, Flow, Flow]]:
     """Yield (gap, forward, backward) for gaps that double from 1; ``gray(i)`` gives frame i reduced.
 
-    Entry i of both directions belongs to frames i and i + gap; both are empty when the clip is too short.
+    The pairs of one gap come in the order of their first frames 0, 1, ...; those of all gaps mix, as soon as their last frame
+    is there.
     """
     assert list(gaps) == [2**power for power in range(len(gaps))], gaps
-    before: list[tuple[Dense, Dense]] = []
-    for gap in gaps:
-        now, judged = [], []
-        for i in range(frames - gap):
-            first, last = gray(i), gray(i + gap)
+    known: dict[tuple[int, int], tuple[Dense, Dense]] = {}
+    for number in range(1, frames):
+        last = gray(number)
+        for gap in gaps:
+            i = number - gap
+            if i < 0:
+                break
+            first = gray(i)
             if gap == 1:
                 there, back = estimator.neighbours(first, last), estimator.neighbours(last, first)
             else:
-                (there_1, back_1), (there_2, back_2) = before[i], before[i + gap // 2]
+                (there_1, back_1), (there_2, back_2) = known.pop((gap // 2, i)), known[gap // 2, i + gap // 2]
                 there = estimator.chained(first, last, there_1, there_2)
                 back = estimator.chained(last, first, back_2, back_1)
-            now.append((there.astype(np.float16), back.astype(np.float16)))
-            judged.append((estimator.judged(there, back), estimator.judged(back, there)))
-        before = now
-        yield gap, *(_stacked([pair[way] for pair in judged], estimator) for way in (0, 1))
+            if gap < gaps[-1]:
+                known[gap, i] = there.astype(np.float16), back.astype(np.float16)
+            yield gap, estimator.judged(there, back), estimator.judged(back, there)
 
 
 def chain(first_to_middle: Dense, middle_to_last: Dense) -> Dense:
@@ -149,13 +153,6 @@ def _sampled(image: np.ndarray, index: Float[np.ndarray, "height width 2"]) -> n
     image = image.astype(np.float32) if image.dtype == np.float16 else image
     index = index.astype(np.float32)
     return cv2.remap(image, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _stacked(parts: list[Flow], estimator: Estimator) -> Flow:
-    height, width = estimator.grid_px.shape[:2]
-    if not parts:
-        return Flow(np.zeros((0, height, width, 2), np.float16), np.zeros((0, height, width), np.uint8))
-    return Flow(np.concatenate([part.flow for part in parts]), np.concatenate([part.confidence for part in parts]))
 
 
 def _search(settings: Search, *, fine_only: bool) -> cv2.DISOpticalFlow:

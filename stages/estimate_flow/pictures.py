@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline import qa
-from stages.estimate_flow.estimation import STRIDE_PX, Flow
+from pipeline.files import arrays
+from stages.estimate_flow.estimation import STRIDE_PX
 
 SHOWN_FRAMES = 6
 CERTAIN = 128
@@ -28,19 +29,20 @@ class Review:
     strip: UInt8[np.ndarray, "height width 3"] | None
 
 
-def review(gap: int, forward: Flow, color: Callable[[int], UInt8[np.ndarray, "height width 3"]]) -> Review:
-    """Summarise the forward flow of one gap; ``color(i)`` gives frame i."""
-    if len(forward.flow) == 0:
+def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "height width 3"]]) -> Review:
+    """Summarise the forward flow of one gap as it was written; ``color(i)`` gives frame i."""
+    flows, confidences = (arrays.open_lazily(folder / f"flow_{gap}_fw.npz", name) for name in ("flow", "confidence"))
+    if len(flows) == 0:
         return Review(gap, float("nan"), float("nan"), None)
-    certain = forward.confidence >= CERTAIN
-    speed_px = [
-        float(np.linalg.norm(flow[keep].astype(np.float32), axis=-1).mean())
-        for flow, keep in zip(forward.flow, certain, strict=True)
-        if keep.any()
-    ]
-    shown = np.unique(np.linspace(0, len(forward.flow) - 1, SHOWN_FRAMES).astype(int))
-    strip = np.concatenate([_column(color(int(i)), forward.flow[i], forward.confidence[i]) for i in shown], axis=1)
-    return Review(gap, float(certain.mean()), float(np.mean(speed_px)) if speed_px else 0.0, strip)
+    agreement, speed_px = [], []
+    for flow, confidence in zip(flows, confidences, strict=True):
+        certain = confidence >= CERTAIN
+        agreement.append(float(certain.mean()))
+        if certain.any():
+            speed_px.append(float(np.linalg.norm(flow[certain].astype(np.float32), axis=-1).mean()))
+    shown = np.unique(np.linspace(0, len(flows) - 1, SHOWN_FRAMES).astype(int))
+    strip = np.concatenate([_column(color(int(i)), flows[i], confidences[i]) for i in shown], axis=1)
+    return Review(gap, float(np.mean(agreement)), float(np.mean(speed_px)) if speed_px else 0.0, strip)
 
 
 def report_quality(folder: Path, reviews: Sequence[Review]) -> None:

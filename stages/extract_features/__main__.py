@@ -8,7 +8,7 @@ from pipeline import cli, progress
 from pipeline.files import arrays
 from pipeline.files.clips import Clip
 from pipeline.models.describers import Describer
-from pipeline.models.features import FeatureBasis
+from pipeline.models.features import CHANNELS, FeatureBasis
 from stages.extract_features import pictures
 
 
@@ -26,10 +26,12 @@ def run(task: cli.Task) -> None:
     clip, basis = Clip.open(task.input("frames")), FeatureBasis.load(task.input("feature_basis"))
     describe = Describer.load(task.input("feature_basis")).open(lambda: task.device)
     numbers = progress.track(range(len(clip)), "features: frames")
-    features = np.stack([basis.project(describe(clip.color(i), settings.stride_px)).astype(np.float16) for i in numbers])
+    shape = (len(clip), *(side // settings.stride_px for side in clip.color_size), CHANNELS)
     with task.create() as folder:
-        arrays.save(folder / "features.npz", features=features)
-        pictures.report_quality(folder, clip, features)
+        with arrays.Rows(folder / "features.npz", features=(shape, np.float16)) as table:
+            for i in numbers:
+                table.append(features=basis.project(describe(clip.color(i), settings.stride_px)).astype(np.float16))
+        pictures.report_quality(folder, clip, arrays.open_lazily(folder / "features.npz", "features"))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame 
     """Write the stage's own judgement."""
     shown = np.unique(np.linspace(0, len(clip) - 1, SHOWN_FRAMES).astype(int))
     columns = [np.concatenate([_resized(clip.color(int(i))), _resized(as_colors(features[i]))], axis=0) for i in shown]
-    steady = np.einsum("fhwc,fhwc->fhw", features[:-1].astype(np.float32), features[1:].astype(np.float32))
+    steady = [np.einsum("hwc,hwc->hw", *features[i : i + 2].astype(np.float32)) for i in range(len(features) - 1)]
     qa.write(
         folder,
         good="the same thing has the same colour in all pictures and in all recordings",

@@ -25,6 +25,7 @@ def dog(tmp_path_factory):
     """The frames as an artifact without depth, true masks, and our flow of gaps 1 and 4."""
     if not DOG.exists():
         pytest.skip(f"no real recordings at {DOG.parent} (set ATS_REALDATA)")
+    cv2.setNumThreads(1)  # the search divides its work, and its result, by threads
     folder = tmp_path_factory.mktemp("dog")
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir()
@@ -41,11 +42,13 @@ def dog(tmp_path_factory):
         tolerance_px=settings.tolerance_px,
     )
     gray = [estimator.reduce(clip.color(frame)) for frame in range(FRAMES)]
-    found = {}
+    found = {(gap, way): [] for gap in (1, 2, 4) for way in ("fw", "bw")}
     for gap, *both in flows(gray.__getitem__, FRAMES, (1, 2, 4), estimator):
         for way, part in zip(("fw", "bw"), both, strict=True):
-            arrays.save(folder / f"flow_{gap}_{way}.npz", flow=part.flow, confidence=part.confidence)
-            found[gap, way] = part.flow
+            found[gap, way].append(part)
+    for (gap, way), parts in found.items():
+        flow, confidence = (np.stack([getattr(part, name) for part in parts]) for name in ("flow", "confidence"))
+        arrays.save(folder / f"flow_{gap}_{way}.npz", flow=flow, confidence=confidence)
     masks = np.stack([cv2.imread(str(DOG / "mask" / f"{frame:05d}.png"), cv2.IMREAD_GRAYSCALE) > 127 for frame in range(FRAMES)])
     return folder, clip, masks, found
 
@@ -84,7 +87,7 @@ def _joint_hits(move, joints, masks, pairs):
 
 
 def test_flow_is_not_below_opencv(dog):
-    """On joints; carrying the whole mask for five frames, OpenCV's is 0.025 ahead: its refinement keeps outlines together."""
+    """On joints and on the whole mask carried for five frames."""
     _, clip, masks, found = dog
     size = masks.shape[1:]
     joints = {}
@@ -103,7 +106,7 @@ def test_flow_is_not_below_opencv(dog):
         return move
 
     rivals = {
-        "ours": chained(lambda frame: _dense(found[1, "fw"][frame], size)),
+        "ours": chained(lambda frame: _dense(found[1, "fw"][frame].flow, size)),
         "opencv": chained(lambda frame: _opencv_medium(clip, frame, frame + 1)),
         "zero": lambda first, second: np.zeros((*size, 2), np.float32),
     }
@@ -127,5 +130,6 @@ def test_flow_is_not_below_opencv(dog):
     warps = {name: warped_iou(move) for name, move in rivals.items()}
     print("DAVIS dog: 5-frame mask-warp IoU", {name: round(value, 3) for name, value in warps.items()})
     assert warps["ours"] > warps["zero"] + 0.1
-    assert hits["ours"] >= hits["opencv"] - 0.005
+    assert warps["ours"] >= warps["opencv"]
+    assert hits["ours"] >= hits["opencv"]
     assert hits["ours"] > hits["zero"] + 0.1
