@@ -18,6 +18,8 @@ ALIGNED_PX = 16
 """pictures are widened to a multiple of it"""
 GAIN = 4.0
 """of the last layer, so that a short training reaches sure answers"""
+SURROUNDINGS_PX = 32
+"""pixels around a rectangle that are looked at to judge it"""
 LIMIT = 8.0
 """largest log-odds of a pixel"""
 
@@ -28,7 +30,7 @@ class Learning:
 
     examples: int = 150
     """frames to learn from"""
-    steps: int = 200
+    steps: int = 300
     """training steps"""
     batch: int = 6
     """crops per step"""
@@ -41,7 +43,9 @@ class Learning:
     doubt: float = 4.0
     """log-odds by which the network must contradict a label to ignore it later"""
     at_animal: float = 0.7
-    """share of crops that show the animal"""
+    """share of the other crops that show the animal"""
+    mined: float = 0.2
+    """share of crops around what was taken for the animal by mistake, once a third of the steps is done"""
     least_px: int = 60
     """animal pixels that an example needs"""
 
@@ -83,6 +87,13 @@ class Appearance(nn.Module):
             deep = up(torch.cat([F.interpolate(deep, size=level.shape[-2:], mode="bilinear", align_corners=False), level], 1))
         return GAIN * self.out(deep)[:, 0]
 
+    def log_odds_within(self, color: UInt8[np.ndarray, "height width 3"], rows: slice, columns: slice) -> Float[np.ndarray, "rows columns"]:
+        """Judge a rectangle of a picture, as `log_odds` of the whole would but for what lies farther than its surroundings."""
+        top, left = max(rows.start - SURROUNDINGS_PX, 0), max(columns.start - SURROUNDINGS_PX, 0)
+        top, left = top - top % ALIGNED_PX, left - left % ALIGNED_PX
+        found = self.log_odds(color[top : rows.stop + SURROUNDINGS_PX, left : columns.stop + SURROUNDINGS_PX])
+        return found[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+
     @torch.no_grad()
     def log_odds(self, color: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
         """Judge every pixel of a picture at working resolution, within +-8."""
@@ -92,19 +103,25 @@ class Appearance(nn.Module):
         return found.clamp(-LIMIT, LIMIT).numpy()
 
 
-def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generator, known: Appearance | None = None) -> Appearance | None:
-    """Train a network on examples, ``known`` further if given; None (or ``known``) when none of them shows the animal."""
+def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generator) -> Appearance | None:
+    """Train a network on examples; None when none of them shows the animal.
+
+    Stripes of a carpet may look like a tabby, so twice it looks at half of the examples and learns more from its mistakes.
+    """
     showing = [example for example in examples if (example.labels == 255).sum() >= options.least_px]
     if not showing:
-        return known
+        return None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
-        network = known or Appearance()
+        network = Appearance()
     optimizer = torch.optim.AdamW(network.parameters(), options.rate, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.rate, total_steps=options.steps)
-    network.train()
+    mistakes = None
     for step in range(options.steps):
-        crops = [_crop(showing[rng.integers(len(showing))], options, rng) for _ in range(options.batch)]
+        if step in (options.steps // 3, 2 * options.steps // 3):
+            mistakes = [_mistake(network, example, options) for example in showing[::2]]
+        network.train()
+        crops = [_crop(*_chosen(showing, mistakes, options, rng), options.crop_px, rng) for _ in range(options.batch)]
         color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
         found = network(color)
         loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
@@ -118,16 +135,36 @@ def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generat
     return network.eval()
 
 
-def _crop(example: Example, options: Learning, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Cut a square, mostly around a pixel of the animal; flip it, change its exposure and contrast."""
+def _mistake(network: Appearance, example: Example, options: Learning) -> UInt8[np.ndarray, "height width"]:
+    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be the animal."""
+    like = network.log_odds(example.color)
+    return np.where((example.labels == 0) & (like < options.doubt), np.clip(10 * (like + 2), 0, 255), 0).astype(np.uint8)
+
+
+def _chosen(
+    examples: Sequence[Example], mistakes: list[UInt8[np.ndarray, "height width"]] | None, options: Learning, rng: np.random.Generator
+) -> tuple[Example, tuple[int, int]]:
+    """Choose an example and the middle (row, column) of a crop: a mistake, a place near the animal, or any."""
+    height, width = examples[0].labels.shape
+    if mistakes is not None and rng.random() < options.mined:
+        total = np.array([weight.sum(dtype=np.int64) for weight in mistakes])
+        if total.any():
+            index = int(rng.choice(len(mistakes), p=total / total.sum()))
+            heaped = np.cumsum(mistakes[index], dtype=np.int64)
+            return examples[2 * index], divmod(int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right")), width)
+    example = examples[rng.integers(len(examples))]
+    if rng.random() >= options.at_animal:
+        return example, (int(rng.integers(height)), int(rng.integers(width)))
+    inside = np.flatnonzero(example.labels == 255)
+    row, column = divmod(int(inside[rng.integers(len(inside))]), width)
+    reach = options.crop_px * 3 // 8
+    return example, (row + int(rng.integers(-reach, reach)), column + int(rng.integers(-reach, reach)))
+
+
+def _crop(example: Example, middle: tuple[int, int], side: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Cut a square; flip it, change its exposure and contrast."""
     height, width = example.labels.shape
-    side = options.crop_px
-    if rng.random() < options.at_animal:
-        inside = np.flatnonzero(example.labels == 255)
-        row, column = divmod(int(inside[rng.integers(len(inside))]), width)
-        top, left = row - int(rng.integers(side // 8, side - side // 8)), column - int(rng.integers(side // 8, side - side // 8))
-    else:
-        top, left = int(rng.integers(height)) - side // 2, int(rng.integers(width)) - side // 2
+    top, left = middle[0] - side // 2, middle[1] - side // 2
     top, left = int(np.clip(top, 0, max(height - side, 0))), int(np.clip(left, 0, max(width - side, 0)))
     rows, columns = slice(top, top + side), slice(left, left + side)
     color, labels = example.color[rows, columns], example.labels[rows, columns]

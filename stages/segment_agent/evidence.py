@@ -44,6 +44,9 @@ class Weighing:
     """certainty of depth of low confidence or at a step; 1 is that of all other depth"""
 
 
+ASKEW_PX = 2
+"""how far a texture may lie from where it was, working pixels"""
+
 Judge = Callable[[int, Window, Sphere], Evidence]
 
 
@@ -72,13 +75,18 @@ def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing
 def recolored(window: Window, votes: Votes, settled: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
     """Return by how many times the noise (0..6) a surface shows another colour than at other times, shadows taken out.
 
-    A shadow or a changed exposure scales all channels alike, and a shadow only darkens.
+    A shadow or a changed exposure scales all channels alike, and a shadow only darkens. Any colour that the surface had
+    within `ASKEW_PX` is no other one: the edges of a texture never lie quite where they were.
     """
     if settled.sum() < 50:
         return np.zeros(settled.shape)
     now = cv2.GaussianBlur(window.color, (5, 5), 1.2).astype(np.float32)
     before = votes.color * np.median((now[settled] + 4) / (votes.color[settled] + 4), axis=0)
     scale = np.clip((now * before).sum(-1) / np.maximum((before**2).sum(-1), 1), 0.5, 1.0)
-    difference = np.linalg.norm(now - scale[..., None] * before, axis=-1)
+    then, beside = scale[..., None] * before, np.ones((2 * ASKEW_PX + 1, 2 * ASKEW_PX + 1), np.uint8)
+    known = settled[..., None]
+    low = np.minimum(cv2.erode(np.where(known, then, np.float32(np.inf)), beside), then)
+    high = np.maximum(cv2.dilate(np.where(known, then, np.float32(-np.inf)), beside), then)
+    difference = np.linalg.norm(np.maximum(np.maximum(low - now, now - high), 0), axis=-1)
     noise = max(float(np.median(difference[settled])), 3.0)
     return np.where(settled, np.clip(difference / noise - 3, 0, 6), 0)

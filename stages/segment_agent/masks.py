@@ -25,7 +25,7 @@ from stages.segment_agent.prompt import Prompt
 from stages.segment_agent.refine import Palette, Refinement
 from stages.segment_agent.trajectory import Trajectory, steady
 from stages.segment_agent.turnaround import Turnaround, find_standing, meeting_point
-from stages.segment_agent.windows import Sphere, working_picture
+from stages.segment_agent.windows import Sphere, rectangle, working_picture
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def segment(
                 "MSK-004",
                 "there is no depth, so motion alone does not tell the animal from the room",
                 str(clip.folder),
-                "give a hint: one box around the animal in one frame (--prompt)",
+                "give a hint: one box around the animal in one frame (<recording>.prompt.toml)",
             )
         footage = Footage(clip, flow, options.refinement.height_px)
         return follow(footage, hint, options.following, options.learning, rng), None
@@ -78,10 +78,11 @@ def segment(
             mark = None if place is None else Hint(hint.frame, place)
             references = free_space.gather(clip, poses, options.free_space)
             balls, judge = _locate(clip, poses, references, options, mark, None)
-            network = _learn(Painter(clip, poses, balls, judge, options.refinement, Palette()), options, rng)
+            painter = Painter(clip, poses, balls, judge, options.refinement, Palette())
+            network = _learn(painter, options, rng)
             looks = Palette() if network is None else network
             if network is not None:
-                room = free_space.without(references, lambda frame: _hidden(clip, frame, network, options), options.free_space)
+                room = free_space.without(references, lambda frame: _hidden(painter, frame, network), options.free_space)
                 balls, judge = _locate(clip, poses, room, options, mark, network)
         case _:
             assert_never(role)
@@ -122,7 +123,13 @@ def _knows(network: Appearance, examples: list[Example], least: float = 0.6) -> 
     return bool(shown) and float(np.mean(shown)) > least
 
 
-def _hidden(clip: Clip, frame: int, network: Appearance, options: Options) -> Bool[np.ndarray, "height width"]:
-    """Tell where the animal, by its looks and with a rim, hides the room."""
-    like = network.log_odds(working_picture(clip, frame, options.refinement.height_px)) > 0
+def _hidden(painter: Painter, frame: int, network: Appearance) -> Bool[np.ndarray, "height width"]:
+    """Tell where the animal, by its looks and with a rim, hides the room: near where it was seen to move, if it was."""
+    color = working_picture(painter.clip, frame, painter.options.height_px)
+    like, ball = network.log_odds(color) > 0, painter.balls[frame]
+    if ball is not None and not ball.presumed:
+        rows, columns = rectangle(painter.clip, frame, painter.world_from_camera[frame], ball, color.shape[:2])
+        beside = np.ones_like(like)
+        beside[rows, columns] = False
+        like &= ~beside
     return cv2.dilate(like.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0

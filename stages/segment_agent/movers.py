@@ -127,8 +127,8 @@ def track(
 
 
 def _score(candidate: Candidate, options: Mover) -> float:
-    """Reward area up to a convincing one; halve what is larger than an animal."""
-    reward = candidate.conviction * min(candidate.area_m2 / options.likely_area_m2, 1.0) ** 0.5
+    """Reward area up to a convincing one; halve what is larger than an animal, and count nothing that is as likely as not."""
+    reward = max(2 * candidate.conviction - 1, 0) * min(candidate.area_m2 / options.likely_area_m2, 1.0) ** 0.5
     return reward * (0.5 if candidate.radius_m > options.largest_m / 2 else 1.0)
 
 

@@ -61,11 +61,11 @@ class Painter:
                 log_odds = evidence.log_odds + self.options.color_weight * palette.ratio(window.color, evidence.room)
                 log_odds = refine.sharpen(log_odds, evidence.certainty, window.color, self.options)
             case Appearance() as network:
-                like = network.log_odds(color)[window.rows, window.columns]
+                like = network.log_odds_within(color, window.rows, window.columns)
                 known = refine.sharpen(evidence.log_odds, evidence.certainty, window.color, self.options)
                 most = np.where(evidence.certainty < 0.3, self.options.looks_alone, self.options.looks_for)
                 log_odds = known + np.clip(self.options.looks_weight * like, -self.options.looks_against, most)
-                sure = log_odds > self.options.sure
+                sure = (log_odds > self.options.sure) & (evidence.animal | (like > 0))
         labels = refine.label(log_odds, sure, self.options)
         least = self.options.least_presumed_px if ball.presumed else 1
         if sure[labels == 255].sum() < least:

@@ -19,7 +19,7 @@ class Refinement:
     """log-odds per unit of the colours' log-ratio"""
     looks_weight: float = 0.5
     """weight of the learnt looks' log-odds"""
-    looks_for: float = 0.5
+    looks_for: float = 0.0
     """largest log-odds by which the learnt looks speak for the animal where geometry is sure: its edges are sharper"""
     looks_alone: float = 3.0
     """the same where geometry knows nothing"""

@@ -10,6 +10,9 @@ from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
 from stages.segment_agent.free_space import usable_depth
 
+STEP_M = 0.05
+"""difference of neighbouring depths that is a step and not a slope"""
+
 
 @dataclass(frozen=True)
 class Sphere:
@@ -47,26 +50,45 @@ def working_picture(clip: Clip, frame: int, height_px: int) -> UInt8[np.ndarray,
     return color if size == clip.color_size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
 
 
-def cut(
-    clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, color: UInt8[np.ndarray, "height width 3"]
-) -> Window | None:
-    """Read the rectangle around a ball with a rim of 8 px out of a working picture; None when it is out of view."""
-    size = color.shape[:2]
+def rectangle(
+    clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, size: tuple[int, int], rim_px: int = 8
+) -> tuple[slice, slice]:
+    """Return the rows and columns of a working picture of (height, width) that show a ball; empty where it is out of view."""
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     centre = rigid.apply(rigid.inverse(world_from_camera), ball.centre_world[None])[0]
     pixel, depth = cameras.project(centre, intrinsics)
     if depth < 0.1:
+        return slice(0, 0), slice(0, 0)
+    reach = intrinsics[[0, 1], [0, 1]] * ball.radius_m / max(depth - 0.5 * ball.radius_m, 0.2) + rim_px
+    low = np.clip(np.floor(pixel - reach), 0, size[::-1]).astype(int)
+    high = np.clip(np.ceil(pixel + reach), 0, size[::-1]).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def cut(
+    clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, color: UInt8[np.ndarray, "height width 3"]
+) -> Window | None:
+    """Read the rectangle around a ball out of a working picture; None when it is out of view."""
+    size = color.shape[:2]
+    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
+    rows, columns = rectangle(clip, frame, world_from_camera, ball, size)
+    if min(rows.stop - rows.start, columns.stop - columns.start) < 4:
         return None
-    reach = intrinsics[[0, 1], [0, 1]] * ball.radius_m / max(depth - 0.5 * ball.radius_m, 0.2) + 8
-    low = np.clip(np.floor(pixel - reach), 0, [size[1], size[0]]).astype(int)
-    high = np.clip(np.ceil(pixel + reach), 0, [size[1], size[0]]).astype(int)
-    if (high - low).min() < 4:
-        return None
-    rows, columns = slice(low[1], high[1]), slice(low[0], high[0])
     grid = cameras.pixel_grid(*size)[rows, columns]
     at = np.floor(grid * [clip.depth_size[1] / size[1], clip.depth_size[0] / size[0]]).astype(int)
-    z = clip.depth(frame)[at[..., 1], at[..., 0]]
+    z = unblurred(clip.depth(frame))[at[..., 1], at[..., 0]]
     trusted = usable_depth(clip, frame)[at[..., 1], at[..., 0]] > 0
     points = rigid.apply(world_from_camera, (cameras.unproject(grid, intrinsics) * z[..., None]).reshape(-1, 3)).reshape(*z.shape, 3)
     points[z == 0] = np.nan
     return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points, trusted)
+
+
+def unblurred(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Give a depth between two surfaces to the nearer one of both: sensors blur steps, and what floats there is no animal.
+
+    Toggle mapping (Kramer and Bruckner 1975) where the neighbours differ by more than a step; it leaves the step where it is.
+    """
+    around = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around), cv2.dilate(depth, around)
+    snapped = np.where(depth - low < high - depth, low, high)
+    return np.where((depth > 0) & (high - low > STEP_M), snapped, depth)
