@@ -136,8 +136,13 @@ def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generat
 
 
 def _mistake(network: Appearance, example: Example, options: Learning) -> UInt8[np.ndarray, "height width"]:
-    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be the animal."""
+    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be the animal.
+
+    Nothing where the labelled animal does not look like one: then the label may be the mistake.
+    """
     like = network.log_odds(example.color)
+    if (like[example.labels == 255] > 0).mean() < 0.5:
+        return np.zeros(like.shape, np.uint8)
     return np.where((example.labels == 0) & (like < options.doubt), np.clip(10 * (like + 2), 0, 255), 0).astype(np.uint8)
 
 

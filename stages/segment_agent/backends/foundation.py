@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from pipeline.errors import InputError
 from pipeline.files.clips import Clip
+from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
 
 if TYPE_CHECKING:
@@ -41,16 +42,7 @@ class Foundation:
     """Log-odds on both sides of even within which a pixel is unknown."""
 
 
-@dataclass(frozen=True)
-class Followed:
-    """One frame's result at colour resolution, as the other backend gives it."""
-
-    labels: UInt8[np.ndarray, "height width"]
-    visible: bool
-    confidence: float
-
-
-def segment(clip: Clip, hint: Prompt | None, options: Foundation, device: str) -> Iterator[Followed]:
+def segment(clip: Clip, hint: Prompt | None, options: Foundation, device: str) -> Iterator[Mask]:
     """Return one mask per frame, in order. Raises MSK-004 where the animal is not found, MOD-001..003 without models."""
     from pipeline.models.grounding_dino import GroundingDino
     from pipeline.models.sam2 import Sam2
@@ -84,22 +76,22 @@ def widened(hint: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[n
     return np.concatenate([np.maximum(low, 0), np.minimum(high, size[::-1])])
 
 
-def _follow(clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, 4], options: Foundation) -> Iterator[Followed]:
+def _follow(clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, 4], options: Foundation) -> Iterator[Mask]:
     before: list[tuple[bytes, bool, float]] = []
     for log_odds, presence in tracker.track(clip.color, range(start, -1, -1), box_px):
         mask = labelled(log_odds, presence, options.unsure)
         before.append((cv2.imencode(".png", mask.labels)[1].tobytes(), mask.visible, mask.confidence))
     while len(before) > 1:
         png, visible, confidence = before.pop()
-        yield Followed(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), visible, confidence)
+        yield Mask(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), visible, confidence)
     for log_odds, presence in tracker.track(clip.color, range(start, len(clip)), box_px):
         yield labelled(log_odds, presence, options.unsure)
 
 
-def labelled(log_odds: Float[np.ndarray, "height width"], presence: float, unsure: float) -> Followed:
+def labelled(log_odds: Float[np.ndarray, "height width"], presence: float, unsure: float) -> Mask:
     """Turn log-odds into 255 agent, 0 not, 128 unknown; nothing where the animal is rather out of view."""
     labels = np.where(log_odds > unsure, 255, np.where(log_odds < -unsure, 0, 128)).astype(np.uint8)
     inside = labels == 255
     if presence <= 0 or not inside.any():
-        return Followed(np.zeros(labels.shape, np.uint8), False, float(1 / (1 + np.exp(presence))))
-    return Followed(labels, True, float((1 / (1 + np.exp(-log_odds[inside]))).mean()))
+        return Mask(np.zeros(labels.shape, np.uint8), False, float(1 / (1 + np.exp(presence))))
+    return Mask(labels, True, float((1 / (1 + np.exp(-log_odds[inside]))).mean()))
