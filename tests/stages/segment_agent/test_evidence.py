@@ -1,0 +1,36 @@
+"""Depth steps are sharp again, and a texture a little askew is no other colour."""
+
+import numpy as np
+import pytest
+
+from stages.segment_agent.evidence import recolored
+from stages.segment_agent.free_space import Votes
+from stages.segment_agent.windows import Window, unblurred
+
+
+@pytest.mark.parametrize(("share", "nearer"), [(0.4, 1.5), (0.6, 2.5)])
+def test_what_floats_between_two_surfaces_goes_to_the_nearer_one(share, nearer):
+    step = np.where(np.arange(40) < 20, 1.5, 2.5)[None].repeat(30, 0).astype(np.float32)
+    blurred, expected = step.copy(), step.copy()
+    blurred[:, 20], expected[:, 20] = 1.5 + share, nearer
+    np.testing.assert_array_equal(unblurred(blurred), expected)
+
+
+def test_a_slope_and_unknown_depth_stay():
+    slope = np.linspace(1, 2, 60)[None].repeat(30, 0).astype(np.float32)
+    slope[10:14, 20:24] = 0
+    np.testing.assert_array_equal(unblurred(slope), slope)
+
+
+def test_only_what_is_no_neighbouring_colour_is_another_one():
+    rng = np.random.default_rng(0)
+    stripes = np.where(np.arange(60) // 6 % 2 == 0, 60, 200)[None, :, None].repeat(60, 0).repeat(3, 2)
+    before = stripes + rng.normal(0, 2, stripes.shape)
+    now = 0.8 * np.roll(stripes, 1, axis=1) + rng.normal(0, 2, stripes.shape)
+    now[20:34, 20:34] = [160, 40, 30]
+    votes = Votes(*(np.zeros((60, 60)) for _ in range(3)), before.astype(np.float32))
+    whole = slice(0, 60)
+    window = Window(whole, whole, np.clip(now, 0, 255).astype(np.uint8), np.zeros((60, 60, 3)), np.ones((60, 60), bool))
+    other = recolored(window, votes, np.ones((60, 60), bool))
+    assert (other[23:31, 23:31] > 1).mean() > 0.9
+    assert (other[:, 40:] > 1).mean() < 0.02
