@@ -1,14 +1,17 @@
 """Polycam raw data (LiDAR or room mode, developer mode): sparse keyframes with poses, for the walk-through.
 
-Optimised pictures and cameras (`corrected_*`) are used where both exist; their black borders carry no depth.
+Optimised pictures and cameras (`corrected_*`) are used where both exist; their black borders carry no depth. The app's own
+mesh, `raw.glb`, stands turned to its axes; the inverse of `alignmentTransform` (column-major) brings it back to the cameras.
 """
 
+import io
 import json
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import trimesh
 from jaxtyping import Float, UInt8
 
 from pipeline.files import images
@@ -20,6 +23,7 @@ from pipeline.recordings.recording import (
     Y_UP,
     Recording,
     broken_metadata,
+    damaged,
     decode_gray,
     intrinsics_from_coefficients,
     meters_from_png,
@@ -27,9 +31,12 @@ from pipeline.recordings.recording import (
     no_frames,
     pose_from_matrix,
 )  # fmt: skip
+from pipeline.space import rigid
+from pipeline.space.meshes import Mesh
 
 TRUSTED_M = 5.0
 """depth beyond this is unknown, metres"""
+MAX_MESH_BYTES = 512 << 20
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
 
 
@@ -71,6 +78,7 @@ def open_recording(path: Path) -> Recording:
         read_confidence=(lambda i: _confidence(container, i, size)) if known else None,
         convention=OPENGL,
         up=Y_UP,
+        read_mesh=(lambda: _mesh(container)) if {"raw.glb", "mesh_info.json"} <= set(container.names) else None,
         remarks=("Polycam keeps sparse keyframes: good for the walk-through, too few for the animal",),
     )
 
@@ -99,6 +107,25 @@ def _depth(container: FolderContainer, number: int, size: tuple[int, int] | None
     name = f"keyframes/depth/{number}.png"
     depth = meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, f"{container.where}/{name}")
     return np.where(depth <= TRUSTED_M, depth, np.float32(0))
+
+
+def _mesh(container: FolderContainer) -> Mesh:
+    """Read the app's mesh in the cameras' world. Raises CAP-001 and CAP-004."""
+    where = f"{container.where}/mesh_info.json"
+    try:
+        table = json.loads(container.read("mesh_info.json", MAX_TEXT_BYTES))
+        aligned_from_world = np.array(table["alignmentTransform"], float).reshape(4, 4).T
+        world_from_aligned = np.linalg.inv(aligned_from_world)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise broken_metadata(where, f"no alignmentTransform of 16 numbers ({error!r})") from error
+    try:
+        loaded = trimesh.load(io.BytesIO(container.read("raw.glb", MAX_MESH_BYTES)), file_type="glb", force="mesh")
+    except Exception as error:  # whatever the reader meets in a file that was cut
+        raise damaged(f"{container.where}/raw.glb", repr(error)) from error
+    if not len(loaded.faces):
+        raise damaged(f"{container.where}/raw.glb", "it holds no surface")
+    vertices = rigid.apply(world_from_aligned, np.asarray(loaded.vertices, float)).astype(np.float32)
+    return Mesh(vertices, np.asarray(loaded.faces, np.int32), np.full((len(vertices), 3), 128, np.uint8))
 
 
 def _border(container: FolderContainer, name: str, size: tuple[int, int]) -> np.ndarray:

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, UInt8, UInt16
 from pipeline.errors import InputError
 from pipeline.recordings.conventions import OPENCV, Convention
 from pipeline.space import rigid
+from pipeline.space.meshes import Mesh
 
 MAX_PICTURE_BYTES = 64 << 20
 MAX_TEXT_BYTES = 64 << 20
@@ -53,6 +54,8 @@ class Recording:
     """direction that points up in the poses' world; None where the format does not tell"""
     quarter_turns: int = 0
     """clockwise, stored to upright, where the file itself tells (video rotation tag) and `up` does not"""
+    read_mesh: Callable[[], Mesh] | None = None
+    """the app's own surface of the room, metres, in the poses' world; None where it has none"""
     remarks: tuple[str, ...] = ()
     """what had to be assumed or left out, one sentence each"""
 

@@ -16,9 +16,10 @@ import numpy as np
 from pipeline import cli, qa
 from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip
-from stages.build_scene_template import pictures, template
+from stages.build_scene_template import given, pictures, template
 from stages.build_scene_template.anchor import AnchorOptions
 from stages.build_scene_template.fuse import FuseOptions
+from stages.build_scene_template.given import GivenOptions
 from stages.build_scene_template.refine import RefineOptions
 from stages.build_scene_template.sfm import SfmOptions
 
@@ -35,6 +36,8 @@ class Config:
     """Weights of depth, tracks and odometry."""
     fusion: FuseOptions = field(default_factory=FuseOptions)
     """Resolution and reach of the fusion."""
+    own_mesh: GivenOptions = field(default_factory=GivenOptions)
+    """When a mesh that the recording brings along (Polycam's) is taken in place of a fused one."""
     seed: int = 0
     """Seed of COLMAP's random choices."""
 
@@ -45,11 +48,15 @@ def run(task: cli.Task) -> None:
     clip = Clip.open(frames)
     features = arrays.open_lazily(task.per_video("features", roles=("walkthrough",))[video] / "features.npz", "features")
     config = task.config
-    with tempfile.TemporaryDirectory() as workspace:
-        made, sparse = template.build(
-            clip, features, structure=config.structure, believe=config.believe, weights=config.weights,
-            fusion=config.fusion, workspace=Path(workspace), seed=config.seed,
-        )  # fmt: skip
+    made, sparse, own = None, None, frames / "mesh.ply"
+    if own.exists() and config.own_mesh.take:
+        made = given.build(clip, features, meshes.read_ply(own), config.own_mesh, config.weights, config.fusion)
+    if made is None:
+        with tempfile.TemporaryDirectory() as workspace:
+            made, sparse = template.build(
+                clip, features, structure=config.structure, believe=config.believe, weights=config.weights,
+                fusion=config.fusion, workspace=Path(workspace), seed=config.seed,
+            )  # fmt: skip
     with task.create() as folder:
         normals = made.mesh.vertex_normals()
         meshes.write_ply(folder / "mesh.ply", made.mesh, nx=normals[:, 0], ny=normals[:, 1], nz=normals[:, 2])

@@ -58,6 +58,13 @@ def frames(template: Template, clip: Clip, caster: RayCaster) -> np.ndarray:
 def checks(template: Template) -> list[Check]:
     """Judge the template."""
     start = template.start
+    surface = [
+        Check("metres known", float(template.scale != "relative"), "", 0.5, better="higher"),
+        Check("depth against the surface", float(np.nanmedian(template.gap_m) * 100), "cm, median", 2.0, 5.0),
+        Check("frames that fit the surface", float(template.registered.mean()), "share", 0.95, 0.5, "higher"),
+    ]
+    if template.own_mesh:
+        return surface
     return [
         Check("keyframes registered by COLMAP", len(start.registered) / template.keyframes, "share", 0.8, 0.0, "higher"),
         Check("reprojection error", template.reprojection_px, "px", 1.5),
@@ -68,9 +75,7 @@ def checks(template: Template) -> list[Check]:
             "relative difference",
             0.05,
         ),
-        Check("metres known", float(template.scale != "relative"), "", 0.5, better="higher"),
-        Check("depth against the surface", float(np.nanmedian(template.gap_m) * 100), "cm, median", 2.0, 5.0),
-        Check("frames that fit the surface", float(template.registered.mean()), "share", 0.95, 0.5, "higher"),
+        *surface,
     ]
 
 
@@ -92,6 +97,7 @@ def world(template: Template) -> dict:
         "gravity": template.gravity,
         "scale": _scale(template),
         "poses": start.source,
+        "mesh": "the recording's own" if template.own_mesh else "fused from depth",
         "colmap_refuted": start.reason or None,
         "bounds": [low.round(4).tolist(), high.round(4).tolist()],
         "floor": round(template.floor_m, 4),

@@ -34,6 +34,8 @@ class Template:
     """Height of the floor, world y."""
     scale: str
     """What makes lengths metres (`Clip.scale`)."""
+    own_mesh: bool = False
+    """Whether the recording brought its surface along."""
 
 
 def build(

@@ -61,6 +61,7 @@ def run(task: cli.Task) -> None:
             folder, frames, total=len(plan.chosen), min_depth_valid=settings.min_depth_valid, where=recording.where
         )
         writing.write_table(folder, recording, plan, written)
+        writing.write_mesh(folder, recording, plan)
         writing.report_quality(folder, plan, written, rate_hz=settings.rate_hz)
 
 

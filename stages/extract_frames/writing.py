@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline import qa
 from pipeline.errors import InputError
-from pipeline.files import arrays, images
+from pipeline.files import arrays, images, meshes
 from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, Frame, Plan, quality_of
 from pipeline.recordings.recording import Recording
 
@@ -86,6 +86,12 @@ def write_table(folder: Path, recording: Recording, plan: Plan, written: Written
         depth_valid=written.depth_valid.astype(np.float32),
         quality=quality_of(written.sharpness, written.brightness, written.depth_valid).astype(np.float32),
     )
+
+
+def write_mesh(folder: Path, recording: Recording, plan: Plan) -> None:
+    """Write the app's own surface of the room as ``mesh.ply`` where it has one and device poses tell where it stands."""
+    if recording.read_mesh is not None and plan.odometry_from_camera is not None:
+        meshes.write_ply(folder / "mesh.ply", recording.read_mesh())
 
 
 def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float) -> None:

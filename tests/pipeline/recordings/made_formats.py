@@ -7,6 +7,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import trimesh
 
 from pipeline.files import images
 from pipeline.space import cameras
@@ -82,7 +83,7 @@ def stray(folder: Path, made: Made, columns: int = 15) -> Path:
 
 
 def polycam(folder: Path, made: Made, corrected: bool = False) -> Path:
-    members: dict[str, bytes | str] = {"raw.glb": b"", "mesh_info.json": "{}"}
+    members: dict[str, bytes | str] = {"thumbnail.jpg": images.encode_jpeg(made.color(0))}
     parts = ("corrected_images", "corrected_cameras") if corrected else ("images", "cameras")
     fx, fy, cx, cy = coefficients(made)
     for i, camera in enumerate(cameras.opencv_from_opengl(stored_cameras(made))):
@@ -95,6 +96,12 @@ def polycam(folder: Path, made: Made, corrected: bool = False) -> Path:
         members[f"keyframes/depth/{stem}.png"] = png(millimeters(made.depth(i)))
         members[f"keyframes/confidence/{stem}.png"] = png(np.full(made.depth(i).shape, 54, np.uint8))
     return put(folder, members)
+
+
+def polycam_mesh(folder: Path, mesh: trimesh.Trimesh, aligned_from_world: np.ndarray) -> None:
+    """Add the app's own mesh as it stores it: turned to its own axes, and the turn beside it."""
+    (folder / "raw.glb").write_bytes(mesh.copy().apply_transform(aligned_from_world).export(file_type="glb"))
+    (folder / "mesh_info.json").write_text(json.dumps({"alignmentTransform": aligned_from_world.T.ravel().tolist()}))
 
 
 def nerfcapture(folder: Path, made: Made) -> Path:

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+import trimesh
 
 from pipeline.errors import InputError
 from pipeline.recordings import extraction, stray_scanner, tum
@@ -258,3 +259,19 @@ def _turn_track(path, turns):
     for place, value in ((0, cosine), (1, sine), (3, -sine), (4, cosine)):
         struct.pack_into(">i", data, at + 4 * place, value << 16)
     path.write_bytes(data)
+
+
+def test_polycams_own_mesh_stands_where_its_cameras_do(tmp_path):
+    box = trimesh.creation.box((4.0, 2.5, 5.0), rigid.make(np.eye(3), np.array([2.0, 1.25, 2.5])))
+    folder = made_formats.polycam(tmp_path / "a", walk(12))
+    assert open_recording(folder).read_mesh is None
+    turn = rigid.make(rigid.rotation_from_vector(np.array([0.0, 0.7, 0.0])), np.array([0.3, -1.0, 0.2]))
+    made_formats.polycam_mesh(folder, box, turn)
+    mesh = open_recording(folder).read_mesh()
+    np.testing.assert_allclose(np.sort(mesh.vertices, axis=0), np.sort(box.vertices, axis=0), atol=1e-5)
+    (folder / "raw.glb").write_bytes((folder / "raw.glb").read_bytes()[:100])
+    with pytest.raises(InputError, match="CAP-001"):
+        open_recording(folder).read_mesh()
+    (folder / "mesh_info.json").write_text("{}")
+    with pytest.raises(InputError, match="CAP-004"):
+        open_recording(folder).read_mesh()

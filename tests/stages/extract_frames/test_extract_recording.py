@@ -4,12 +4,14 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 
 from pipeline import cli
-from pipeline.files import arrays, images
+from pipeline.files import arrays, images, meshes
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
 from stages.extract_frames import __main__ as front
+from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 
@@ -90,3 +92,10 @@ def test_large_pictures_are_reduced_with_their_intrinsics(tmp_path, monkeypatch,
     assert clip.color_size == (32, 24)
     np.testing.assert_allclose(clip.intrinsics[0], np.diag([0.5, 0.5, 1]) @ walk().intrinsics)
     np.testing.assert_allclose(clip.odometry_from_camera[0], made.world_from_camera[0], atol=1e-6)
+
+
+def test_a_mesh_that_the_app_made_comes_along(tmp_path, monkeypatch):
+    folder = made_formats.polycam(tmp_path / "a", walk(24))
+    made_formats.polycam_mesh(folder, trimesh.creation.box((4.0, 2.5, 5.0)), np.eye(4))
+    clip = _extract(folder, tmp_path / "out", monkeypatch)
+    assert np.allclose(np.ptp(meshes.read_ply(clip.folder / "mesh.ply").vertices, axis=0), (4.0, 2.5, 5.0))
