@@ -20,6 +20,9 @@ FORGET_M = 0.1
 JITTER_M = 0.02
 """step of a path, per frame, of which half is taken for noise"""
 
+FAINT = 0.01
+"""length of a vector, in metres or of a unit, below which it tells no direction"""
+
 
 class BodyDenoiser(nn.Module):
     """Denoise what a body does along a path: its departure from the posture that it holds now.
@@ -91,5 +94,5 @@ def turned(root: Float[Tensor, "batch 6 frame"], heading: Float[Tensor, "batch 2
 
 
 def unit(vector: Float[Tensor, "batch 2 frame"]) -> Float[Tensor, "batch 2 frame"]:
-    """Return vectors of length 1, or near zero where there is no direction."""
-    return vector / (vector.square().sum(1, keepdim=True) + 1e-8).sqrt()
+    """Return vectors of about length 1, shorter ones where there is hardly a direction: rounding must not turn a body."""
+    return vector / (vector.square().sum(1, keepdim=True) + FAINT**2).sqrt()
