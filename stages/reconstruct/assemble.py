@@ -42,14 +42,16 @@ class Video:
 
 @dataclass(frozen=True)
 class Doubt:
-    """What is done with frames in which registration doubts the agent's root: mostly their masks are wrong too."""
+    """Which registered roots are given up: doubtful ones far from where their neighbours in time have the agent."""
 
     least_confidence: float = 0.4
-    """roots that are less certain are not taken over where others are near in time"""
+    """roots that are less certain may be given up"""
+    farthest_m: float = 0.3
+    """if they lie farther than this from between the certain ones"""
     longest_gap_s: float = 3.0
-    """roots are interpolated over gaps up to this long"""
+    """and those are no farther apart in time"""
     trust: float = 0.05
-    """how much the masks of such frames still count"""
+    """how much the masks of such frames still count: mostly they show something else"""
 
 
 @dataclass(frozen=True)
@@ -97,10 +99,10 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     store = join([usable(video) for video in videos])
     lengths = [len(video.timestamp_s) for video in videos]
     camera = np.concatenate([filled(video.timestamp_s, video.world_from_camera) for video in videos])
-    roots = [believed_roots(video, shapes.doubt) for video in videos]
+    roots, kept = zip(*(steadied(video, shapes.doubt) for video in videos), strict=True)
     agent = np.concatenate([filled(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)])
     rooted = torch.from_numpy(np.concatenate([np.isfinite(root).all((1, 2)) for root in roots]))
-    trust = np.concatenate([np.where(certain(video, shapes.doubt), 1.0, shapes.doubt.trust) for video in videos])
+    trust = np.where(np.concatenate(kept), 1.0, shapes.doubt.trust)
     low, high = measured_box(videos, shapes.scene_margin_m)
     scene = Field(
         FieldShape(
@@ -161,25 +163,26 @@ def usable(video: Video, least_confidence: float = 0.1) -> Store:
     return Store(*(rays.at(torch.nonzero(good[rays.frame])[:, 0]) for rays in (store.scene, store.agent)), store.views)
 
 
-def certain(video: Video, doubt: Doubt) -> Bool[np.ndarray, "frame"]:
-    """Tell in which frames the agent's root is known and believed."""
-    known = np.isfinite(video.world_from_agent).all((1, 2))
-    return known if video.agent_confidence is None else known & (video.agent_confidence > doubt.least_confidence)
+def steadied(video: Video, doubt: Doubt) -> tuple[Float[np.ndarray, "frame 4 4"], Bool[np.ndarray, "frame"]]:
+    """Replace roots that registration doubts and that leap away from the certain ones around them.
 
-
-def believed_roots(video: Video, doubt: Doubt) -> Float[np.ndarray, "frame 4 4"]:
-    """Return the agent's roots (NaN where unknown), interpolated between believed ones where those are near in time."""
-    believed = certain(video, doubt)
-    when, found = video.timestamp_s, video.world_from_agent.copy()
-    if not believed.any():
-        return found
-    known_s = when[believed]
-    after = np.searchsorted(known_s, when).clip(1, max(len(known_s) - 1, 1))
-    before_s, after_s = known_s[after - 1], known_s[np.minimum(after, len(known_s) - 1)]
-    between = ~believed & (when > before_s) & (when < after_s) & (after_s - before_s <= doubt.longest_gap_s)
-    if between.any():
-        found[between] = rigid.interpolate(known_s, found[believed], when[between])
-    return found
+    Returns:
+        The roots (NaN where unknown), and which frames were left as they are.
+    """
+    root, when = video.world_from_agent.copy(), video.timestamp_s
+    known = np.isfinite(root).all((1, 2))
+    certain = known & (video.agent_confidence >= doubt.least_confidence) if video.agent_confidence is not None else known
+    kept = np.ones(len(root), bool)
+    if certain.sum() < 2:
+        return root, kept
+    certain_s = when[certain]
+    after = np.searchsorted(certain_s, when).clip(1, len(certain_s) - 1)
+    near = (when > certain_s[0]) & (when < certain_s[-1]) & (certain_s[after] - certain_s[after - 1] <= doubt.longest_gap_s)
+    doubted = np.flatnonzero(known & ~certain & near)
+    between = rigid.interpolate(certain_s, root[certain], when[doubted])
+    far = np.linalg.norm(root[doubted, :3, 3] - between[:, :3, 3], axis=1) > doubt.farthest_m
+    root[doubted[far]], kept[doubted[far]] = between[far], False
+    return root, kept
 
 
 def filled(timestamp_s: Float[np.ndarray, "frame"], a_from_b: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 4 4"]:

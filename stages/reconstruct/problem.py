@@ -33,7 +33,7 @@ class Problem:
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
     trust: Float[Tensor, "frame"]
-    """how much a frame's mask counts for the agent, 0..1: what registration thought of the root that it found there"""
+    """how much a frame's mask counts for the agent, 0..1: less where its root was given up"""
 
     @property
     def device(self) -> torch.device:

@@ -1,4 +1,4 @@
-"""Roots that registration doubts are bridged where believed ones are near in time, and their masks hardly count."""
+"""Doubtful roots that leap away from certain ones near in time are given up, and their masks hardly count."""
 
 import dataclasses
 
@@ -11,32 +11,29 @@ from stages.reconstruct.assemble import Doubt
 from tests.stages.reconstruct.test_optimise import SHAPES, WIDE, film, problem
 
 
-def doubted(confidence: np.ndarray, spacing_s: float = 0.5) -> assemble.Video:
-    """Return a ball that moves 3 cm a frame along x; where it is doubted, it is registered 2 m too high and turned round."""
+def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.Video:
+    """Return a ball that moves 3 cm a frame along x, two frames a second; where it is doubted, it is registered too high and turned round."""
     video = film("v002", len(confidence), True, np.random.default_rng(0), WIDE)
     root = rigid.make(np.eye(3), np.arange(len(confidence))[:, None] * np.array([0.03, 0, 0]))
-    wrong = rigid.exp(np.array([0, np.pi, 0, 0, 2.0, 0]))
-    root[confidence < 0.4] = root[confidence < 0.4] @ wrong
-    return dataclasses.replace(
-        video, timestamp_s=np.arange(len(confidence)) * spacing_s, world_from_agent=root, agent_confidence=confidence
-    )
+    root[confidence < 0.4] = root[confidence < 0.4] @ rigid.exp(np.array([0, np.pi, 0, 0, leap_m, 0]))
+    return dataclasses.replace(video, timestamp_s=np.arange(len(confidence)) * 0.5, world_from_agent=root, agent_confidence=confidence)
 
 
-def test_short_doubt_is_bridged_and_long_doubt_stays():
+def test_leaps_are_given_up_where_certain_roots_are_near():
     confidence = np.ones(12)
     confidence[[3, 4, 11]] = 0.1
-    root = assemble.believed_roots(doubted(confidence), Doubt(longest_gap_s=2.0))
-    np.testing.assert_allclose(root[:11, 0, 3], 0.03 * np.arange(11), atol=1e-9)
-    np.testing.assert_allclose(root[:11, 1, 3], 0, atol=1e-9)
-    assert root[11, 1, 3] == 2.0, "nothing believed comes after: what is registered is all there is"
+    root, kept = assemble.steadied(doubted(confidence), Doubt(longest_gap_s=2.0))
+    np.testing.assert_allclose(root[:11], rigid.make(np.eye(3), np.arange(11)[:, None] * np.array([0.03, 0, 0])), atol=1e-9)
+    assert np.flatnonzero(~kept).tolist() == [3, 4] and root[11, 1, 3] == 2.0, "nothing certain comes after frame 11"
+    assert assemble.steadied(doubted(confidence, 0.2), Doubt(longest_gap_s=2.0))[1].all(), "doubtful, but where the agent may be"
     confidence[2:9] = 0.1
-    assert (assemble.believed_roots(doubted(confidence), Doubt(longest_gap_s=2.0))[2:9, 1, 3] == 2.0).all()
+    assert assemble.steadied(doubted(confidence), Doubt(longest_gap_s=2.0))[1].all(), "the certain ones are 4 s apart"
     unknown = doubted(np.zeros(4))
     unknown.world_from_agent[:] = np.nan
-    assert np.isnan(assemble.believed_roots(unknown, Doubt())).all()
+    assert np.isnan(assemble.steadied(unknown, Doubt())[0]).all()
 
 
-def test_doubted_frames_hardly_count_and_the_joint_phase_leaves_them_out():
+def test_given_up_frames_hardly_count_and_the_joint_phase_leaves_them_out():
     confidence = np.ones(12)
     confidence[5] = 0.2
     _, videos = problem()
