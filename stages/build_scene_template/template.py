@@ -15,6 +15,9 @@ from pipeline.space.meshes import Mesh
 from pipeline.space.sparse import Sparse
 from stages.build_scene_template import anchor, fuse, refine, sfm
 
+LEAST_POINTS = 100
+"""measured points with a surface direction below which there is nothing to fuse"""
+
 
 @dataclass(frozen=True)
 class Template:
@@ -73,10 +76,12 @@ def build(
     normals = np.concatenate([(k.normals.reshape(-1, 3)[k.scan.pixel_index]) @ p[:3, :3].T for k, p in zip(keyframes, keys, strict=True)])
     points = np.concatenate([rigid.apply(p, k.scan.points_camera) for k, p in zip(keyframes, keys, strict=True)])
     known = np.abs(normals).sum(1) > 0
+    if known.sum() < LEAST_POINTS:
+        raise _no_surface(clip)
     upright_from_world, gravity = anchor.upright(clip, poses, points[known], normals[known])
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, fusion)
     if len(mesh.faces) < 100:
-        raise InputError("MAP-002", "depth fused to no surface", str(clip.folder), "check that the recording has LiDAR depth within 4 m")
+        raise _no_surface(clip)
     poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, fusion, weights)
     mesh = fuse.clean(fuse.fuse(clip, np.arange(len(clip)), poses, fusion), workspace, fusion.island_faces)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
@@ -94,6 +99,10 @@ def build(
         scale=clip.scale,
     )
     return made, sparse
+
+
+def _no_surface(clip: Clip) -> InputError:
+    return InputError("MAP-002", "depth fused to no surface", str(clip.folder), "check that the recording has LiDAR depth within 4 m")
 
 
 def floor_height(mesh: Mesh) -> float:

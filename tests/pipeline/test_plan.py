@@ -162,6 +162,17 @@ def test_a_new_session_does_not_touch_the_maps(house):
     assert not changed & {"scene_template.json", "agent_template.json", "frames.json", "video.v002.json", "masks.json"}
 
 
+def test_a_walkthrough_without_depth_is_told_metres_by_sessions_that_train(house):
+    for name in ("walkthrough.mp4", "turnaround.r3d", "a.r3d", "b.mp4", "c.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.plan", "plan", "toy")
+    told = {job["id"]: job for job in json.loads((house.folder / "build/toy/plan/dag.json").read_text())}
+    walk = told["frames.v000"]
+    assert walk["arguments"][walk["arguments"].index("--captures") + 1] == "captures/toy"
+    assert [key.rpartition("/")[2] for key in walk["keys"]] == ["frames.json", "video.v000.json", "video.v002.json"]
+    assert not [id for id, job in told.items() if "--captures" in job["arguments"] and id != "frames.v000"]
+
+
 def test_clicks_are_read_by_the_evaluation_alone(house):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
         house.write(f"captures/toy/{name}", name)

@@ -92,3 +92,9 @@ def test_meshes_come_back_and_damage_is_refused(tmp_path):
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-8])
     with pytest.raises(InputError, match="ART-020"):
         meshes.read_ply(tmp_path / "a.ply")
+
+
+def test_a_broken_mask_is_refused(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"not a picture")
+    with pytest.raises(InputError, match="CAP-021"):
+        images.read_gray(tmp_path / "a.png")

@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from pipeline.errors import InputError
 from pipeline.files import meshes as mesh_files
 from pipeline.space import ground, rigid, tsdf
 from pipeline.space.meshes import Mesh, RayCaster
@@ -98,6 +99,28 @@ def test_cleaning_drops_islands_and_keeps_colours(tmp_path):
     assert np.linalg.norm(cleaned.vertices - 0.9, axis=1).max() < 0.6, "the small sphere is gone"
     assert (cleaned.color == (200, 30, 90)).all()
     mesh_files.write_ply(tmp_path / "again.ply", Mesh(cleaned.vertices, cleaned.faces, cleaned.color))
+
+
+def test_a_cleaner_that_fails_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(fuse.sys, "executable", "/bin/false")
+    with pytest.raises(InputError, match="MAP-003"):
+        fuse.clean(textured_room(edge_m=0.5), tmp_path, island_faces=2)
+
+
+@pytest.mark.parametrize("code", ["MAP-001", "MAP-002"])
+def test_a_walk_that_shows_nothing_is_refused(code, tmp_path, monkeypatch):
+    """Nothing but darkness and no odometry; or odometry, and depth beyond reach."""
+    truth = walk(10)
+    dark = MemoryClip(RayCaster(textured_room(edge_m=0.5)), truth, None if code == "MAP-001" else truth, folder=tmp_path / "walk")
+    for frame in range(len(dark)):
+        far = np.where(dark.depth(frame) > 0, 4.9 if code == "MAP-002" else 0, 0).astype(np.float32)
+        dark.cache[frame] = np.zeros((*dark.color_size, 3), np.uint8), far
+    dark.write_color(tmp_path / "walk")
+    with pytest.raises(InputError, match=code):
+        template.build(
+            dark, np.zeros((len(dark), 4, 4, 2)), structure=STRUCTURE, believe=anchor.AnchorOptions(),
+            weights=refine.RefineOptions(rounds=1), fusion=fuse.FuseOptions(voxel_m=0.1), workspace=tmp_path, seed=0,
+        )  # fmt: skip
 
 
 def test_nothing_is_marked_seen_by_an_empty_volume():
