@@ -205,7 +205,8 @@ class Sampler:
             return lambda x, t: self.networks.body(x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0))
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
-        body = self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng)
+        pair = denoise(codes.full), denoise(codes.blind)
+        body = self._drawn(*pair, shape, sampling, sampling.sequence_steps, rng, spread=sampling.body_spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def goals_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
@@ -229,12 +230,15 @@ class Sampler:
         count: int,
         rng: np.random.Generator,
         correct: Callable[[Array], Array] | None = None,
+        spread: float | Array = 1.0,
     ) -> Array:
         def draw() -> Array:
             return rng.standard_normal(shape, dtype=np.float32)
 
         denoise = guided(full, blind, sampling.guidance)
-        x = sample(denoise, draw(), self.schedule, method=sampling.method, count=count, draw=draw, correct=correct)
+        x = sample(
+            denoise, (spread * draw()).astype(np.float32), self.schedule, method=sampling.method, count=count, draw=draw, correct=correct
+        )
         return x.astype(np.float32)
 
 

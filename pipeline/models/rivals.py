@@ -67,7 +67,7 @@ class GaussianSampler(Sampler):
         control = (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
         nothing = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         told = [self.networks.body(nothing, _step(nothing, t), codes.full, control, _kept(nothing, 1.0)) for t in (MEAN, SPREAD)]
-        return np.swapaxes(self._drawn_from(told, rng), 1, 2) * self.scaling.body_std + self.scaling.body_mean
+        return np.swapaxes(self._drawn_from(told, rng, sampling.body_spread), 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def _goal(self, codes: Codes) -> list[Array]:
         nothing = np.zeros((len(codes.full), 3), np.float32)
@@ -79,9 +79,9 @@ class GaussianSampler(Sampler):
         keep = _kept(nothing, float(sampling.goal))
         return [self.networks.path(nothing, _step(nothing, t), codes.full, control, keep) for t in (MEAN, SPREAD)]
 
-    def _drawn_from(self, told: list[Array], rng: np.random.Generator) -> Array:
+    def _drawn_from(self, told: list[Array], rng: np.random.Generator, spread: float = 1.0) -> Array:
         mean, log_std = told
-        return mean + np.exp(np.clip(log_std, *LOG_STD)) * rng.standard_normal(mean.shape, dtype=np.float32)
+        return mean + spread * np.exp(np.clip(log_std, *LOG_STD)) * rng.standard_normal(mean.shape, dtype=np.float32)
 
     def _metres(self, path: Array) -> Float[np.ndarray, "plan frame 3"]:
         return np.swapaxes(path * self.scaling.path_std, 1, 2)
@@ -118,7 +118,8 @@ class OneStageSampler(Sampler):
             return np.concatenate([self.paths_cleared(codes, x[:, :3]), x[:, 3:]], axis=1)
 
         shape = (len(codes.full), 3 + len(self.scaling.body_mean), frames)
-        return self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng, correct)
+        spread = np.array([1.0] * 3 + [sampling.body_spread] * len(self.scaling.body_mean))[:, None]
+        return self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng, correct, spread)
 
 
 def _step(x: Array, t: float) -> Array:

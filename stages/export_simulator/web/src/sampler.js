@@ -45,12 +45,13 @@ export class Sampler {
     return this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
   }
 
-  // A scaled body [channels, frames] along a scaled path.
+  // A scaled body [channels, frames] along a scaled path, drawn from fainter noise than goals and paths are.
   body(codes, path, { noise, steps, interactivity, method, draw }) {
     const denoise = (code) => (x, t) => this.networks.body({
       x: [x, [1, this.channels, this.frames]], ...this.step(1, t, code), control: [path, [1, 3, this.frames]], keep: [Float32Array.of(1), [1, 1]],
     });
-    return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity });
+    const faint = noise.map((value) => value * this.contract.sampling.body_spread);
+    return this.run(denoise(codes.full), denoise(codes.blind), faint, { method, count: steps, draw, interactivity });
   }
 
   step(count, t, code) {
