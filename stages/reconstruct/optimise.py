@@ -42,14 +42,14 @@ def optimise(problem: Problem, plan: Plan) -> dict[str, FitRecord]:
     """Run all phases; the modules of the problem change in place. Returns the losses of each phase."""
     steps, rates = plan.steps, plan.rates
     records = {}
-    records["template"] = _run(problem, plan, "template", TemplateLoss(problem), steps.template, _field_groups(problem.agent, rates))
-    scene = [*_field_groups(problem.scene, rates), _motion_group([problem.motion.camera], rates.camera, momentum=0.9)]
+    records["template"] = _run(problem, plan, "template", TemplateLoss(problem), steps.template, field_groups(problem.agent, rates))
+    scene = [*field_groups(problem.scene, rates), _motion_group([problem.motion.camera], rates.camera, momentum=0.9)]
     records["scene"] = _run(problem, plan, "scene", SceneLoss(problem, plan.weights, plan.batches, steps.scene), steps.scene, scene)
     if len(problem.agent_frames):
         for index, frame in enumerate(chunks(problem, steps.body_chunk_frames)):
             _pose_chunk(problem, plan, frame, f"body_{index:04d}")
         records["joint"] = _run(
-            problem, plan, "joint", JointLoss(problem, plan.weights, plan.batches, steps.joint), steps.joint, _joint_groups(problem, rates)
+            problem, plan, "joint", JointLoss(problem, plan.weights, plan.batches, steps.joint), steps.joint, joint_groups(problem, rates)
         )
     return records
 
@@ -113,8 +113,8 @@ class _Learned(nn.Module):
         self.root, self.bone = chunk.root, chunk.bone
 
 
-def _field_groups(field: nn.Module, rates: Rates) -> list[dict]:
-    """Grids learn fast; whatever is a network, the encoding too where it is one, learns like the heads."""
+def field_groups(field: nn.Module, rates: Rates) -> list[dict]:
+    """Return a field's parameters with their rates; grids learn fast, networks slowly, an encoding that is one too."""
     heads = [parameter for name, parameter in field.named_parameters() if not name.startswith("grid.levels.")]
     grid = [parameter for name, parameter in field.named_parameters() if name.startswith("grid.levels.")]
     return [
@@ -128,10 +128,11 @@ def _motion_group(parameters: list[nn.Parameter], rate: float, momentum: float =
     return {"params": parameters, "lr": rate, "weight_decay": 0.0, "betas": (momentum, 0.99)}
 
 
-def _joint_groups(problem: Problem, rates: Rates) -> list[dict]:
+def joint_groups(problem: Problem, rates: Rates) -> list[dict]:
+    """Return all that learns in the second phase, with its rates."""
     motion = problem.motion
     shares = ((problem.scene, 0.25), (problem.agent, rates.agent))
-    groups = [{**group, "lr": group["lr"] * share} for field, share in shares for group in _field_groups(field, rates)]
+    groups = [{**group, "lr": group["lr"] * share} for field, share in shares for group in field_groups(field, rates)]
     groups += [_motion_group([motion.camera], rates.camera * 0.3, momentum=0.9), _motion_group([motion.root, motion.bone], rates.motion)]
     return [*groups, {"params": list(problem.body.parameters()), "lr": rates.skin, "weight_decay": 0.0}]
 
