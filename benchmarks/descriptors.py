@@ -195,6 +195,7 @@ def main() -> None:
     parser.add_argument("build", type=Path, help="a build with a finished registration")
     parser.add_argument("--rgbd", type=Path, help="a folder of frames of the 7-Scenes kind")
     parser.add_argument("--pairs", type=int, default=24, help="pairs of views per set")
+    parser.add_argument("--descriptors", nargs="+", choices=DESCRIPTORS, default=list(DESCRIPTORS))
     given = parser.parse_args()
     sessions, sets = of_build(given.build, 12), {}
     if given.rgbd:
@@ -207,7 +208,7 @@ def main() -> None:
         return sessions[one][rng.integers(len(sessions[one]))], sessions[other][rng.integers(len(sessions[other]))]
 
     sets["between sessions"] = drawn(of_two_sessions, given.pairs)
-    for name, describe in DESCRIPTORS.items():
+    for name, describe in ((name, DESCRIPTORS[name]) for name in given.descriptors):
         begin = time.process_time()
         shares = {part: [round(raw, 3), round(reduced, 3)] for part, raw, reduced in compared(sets, describe)}
         counts = {part: len(pairs) for part, pairs in sets.items()}
