@@ -13,7 +13,8 @@ class Chapter:
     """what happened here, in plain words"""
     per_video: bool = False
     nobody_in: tuple[str, ...] = ()
-    """its pictures (names with *) that are drawn from numbers or show the animal alone: no person or home can be in them"""
+    """its pictures (names with *) that are drawn from numbers or show the animal alone: nobody, and no more of the
+    home than its outline, can be in them"""
 
 
 CHAPTERS = (
@@ -26,7 +27,7 @@ CHAPTERS = (
     Chapter("agent_template", "Shape of the animal", "The turnaround became a first body with 25 bones.", nobody_in=("*",)),
     Chapter("scene_localizer", "Finding the camera", "Views rendered from the map teach where a picture was taken.", nobody_in=("errors",)),
     Chapter("agent_localizer", "Finding the animal", "Views rendered from the body teach how the animal stands.", nobody_in=("*",)),
-    Chapter("video_poses", "Sessions on the map", "Each session's cameras and animal, placed on the map.", True, ("bird", "depth")),
+    Chapter("video_poses", "Sessions on the map", "Each session's cameras and animal, placed on the map.", True),
     Chapter("registration", "Registration", "All sessions together in one world; those that do not fit are named.", nobody_in=("*",)),
     Chapter(
         "reconstruction", "4D reconstruction", "Room, animal, bones and motion, fitted to all recordings at once.", nobody_in=("losses",)
