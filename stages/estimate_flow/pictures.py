@@ -41,7 +41,8 @@ def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "hei
         if certain.any():
             speed_px.append(float(np.linalg.norm(flow[certain].astype(np.float32), axis=-1).mean()))
     shown = np.unique(np.linspace(0, len(flows) - 1, SHOWN_FRAMES).astype(int))
-    strip = np.concatenate([_column(color(int(i)), flows[i], confidences[i]) for i in shown], axis=1)
+    columns = [_column(color(int(i)), flows[i], confidences[i]) for i in shown]
+    strip = np.concatenate([*columns, _key(len(columns[0]))], axis=1)
     return Review(gap, float(np.mean(agreement)), float(np.mean(speed_px)) if speed_px else 0.0, strip)
 
 
@@ -59,7 +60,9 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
         for each in reviews
     ] + [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
     pictures = [
-        qa.Picture(f"gap_{each.gap}", each.strip, f"frames, flow to {each.gap} later (hue = direction), dark where uncertain")
+        qa.Picture(
+            f"gap_{each.gap}", each.strip, f"frames, flow to {each.gap} later (hue = direction, as the disc shows), dark where uncertain"
+        )
         for each in reviews
         if each.strip is not None
     ]
@@ -79,6 +82,19 @@ def flow_wheel(flow: Float[np.ndarray, "height width 2"], full_px: float) -> UIn
     value = np.clip(np.linalg.norm(flow, axis=-1) / full_px, 0, 1) * 255
     hsv = np.stack([hue, np.full_like(hue, 220), value], axis=-1).astype(np.uint8)
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
+
+
+def _key(height: int, edge: int = 96) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw what the colours mean: the disc shows at each place the colour of motion towards it, brighter when faster."""
+    key = np.full((height, edge, 3), 255, np.uint8)
+    along = np.arange(edge) - (edge - 1) / 2
+    towards = np.stack(np.meshgrid(along, along), axis=-1)
+    radius = 0.42 * edge
+    inside = np.linalg.norm(towards, axis=-1) <= radius
+    top = max(height - edge, 0)
+    part = key[top : top + edge]
+    part[inside[: len(part)]] = flow_wheel(towards, radius)[: len(part)][inside[: len(part)]]
+    return key
 
 
 def _column(color: np.ndarray, flow: np.ndarray, confidence: np.ndarray) -> UInt8[np.ndarray, "height width 3"]:

@@ -103,6 +103,7 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
     checks = [
         qa.Check("duration", duration_s, "s", warn=5.0, better="higher"),
         qa.Check("frames", float(len(timestamp_s)), "", warn=50, fail=2, better="higher"),
+        qa.Check("frames a second", (len(timestamp_s) - 1) / max(duration_s, 1e-6), "Hz"),
         qa.Check("missing ticks", 100 * missing, "%", warn=20.0),
         qa.Check("dark frames", 100 * float((written.brightness < DARK).mean()), "%", warn=20.0),
         qa.Check("blurred frames", 100 * float((written.sharpness < 0.4 * median_sharpness).mean()), "%", warn=25.0),
