@@ -1,30 +1,47 @@
-// The room from above: a faint picture, where animal and observer have been, where they are and what comes next.
+// The room from above, turned as the view of the whole room is: a faint picture, where animal and observer have been,
+// where they are and what comes next.
 
 const CELLS = 72;
+const PAPER = [0xf5, 0xf2, 0xec]; // what the view draws where nothing is
 const COLORS = { animal: [200, 114, 43], observer: [47, 111, 159] };
 
 export class Minimap {
-  constructor(canvas, picture) {
-    this.canvas = canvas;
+  // heading: what is up on the map, radians from +z towards +x.
+  constructor(canvas, picture, heading) {
     this.pen = canvas.getContext('2d');
     this.center = picture.center;
-    this.half = picture.half * 1.06;
+    this.ahead = [Math.sin(heading), Math.cos(heading)];
+    this.turn = heading + Math.PI;
     this.size = canvas.width;
-    this.back = backdrop(picture, this.size, picture.half / this.half);
+    this.half = 1.06 * this.reach(picture);
+    this.back = backdrop(picture, this.size, picture.half / this.half, this.turn);
     this.heat = { animal: new Float32Array(CELLS * CELLS), observer: new Float32Array(CELLS * CELLS) };
     this.layers = { animal: heatLayer(), observer: heatLayer() };
     this.stale = true;
   }
 
+  // How far to the right and down on the map something is that lies x, z beside the centre.
+  turned(x, z) {
+    const [fx, fz] = this.ahead;
+    return [x * -fz + z * fx, -(x * fx + z * fz)];
+  }
+
   // World x, z to map pixels.
   pixel(x, z) {
     const scale = this.size / (2 * this.half);
-    return [(x - this.center[0]) * scale + this.size / 2, (z - this.center[1]) * scale + this.size / 2];
+    return this.turned(x - this.center[0], z - this.center[1]).map((value) => value * scale + this.size / 2);
   }
 
-  world(px, py) {
-    const scale = (2 * this.half) / this.size;
-    return [(px - this.size / 2) * scale + this.center[0], (py - this.size / 2) * scale + this.center[1]];
+  // How far the room goes on the turned map, metres from its middle.
+  reach({ pixels, half }) {
+    const side = Math.sqrt(pixels.length / 4);
+    let furthest = 0;
+    for (let i = 0; i < side * side; i++) {
+      if (isPaper(pixels, i)) continue;
+      const [x, z] = [i % side, side - 1 - Math.floor(i / side)].map((place) => ((place + 0.5) / side - 0.5) * 2 * half);
+      furthest = Math.max(furthest, ...this.turned(x, z).map(Math.abs));
+    }
+    return furthest || half;
   }
 
   visit(who, x, z, weight = 1) {
@@ -94,7 +111,7 @@ export class Minimap {
     const [px, py] = this.pixel(x, z);
     pen.save();
     pen.translate(px, py);
-    pen.rotate(-heading + Math.PI);
+    pen.rotate(this.turn + Math.PI - heading);
     pen.fillStyle = color;
     pen.strokeStyle = '#fff';
     pen.lineWidth = 2.5;
@@ -106,19 +123,23 @@ export class Minimap {
   }
 }
 
-function backdrop({ pixels, half }, size, share) {
+const isPaper = (pixels, i) => PAPER.every((value, channel) => Math.abs(pixels[4 * i + channel] - value) < 5);
+
+function backdrop({ pixels }, size, share, turn) {
   const side = Math.sqrt(pixels.length / 4);
   const raw = document.createElement('canvas');
   raw.width = raw.height = side;
   const image = new ImageData(side, side);
   for (let row = 0; row < side; row++) image.data.set(pixels.subarray((side - 1 - row) * side * 4, (side - row) * side * 4), row * side * 4);
+  for (let i = 0; i < side * side; i++) if (isPaper(image.data, i)) image.data[4 * i + 3] = 0;
   raw.getContext('2d').putImageData(image, 0, 0);
   const canvas = document.createElement('canvas');
   canvas.width = canvas.height = size;
-  const inset = (size * (1 - share)) / 2;
   const pen = canvas.getContext('2d');
   pen.filter = 'saturate(.45)';
-  pen.drawImage(raw, inset, inset, size * share, size * share);
+  pen.translate(size / 2, size / 2);
+  pen.rotate(turn);
+  pen.drawImage(raw, (-size * share) / 2, (-size * share) / 2, size * share, size * share);
   return canvas;
 }
 

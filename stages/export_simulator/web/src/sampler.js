@@ -95,13 +95,20 @@ export class Sampler {
     const scaled = question.aim ? this.leg(frame, question.aim) : dreamt;
     const commanded = Boolean(question.aim);
     const keepGoal = commanded ? 1 : question.keep.goal;
-    const tried = Math.min(CANDIDATES, question.samples);
-    const targets = commanded ? Float32Array.from({ length: 3 * tried }, (_, i) => scaled[i % 3]) : scaled.slice(0, 3 * tried);
-    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(3 * this.frames * tried) });
-    if (commanded) for (let i = 0; i < tried; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
+    const goals = this.goalsInWorld(frame, scaled);
+    const tried = commanded ? Array(Math.min(CANDIDATES, question.samples)).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
+    const targets = Float32Array.from(tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))));
+    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(3 * this.frames * tried.length) });
+    if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
     const path = paths.slice(3 * this.frames * best, 3 * this.frames * (best + 1));
-    return { goals: this.goalsInWorld(frame, scaled), chosen: commanded ? 0 : best, ...(await this.embodied(frame, codes, path, options)) };
+    return { goals, chosen: tried[best], ...(await this.embodied(frame, codes, path, options)) };
+  }
+
+  // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.
+  insideFirst(goals) {
+    const inside = goals.map((goal) => this.senses.allows(goal));
+    return goals.map((_, i) => i).sort((a, b) => inside[b] - inside[a] || a - b);
   }
 
   // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the animal's pace
