@@ -31,7 +31,7 @@ class Settings:
     """learning rate, metres and radians a step; falls to a tenth"""
     foot: float = 120.0
     """a standing foot stays where it stands on average"""
-    collision: float = 20.0
+    collision: float = 40.0
     """nothing is inside the scene"""
     contact: float = 0.02
     """contact vertices near the scene touch it"""

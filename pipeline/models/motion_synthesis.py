@@ -20,7 +20,7 @@ from pipeline.models.contacts import Contacts, tensors
 from pipeline.models.longterm import ROOT, PoseNet, RouteNet, Sizes, StaticBody
 from pipeline.models.motion_optimization import Physique
 from pipeline.models.plausibility import Judge
-from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, joined
+from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, eased, joined
 from pipeline.models.surroundings import Surroundings
 
 NETWORKS = ("static", "route", "pose")
@@ -137,7 +137,7 @@ class LongTerm:
     ) -> tuple[Moving, Moving]:
         """Return motion through a row of places, two seconds from one to the next, and the bodies at them."""
         bodies = self.bodies(world_from_agent, body, scene, rng)
-        return joined(self.short_motions(bodies[:-1], bodies[1:], scene, rng)), bodies
+        return eased(joined(self.short_motions(bodies[:-1], bodies[1:], scene, rng))), bodies
 
 
 def placed(channels: Float[Tensor, "body channel"], world_from_place: Float[np.ndarray, "body 4 4"], poses: PoseSpace) -> Moving:

@@ -1,7 +1,7 @@
 """Motion at 30 fps and its 2-second pieces, in which long-term motion is learned and made.
 
 `Moving` is a stretch of motion of one body; `resampled` brings a trajectory to 30 fps (spline on positions, slerp on
-rotations), `stretches` cuts it where frames are missing.
+rotations), `stretches` cuts it where frames are missing; `eased` smooths where short motions were `joined`.
 """
 
 from collections.abc import Sequence
@@ -40,6 +40,19 @@ def joined(parts: Sequence[Moving]) -> Moving:
     first, *rest = parts
     kept = [first, *(part[1:] for part in rest)]
     return Moving(np.concatenate([part.world_from_agent for part in kept]), np.concatenate([part.agent_from_bone for part in kept]))
+
+
+def eased(motion: Moving, every: int = STEPS, reach: int = 6) -> Moving:
+    """Take the snap out of the seams at every ``every``-th frame: the ``reach`` frames on both sides lead there evenly.
+
+    Each short motion ends in a body that was made without it, and turns to it within its last frames.
+    """
+    frame = np.arange(len(motion))
+    seam = np.clip(np.round(frame / every), 1, max(1, (len(motion) - 1) // every - 1)) * every
+    away = np.abs(frame - seam)
+    kept = np.flatnonzero((away == 0) | (away > reach))
+    bones = [_at(kept, motion.agent_from_bone[kept, bone], frame) for bone in range(motion.agent_from_bone.shape[1])]
+    return Moving(_at(kept, motion.world_from_agent[kept], frame), np.stack(bones, axis=1))
 
 
 def resampled(timestamp_s: Float[np.ndarray, "frame"], moving: Moving, rate_hz: float = RATE_HZ) -> Moving:
