@@ -47,8 +47,10 @@ def eased(motion: Moving, every: int = STEPS, reach: int = 6) -> Moving:
 
     Each short motion ends in a body that was made without it, and turns to it within its last frames.
     """
-    frame = np.arange(len(motion))
-    seam = np.clip(np.round(frame / every), 1, max(1, (len(motion) - 1) // every - 1)) * every
+    frame, last = np.arange(len(motion)), (len(motion) - 1) // every - 1
+    if last < 1:
+        return motion
+    seam = np.clip(np.round(frame / every), 1, last) * every
     away = np.abs(frame - seam)
     kept = np.flatnonzero((away == 0) | (away > reach))
     bones = [_at(kept, motion.agent_from_bone[kept, bone], frame) for bone in range(motion.agent_from_bone.shape[1])]
