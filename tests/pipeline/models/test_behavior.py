@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,17 @@ def test_given_goal_and_path_replace_their_levels(ats, data):
     plan = ats.sampler.plan(observation, ats.sampling, np.random.default_rng(0), goal=goal, path=path)
     np.testing.assert_allclose(plan.goal, goal, atol=1e-6)
     np.testing.assert_allclose(plan.path, path, atol=1e-6)
+
+
+def test_bodies_spread_as_far_as_they_are_told(ats, data):
+    context, _ = data.windows(np.array([0]))
+    codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), ats.sampling, 40)
+    path = np.tile(np.linspace(0, 1, 56)[None, :, None] * [0.3, 0.0, 0.7], (40, 1, 1))
+    spread = [
+        ats.sampler.bodies(codes, path, replace(ats.sampling, body_spread=told), np.random.default_rng(0)).std(0).mean()
+        for told in (0.0, 0.3, 1.0)
+    ]
+    assert spread[0] < 1e-6 < spread[1] < spread[2]
 
 
 def test_predictors_share_one_call(ats, data):
