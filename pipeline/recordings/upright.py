@@ -12,6 +12,8 @@ ROLL = 4.0
 """what a mean squared sine of roll counts against a share of level surface"""
 MARGIN = 0.15
 """by which the best of the four directions must be ahead of the others"""
+SIDE_PX = 200
+"""longer side that depth is thinned to: directions over fewer pixels than that are noise"""
 LEAST_POINTS = 100
 """points with a surface direction that the room must show"""
 
@@ -45,7 +47,9 @@ def up_from_room(
     seen = np.linspace(0, len(odometry_from_camera) - 1, len(views)).round().astype(int)
     normals = []
     for (depth, intrinsics), odometry in zip(views, odometry_from_camera[seen], strict=True):
-        normal = surface.image_normals(depth, intrinsics)
+        step = max(1, max(depth.shape) // SIDE_PX)
+        thinned = depth[step // 2 :: step, step // 2 :: step]
+        normal = surface.image_normals(thinned, cameras.scale_intrinsics(intrinsics, depth.shape, thinned.shape))
         normals.append(normal[np.abs(normal).sum(-1) > 0][::5] @ odometry[:3, :3].T)
     towards_camera = np.concatenate(normals)
     if len(towards_camera) < LEAST_POINTS:
