@@ -31,6 +31,9 @@ from pipeline.space import rigid
 
 ROOT_CHANNELS = 6
 """the body's leading channels: the root's rotation in the ego frame, its first two columns"""
+PATH_NOISE = 0.3
+"""standard deviation of the tremble of drawn paths, in scaled numbers: what is left then speeds up and slows down as much
+as recorded paths do (measured on a session kept from training)"""
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,8 @@ class Scaling:
     path_std: Float[np.ndarray, "3 56"]
     body_mean: Float[np.ndarray, "channel"]
     body_std: Float[np.ndarray, "channel"]
+    path_smoother: Float[np.ndarray, "3 56 56"]
+    """keeps of a scaled path what recorded paths vary by; see `smoother_from_paths`"""
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,16 @@ class BehaviorNets(nn.Module):
             case _:
                 assert_never(a.control)
         self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
+
+
+def smoother_from_paths(scaled: Float[np.ndarray, "window 3 frame"], noise: float = PATH_NOISE) -> Float[np.ndarray, "3 frame frame"]:
+    """Return per axis the linear map that best recovers recorded paths from themselves and white noise (Wiener's filter).
+
+    Denoisers leave a tremble that animals do not have, in frequencies in which recorded paths hardly vary; the map takes
+    away those and leaves the others. ``noise`` is the tremble's standard deviation.
+    """
+    moments = np.einsum("nct,ncs->cts", scaled, scaled) / len(scaled)
+    return moments @ np.linalg.inv(moments + noise**2 * np.eye(scaled.shape[-1]))
 
 
 def channels_from_bones(

@@ -193,7 +193,7 @@ class Sampler:
         pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
         shape = len(goal), *self.scaling.path_std.shape
         path = self._drawn(*pair, shape, sampling, sampling.sequence_steps, rng, lambda x: self.paths_cleared(codes, x))
-        return np.swapaxes(path * self.scaling.path_std, 1, 2)
+        return self.paths_finished(codes, path)
 
     def bodies(
         self, codes: Codes, path: Float[np.ndarray, "plan 56 3"], sampling: Sampling, rng: np.random.Generator
@@ -220,6 +220,11 @@ class Sampler:
         if codes.ground is None:
             return scaled
         return np.swapaxes(codes.ground.cleared(np.swapaxes(scaled * self.scaling.path_std, 1, 2)), 1, 2) / self.scaling.path_std
+
+    def paths_finished(self, codes: Codes, scaled: Float[np.ndarray, "plan 3 frame"]) -> Float[np.ndarray, "plan frame 3"]:
+        """Take the tremble out of scaled paths, keep them where the agent may be, and return them in metres."""
+        calm = np.einsum("cts,ncs->nct", self.scaling.path_smoother, scaled).astype(np.float32)
+        return np.swapaxes(self.paths_cleared(codes, calm) * self.scaling.path_std, 1, 2)
 
     def _drawn(
         self,

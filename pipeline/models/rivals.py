@@ -58,7 +58,7 @@ class GaussianSampler(Sampler):
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to goals."""
-        return self._metres(self.paths_cleared(codes, self._drawn_from(self._path(codes, goal, sampling), rng)))
+        return self.paths_finished(codes, self._drawn_from(self._path(codes, goal, sampling), rng))
 
     def bodies(
         self, codes: Codes, path: Float[np.ndarray, "plan frame 3"], sampling: Sampling, rng: np.random.Generator
@@ -95,7 +95,7 @@ class OneStageSampler(Sampler):
         """Draw plans. A given goal or path cannot steer a model without stages."""
         assert goal is None and path is None, "a one-stage model takes no goal and no path"
         whole = self._whole(codes, sampling, rng)
-        path = np.swapaxes(whole[:, :3] * self.scaling.path_std, 1, 2)
+        path = self.paths_finished(codes, whole[:, :3])
         body = np.swapaxes(whole[:, 3:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
         return Plan(path[:, -1], path, body)
 
@@ -105,7 +105,7 @@ class OneStageSampler(Sampler):
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw whole plans and keep where they end."""
-        return (self._whole(codes, sampling, rng)[:, :3] * self.scaling.path_std)[..., -1]
+        return self.paths_finished(codes, self._whole(codes, sampling, rng)[:, :3])[:, -1]
 
     def _whole(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Array:
         frames = self.scaling.path_std.shape[1]

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import convolve1d
 from torch import Tensor
 
-from pipeline.models.behavior import Architecture, Scaling, channels_from_bones
+from pipeline.models.behavior import Architecture, Scaling, channels_from_bones, smoother_from_paths
 from pipeline.models.perception import FeatureVolume, Minds, grid_points_ego, world_from_ego
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, BehaviorData
@@ -178,7 +178,7 @@ def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
     whole = body_statistics(tracks.rotation[:, PAST:], windows.bones[rows[:, PAST:].unique()], turn_rad)
-    scaling = Scaling(path_std[:, -1], path_std, *whole)
+    scaling = Scaling(path_std[:, -1], path_std, *whole, smoother_from_paths(np.swapaxes(future, 1, 2) / path_std))
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
     position = tracks.root[:, :PAST].std().clip(0.05).expand(3)
     return Statistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))

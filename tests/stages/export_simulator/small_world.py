@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from pipeline.files import arrays, meshes
-from pipeline.models.behavior import Architecture, BehaviorNets, Scaling
+from pipeline.models.behavior import Architecture, BehaviorNets, Scaling, smoother_from_paths
 from pipeline.models.diffusion import Schedule, noised
 from pipeline.models.trajectories import FUTURE, BehaviorData, Trajectory
 from pipeline.space import rigid
@@ -110,7 +110,8 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
     channels = architecture.body_channels
     mean = np.zeros(channels)
     mean[[0, 4]] = 1.0
-    return nets, Scaling(np.ones(3), path_std, mean, np.full(channels, 0.05))
+    straight = np.random.default_rng(0).standard_normal((200, 3, 1)) * grow
+    return nets, Scaling(np.ones(3), path_std, mean, np.full(channels, 0.05), smoother_from_paths(straight))
 
 
 def _teach_paths(nets: BehaviorNets, architecture: Architecture, schedule: Schedule, steps: int = 100) -> None:

@@ -22,9 +22,14 @@ EFFORT = Effort(samples=4, trials=2, stride=20, plan_trials=1, plan_stride=30, s
 QUICK = Sampling(goal_steps=2, sequence_steps=2)
 
 
+def as_drawn(frames: int) -> np.ndarray:
+    """Return a smoother that takes nothing away."""
+    return np.tile(np.eye(frames), (3, 1, 1))
+
+
 def untrained(architecture):
     channels = architecture.body_channels
-    scaling = Scaling(np.ones(3), np.ones((3, architecture.future)), np.zeros(channels), np.ones(channels))
+    scaling = Scaling(np.ones(3), np.ones((3, architecture.future)), np.zeros(channels), np.ones(channels), as_drawn(architecture.future))
     sampler = rivals.sampler_of(architecture, TorchNetworks(BehaviorNets(architecture)), STANDARD, scaling)
     return Ats(sampler, Scenes.of(room()), REST, architecture.ego, QUICK)
 
@@ -113,7 +118,7 @@ def test_a_gaussian_draws_what_its_networks_tell():
         def path(self, x, t, condition, control, keep):
             return np.broadcast_to(control[:, :, None], x.shape) if t[0] == rivals.MEAN else np.full_like(x, -9)
 
-    sampler = rivals.GaussianSampler(Told(), STANDARD, Scaling(np.full(3, 3.0), np.ones((3, 56)), np.zeros(6), np.ones(6)))
+    sampler = rivals.GaussianSampler(Told(), STANDARD, Scaling(np.full(3, 3.0), np.ones((3, 56)), np.zeros(6), np.ones(6), as_drawn(56)))
     codes = sampler.codes(behavior_observation(), Sampling(), 4000)
     goals = sampler.goals(codes, Sampling(), np.random.default_rng(0))
     np.testing.assert_allclose([goals.mean(), goals.std()], [6, 1.5], rtol=0.03)

@@ -27,6 +27,7 @@ def simulator():
         np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
         mean,
         np.full(channels, 0.05),
+        np.tile(np.eye(56), (3, 1, 1)),
     )
     volume = room()
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)

@@ -36,13 +36,21 @@ export class Sampler {
 
   // Scaled paths [3, frames] towards scaled goals. The reference of the guidance sees neither observer nor goal,
   // but a goal that the visitor has set is not taken away.
-  paths(codes, goals, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
+  async paths(codes, goals, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) => this.networks.path({
       x: [x, [count, 3, this.frames]], ...this.step(count, t, code),
       control: [goals, [count, 3]], keep: [new Float32Array(count).fill(keep), [count, 1]],
     });
-    return this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
+    const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
+    return this.calm(drawn);
+  }
+
+  // Scaled paths without the tremble that recorded ones do not have.
+  calm(paths) {
+    const { path_smoother: smoother } = this.contract.scaling;
+    const place = (row, i) => smoother[row % 3][i].reduce((sum, weight, j) => sum + weight * paths[row * this.frames + j], 0);
+    return paths.map((_, at) => place(Math.floor(at / this.frames), at % this.frames));
   }
 
   // A scaled body [channels, frames] along a scaled path, drawn from fainter noise than goals and paths are.
