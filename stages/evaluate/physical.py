@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from pipeline import figures as drawing
 from pipeline.files import meshes
@@ -105,6 +106,9 @@ def _drawn(found: Mapping[str, Sequence[Plausibility]]) -> UInt8[np.ndarray, "he
             share, told = np.arange(1, len(values) + 1) / max(len(values), 1), f"{np.median(values):.1f}" if len(values) else "none"
             axes.step(values, share, dash, color=color, where="post", label=f"{KINDS[kind]}, median {told}")
         axes.set(xscale="log", xlabel=label, ylabel="share of windows", ylim=(0, 1.02))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=8)
     return drawing.pixels(figure)
