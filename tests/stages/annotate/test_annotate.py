@@ -42,7 +42,9 @@ def running(room, path):
 def folders(room, registration) -> Folders:
     frames = {id: room.build / "frames" / id for id in ("v000", "v001")}
     nowhere = room.build / "none"
-    return Folders(frames, {}, {}, room.build / "scene_template", *[nowhere] * 2, registration, *[nowhere] * 4, truth=None)
+    unread = dict.fromkeys(("agent_template", "reconstruction", "scene_localizer", "splats", "behavior_data", "behavior"), nowhere)
+    template = room.build / "scene_template"
+    return Folders(frames=frames, masks={}, flow={}, scene_template=template, registration=registration, truth=None, **unread)
 
 
 def click(page, view: str, pixel) -> None:
