@@ -13,7 +13,7 @@ from jaxtyping import Int
 
 from pipeline.files.clips import Clip
 from pipeline.progress import log
-from pipeline.space import rigid
+from pipeline.space import colmap, rigid
 from pipeline.space.sparse import Sparse, sparse_from_model
 from stages.build_scene_template.matches import ConfirmOptions, confirm
 
@@ -86,42 +86,17 @@ def choose_pairs(clip: Clip, keyframes: Int[np.ndarray, "key"], options: SfmOpti
 
 def reconstruct(clip: Clip, options: SfmOptions, workspace: Path, seed: int) -> Sparse | None:
     """Run COLMAP on the keyframes in an empty workspace; None when no model has at least three of them."""
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    pycolmap.set_random_seed(seed)
+    colmap.seed_everything(seed)
     keyframes = choose_keyframes(clip, options)
     names = [f"{frame:06d}.jpg" for frame in keyframes]
     database, pictures = workspace / "database.db", clip.folder / "color"
-    _extract(clip, names, database, pictures, options)
-    listing = workspace / "pairs.txt"
-    listing.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in choose_pairs(clip, keyframes, options)))
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=listing)
-    pycolmap.match_image_pairs(database, matching, pairing, verification, device=pycolmap.Device.cpu)
+    sift = {"max_num_features": options.features, "first_octave": options.first_octave, "peak_threshold": options.peak_threshold}
+    colmap.extract(database, pictures, names, colmap.pinhole(np.median(clip.intrinsics, axis=0)), sift)
+    colmap.match(database, ((names[a], names[b]) for a, b in choose_pairs(clip, keyframes, options)), seed)
     kept, pairs = confirm(clip, database, options.confirm, np.random.default_rng(seed))
     log(f"depth confirms {kept} of {pairs} matched pairs of {len(keyframes)} keyframes")
-    mapping = pycolmap.IncrementalPipelineOptions(
-        num_threads=1, random_seed=seed, ba_refine_focal_length=False, ba_refine_extra_params=False
-    )
-    mapping.mapper.num_threads, mapping.mapper.random_seed, mapping.triangulation.random_seed = 1, seed, seed
-    mapping.mapper.abs_pose_refine_focal_length = False
-    mapping.mapper.init_min_tri_angle = 6.0
-    mapping.mapper.abs_pose_min_num_inliers = 20
-    mapping.ba_global_frames_ratio = mapping.ba_global_points_ratio = 1.3
-    models = pycolmap.incremental_mapping(database, pictures, workspace, mapping)
+    models = pycolmap.incremental_mapping(database, pictures, workspace, colmap.mapping_options(seed))
     if not models:
         return None
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     return sparse_from_model(largest) if largest.num_reg_images() >= 3 else None
-
-
-def _extract(clip, names, database, pictures, options):
-    intrinsics = np.median(clip.intrinsics, axis=0)
-    parameters = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=",".join(f"{value:.6f}" for value in parameters))
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
-    extraction.sift.max_num_features = options.features
-    extraction.sift.first_octave = options.first_octave
-    extraction.sift.peak_threshold = options.peak_threshold
-    pycolmap.extract_features(database, pictures, names, pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu)

@@ -14,6 +14,7 @@ import pycolmap
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.progress import log
+from pipeline.space import colmap
 from pipeline.space.sparse import Sparse, sparse_from_model
 
 
@@ -96,26 +97,19 @@ def solve(
     pictures: Path, names: list[str], intrinsics: Float[np.ndarray, "3 3"] | None, options: StructureOptions, workspace: Path, seed: int
 ) -> Structure | None:
     """Pose the pictures ``names`` (six digits, in time order); None where no model of enough of them comes out."""
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    pycolmap.set_random_seed(seed)
+    colmap.seed_everything(seed)
     database = workspace / "database.db"
-    _extract(pictures, names, intrinsics, options, database)
-    listing = workspace / "pairs.txt"
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", default_focal_length_factor=options.focal_share)
+    sift = {"max_num_features": options.features, "peak_threshold": options.peak_threshold}
+    colmap.extract(database, pictures, names, reader if intrinsics is None else colmap.pinhole(intrinsics), sift)
     pairs = _pairs(_descriptors(database, names), options, seed)
-    listing.write_text("".join(f"{names[first]} {names[second]}\n" for first, second in pairs))
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    pycolmap.match_image_pairs(
-        database,
-        pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False),
-        pycolmap.ImportedPairingOptions(match_list_path=listing),
-        verification,
-        device=pycolmap.Device.cpu,
-    )
+    colmap.match(database, ((names[first], names[second]) for first, second in pairs), seed)
     if _telling(database) < options.least_telling:
         log("between none of the pictures the camera moves sideways: it turns on the spot")
         return None
-    models = pycolmap.incremental_mapping(database, pictures, workspace, _mapping(intrinsics is None, options, seed))
+    mapping = colmap.mapping_options(seed, calibrate=intrinsics is None)
+    mapping.min_model_size = options.least_keyframes
+    models = pycolmap.incremental_mapping(database, pictures, workspace, mapping)
     sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     log(f"COLMAP: {len(pairs)} pairs of {len(names)} keyframes; models of {sizes or 'no'} pictures")
     if not sizes or sizes[0] < options.least_keyframes:
@@ -124,34 +118,6 @@ def solve(
     camera = next(iter(largest.cameras.values()))
     radial = float(camera.params[3]) if intrinsics is None else 0.0
     return Structure(sparse_from_model(largest), camera.calibration_matrix(), radial, len(sizes))
-
-
-def _extract(pictures, names, intrinsics, options, database):
-    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", default_focal_length_factor=options.focal_share)
-    if intrinsics is not None:
-        told = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-        reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=",".join(f"{value:.6f}" for value in told))
-    extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
-    extraction.sift.max_num_features = options.features
-    extraction.sift.peak_threshold = options.peak_threshold
-    pycolmap.extract_features(database, pictures, names, pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu)
-
-
-def _mapping(calibrate: bool, options: StructureOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    mapping = pycolmap.IncrementalPipelineOptions(
-        num_threads=1,
-        random_seed=seed,
-        min_model_size=options.least_keyframes,
-        ba_refine_focal_length=calibrate,
-        ba_refine_extra_params=calibrate,
-        ba_global_frames_ratio=1.3,
-        ba_global_points_ratio=1.3,
-    )
-    mapping.mapper.num_threads, mapping.mapper.random_seed, mapping.triangulation.random_seed = 1, seed, seed
-    mapping.mapper.abs_pose_refine_focal_length = mapping.mapper.abs_pose_refine_extra_params = calibrate
-    mapping.mapper.init_min_tri_angle = 6.0
-    mapping.mapper.abs_pose_min_num_inliers = 20
-    return mapping
 
 
 def _telling(database: Path) -> float:
