@@ -120,20 +120,14 @@ def _report(
     for method, of_method in scores.items():
         for name in SCORES:
             if name in of_method:
-                _put(figures, f"behavior/{method}/{name}", interval(of_method[name]))
+                figures.put_mean(f"behavior/{method}/{name}", interval(of_method[name]))
             else:
                 figures.skip([f"behavior/{method}/{name}"], "this method predicts goals only")
     for rival in RIVALS:
         for name in SCORES:
             if name in scores[rival]:
                 difference = interval(scores[OURS][name] - scores[rival][name])
-                _put(figures, f"behavior/{OURS}_minus_{rival}/{name}", difference)
-
-
-def _put(figures: Figures, name: str, interval: Interval) -> None:
-    figures.put(name, interval.mean)
-    figures.put(f"{name}_ci95_low", interval.low)
-    figures.put(f"{name}_ci95_high", interval.high)
+                figures.put_mean(f"behavior/{OURS}_minus_{rival}/{name}", difference)
 
 
 def _names() -> list[str]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import UInt8
 
+from pipeline.models.intervals import Interval
+
 
 @dataclass(frozen=True)
 class Figures:
@@ -26,10 +28,20 @@ class Figures:
         else:
             self.skip([name], why_unknown)
 
+    def put_mean(self, name: str, interval: Interval) -> None:
+        """Record a mean with the bounds of its 95 % interval."""
+        for end, value in (("", interval.mean), ("_ci95_low", interval.low), ("_ci95_high", interval.high)):
+            self.put(name + end, value)
+
     def skip(self, names: Iterable[str], reason: str) -> None:
         """Record figures that do not apply."""
         for name in names:
             self.values[name], self.reasons[name] = None, reason
+
+    def add_as(self, variant: str, other: "Figures", stage: str) -> None:
+        """Take over the figures of one variant: ``<stage>/<figure>`` becomes ``<variant>/<figure>``."""
+        for there, here in ((other.values, self.values), (other.reasons, self.reasons)):
+            here.update({name.replace(stage, variant, 1): value for name, value in there.items()})
 
     def add(self, other: "Figures") -> None:
         """Take over another room's figures; what is measured there needs no reason any more."""
@@ -40,6 +52,11 @@ class Figures:
         self.reasons.update(other.reasons)
         self.pictures.update(other.pictures)
         self.charts.update(other.charts)
+
+
+def told(value: float | None, form: str = ".3f") -> str:
+    """Write a figure for a table; ``-`` where there is none."""
+    return "-" if value is None else format(value, form)
 
 
 def median(errors: np.ndarray) -> float:

@@ -11,7 +11,7 @@ from pipeline.models.intervals import bootstrapped, episodes
 from pipeline.qa import Check
 from pipeline.videos import Video
 from stages.evaluate import heldout, reading, reconstruction, surfaces
-from stages.evaluate.figures import Figures
+from stages.evaluate.figures import Figures, told
 from stages.evaluate.heldout import PARTS, View
 from stages.evaluate.reading import Reconstructed
 from stages.evaluate.registration import root_figures
@@ -76,8 +76,7 @@ def figures(
         one.add(root_figures("reconstruction", [reconstruction.root_errors(motions[each.video.id], each, frames) for each in sessions]))
         followed = reconstruction.track_distances(here, sessions, motions, of_role["turnaround"][0], frames)
         one.add(surfaces.track_figures(followed))
-        for there, target in ((one.values, found.values), (one.reasons, found.reasons)):
-            target.update({name.replace("reconstruction", variant, 1): value for name, value in there.items()})
+        found.add_as(variant, one, "reconstruction")
         right[variant] = np.array([_depth_acc(view) for view in views])
         if views:
             found.pictures[variant] = heldout.side_by_side(views)
@@ -109,9 +108,7 @@ def _compare(found: Figures, variant: str, lacking: Float[np.ndarray, "view part
             continue
         episode = episodes(seen, np.zeros(len(seen), int), effort.episode_frames)
         interval = bootstrapped(lacking[seen, column], episode, effort.bootstrap_draws, rng)
-        name = f"{variant}/depth_acc_{part}_less_than_ours"
-        for end, value in (("", interval.mean), ("_ci95_low", interval.low), ("_ci95_high", interval.high)):
-            found.put(name + end, value)
+        found.put_mean(f"{variant}/depth_acc_{part}_less_than_ours", interval)
 
 
 def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
@@ -123,21 +120,17 @@ def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
         row = f"{NAMES.get(variant, variant):34}"
         for kind in COLUMNS:
             form = ".1f" if kind == "psnr" else ".3f"
-            row += f"{' / '.join(_told(values.get(f'{variant}/{kind}_{part}'), form) for part in PARTS):>24}"
-        lacking = [_told(values.get(f"{variant}/depth_acc_all_less_than_ours{end}")) for end in ("", "_ci95_low", "_ci95_high")]
+            row += f"{' / '.join(told(values.get(f'{variant}/{kind}_{part}'), form) for part in PARTS):>24}"
+        lacking = [told(values.get(f"{variant}/depth_acc_all_less_than_ours{end}")) for end in ("", "_ci95_low", "_ci95_high")]
         row += f"{'' if variant == 'ours' else f'{lacking[0]} [{lacking[1]}, {lacking[2]}]':>28}"
-        root = _told(values.get(f"{variant}/agent_root_m_median")), _told(values.get(f"{variant}/agent_root_deg_median"), ".1f")
-        tracks = (_told(values.get(f"{variant}/agent_track_m_{which}")) for which in ("median", "p90"))
+        root = told(values.get(f"{variant}/agent_root_m_median")), told(values.get(f"{variant}/agent_root_deg_median"), ".1f")
+        tracks = (told(values.get(f"{variant}/agent_track_m_{which}")) for which in ("median", "p90"))
         row += f"{' / '.join(root):>18}{' / '.join(tracks):>18}"
         lines.append(row + f"{' / '.join(f'{value:g}' for value in PAPER.get(variant, ())):>24}")
     lines.append(
         "paper: DepthAcc on its own cat; tracks: median / 90th percentile; '-': nothing could be measured. Same steps and seed for all."
     )
     return "\n".join(lines) + "\n"
-
-
-def _told(value: float | None, form: str = ".3f") -> str:
-    return "-" if value is None else format(value, form)
 
 
 def pictures(found: Figures) -> dict[str, tuple[UInt8[np.ndarray, "height width 3"], str]]:

@@ -13,7 +13,7 @@ from pipeline.qa import Check
 from pipeline.videos import Video
 from stages.evaluate import registration
 from stages.evaluate.alignment import PoseErrors, constant_between, joined, pose_errors
-from stages.evaluate.figures import Figures, median
+from stages.evaluate.figures import Figures, median, told
 from stages.evaluate.reading import read_registration
 from stages.evaluate.truth import Truth
 
@@ -73,8 +73,7 @@ def figures(
         for id, error in named.items():
             for unit in UNITS:
                 found.put(f"{variant}/{id}/{unit}_median", median(getattr(error, UNITS[unit])), registration.REFUSED)
-        for there, here in ((one.values, found.values), (one.reasons, found.reasons)):
-            here.update({name.replace("registration", variant, 1): value for name, value in there.items()})
+        found.add_as(variant, one, "registration")
     for variant in folders:
         if variant != "ours":
             _compare(found, variant, sessions, errors, resampling)
@@ -91,8 +90,7 @@ def _compare(found, variant, sessions, errors, resampling):
         for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
             theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
             interval = bootstrapped(theirs - ours, episodes(start, video, 1), resampling.draws, resampling.rng)
-            for end, value in (("", interval.mean), ("_ci95_low", interval.low), ("_ci95_high", interval.high)):
-                found.put(f"{name}/{unit}_more_than_ours{end}", value)
+            found.put_mean(f"{name}/{unit}_more_than_ours", interval)
 
 
 def _sessions(frames, videos, scene_template, truth) -> list[_Session]:
@@ -121,31 +119,27 @@ def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
         f"{'':34}{'rotation, deg':>20}{'translation, m':>20}{'videos':>9}{'to ours, deg':>28}{'paper':>16}",
     ]
     for variant in variants:
-        pairs = ["; ".join(_told(values.get(f"{variant}/{unit}_{which}")) for which in ("median", "p95")) for unit in UNITS]
-        videos = "/".join(_told(values.get(f"{variant}/videos_{which}"), "g") for which in ("registered", "total"))
+        pairs = ["; ".join(told(values.get(f"{variant}/{unit}_{which}")) for which in ("median", "p95")) for unit in UNITS]
+        videos = "/".join(told(values.get(f"{variant}/videos_{which}"), "g") for which in ("registered", "total"))
         against = "" if variant == "ours" else _interval(values, f"{variant}/rotation_deg_more_than_ours", ".3f")
         paper = "{:g} / {:g}".format(*PAPER[variant]) if variant in PAPER else ""
         lines.append(f"{NAMES.get(variant, variant):34}{pairs[0]:>20}{pairs[1]:>20}{videos:>9}{against:>28}{paper:>16}")
     sessions = sorted({name.split("/")[1] for name in values if name.count("/") == 2})
     lines += ["", f"{'per session: median deg':34}" + "".join(f"{id:>26}" for id in sessions)] if sessions else []
     for variant in variants if sessions else ():
-        told = "".join(f"{_told(values.get(f'{variant}/{id}/rotation_deg_median')):>26}" for id in sessions)
-        lines.append(f"{NAMES.get(variant, variant):34}{told}")
+        row = "".join(f"{told(values.get(f'{variant}/{id}/rotation_deg_median')):>26}" for id in sessions)
+        lines.append(f"{NAMES.get(variant, variant):34}{row}")
     lines += ["", "per session: mean difference to ours, mm"] if sessions else []
     for variant in [each for each in variants if each != "ours"] if sessions else ():
-        told = "".join(f"{_interval(values, f'{variant}/{id}/translation_m_more_than_ours', '.1f', 1000):>26}" for id in sessions)
-        lines.append(f"{NAMES.get(variant, variant):34}{told}")
+        row = "".join(f"{_interval(values, f'{variant}/{id}/translation_m_more_than_ours', '.1f', 1000):>26}" for id in sessions)
+        lines.append(f"{NAMES.get(variant, variant):34}{row}")
     lines.append("paper: its own cat videos, degrees / metres; '-': more than half (a twentieth) of the frames has no pose.")
     return "\n".join(lines) + "\n"
 
 
 def _interval(values: Mapping[str, float | None], name: str, form: str, scale: float = 1.0) -> str:
     mean, low, high = (None if values.get(name + end) is None else scale * values[name + end] for end in ("", "_ci95_low", "_ci95_high"))
-    return f"{_told(mean, form)} [{_told(low, form)}, {_told(high, form)}]"
-
-
-def _told(value: float | None, form: str = ".3f") -> str:
-    return "-" if value is None else format(value, form)
+    return f"{told(mean, form)} [{told(low, form)}, {told(high, form)}]"
 
 
 def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:
