@@ -11,7 +11,7 @@ endif
 
 PYTHON := .venv/bin/python
 PLAN   := $(PYTHON) -SE -m pipeline.plan
-RUN    := $(PYTHON) -SE -m pipeline.run
+RUN    := $(PYTHON) -SE -m pipeline.run $(if $(PROCESSES),--processes $(PROCESSES))
 AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 

@@ -68,6 +68,8 @@ class Node:
     """What a scheduler reserves; not a limit."""
     resumable: bool = False
     """Owns a folder for checkpoints that survives a kill."""
+    shared: bool = False
+    """Several processes, each with a GPU of its own, can do it together."""
     beside: tuple[str, ...] = ()
     """Files in the capture folder that it reads where they exist, each as `--<stem>`."""
     sidecars: tuple[str, ...] = ()
@@ -108,7 +110,7 @@ FLOW: tuple[Node, ...] = (
     Node("reconstruction", "reconstruct",
          ("registration", *merging("frames", roles=VIEWED), *merging("masks", "flow", "features"),
           "scene_template", "agent_template"),
-         sees=("heldout",), threads=2, gpu=1, memory_mb=6000, resumable=True),
+         sees=("heldout",), threads=2, gpu=1, memory_mb=6000, resumable=True, shared=True),
     Node("splats", "refine_gaussians",
          ("reconstruction", *merging("frames", roles=VIEWED), *merging("masks", "flow")),
          gpu=1, memory_mb=6000, resumable=True),

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline import progress
+from pipeline import progress, together
 
 KEEP = 3
 BROKEN_IN_A_ROW = 3
@@ -54,6 +54,7 @@ def fit(
     label: str = "fit",
     clip_norm: float | None = None,
     after_step: Callable[[int], None] | None = None,
+    shared: bool = False,
 ) -> FitRecord:
     """Minimise ``loss(step, generator)`` for ``steps`` steps, from the newest checkpoint in ``resume`` if there is one.
 
@@ -61,33 +62,39 @@ def fit(
     scalar or named, weighted, scalar terms. ``schedule`` maps progress 0..1 to a factor on each group's rate.
     Steps whose loss or gradient is not finite are skipped; three in a row fall back to the last checkpoint at
     half the rate, and the second such fall ends the run (exit 76, ``diagnosis.json`` in ``resume``).
+    With ``shared``, all processes of `pipeline.together` minimise the mean of their losses; the first keeps checkpoints.
     """
-    loop = _Loop(dict(modules), optimizer, resume)
+    shared = shared and together.size() > 1
+    loop = _Loop(dict(modules), optimizer, resume, shared)
     loop.restore()
+    loss = together.shared(modules, loss) if shared else loss
     with _termination() as asked_to_stop:
         for _ in progress.track(loop.until(steps), label, total=steps - loop.step):
             if not loop.advance(loss, steps, seed, schedule, clip_norm):
                 continue
             if after_step:
                 after_step(loop.step - 1)
-            if resume and (loop.step % save_every == 0 or asked_to_stop()):
+            stop = loop.anywhere(asked_to_stop())
+            if resume and (loop.step % save_every == 0 or stop):
                 loop.save()
-            if asked_to_stop():
+            if stop:
                 progress.log(f"{label}: stopped at step {loop.step}" + (", saved" if resume else ""))
                 sys.exit(EXIT_SAVED)
     return FitRecord({name: np.asarray(values, np.float32) for name, values in loop.terms.items()}, loop.rolled_back)
 
 
-def generator_for(seed: int, step: int, device: str = "cpu") -> torch.Generator:
-    """Return the generator of one step, a pure function of (seed, step)."""
-    return torch.Generator(device).manual_seed(int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> np.uint64(1)))
+def generator_for(seed: int, step: int, rank: int = 0) -> torch.Generator:
+    """Return the generator of one step, a pure function of (seed, step) and of the process, where there are several."""
+    seeds = np.random.SeedSequence([seed, step, rank] if rank else [seed, step])
+    return torch.Generator().manual_seed(int(seeds.generate_state(1, np.uint64)[0] >> np.uint64(1)))
 
 
 class _Loop:
     """The state of a run: modules, optimiser, step, losses so far; knows how to save and restore itself."""
 
-    def __init__(self, modules: dict[str, torch.nn.Module], optimizer: torch.optim.Optimizer, folder: Path | None):
-        self.modules, self.optimizer, self.folder = modules, optimizer, folder
+    def __init__(self, modules: dict[str, torch.nn.Module], optimizer: torch.optim.Optimizer, folder: Path | None, shared: bool):
+        self.modules, self.optimizer, self.folder, self.shared = modules, optimizer, folder, shared
+        self.rank = together.rank() if shared else 0
         self.step, self.rate, self.rolled_back, self.broken = 0, 1.0, 0, 0
         self.terms: dict[str, list[float]] = {}
         self.base_rates = [group["lr"] for group in optimizer.param_groups]
@@ -103,7 +110,7 @@ class _Loop:
         factor = self.rate * (schedule(self.step / max(steps, 1)) if schedule else 1.0)
         for group, base in zip(self.optimizer.param_groups, self.base_rates, strict=True):
             group["lr"] = base * factor
-        generator = generator_for(seed, self.step)
+        generator = generator_for(seed, self.step, self.rank)
         torch.manual_seed(generator.initial_seed())
         terms = loss(self.step, generator)
         terms = {"loss": terms} if isinstance(terms, Tensor) else terms
@@ -112,28 +119,38 @@ class _Loop:
         total.backward()
         parameters = [p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
         norm = torch.nn.utils.clip_grad_norm_(parameters, clip_norm or math.inf)
-        if torch.isfinite(norm) and torch.isfinite(total):
+        told = self._told(terms)
+        if torch.isfinite(norm) and math.isfinite(sum(told.values())):
             self.optimizer.step()
             self.broken = 0
         else:
             self.broken += 1
             if self.broken >= BROKEN_IN_A_ROW:
-                self._fall_back(terms, float(norm))
+                self._fall_back(told, float(norm))
                 return False
-        for name, value in terms.items():
-            values = self.terms.setdefault(name, [math.nan] * self.step)
-            values.append(float(value.detach()) if self.broken == 0 else math.nan)
+        for name, value in told.items():
+            self.terms.setdefault(name, [math.nan] * self.step).append(value if self.broken == 0 else math.nan)
         self.step += 1
         return True
 
-    def _fall_back(self, terms: Mapping[str, Tensor], norm: float) -> None:
+    def _told(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
+        """Return the terms as numbers; the mean of all processes'."""
+        values = torch.stack([value.detach().float() for value in terms.values()])
+        values = together.total(values) / together.size() if self.shared else values
+        return dict(zip(terms, values.tolist(), strict=True))
+
+    def anywhere(self, here: bool) -> bool:
+        """Tell whether something is so in any of the processes."""
+        return bool(together.total(torch.tensor(float(here)))) if self.shared else here
+
+    def _fall_back(self, told: Mapping[str, float], norm: float) -> None:
         diagnosis = {
             "step": self.step,
             "gradient_norm": repr(norm),
-            "terms": {name: repr(float(value.detach())) for name, value in terms.items()},
+            "terms": {name: repr(value) for name, value in told.items()},
         }
         if self.rolled_back >= 1:
-            if self.folder:
+            if self.folder and self.rank == 0:
                 (self.folder / "diagnosis.json").write_text(json.dumps(diagnosis, indent=2) + "\n")
             progress.log(f"the loss is not finite and did not recover at half the rate: {json.dumps(diagnosis)}")
             sys.exit(EXIT_DIVERGED)
@@ -164,7 +181,9 @@ class _Loop:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def save(self) -> None:
-        """Write a checkpoint by temp file, fsync and rename; keep the newest three."""
+        """Write a checkpoint by temp file, fsync and rename; keep the newest three. Of several processes, the first does."""
+        if self.rank:
+            return
         temp = self.folder / f".step.tmp.{os.getpid()}"
         with open(temp, "wb") as file:
             torch.save(self._state(), file)
@@ -175,12 +194,21 @@ class _Loop:
             old.unlink()
 
     def restore(self) -> None:
-        """Load the newest checkpoint that can be read; start over when there is none."""
+        """Load the newest checkpoint that can be read; start over when there is none. Of several processes, the first goes first."""
         if self.folder is None:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        for dead in self.folder.glob(".step.tmp.*"):
-            dead.unlink()
+        if self.rank == 0:
+            self._restore()
+        if self.shared:
+            together.wait()
+        if self.rank:
+            self._restore()
+
+    def _restore(self) -> None:
+        if self.rank == 0:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for dead in self.folder.glob(".step.tmp.*"):
+                dead.unlink()
         for path in self._checkpoints():
             try:
                 state = torch.load(path, weights_only=True, map_location="cpu")

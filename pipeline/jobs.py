@@ -86,6 +86,7 @@ class Job:
     gpu: int
     memory_mb: int
     resumable: bool
+    shared: bool
     aside: bool
 
     @property
@@ -196,6 +197,7 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
         gpu=node.gpu,
         memory_mb=node.memory_mb,
         resumable=node.resumable,
+        shared=node.shared,
         aside=node.aside,
     )
 

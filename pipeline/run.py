@@ -1,12 +1,13 @@
 """The runner: do one job so that its artifact is complete or absent. What Make, Snakemake and schedulers call.
 
-    python -SE -m pipeline.run HOME JOB      for example `toy masks.v002`
+    python -SE -m pipeline.run [--processes N] HOME JOB      for example `toy masks.v002`
 
 lock -> key -> unchanged? refresh the stamp -> clean up after the dead -> run the stage program, which publishes
 atomically -> record -> stamp. Exit codes: the stage's own (2 bad input, 75 stopped but resumable, 76 diverged),
-128 + n when signal n ended it. Standard library only.
+128 + n when signal n ended it. With --processes, what several can do together they do (torchrun). Standard library only.
 """
 
+import argparse
 import errno
 import json
 import os
@@ -38,7 +39,7 @@ EXPLAINED = {
 }
 
 
-def run(home: str, job_id: str) -> int:
+def run(home: str, job_id: str, together: int = 1) -> int:
     """Do the job if anything that decides its artifact has changed; return the exit code."""
     job = _job(home, job_id)
     out, stamp = Path(job["out"]), Path(job["stamp"])
@@ -52,7 +53,7 @@ def run(home: str, job_id: str) -> int:
         if made is None or made.key != key or redo.exists():
             if redo.exists() or _other_key(resume, key):
                 shutil.rmtree(resume, ignore_errors=True)
-            code = _do(job, key, resume)
+            code = _do(job, key, resume, together)
             if code:
                 return code
         stamp.touch()
@@ -95,7 +96,7 @@ def _other_key(resume: Path, key: str) -> bool:
         return True
 
 
-def _do(job: dict[str, Any], key: str, resume: Path) -> int:
+def _do(job: dict[str, Any], key: str, resume: Path, together: int) -> int:
     """Run the stage program and, if its artifact stands, record how it went."""
     out = Path(job["out"])
     if not Path("stages", *job["stage"].split("."), "__main__.py").is_file():
@@ -110,7 +111,8 @@ def _do(job: dict[str, Any], key: str, resume: Path) -> int:
         arguments += ["--resume", str(resume)]
     _say(job["id"], f"begins ({job['place']})")
     start = time.time()
-    code, peak_mb = _spawn(job, [sys.executable, "-m", f"stages.{job['stage']}", *arguments])
+    several = ["torch.distributed.run", "--standalone", f"--nproc-per-node={together}", "-m"] if job["shared"] and together > 1 else []
+    code, peak_mb = _spawn(job, [sys.executable, "-m", *several, f"stages.{job['stage']}", *arguments])
     seconds = time.time() - start
     if code:
         _say(job["id"], EXPLAINED.get(code, f"failed with exit code {code}"))
@@ -214,20 +216,20 @@ def _commit() -> str | None:
 
 def main(arguments: list[str]) -> int:
     """Run the command line of the runner; returns its exit code."""
-    if len(arguments) != 2:
-        print(__doc__, file=sys.stderr)
-        return 2
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("home")
+    parser.add_argument("job")
+    given = parser.parse_args(arguments)
     try:
-        return run(*arguments)
+        return run(given.home, given.job, given.processes)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        print(
-            f"error: {InputError('SYS-001', 'the disk is full', arguments[1], 'free some space and run the same again')}", file=sys.stderr
-        )
+        print(f"error: {InputError('SYS-001', 'the disk is full', given.job, 'free some space and run the same again')}", file=sys.stderr)
         return 2
 
 

@@ -18,7 +18,7 @@ FRONTS = sorted((ROOT / "stages").rglob("__main__.py"))
 FLOORS = (
     {"errors"},
     {"space"},
-    {"files", "models", "videos", "progress", "processes"},
+    {"files", "models", "videos", "progress", "processes", "together"},
     {"recordings"},
     {"fit"},
     {"artifact", "config", "dag", "qa"},

@@ -8,7 +8,7 @@ turnaround; then extracts surfaces, skin, motion per video and the scene's featu
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline import cli, progress
+from pipeline import cli, progress, together
 from pipeline.models.fields import Reconstruction
 from stages.reconstruct import assemble, fuse, optimise, pictures, reading, results, writing
 from stages.reconstruct.assemble import Shapes
@@ -51,9 +51,9 @@ class Config:
 def run(task: cli.Task) -> None:
     """Reconstruct one agent's recordings."""
     config: Config = task.config
-    names = ("frames", "masks", "flow", "features")
+    together.join(task.device)
     roles = {"frames": ("walkthrough", "turnaround", "session")}
-    per_video = {name: task.per_video(name, roles.get(name)) for name in names}
+    per_video = {name: task.per_video(name, roles.get(name)) for name in ("frames", "masks", "flow", "features")}
     folders = reading.Folders(**per_video, **{name: task.input(name) for name in ("registration", "scene_template", "agent_template")})
     by_role = {video.role: video.id for video in task.videos}
     twice = [video.synchronized_with for video in task.videos if video.role == "heldout"] if config.sessions == "filmed_twice" else None
@@ -63,6 +63,8 @@ def run(task: cli.Task) -> None:
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(problem.store.scene)} scene rays, {len(problem.store.agent)} agent rays")
     plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, task.resume)
     records = optimise.optimise(problem, plan)
+    if not together.leave():
+        return
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
     motions = results.motions(problem, videos, config.longest_gap_s)
     sessions = [video.id for video in videos if video.camera_free]

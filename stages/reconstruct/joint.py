@@ -38,7 +38,7 @@ class JointLoss:
         terms |= body.prior_terms(problem, pose, problem.motion.bone[frame], self.run_frames, self.weights)
         terms |= rendered_terms(problem, pose, max(1, batches.rendered_rays // len(frame)), probability, self.weights, generator)
         terms |= field_terms(problem, self.weights, generator) | drift_term(problem.motion, self.weights)
-        return losses.weighted(terms)
+        return losses.weighted(terms, shared=True)
 
 
 def rendered_terms(problem: Problem, pose: Pose, number: int, probability: float, weights: Weights, generator: Generator) -> Terms:
@@ -145,5 +145,6 @@ class TemplateLoss:
                 "distance": (1.0, ((values.signed_distance - surface.distance[index]) / body.REACH_M).abs()),
                 "color": (20.0, losses.color(values.color, surface.color[index])[close]),
                 "feature": (0.3, losses.feature(values.feature, surface.feature[index])[close]),
-            }
+            },
+            shared=True,
         )

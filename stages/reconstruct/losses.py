@@ -5,9 +5,12 @@ Weights stand in the stage's configuration; `weighted` is the one place where lo
 
 from collections.abc import Mapping
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
+
+from pipeline import together
 
 
 def truncated_distance(found_m: Float[Tensor, "*point"], target_m: Float[Tensor, "*point"], limit_m: float) -> Float[Tensor, "*point"]:
@@ -46,6 +49,11 @@ def eikonal(distance: Float[Tensor, "point"], beside: Float[Tensor, "3 point"], 
     return (((beside - distance) / step_m).square().sum(0).clamp_min(1e-8).sqrt() - 1).square()
 
 
-def weighted(terms: Mapping[str, tuple[float, Tensor]]) -> dict[str, Tensor]:
-    """Average each term over its elements and weigh it; terms without elements vanish."""
-    return {name: weight * (values.mean() if values.numel() else values.sum()) for name, (weight, values) in terms.items()}
+def weighted(terms: Mapping[str, tuple[float, Tensor]], shared: bool = False) -> dict[str, Tensor]:
+    """Average each term over its elements and weigh it; terms without elements vanish.
+
+    With ``shared``, the elements of all processes count (`pipeline.together`), whose gradients will be averaged.
+    """
+    counts = torch.tensor([float(values.numel()) for _, values in terms.values()])
+    counts = (together.total(counts).clamp_min(1) / together.size() if shared else counts.clamp_min(1)).tolist()
+    return {name: weight * (values.sum() / count) for (name, (weight, values)), count in zip(terms.items(), counts, strict=True)}

@@ -5,13 +5,14 @@ Each phase is one call of `pipeline.fit.fit` with its own checkpoints, so that a
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import nn
 
+from pipeline import together
 from pipeline.fit import FitRecord, fit
 from stages.reconstruct.body import ChunkLoss
 from stages.reconstruct.joint import JointLoss, TemplateLoss
@@ -39,15 +40,24 @@ def cosine(progress: float) -> float:
 
 
 def optimise(problem: Problem, plan: Plan) -> dict[str, FitRecord]:
-    """Run all phases; the modules of the problem change in place. Returns the losses of each phase."""
-    steps, rates = plan.steps, plan.rates
+    """Run all phases; the modules of the problem change in place. Returns the losses of each phase.
+
+    Several processes (`pipeline.together`) share the videos: each looks at its own ones' rays, and poses the template in them.
+    """
+    steps, rates, everything = plan.steps, plan.rates, problem
+    if together.size() > 1:
+        problem = problem.share(together.rank(), together.size())
+        plan = replace(plan, batches=plan.batches.share(together.size()))
     records = {}
     records["template"] = _run(problem, plan, "template", TemplateLoss(problem), steps.template, field_groups(problem.agent, rates))
     scene = [*field_groups(problem.scene, rates), _motion_group([problem.motion.camera], rates.camera, momentum=0.9)]
     records["scene"] = _run(problem, plan, "scene", SceneLoss(problem, plan.weights, plan.batches, steps.scene), steps.scene, scene)
-    if len(problem.agent_frames):
-        for index, frame in enumerate(chunks(problem, steps.body_chunk_frames)):
-            _pose_chunk(problem, plan, frame, f"body_{index:04d}")
+    if len(everything.agent_frames):
+        for index, frame in enumerate(chunks(everything, steps.body_chunk_frames)):
+            if torch.isin(frame, problem.agent_frames).any():
+                _pose_chunk(problem, plan, frame, f"body_{index:04d}")
+        for corrections in (problem.motion.root, problem.motion.bone):
+            corrections.data.copy_(together.total(corrections))
         records["joint"] = _run(
             problem, plan, "joint", JointLoss(problem, plan.weights, plan.batches, steps.joint), steps.joint, joint_groups(problem, rates)
         )
@@ -75,6 +85,7 @@ def _run(problem: Problem, plan: Plan, name: str, loss, steps: int, groups: list
         schedule=cosine,
         label=name,
         clip_norm=10.0,
+        shared=True,
     )
 
 

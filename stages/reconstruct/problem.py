@@ -1,7 +1,7 @@
 """What is being reconstructed: measurements, fields, body, motion, and which frame belongs to which video."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Generator, Tensor, nn
 
+from pipeline.errors import InputError
 from pipeline.models.fields import Body, Field
 from pipeline.models.motion import MotionTable
 from pipeline.space.meshes import Mesh
@@ -43,6 +44,31 @@ class Problem:
     def modules(self) -> dict[str, nn.Module]:
         """Return everything that learns, by name."""
         return {"scene": self.scene, "agent": self.agent, "body": self.body, "motion": self.motion}
+
+    def share(self, rank: int, size: int) -> "Problem":
+        """Return the same problem with the measurements of one process's videos alone; the longest are dealt out first.
+
+        Raises `InputError` RCN-002 where a process would get no video in which the agent is seen.
+        """
+        frames = torch.bincount(self.video)
+        with_agent = torch.bincount(self.video[self.agent_frames], minlength=len(frames)) > 0
+        with_scene = torch.bincount(self.video[self.has_scene], minlength=len(frames)) > 0
+        order = sorted(range(len(frames)), key=lambda video: (not (with_agent & with_scene)[video], -int(frames[video])))
+        if int((with_agent & with_scene).sum()) < size:
+            raise InputError(
+                "RCN-002",
+                what=f"{size} processes, but fewer recordings that show the agent in its home",
+                where="PROCESSES",
+                remedy="take fewer processes",
+            )
+        own = torch.isin(self.video, torch.tensor(order[rank::size], device=self.device))
+        scene, agent = (rays.at(torch.nonzero(own[rays.frame])[:, 0]) for rays in (self.store.scene, self.store.agent))
+        return replace(
+            self,
+            store=Store(scene, agent, self.store.views),
+            agent_frames=self.agent_frames[own[self.agent_frames]],
+            agent_rays=RaysByFrame.of(agent, len(self.video)),
+        )
 
     def runs(self, length: int) -> Int[Tensor, "run"]:
         """Return first frames of stretches of usable frames of one video that are trusted, as far as any is."""

@@ -136,7 +136,8 @@ class SceneLoss:
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
         return losses.weighted(
             self.terms(self.batches.scene_rays, swap_probability(step / self.steps, self.batches), generator)
-            | drift_term(self.problem.motion, self.weights)
+            | drift_term(self.problem.motion, self.weights),
+            shared=True,
         )
 
     def terms(self, number: int, probability: float, generator: Generator) -> Terms:

@@ -1,6 +1,6 @@
 """The numbers that steer the reconstruction, grouped as its modules use them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,11 @@ class Batches:
     """how often a ray takes another video's code as a phase begins (scene annealing)"""
     swap_last: float = 0.05
     """and as it ends"""
+
+    def share(self, size: int) -> "Batches":
+        """Return what one of ``size`` processes looks at."""
+        counts = ("scene_rays", "joint_scene_rays", "rendered_rays", "runs")
+        return replace(self, **{name: -(-getattr(self, name) // size) for name in counts})
 
 
 @dataclass(frozen=True)
