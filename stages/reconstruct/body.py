@@ -87,7 +87,7 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
         inside_picture = ((pixel >= 0) & (pixel <= views.size_px[pose.frame, None])).all(-1)
         in_view = inside_picture & (depth > 0.1)
         hidden = (measured > 0) & (measured < depth - MARGIN_M)
-    outside_m = outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None]
+    outside_m = functional.relu(outside_px) * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None]
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int8, UInt8
+from jaxtyping import Bool, Float, Float16, Int, Int8, UInt8
 from numpy.random import Generator
 from torch import Tensor
 from torch.nn import functional
@@ -22,6 +22,8 @@ from pipeline.space import cameras
 AGENT, UNKNOWN, NOT_AGENT = 255, 128, 0
 THUMBNAIL = 4
 """colour pixels along the edge of a thumbnail's pixel"""
+FAR_PX = 255.0
+"""distances from the mask saturate here"""
 SEEN_M = (0.15, 5.0)
 """depth outside this range is not trusted"""
 
@@ -69,8 +71,8 @@ class Views:
     """width and height of the picture, colour pixels"""
     depth: Float[Tensor, "frame height width"]
     """metres, half precision; 0 = unknown"""
-    outside_px: UInt8[Tensor, "frame height width"]
-    """colour pixels from the agent's mask, 255 = farther or no mask"""
+    outside_px: Float[Tensor, "frame height width"]
+    """colour pixels outside the agent's mask, negative inside, half precision; `FAR_PX` = farther or no mask"""
     agent_seen: Bool[Tensor, "frame"]
     """the mask of this frame can be trusted"""
 
@@ -128,8 +130,8 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
         if seen:
             agent.append(reader.read(_choose(near, sampling.agent_per_frame, rng), rng))
         small = tuple(size // THUMBNAIL for size in mask.shape)
-        depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float16))
-        outsides.append(_distance_outside(mask, small) if seen else np.full(small, 255, np.uint8))
+        depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16))
+        outsides.append(distance_outside(mask, small) if seen else np.full(small, FAR_PX, np.float16))
     visible = source.masks.visible if source.masks is not None else np.zeros(len(source.clip), bool)
     views = Views(
         torch.from_numpy(source.clip.intrinsics).float(),
@@ -156,7 +158,7 @@ def join(stores: Sequence[Store]) -> Store:
 def _padded(views: Views, height: int, width: int) -> Views:
     """Widen thumbnails to the right and below with unknown depth and no mask: recordings may be upright or wide."""
     edge = (0, width - views.depth.shape[2], 0, height - views.depth.shape[1])
-    return replace(views, depth=functional.pad(views.depth, edge), outside_px=functional.pad(views.outside_px, edge, value=255))
+    return replace(views, depth=functional.pad(views.depth, edge), outside_px=functional.pad(views.outside_px, edge, value=FAR_PX))
 
 
 def _shift(rays: Rays, start: int) -> Rays:
@@ -204,10 +206,18 @@ def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np
     return cv2.dilate((mask == AGENT).astype(np.uint8), kernel) > 0
 
 
-def _distance_outside(mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
-    outside = cv2.resize((mask == NOT_AGENT).astype(np.uint8), small[::-1], interpolation=cv2.INTER_NEAREST)
-    distance = cv2.distanceTransform(outside, cv2.DIST_L2, 3) * THUMBNAIL
-    return np.minimum(distance, 255).astype(np.uint8)
+def distance_outside(mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]) -> Float16[np.ndarray, "small_height small_width"]:
+    """Return how many colour pixels the middles of a thumbnail's pixels lie outside the mask's edge, negative inside.
+
+    The edge runs between pixels. It is found at full resolution; the thumbnail averages a distance, not labels.
+    """
+    outside = (mask == NOT_AGENT).astype(np.uint8)
+    if outside.all():
+        return np.full(small, FAR_PX, np.float16)
+    beyond, within = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (outside, 1 - outside))
+    signed = np.where(outside, beyond - 0.5, 0.5 - within)
+    height, width = (size * THUMBNAIL for size in small)
+    return cv2.resize(np.clip(signed[:height, :width], -FAR_PX, FAR_PX), small[::-1], interpolation=cv2.INTER_AREA).astype(np.float16)
 
 
 def _choose(allowed: Bool[np.ndarray, "height width"], count: int, rng: Generator) -> Int[np.ndarray, "ray 2"]:

@@ -56,10 +56,10 @@ def read(recording: Recording, frame: int, size: tuple[int, int], device: str) -
     color = cv2.resize(clip.color(frame), small, interpolation=cv2.INTER_AREA)
     depth = clip.depth(frame)
     depth = np.where((clip.confidence(frame) > 0) & (depth < 5), depth, 0)
-    depth = cv2.resize(depth, small, interpolation=cv2.INTER_NEAREST)
+    depth = cv2.resize(depth, small, interpolation=cv2.INTER_NEAREST_EXACT)
     mask = np.zeros(size, np.uint8)
     if recording.masks is not None:
-        mask = cv2.resize(recording.masks[frame], small, interpolation=cv2.INTER_NEAREST)
+        mask = cv2.resize(recording.masks[frame], small, interpolation=cv2.INTER_NEAREST_EXACT)
     flow = confidence = None
     if recording.flow is not None and frame < len(recording.flow):
         scale = np.array([size[1] / clip.color_size[1], size[0] / clip.color_size[0]])

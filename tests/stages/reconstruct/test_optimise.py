@@ -76,7 +76,7 @@ def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
     views = Views(
         torch.from_numpy(intrinsics).float().repeat(frames, 1, 1), torch.tensor([width * 4.0, height * 4.0]).repeat(frames, 1),
         torch.from_numpy(np.stack(depths)).half(),
-        torch.from_numpy(np.stack(outside)).byte(), torch.ones(frames, dtype=torch.bool),
+        torch.from_numpy(np.stack(outside)).half(), torch.ones(frames, dtype=torch.bool),
     )  # fmt: skip
     return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
 

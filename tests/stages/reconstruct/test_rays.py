@@ -1,0 +1,22 @@
+"""What is read of pictures stands where it was seen."""
+
+import numpy as np
+import pytest
+
+from stages.reconstruct.rays import AGENT, FAR_PX, NOT_AGENT, THUMBNAIL, UNKNOWN, distance_outside
+
+
+@pytest.mark.parametrize(("radius_px", "label"), [(9.0, AGENT), (25.0, AGENT), (25.0, UNKNOWN)])
+def test_distance_from_the_mask_is_that_of_the_thumbnail_pixels_middle(radius_px, label):
+    height, width, centre = 80, 120, np.array([53.0, 37.0])
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    mask = np.where(np.hypot(x - centre[0], y - centre[1]) < radius_px, label, NOT_AGENT).astype(np.uint8)
+    found = distance_outside(mask, (height // THUMBNAIL, width // THUMBNAIL)).astype(float)
+    middle = np.stack(np.meshgrid(*((np.arange(size // THUMBNAIL) + 0.5) * THUMBNAIL for size in (width, height))), axis=-1)
+    true = np.linalg.norm(middle - centre, axis=-1) - radius_px
+    assert np.abs(found - true)[true > -0.5 * radius_px].max() < 1.0, "pixels are counted as in or out whole: below one pixel"
+    assert abs((found - true)[np.abs(true) < 6].mean()) < 0.1, "neither shifted nor eroded, pixels"
+
+
+def test_without_a_mask_everything_is_far():
+    assert (distance_outside(np.zeros((8, 8), np.uint8), (2, 2)) == FAR_PX).all()
