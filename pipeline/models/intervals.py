@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean, or a median, and its 95 % interval."""
+    """A mean, or a median, and its 95 % interval; NaN bounds where one episode alone tells nothing of others."""
 
     mean: float
     low: float
@@ -24,12 +24,14 @@ def bootstrapped(
     values: Float[np.ndarray, "window"], episode: Int[np.ndarray, "window"], draws: int, rng: np.random.Generator, *, median: bool = False
 ) -> Interval:
     """Resample episodes with replacement and return the mean, or the median, with its percentiles 2.5 and 97.5."""
+    middle = float(np.median(values) if median else values.mean())
     count = episode.max() + 1
+    if count < 2:
+        return Interval(middle, np.nan, np.nan)
     chosen = rng.integers(0, count, (draws, count))
     if median:
         parts = [values[episode == number] for number in range(count)]
         drawn = [np.median(np.concatenate([parts[number] for number in row])) for row in chosen]
     else:
         drawn = np.bincount(episode, values, count)[chosen].sum(1) / np.bincount(episode, minlength=count)[chosen].sum(1)
-    middle = float(np.median(values) if median else values.mean())
     return Interval(middle, *(float(bound) for bound in np.percentile(drawn, (2.5, 97.5))))

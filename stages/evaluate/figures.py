@@ -30,8 +30,9 @@ class Figures:
 
     def put_mean(self, name: str, interval: Interval) -> None:
         """Record a mean with the bounds of its 95 % interval."""
-        for end, value in (("", interval.mean), ("_ci95_low", interval.low), ("_ci95_high", interval.high)):
-            self.put(name + end, value)
+        self.put(name, interval.mean)
+        for end, value in (("_ci95_low", interval.low), ("_ci95_high", interval.high)):
+            self.put(name + end, value, "one episode alone tells nothing of others: no interval")
 
     def skip(self, names: Iterable[str], reason: str) -> None:
         """Record figures that do not apply."""

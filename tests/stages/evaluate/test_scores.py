@@ -230,3 +230,10 @@ def test_intervals_widen_when_windows_repeat_each_other():
     assert wide.low <= wide.mean <= wide.high
     skewed = bootstrapped(np.append(values, 1e6), np.append(blocks, 0), 500, np.random.default_rng(0), median=True)
     assert wide.low - 0.5 < skewed.low <= skewed.mean <= skewed.high < wide.high + 0.5
+
+
+def test_one_episode_alone_has_no_interval():
+    found = Figures()
+    found.put_mean("goal", bootstrapped(np.arange(5.0), np.zeros(5, int), 100, np.random.default_rng(0)))
+    assert found.values == {"goal": 2.0, "goal_ci95_low": None, "goal_ci95_high": None}
+    assert "one episode" in found.reasons["goal_ci95_low"]
