@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+BLOCK = 4096
+"""Patches of the bank that are compared at once: their table stays in the processor's cache."""
+
 
 @dataclass(frozen=True)
 class Bank:
@@ -20,10 +23,14 @@ class Bank:
     ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
         """Return the map's point under each query patch and how far to trust it, asking all patches or some."""
         descriptors, points = (self.descriptors, self.points_map) if part is None else (self.descriptors[part], self.points_map[part])
-        similarity = query @ descriptors.T
-        nearest = similarity.argmax(1)
-        weight = np.clip(similarity[np.arange(len(query)), nearest], 0.05, 1).astype(float)
-        return points[nearest].astype(float), weight**2
+        nearest, similarity = np.zeros(len(query), int), np.full(len(query), -np.inf, np.float32)
+        for first in range(0, len(descriptors), BLOCK):
+            table = query @ descriptors[first : first + BLOCK].T
+            best = table.argmax(1)
+            found = table[np.arange(len(query)), best]
+            nearest = np.where(found > similarity, best + first, nearest)
+            similarity = np.maximum(similarity, found)
+        return points[nearest].astype(float), np.clip(similarity, 0.05, 1).astype(float) ** 2
 
     def sectors(self, count: int) -> list[Int[np.ndarray, "part"]]:
         """Split the patches by the azimuth their view was taken from."""

@@ -52,6 +52,11 @@ class Roots:
     share: Float[np.ndarray, "frame"]
     """Visible area over the area in full view, 0..1."""
 
+    @staticmethod
+    def unseen(frames: int) -> "Roots":
+        """Return the roots of a recording in which no animal was looked for, or none was seen."""
+        return Roots(np.full((frames, 4, 4), np.nan), np.zeros(frames, bool), np.full(frames, np.nan), np.zeros(frames))
+
 
 def find_roots(
     clip: Clip,
@@ -64,10 +69,8 @@ def find_roots(
     rng: np.random.Generator,
 ) -> Roots:
     """Find the animal's root in every frame that shows it."""
-    body = bodies.make_body(mesh, options.fit, rng)
-    count = len(clip)
-    roots = np.full((count, 4, 4), np.nan)
-    cost, share, visible = np.full(count, np.nan), np.zeros(count), np.zeros(count, bool)
+    body, found = bodies.make_body(mesh, options.fit, rng), Roots.unseen(len(clip))
+    roots, visible, cost, share = found.world_from_agent, found.visible, found.cost_m, found.share
 
     def look(frame: int) -> Glimpse | None:
         return bodies.observe(clip, masks[frame], frame, world_from_camera[frame], body, ground, options.fit)
@@ -77,7 +80,7 @@ def find_roots(
         if (glimpse := look(frame)) is not None:
             candidates.append(_candidates(clip, glimpse, body, localizer, len(candidates), options))
     if not candidates:
-        return Roots(roots, visible, cost, share)
+        return found
     path = headings.choose(clip.timestamp_s, candidates, options.path)
     for candidate, chosen in track(list(zip(candidates, path, strict=True)), "refining the animal"):
         glimpse = look(candidate.frame)

@@ -45,11 +45,6 @@ class Alike:
     targets: Float[np.ndarray, "compared"]
     decoys: Float[np.ndarray, "decoy"]
 
-    @property
-    def usual(self) -> float | None:
-        """Median of the targets, None where nothing could be compared."""
-        return float(np.nanmedian(self.targets)) if np.isfinite(self.targets).any() else None
-
 
 def compare(
     clip: Clip,
@@ -84,18 +79,22 @@ def _wrong_twists(options, rng):
     return np.concatenate([turn * part[:, :1] * size * NEAR_RAD, step * part[:, 1:] * size * NEAR_M], axis=1)
 
 
+def looks_right(timestamp_s: Float[np.ndarray, "frame"], alike: Alike, options: ConfidenceOptions) -> Float[np.ndarray, "frame"]:
+    """Return how likely each frame shows the place where it is believed to be, by the pictures around it."""
+    known = np.isfinite(alike.targets)
+    targets = averaged(timestamp_s, timestamp_s[alike.frame[known]], alike.targets[known], options.bridge_s)
+    return right_place(targets, alike.decoys, options.attempts)
+
+
 def camera_confidence(
-    timestamp_s: Float[np.ndarray, "frame"],
     spread: Float[np.ndarray, "frame 6 6"],
-    alike: Alike,
+    looks: Float[np.ndarray, "frame"],
     anchored: Bool[np.ndarray, "frame"],
     options: ConfidenceOptions,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "frame"]:
     """Return P(camera within 2 deg and 5 cm): that it is held so firmly, times that it is the right place."""
-    known = np.isfinite(alike.targets)
-    targets = averaged(timestamp_s, timestamp_s[alike.frame[known]], alike.targets[known], options.bridge_s)
-    return near_probability(spread, rng) * right_place(targets, alike.decoys, options.attempts) * np.where(anchored, 1.0, options.adrift)
+    return near_probability(spread, rng) * looks * np.where(anchored, 1.0, options.adrift)
 
 
 def right_place(targets: Float[np.ndarray, "frame"], decoys: Float[np.ndarray, "decoy"], attempts: int) -> Float[np.ndarray, "frame"]:

@@ -56,7 +56,7 @@ def checks(found: Registered | Refused) -> list[Check]:
         Check("frame votes that agree", float(found.supports.mean()) if len(found.supports) else None, "share", 0.5, 0.25, "higher"),
         Check("depth against the template", float(np.nanmedian(found.aligned.gap_m) * 100), "cm, median", 2.5, 6.0),
         Check("static depth within 5 cm", float(np.median(found.aligned.fit)), "share", 0.6, 0.35, "higher"),
-        Check("likeness of frames and renderings", found.likeness, "correlation", 0.5, None, "higher"),
+        Check("likeness of frames and renderings", found.likeness, "share", 0.5, None, "higher"),
         Check("camera confidence", float(found.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(found.roots.visible.mean()), "share of frames", 0.4, None, "higher"),
     ]

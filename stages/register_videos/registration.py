@@ -17,7 +17,7 @@ from stages.register_videos import votes as voting
 from stages.register_videos.agent_roots import RootOptions, Roots, find_roots
 from stages.register_videos.alignment import Aligned, AlignOptions
 from stages.register_videos.body import Ground
-from stages.register_videos.confidence import ConfidenceOptions, agent_confidence, camera_confidence, compare
+from stages.register_videos.confidence import ConfidenceOptions, agent_confidence, camera_confidence, compare, looks_right
 from stages.register_videos.votes import VoteOptions, Votes
 
 
@@ -29,8 +29,11 @@ class GateOptions:
     """Median share of a frame's static depth that must lie within 5 cm of the template."""
     least_certainty: float = 0.5
     """Where not even `least_votes` of the agreeing votes have this probability, ..."""
-    least_likeness: float = 0.6
-    """... the frames must resemble their renderings by this correlation: flats of one house have the same shape."""
+    least_right: float = 0.3
+    """... this share of the frames must look more like their renderings than like renderings from wrong places: flats of one
+    house have the same shape. Right places have 0.6 and more, by lamplight and on a real kitchen too; repainted rooms at most
+    0.1.
+    """
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,8 @@ class Options:
     """When a recording is believed."""
     confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
     """How sure each frame's pose is."""
+    animal: bool = True
+    """False: cameras alone, for tables that compare nothing else."""
     root: RootOptions = field(default_factory=RootOptions)
     """How the animal is placed."""
 
@@ -78,8 +83,8 @@ class Registered:
     agent_confidence: Float[np.ndarray, "frame"]
     votes: Votes
     supports: Bool[np.ndarray, "vote"]
-    likeness: float | None
-    """Median correlation of frames with their rendering."""
+    likeness: float
+    """Share of the frames that look more like their rendering than like renderings from wrong places."""
 
     def tables(self) -> dict[str, np.ndarray]:
         """Return the arrays of ``poses.npz`` but the time."""
@@ -120,14 +125,17 @@ def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.ran
     log(f"static depth: {np.nanmedian(aligned.gap_m) * 100:.1f} cm from the template, {fit:.0%} within 5 cm")
     caster = RayCaster(maps.scene)
     alike = compare(clip, masks, caster, aligned.world_from_camera, options.confidence, rng)
-    reason = _strange(fit, alike.usual, votes, start.supports, options) if options.begin == "votes" else None
+    looks = looks_right(clip.timestamp_s, alike, options.confidence)
+    reason = _strange(fit, float(looks.mean()), votes, start.supports, options) if options.begin == "votes" else None
     if reason is not None:
         return Refused(reason, votes)
-    confidence = camera_confidence(clip.timestamp_s, aligned.spread, alike, start.anchored, options.confidence, rng)
-    ground = Ground(caster, float(np.quantile(maps.scene.vertices[:, 1], 0.02)))
-    roots = find_roots(clip, masks, maps.agent, ground, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
-    log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
-    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, start.supports, alike.usual)
+    confidence = camera_confidence(aligned.spread, looks, start.anchored, options.confidence, rng)
+    roots = Roots.unseen(len(clip))
+    if options.animal:
+        ground = Ground(caster, float(np.quantile(maps.scene.vertices[:, 1], 0.02)))
+        roots = find_roots(clip, masks, maps.agent, ground, maps.agent_localizer, aligned.world_from_camera, options.root, rng)
+        log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
+    return Registered(aligned, confidence, roots, agent_confidence(roots), votes, start.supports, float(looks.mean()))
 
 
 @dataclass(frozen=True)
@@ -164,13 +172,13 @@ def _begin(clip, votes, motion, vote_options) -> _Start | None:
     return _Start(poses, supports, following.anchored(votes, supports, motion))
 
 
-def _strange(fit: float, alike: float | None, votes: Votes, supports: Bool[np.ndarray, "vote"], options: Options) -> str | None:
+def _strange(fit: float, right: float, votes: Votes, supports: Bool[np.ndarray, "vote"], options: Options) -> str | None:
     """Say why an aligned recording is not believed, None when it is."""
     if fit < options.gate.least_fit:
         return f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken"
     certain = (votes.probability[supports] >= options.gate.least_certainty).sum() >= options.vote.least_votes
-    if not certain and (alike is None or alike < options.gate.least_likeness):
-        told = "nothing could be compared" if alike is None else f"frames resemble its renderings by {alike:.2f} only"
+    if not certain and right < options.gate.least_right:
+        told = f"only {right:.0%} of the frames look more like the room than like wrong places in it"
         return f"the room has the same shape but looks different: {told}, and hardly a frame was recognised with certainty"
     return None
 

@@ -10,8 +10,7 @@ from pipeline.space import rigid
 from pipeline.space.meshes import Mesh, RayCaster
 from stages.register_videos import alignment, pictures, registration
 from stages.register_videos import votes as voting
-from stages.register_videos.confidence import ConfidenceOptions, camera_confidence, compare
-from stages.register_videos.likeness import likeness
+from stages.register_videos.confidence import ConfidenceOptions, camera_confidence, compare, looks_right
 from stages.train_localizer import training
 from stages.train_localizer.views import ViewOptions
 from tests.stages.textured_room import MemoryClip, NoAgent, drifting, textured_room, walk
@@ -60,8 +59,8 @@ def test_a_recording_of_the_right_shape_in_the_wrong_place_is_not_trusted(maps):
     clip, options, rng = MemoryClip(caster, truth, truth), ConfidenceOptions(), np.random.default_rng(0)
     firmly = np.repeat(1e-8 * np.eye(6)[None], 40, axis=0)
     for poses, low, high in ((truth, 0.8, 1.0), (turned, 0.0, 0.2)):
-        alike = compare(clip, NoAgent(40), caster, poses, options, rng)
-        confidence = camera_confidence(clip.timestamp_s, firmly, alike, np.ones(40, bool), options, rng)
+        looks = looks_right(clip.timestamp_s, compare(clip, NoAgent(40), caster, poses, options, rng), options)
+        confidence = camera_confidence(firmly, looks, np.ones(40, bool), options, rng)
         assert low <= confidence.mean() <= high
 
 
@@ -85,18 +84,25 @@ def test_votes_come_from_masked_frames_only(maps):
 
 
 def test_a_repainted_room_of_the_same_shape_is_refused(maps):
-    truth = walk(40, seed=7)
-    repainted, caster = Mesh(maps.scene.vertices, maps.scene.faces, textured_room(seed=99).color), RayCaster(maps.scene)
-    clip = MemoryClip(RayCaster(repainted), truth, drifting(truth, 2))
-    own = MemoryClip(caster, truth, drifting(truth, 2))
-    for seen, expected in ((clip, lambda value: value < 0.4), (own, lambda value: value > 0.8)):
-        assert expected(np.median([likeness(seen, NoAgent(40), caster, frame, truth[frame]) for frame in range(0, 40, 7)]))
-    votes = voting.collect(own, NoAgent(40), maps.scene_localizer, voting.VoteOptions())
-    doubtful = replace(votes, answers=[replace(answer, probability=0.3) for answer in votes.answers])
-    supports, options = np.ones(len(votes.frame), bool), registration.Options()
-    assert "looks different" in registration._strange(0.9, 0.3, doubtful, supports, options)
-    assert registration._strange(0.9, 0.8, doubtful, supports, options) is None
-    assert registration._strange(0.9, 0.3, votes, supports, options) is None, "recognised with certainty"
+    """In dim light as well, and unless frames were recognised with certainty."""
+    truth, options, rng = walk(40, seed=7), registration.Options(), np.random.default_rng(0)
+    caster = RayCaster(maps.scene)
+    painted = {name: Mesh(maps.scene.vertices, maps.scene.faces, color) for name, color in (
+        ("other", textured_room(seed=99).color), ("own", maps.scene.color), ("dim", maps.scene.color // 6))}  # fmt: skip
+    right = {}
+    for name, mesh in painted.items():
+        clip = MemoryClip(RayCaster(mesh), truth, truth)
+        right[name] = looks_right(
+            clip.timestamp_s, compare(clip, NoAgent(40), caster, truth, options.confidence, rng), options.confidence
+        ).mean()
+    assert right["other"] < 0.5 * options.gate.least_right
+    assert min(right["own"], right["dim"]) > 2 * options.gate.least_right
+    votes = voting.collect(clip, NoAgent(40), maps.scene_localizer, voting.VoteOptions(every_frames=8))
+    doubtful, sure = (replace(votes, answers=[replace(answer, probability=p) for answer in votes.answers]) for p in (0.3, 0.9))
+    supports = np.ones(len(votes.frame), bool)
+    assert "looks different" in registration._strange(0.9, right["other"], doubtful, supports, options)
+    assert registration._strange(0.9, right["dim"], doubtful, supports, options) is None
+    assert registration._strange(0.9, right["other"], sure, supports, options) is None, "recognised with certainty"
 
 
 def test_a_refusal_names_the_nearest_moment_of_the_walk():
