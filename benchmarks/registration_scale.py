@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Int
 
 from pipeline.files import meshes
 from pipeline.files.clips import Clip, Masks
@@ -72,13 +73,17 @@ class ThereMasks:
         return self.masks[int(self.order[frame])]
 
 
+def forth_and_back(length: int, frames: int) -> Int[np.ndarray, "frame"]:
+    """Return which frame of a clip of this length is shown when it is walked forth and back."""
+    phase = np.arange(frames) % (2 * length - 2)
+    return np.where(phase < length, phase, 2 * length - 2 - phase)
+
+
 def measure(build: Path, video: str, frames: int) -> tuple[float, float, bool]:
     """Return CPU seconds, peak memory in MB, and whether the recording was registered."""
     cv2.setNumThreads(1)
     clip, masks = Clip.open(build / "frames" / video), Masks.open(build / "masks" / video)
-    period = 2 * len(clip) - 2
-    phase = np.arange(frames) % period
-    order = np.where(phase < len(clip), phase, period - phase)
+    order = forth_and_back(len(clip), frames)
     maps = registration.Maps(
         meshes.read_ply(build / "scene_template" / "mesh.ply"),
         meshes.read_ply(build / "agent_template" / "agent.ply"),

@@ -44,7 +44,8 @@ def presume(balls: list[Sphere | None], timestamp_s: Float[np.ndarray, "frame"],
         return balls
     centres = np.stack([balls[frame].centre_world for frame in seen])
     guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], centres[:, axis]) for axis in range(3)], axis=1)
-    wait = np.abs(timestamp_s[:, None] - timestamp_s[seen]).min(1)
+    after = np.minimum(np.searchsorted(seen, np.arange(len(balls))), len(seen) - 1)
+    wait = np.abs(timestamp_s - timestamp_s[seen[[np.maximum(after - 1, 0), after]]]).min(0)
     radius = balls[seen[0]].radius_m
     return [
         ball or (Sphere(guess[frame], radius, presumed=True) if wait[frame] < mover.presumed_s else None)
