@@ -41,6 +41,9 @@ KINDS: dict[str, Kind] = {
     "base_no_scene": Kind(seeing=False, one=True),
 }
 
+RIVALS = ("ours_no_scene", "base")
+"""Those that say whether the scene, and two networks instead of one, are worth it."""
+
 
 class Ablated(nn.Module):
     """Short motions by other networks."""

@@ -71,8 +71,9 @@ class PosedSurface(nn.Module):
         self, world_from_agent: Float[Tensor, "frame 4 4"], agent_from_bone: Float[Tensor, "frame bone 4 4"]
     ) -> Float[Tensor, "frame vertex 3"]:
         """Return the vertices in the world."""
-        columns = agent_from_bone[..., :3, :].transpose(-1, -2).flatten(1, 2)  # frame bone*4 3
-        return rigid_torch.apply(world_from_agent, self.blend @ columns)
+        world_from_bone = (world_from_agent[:, None] @ agent_from_bone)[..., :3, :]
+        columns = world_from_bone.permute(1, 3, 0, 2).reshape(self.blend.shape[1], -1)  # bone*4 frame*3
+        return (self.blend @ columns).unflatten(1, (-1, 3)).transpose(0, 1)
 
 
 class PoseSpace(nn.Module):

@@ -4,7 +4,9 @@
 the frames. `planted` then tells, for any motion, in which frames each foot carries weight.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -25,6 +27,12 @@ SHARE = 0.15
 """A vertex that touches in this share of the frames is a contact vertex."""
 FOOT_M = 0.035
 """Contact vertices closer than this at rest belong to the same foot."""
+SWING_M_S2 = 30.0
+"""Acceleration that a swinging foot may need: a step of 10 cm takes 0.14 s."""
+STRIDE_M = 0.25
+"""A foot that glides further than this in one phase should stand more than once."""
+BRIEFEST = 3
+"""Frames that a phase has at least."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +111,51 @@ def planted(
     slow = foot < np.maximum(0.4 * body, 0.08)
     slow |= (least | (even < 0.8 * body)) if treading else (least & (even < 0.6 * body))
     both = ndimage.binary_closing(slow & low, np.ones((3, 1)))
-    return ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
+    stands = ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
+    return with_time_to_swing(stands, centres_world, rate_hz) if treading else stands
+
+
+def with_time_to_swing(
+    stance: Bool[np.ndarray, "frame foot"], centres_world: Float[np.ndarray, "frame foot 3"], rate_hz: float
+) -> Bool[np.ndarray, "frame foot"]:
+    """Shorten, part or leave out phases in which feet should stand, so that between two of them each foot can swing.
+
+    A foot that glides on for more than `STRIDE_M` should stand more than once; from one place to another d metres away it
+    takes sqrt(6 d / `SWING_M_S2`) seconds at least (a cubic in time, at rest at both ends).
+    """
+    kept = np.zeros_like(stance)
+    for foot, centres in enumerate(np.moveaxis(centres_world, 1, 0)):
+        phases: list[range] = []
+        for phase in _parted(stance[:, foot], centres):
+            while phases and (pair := _shortened(phases[-1], phase, centres, rate_hz)) is None and len(phase) > len(phases[-1]):
+                phases.pop()
+            if not phases:
+                phases.append(phase)
+            elif pair is not None:
+                phases[-1:] = pair
+        kept[[frame for phase in phases for frame in phase], foot] = True
+    return kept
+
+
+def _parted(stance: Bool[np.ndarray, "frame"], centres: Float[np.ndarray, "frame 3"]) -> Iterator[range]:
+    """Yield the frames of each phase; those in which the foot goes too far, in parts."""
+    edges = np.flatnonzero(np.diff(np.pad(stance.astype(np.int8), 1)))
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        gone = np.linalg.norm(np.diff(centres[start:end], axis=0), axis=1).sum()
+        count = max(1, min(int(np.ceil(gone / STRIDE_M)), (end - start) // BRIEFEST))
+        cuts = np.linspace(start, end, count + 1).round().astype(int).tolist()
+        yield from (range(*pair) for pair in pairwise(cuts))
+
+
+def _shortened(before: range, after: range, centres: Float[np.ndarray, "frame 3"], rate_hz: float) -> tuple[range, range] | None:
+    """Give two phases of a foot the time between them that it needs to swing; None where there is not that much."""
+    away = np.linalg.norm(centres[after].mean(0) - centres[before].mean(0))
+    lacking = max(int(np.ceil(np.sqrt(6 * away / SWING_M_S2) * rate_hz)) - (after.start - before.stop), 0)
+    spare = [max(len(phase) - BRIEFEST, 0) for phase in (before, after)]
+    if lacking > sum(spare):
+        return None
+    early = int(np.clip(lacking // 2, lacking - min(spare[1], lacking), spare[0]))
+    return range(before.start, before.stop - early), range(after.start + lacking - early, after.stop)
 
 
 def tensors(motion: Moving) -> tuple[Tensor, Tensor]:

@@ -1,5 +1,6 @@
 """Intervals for means and medians over overlapping windows: whole episodes are drawn again, not single windows."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,24 @@ class Interval:
     mean: float
     low: float
     high: float
+
+    def named(self, name: str) -> dict[str, float | None]:
+        """Return it as three figures of a table; None for bounds that are not known."""
+        values = (self.mean, self.low, self.high)
+        return {each: value if np.isfinite(value) else None for each, value in zip(names_of(name), values, strict=True)}
+
+
+def names_of(name: str) -> tuple[str, str, str]:
+    """Return the names under which a mean and its interval stand in a table of figures."""
+    return name, f"{name}_ci95_low", f"{name}_ci95_high"
+
+
+def told(figures: Mapping[str, float | None], name: str, form: str = ".4g") -> str:
+    """Write a figure of a table with its interval, where it has one; ``-`` where it is nothing."""
+    mean, *ends = (figures.get(each) for each in names_of(name))
+    if mean is None:
+        return "-"
+    return format(mean, form) + (f" [{' '.join(format(end, form) for end in ends)}]" if None not in ends else "")
 
 
 def episodes(start: Int[np.ndarray, "window"], video: Int[np.ndarray, "window"], frames: int) -> Int[np.ndarray, "window"]:

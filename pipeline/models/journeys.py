@@ -55,7 +55,7 @@ class Journey:
 def travel(world: World, subgoals: list[Subgoal], settings: Settings | None, rng: np.random.Generator) -> Journey:
     """Make motion through sub-goals; ``settings`` None leaves it as the networks made it."""
     places = legs(None, subgoals, world.scene, world.model.habits)
-    raw, _ = world.model.long_motion(places.world_from_agent, world.body, world.scene, rng)
+    raw, _ = world.model.long_motion(places.world_from_agent, world.body, world.scene, rng, stops=places.subgoal)
     made = stayed(world, raw, settings)
     return replace(made, subgoals_world=places.world_from_agent[places.subgoal, :3, 3], arrival_s=places.subgoal * STEPS / RATE_HZ)
 

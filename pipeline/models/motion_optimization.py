@@ -108,7 +108,7 @@ def optimise(
             settings.foot * foot_error(feet, phases).mean()
             + settings.collision * collision_error(distance, settings.margin_m).mean()
             + settings.contact * contact_error(distance[:, count:], settings.contact_scale_m).mean()
-            + settings.smooth * smooth_error(body, settings.smoothness).mean()
+            + settings.smooth * (smooth_error(body, settings.smoothness).mean() + smooth_error(feet, settings.smoothness).mean())
             + settings.stay * ((points - given) ** 2).sum(-1).mean()
         )
         optimizer.zero_grad(set_to_none=True)

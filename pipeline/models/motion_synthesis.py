@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -24,6 +24,8 @@ from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, eased, joined
 from pipeline.models.surroundings import Surroundings
 
 NETWORKS = ("static", "route", "pose")
+SWEEPS = 2
+"""How often bodies in passing are made again from what is before and after them."""
 
 
 @dataclass(frozen=True)
@@ -133,11 +135,35 @@ class LongTerm:
             return self.pose(start[:, ROOT:], end[:, ROOT:], route, points)
 
     def long_motion(
-        self, world_from_agent: Float[np.ndarray, "body 4 4"], body: Body, scene: Surroundings, rng: np.random.Generator
+        self,
+        world_from_agent: Float[np.ndarray, "body 4 4"],
+        body: Body,
+        scene: Surroundings,
+        rng: np.random.Generator,
+        *,
+        stops: Int[np.ndarray, "stop"] | None = None,
     ) -> tuple[Moving, Moving]:
-        """Return motion through a row of places, two seconds from one to the next, and the bodies at them."""
-        bodies = self.bodies(world_from_agent, body, scene, rng)
+        """Return motion through a row of places, two seconds from one to the next, and the bodies at them.
+
+        A body that stays at its place stays as it is. At places that are none of ``stops`` (None: all are) it is only
+        passing: there it is what the networks make of it between where it is a second before and a second after, for a body
+        drawn on its own would be caught at any moment of a stride.
+        """
+        number = np.arange(len(world_from_agent))
+        stays = np.append(False, np.isclose(world_from_agent[1:], world_from_agent[:-1]).all((1, 2)))
+        bodies = self.bodies(world_from_agent, body, scene, rng)[np.maximum.accumulate(np.where(stays, 0, number))]
+        drawn = np.isin(number, number if stops is None else [0, *stops, number[-1]]) | stays | np.append(stays[1:], False)
+        for _ in range(SWEEPS if not drawn.all() else 0):
+            bodies = self._passed(bodies, np.flatnonzero(~drawn), scene, rng)
         return eased(joined(self.short_motions(bodies[:-1], bodies[1:], scene, rng))), bodies
+
+    def _passed(self, bodies: Moving, passing: Int[np.ndarray, "place"], scene: Surroundings, rng: np.random.Generator) -> Moving:
+        middle = _stacked([part[STEPS // 2] for part in self.short_motions(bodies[:-1], bodies[1:], scene, rng)])
+        made = self.short_motions(middle[passing - 1], middle[passing], scene, rng)
+        roots, bones = bodies.world_from_agent.copy(), bodies.agent_from_bone.copy()
+        for place, part in zip(passing, made, strict=True):
+            roots[place], bones[place] = part.world_from_agent[STEPS // 2], part.agent_from_bone[STEPS // 2]
+        return Moving(roots, bones)
 
 
 def placed(channels: Float[Tensor, "body channel"], world_from_place: Float[np.ndarray, "body 4 4"], poses: PoseSpace) -> Moving:
@@ -163,6 +189,10 @@ def habits_of(stretches: list[Moving], scenes: list[Surroundings], *, moving_m: 
         ]
         return Habits(float(np.median(lowest)), moving_m)
     return Habits(float(np.median(np.concatenate(clearance))), float(np.median(np.concatenate(pace))))
+
+
+def _stacked(frames: list[Moving]) -> Moving:
+    return Moving(np.stack([each.world_from_agent for each in frames]), np.stack([each.agent_from_bone for each in frames]))
 
 
 def _chosen(first: np.ndarray, one: Moving, other: Moving) -> Moving:

@@ -5,6 +5,7 @@ optimised is judged by the same stance.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -47,6 +48,11 @@ class Judge:
     contacts: Contacts
     scene: SignedDistance
 
+    @cached_property
+    def surface(self) -> PosedSurface:
+        """All vertices of the body, to be posed."""
+        return PosedSurface(self.body)
+
     def stance(self, motion: Moving, rate_hz: float = RATE_HZ, *, treading: bool = False) -> Bool[np.ndarray, "frame foot"]:
         """Tell which feet stand when, or with ``treading`` which should."""
         points = PosedSurface(self.body, self.contacts.vertices)(*tensors(motion))
@@ -55,16 +61,15 @@ class Judge:
 
     def fit_of(self, motion: Moving) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
         """Return, per frame, the gap between the body and the scene, and its deepest vertex inside the scene, metres."""
-        distance = self.scene.at(PosedSurface(self.body)(*tensors(motion)))
+        distance = self.scene.at(self.surface(*tensors(motion)))
         gap = distance[:, self.contacts.vertices].min(1).values.clamp_min(0)
         return gap.numpy(), (-distance).clamp_min(0).amax(1).numpy()
 
     def plausibility(self, motion: Moving, stance: Bool[np.ndarray, "frame foot"], rate_hz: float = RATE_HZ) -> Plausibility:
         """Measure a motion on all vertices of the body."""
         distance, points = [], []
-        everything = PosedSurface(self.body)
         for start in range(0, len(motion), 200):
-            vertices = everything(*tensors(motion[start : start + 200]))
+            vertices = self.surface(*tensors(motion[start : start + 200]))
             distance.append(self.scene.at(vertices))
             points.append(vertices[:, self.contacts.vertices])
         depth, touching = torch.cat(distance), torch.cat(points)

@@ -1,9 +1,10 @@
 """The scene around a motion: its signed distance, and points of its surface as PointNet reads them.
 
-`Surroundings.of` prepares a mesh once; `Surroundings.around` draws the points near any frame, in that frame.
+`Surroundings` is a part of a mesh; `Surroundings.around` draws the points near any frame, in that frame.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -19,26 +20,33 @@ STANDING = 0.7
 
 @dataclass(frozen=True)
 class Surroundings:
-    """A still surface, ready to be asked."""
+    """A still surface between two corners of a box, ready to be asked."""
 
-    distance: SignedDistance
-    surface: SurfacePoints
-
-    @classmethod
-    def of(cls, mesh: Mesh, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], *, voxel_m: float = 0.04) -> "Surroundings":
-        """Prepare the part of a mesh between two corners of a box, world frame."""
-        distance = signed_distance.from_mesh(mesh, np.asarray(low, float), np.asarray(high, float), voxel_m=voxel_m)
-        points = signed_distance.surface_points(mesh, SPACING_M)
-        inside = ((points.points > low) & (points.points < high)).all(1)
-        return cls(distance, SurfacePoints(points.points[inside], points.normals[inside]))
+    mesh: Mesh
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+    """world frame"""
+    voxel_m: float = 0.04
 
     @classmethod
     def for_motion(cls, mesh: Mesh, roots_world: Float[np.ndarray, "frame 3"], reach_m: float = 0.7) -> "Surroundings":
-        """Prepare the whole breadth of a mesh, at the heights where a body has been."""
+        """Take the whole breadth of a mesh, at the heights where a body has been."""
         low, high = np.asarray(mesh.vertices).min(0) - 0.15, np.asarray(mesh.vertices).max(0) + 0.15
         low[1] = max(low[1], roots_world[:, 1].min() - reach_m)
         high[1] = min(high[1], roots_world[:, 1].max() + reach_m)
-        return cls.of(mesh, low, high)
+        return cls(mesh, low, high)
+
+    @cached_property
+    def distance(self) -> SignedDistance:
+        """The signed distance in that part; measured when first asked for."""
+        return signed_distance.from_mesh(self.mesh, self.low, self.high, voxel_m=self.voxel_m)
+
+    @cached_property
+    def surface(self) -> SurfacePoints:
+        """Points of the surface in that part."""
+        points = signed_distance.surface_points(self.mesh, SPACING_M)
+        inside = ((points.points > self.low) & (points.points < self.high)).all(1)
+        return SurfacePoints(points.points[inside], points.normals[inside])
 
     @property
     def floor_m(self) -> float:
@@ -62,6 +70,8 @@ class Surroundings:
         points, standing = self.surface.points.astype(np.float32), np.abs(self.surface.normals[:, 1]) < STANDING
         frame_from_world = rigid.inverse(world_from_frame)
         drawn = np.zeros((len(centre_world), count, 3), np.float32)
+        if not count:
+            return drawn
         for row, centre in enumerate(np.asarray(centre_world, np.float32)):
             near = np.flatnonzero(((points - centre) ** 2).sum(1) < reach_m**2)
             if not len(near):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.models.intervals import Interval
+from pipeline.models.intervals import Interval, names_of
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Figures:
     def put_mean(self, name: str, interval: Interval) -> None:
         """Record a mean with the bounds of its 95 % interval."""
         self.put(name, interval.mean)
-        for end, value in (("_ci95_low", interval.low), ("_ci95_high", interval.high)):
-            self.put(name + end, value, "one episode alone tells nothing of others: no interval")
+        for end, value in zip(names_of(name)[1:], (interval.low, interval.high), strict=True):
+            self.put(end, value, "one episode alone tells nothing of others: no interval")
 
     def skip(self, names: Iterable[str], reason: str) -> None:
         """Record figures that do not apply."""

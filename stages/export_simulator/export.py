@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.files.glb import Action, Skin
+from pipeline.models import refit
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
-from stages.export_simulator import refit, surfaces
+from stages.export_simulator import surfaces
 from stages.export_simulator.actions import Motion, resample
 from stages.export_simulator.contract import Setting
 from stages.export_simulator.reading import Body, Gaussians

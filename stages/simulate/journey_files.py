@@ -5,11 +5,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter1d
 
 from pipeline import progress
 from pipeline.files import arrays, glb, images
+from pipeline.models import refit
 from pipeline.models.bodies import Body, PosedSurface
 from pipeline.models.contacts import tensors
 from pipeline.models.journeys import Journey
@@ -20,6 +22,8 @@ from pipeline.space.meshes import Mesh, RayCaster, render_view
 
 FOCAL = 0.9
 """Focal length of the frames in units of their width."""
+FITTED_POSES = 60
+"""Poses of a take that the four weights of its surface are fitted to."""
 
 
 def write_journey(folder: Path, journey: Journey, body: Body) -> None:
@@ -32,7 +36,7 @@ def write_journey(folder: Path, journey: Journey, body: Body) -> None:
         subgoals_world=journey.subgoals_world,
         arrival_s=journey.arrival_s.astype(np.float64),
     )
-    skin = glb.Skin(*four_weights(body), body.agent_from_bone_rest, tuple(f"bone_{k:02d}" for k in range(len(body.agent_from_bone_rest))))
+    skin = skin_of(body, journey.moving.agent_from_bone)
     action = glb.Action("take", journey.timestamp_s, journey.moving.world_from_agent, journey.moving.agent_from_bone)
     (folder / "take.glb").write_bytes(glb.skinned(body.mesh, skin, [action]))
     about = {
@@ -94,11 +98,13 @@ def drawn(
     return np.where(nearer[..., None], fur.reshape(height, width, 3).astype(np.uint8), picture)
 
 
-def four_weights(body: Body) -> tuple[UInt8[np.ndarray, "vertex 4"], Float[np.ndarray, "vertex 4"]]:
-    """Keep each vertex's four strongest bones."""
-    joints = np.argsort(-body.weights, axis=1, kind="stable")[:, :4]
-    weights = np.take_along_axis(body.weights, joints, axis=1)
-    return joints.astype(np.uint8), (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+def skin_of(body: Body, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> glb.Skin:
+    """Fit four weights a vertex to the surface in the poses that differ most."""
+    rest, some = body.agent_from_bone_rest, agent_from_bone[refit.different_poses(agent_from_bone, FITTED_POSES)]
+    still = torch.eye(4).expand(len(some), 4, 4)
+    posed = PosedSurface(body)(still, torch.from_numpy(some).float()).double().numpy()
+    four, _ = refit.refit_weights(np.asarray(body.mesh.vertices, np.float64), body.weights, refit.Poses(some @ rigid.inverse(rest), posed))
+    return glb.Skin(four.joints, four.weights, rest, tuple(f"bone_{bone:02d}" for bone in range(len(rest))))
 
 
 def _finite(worth: Plausibility) -> dict[str, float | None]:

@@ -17,9 +17,9 @@ from stages.tabulate_longterm.lengths import Length
 class Config:
     """How much is measured."""
 
-    clips: int = 120
+    clips: int = 160
     """Short motions of each source, evenly chosen among those that end more than 0.5 m from their start."""
-    optimised_clips: int = 48
+    optimised_clips: int = 40
     """How many of them are also optimised."""
     optimisation: Settings = field(default_factory=Settings)
     """Weights and length of the optimisation."""
@@ -27,7 +27,7 @@ class Config:
     """Length of the long motion, seconds; 0 = none."""
     subgoals: int = 20
     """Sub-goals of the long motion."""
-    samples: int = 24
+    samples: int = 60
     """Samples of the behaviour model that are made physical; 0 = none."""
     draws: int = 2000
     """Resamples of the intervals."""
@@ -41,14 +41,9 @@ def run(task: cli.Task) -> None:
     world = reading.simulated(task.input("longterm_world"), task.input("longterm_study"))
     recorded = reading.recorded(task.input("reconstruction"), task.input("behavior_data"), task.input("longterm_ablations"))
     figures = {}
-    for prefix, source, split in (
-        ("longterm", world, None),
-        ("longterm_unseen", world, "unseen"),
-        ("longterm_recorded", recorded, None),
-    ):
+    for prefix, source in (("longterm", world), ("longterm_recorded", recorded)):
         if len(source.held_out.stretches):
-            figures |= comparison.figures(prefix, source, c, only=split)
-            progress.log(f"{prefix}: {len(figures)} figures")
+            figures |= comparison.figures(prefix, source, c)
     if c.minutes_s > 0:
         figures |= comparison.minutes(recorded, Length(c.minutes_s, c.subgoals), c)
     if c.samples:

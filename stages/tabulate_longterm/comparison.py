@@ -4,13 +4,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Bool
 
+from pipeline import progress
 from pipeline.models import behavior
+from pipeline.models.clip_channels import Clips
+from pipeline.models.intervals import episodes
 from pipeline.models.journeys import World
-from pipeline.models.longterm_examples import Cuts, Cutting, cut, encoded
+from pipeline.models.longterm_examples import Cuts, Cutting, Lives, cut, encoded
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN
+from pipeline.space import rigid
 from stages.tabulate_longterm import lengths, methods, scores, tables
 from stages.tabulate_longterm import samples as behavior_samples
 from stages.tabulate_longterm.lengths import Length
@@ -18,33 +24,54 @@ from stages.tabulate_longterm.reading import Source
 
 EPISODE_FRAMES = 300
 """Clips that begin within the same ten seconds count as one episode."""
+BLOCKED_M = 0.06
+"""A straight line from start to end that comes nearer than this to anything is not the animal's way."""
 
 
-def figures(prefix: str, source: Source, c: Any, *, only: str | None = None) -> dict[str, float | None]:
-    """Measure every method on held-out short motions, or on those of one split; nothing where there are none."""
+def figures(prefix: str, source: Source, c: Any) -> dict[str, float | None]:
+    """Measure every method on held-out short motions: on all, in unseen homes alone, and where something is in the way."""
     lives, model = source.held_out, source.models.ours
     rng = np.random.default_rng(c.seed)
-    cuts = cut(lives, Cutting(stride=10, resting=0.0), rng)
-    wanted = np.array([index for index, stretch in enumerate(cuts.stretch) if only in (None, source.split[stretch])], int)
-    if not len(wanted):
-        return {}
-    wanted = wanted[np.unique(np.linspace(0, len(wanted) - 1, min(c.clips, len(wanted))).astype(int))]
-    cuts = Cuts(cuts.stretch[wanted], cuts.start[wanted])
+    cuts = chosen(cut(lives, Cutting(stride=10, resting=0.0), rng), c.clips)
     clips = encoded(lives, cuts, model.poses, model.sizes.points, rng)
     known = scores.references(cuts.parts(lives), clips.scene, lives, model)
-    episode = np.unique(np.stack([cuts.stretch, cuts.start // EPISODE_FRAMES], axis=1), axis=0, return_inverse=True)[1].ravel()
-    rows = {"truth": np.array([scores.score(each.truth, each, model.poses) for each in known])}
-    some = np.unique(np.linspace(0, len(clips) - 1, min(c.optimised_clips, len(clips))).astype(int))
-    found = tables.figures(rows, episode, prefix, draws=c.draws, seed=c.seed)
+    plain, made = {"truth": np.array([scores.score(each.truth, each, model.poses) for each in known])}, {}
     for name, method in methods.methods(source.models, lives, c.seed).items():
-        made = method(clips)
-        rows[name] = plain = scores.scores(made, clips, known, model, None)
-        found |= tables.figures({name: plain}, episode, prefix, draws=c.draws, seed=c.seed)
-        if name in methods.OPTIMISED and only is None:
-            done = scores.scores(made[some], clips[some], [known[index] for index in some], model, c.optimisation)
-            found |= tables.figures({f"{name}_opt": done, f"{name}_same": plain[some]}, episode[some], prefix, draws=c.draws, seed=c.seed)
-    more = {f"{name}_beyond_ours": rows[name] - rows["ours"] for name in methods.RIVALS}
-    return found | tables.figures(more, episode, prefix, draws=c.draws, seed=c.seed)
+        made[name] = method(clips)
+        plain[name] = scores.scores(made[name], clips, known, model, None)
+        progress.log(f"{prefix}: {name}, MPJPE {plain[name][:, scores.METRICS.index('mpjpe_mm')].mean():.1f} mm")
+    plain |= {f"{name}_beyond_ours": plain[name] - plain["ours"] for name in methods.RIVALS if name in plain}
+    some = np.unique(np.linspace(0, len(clips) - 1, min(c.optimised_clips, len(clips))).astype(int))
+    done = {}
+    for name in methods.OPTIMISED:
+        done[f"{name}_opt"] = scores.scores(made[name][some], clips[some], [known[index] for index in some], model, c.optimisation)
+        done[f"{name}_same"] = plain[name][some]
+        progress.log(f"{prefix}: {name}, optimised")
+    episode = episodes(cuts.start, cuts.stretch, EPISODE_FRAMES)
+    unseen = np.array([source.split[stretch] == "unseen" for stretch in cuts.stretch])
+    found = {}
+    for ending, kept in (("", np.ones(len(clips), bool)), ("_unseen", unseen), ("_blocked", blocked(clips, lives))):
+        if kept.any():
+            rows = {name: values[kept] for name, values in plain.items()}
+            found |= tables.figures(rows, episode[kept], prefix + ending, draws=c.draws, seed=c.seed)
+    return found | tables.figures(done, episode[some], prefix, draws=c.draws, seed=c.seed)
+
+
+def chosen(cuts: Cuts, most: int) -> Cuts:
+    """Leave short motions out evenly until there are few enough."""
+    some = np.unique(np.linspace(0, len(cuts.start) - 1, min(most, len(cuts.start))).astype(int))
+    return Cuts(cuts.stretch[some], cuts.start[some])
+
+
+def blocked(clips: Clips, lives: Lives) -> Bool[np.ndarray, "clip"]:
+    """Tell on which clips something is nearer than `BLOCKED_M` to the straight line that the root could take."""
+    share = torch.linspace(0.1, 0.9, 17)[None, :, None]
+    line = torch.lerp(clips.channels[:, :1, :3], clips.channels[:, -1:, :3], share).double().numpy()
+    near = [
+        lives.scenes[scene].distance.at(torch.from_numpy(points))
+        for scene, points in zip(clips.scene, rigid.apply(clips.world_from_clip, line), strict=True)
+    ]
+    return np.array([float(each.min()) < BLOCKED_M for each in near], bool)
 
 
 def minutes(source: Source, length: Length, c: Any) -> dict[str, float | None]:
@@ -60,9 +87,11 @@ def samples(source: Source, model: Path, behavior_data: Path, c: Any, device: st
     scenes = Scenes.load(behavior_data, data.videos)
     windows = np.flatnonzero(data.split != TRAIN)
     windows = windows if len(windows) else np.flatnonzero(data.split == TRAIN)
-    chosen = windows[np.unique(np.linspace(0, len(windows) - 1, min(c.samples, len(windows))).astype(int))]
+    some = windows[np.unique(np.linspace(0, len(windows) - 1, min(c.samples, len(windows))).astype(int))]
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
-    return behavior_samples.figures(world_of(source), sampler, data, scenes, architecture.ego, chosen, c.optimisation, c.seed)
+    return behavior_samples.figures(
+        world_of(source), sampler, data, scenes, architecture.ego, some, c.optimisation, draws=c.draws, seed=c.seed
+    )
 
 
 def world_of(source: Source) -> World:

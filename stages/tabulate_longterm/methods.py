@@ -29,7 +29,7 @@ class Models:
     ours: LongTerm
     ablated: dict[str, Ablated]
     bank: Clips
-    """the short motions that were learned from"""
+    """the short motions that were learned from, without scene points"""
 
 
 def methods(models: Models, lives: Lives, seed: int) -> dict[str, Method]:

@@ -7,6 +7,7 @@ from jaxtyping import UInt8
 from matplotlib.figure import Figure
 
 from pipeline import figures as drawing
+from pipeline.models.intervals import names_of
 from pipeline.qa import Check, Picture
 
 QUALITY = {
@@ -40,9 +41,8 @@ def checks(figures: Mapping[str, float | None]) -> list[Check]:
         ),
         Check("samples: penetration left", ratio("longterm_samples/penetration_m", "longterm_samples/penetration_before_m"), "", 0.5),
         Check("samples: slide left", ratio("longterm_samples/slide_m_s", "longterm_samples/slide_before_m_s"), "", 0.5),
-        Check(
-            "samples: path error against before", ratio("longterm_samples/path_error_m", "longterm_samples/path_error_before_m"), "", 1.03
-        ),
+        Check("samples: goal error left", ratio("longterm_samples/goal_error_m", "longterm_samples/goal_error_before_m"), "", 1.03),
+        Check("samples: path error left", ratio("longterm_samples/path_error_m", "longterm_samples/path_error_before_m"), "", 1.03),
         Check("minutes: largest seam", of("longterm_minutes/largest_seam_m"), "m", 0.02),
         Check("minutes: outside of the room", of("longterm_minutes/outside_room_m"), "m", 0.01),
         Check("minutes: deepest vertex inside something", of("longterm_minutes/deepest_m"), "m", 0.02),
@@ -65,7 +65,7 @@ def bars(figures: Mapping[str, float | None]) -> UInt8[np.ndarray, "height width
         names = [name.split("/")[1] for name in figures if name.startswith(f"{prefix}/") and name.endswith(ending)]
         names = [name for name in names if figures[f"{prefix}/{name}{ending}"] is not None and name != "truth"]
         mean = np.array([figures[f"{prefix}/{name}{ending}"] for name in names])
-        ends = np.array([[figures[f"{prefix}/{name}{ending}_ci95_{side}"] for side in ("low", "high")] for name in names]).reshape(-1, 2)
+        ends = np.array([[figures[each] for each in names_of(f"{prefix}/{name}{ending}")[1:]] for name in names]).reshape(-1, 2)
         off = np.abs(ends - mean[:, None]).T
         axis.barh(names, mean, xerr=off, color=["#dd8452" if name.startswith("ours") else "#8fa9c4" for name in names])
         axis.set(title=prefix, xlabel="mm")

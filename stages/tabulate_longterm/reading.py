@@ -48,7 +48,8 @@ def _models(folder: Path, train: Lives) -> Models:
     ablated = {
         name: ablated_motion.load(folder / "ablations" / f"{name}.safetensors", kind, ours.sizes)
         for name, kind in ablated_motion.KINDS.items()
+        if (folder / "ablations" / f"{name}.safetensors").is_file()
     }
     rng = np.random.default_rng(0)
-    bank = encoded(train, cut(train, Cutting(resting=0.0), rng), ours.poses, ours.sizes.points, rng)
+    bank = encoded(train, cut(train, Cutting(resting=0.0), rng), ours.poses, 0, rng)
     return Models(ours, ablated, bank)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.models.behavior import channels_from_bones
-from pipeline.models.bodies import Body, PosedSurface, PoseSpace
+from pipeline.models.bodies import PoseSpace
 from pipeline.models.clip_channels import Clips, decode_clip
 from pipeline.models.contacts import tensors
 from pipeline.models.longterm_examples import Lives
@@ -47,8 +47,9 @@ def score(made: Moving, reference: Reference, poses: PoseSpace) -> Float[np.ndar
     body, truth = reference.judge.body, reference.truth
     stance = reference.judge.stance(made)
     worth = reference.judge.plausibility(made, stance)
-    apart = _apart(made, truth, body)
-    beside = float(_apart(made[NEXT_TO_ENDS], truth[ENDS], body).mean())
+    meshes = [reference.judge.surface(*tensors(each)) for each in (made, truth)]
+    apart = (meshes[0] - meshes[1]).norm(dim=-1)
+    beside = float((meshes[0][NEXT_TO_ENDS] - meshes[1][ENDS]).norm(dim=-1).mean())
     turn = np.abs(made.world_from_agent - truth.world_from_agent)[:, :3, :2].mean()
     joints = [each.world_from_agent[:, None] @ each.agent_from_bone for each in (made, truth)]
     rest = poses.rest.double().numpy()
@@ -91,8 +92,3 @@ def references(parts: list[Moving], scene: np.ndarray, lives: Lives, model: Long
     """Pair true short motions with what judges them."""
     judges = [Judge(lives.body, model.contacts, each.distance) for each in lives.scenes]
     return [Reference(part, judges[index]) for part, index in zip(parts, scene, strict=True)]
-
-
-def _apart(first: Moving, second: Moving, body: Body) -> Float[Tensor, "frame vertex"]:
-    surface = PosedSurface(body)
-    return (surface(*tensors(first)) - surface(*tensors(second))).norm(dim=-1)

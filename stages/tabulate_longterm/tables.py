@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.intervals import bootstrapped
+from pipeline.models.intervals import bootstrapped, names_of, told
 from stages.tabulate_longterm.scores import MEDIANS, METRICS
 
 TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
@@ -25,11 +25,10 @@ def figures(
         for metric, column in zip(METRICS, values.T, strict=True):
             known, name = np.isfinite(column), f"{prefix}/{method}/{metric}"
             if not known.any():
-                found |= {name: None, f"{name}_ci95_low": None, f"{name}_ci95_high": None}
+                found |= dict.fromkeys(names_of(name))
                 continue
             groups = np.unique(episode[: len(column)][known], return_inverse=True)[1]
-            told = bootstrapped(column[known], groups, draws, np.random.default_rng(seed), median=metric in MEDIANS)
-            found |= {name: told.mean, f"{name}_ci95_low": told.low, f"{name}_ci95_high": told.high}
+            found |= bootstrapped(column[known], groups, draws, np.random.default_rng(seed), median=metric in MEDIANS).named(name)
     return found
 
 
@@ -39,18 +38,18 @@ def text(found: Mapping[str, float | None]) -> str:
     for prefix, title in (
         ("longterm", "built-in world, held-out sessions and an unseen home"),
         ("longterm_unseen", "built-in world, the unseen home alone"),
+        ("longterm_blocked", "built-in world, something in the way"),
         ("longterm_recorded", "reconstructed motion, test recording"),
+        ("longterm_recorded_blocked", "reconstructed motion, something in the way"),
     ):
         methods = dict.fromkeys(name.split("/")[1] for name in found if name.startswith(f"{prefix}/") and name.count("/") == 2)
         for number, columns in ((1, TABLE_1), (2, TABLE_2), (4, TABLE_4)):
             if methods:
                 parts.append(_table(f"Table {number}: {title}", prefix, list(methods), columns, found))
-    others = {name: value for name, value in found.items() if name.split("/")[0] in ("longterm_minutes", "longterm_samples")}
+    others = [name for name in found if name.split("/")[0] in ("longterm_minutes", "longterm_samples")]
     if others:
         parts.append(
-            "\n".join(
-                ["Minutes of motion, and samples of the behaviour model", *(f"{name}  {_told(value)}" for name, value in others.items())]
-            )
+            "\n".join(["Minutes of motion, and samples of the behaviour model", *(f"{name}  {told(found, name)}" for name in others)])
         )
     return "\n\n".join(parts)
 
@@ -58,16 +57,6 @@ def text(found: Mapping[str, float | None]) -> str:
 def _table(title: str, prefix: str, methods: list[str], columns: tuple[str, ...], found: Mapping[str, float | None]) -> str:
     rows = [["method", *columns]]
     for method in methods:
-        cells = []
-        for column in columns:
-            name = f"{prefix}/{method}/{column}"
-            value = found.get(name)
-            bounds = f" [{_told(found[f'{name}_ci95_low'])} {_told(found[f'{name}_ci95_high'])}]" if value is not None else ""
-            cells.append(_told(value) + bounds)
-        rows.append([method, *cells])
+        rows.append([method, *(told(found, f"{prefix}/{method}/{column}") for column in columns)])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return "\n".join([title, *("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)])
-
-
-def _told(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"

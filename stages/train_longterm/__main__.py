@@ -6,6 +6,7 @@ finds from them which parts of the body touch the scene. `stages.simulate --subg
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from pipeline import cli, progress, qa
 from pipeline.models.longterm import Sizes
@@ -32,8 +33,8 @@ class Config:
     """Terms of the losses."""
     scene: bool = True
     """Whether RouteNet and PoseNet see the scene."""
-    ablations: bool = False
-    """Train also the networks that the tables compare with."""
+    ablations: Literal["none", "rivals", "all"] = "none"
+    """Which of the networks that the tables compare with to train too."""
     point_net: str | None = None
     """Weights (safetensors, as `longterm.safetensors` names them: `layers.0.weight` ...) that every PointNet starts from."""
     smplx_model: str | None = None

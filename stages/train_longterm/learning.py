@@ -52,14 +52,14 @@ def learn(lives: Lives, settings: Any, *, resume: Path | None = None) -> Learned
     }
     scenes = [lives.scenes[index] for index in lives.scene_of]
     model = LongTerm(settings.sizes, poses, contacts, habits_of(list(lives.stretches), scenes), **nets)
-    ablated = learn_ablations(clips, trainer, settings, nets["route"]) if settings.ablations else {}
-    return Learned(model, records, ablated)
+    return Learned(model, records, learn_ablations(clips, trainer, settings, nets["route"]))
 
 
 def learn_ablations(clips: Clips, trainer: Trainer, settings: Any, route: RouteNet) -> dict[str, Ablated]:
-    """Train the networks of Table 1 that are not part of the model; routes of the same kind are shared."""
+    """Train those networks of Table 1 that are asked for and not part of the model; routes of the same kind are shared."""
     routes, trained = {(True, True, False): route} if settings.scene else {}, {}
-    for name, kind in ablated_motion.KINDS.items():
+    wanted = {"none": (), "rivals": ablated_motion.RIVALS, "all": tuple(ablated_motion.KINDS)}[settings.ablations]
+    for name, kind in ((name, ablated_motion.KINDS[name]) for name in wanted):
         made = fresh(lambda kind=kind: ablated_motion.build(kind, settings.sizes), settings)
         if made.base is not None:
             training.fit_base(made.base, clips, trainer, settings.pose, name)

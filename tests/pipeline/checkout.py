@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 SETTINGS = {
     "synthesize_capture": "    session_count: int = 2\n    heldout_of: int = 1\n    foreign_sessions: int = 0\n",
     "train_localizer": "    target: str = ''\n",
-    "train_longterm": "    ablations: bool = False\n",
+    "train_longterm": '    ablations: str = "none"\n',
 }
 STAGE = '''"""Hash the inputs."""
 

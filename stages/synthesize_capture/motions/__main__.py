@@ -24,7 +24,7 @@ class Config:
     """Homes, differently furnished; the last one is unseen in training."""
     sessions_per_home: int = 3
     """Sessions in each home, with its loose things elsewhere each time; the last of each is held out."""
-    session_s: float = 120.0
+    session_s: float = 200.0
     """Length of a session, seconds."""
 
 

@@ -64,7 +64,7 @@ def lives(seed: int = 0, count: int = 3, seconds: float = 8.0) -> Lives:
     for _ in range(count):
         turn = rng.uniform(0, 2 * np.pi) + np.linspace(0, rng.choice([-1, 1]) * rng.uniform(2, 4), 12)
         walks.append(striding(np.column_stack([1.1 * np.sin(turn), np.zeros(12), 1.1 * np.cos(turn)]), seconds))
-    scene = Surroundings.of(room(), np.array([-2.1, -0.2, -2.1]), np.array([2.1, 0.8, 2.1]), voxel_m=0.05)
+    scene = Surroundings(room(), np.array([-2.1, -0.2, -2.1]), np.array([2.1, 0.8, 2.1]), voxel_m=0.05)
     return Lives(body(), tuple(walks), (0,) * count, (scene,))
 
 

@@ -156,6 +156,24 @@ def test_a_long_motion_goes_through_its_places(lives, model):
     np.testing.assert_allclose(np.linalg.det(moving.world_from_agent[:, :3, :3]), 1, atol=1e-4)
 
 
+def test_bodies_in_passing_are_made_by_the_motion_and_those_that_stay_stay(lives, model):
+    ends = [
+        Subgoal(np.array([-1.2, np.nan, -1.0])),
+        Subgoal(np.array([1.2, np.nan, -1.0]), time_s=30.0),
+        Subgoal(np.array([1.2, np.nan, 1.0])),
+    ]
+    places = legs(None, ends, lives.scenes[0], model.habits)
+    given, drawn = (
+        model.long_motion(places.world_from_agent, lives.body, lives.scenes[0], np.random.default_rng(0), stops=stops)
+        for stops in (places.subgoal, None)
+    )
+    changed = (given[1].agent_from_bone != drawn[1].agent_from_bone).any((1, 2, 3))
+    assert not changed[places.subgoal].any() and changed.any()
+    rest = given[1].agent_from_bone[2 : places.subgoal[1]]  # on the last of these places it turns to leave
+    np.testing.assert_array_equal(rest, np.broadcast_to(rest[:1], rest.shape))
+    assert len(given[0]) == len(drawn[0])
+
+
 def test_simulated_lives_come_back(lives, tmp_path):
     simulated_lives.save(tmp_path, lives.body, [strider.room()], lives.stretches, lives.scene_of, ["train", "held_out", "unseen"])
     again, split = simulated_lives.load(tmp_path)

@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from pipeline.models.bodies import PosedSurface, PoseSpace
-from pipeline.models.contacts import find_contacts, tensors
+from pipeline.models.contacts import BRIEFEST, SWING_M_S2, find_contacts, tensors, with_time_to_swing
 from pipeline.models.motion_optimization import Physique, Settings, contact_error, foot_error, optimise, phase_means, smooth_error
 from pipeline.models.plausibility import Judge, seams
 from pipeline.models.short_motions import Moving, eased
@@ -44,6 +44,24 @@ def test_feet_stand_two_thirds_of_the_time_and_true_motion_is_physical(lives, ph
     assert worth.slide_m_s < 0.01
     assert worth.contact == 1
     assert worth.non_collision > 0.999
+
+
+def test_feet_that_should_stand_have_time_to_swing():
+    """One foot glides at the body's pace, one rests, one leaps 10 cm aside between two rests."""
+    feet = np.zeros((120, 3, 3))
+    feet[:, 0, 2] = np.arange(120) / 30
+    feet[60:, 2, 0] = 0.1
+    stance = np.ones((120, 3), bool)
+    stance[60, 2] = False
+    kept = with_time_to_swing(stance, feet, 30.0)
+    assert kept[:, 1].all()
+    gaps = {foot: np.diff(np.flatnonzero(np.diff(kept[:, foot].astype(int))))[::2] for foot in (0, 2)}
+    assert gaps[2].tolist() == [int(np.ceil(np.sqrt(6 * 0.1 / SWING_M_S2) * 30))]
+    assert len(gaps[0]) >= 3 and kept[:, 0].sum() > 3 * BRIEFEST
+    away = np.diff(
+        [feet[phase, 0, 2].mean() for phase in np.split(np.arange(120), np.flatnonzero(np.diff(kept[:, 0].astype(int))) + 1)[::2]]
+    )
+    assert (gaps[0] + 2 >= np.sqrt(6 * away / SWING_M_S2) * 30).all()
 
 
 def test_a_shaken_motion_becomes_physical_and_stays_near(lives, physique):

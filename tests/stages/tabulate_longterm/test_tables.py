@@ -1,4 +1,4 @@
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -85,10 +85,9 @@ def test_tables_hold_every_method_with_intervals(source):
     assert found["longterm/base_beyond_ours/mpjpe_mm"] == pytest.approx(apart)
     for method in ("ours", "ours_opt", "base_opt"):
         assert found[f"longterm/{method}/end_v2v_share"] < 1e-4, "given ends are kept, by the networks and by the optimisation"
-    unseen = comparison.figures("longterm_unseen", source, Small(), only="unseen")
-    assert "longterm_unseen/ours/mpvpe_mm" in unseen and "longterm_unseen/ours_opt/mpvpe_mm" not in unseen
-    text = tables.text(found | unseen)
-    assert text.count("Table 1") == text.count("Table 4") == 2
+    assert "longterm_unseen/ours/mpvpe_mm" in found and "longterm_unseen/ours_opt/mpvpe_mm" not in found
+    text = tables.text(found)
+    assert text.count("Table 1") == text.count("Table 4") == len({name.split("/")[0] for name in found})
     assert len(pictures.pictures(found)) == 1 and len(pictures.checks(found)) > 10
 
 
@@ -97,3 +96,22 @@ def test_minutes_are_measured(source):
     assert found["longterm_minutes/seconds"] >= 12.0
     assert found["longterm_minutes/subgoals"] == 3
     assert found["longterm_minutes/outside_room_m"] < 0.05
+
+
+def test_a_clip_is_blocked_where_the_block_stands_between_its_ends(source):
+    """The strider walks around the block: only ends on opposite sides of it have it between them."""
+    clips = comparison.encoded(
+        source.held_out,
+        cut(source.held_out, Cutting(stride=5), np.random.default_rng(0)),
+        source.models.ours.poses,
+        4,
+        np.random.default_rng(0),
+    )
+    around = clips.channels.clone()
+    inverse = torch.from_numpy(np.linalg.inv(clips.world_from_clip)).float()
+    for frame, place in ((0, [-1.2, 0.2, 0.0]), (-1, [1.2, 0.2, 0.0])):
+        around[:, frame, :3] = inverse[:, :3, :3] @ torch.tensor(place) + inverse[:, :3, 3]
+    assert comparison.blocked(replace(clips, channels=around), source.held_out).all()
+    for frame, place in ((0, [-1.2, 0.2, 1.2]), (-1, [1.2, 0.2, 1.2])):
+        around[:, frame, :3] = inverse[:, :3, :3] @ torch.tensor(place) + inverse[:, :3, 3]
+    assert not comparison.blocked(replace(clips, channels=around), source.held_out).any()

@@ -27,7 +27,7 @@ class Settings:
     pose: Pace = SHORT
     weights: Weights = field(default_factory=Weights)
     scene: bool = True
-    ablations: bool = False
+    ablations: str = "none"
     point_net: str | None = None
     seed: int = 0
 
@@ -50,8 +50,8 @@ def test_every_network_learns(learned):
 
 def test_same_seed_same_weights_and_ablations_are_written(lives, learned, tmp_path):
     one = Pace(steps=2, batch=4)
-    settings = Settings(body=one, route=one, pose=one, ablations=True)
-    first, second = learning.learn(lives, settings), learning.learn(lives, replace(settings, ablations=False))
+    settings = Settings(body=one, route=one, pose=one, ablations="all")
+    first, second = learning.learn(lives, settings), learning.learn(lives, replace(settings, ablations="none"))
     for name in ("static", "route", "pose"):
         for key, value in getattr(first.model, name).state_dict().items():
             assert torch.equal(value, getattr(second.model, name).state_dict()[key]), f"{name}.{key}"

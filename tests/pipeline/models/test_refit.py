@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.models import refit
 from pipeline.space import rigid
-from stages.export_simulator import refit
 
 RNG = np.random.default_rng(0)
 
