@@ -23,7 +23,7 @@ from stages.train_longterm import objectives
 class Pace:
     """Length and speed of one network's training."""
 
-    steps: int = 700
+    steps: int = 500
     """steps of Adam"""
     batch: int = 48
     """examples a step"""
