@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -138,10 +139,11 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=60, help="fresh renders that are asked")
     parser.add_argument("--frames", type=int, default=12, help="frames of each session that are asked")
     parser.add_argument("--most-steps", type=int, default=8000, help="networks that learn for longer are left out")
+    parser.add_argument("--kinds", nargs="+", default=list(get_args(model.Kind)), choices=get_args(model.Kind), help="kinds compared")
     given = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    settings = tuple(setting for setting in SETTINGS if setting.steps <= given.most_steps)
+    settings = tuple(setting for setting in SETTINGS if setting.steps <= given.most_steps and setting.kind in given.kinds)
     for line in rows(given.build / given.agent, given.queries, given.frames, settings):
         print(line, flush=True)
 

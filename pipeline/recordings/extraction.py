@@ -16,7 +16,7 @@ from pipeline.recordings import conventions
 from pipeline.recordings.conventions import SelfCheck
 from pipeline.recordings.recording import Picture, Recording, broken_metadata, no_depth
 from pipeline.recordings.selection import choose_frames
-from pipeline.recordings.upright import quarter_turns_from_gravity, quarter_turns_from_room
+from pipeline.recordings.upright import quarter_turns_from_gravity, quarter_turns_from_room, quarter_turns_from_surfaces
 from pipeline.space import cameras, rigid
 
 JPEG = b"\xff\xd8"
@@ -90,15 +90,21 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
         used, check = np.arange(len(recording.index)), dataclasses.replace(check, reason=f"{check.reason}; {lost}")
     chosen = used[choose_frames(recording.timestamp_s[used], rate_hz)]
     odometry_from_camera, turns = None, recording.quarter_turns
-    if check.verdict != "unusable":
+    looked_at = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
+
+    def room() -> list[tuple[np.ndarray, np.ndarray]]:
+        views = [view(int(frame)) for frame in np.searchsorted(used, chosen[looked_at])]
+        return [(each.depth, each.intrinsics) for each in views]
+
+    if check.verdict == "unusable":
+        turns = turns or quarter_turns_from_surfaces(room())
+    else:
         odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)[np.searchsorted(used, chosen)]
         if recording.up is not None:
             odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
             turns = quarter_turns_from_gravity(odometry_from_camera)
         elif not turns:
-            looked_at = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
-            views = [view(int(frame)) for frame in np.searchsorted(used, chosen[looked_at])]
-            turns = quarter_turns_from_room(odometry_from_camera, [(each.depth, each.intrinsics) for each in views])
+            turns = quarter_turns_from_room(odometry_from_camera, room())
         odometry_from_camera = cameras.turn_camera(odometry_from_camera, turns)
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)

@@ -45,12 +45,7 @@ def up_from_room(
     the pictures stays level while they turn. ``views`` are (depth in metres, intrinsics) of frames spread evenly.
     """
     seen = np.linspace(0, len(odometry_from_camera) - 1, len(views)).round().astype(int)
-    normals = []
-    for (depth, intrinsics), odometry in zip(views, odometry_from_camera[seen], strict=True):
-        step = max(1, max(depth.shape) // SIDE_PX)
-        thinned = depth[step // 2 :: step, step // 2 :: step]
-        normal = surface.image_normals(thinned, cameras.scale_intrinsics(intrinsics, depth.shape, thinned.shape))
-        normals.append(normal[np.abs(normal).sum(-1) > 0][::5] @ odometry[:3, :3].T)
+    normals = [_normals(*view) @ odometry[:3, :3].T for view, odometry in zip(views, odometry_from_camera[seen], strict=True)]
     towards_camera = np.concatenate(normals)
     if len(towards_camera) < LEAST_POINTS:
         return None
@@ -67,6 +62,14 @@ def up_from_room(
     return directions[best] if scores[best] > scores[second] + MARGIN else None
 
 
+def _normals(depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "point 3"]:
+    """Return some of the directions that surfaces face, in camera axes."""
+    step = max(1, max(depth.shape) // SIDE_PX)
+    thinned = depth[step // 2 :: step, step // 2 :: step]
+    normal = surface.image_normals(thinned, cameras.scale_intrinsics(intrinsics, depth.shape, thinned.shape))
+    return normal[np.abs(normal).sum(-1) > 0][::5]
+
+
 def quarter_turns_from_room(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
@@ -74,3 +77,13 @@ def quarter_turns_from_room(
     """Return the clockwise quarter turns (0..3) that make pictures upright where no sensor told up; 0 where nothing tells."""
     up = up_from_room(odometry_from_camera, views)
     return 0 if up is None else quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
+
+
+def quarter_turns_from_surfaces(views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]]) -> int:
+    """Return the clockwise quarter turns (0..3) that make pictures upright where not even poses are known.
+
+    Floors, seats and tables are seen from above, so surfaces face up in the pictures more than to any other side; the pictures
+    stay as they are where that is not clear.
+    """
+    lean = [found.mean(0) for found in (_normals(*view) for view in views) if len(found) >= LEAST_POINTS]
+    return quarter_turns_from_gravity(np.eye(4)[None], up_odometry=np.mean(lean, axis=0)) if lean else 0

@@ -5,6 +5,8 @@ import pytest
 
 from pipeline.recordings import conventions, upright
 from pipeline.space import cameras, rigid
+from pipeline.space.meshes import RayCaster
+from tests.stages import textured_room
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 
@@ -90,3 +92,12 @@ def test_gravity_gives_the_turn_that_makes_upright(turns):
 def test_a_phone_that_looks_down_is_left_alone():
     down = rigid.look_at(np.array([1.0, 2, 1]), np.array([1.0, 0, 1.001]), np.array([0.0, 0, 1]))
     assert upright.quarter_turns_from_gravity(cameras.turn_camera(down[None], 1)) == 0
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_surfaces_give_the_turn_where_nothing_else_does(turns):
+    room = textured_room.MemoryClip(RayCaster(textured_room.textured_room(edge_m=0.2)), textured_room.walk(6), None)
+    intrinsics = cameras.turn_intrinsics(textured_room.INTRINSICS, textured_room.SIZE, -turns)
+    stored = [(cameras.turn_image(room.depth(frame), -turns), intrinsics) for frame in range(6)]
+    assert upright.quarter_turns_from_surfaces(stored) == turns
+    assert upright.quarter_turns_from_surfaces([(np.zeros_like(stored[0][0]), intrinsics)]) == 0
