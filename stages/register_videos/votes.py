@@ -20,7 +20,9 @@ class VoteOptions:
     """Which frames vote, and when votes agree."""
 
     every_frames: int = 5
-    """One frame in so many votes (2 Hz)."""
+    """One frame in so many votes (2 Hz) ..."""
+    least_asked: int = 20
+    """... and more often in recordings so short that fewer than this would."""
     least_probability: float = 0.2
     """Votes below this probability are not cast."""
     agree_deg: float = 8.0
@@ -77,7 +79,8 @@ def none_cast() -> Votes:
 
 def collect(clip: Clip, masks: Masks, localizer: Localizer, options: VoteOptions) -> Votes:
     """Localise every so many frames, with the agent masked out."""
-    asked = np.arange(min(options.every_frames // 2, len(clip) - 1), len(clip), options.every_frames)
+    step = min(options.every_frames, max(len(clip) // options.least_asked, 1))
+    asked = np.arange(min(step // 2, len(clip) - 1), len(clip), step)
     frames, answers, nearest = [], [], None
     for frame in track(asked.tolist(), "localising frames"):
         found = localizer.localize(
