@@ -125,7 +125,7 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     )
     agent_shape = FieldShape(low, high, shapes.agent_voxel_m, shapes.grid_channels, shapes.width, encoding=shapes.encoding)
     rest = torch.from_numpy(template.agent_from_bone_rest).float()
-    by_frame = RaysByFrame.of(store.agent, len(camera))
+    by_frame = RaysByFrame.of(store.agent.frame, len(camera))
     usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
     problem = Problem(

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from pipeline.space import cameras, rigid_torch
 from stages.reconstruct import losses
-from stages.reconstruct.problem import Problem, neighbours
+from stages.reconstruct.problem import Problem, RaysByFrame, neighbours, pick
 from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
 from stages.reconstruct.scene import Terms
 from stages.reconstruct.settings import Weights
@@ -25,6 +25,10 @@ OUTLIER_M = 0.1
 """measured points this far from the agent count half; all keep pulling, or the body could hide behind the scene"""
 ROOT_M, ROOT_RAD = 0.05, 0.05
 """registered roots are about this good"""
+COVER_M = 0.01
+"""a masked pixel is covered when a sample of the posed surface is seen this near to it"""
+COVER_POINTS = 400
+"""such samples, a centimetre and a half apart"""
 MARGIN_M = 0.03
 """the posed surface may stand this much before the measured depth"""
 
@@ -67,7 +71,7 @@ def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, g
     back = problem.body.pose(rest.view(frames, number, 1 + near, 3)[:, :, 0], pose.agent_from_bone)
     cycle = (back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2
     return {
-        "agent distance": (weights.distance, (trust[:, None] * losses.truncated_distance(distance, target, REACH_M))[good]),
+        "agent distance": (weights.agent_distance, (trust[:, None] * losses.truncated_distance(distance, target, REACH_M))[good]),
         "agent color": (weights.color, (trust * losses.color(color, rays.color / 255))[good]),
         "agent feature": (weights.feature, (trust * losses.feature(feature, rays.feature / 127))[good]),
         "cycle": (weights.cycle, cycle[good]),
@@ -95,6 +99,26 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
         "outside": (weights.outside, (trust * outside_m / DECIMETRE)[in_view & ~hidden]),
         "in front": (weights.in_front, (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
     }
+
+
+def cover_terms(problem: Problem, pose: Pose, rays: Rays, number: int, weights: Weights, generator: Generator) -> Terms:
+    """Draw the posed surface to masked pixels ``[frame * ray]`` that it does not cover, with or without depth.
+
+    Each pixel pulls that of ``number`` surface points which lies nearest to it in the picture.
+    """
+    frames, device = len(pose.frame), problem.device
+    points = problem.surface.points[pick(len(problem.surface.points), number, generator, device)]
+    camera_from_agent = rigid_torch.inverse(pose.agent_from_camera)
+    target = rays.direction[:, :2].view(frames, -1, 2)
+    with torch.no_grad():
+        seen = rigid_torch.apply(camera_from_agent, problem.body.pose(points.expand(frames, -1, -1), pose.agent_from_bone))
+        near = torch.cdist(target, seen[..., :2] / seen[..., 2:].clamp_min(0.1)).argmin(-1)
+    nearest = rigid_torch.apply(camera_from_agent, problem.body.pose(points[near], pose.agent_from_bone))
+    depth = nearest[..., 2:].clamp_min(0.1)
+    gap_m = (nearest[..., :2] / depth - target).norm(dim=-1) * depth[..., 0].detach()
+    masked = (rays.label == AGENT).view(frames, -1)
+    bare_m = functional.relu(gap_m - COVER_M).clamp_max(2 * DECIMETRE)
+    return {"cover": (weights.cover, (problem.trust[pose.frame, None] * bare_m / DECIMETRE)[masked])}
 
 
 def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: Weights) -> Terms:
@@ -146,7 +170,9 @@ class ChunkLoss(torch.nn.Module):
         """Bones start to move after ``root_share`` of the steps."""
         super().__init__()
         self.problem, self.frame, self.weights, self.rays, self.points, self.root_share = problem, frame, weights, rays, points, root_share
-        self.seen = torch.isin(frame, problem.agent_frames)
+        self.masked = torch.nonzero(problem.store.agent.label == AGENT)[:, 0]
+        self.masked_rays = RaysByFrame.of(problem.store.agent.frame[self.masked], len(problem.video))
+        self.seen = torch.isin(frame, problem.agent_frames) & (self.masked_rays.count[frame] > 0)
         self.root = torch.nn.Parameter(problem.motion.root.detach()[frame].clone())
         self.bone = torch.nn.Parameter(problem.motion.bone.detach()[frame].clone())
 
@@ -165,8 +191,10 @@ class ChunkLoss(torch.nn.Module):
         seen = Pose(
             self.frame[self.seen], pose.world_from_camera[self.seen], pose.world_from_agent[self.seen], pose.agent_from_bone[self.seen]
         )
-        rays = problem.store.agent.at(problem.agent_rays.pick(seen.frame, self.rays, generator).flatten())
+        rays = problem.store.agent.at(self.masked[self.masked_rays.pick(seen.frame, self.rays, generator).flatten()])
         terms = measured_terms(problem, seen, rays, self.weights, generator, near=0)
+        if self.weights.cover:
+            terms |= cover_terms(problem, seen, rays, COVER_POINTS, self.weights, generator)
         terms |= surface_terms(problem, seen, self.points, self.weights, generator)
         terms |= prior_terms(problem, pose, self.bone, len(self.frame), self.weights)
         return losses.weighted(terms)

@@ -13,7 +13,7 @@ from pipeline.errors import InputError
 from pipeline.models.fields import Body, Field
 from pipeline.models.motion import MotionTable
 from pipeline.space.meshes import Mesh
-from stages.reconstruct.rays import Rays, Store
+from stages.reconstruct.rays import Store
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Problem:
             self,
             store=Store(scene, agent, self.store.views),
             agent_frames=self.agent_frames[own[self.agent_frames]],
-            agent_rays=RaysByFrame.of(agent, len(self.video)),
+            agent_rays=RaysByFrame.of(agent.frame, len(self.video)),
         )
 
     def runs(self, length: int) -> Int[Tensor, "run"]:
@@ -90,9 +90,9 @@ class RaysByFrame:
     count: Int[Tensor, "frame"]
 
     @classmethod
-    def of(cls, rays: Rays, frames: int) -> "RaysByFrame":
+    def of(cls, frame: Int[Tensor, "ray"], frames: int) -> "RaysByFrame":
         """Count rays, which are sorted by frame."""
-        count = torch.bincount(rays.frame, minlength=frames)
+        count = torch.bincount(frame, minlength=frames)
         return cls(count.cumsum(0) - count, count)
 
     def pick(self, frame: Int[Tensor, "frame"], number: int, generator: Generator) -> Int[Tensor, "frame ray"]:

@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from pipeline.files.clips import Clip, Masks
 from pipeline.space import cameras
+from pipeline.space.thin_depth import supported
 
 AGENT, UNKNOWN, NOT_AGENT = 255, 128, 0
 THUMBNAIL = 4
@@ -124,10 +125,11 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
         mask = source.masks[frame] if source.masks is not None else np.zeros(source.clip.color_size, np.uint8)
         seen = source.masks is not None and source.masks.visible[frame]
         near = near_agent(mask, sampling.ring_px) if seen else np.zeros(mask.shape, bool)
-        reader = _Reader(source, frame, mask, depth, slope)
         if source.has_scene:
+            reader = _Reader(source, frame, mask, depth, slope)
             scene.append(reader.read(_choose(mask == NOT_AGENT, sampling.scene_per_frame, rng), rng))
         if seen:
+            reader = _Reader(source, frame, mask, thin_depth(source.clip, frame), slope)
             agent.append(reader.read(_choose(near, sampling.agent_per_frame, rng), rng))
         small = tuple(size // THUMBNAIL for size in mask.shape)
         depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16))
@@ -198,6 +200,12 @@ def trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height wid
     jump = cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3))) > 0.1 + 0.05 * depth
     depth[jump] = 0
     return depth, np.clip(slope, 0.15, None).astype(np.float32)
+
+
+def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
+    """Return depth (0 = unknown) that neighbours support, however much the sensor doubts it: thin limbs are all edge."""
+    depth = clip.depth(frame).astype(np.float32)
+    return np.where(supported(depth) & (depth >= SEEN_M[0]) & (depth <= SEEN_M[1]), depth, 0)
 
 
 def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np.ndarray, "height width"]:

@@ -8,7 +8,9 @@ class Weights:
     """How much each loss counts, after averaging over its elements."""
 
     distance: float = 1.0
-    """signed distance at and near measured depth"""
+    """signed distance of the scene at and near measured depth"""
+    agent_distance: float = 2.0
+    """signed distance of the agent at and near measured depth"""
     color: float = 4.0
     """colour at measured surfaces"""
     feature: float = 0.5
@@ -27,8 +29,10 @@ class Weights:
     """gradients of signed distance have length 1"""
     cycle: float = 1.0
     """backward then forward warp returns, per decimetre"""
-    outside: float = 1.0
+    outside: float = 2.0
     """posed surface outside the mask, per decimetre"""
+    cover: float = 2.0
+    """masked pixels that the posed surface leaves bare, per decimetre"""
     in_front: float = 0.5
     """posed surface in space seen free, per decimetre"""
     rigidity: float = 10.0
@@ -41,7 +45,7 @@ class Weights:
     """corrections of neighbouring camera knots agree (relative motion of registration), per centimetre"""
     anchor: float = 0.05
     """corrections of cameras are small, per centimetre"""
-    root: float = 0.02
+    root: float = 0.005
     """the agent's root stays near the registered one, per 5 cm and 3 degrees"""
     template: float = 2.0
     """the agent's field stays near its template, in shape and colour"""

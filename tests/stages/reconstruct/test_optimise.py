@@ -9,11 +9,13 @@ import trimesh
 
 from pipeline.models import fields
 from pipeline.models.fields import Reconstruction
-from pipeline.space import cameras, rigid
+from pipeline.space import cameras, rigid, rigid_torch
 from pipeline.space.meshes import Mesh
-from stages.reconstruct import assemble, optimise, results
+from stages.reconstruct import assemble, body, optimise, results
 from stages.reconstruct.assemble import Shapes, Template, Video
-from stages.reconstruct.rays import AGENT, Rays, Store, Views
+from stages.reconstruct.body import Pose
+from stages.reconstruct.problem import RaysByFrame
+from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, Store, Views, distance_outside
 from stages.reconstruct.settings import Batches, Rates, Steps, Weights
 
 WIDE, UPRIGHT = (24, 32), (32, 24)
@@ -49,9 +51,8 @@ def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> Video:
         depth, hit = cast(eye, directions @ camera[-1][:3, :3].T, centre)
         chosen = np.concatenate([rng.choice(np.flatnonzero(~hit), 60), rng.choice(np.flatnonzero(hit), 40)])
         rays.append((frame, directions[chosen], depth[chosen], hit[chosen]))
-        image = hit.reshape(height, width)[2::4, 2::4]
         depths.append(depth.reshape(height, width)[2::4, 2::4])
-        outside.append(np.where(image, 0, 20))
+        outside.append(distance_outside(np.where(hit, AGENT, NOT_AGENT).astype(np.uint8).reshape(height, width), size))
     store = pack(rays, depths, outside, intrinsics, has_scene)
     registered = np.stack(root)
     if has_scene:
@@ -76,7 +77,7 @@ def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
     views = Views(
         torch.from_numpy(intrinsics).float().repeat(frames, 1, 1), torch.tensor([width * 4.0, height * 4.0]).repeat(frames, 1),
         torch.from_numpy(np.stack(depths)).half(),
-        torch.from_numpy(np.stack(outside)).half(), torch.ones(frames, dtype=torch.bool),
+        torch.from_numpy(np.stack(outside)), torch.ones(frames, dtype=torch.bool),
     )  # fmt: skip
     return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
 
@@ -128,6 +129,24 @@ def test_posed_surface_comes_nearer_to_the_truth(solved):
     truth = np.stack([0.03 * np.arange(12), np.zeros(12), np.zeros(12)], axis=-1)
     before = np.linalg.norm(videos[0].world_from_agent[:, :3, 3] - truth, axis=-1).mean()
     assert np.linalg.norm(centre - truth, axis=-1).mean() < 0.6 * before
+
+
+def test_bare_masked_pixels_draw_the_surface_to_them():
+    found, _ = problem()
+    frame, rays, generator = found.agent_frames[:4], found.store.agent, torch.Generator().manual_seed(0)
+    masked = torch.nonzero(rays.label == AGENT)[:, 0]
+    rays = rays.at(masked[RaysByFrame.of(rays.frame[masked], len(found.video)).pick(frame, 40, generator).flatten()])
+    pose = Pose.of(found, frame)
+
+    def bare(shift: torch.Tensor) -> torch.Tensor:
+        there = pose.world_from_agent @ rigid_torch.make(torch.eye(3), shift)
+        terms = body.cover_terms(found, replace(pose, world_from_agent=there), rays, 4000, Weights(), torch.Generator().manual_seed(0))
+        return terms["cover"][1].mean()
+
+    home, shift = torch.tensor([-0.03, 0.03, -0.02]), torch.zeros(3, requires_grad=True)
+    assert bare(home) < 0.2 * bare(shift), "registered roots are off by as much"
+    bare(shift).backward()
+    assert torch.nn.functional.cosine_similarity(-shift.grad, home, dim=0) > 0.7
 
 
 def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
