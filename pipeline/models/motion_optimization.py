@@ -25,19 +25,21 @@ from pipeline.space.signed_distance import SignedDistance
 class Settings:
     """Weights and length of the optimisation; every term is a mean over frames, in metres or square metres of motion."""
 
-    steps: int = 150
+    steps: int = 200
     """steps of Adam"""
     rate: float = 0.004
     """learning rate, metres and radians a step; falls to a tenth"""
     foot: float = 120.0
     """a standing foot stays where it stands on average"""
     collision: float = 40.0
-    """nothing is inside the scene"""
+    """nothing is inside the scene, on average over vertices"""
+    deepest: float = 4.0
+    """nor is the deepest vertex of any frame"""
     contact: float = 0.02
     """contact vertices near the scene touch it"""
     contact_scale_m: float = 0.02
     """distance at which the Geman-McClure function lets go"""
-    smooth: float = 30.0
+    smooth: float = 70.0
     """neighbouring meshes"""
     smoothness: Literal["acceleration", "velocity"] = "acceleration"
     """what is kept small between neighbouring meshes; the paper's is the velocity, which also slows the animal down"""
@@ -103,10 +105,11 @@ def optimise(
         points = surface(*correction())
         body, touching = points[:, :count], points[:, count:]
         distance = scene.at(points)
-        feet = physique.contacts.centres(touching)
+        feet, inside = physique.contacts.centres(touching), collision_error(distance, settings.margin_m)
         total = (
             settings.foot * foot_error(feet, phases).mean()
-            + settings.collision * collision_error(distance, settings.margin_m).mean()
+            + settings.collision * inside.mean()
+            + settings.deepest * inside.amax(dim=1).mean()
             + settings.contact * contact_error(distance[:, count:], settings.contact_scale_m).mean()
             + settings.smooth * (smooth_error(body, settings.smoothness).mean() + smooth_error(feet, settings.smoothness).mean())
             + settings.stay * ((points - given) ** 2).sum(-1).mean()

@@ -20,10 +20,12 @@ from pipeline.models.contacts import Contacts, tensors
 from pipeline.models.longterm import ROOT, PoseNet, RouteNet, Sizes, StaticBody
 from pipeline.models.motion_optimization import Physique
 from pipeline.models.plausibility import Judge
-from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, eased, joined
+from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, eased, joined, leaping
 from pipeline.models.surroundings import Surroundings
 
 NETWORKS = ("static", "route", "pose")
+LEAP_M = 0.1
+"""A leg between places whose levels differ by more than this is leapt."""
 SWEEPS = 2
 """How often bodies in passing are made again from what is before and after them."""
 
@@ -146,8 +148,8 @@ class LongTerm:
         """Return motion through a row of places, two seconds from one to the next, and the bodies at them.
 
         A body that stays at its place stays as it is. At places that are none of ``stops`` (None: all are) it is only
-        passing: there it is what the networks make of it between where it is a second before and a second after, for a body
-        drawn on its own would be caught at any moment of a stride.
+        passing: there its pose is what the networks make of it between a second before and a second after, for a body drawn
+        on its own would be caught at any moment of a stride.
         """
         number = np.arange(len(world_from_agent))
         stays = np.append(False, np.isclose(world_from_agent[1:], world_from_agent[:-1]).all((1, 2)))
@@ -155,15 +157,16 @@ class LongTerm:
         drawn = np.isin(number, number if stops is None else [0, *stops, number[-1]]) | stays | np.append(stays[1:], False)
         for _ in range(SWEEPS if not drawn.all() else 0):
             bodies = self._passed(bodies, np.flatnonzero(~drawn), scene, rng)
-        return eased(joined(self.short_motions(bodies[:-1], bodies[1:], scene, rng))), bodies
+        rise = np.abs(np.diff(world_from_agent[:, 1, 3]))
+        parts = zip(self.short_motions(bodies[:-1], bodies[1:], scene, rng), rise > LEAP_M, strict=True)
+        return eased(joined([leaping(part) if leaps else part for part, leaps in parts])), bodies
 
     def _passed(self, bodies: Moving, passing: Int[np.ndarray, "place"], scene: Surroundings, rng: np.random.Generator) -> Moving:
         middle = _stacked([part[STEPS // 2] for part in self.short_motions(bodies[:-1], bodies[1:], scene, rng)])
         made = self.short_motions(middle[passing - 1], middle[passing], scene, rng)
-        roots, bones = bodies.world_from_agent.copy(), bodies.agent_from_bone.copy()
-        for place, part in zip(passing, made, strict=True):
-            roots[place], bones[place] = part.world_from_agent[STEPS // 2], part.agent_from_bone[STEPS // 2]
-        return Moving(roots, bones)
+        bones = bodies.agent_from_bone.copy()
+        bones[passing] = np.stack([part.agent_from_bone[STEPS // 2] for part in made])
+        return Moving(bodies.world_from_agent, bones)
 
 
 def placed(channels: Float[Tensor, "body channel"], world_from_place: Float[np.ndarray, "body 4 4"], poses: PoseSpace) -> Moving:

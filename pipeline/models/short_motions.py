@@ -42,6 +42,22 @@ def joined(parts: Sequence[Moving]) -> Moving:
     return Moving(np.concatenate([part.world_from_agent for part in kept]), np.concatenate([part.agent_from_bone for part in kept]))
 
 
+def leaping(motion: Moving, hop_m: float = 0.08) -> Moving:
+    """Let a motion that ends on another level go up before it goes across, or down after: straight, it would go through the edge."""
+    share, (start, end) = np.linspace(0, 1, len(motion)), motion.world_from_agent[[0, -1], :3, 3]
+    early, late = (_smooth(share, *span) for span in ((0.2, 0.55), (0.45, 0.8)))
+    upward, across = (early, late) if end[1] > start[1] else (late, early)
+    roots = motion.world_from_agent.copy()
+    roots[:, :3, 3] = start + np.stack([across, upward, across], axis=-1) * (end - start)
+    roots[:, 1, 3] += hop_m * _smooth(share, 0.2, 0.45) * (1 - _smooth(share, 0.55, 0.8))
+    return Moving(roots, motion.agent_from_bone)
+
+
+def _smooth(share: Float[np.ndarray, "frame"], low: float, high: float) -> Float[np.ndarray, "frame"]:
+    part = np.clip((share - low) / (high - low), 0, 1)
+    return part * part * (3 - 2 * part)
+
+
 def eased(motion: Moving, every: int = STEPS, reach: int = 6) -> Moving:
     """Take the snap out of the seams at every ``every``-th frame: the ``reach`` frames on both sides lead there evenly.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from skimage.graph import route_through_array
 
 from pipeline.errors import InputError
@@ -24,6 +24,12 @@ RAISED_M = 0.15
 """A sub-goal whose body stands higher than this above the floor is on furniture and is reached by a leap."""
 SLACK = 1.35
 """How much longer than the usual pace a leg may be before another one is needed."""
+TURN_M = 0.2
+"""A body that stops keeps this far from where it cannot walk, to have room to turn."""
+ABOUT_RAD = 1.7
+"""A turn of more than this takes a body at rest two legs."""
+MORE_LEGS = 4
+"""How many more legs than the pace asks for a way may be parted into, so that none leads through furniture."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,8 @@ class Floor:
     """Where a body can walk, on cells of the ground."""
 
     free: Bool[np.ndarray, "x z"]
-    clearance_m: Float[np.ndarray, "x z"]
-    """distance from what stands, at the heights of the body"""
+    room_m: Float[np.ndarray, "x z"]
+    """distance from where it cannot"""
     corner: Float[np.ndarray, "2"]
     height_m: float
 
@@ -68,13 +74,31 @@ class Floor:
         points = np.stack(np.meshgrid(x, levels, z, indexing="ij"), axis=-1)
         above = grid.at(torch.from_numpy(points).float()).numpy()
         beneath = grid.at(torch.from_numpy(points[:, 0] * [1, 0, 1] + [0, floor, 0]).float()).numpy()
-        clearance = above.min(1)
-        free = (clearance > np.minimum(breadth_m / 2, 0.6 * root_m)) & (np.abs(beneath) < 0.1)
-        return cls(free, clearance, low[[0, 2]], floor)
+        free = (above.min(1) > np.minimum(breadth_m / 2, 0.6 * root_m)) & (np.abs(beneath) < 0.1)
+        return cls(free, CELL_M * distance_transform_edt(free), low[[0, 2]], floor)
 
     def cell(self, position: Float[np.ndarray, "3"]) -> tuple[int, int]:
         """Return the free cell nearest to a position."""
-        cells = np.argwhere(self.free)
+        return self._nearest(self.free, position)
+
+    def roomy(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Return a position where a body can turn: the given one if it can, else the nearest."""
+        room = self.room_m > TURN_M
+        cell = np.array(self._nearest(room if room.any() else self.free, position))
+        place = self.corner + CELL_M * cell
+        stays = np.abs(place - position[[0, 2]]).max() <= CELL_M / 2
+        return np.asarray(position) if stays else np.array([place[0], position[1], place[1]])
+
+    def blocked_m(self, way: Float[np.ndarray, "point 3"]) -> float:
+        """Return how much of a polyline does not lead over free floor, metres."""
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way[:, [0, 2]], axis=0), axis=1))])
+        where = np.arange(0, along[-1], CELL_M / 4)
+        points = np.stack([np.interp(where, along, way[:, axis]) for axis in (0, 2)], axis=-1)
+        cells = np.clip(np.rint((points - self.corner) / CELL_M).astype(int), 0, np.array(self.free.shape) - 1)
+        return float((~self.free[tuple(cells.T)]).sum() * CELL_M / 4)
+
+    def _nearest(self, wanted: Bool[np.ndarray, "x z"], position: Float[np.ndarray, "3"]) -> tuple[int, int]:
+        cells = np.argwhere(wanted)
         if not len(cells):
             raise InputError("SIM-003", "there is no free floor in this scene", "", "give sub-goals in a scene that shows its floor")
         off = self.corner + CELL_M * cells - np.asarray(position)[[0, 2]]
@@ -90,7 +114,7 @@ class Floor:
 
     def way(self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "point 2"]:
         """Return a way over the ground from near one position to near another, smooth, away from furniture."""
-        cost = np.where(self.free, 1 + 1.5 * np.exp(-np.maximum(self.clearance_m - 0.1, 0) / 0.08), 80.0)
+        cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / 0.12), 80.0)
         cells, _ = route_through_array(cost, self.cell(start), self.cell(end), fully_connected=True, geometric=True)
         way = self.corner + CELL_M * np.array(cells, float)
         return gaussian_filter1d(way, 3.0, axis=0, mode="nearest") if len(way) > 2 else way
@@ -104,14 +128,12 @@ def legs(start: Float[np.ndarray, "4 4"] | None, subgoals: list[Subgoal], scene:
     for goal in subgoals:
         floor.refuse_outside(goal.position_world)
     root_m = floor.height_m + habits.clearance_m
-    here = subgoals[0].position_world if start is None else start[:3, 3]
-    points, headings, marks, clock = [_grounded(here, root_m)], [subgoals[0].heading_rad if start is None else _heading(start)], [0], 0.0
+    points = [_standing(floor, subgoals[0].position_world, root_m) if start is None else _grounded(start[:3, 3], root_m)]
+    headings, marks, clock = [subgoals[0].heading_rad if start is None else _heading(start)], [0], 0.0
     for goal in subgoals[1:] if start is None else subgoals:
-        stations = _stations(floor, points[-1], _grounded(goal.position_world, root_m), root_m)
-        length = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum())
-        count = max(1, int(np.ceil(length / (SLACK * habits.pace_m))))
+        added = _way(floor, points[-1], _standing(floor, goal.position_world, root_m), root_m, SLACK * habits.pace_m)
+        count = len(added)
         spare = 0 if goal.time_s is None else max(0, round((goal.time_s - clock) / LEG_S) - count)
-        added = _spaced(stations, count)
         points += [*added, *[added[-1]] * spare]
         headings += [None] * (count - 1) + [goal.heading_rad] * (1 + spare)
         clock += (count + spare) * LEG_S
@@ -136,6 +158,12 @@ def preferred(
     return found
 
 
+def _standing(floor: Floor, position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
+    """Return where a body stands that is to be at a position: there if on furniture, else where it has room to turn."""
+    grounded = _grounded(position, root_m)
+    return floor.roomy(grounded) if grounded[1] == root_m else grounded
+
+
 def _grounded(position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
     """Give a position without height, or one near the floor, the root's usual height."""
     position = np.asarray(position, float)
@@ -143,11 +171,21 @@ def _grounded(position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarr
     return np.array([position[0], root_m if level else position[1], position[2]])
 
 
-def _stations(floor: Floor, start: np.ndarray, end: np.ndarray, root_m: float) -> Float[np.ndarray, "point 3"]:
-    """Return the way from one root position to another; up to and down from furniture in a straight line."""
-    way = floor.way(start, end)
-    ground = np.column_stack([way[:, 0], np.full(len(way), root_m), way[:, 1]])
-    return np.concatenate([start[None], ground, end[None]])
+def _way(floor: Floor, start: np.ndarray, end: np.ndarray, root_m: float, longest_m: float) -> list[Float[np.ndarray, "3"]]:
+    """Return the ends of the legs from one root position to another; onto furniture and down from it in one leap."""
+    leaps = [abs(place[1] - root_m) > 1e-6 for place in (start, end)]
+    ground = floor.way(*(floor.roomy(place) if leap else place for place, leap in zip((start, end), leaps, strict=True)))
+    ground = np.column_stack([ground[:, 0], np.full(len(ground), root_m), ground[:, 1]])
+    walked = np.concatenate([ground[:0] if leaps[0] else start[None], ground, ground[:0] if leaps[1] else end[None]])
+    return [*([walked[0]] if leaps[0] else []), *_parted(floor, walked, longest_m), *([end] if leaps[1] else [])]
+
+
+def _parted(floor: Floor, way: Float[np.ndarray, "point 3"], longest_m: float) -> list[Float[np.ndarray, "3"]]:
+    """Return the ends of legs along a way: few, but straight from end to end they are to lead through as little as can be."""
+    fewest = max(1, int(np.ceil(np.linalg.norm(np.diff(way, axis=0), axis=1).sum() / longest_m)))
+    tried = [_spaced(way, count) for count in range(fewest, fewest + MORE_LEGS + 1)]
+    blocked = [floor.blocked_m(np.array([way[0], *points])) for points in tried]
+    return tried[int(np.argmax(np.array(blocked) <= min(blocked) + CELL_M / 2))]
 
 
 def _spaced(stations: Float[np.ndarray, "point 3"], count: int) -> list[Float[np.ndarray, "3"]]:
@@ -158,13 +196,18 @@ def _spaced(stations: Float[np.ndarray, "point 3"], count: int) -> list[Float[np
 
 
 def _facing(points: Float[np.ndarray, "place 3"], headings: list[float | None]) -> Float[np.ndarray, "place 4 4"]:
-    """Turn every place along the way through it, where no heading is given."""
+    """Turn every place along the way through it, where no heading is given; a body at rest turns about in two legs."""
     turned = []
     for index, given in enumerate(headings):
         way = points[min(index + 1, len(points) - 1)] - points[max(index - 1, 0)]
         if given is None and np.linalg.norm(way[[0, 2]]) < 0.05:
             given = turned[-1] if turned else 0.0
         turned.append(float(np.arctan2(way[0], way[2])) if given is None else given)
+    for index in range(2, len(turned)):
+        about = (turned[index] - turned[index - 1] + np.pi) % (2 * np.pi) - np.pi
+        rests = np.linalg.norm(points[index - 2 : index + 1] - points[index], axis=1).max() < 1e-6
+        if rests and headings[index - 1] is None and abs(about) > ABOUT_RAD:
+            turned[index - 1] += about / 2
     vectors = np.zeros((len(turned), 3))
     vectors[:, 1] = turned
     return rigid.make(rigid.rotation_from_vector(vectors), points)

@@ -141,6 +141,24 @@ def test_legs_lead_around_the_block_and_are_on_time(lives, model):
     assert not floor.free[tuple(np.round((np.array([0.0, 0.0]) - floor.corner) / 0.08).astype(int))]
 
 
+def test_sub_goals_by_the_block_are_moved_to_where_a_body_can_turn_and_legs_lead_past_it(lives, model):
+    floor = Floor.of(lives.scenes[0], strider.HIP_M)
+    beside, inside, far = (np.array([x, strider.HIP_M, 0.1]) for x in (0.5, 0.0, 1.2))
+    for position in (beside, inside):
+        moved = floor.roomy(position)
+        assert 0.55 < np.abs(moved[[0, 2]]).max() < 0.9
+    np.testing.assert_array_equal(floor.roomy(far), far)
+    places = legs(None, [Subgoal(np.array([-0.75, np.nan, 0.0])), Subgoal(np.array([0.75, np.nan, 0.0]))], lives.scenes[0], model.habits)
+    assert floor.blocked_m(places.world_from_agent[[0, -1], :3, 3]) > 0.7
+    assert floor.blocked_m(places.world_from_agent[:, :3, 3]) < 0.1
+
+
+def test_a_body_at_rest_turns_about_in_two_legs(lives, model):
+    goals = [Subgoal(np.array([x, np.nan, 1.2]), time_s=t) for x, t in ((-1.0, None), (1.0, 20.0), (-1.0, None))]
+    ahead = legs(None, goals, lives.scenes[0], model.habits).world_from_agent[:, :3, 2]
+    assert np.degrees(np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(1), -1, 1))).max() < 100
+
+
 def test_preferred_places_are_where_the_animal_was():
     been = np.concatenate([np.tile([1.0, 0.2, 1.0], (300, 1)), np.tile([-1.0, 0.4, 0.5], (100, 1))])
     drawn = np.array([goal.position_world for goal in preferred(been, 200, np.random.default_rng(0))])

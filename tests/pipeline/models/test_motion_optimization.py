@@ -92,7 +92,7 @@ def test_a_gliding_motion_gets_feet_that_stand(lives, physique):
     done = optimise(gliding, physique, scene, SETTINGS)
     before, after = (judge.plausibility(each, judge.stance(each)).least_slide_m_s for each in (gliding, done))
     assert before > 0.1 and after < 0.3 * before
-    assert not judge.stance(gliding).any() and judge.stance(done).any(axis=1).mean() > 0.6
+    assert not judge.stance(gliding).any() and judge.stance(done).any(axis=1).mean() > 0.5
 
 
 def test_held_frames_stay(lives, physique):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.models.short_motions import Moving, joined, resampled, stretches
+from pipeline.models.short_motions import Moving, joined, leaping, resampled, stretches
 from pipeline.models.trajectories import Trajectory
 from pipeline.space import rigid
 
@@ -36,3 +36,15 @@ def test_joints_count_once():
     whole = joined([moving[:4], moving[3:7], moving[6:]])
     np.testing.assert_array_equal(whole.world_from_agent, moving.world_from_agent)
     assert len(joined([moving])) == pytest.approx(10)
+
+
+def test_a_leap_goes_up_before_across_and_down_after():
+    roots = np.tile(np.eye(4), (61, 1, 1))
+    roots[:, :3, 3] = np.linspace(0, 1, 61)[:, None] * [1.0, 0.5, 0.0]
+    up = leaping(Moving(roots, np.tile(np.eye(4), (61, 2, 1, 1))))
+    down = leaping(Moving(roots[::-1], up.agent_from_bone))
+    for motion in (up, Moving(down.world_from_agent[::-1], down.agent_from_bone)):
+        place = motion.world_from_agent[:, :3, 3]
+        np.testing.assert_allclose(place[[0, -1]], roots[[0, -1], :3, 3], atol=1e-9)
+        assert place[place[:, 0] > 0.2, 1].min() > 0.4, "over the edge it is up"
+        assert np.linalg.norm(np.diff(place, 2, axis=0), axis=1).max() < 0.02
