@@ -9,28 +9,37 @@ from scipy.stats import ks_2samp
 from pipeline.models.predictors import Ats
 from pipeline.models.scenes import Scenes
 from pipeline.models.simulator import Chaining, Simulator
-from pipeline.models.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory
+from pipeline.models.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData
+
+REST_M_S = 0.05
+"""speed below which an animal rests: it breathes, and reconstructions err by more"""
 
 
 def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds: float, seed: int) -> dict[str, float]:
     """Return the share of time inside something solid or outside, and Kolmogorov-Smirnov distances of speeds.
 
-    Truth against truth compares each test recording (each half, if there is one) with the others.
+    Truth against truth compares each test recording (each half, if there is one) with the others. ``moving`` counts all
+    speeds of an animal that rests as one.
     """
     videos = sorted({int(video) for video in data.video[data.split == TEST]})
     recorded = [data.trajectories[data.videos[video]] for video in videos]
     lived = [_rollout(ats, data, scenes, videos[number % len(videos)], seconds, seed + number) for number in range(count)]
     solid = [scenes.inside_solid(life[None], np.array([videos[n % len(videos)]])).mean() for n, life in enumerate(lived)]
-    true = np.concatenate([_speeds(t.world_from_agent[t.valid, :3, 3]) for t in recorded])
-    distances = [ks_2samp(_speeds(life), true).statistic for life in lived]
+    true = [_speeds(t.world_from_agent[t.valid, :3, 3]) for t in recorded]
+    speeds, whole = [_speeds(life) for life in lived], np.concatenate(true)
     return {
         "behavior/ats/chain_rollouts": float(count),
         "behavior/ats/chain_seconds": float(seconds),
         "behavior/ats/chain_solid_share": float(np.mean(solid)),
         "behavior/ats/chain_solid_share_worst": float(np.max(solid)),
-        "behavior/ats/chain_speed_ks": float(np.mean(distances)),
-        "behavior/ats/chain_speed_ks_pooled": float(ks_2samp(np.concatenate([_speeds(life) for life in lived]), true).statistic),
-        "behavior/true/chain_speed_ks": _among(recorded),
+        "behavior/ats/chain_speed_ks": float(np.mean([_apart(each, whole) for each in speeds])),
+        "behavior/ats/chain_speed_ks_pooled": _apart(np.concatenate(speeds), whole),
+        "behavior/ats/chain_moving_speed_ks": float(np.mean([_apart(each, whole, REST_M_S) for each in speeds])),
+        "behavior/ats/chain_moving_speed_ks_pooled": _apart(np.concatenate(speeds), whole, REST_M_S),
+        "behavior/ats/chain_rest_share": float(np.mean(np.concatenate(speeds) < REST_M_S)),
+        "behavior/true/chain_speed_ks": _among(true),
+        "behavior/true/chain_moving_speed_ks": _among(true, REST_M_S),
+        "behavior/true/chain_rest_share": float(np.mean(whole < REST_M_S)),
     }
 
 
@@ -56,8 +65,11 @@ def _speeds(path: Float[np.ndarray, "frame 3"]) -> Float[np.ndarray, "step"]:
     return np.linalg.norm(np.diff(path, axis=0), axis=-1) * RATE_HZ
 
 
-def _among(recorded: list[Trajectory]) -> float:
-    parts = [_speeds(t.world_from_agent[t.valid, :3, 3]) for t in recorded]
-    parts = parts if len(parts) > 1 else np.array_split(parts[0], 2)
+def _apart(mine: Float[np.ndarray, "step"], others: Float[np.ndarray, "other"], least: float = 0.0) -> float:
+    return float(ks_2samp(np.maximum(mine, least), np.maximum(others, least)).statistic)
+
+
+def _among(recorded: list[Float[np.ndarray, "step"]], least: float = 0.0) -> float:
+    parts = recorded if len(recorded) > 1 else np.array_split(recorded[0], 2)
     others = [np.concatenate([part for other, part in enumerate(parts) if other != mine]) for mine in range(len(parts))]
-    return float(np.mean([ks_2samp(part, rest).statistic for part, rest in zip(parts, others, strict=True)]))
+    return float(np.mean([_apart(part, rest, least) for part, rest in zip(parts, others, strict=True)]))

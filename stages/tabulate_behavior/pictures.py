@@ -33,12 +33,12 @@ def learning_curves(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed st
     return drawing.pixels(figure)
 
 
-def checks(figures: Mapping[str, float], ours: str) -> list[Check]:
+def checks(figures: Mapping[str, float | None], ours: str) -> list[Check]:
     """Judge whether ours is ahead of each method, and whether the curves lie flat."""
     ahead = [
         Check(f"{name.split('/')[1].replace('_', ' ')}, goal, upper end of the interval", value, "m", 0.0)
         for name, value in figures.items()
-        if name.startswith(f"behavior/{ours}_minus_") and name.endswith("/goal_minde_m_ci95_high")
+        if name.startswith(f"behavior/{ours}_minus_") and name.endswith("/goal_minde_m_ci95_high") and value is not None
     ]
     falling = [value for name, value in figures.items() if name.endswith("_loss_still_falls")]
     return [*ahead, Check("losses still falling over the last tenth, at most", max(falling), "of itself", STILL_FALLING)]

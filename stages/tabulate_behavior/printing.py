@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+from pipeline.models.intervals import told
+
 END_TO_END = (
     ("goal_minde_m", "goal [m]"),
     ("path_minade_m", "path [m]"),
@@ -18,7 +20,7 @@ TRUTH_FED = (
 FLIGHT = (("flees_seen", "person walks up"), ("flees_unseen", "person not perceived"), ("flees_standing", "person stands"))
 
 
-def tables(figures: Mapping[str, float], methods: tuple[str, ...]) -> str:
+def tables(figures: Mapping[str, float | None], methods: tuple[str, ...]) -> str:
     """Return Tables 4 and 5 of the paper, and how often the animal flees, as text: mean [95 % interval]."""
     parts = [
         table("Table 4: end to end, best of 16 samples", END_TO_END, figures, methods),
@@ -30,20 +32,13 @@ def tables(figures: Mapping[str, float], methods: tuple[str, ...]) -> str:
     return "\n\n".join(parts)
 
 
-def table(title: str, columns: tuple[tuple[str, str], ...], figures: Mapping[str, float], methods: tuple[str, ...]) -> str:
+def table(title: str, columns: tuple[tuple[str, str], ...], figures: Mapping[str, float | None], methods: tuple[str, ...]) -> str:
     """Return one table; methods that have none of its figures are left out."""
     rows = [["method", *(head for _, head in columns)]]
     for method in methods:
-        cells = [cell(figures, f"behavior/{method}/{name}") for name, _ in columns]
+        cells = [told(figures, f"behavior/{method}/{name}", ".3f") for name, _ in columns]
         if any(text != "-" for text in cells):
             rows.append([method, *cells])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join([title, *lines])
-
-
-def cell(figures: Mapping[str, float], name: str) -> str:
-    """Return a figure with its interval, or a dash."""
-    if name not in figures:
-        return "-"
-    return f"{figures[name]:.3f} [{figures[f'{name}_ci95_low']:.3f} {figures[f'{name}_ci95_high']:.3f}]"

@@ -19,39 +19,44 @@ CONTRASTS = (
 """Figure, and the two scores whose difference it is, approach by approach or window by window."""
 
 
-def figures(found: Mapping[str, Scores], ours: str, *, draws: int, seed: int) -> dict[str, float]:
+def figures(found: Mapping[str, Scores], ours: str, *, draws: int, seed: int) -> dict[str, float | None]:
     """Return all figures with their intervals, and those of the differences to ours where windows are the same."""
-    table: dict[str, float] = {}
+    table: dict[str, float | None] = {}
     for method, scores in found.items():
         for name, values in scores.values.items():
             window = scores.windows_of(name)
-            _put(table, f"behavior/{method}/{_figure(name)}", interval(values, window, draws, seed))
+            table |= interval(values, window, draws, seed).named(f"behavior/{method}/{_figure(name)}")
             rival = found[ours].values.get(name)
             if method != ours and rival is not None and np.array_equal(window, found[ours].windows_of(name)):
                 both = min(len(rival), len(values)) if min(len(rival), len(values)) > 1 else max(len(rival), len(values))
                 less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(values[:both], (both, values.shape[1]))
-                _put(table, f"behavior/{ours}_minus_{method}/{_figure(name)}", interval(less, window, draws, seed))
+                table |= interval(less, window, draws, seed).named(f"behavior/{ours}_minus_{method}/{_figure(name)}")
         _contrast(table, method, scores, draws, seed)
         table[f"behavior/{method}/seeds"] = len(next(iter(scores.values.values())))
     return table
 
 
-def _contrast(table: dict[str, float], method: str, scores: Scores, draws: int, seed: int) -> None:
+def _contrast(table: dict[str, float | None], method: str, scores: Scores, draws: int, seed: int) -> None:
     """Put what the bars ask of one method alone: flight against the animal's own and without the observer, and control."""
     for name, first, second in CONTRASTS:
         if first in scores.values and second in scores.values:
             less = scores.values[first] - scores.values[second]
-            _put(table, f"behavior/{method}/{name}", interval(less, scores.windows_of(first), draws, seed))
+            table |= interval(less, scores.windows_of(first), draws, seed).named(f"behavior/{method}/{name}")
     fed, alone = (scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", PLAIN))
     if fed is not None and alone is not None:
         table[f"behavior/{method}/path_minade_truth_fed_share"] = float(fed.mean() / alone.mean())
 
 
 def interval(values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], draws: int, seed: int) -> Interval:
-    """Resample seeds and episodes of 6.4 s, both with replacement, and return the mean with percentiles 2.5 and 97.5."""
+    """Resample seeds and episodes of 6.4 s, both with replacement, and return the mean with percentiles 2.5 and 97.5.
+
+    The bounds of one episode alone are NaN.
+    """
     rng = np.random.default_rng(seed)
     episode = episodes(window[:, 1], window[:, 0], PAST + FUTURE)
     count = episode.max() + 1
+    if count == 1:
+        return Interval(float(values.mean()), np.nan, np.nan)
     total = np.stack([np.bincount(episode, row, count) for row in values])
     size = np.bincount(episode, minlength=count)
     means = np.empty(draws)
@@ -75,9 +80,3 @@ def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]])
 
 def _figure(name: str) -> str:
     return name.removeprefix(f"{PLAIN}/").replace("/", "_")
-
-
-def _put(table: dict[str, float], name: str, found: Interval) -> None:
-    table[name] = found.mean
-    table[f"{name}_ci95_low"] = found.low
-    table[f"{name}_ci95_high"] = found.high
