@@ -1,7 +1,7 @@
 """NPZ files: written with fixed timestamps so that equal arrays give equal bytes, read without pickle.
 
 `save` writes, `Rows` writes what does not fit into memory, `load` reads everything after checking each header,
-`open_lazily` maps big uncompressed members.
+`open_lazily` maps big uncompressed members, `Column` keeps what only this process needs out of memory.
 """
 
 import shutil
@@ -66,6 +66,30 @@ class Rows:
                     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
                     np.lib.format.write_array_header_1_0(member, header)
                     shutil.copyfileobj(part, member, 1 << 20)
+
+
+class Column:
+    """Rows of one array in an unnamed file that vanishes with it, mapped into memory.
+
+    Of any number of rows, those that are looked at are read, and the system drops them again where memory is short.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        """``folder`` is where the file lies; None: where temporary files do."""
+        self._file, self._rows, self._like = tempfile.TemporaryFile(dir=folder), 0, np.zeros(0)
+
+    def append(self, rows: np.ndarray) -> Self:
+        """Add rows at the end."""
+        self._file.write(np.ascontiguousarray(rows).data)
+        self._rows, self._like = self._rows + len(rows), rows[:0].copy()
+        return self
+
+    def array(self) -> np.ndarray:
+        """Return all rows."""
+        if not self._rows:
+            return self._like
+        self._file.flush()
+        return np.memmap(self._file, self._like.dtype, "r+", shape=(self._rows, *self._like.shape[1:]))
 
 
 def load(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ turnaround; then extracts surfaces, skin, motion per video and the scene's featu
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline import cli, progress, together
+from pipeline import cli, dag, progress, together
 from pipeline.models.fields import Reconstruction
 from stages.reconstruct import assemble, fuse, optimise, pictures, reading, results, writing
 from stages.reconstruct.assemble import Shapes
@@ -50,18 +50,19 @@ class Config:
 
 def run(task: cli.Task) -> None:
     """Reconstruct one agent's recordings."""
-    config: Config = task.config
+    config, scratch = task.config, task.resume
     together.join(task.device)
-    roles = {"frames": ("walkthrough", "turnaround", "session")}
-    per_video = {name: task.per_video(name, roles.get(name)) for name in ("frames", "masks", "flow", "features")}
-    folders = reading.Folders(**per_video, **{name: task.input(name) for name in ("registration", "scene_template", "agent_template")})
+    per_video = {name: task.per_video(name, dag.VIEWED if name == "frames" else None) for name in ("frames", "masks", "flow", "features")}
+    single = {name: task.input(name) for name in ("registration", "scene_template", "agent_template")}
+    folders = reading.Folders(**per_video, **single, scratch=scratch)
     by_role = {video.role: video.id for video in task.videos}
     twice = [video.synchronized_with for video in task.videos if video.role == "heldout"] if config.sessions == "filmed_twice" else None
     videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed, twice)
-    fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion) if config.ground == "fused" else None
-    problem = assemble.build(videos, reading.read_template(folders.agent_template), config.shapes, config.seed, task.device, fused)
+    fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion, scratch) if config.ground == "fused" else None
+    template = reading.read_template(folders.agent_template)
+    problem = assemble.build(videos, template, config.shapes, config.seed, task.device, fused, scratch)
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(problem.store.scene)} scene rays, {len(problem.store.agent)} agent rays")
-    plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, task.resume)
+    plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, scratch)
     records = optimise.optimise(problem, plan)
     if not together.leave():
         return
@@ -75,6 +76,5 @@ def run(task: cli.Task) -> None:
 
 
 if __name__ == "__main__":
-    cli.enter(
-        __doc__, run, config=Config, reads=("frames", "masks", "flow", "features", "registration", "scene_template", "agent_template")
-    )
+    reads = ("frames", "masks", "flow", "features", "registration", "scene_template", "agent_template")
+    cli.enter(__doc__, run, config=Config, reads=reads)

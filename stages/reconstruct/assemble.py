@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -92,33 +93,29 @@ class Shapes:
     """of the agent's roots"""
 
 
-def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int, device: str, fused: Fused | None = None) -> Problem:
-    """Make the problem; videos with a scene come first, so that codes count them. The scene learns on what is fused."""
+def build(
+    videos: Sequence[Video],
+    template: Template,
+    shapes: Shapes,
+    seed: int,
+    device: str,
+    fused: Fused | None = None,
+    scratch: Path | None = None,
+) -> Problem:
+    """Make the problem; videos with a scene come first, so that codes count them. The scene learns on what is fused.
+
+    Measurements are kept in unnamed files in ``scratch`` (None: where temporary files stand).
+    """
     videos = scene_first(videos)
     torch.manual_seed(seed)
-    store = join([usable(video) for video in videos])
+    thumbnail = tuple(max(video.store.views.depth.shape[axis] for video in videos) for axis in (1, 2))
+    store = join((usable(video) for video in videos), scratch, thumbnail)
     lengths = [len(video.timestamp_s) for video in videos]
     camera = np.concatenate([filled(video.timestamp_s, video.world_from_camera) for video in videos])
     roots, kept = zip(*(steadied(video, shapes.doubt) for video in videos), strict=True)
     agent = np.concatenate([filled(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)])
     rooted = torch.from_numpy(np.concatenate([np.isfinite(root).all((1, 2)) for root in roots]))
     trust = np.where(np.concatenate(kept), 1.0, shapes.doubt.trust)
-    low, high = measured_box(videos, shapes.scene_margin_m)
-    scene = Field(
-        FieldShape(
-            low,
-            high,
-            shapes.scene_voxel_m,
-            shapes.grid_channels,
-            shapes.width,
-            sum(v.has_scene for v in videos) if shapes.code_channels else 0,
-            shapes.code_channels,
-            truncation_m=fused.truncation_m if fused else shapes.truncation_m,
-            encoding=shapes.encoding,
-        ),
-        free_m=-0.03,
-        fused=fused,
-    )
     vertices = template.mesh.vertices
     low, high = (
         tuple(float(x) for x in corner) for corner in (vertices.min(0) - shapes.agent_margin_m, vertices.max(0) + shapes.agent_margin_m)
@@ -130,7 +127,7 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
     problem = Problem(
         store=store,
-        scene=scene,
+        scene=scene_field(videos, shapes, fused),
         agent=Field(agent_shape, free_m=0.1),
         body=Body(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape),
         motion=MotionTable(
@@ -144,6 +141,21 @@ def build(videos: Sequence[Video], template: Template, shapes: Shapes, seed: int
         trust=torch.from_numpy(trust).float(),
     )
     return problem if device == "cpu" else _moved(problem, device)
+
+
+def scene_field(videos: Sequence[Video], shapes: Shapes, fused: Fused | None) -> Field:
+    """Return the scene's field, empty where nothing is fused, in the box of what was measured."""
+    shape = FieldShape(
+        *measured_box(videos, shapes.scene_margin_m),
+        shapes.scene_voxel_m,
+        shapes.grid_channels,
+        shapes.width,
+        sum(video.has_scene for video in videos) if shapes.code_channels else 0,
+        shapes.code_channels,
+        truncation_m=fused.truncation_m if fused else shapes.truncation_m,
+        encoding=shapes.encoding,
+    )
+    return Field(shape, free_m=-0.03, fused=fused)
 
 
 def scene_first(videos: Sequence[Video]) -> list[Video]:
@@ -193,10 +205,11 @@ def filled(timestamp_s: Float[np.ndarray, "frame"], a_from_b: Float[np.ndarray, 
     return rigid.interpolate(timestamp_s[known], a_from_b[known], timestamp_s)
 
 
-def measured_box(videos: Sequence[Video], margin_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the box of nearly all measured points of the scene, and of the cameras that saw them."""
-    stores = [usable(video).scene for video in videos]
-    rays = [store.at(torch.nonzero(store.depth > 0)[:, 0][::7]) for store in stores]
+def measured_box(videos: Sequence[Video], margin_m: float, most: int = 200_000) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the box of nearly all measured points of the scene (about ``most`` are asked), and of the cameras that saw them."""
+    step = max(7, sum(len(video.store.scene) for video in videos) // most)
+    stores = (usable(video).scene for video in videos)
+    rays = [store.at(torch.nonzero(store.depth > 0)[:, 0][::step]) for store in stores]
     points = [
         rigid.apply(video.world_from_camera[some.frame.numpy()], (some.direction * some.depth[:, None]).numpy()[:, None])[:, 0]
         for video, some in zip(videos, rays, strict=True)

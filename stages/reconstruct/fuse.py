@@ -6,6 +6,7 @@ video the blocks where it saw something else: things that were moved between the
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Float16
 
 from pipeline import progress
+from pipeline.files import arrays
 from pipeline.models.fused import CELLS, CHANNELS, NODES, NOWHERE, Fused
 from pipeline.space.tsdf import Volume
 from stages.reconstruct.assemble import Video, measured_box, scene_first
@@ -41,9 +43,12 @@ class Fusion:
     """a block counts as changed from so many such voxels on"""
 
 
-def ground(videos: Sequence[Video], margin_m: float, fusion: Fusion, least_confidence: float = 0.1) -> Fused:
-    """Fuse the videos that have a scene, in the order of their codes, in the box of the scene's field."""
-    ground = Ground(measured_box(videos, margin_m), fusion)
+def ground(videos: Sequence[Video], margin_m: float, fusion: Fusion, scratch: Path | None = None, least_confidence: float = 0.1) -> Fused:
+    """Fuse the videos that have a scene, in the order of their codes, in the box of the scene's field.
+
+    Their volumes wait in unnamed files in ``scratch`` (None: where temporary files stand).
+    """
+    ground = Ground(measured_box(videos, margin_m), fusion, scratch)
     for video in progress.track([video for video in scene_first(videos) if video.has_scene], "fusing depth"):
         volume = ground.empty()
         good = np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= least_confidence)
@@ -66,7 +71,7 @@ def _integrate(volume: Volume, video: Video, frame: int, ring_px: int) -> None:
 
 @dataclass(frozen=True)
 class _Kept:
-    """One video's volume, packed."""
+    """One video's volume, packed, on disk."""
 
     distance: Float16[np.ndarray, "x y z"]
     weight: Float16[np.ndarray, "x y z"]
@@ -77,8 +82,8 @@ class _Kept:
 class Ground:
     """Sums up volumes and sets the blocks of all videos."""
 
-    def __init__(self, box: Box, fusion: Fusion):
-        self.fusion, self.low = fusion, np.asarray(box[0], float)
+    def __init__(self, box: Box, fusion: Fusion, scratch: Path | None = None):
+        self.scratch, self.fusion, self.low = scratch, fusion, np.asarray(box[0], float)
         self.size = np.ceil((np.asarray(box[1]) - self.low) / (fusion.voxel_m * CELLS)).astype(int)
         self.shared = self.empty()
         self.videos: list[_Kept] = []
@@ -96,7 +101,8 @@ class Ground:
             share = gain / np.maximum(total, 1e-9)
             mean += (new - mean) * (share if mean.ndim == 3 else share[..., None])
         packed = volume.distance.astype(np.float16), np.minimum(volume.weight, 6e4).astype(np.float16)
-        self.videos.append(_Kept(*packed, (volume.color + 0.5).astype(np.uint8), volume.color_weight > 0))
+        packed += (volume.color + 0.5).astype(np.uint8), volume.color_weight > 0
+        self.videos.append(_Kept(*(arrays.Column(self.scratch).append(part).array() for part in packed)))
 
     def finish(self) -> Fused:
         """Return the blocks of the shared scene and of what each video saw otherwise."""

@@ -5,8 +5,9 @@ agent. `Views` also keeps a thumbnail per frame (depth, distance from the agent'
 against. `join` strings the videos together on one frame axis.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.random import Generator
 from torch import Tensor
 from torch.nn import functional
 
+from pipeline.files import arrays
 from pipeline.files.clips import Clip, Masks
 from pipeline.space import cameras
 from pipeline.space.thin_depth import supported
@@ -145,16 +147,26 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
     return Store(_concatenate(scene), _concatenate(agent), views)
 
 
-def join(stores: Sequence[Store]) -> Store:
-    """String videos together; frame indices of later videos are shifted by the frames before them."""
-    starts = np.cumsum([0] + [len(store.views.intrinsics) for store in stores])
-    parts = [
-        [_shift(getattr(store, name), int(start)) for store, start in zip(stores, starts, strict=False)] for name in ("scene", "agent")
-    ]
-    size = tuple(max(store.views.depth.shape[axis] for store in stores) for axis in (1, 2))
-    padded = [_padded(store.views, *size) for store in stores]
-    views = Views(*(torch.cat([getattr(view, field.name) for view in padded]) for field in fields(Views)))
-    return Store(*(_concatenate(part) for part in parts), views)
+def join(stores: Iterable[Store], folder: Path | None, size: tuple[int, int] | None = None) -> Store:
+    """String videos together; frame indices of later videos are shifted by the frames before them.
+
+    What comes out lies in unnamed files in ``folder``, so that memory does not grow with the frames (`arrays.Column`).
+
+    Args:
+        size: height and width of all thumbnails; those of the first store if None.
+    """
+    parts = [[arrays.Column(folder) for _ in fields(kind)] for kind in (Rays, Rays, Views)]
+    frames = 0
+    for store in stores:
+        size = size or tuple(store.views.depth.shape[1:])
+        tables = _shift(store.scene, frames), _shift(store.agent, frames), _padded(store.views, *size)
+        for columns, table in zip(parts, tables, strict=True):
+            for column, field in zip(columns, fields(table), strict=True):
+                column.append(getattr(table, field.name).numpy())
+        frames += len(store.views.intrinsics)
+    return Store(
+        *(kind(*(torch.from_numpy(column.array()) for column in columns)) for kind, columns in zip((Rays, Rays, Views), parts, strict=True))
+    )
 
 
 def _padded(views: Views, height: int, width: int) -> Views:
@@ -254,15 +266,15 @@ class _Reader:
             np.minimum(row // 8, features.shape[1] - 1), np.minimum(column // 8, features.shape[2] - 1)
         ]
         flow, confidence, gap = self._flow(place, rng)
-        arrays = (
+        measured = (
             direction.astype(np.float32),
             self.depth[y, x],
             self.slope[y, x],
             self.color[row, column],
             np.rint(feature.astype(np.float32) * 127).astype(np.int8),
         )
-        arrays += (self.mask[row, column], (pixel + flow).astype(np.float32), confidence, gap)
-        return Rays(torch.full((len(place),), self.frame), *(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
+        measured += (self.mask[row, column], (pixel + flow).astype(np.float32), confidence, gap)
+        return Rays(torch.full((len(place),), self.frame), *(torch.from_numpy(np.ascontiguousarray(array)) for array in measured))
 
     def _flow(self, place: Int[np.ndarray, "ray 2"], rng: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return displacement, confidence and gap, one gap for all pixels of the frame."""

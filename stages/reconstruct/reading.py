@@ -11,7 +11,7 @@ from pipeline.errors import InputError
 from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip, Masks
 from stages.reconstruct.assemble import Template, Video
-from stages.reconstruct.rays import Sampling, Source, collect
+from stages.reconstruct.rays import Sampling, Source, collect, join
 
 FLOW_GAPS = (1, 2, 4, 8)
 
@@ -27,10 +27,17 @@ class Folders:
     registration: Path
     scene_template: Path
     agent_template: Path
+    scratch: Path | None = None
+    """where unnamed files with what was read may stand; None: where temporary files do"""
 
 
 def read_videos(
-    folders: Folders, walkthrough: str, turnaround: str, sampling: Sampling, seed: int, only: Collection[str | None] | None = None
+    folders: Folders,
+    walkthrough: str,
+    turnaround: str,
+    sampling: Sampling,
+    seed: int,
+    only: Collection[str | None] | None = None,
 ) -> list[Video]:
     """Read the walk-through, the turnaround and every registered session once into rays with their poses.
 
@@ -51,7 +58,7 @@ def _walkthrough(id: str, folders: Folders, sampling: Sampling, seed: int) -> Vi
     cameras = np.where(table["registered"][:, None, None], table["world_from_camera"], np.nan)
     source = Source(Clip.open(folders.frames[id]), _features(folders, id))
     nowhere, nothing = np.full_like(cameras, np.nan), np.zeros(len(cameras), bool)
-    store = collect(source, sampling, _rng(seed, id))
+    store = join([collect(source, sampling, _rng(seed, id))], folders.scratch)
     return Video(
         id,
         table["timestamp_s"],
@@ -72,13 +79,13 @@ def _turnaround(id: str, folders: Folders, sampling: Sampling, seed: int) -> Vid
     cameras = np.where(table["registered"][:, None, None], table["agent_from_camera"], np.nan)
     known = np.isfinite(cameras).all((1, 2))
     root = np.where(known[:, None, None], np.eye(4), np.nan)
-    store = collect(_masked(id, folders, has_scene=False), sampling, _rng(seed, id))
+    store = join([collect(_masked(id, folders, has_scene=False), sampling, _rng(seed, id))], folders.scratch)
     return Video(id, table["timestamp_s"], cameras, root, known.astype(float), known, camera_free=False, has_scene=False, store=store)
 
 
 def _session(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
     table, source = arrays.load(folders.registration / id / "poses.npz"), _masked(id, folders, has_scene=True)
-    store = collect(source, sampling, _rng(seed, id))
+    store = join([collect(source, sampling, _rng(seed, id))], folders.scratch)
     return Video(
         id,
         table["timestamp_s"],

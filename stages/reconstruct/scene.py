@@ -75,10 +75,11 @@ def measured_terms(
     return terms
 
 
-def rendered_terms(problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, generator: Generator) -> Terms:
-    """Fit the scene by volume rendering: any rays, with or without depth."""
+def rendered_terms(
+    problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, depth: Float[Tensor, "ray sample"]
+) -> Terms:
+    """Fit the scene by volume rendering at samples ``depth``: any rays, with or without measured depth."""
     origin, direction = world_rays(problem.motion, rays)
-    depth = render_depths(rays, generator)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     scene = scene_layer(problem, points, problem.video[rays.frame], code_of)
     empty = Layer(torch.zeros_like(scene.density), torch.zeros_like(scene.color), torch.zeros_like(scene.feature))
@@ -117,6 +118,12 @@ def render_depths(
     return torch.cat([far, near], dim=1).sort(dim=1).values
 
 
+def even_depths(rays: Rays, samples: int, generator: Generator) -> Float[Tensor, "ray sample"]:
+    """Place samples evenly up to 5 m, wherever the surface is."""
+    step = torch.arange(samples) + torch.rand(len(rays), samples, generator=generator)
+    return (FREE_FROM_M + (FARTHEST_M - FREE_FROM_M) * step / samples).to(rays.depth.device)
+
+
 def drift_term(motion: MotionTable, weights: Weights) -> Terms:
     """Keep the corrections of cameras small, and those of neighbouring knots alike: units of 1 cm and half a degree."""
     unit = 0.01
@@ -131,7 +138,7 @@ class SceneLoss:
 
     def __init__(self, problem: Problem, weights: Weights, batches: Batches, steps: int):
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
-        self.measured = torch.nonzero(problem.store.scene.depth > 0)[:, 0]
+        self.measured = torch.nonzero(problem.store.scene.depth > 0)[:, 0].int()
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
         return losses.weighted(
@@ -142,10 +149,14 @@ class SceneLoss:
 
     def terms(self, number: int, probability: float, generator: Generator) -> Terms:
         """Return the scene's terms over random rays."""
-        problem, store = self.problem, self.problem.store.scene
+        problem, store, batches = self.problem, self.problem.store.scene, self.batches
+        if batches.places == "even":
+            rays = store.at(pick(len(store), number // 6, generator, problem.device))
+            code_of = swap(problem.video[rays.frame], problem.scene.shape.videos, probability, generator)
+            return rendered_terms(problem, rays, code_of, self.weights, even_depths(rays, batches.even, generator))
         rays = store.at(self.measured[pick(len(self.measured), number, generator, problem.device)])
-        others = store.at(pick(len(store), self.batches.rendered_rays // 2, generator, problem.device))
+        others = store.at(pick(len(store), batches.rendered_rays // 2, generator, problem.device))
         videos = problem.scene.shape.videos
         code_of, other_code = (swap(problem.video[some.frame], videos, probability, generator) for some in (rays, others))
-        found = measured_terms(problem, rays, code_of, self.weights, self.batches, generator)
-        return found | rendered_terms(problem, others, other_code, self.weights, generator)
+        found = measured_terms(problem, rays, code_of, self.weights, batches, generator)
+        return found | rendered_terms(problem, others, other_code, self.weights, render_depths(others, generator))

@@ -1,6 +1,7 @@
 """The numbers that steer the reconstruction, grouped as its modules use them."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,10 @@ class Batches:
     """samples of a ray near its measured depth"""
     free: int = 3
     """samples of a ray in the free space before it"""
+    places: Literal["measured", "even"] = "measured"
+    """where the scene is asked along its rays: at, around and before measured depth; or evenly, and by rendering alone (rivals)"""
+    even: int = 64
+    """samples of a ray that is asked evenly; a sixth as many rays are taken then"""
     swap_first: float = 1.0
     """how often a ray takes another video's code as a phase begins (scene annealing)"""
     swap_last: float = 0.05

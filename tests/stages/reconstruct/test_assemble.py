@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from pipeline.space import rigid
-from stages.reconstruct import assemble
+from stages.reconstruct import assemble, rays
 from stages.reconstruct.assemble import Doubt
 from tests.stages.reconstruct.test_optimise import SHAPES, WIDE, film, problem
 
@@ -31,6 +31,18 @@ def test_leaps_are_given_up_where_certain_roots_are_near():
     unknown = doubted(np.zeros(4))
     unknown.world_from_agent[:] = np.nan
     assert np.isnan(assemble.steadied(unknown, Doubt())[0]).all()
+
+
+def test_what_is_joined_comes_back_from_disk(tmp_path):
+    _, videos = problem()
+    stores = [video.store for video in videos]
+    joined = rays.join(stores, tmp_path, (32, 32))
+    starts = (0, len(stores[0].views.intrinsics))
+    assert torch.equal(joined.agent.frame, torch.cat([store.agent.frame + start for store, start in zip(stores, starts, strict=True)]))
+    assert torch.equal(joined.scene.feature, stores[0].scene.feature), "the turnaround has no scene"
+    depth = joined.views.depth[-1, :32, :24]
+    assert torch.equal(depth, stores[1].views.depth[-1]) and not joined.views.depth[-1, :, 24:].any()
+    assert not list(tmp_path.iterdir()), "the files have no names"
 
 
 def test_given_up_frames_hardly_count_and_the_joint_phase_leaves_them_out():
