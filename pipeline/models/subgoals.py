@@ -4,7 +4,7 @@
 every two seconds. Sub-goals come from the user, from the behaviour model, or from `preferred` spots.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -104,13 +104,18 @@ class Floor:
         off = self.corner + CELL_M * cells - np.asarray(position)[[0, 2]]
         return tuple(int(v) for v in cells[np.argmin((off**2).sum(1))])
 
+    def holds(self, position: Float[np.ndarray, "3"]) -> bool:
+        """Tell whether a position is within the scene's edges."""
+        place = (np.asarray(position)[[0, 2]] - self.corner) / CELL_M
+        return bool(np.all(place >= 0) and np.all(place <= self.free.shape))
+
     def refuse_outside(self, position: Float[np.ndarray, "3"]) -> None:
-        """Raise SIM-003 for a position beyond the scene's edge."""
-        low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
-        place = np.asarray(position)[[0, 2]]
-        if np.any(place < low) or np.any(place > high):
+        """Raise SIM-003 for a position beyond the scene's edges."""
+        if not self.holds(position):
+            low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
             room = f"x {low[0]:.1f} .. {high[0]:.1f} m, z {low[1]:.1f} .. {high[1]:.1f} m"
-            raise InputError("SIM-003", "a sub-goal lies outside the scene", f"x {place[0]:g}, z {place[1]:g}", f"the scene: {room}")
+            where = f"x {position[0]:g}, z {position[2]:g}"
+            raise InputError("SIM-003", "a sub-goal lies outside the scene", where, f"the scene: {room}")
 
     def way(self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "point 2"]:
         """Return a way over the ground from near one position to near another, smooth, away from furniture."""
@@ -140,6 +145,14 @@ def legs(start: Float[np.ndarray, "4 4"] | None, subgoals: list[Subgoal], scene:
         marks.append(len(points) - 1)
     marks = marks if start is None else marks[1:]
     return Places(_facing(np.array(points), headings), np.array(marks))
+
+
+def brought_in(subgoals: list[Subgoal], scene: Surroundings, habits: Habits) -> list[Subgoal]:
+    """Move sub-goals that a model drew outside of the scene to the nearest place where a body can turn."""
+    floor = Floor.of(scene, habits.clearance_m)
+    return [
+        goal if floor.holds(goal.position_world) else replace(goal, position_world=floor.roomy(goal.position_world)) for goal in subgoals
+    ]
 
 
 def preferred(

@@ -18,7 +18,7 @@ from pipeline.models.perception import FeatureVolume
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.short_motions import RATE_HZ, Moving, stretches
 from pipeline.models.simulator import Simulator
-from pipeline.models.subgoals import Subgoal, preferred
+from pipeline.models.subgoals import Subgoal, brought_in, preferred
 from pipeline.models.surroundings import Surroundings
 from pipeline.models.trajectories import FUTURE, TRAIN, BehaviorData
 from stages.simulate import journey_files
@@ -96,7 +96,8 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
         raise InputError("SIM-004", "which sub-goals?", "stages.simulate", "give --subgoals file.toml")
     elif c.subgoals == "behavior":
         simulator = _simulator(given, data, c, replace(c.chaining, replan_frames=FUTURE, fade_frames=0), device)
-        subgoals = chained_goals(simulator, _observer(data, c), c.subgoal_count, c.seed)
+        drawn = chained_goals(simulator, _observer(data, c), c.subgoal_count, c.seed)
+        subgoals = brought_in(drawn, world.scene, world.model.habits)
     else:
         learned = [data.trajectories[data.videos[video]] for video in np.unique(data.video[data.split == TRAIN])]
         been = np.concatenate([trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in learned])

@@ -43,7 +43,7 @@ def figures(prefix: str, source: Source, c: Any) -> dict[str, float | None]:
     plain |= {f"{name}_beyond_ours": plain[name] - plain["ours"] for name in methods.RIVALS if name in plain}
     some = np.unique(np.linspace(0, len(clips) - 1, min(c.optimised_clips, len(clips))).astype(int))
     done = {}
-    for name in methods.OPTIMISED:
+    for name in methods.OPTIMISED if source.data is None else ("ours",):
         done[f"{name}_opt"] = scores.scores(made[name][some], clips[some], [known[index] for index in some], model, c.optimisation)
         done[f"{name}_same"] = plain[name][some]
         progress.log(f"{prefix}: {name}, optimised")

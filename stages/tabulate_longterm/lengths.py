@@ -8,6 +8,7 @@ from pipeline.models.bodies import PosedSurface
 from pipeline.models.contacts import tensors
 from pipeline.models.journeys import World, travel
 from pipeline.models.motion_optimization import Settings
+from pipeline.models.short_motions import RATE_HZ
 from pipeline.models.subgoals import preferred
 
 
@@ -34,7 +35,8 @@ def figures(world: World, been: np.ndarray, length: Length, settings: Settings, 
         points = surface(*tensors(made.moving[start : start + 300])).numpy()
         beyond = np.maximum(np.maximum(low - points, points - high), 0)[..., [0, 2]]
         outside = max(outside, float(beyond.max()))
-    reached = np.linalg.norm((_at(made, made.arrival_s) - made.subgoals_world)[:, [0, 2]], axis=1)
+    there = made.moving.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]
+    reached = np.linalg.norm((there - made.subgoals_world)[:, [0, 2]], axis=1)
     found = {
         "seconds": float(made.timestamp_s[-1]),
         "subgoals": float(len(drawn) - 1),
@@ -49,8 +51,3 @@ def figures(world: World, been: np.ndarray, length: Length, settings: Settings, 
         "subgoal_error_m": float(reached.max()),
     }
     return {f"longterm_minutes/{name}": value if np.isfinite(value) else None for name, value in found.items()}
-
-
-def _at(made, time_s: np.ndarray) -> np.ndarray:
-    frame = np.minimum(np.round(time_s * 30).astype(int), len(made.moving) - 1)
-    return made.moving.world_from_agent[frame, :3, 3]

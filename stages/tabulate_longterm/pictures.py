@@ -65,7 +65,7 @@ def bars(figures: Mapping[str, float | None]) -> UInt8[np.ndarray, "height width
         names = [name.split("/")[1] for name in figures if name.startswith(f"{prefix}/") and name.endswith(ending)]
         names = [name for name in names if figures[f"{prefix}/{name}{ending}"] is not None and name != "truth"]
         mean = np.array([figures[f"{prefix}/{name}{ending}"] for name in names])
-        ends = np.array([[figures[each] for each in names_of(f"{prefix}/{name}{ending}")[1:]] for name in names]).reshape(-1, 2)
+        ends = np.array([[figures[each] for each in names_of(f"{prefix}/{name}{ending}")[1:]] for name in names], float).reshape(-1, 2)
         off = np.abs(ends - mean[:, None]).T
         axis.barh(names, mean, xerr=off, color=["#dd8452" if name.startswith("ours") else "#8fa9c4" for name in names])
         axis.set(title=prefix, xlabel="mm")
