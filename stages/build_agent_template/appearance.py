@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 
 from pipeline.space import cameras, rigid
@@ -36,6 +36,14 @@ def visibility(
         weights.append(np.where(seen, np.clip(facing, 0, 1) ** 2, 0))
         pixels.append(pixel)
     return np.stack(weights), np.stack(pixels)
+
+
+def on_mask(pixel: Float[np.ndarray, "vertex 2"], labels: UInt8[np.ndarray, "height width"]) -> Bool[np.ndarray, "vertex"]:
+    """Tell which vertices are seen on the mask (255): where a limb moved, other frames show what lies behind it."""
+    height, width = labels.shape
+    column, row = np.floor(pixel).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    return inside & (labels[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] == 255)
 
 
 def gather(

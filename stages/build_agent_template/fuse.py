@@ -4,7 +4,8 @@ A pixel on the animal says where its surface is; a pixel beside it says that its
 What hardly any frame sees through is inside the body; below the ground is outside.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 
 import cv2
 import fast_simplification
@@ -15,9 +16,12 @@ from jaxtyping import Bool, Float, UInt8
 from skimage import measure
 
 from pipeline.files.clips import Clip, Masks
+from pipeline.space import cameras, rigid
 from pipeline.space.meshes import Mesh
+from pipeline.space.thin_depth import supported
 from pipeline.space.tsdf import Volume, enclose
 from stages.build_agent_template.carve import Silhouettes
+from stages.build_agent_template.limbs import Moving, find_limb, space_of
 from stages.build_agent_template.poses import Circle, depth_labels
 
 
@@ -37,6 +41,8 @@ class Fusion:
     """standard deviation of the smoothing of the signed distance"""
     vertices: int = 3000
     """about how many vertices the surface keeps"""
+    moving: Moving = field(default_factory=Moving)
+    """how limbs that moved are found"""
 
 
 @dataclass(frozen=True)
@@ -49,16 +55,45 @@ class Body:
 
 
 def fuse(clip: Clip, masks: Masks, circle: Circle, options: Fusion) -> Body:
-    """Fuse and carve all frames that show the animal, then extract the largest closed surface."""
+    """Fuse and carve all frames that show the animal, then extract the largest closed surface.
+
+    Where a limb moved, the frames in which it stood alike decide.
+    """
+    seen = np.flatnonzero(masks.visible).tolist()
+    volume, silhouettes = _gathered(clip, masks, circle, options, seen)
+    beside, below = silhouettes.share_beside(), _below(volume, circle)
+    body = extract(volume, beside, below, options)
+    points = {frame: _on_animal(clip, masks, circle, frame) for frame in seen}
+    above = {frame: circle.ground.above(each) for frame, each in points.items()}
+    limb = find_limb(points, above, body.inside_world, options.moving)
+    if limb is None:
+        return body
+    alike, outlines = _gathered(clip, masks, circle, options, limb.frames.tolist(), thin=True)
+    there = space_of(limb, volume, options.moving)
+    volume.distance[there], volume.weight[there] = alike.distance[there], alike.weight[there]
+    return extract(volume, np.where(there, outlines.share_beside(), beside), below, options)
+
+
+def _gathered(
+    clip: Clip, masks: Masks, circle: Circle, options: Fusion, frames: Iterable[int], thin: bool = False
+) -> tuple[Volume, Silhouettes]:
+    """Fuse the animal's depth and its outlines in some frames; ``thin`` keeps depth that the sensor doubts where neighbours agree."""
     volume = enclose(circle.points_world, voxel_m=options.voxel_m, truncation_m=options.truncation_m)
     silhouettes = Silhouettes(volume.origin, volume.weight.shape, volume.voxel_m)
-    for frame in np.flatnonzero(masks.visible):
+    for frame in frames:
         pose, intrinsics = circle.world_from_camera[frame], clip.depth_intrinsics[frame]
         labels, depth = depth_labels(masks[frame], clip.depth_size), clip.depth(frame)
         silhouettes.add(labels, depth, intrinsics, pose)
-        on_animal = np.where(labels == 255, _trusted(depth, clip.confidence(frame)), 0)
-        volume.integrate(on_animal, intrinsics, clip.color(frame), clip.intrinsics[frame], pose)
-    return extract(volume, silhouettes.share_beside(), _below(volume, circle), options)
+        trusted = np.where(supported(depth), depth, 0) if thin else _trusted(depth, clip.confidence(frame))
+        volume.integrate(np.where(labels == 255, trusted, 0), intrinsics, clip.color(frame), clip.intrinsics[frame], pose)
+    return volume, silhouettes
+
+
+def _on_animal(clip: Clip, masks: Masks, circle: Circle, frame: int) -> Float[np.ndarray, "point 3"]:
+    """Return the points measured on the animal in one frame, thin limbs included, in the turnaround's world."""
+    depth = clip.depth(frame)
+    own = (depth_labels(masks[frame], clip.depth_size) == 255) & supported(depth)
+    return rigid.apply(circle.world_from_camera[frame], cameras.back_project(depth, clip.depth_intrinsics[frame])[own].astype(float))
 
 
 def extract(volume: Volume, share_beside: Float[np.ndarray, "x y z"], below_ground: Bool[np.ndarray, "x y z"], options: Fusion) -> Body:

@@ -79,6 +79,7 @@ def build(
     seen = np.flatnonzero(masks.visible)
     views = seen[np.unique(np.linspace(0, len(seen) - 1, options.views).astype(int))]
     weight, pixel = appearance.visibility(mesh, cameras[views], clip.intrinsics[views], clip.color_size)
+    weight = weight * np.stack([appearance.on_mask(at, masks[view]) for at, view in zip(pixel, views, strict=True)])
     color = appearance.gather(mesh.vertices, weight, pixel, [clip.color(view) for view in views], 1)
     vertex_features = appearance.gather(mesh.vertices, weight, pixel, features[views], FEATURE_STRIDE)
     vertex_features /= np.maximum(np.linalg.norm(vertex_features, axis=1, keepdims=True), 1e-9)
