@@ -25,10 +25,8 @@ OUTLIER_M = 0.1
 """measured points this far from the agent count half; all keep pulling, or the body could hide behind the scene"""
 ROOT_M, ROOT_RAD = 0.05, 0.05
 """registered roots are about this good"""
-COVER_M = 0.01
+COVER_M = 0.015
 """a masked pixel is covered when a sample of the posed surface is seen this near to it"""
-COVER_POINTS = 400
-"""such samples, a centimetre and a half apart"""
 MARGIN_M = 0.03
 """the posed surface may stand this much before the measured depth"""
 
@@ -78,11 +76,13 @@ def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, g
     }
 
 
-def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, generator: Generator) -> Terms:
-    """Keep the posed surface inside the mask, unless something stands before it, and out of space seen free."""
-    views, frames = problem.store.views, len(pose.frame)
-    index = torch.randint(len(problem.surface.points), (frames, number), generator=generator).to(problem.device)
-    posed = problem.body.pose(problem.surface.points[index], pose.agent_from_bone)
+def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, generator: Generator, masked: Rays | None = None) -> Terms:
+    """Keep the posed surface inside the mask, unless something stands before it, and out of space seen free.
+
+    Rays ``[frame * ray]`` on the mask, with or without depth, must be covered too.
+    """
+    views, chosen = problem.store.views, pick(len(problem.surface.points), number, generator, problem.device)
+    posed = problem.body.pose(problem.surface.points[chosen], pose.agent_from_bone)
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
     outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel)
@@ -95,30 +95,24 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
-    return {
+    terms = {
         "outside": (weights.outside, (trust * outside_m / DECIMETRE)[in_view & ~hidden]),
         "in front": (weights.in_front, (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
     }
+    if masked is not None:
+        terms["cover"] = (weights.cover, trust * bare_m(points, masked) / DECIMETRE)
+    return terms
 
 
-def cover_terms(problem: Problem, pose: Pose, rays: Rays, number: int, weights: Weights, generator: Generator) -> Terms:
-    """Draw the posed surface to masked pixels ``[frame * ray]`` that it does not cover, with or without depth.
-
-    Each pixel pulls that of ``number`` surface points which lies nearest to it in the picture.
-    """
-    frames, device = len(pose.frame), problem.device
-    points = problem.surface.points[pick(len(problem.surface.points), number, generator, device)]
-    camera_from_agent = rigid_torch.inverse(pose.agent_from_camera)
-    target = rays.direction[:, :2].view(frames, -1, 2)
+def bare_m(points_camera: Float[Tensor, "frame point 3"], masked: Rays) -> Float[Tensor, "frame ray"]:
+    """Measure how far beside each ray the nearest surface point passes, metres beyond what counts as covered."""
+    target = masked.direction[:, :2].view(len(points_camera), -1, 2)
+    depth = points_camera[..., 2:].clamp_min(0.1)
+    place = points_camera[..., :2] / depth
     with torch.no_grad():
-        seen = rigid_torch.apply(camera_from_agent, problem.body.pose(points.expand(frames, -1, -1), pose.agent_from_bone))
-        near = torch.cdist(target, seen[..., :2] / seen[..., 2:].clamp_min(0.1)).argmin(-1)
-    nearest = rigid_torch.apply(camera_from_agent, problem.body.pose(points[near], pose.agent_from_bone))
-    depth = nearest[..., 2:].clamp_min(0.1)
-    gap_m = (nearest[..., :2] / depth - target).norm(dim=-1) * depth[..., 0].detach()
-    masked = (rays.label == AGENT).view(frames, -1)
-    bare_m = functional.relu(gap_m - COVER_M).clamp_max(2 * DECIMETRE)
-    return {"cover": (weights.cover, (problem.trust[pose.frame, None] * bare_m / DECIMETRE)[masked])}
+        near = torch.cdist(target, place).argmin(-1, keepdim=True)
+    gap = place.gather(1, near.expand(-1, -1, 2)) - target
+    return functional.relu(gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach() - COVER_M).clamp_max(2 * DECIMETRE)
 
 
 def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: Weights) -> Terms:
@@ -193,8 +187,6 @@ class ChunkLoss(torch.nn.Module):
         )
         rays = problem.store.agent.at(self.masked[self.masked_rays.pick(seen.frame, self.rays, generator).flatten()])
         terms = measured_terms(problem, seen, rays, self.weights, generator, near=0)
-        if self.weights.cover:
-            terms |= cover_terms(problem, seen, rays, COVER_POINTS, self.weights, generator)
-        terms |= surface_terms(problem, seen, self.points, self.weights, generator)
+        terms |= surface_terms(problem, seen, self.points, self.weights, generator, rays)
         terms |= prior_terms(problem, pose, self.bone, len(self.frame), self.weights)
         return losses.weighted(terms)

@@ -88,6 +88,8 @@ class Batches:
     """rays on the agent per frame and step"""
     surface_points: int = 96
     """points of the agent's surface per frame and step"""
+    posed_points: int = 256
+    """the same while the template is posed"""
     near: int = 4
     """samples of a ray near its measured depth"""
     free: int = 3

@@ -95,7 +95,7 @@ def problem(shapes: Shapes = SHAPES, videos=None):
 
 
 def plan(resume=None, **steps) -> optimise.Plan:
-    batches = Batches(scene_rays=256, joint_scene_rays=128, rendered_rays=16, runs=2, agent_rays=16, surface_points=32)
+    batches = Batches(scene_rays=256, joint_scene_rays=128, rendered_rays=16, runs=2, agent_rays=16, surface_points=32, posed_points=64)
     return optimise.Plan(Steps(**steps), Weights(), batches, Rates(), 0, resume)
 
 
@@ -140,7 +140,7 @@ def test_bare_masked_pixels_draw_the_surface_to_them():
 
     def bare(shift: torch.Tensor) -> torch.Tensor:
         there = pose.world_from_agent @ rigid_torch.make(torch.eye(3), shift)
-        terms = body.cover_terms(found, replace(pose, world_from_agent=there), rays, 4000, Weights(), torch.Generator().manual_seed(0))
+        terms = body.surface_terms(found, replace(pose, world_from_agent=there), 4000, Weights(), torch.Generator().manual_seed(0), rays)
         return terms["cover"][1].mean()
 
     home, shift = torch.tensor([-0.03, 0.03, -0.02]), torch.zeros(3, requires_grad=True)
