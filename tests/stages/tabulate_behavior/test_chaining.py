@@ -1,0 +1,41 @@
+"""Chained lives: an animal that only breathes counts as resting, however its millimetres differ from the recorded ones."""
+
+import numpy as np
+import pytest
+
+from pipeline.models.behavior import Sampling
+from pipeline.models.planning import Plan
+from pipeline.models.predictors import Ats
+from pipeline.models.scenes import Scenes
+from pipeline.models.trajectories import FUTURE, RATE_HZ
+from stages.tabulate_behavior import chaining
+from tests.pipeline.models.wandering import REST, room, wandering
+
+
+class Breathing:
+    """A sampler whose animal stays where it is and breathes."""
+
+    def codes(self, observation, sampling, count=1):
+        return count
+
+    def goals(self, count, sampling, rng):
+        return np.zeros((count, 3))
+
+    def paths(self, count, goal, sampling, rng):
+        return np.tile(0.002 * np.sin(np.arange(FUTURE))[:, None] * [0, 1, 0], (count, 1, 1))
+
+    def plan(self, observation, sampling, rng, goal, path):
+        upright = np.concatenate([[1, 0, 0, 0, 1, 0], np.zeros(6 * len(REST))])
+        return Plan(goal, path, np.tile(upright, (len(path), FUTURE, 1)))
+
+
+def test_breathing_is_rest_and_rest_is_one_speed():
+    data, scenes = wandering(), Scenes.of(room())
+    ats = Ats(Breathing(), scenes, REST, "yaw", Sampling())
+    found = chaining.figures(ats, data, scenes, count=2, seconds=2.0, seed=0)
+    tested = data.trajectories[data.videos[-1]]
+    speed = np.linalg.norm(np.diff(tested.world_from_agent[:, :3, 3], axis=0), axis=-1) * RATE_HZ
+    assert found["behavior/ats/chain_rest_share"] == 1 and found["behavior/ats/chain_solid_share"] == 0
+    assert found["behavior/true/chain_rest_share"] == pytest.approx((speed < chaining.REST_M_S).mean())
+    assert found["behavior/ats/chain_moving_speed_ks"] == pytest.approx((speed > chaining.REST_M_S).mean())
+    assert found["behavior/ats/chain_moving_speed_ks"] <= found["behavior/ats/chain_speed_ks"]
