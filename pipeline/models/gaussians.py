@@ -4,12 +4,12 @@
 agent before one camera; `save_ply` and `load_ply` use the 62 floats a row that every viewer of 3DGS reads.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -21,10 +21,25 @@ from pipeline.space.meshes import Mesh
 
 BAND0 = 0.28209479177387814
 """value of the constant spherical harmonic"""
+THICKEST_M = 0.004
+"""a surface's Gaussians are no thicker, or wide ones would stand out of it"""
 COLUMNS = (
     ["x", "y", "z", "nx", "ny", "nz"] + [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(45)]
     + ["opacity"] + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Gaussians placed in the world, ready to be drawn."""
+
+    means: Float[Tensor, "point 3"]
+    rotation: Float[Tensor, "point 4"]
+    log_scale: Float[Tensor, "point 3"]
+    opacity: Float[Tensor, "point"]
+    color: Float[Tensor, "point 3"]
+    agent: Float[Tensor, "point"]
+    """1 for the agent's, 0 for the scene's"""
 
 
 class Gaussians(nn.Module):
@@ -57,22 +72,55 @@ class Gaussians(nn.Module):
         """Red, green, blue, about 0..1."""
         return self.band0 * BAND0 + 0.5
 
+    def cloud(self, which: Int[Tensor, "chosen"] | slice = slice(None)) -> Cloud:
+        """Return all or some of them as they stand, in their own frame."""
+        opacity = self.opacity_logit[which].sigmoid()
+        color = self.band0[which] * BAND0 + 0.5
+        return Cloud(self.means[which], self.rotation[which], self.log_scale[which], opacity, color, torch.zeros_like(opacity))
 
-def from_mesh(mesh: Mesh, number: int, rng: np.random.Generator) -> Gaussians:
-    """Cover a coloured surface evenly with flat Gaussians."""
+
+@dataclass(frozen=True)
+class Spread:
+    """Points spread evenly over a coloured surface."""
+
+    points: Float[np.ndarray, "point 3"]
+    normal: Float[np.ndarray, "point 3"]
+    color: Float[np.ndarray, "point 3"]
+    """0..1"""
+    spacing_m: float
+    """how far apart they lie"""
+
+
+def spread(mesh: Mesh, number: int, rng: np.random.Generator) -> Spread:
+    """Spread points over a coloured surface, the same number on equal areas."""
     corner = mesh.vertices[mesh.faces].astype(np.float64)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = 0.5 * np.linalg.norm(normal, axis=-1)
     along = np.cumsum(area) / area.sum()
     face = np.searchsorted(along, (np.arange(number) + rng.random()) / number).clip(0, len(area) - 1)
     mix = rng.dirichlet(np.ones(3), number)
-    means = np.einsum("pk,pkd->pd", mix, corner[face])
+    points = np.einsum("pk,pkd->pd", mix, corner[face])
     color = np.einsum("pk,pkc->pc", mix, mesh.color[mesh.faces[face]] / 255)
-    size = np.log(0.7 * np.sqrt(area.sum() / number))
-    log_scale = np.tile([size, size, size - np.log(5)], (number, 1))
-    rotation = _facing(normal[face] / np.maximum(2 * area[face, None], 1e-12))
-    parts = (torch.from_numpy(part).float() for part in (means, rotation, log_scale, np.full(number, 0.9), color))
+    return Spread(points, normal[face] / np.maximum(2 * area[face, None], 1e-12), color, float(np.sqrt(area.sum() / number)))
+
+
+def on_surface(
+    points: Float[np.ndarray, "point 3"],
+    normal: Float[np.ndarray, "point 3"],
+    color: Float[np.ndarray, "point 3"],
+    spacing_m: float | Float[np.ndarray, "point"],
+) -> Gaussians:
+    """Lay a flat Gaussian on each point of a surface, as wide as the points lie apart; colours in 0..1."""
+    size = np.log(0.7 * np.broadcast_to(spacing_m, len(points)))
+    log_scale = np.stack([size, size, np.minimum(size - np.log(5), np.log(THICKEST_M))], axis=-1)
+    parts = (torch.from_numpy(part).float() for part in (points, _facing(normal), log_scale, np.full(len(points), 0.9), color))
     return Gaussians(*parts)
+
+
+def from_mesh(mesh: Mesh, number: int, rng: np.random.Generator) -> Gaussians:
+    """Cover a coloured surface evenly with flat Gaussians."""
+    covered = spread(mesh, number, rng)
+    return on_surface(covered.points, covered.normal, covered.color, covered.spacing_m)
 
 
 def _facing(normal: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 4"]:
@@ -81,19 +129,6 @@ def _facing(normal: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 4"
     turned = np.stack([w, -normal[:, 1], normal[:, 0], np.zeros_like(w)], axis=-1)
     turned[w < 1e-6] = [0.0, 1.0, 0.0, 0.0]
     return turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-
-
-@dataclass(frozen=True)
-class Cloud:
-    """Gaussians placed in the world, ready to be drawn."""
-
-    means: Float[Tensor, "point 3"]
-    rotation: Float[Tensor, "point 4"]
-    log_scale: Float[Tensor, "point 3"]
-    opacity: Float[Tensor, "point"]
-    color: Float[Tensor, "point 3"]
-    agent: Float[Tensor, "point"]
-    """1 for the agent's, 0 for the scene's"""
 
 
 class Splats(nn.Module):
@@ -114,26 +149,24 @@ class Splats(nn.Module):
         self.appearance = nn.Parameter(torch.eye(3, 4).repeat(max(videos, 1), 1, 1))
         """per video: red, green, blue <- matrix @ (red, green, blue, 1)"""
 
-    def place_scene(self, video: int | None) -> Cloud:
-        """Return the room as one video shows it (None: without exposure)."""
-        scene, color = self.scene, self.scene.color
-        if video is not None:
-            matrix = self.appearance[video]
-            color = color @ matrix[:, :3].T + matrix[:, 3]
-        return Cloud(scene.means, scene.rotation, scene.log_scale, scene.opacity, color, torch.zeros_like(scene.opacity))
+    def place_scene(self, video: int | None, which: Int[Tensor, "chosen"] | slice = slice(None)) -> Cloud:
+        """Return the room, or some Gaussians of it, in the light of one video (None: in its own)."""
+        return self._lit(self.scene.cloud(which), video)
 
     def place_agent(self, world_from_agent: Float[Tensor, "4 4"], agent_from_bone: Float[Tensor, "bone 4 4"], video: int | None) -> Cloud:
         """Return the animal in one pose, in the light of one video."""
-        agent = self.agent
+        agent = self.agent.cloud()
         world_from_rest = world_from_agent @ blend(self.agent_weights, agent_from_bone, self.agent_from_bone_rest)
         turn = rigid_torch.quaternion_from_rotation(world_from_rest[:, :3, :3])
         rotation = skinning.multiply(turn, functional.normalize(agent.rotation, dim=-1))
-        color = agent.color
-        if video is not None:
-            color = color @ self.appearance[video][:, :3].T + self.appearance[video][:, 3]
-        return Cloud(
-            skinning.move(world_from_rest, agent.means), rotation, agent.log_scale, agent.opacity, color, torch.ones_like(agent.opacity)
-        )
+        posed = replace(agent, means=skinning.move(world_from_rest, agent.means), rotation=rotation, agent=torch.ones_like(agent.opacity))
+        return self._lit(posed, video)
+
+    def _lit(self, cloud: Cloud, video: int | None) -> Cloud:
+        if video is None:
+            return cloud
+        matrix = self.appearance[video]
+        return replace(cloud, color=cloud.color @ matrix[:, :3].T + matrix[:, 3])
 
 
 def together(*clouds: Cloud) -> Cloud:

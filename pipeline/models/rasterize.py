@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, assert_never
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.space import rigid_torch
@@ -61,6 +61,20 @@ def project(
     return Footprints(
         torch.stack([fx * x / z + cx, fy * y / z + cy], -1), torch.stack([c, -b, a], -1) / determinant[:, None], radius, depth
     )
+
+
+@torch.no_grad()
+def in_view(
+    means_world: Float[Tensor, "point 3"], log_scale: Float[Tensor, "point 3"],
+    camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int,
+) -> Int[Tensor, "chosen"]:  # fmt: skip
+    """Return which Gaussians may touch the picture, quickly: a sphere around each does."""
+    camera = means_world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    z = camera[:, 2].clamp_min(NEAREST_M)
+    reach = REACH * log_scale.amax(-1).exp() / z * intrinsics[0, 0] + 2
+    x, y = (intrinsics[axis, axis] * camera[:, axis] / z + intrinsics[axis, 2] for axis in (0, 1))
+    inside = (x > -reach) & (x < width + reach) & (y > -reach) & (y < height + reach)
+    return torch.nonzero(inside & (camera[:, 2] > NEAREST_M))[:, 0]
 
 
 def blend_dense(

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline import cli
 from stages.refine_gaussians import pictures, reading, refine, writing
+from stages.refine_gaussians.cover import Cover
 from stages.refine_gaussians.reading import Counts
 from stages.refine_gaussians.refine import Rates, Weights
 
@@ -25,7 +26,9 @@ class Config:
     """frames drawn, one a step"""
     counts: Counts = Counts()
     """numbers of Gaussians"""
-    long_side_px: int = 160
+    cover: Cover = Cover()
+    """how the room is covered at the beginning"""
+    long_side_px: int = 192
     """longer side of drawn pictures, pixels"""
     weights: Weights = Weights()
     """of the losses"""
@@ -44,8 +47,7 @@ def run(task: cli.Task) -> None:
     folder_4d = task.input("reconstruction")
     frames = task.per_video("frames", ("walkthrough", "turnaround", "session"))
     sequences = reading.read_sequences(folder_4d, frames, task.per_video("masks"), task.per_video("flow"))
-    videos = sum(sequence.video is not None for sequence in sequences)
-    splats = reading.read_splats(folder_4d, config.counts, videos, np.random.default_rng(config.seed), task.device)
+    splats = reading.read_splats(folder_4d, config.counts, sequences, config.cover, np.random.default_rng(config.seed), task.device)
     total = sum(len(sequence.motion.timestamp_s) for sequence in sequences)
     deltas = refine.MotionDeltas(total, len(splats.agent_from_bone_rest)).to(task.device)
     loss = refine.FrameLoss(splats, deltas, sequences, config.weights, config.long_side_px, backend)

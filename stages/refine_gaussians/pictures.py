@@ -61,8 +61,8 @@ def compare(loss: FrameLoss, sequence: Sequence4D, frame: int) -> tuple[UInt8[np
     """Draw one frame beside its picture; return the row of pictures and the PSNR."""
     size = drawn_size(sequence.recording, loss.long_side_px)
     target = read(sequence.recording, frame, size, loss.device)
-    camera = torch.from_numpy(np.linalg.inv(sequence.motion.world_from_camera[frame])).float().to(loss.device)
-    view = see(loss.cloud(sequence, frame), camera, target.intrinsics, *size, loss.backend)
+    camera = loss.camera(sequence, frame)
+    view = see(loss.cloud(sequence, frame, camera, target), camera, target.intrinsics, *size, loss.backend)
     error = (view.color.clamp(0, 1) - target.color).square().mean()
     near = (255 * (1 - view.depth / DEPTH_RANGE_M)).clamp(0, 255).byte().cpu().numpy()
     depth = cv2.applyColorMap(near, cv2.COLORMAP_VIRIDIS)[..., ::-1]

@@ -1,6 +1,6 @@
 """Open what the stage reads: recordings, and the reconstruction as meshes and motion."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,8 +9,10 @@ import torch
 
 from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip, Masks
-from pipeline.models import fields, gaussians, motion
+from pipeline.models import fields, gaussians, motion, surfaces
 from pipeline.models.gaussians import Splats
+from stages.refine_gaussians import cover
+from stages.refine_gaussians.cover import Cover
 from stages.refine_gaussians.refine import Sequence4D
 from stages.refine_gaussians.views import Recording
 
@@ -19,7 +21,7 @@ from stages.refine_gaussians.views import Recording
 class Counts:
     """How many Gaussians there are."""
 
-    scene: int = 30_000
+    scene: int = 100_000
     """of the scene"""
     agent: int = 5_000
     """of the agent"""
@@ -48,11 +50,16 @@ def _recording(id: str, frames: Mapping[str, Path], masks: Mapping[str, Path], f
     return Recording(id, Clip.open(frames[id]), Masks.open(masks[id]) if id in masks else None, *lazily)
 
 
-def read_splats(reconstruction: Path, counts: Counts, videos: int, rng: np.random.Generator, device: str) -> Splats:
+def read_splats(
+    reconstruction: Path, counts: Counts, sequences: Sequence[Sequence4D], looking: Cover, rng: np.random.Generator, device: str
+) -> Splats:
     """Cover the reconstruction's surfaces with Gaussians; the agent's take their skinning weights from its body."""
-    scene = gaussians.from_mesh(meshes.read_ply(reconstruction / "scene.ply"), counts.scene, rng)
+    found = fields.load(reconstruction)
+    room = surfaces.extract_scene(found.scene, -1, found.scene.lattice_m)
+    scene, appearance = cover.scene(room, counts.scene, sequences, looking, rng)
     agent = gaussians.from_mesh(meshes.read_ply(reconstruction / "agent.ply"), counts.agent, rng)
-    body = fields.load(reconstruction).body
     with torch.no_grad():
-        weights = body.weights(agent.means)
-    return Splats(scene, agent, weights, body.agent_from_bone_rest, videos).to(device)
+        weights = found.body.weights(agent.means)
+    splats = Splats(scene, agent, weights, found.body.agent_from_bone_rest, len(appearance))
+    splats.appearance.data.copy_(torch.from_numpy(appearance))
+    return splats.to(device)

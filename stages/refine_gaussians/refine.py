@@ -14,7 +14,7 @@ from torch.nn import functional
 from pipeline.fit import FitRecord, fit
 from pipeline.models.gaussians import Cloud, Splats, see, together
 from pipeline.models.motion import Motion
-from pipeline.models.rasterize import Backend
+from pipeline.models.rasterize import REACH, Backend, in_view
 from pipeline.space import cameras, rigid_torch
 from stages.refine_gaussians.views import Recording, Target, drawn_size, flow_lattice, read
 
@@ -82,7 +82,7 @@ class MotionDeltas(nn.Module):
 
 
 class FrameLoss:
-    """The loss of one random frame."""
+    """The loss of one random frame; before a random colour, so that no hole looks right."""
 
     def __init__(
         self,
@@ -93,14 +93,8 @@ class FrameLoss:
         long_side_px: int,
         backend: Backend,
     ):
-        self.splats, self.deltas, self.sequences, self.weights, self.long_side_px, self.backend = (
-            splats,
-            deltas,
-            sequences,
-            weights,
-            long_side_px,
-            backend,
-        )
+        self.splats, self.deltas, self.sequences = splats, deltas, sequences
+        self.weights, self.long_side_px, self.backend = weights, long_side_px, backend
         self.device = str(splats.appearance.device)
         self.frames = [(s, f) for s, sequence in enumerate(sequences) for f in usable_frames(sequence)]
 
@@ -109,14 +103,16 @@ class FrameLoss:
         sequence = self.sequences[number]
         size = drawn_size(sequence.recording, self.long_side_px)
         target = read(sequence.recording, frame, size, self.device)
-        cloud = self.cloud(sequence, frame)
-        camera = self._camera(sequence, frame)
+        camera = self.camera(sequence, frame)
+        cloud = self.cloud(sequence, frame, camera, target)
         later = self._later_pixels(sequence, frame, target, cloud)
         view = see(cloud, camera, target.intrinsics, *size, self.backend, extra=later)
         everywhere = torch.ones_like(target.agent) if sequence.video is not None else target.agent
         measured = (target.depth > 0) & everywhere
         weights, terms = self.weights, {}
-        terms["color"] = weights.color * (view.color - target.color).abs().mean(-1)[everywhere & target.known]
+        behind = torch.rand(3, generator=generator).to(self.device)
+        color = view.color + (1 - view.coverage)[..., None] * behind
+        terms["color"] = weights.color * (color - target.color).abs().mean(-1)[everywhere & target.known]
         terms["depth"] = weights.depth * ((view.depth - target.depth).abs() / 0.2).clamp_max(1)[measured]
         terms["silhouette"] = weights.silhouette * (view.agent - target.agent.float()).abs()[target.known]
         if later is not None:
@@ -125,12 +121,25 @@ class FrameLoss:
         terms["stay"] = weights.stay * torch.cat([self.deltas.root[index : index + 1], self.deltas.bone[index]]).square() / 0.01
         return {name: values.mean() if values.numel() else values.sum() for name, values in terms.items()}
 
-    def cloud(self, sequence: Sequence4D, frame: int) -> Cloud:
+    def cloud(self, sequence: Sequence4D, frame: int, camera_from_world: Float[Tensor, "4 4"], target: Target) -> Cloud:
         """Return what stands before the camera in one frame."""
-        parts = [] if sequence.video is None else [self.splats.place_scene(sequence.video)]
-        if np.isfinite(sequence.motion.world_from_agent[frame]).all():
+        parts = []
+        if sequence.video is not None:
+            scene = self.splats.scene
+            seen = in_view(scene.means, scene.log_scale, camera_from_world, target.intrinsics, *target.depth.shape)
+            parts.append(self.splats.place_scene(sequence.video, seen))
+        if sequence.video is None or self._shows_agent(sequence, frame, camera_from_world, target):
             parts.append(self.splats.place_agent(*self._pose(sequence, frame), sequence.video))
         return together(*parts)
+
+    def _shows_agent(self, sequence: Sequence4D, frame: int, camera_from_world: Tensor, target: Target) -> bool:
+        """Tell whether the agent's pose is known, and whether it may be in the picture: a ball as large as it at rest is."""
+        root = torch.from_numpy(sequence.motion.world_from_agent[frame]).float().to(self.device)
+        if not root.isfinite().all():
+            return False
+        radius = self.splats.agent.means.detach().norm(dim=-1).amax() / REACH
+        centre = root[None, :3, 3]
+        return len(in_view(centre, radius.log().expand(1, 3), camera_from_world, target.intrinsics, *target.depth.shape)) > 0
 
     def _pose(self, sequence: Sequence4D, frame: int) -> tuple[Tensor, Tensor]:
         root, bones = (
@@ -138,7 +147,8 @@ class FrameLoss:
         )
         return self.deltas.apply(root, bones, sequence.first + frame)
 
-    def _camera(self, sequence: Sequence4D, frame: int) -> Tensor:
+    def camera(self, sequence: Sequence4D, frame: int) -> Float[Tensor, "4 4"]:
+        """Return ``camera_from_world`` of one frame."""
         return torch.from_numpy(np.linalg.inv(sequence.motion.world_from_camera[frame])).float().to(self.device)
 
     def _later_pixels(self, sequence: Sequence4D, frame: int, target: Target, cloud: Cloud) -> Tensor | None:
@@ -152,8 +162,8 @@ class FrameLoss:
                 return None
             moved = self.splats.place_agent(*self._pose(sequence, later), sequence.video).means
             means = torch.cat([cloud.means[: len(cloud.means) - len(moved)], moved])
-        now = cameras.project(rigid_torch.apply(self._camera(sequence, frame), cloud.means), target.intrinsics)[0]
-        then = cameras.project(rigid_torch.apply(self._camera(sequence, later), means), target.intrinsics)[0]
+        now = cameras.project(rigid_torch.apply(self.camera(sequence, frame), cloud.means), target.intrinsics)[0]
+        then = cameras.project(rigid_torch.apply(self.camera(sequence, later), means), target.intrinsics)[0]
         return (then - now).clamp(-100, 100)
 
     def _flow_errors(self, sequence: Sequence4D, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor) -> Tensor:
@@ -182,7 +192,7 @@ def refine(loss: FrameLoss, rates: Rates, steps: int, seed: int, resume: Path | 
     groups.append({"params": list(deltas.parameters()), "lr": rates.motion, "betas": (0.0, 0.99)})
     return fit(
         modules={"splats": splats, "motion": deltas},
-        optimizer=torch.optim.Adam(groups, lr=1.0),
+        optimizer=torch.optim.Adam(groups, lr=1.0, fused=True),
         loss=loss,
         steps=steps,
         seed=seed,

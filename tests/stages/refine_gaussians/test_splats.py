@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import trimesh
 
-from pipeline.models import gaussians
+from pipeline.models import gaussians, rasterize
 from pipeline.models.gaussians import Splats, see, together
 from pipeline.space import rigid_torch
 from pipeline.space.meshes import Mesh
@@ -92,3 +92,14 @@ def test_the_animal_hides_the_room_behind_it():
 def test_flow_cells_meet_the_pixels_under_them():
     row, column = views.flow_lattice(80, 60, (320, 240), (160, 120))
     assert row[0, 0] == 1 and row[-1, 0] == 159 and column[0, -1] == 119
+
+
+def test_what_is_out_of_view_can_be_left_out():
+    splats = Splats(ball(), ball(0.2), torch.ones(400, 1), torch.eye(4)[None], videos=1)
+    camera, intrinsics = torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 40.0, 15], [0, 0, 1]])
+    camera[0, 3], camera[2, 3] = -0.4, 0.3
+    seen = rasterize.in_view(splats.scene.means, splats.scene.log_scale, camera, intrinsics, 30, 40)
+    assert 20 < len(seen) < 300
+    whole, part = (see(splats.place_scene(0, which), camera, intrinsics, 30, 40) for which in (slice(None), seen))
+    torch.testing.assert_close(part.color, whole.color)
+    torch.testing.assert_close(part.coverage, whole.coverage)

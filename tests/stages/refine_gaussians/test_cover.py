@@ -1,0 +1,84 @@
+"""A wall, plain on one side and checked on the other, in two videos of different light: colours, light and density are found."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pipeline.models import gaussians
+from pipeline.models.motion import Motion
+from pipeline.space.meshes import Mesh
+from stages.refine_gaussians import cover
+from stages.refine_gaussians.cover import Cover
+from stages.refine_gaussians.refine import Sequence4D
+
+SIZE, FOCAL, WALL_M = (120, 160), 80.0, 1.5
+LIGHT = (1.0, 0.7)
+COVER = Cover(frames=8, plain=0.01, even=0.1)
+
+
+def paint(points: np.ndarray) -> np.ndarray:
+    """Grey where x < 0, squares of 10 cm, red and blue, elsewhere."""
+    checked = (np.floor(points[:, 0] / 0.1) + np.floor(points[:, 1] / 0.1)) % 2
+    squares = np.where(checked[:, None], [0.9, 0.2, 0.2], [0.2, 0.2, 0.9])
+    return np.where(points[:, :1] < 0, 0.5, squares)
+
+
+def film(video: int) -> Sequence4D:
+    """Film the wall from its front, the camera a little aside in each frame."""
+    intrinsics = np.array([[FOCAL, 0, 80], [0, FOCAL, 60], [0, 0, 1]])
+    camera = np.tile(np.eye(4), (4, 1, 1))
+    camera[:, 0, 3] = np.linspace(-0.1, 0.1, 4)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
+
+    def color(frame: int) -> np.ndarray:
+        place = np.stack([(x - 80) / FOCAL * WALL_M + camera[frame, 0, 3], (y - 60) / FOCAL * WALL_M], axis=-1).reshape(-1, 2)
+        return np.rint(255 * LIGHT[video] * paint(place)).astype(np.uint8).reshape(*SIZE, 3)
+
+    clip = SimpleNamespace(
+        color=color, depth=lambda _: np.full((60, 80), WALL_M), confidence=lambda _: np.full((60, 80), 2),
+        intrinsics=np.tile(intrinsics, (4, 1, 1)), color_size=SIZE,
+    )  # fmt: skip
+    motion = Motion(np.arange(4.0), camera, np.full((4, 4, 4), np.nan), np.zeros((4, 1, 4, 4)), np.ones(4), np.zeros(4, bool))
+    return Sequence4D(SimpleNamespace(id=f"v{video}", clip=clip, masks=None), motion, 4 * video, video)
+
+
+@pytest.fixture(scope="module")
+def wall() -> gaussians.Spread:
+    """The wall as the reconstruction has it: its colours blurred to the mean of each side; a second layer behind faces away."""
+    vertices = np.array([[x, y, WALL_M + z] for z in (0, 0.02) for x in (-1.4, 0, 1.4) for y in (-1, 1)], np.float32)
+    front = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5]])
+    dark = np.where(vertices[:, :1] < 0, 128, [140, 51, 140]).astype(np.uint8)
+    return gaussians.spread(Mesh(vertices, np.concatenate([front, front[:, ::-1] + 6]), dark), 8000, np.random.default_rng(0))
+
+
+def test_pictures_tell_colour_and_light(wall):
+    seen = cover.watch(wall, [film(0), film(1)], COVER)
+    shown = seen.weight > 0
+    assert not shown[wall.points[:, 2] > WALL_M + 0.01].any(), "what faces away is not seen"
+    assert shown[(np.abs(wall.points[:, :2]) < [1.2, 0.9]).all(1) & (wall.points[:, 2] < WALL_M + 0.01)].mean() > 0.99
+    bright, dark = (matrix[:, :3] @ np.full(3, 0.5) + matrix[:, 3] for matrix in seen.appearance)
+    np.testing.assert_allclose(dark / bright, LIGHT[1] / LIGHT[0], atol=0.04)
+    found = seen.color[shown] @ seen.appearance[0][:, :3].T + seen.appearance[0][:, 3]
+    assert np.median(np.abs(found - paint(wall.points[shown]))) < 0.04, "the squares, which the mesh does not know"
+
+
+def test_what_was_carried_away_is_left_out(wall):
+    """The second layer stands half a metre before the wall: all pictures see through it."""
+    ghost = wall.points[:, 2] > WALL_M + 0.01
+    points = wall.points - ghost[:, None] * np.array([0, 0, 0.5])
+    seen = cover.watch(replace(wall, points=points), [film(0), film(1)], COVER)
+    kept, _ = cover.thin(points, seen, 2000, COVER, np.random.default_rng(0))
+    in_view = (np.abs(points[:, :2]) < [0.7, 0.5]).all(1)
+    assert (in_view & ghost).sum() > 300 and not (in_view & ghost)[kept].any() and (in_view & ~ghost)[kept].any()
+
+
+def test_most_gaussians_lie_where_colours_change(wall):
+    seen = cover.watch(wall, [film(0), film(1)], COVER)
+    kept, spacing_m = cover.thin(wall.points, seen, 2000, COVER, np.random.default_rng(0))
+    assert abs(len(kept) - 2000) < 40
+    points = wall.points[kept]
+    middle = (np.abs(points[:, :2]) < [1.0, 0.7]).all(1) & (points[:, 2] < WALL_M + 0.01)
+    plain, checked = (middle & (sign * points[:, 0] > 0.1) for sign in (-1, 1))
+    assert checked.sum() > 4 * plain.sum() > 0 and spacing_m[checked].mean() < 0.6 * spacing_m[plain].mean()
