@@ -13,11 +13,14 @@ import time
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from pipeline import config as configuration
-from pipeline.models.fields import Reconstruction
-from pipeline.models.render import Renderer
+from pipeline.models import surfaces
+from pipeline.models.fields import Field
+from pipeline.space import cameras
+from pipeline.space.meshes import RayCaster
 from pipeline.videos import read
 from stages.evaluate import heldout, reading, reconstruction
 from stages.evaluate.heldout import Shot, View
@@ -53,12 +56,16 @@ def settings_of(build: Path, variant: str | None) -> Config:
     return configuration.from_table(Config, table, where=str(variant))
 
 
-def depth_acc(problem, videos: tuple[str, ...], session: str, shots: list[Shot]) -> float:
-    """Draw the scene as the held-out phone would see it; return the share of right depth."""
-    renderer = Renderer(Reconstruction(problem.scene, problem.agent, problem.body, videos), session, agent_step_m=0.05)
-    drawn = [renderer.draw(shot.world_from_camera, shot.intrinsics, *shot.depth.shape) for shot in shots]
-    views = [View(picture.color, picture.depth, shot) for picture, shot in zip(drawn, shots, strict=True)]
-    return heldout.view_figures(views).values["reconstruction/depth_acc_all"]
+def depth_acc(field: Field, code: int, shots: list[Shot]) -> float:
+    """Return the share of right depth where the held-out phone looks at the scene's surface."""
+    mesh, right = surfaces.extract_scene(field, code, field.lattice_m), []
+    caster = RayCaster(mesh) if len(mesh.faces) else None
+    for shot in shots:
+        rays = cameras.ray_directions(shot.intrinsics, *shot.depth.shape).reshape(-1, 3) @ shot.world_from_camera[:3, :3].T
+        depth = caster.cast(shot.world_from_camera[:3, 3], rays).distance if caster else np.full(len(rays), np.inf)
+        view = View(shot.color, np.where(np.isfinite(depth), depth, 0).reshape(shot.depth.shape), shot)
+        right.append(heldout.depth_is_right(view)[(shot.depth > 0) & (shot.depth <= heldout.RANGE_M)])
+    return float(np.concatenate(right).mean())
 
 
 def measure(build: Path, name: str, read_anew, session: str, shots: list[Shot]) -> list[tuple[float, int, float]]:
@@ -76,7 +83,7 @@ def measure(build: Path, name: str, read_anew, session: str, shots: list[Shot]) 
             optimizer.step()
             step += 1
         taken, drawing = time.process_time() - begin - drawing_s, time.process_time()
-        found.append((taken, step, depth_acc(problem, assemble.scene_ids(videos), session, shots)))
+        found.append((taken, step, depth_acc(problem.scene, assemble.scene_ids(videos).index(session), shots)))
         drawing_s += time.process_time() - drawing
         print(f"{name:14} {taken:6.1f} s  {step:5} steps  DepthAcc {found[-1][2]:.3f}", flush=True)
         if found[-1][2] >= ENOUGH:
