@@ -148,7 +148,7 @@ def thin(
     slope = np.abs(seen.color[near] - seen.color[:, None]).mean((1, 2)) + cover.plain
     visits = seen.weight / max(seen.weight.mean(), 1e-9)
     wanted = np.where(gone, 0, slope * np.sqrt(visits))
-    share = cover.even * ~gone / (~gone).sum() + (1 - cover.even) * wanted / wanted.sum()
+    share = cover.even * ~gone / (~gone).sum() + (1 - cover.even) * wanted / max(wanted.sum(), 1e-9)
     share = _capped(number * share, 1.0)
     order = np.argsort(_along_a_curve(points))
     steps = np.cumsum(share[order]) + rng.random()
