@@ -60,7 +60,7 @@ class Steps:
     """steps that copy the agent template into the agent field"""
     scene: int = 1000
     """steps of the first phase: scene and cameras"""
-    body: int = 80
+    body: int = 60
     """steps per chunk that pose the template to the masked depth"""
     joint: int = 1000
     """steps of the second phase: everything"""
