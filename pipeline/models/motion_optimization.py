@@ -10,6 +10,7 @@ from typing import Literal, assert_never
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy import ndimage
 from torch import Tensor
 
 from pipeline.models.behavior import channels_from_bones
@@ -98,6 +99,7 @@ def optimise(
     phases = phase_means(stance)
     with torch.no_grad():
         given = surface(*correction())
+        correction.shift[:, 1] += free[:, 0] * lift(given[:, count:], scene)
     optimizer = torch.optim.Adam(correction.parameters(), lr=settings.rate)
     for step in range(settings.steps):
         for group in optimizer.param_groups:
@@ -122,6 +124,20 @@ def optimise(
     with torch.no_grad():
         root, bones = correction()
     return Moving(root.double().numpy(), bones.double().numpy())
+
+
+def lift(
+    touching: Float[Tensor, "frame vertex 3"], scene: SignedDistance, *, most_m: float = 0.2, step_m: float = 0.02
+) -> Float[Tensor, "frame"]:
+    """Return how far to raise each frame, smoothly, for contact vertices that are inside of something to come out on top.
+
+    The distance alone leads out on the nearest side: from a thin board often downwards. What is no way up within ``most_m`` is a wall.
+    """
+    heights = torch.arange(0, most_m, step_m)
+    inside = torch.stack([scene.at(touching + height * torch.tensor([0.0, 1.0, 0.0])) < 0 for height in heights])  # height frame vertex
+    first = torch.where(inside.all(0), 0, (~inside).float().argmax(0))
+    needed = ndimage.maximum_filter1d(heights[first].amax(1).numpy(), 9, mode="nearest")
+    return torch.from_numpy(ndimage.gaussian_filter1d(needed, 4.0, mode="nearest"))
 
 
 def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pipeline.models.bodies import PosedSurface, PoseSpace
 from pipeline.models.contacts import BRIEFEST, SWING_M_S2, find_contacts, tensors, with_time_to_swing
-from pipeline.models.motion_optimization import Physique, Settings, contact_error, foot_error, optimise, phase_means, smooth_error
+from pipeline.models.motion_optimization import Physique, Settings, contact_error, foot_error, lift, optimise, phase_means, smooth_error
 from pipeline.models.plausibility import Judge, seams
 from pipeline.models.short_motions import Moving, eased
 from pipeline.space import rigid
@@ -144,3 +144,12 @@ def test_a_jump_at_a_seam_is_measured(lives):
 
 def _lift(height_m):
     return rigid.make(np.zeros((3, 3)), np.array([0.0, height_m, 0.0])) * (np.arange(4) == 3)[None] * (np.arange(4) < 3)[:, None]
+
+
+def test_feet_in_a_board_are_lifted_out_of_it_and_those_in_a_wall_are_not(lives):
+    scene = lives.scenes[0].distance  # a floor at 0, a block up to 0.5, walls at 2
+    depth = np.repeat([0.0, 0.06], 40)
+    floor = torch.tensor(np.stack([np.full(80, 1.2), 0.005 - depth, np.full(80, 1.2)], axis=-1)[:, None]).float()
+    raised = lift(floor, scene).numpy()
+    assert raised[0] == 0 and raised[-1] == pytest.approx(0.06, abs=0.025) and np.abs(np.diff(raised)).max() < 0.02
+    assert lift(torch.tensor([[[0.0, 0.1, 0.0]]]), scene) == 0, "0.4 m under the top of the block"
