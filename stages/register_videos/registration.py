@@ -29,10 +29,13 @@ class GateOptions:
     """Median share of a frame's static depth that must lie within 5 cm of the template."""
     least_certainty: float = 0.5
     """Where not even `least_votes` of the agreeing votes have this probability, ..."""
+    least_recognised: float = 0.2
+    """... this share of the frames that were asked must agree: sessions of the room itself have 0.37 and more, of a flat of the
+    same shape with the same furniture elsewhere 0.1, ...
+    """
     least_right: float = 0.3
-    """... this share of the frames must look more like their renderings than like renderings from wrong places: flats of one
-    house have the same shape. Right places have 0.6 and more, by lamplight and on a real kitchen too; repainted rooms at most
-    0.1.
+    """... and this share of the frames must look more like their renderings than like renderings from wrong places: right places
+    have 0.6 and more, by lamplight and on a real kitchen too; that flat has 0.5, repainted rooms at most 0.1.
     """
 
 
@@ -126,7 +129,7 @@ def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.ran
     caster = RayCaster(maps.scene)
     alike = compare(clip, masks, caster, aligned.world_from_camera, options.confidence, rng)
     looks = looks_right(clip.timestamp_s, alike, options.confidence)
-    reason = _strange(fit, float(looks.mean()), votes, start.supports, options) if options.begin == "votes" else None
+    reason = strange(fit, float(looks.mean()), votes, start.supports, options) if options.begin == "votes" else None
     if reason is not None:
         return Refused(reason, votes)
     confidence = camera_confidence(aligned.spread, looks, start.anchored, options.confidence, rng)
@@ -172,15 +175,19 @@ def _begin(clip, votes, motion, vote_options) -> _Start | None:
     return _Start(poses, supports, following.anchored(votes, supports, motion))
 
 
-def _strange(fit: float, right: float, votes: Votes, supports: Bool[np.ndarray, "vote"], options: Options) -> str | None:
+def strange(fit: float, right: float, votes: Votes, supports: Bool[np.ndarray, "vote"], options: Options) -> str | None:
     """Say why an aligned recording is not believed, None when it is."""
     if fit < options.gate.least_fit:
         return f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken"
-    certain = (votes.probability[supports] >= options.gate.least_certainty).sum() >= options.vote.least_votes
-    if not certain and right < options.gate.least_right:
+    if (votes.probability[supports] >= options.gate.least_certainty).sum() >= options.vote.least_votes:
+        return None
+    if supports.sum() < options.gate.least_recognised * votes.asked:
+        told = f"only {supports.sum()} of {votes.asked} frames were recognised and agree"
+    elif right < options.gate.least_right:
         told = f"only {right:.0%} of the frames look more like the room than like wrong places in it"
-        return f"the room has the same shape but looks different: {told}, and hardly a frame was recognised with certainty"
-    return None
+    else:
+        return None
+    return f"the room has the same shape but looks different: {told}, and hardly a frame was recognised with certainty"
 
 
 def _in_the_middle(motion, scene) -> _Start:

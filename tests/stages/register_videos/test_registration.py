@@ -97,9 +97,11 @@ def test_a_repainted_room_of_the_same_shape_is_refused(maps):
     votes = voting.collect(clip, NoAgent(40), maps.scene_localizer, voting.VoteOptions(every_frames=8))
     doubtful, sure = (replace(votes, answers=[replace(answer, probability=p) for answer in votes.answers]) for p in (0.3, 0.9))
     supports = np.ones(len(votes.frame), bool)
-    assert "looks different" in registration._strange(0.9, right["other"], doubtful, supports, options)
-    assert registration._strange(0.9, right["dim"], doubtful, supports, options) is None
-    assert registration._strange(0.9, right["other"], sure, supports, options) is None, "recognised with certainty"
+    assert "looks different" in registration.strange(0.9, right["other"], doubtful, supports, options)
+    assert registration.strange(0.9, right["dim"], doubtful, supports, options) is None
+    assert registration.strange(0.9, right["other"], sure, supports, options) is None, "recognised with certainty"
+    rare = replace(doubtful, asked=10 * len(votes.frame))
+    assert "were recognised and agree" in registration.strange(0.9, right["dim"], rare, supports, options), "chance, of so many"
 
 
 def test_a_refusal_names_the_nearest_moment_of_the_walk():
