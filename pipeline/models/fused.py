@@ -7,7 +7,7 @@ interpolation never leaves a block.
 """
 
 import torch
-from jaxtyping import Float, Float16, Int, Int32
+from jaxtyping import Bool, Float, Float16, Int, Int32
 from torch import Tensor, nn
 
 CELLS = 8
@@ -48,6 +48,17 @@ class Fused(nn.Module):
     def truncation_m(self) -> float:
         """Signed distances saturate here, metres."""
         return float(self.sizes[1])
+
+    def is_own(self, points: Float[Tensor, "point 3"], video: int) -> Bool[Tensor, "point"]:
+        """Tell where a video has a block of its own: it saw something there otherwise than all together."""
+        cell = ((points - self.low) / self.sizes[0]).floor().long()
+        return self._block(cell, torch.tensor(video)) != self._block(cell, torch.tensor(-1))
+
+    def own_blocks(self, video: int) -> tuple[Float[Tensor, "block 3"], Float[Tensor, "block 9 9 9"]]:
+        """Return the lowest corners of a video's own blocks, and signed distances at their nodes in units of the truncation."""
+        place = torch.nonzero(self.table[video] != self.table[-1])
+        block = self.table[video][tuple(place.T)].long()
+        return self.low + place * (CELLS * self.sizes[0]), self.blocks[block][..., 0].float()
 
     def forward(self, points: Float[Tensor, "point 3"], video: Int[Tensor, "point"]) -> Float[Tensor, "point 5"]:
         """Interpolate at points as a video (-1: all together) saw them: signed distance in units of the truncation,

@@ -1,7 +1,8 @@
 """3D Gaussians of scene and agent: made from meshes, posed by bones, drawn together, kept in standard PLY files.
 
 `Gaussians` holds learnable Gaussians; `from_mesh` covers a surface with them; `Splats` puts the room and the posed
-agent before one camera; `save_ply` and `load_ply` use the 62 floats a row that every viewer of 3DGS reads.
+agent before one camera; `save_ply` and `load_ply` use the 62 floats a row that every viewer of 3DGS reads, `load_scene`
+the room as it stood in one video.
 """
 
 from dataclasses import dataclass, replace
@@ -9,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
 from pipeline.errors import InputError
+from pipeline.files import arrays
 from pipeline.models import rasterize, skinning
 from pipeline.models.skinning import blend
 from pipeline.space import rigid_torch
@@ -141,16 +143,21 @@ class Splats(nn.Module):
         agent_weights: Float[Tensor, "point bone"],
         agent_from_bone_rest: Float[Tensor, "bone 4 4"],
         videos: int,
+        stands: Bool[Tensor, "row point"] | None = None,
     ):
+        """``stands`` tells which Gaussians of the room each video shows and, last, which all share; None: all of them."""
         super().__init__()
         self.scene, self.agent = scene, agent
         self.register_buffer("agent_weights", agent_weights)
+        self.register_buffer("stands", torch.ones(videos + 1, len(scene), dtype=torch.bool) if stands is None else stands)
         self.register_buffer("agent_from_bone_rest", agent_from_bone_rest)
         self.appearance = nn.Parameter(torch.eye(3, 4).repeat(max(videos, 1), 1, 1))
         """per video: red, green, blue <- matrix @ (red, green, blue, 1)"""
 
-    def place_scene(self, video: int | None, which: Int[Tensor, "chosen"] | slice = slice(None)) -> Cloud:
-        """Return the room, or some Gaussians of it, in the light of one video (None: in its own)."""
+    def place_scene(self, video: int | None, which: Int[Tensor, "chosen"] | None = None) -> Cloud:
+        """Return the room, or some Gaussians of it, as it stood and was lit in one video (None: as all share it)."""
+        here = self.stands[-1 if video is None else video]
+        which = torch.nonzero(here)[:, 0] if which is None else which[here[which]]
         return self._lit(self.scene.cloud(which), video)
 
     def place_agent(self, world_from_agent: Float[Tensor, "4 4"], agent_from_bone: Float[Tensor, "bone 4 4"], video: int | None) -> Cloud:
@@ -209,8 +216,8 @@ def see(
     return View(image[..., :3], image[..., 3] / coverage.clamp_min(1e-3), image[..., 4], coverage, image[..., 5:])
 
 
-def save_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a standard 3D Gaussian PLY; Gaussians that are not finite or fainter than 1/255 are left out."""
+def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> None:
+    """Write some Gaussians as a standard 3D Gaussian PLY; others than `kept` no reader could draw."""
     with torch.no_grad():
         rotation = functional.normalize(gaussians.rotation, dim=-1)
         rest = torch.zeros(len(gaussians), 45, device=rotation.device)
@@ -218,7 +225,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         table = torch.cat(
             [gaussians.means, normals, gaussians.band0, rest, gaussians.opacity_logit[:, None], gaussians.log_scale, rotation], dim=-1
         )
-        table = table[kept(gaussians)].cpu().numpy().astype("<f4")
+        table = table[which].cpu().numpy().astype("<f4")
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -232,7 +239,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
 
 @torch.no_grad()
 def kept(gaussians: Gaussians) -> Tensor:
-    """Tell which Gaussians a file holds: finite ones that can be seen."""
+    """Tell which Gaussians are worth a file: finite ones that are not fainter than 1/255."""
     finite = torch.stack(
         [
             getattr(gaussians, name).reshape(len(gaussians), -1).isfinite().all(-1)
@@ -251,3 +258,12 @@ def load_ply(path: Path) -> Gaussians:
         raise InputError("ART-021", what="not a 3D Gaussian file of 62 floats a row", where=str(path), remedy="rebuild `splats`")
     table = torch.from_numpy(np.frombuffer(data, "<f4", offset=end).reshape(-1, 62).copy())
     return Gaussians(table[:, :3], table[:, 58:62], table[:, 55:58], table[:, 54].sigmoid(), table[:, 6:9] * BAND0 + 0.5)
+
+
+def load_scene(splats: Path, video: str) -> Gaussians:
+    """Read the room as it stood in one video from the artifact `splats`."""
+    parts = [load_ply(splats / f"{name}.ply") for name in ("scene", "moved")]
+    table = arrays.load(splats / "splats.npz", ("videos", "stands"))
+    here = torch.from_numpy(table["stands"][table["videos"].tolist().index(video)])
+    names = ("means", "rotation", "log_scale", "opacity", "color")
+    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]).detach()[here] for name in names))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from skimage import measure
 from torch import Tensor
 
@@ -50,6 +50,26 @@ def extract_scene(field: Field, code: int, step_m: float) -> Mesh:
         lambda points: field.distance_at(points, torch.full((len(points),), code, device=points.device)), low, high, step_m
     )
     return paint(field, zero_level(volume, low.cpu().numpy(), step_m), code)
+
+
+@torch.no_grad()
+def extract_moved(field: Field, code: int) -> Mesh:
+    """Return the surfaces that one video saw and that are not where all videos together have one, coloured."""
+    pieces, count = [Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))], 0
+    for low, distance in zip(*field.fused.own_blocks(code), strict=True):
+        piece = zero_level(distance.cpu().numpy(), low.cpu().numpy(), field.fused.voxel_m)
+        pieces.append(Mesh(piece.vertices, piece.faces + count))
+        count += len(piece.vertices)
+    mesh = Mesh(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("vertices", "faces")))
+    return paint(field, keep_vertices(mesh, ~stands(field, mesh.vertices, -1)), code)
+
+
+@torch.no_grad()
+def stands(field: Field, points: Float[np.ndarray, "point 3"], code: int) -> Bool[np.ndarray, "point"]:
+    """Tell which points lie on a surface (within half of the truncation) as one video's code, or -1: all together, has it."""
+    at = torch.from_numpy(np.asarray(points, np.float32)).to(field.log_beta.device)
+    distance_m = field.distance_at(at, torch.full((len(at),), code, device=at.device))
+    return (distance_m.abs() < field.fused.truncation_m / 2).cpu().numpy()
 
 
 def extract_agent(field: Field, step_m: float) -> Mesh:

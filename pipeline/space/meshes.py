@@ -18,6 +18,12 @@ class Mesh:
     faces: Int[np.ndarray, "face 3"]
     color: UInt8[np.ndarray, "vertex 3"] | None = None
 
+    @property
+    def area_m2(self) -> float:
+        """Area of all faces."""
+        corner = self.vertices[self.faces].astype(np.float64)
+        return float(np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2)
+
     def face_normals(self) -> Float[np.ndarray, "face 3"]:
         """Return unit normals; zero for degenerate faces."""
         corner = self.vertices[self.faces]

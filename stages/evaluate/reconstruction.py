@@ -71,7 +71,7 @@ def held_out_figures(folders: Folders, seen: Sequence[tuple[str | None, Sequence
         if motion is None:
             continue
         by_fields += drawn_by_fields(folders, session, motion, shots, device)
-        by_splats += _drawn_by_splats(folders, reading.read_motion(folders.splats, session) or motion, shots)
+        by_splats += _drawn_by_splats(folders, session, reading.read_motion(folders.splats, session) or motion, shots)
     if by_fields:
         figures.add(heldout.view_figures(by_fields))
         figures.add(heldout.picture_figures("splats", by_splats))
@@ -111,9 +111,9 @@ def drawn_by_fields(folders: Reconstructed, session: str, motion: Motion, shots:
     return views
 
 
-def _drawn_by_splats(folders: Folders, motion: Motion, shots: Sequence[Shot]) -> list[View]:
-    """Draw the 3D Gaussians; where the animal's pose is not known, the room alone."""
-    scene, agent = (gaussians.load_ply(folders.splats / f"{part}.ply") for part in ("scene", "agent"))
+def _drawn_by_splats(folders: Folders, session: str, motion: Motion, shots: Sequence[Shot]) -> list[View]:
+    """Draw the 3D Gaussians as they stood in a session; where the animal's pose is not known, the room alone."""
+    scene, agent = gaussians.load_scene(folders.splats, session), gaussians.load_ply(folders.splats / "agent.ply")
     weights = torch.from_numpy(arrays.load(folders.splats / "splats.npz", ("agent_weights",))["agent_weights"])
     rest = torch.from_numpy(arrays.load(folders.reconstruction / "skin.npz")["agent_from_bone_rest"])
     splats, views = gaussians.Splats(scene, agent, weights, rest, videos=0), []

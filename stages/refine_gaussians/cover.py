@@ -1,21 +1,23 @@
 """Cover the reconstruction's surfaces with Gaussians, and give those of the scene the colours that the pictures show.
 
-`scene` spreads many points over the surface, `watch` looks at them in some pictures of every video (what stands where
-the sensor measured it counts, near views most) and tells colours and each video's exposure, `thin` keeps most of them
-where colours change fast and where cameras looked: there a coarse cover costs most.
+`spread` puts many points on the surface that all videos share and on what single videos saw elsewhere (a chair that is
+moved between sessions), `watch` looks at them in some pictures of every video that they stand in (what stands where the
+sensor measured it counts, near views most) and tells colours and each video's exposure, `thin` keeps most of them where
+colours change fast and where cameras looked: there a coarse cover costs most.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from pipeline.models import gaussians
+from pipeline.models import gaussians, surfaces
+from pipeline.models.fields import Field
 from pipeline.models.gaussians import Gaussians, Spread
 from pipeline.space import cameras, rigid
-from pipeline.space.meshes import Mesh
 from stages.refine_gaussians.refine import Sequence4D, usable_frames
 from stages.refine_gaussians.views import AGENT, UNKNOWN
 
@@ -54,15 +56,54 @@ class Seen:
     """what turns these colours into each video's"""
 
 
-def scene(mesh: Mesh, number: int, sequences: Sequence[Sequence4D], cover: Cover, rng: np.random.Generator) -> tuple[Gaussians, np.ndarray]:
-    """Return Gaussians that cover the scene's surface, and the exposure of each video (3 x 4)."""
-    spread = gaussians.spread(mesh, cover.candidates * number, rng)
-    seen = watch(spread, sequences, cover)
-    kept, spacing_m = thin(spread.points, seen, number, cover, rng)
-    return gaussians.on_surface(spread.points[kept], spread.normal[kept], seen.color[kept], spacing_m), seen.appearance
+@dataclass(frozen=True)
+class Covered:
+    """The scene in Gaussians."""
+
+    gaussians: Gaussians
+    stands: Bool[np.ndarray, "row point"]
+    """which of them each video shows and, in the last row, which all share"""
+    appearance: Float[np.ndarray, "video 3 4"]
+    """each video's exposure"""
 
 
-def watch(spread: Spread, sequences: Sequence[Sequence4D], cover: Cover) -> Seen:
+def scene(
+    field: Field, codes: Sequence[int], number: int, sequences: Sequence[Sequence4D], cover: Cover, rng: np.random.Generator
+) -> Covered:
+    """Cover the scene as all videos share it and as single ones saw it; ``codes`` are the videos' in the field."""
+    points, layer, stands = spread(field, codes, cover.candidates * number, rng)
+    seen = watch(points, stands, sequences, cover)
+    kept, spacing_m = thin(points.points, layer, seen, number, cover, rng)
+    cloud = gaussians.on_surface(points.points[kept], points.normal[kept], seen.color[kept], spacing_m)
+    return Covered(cloud, stands[:, kept], seen.appearance)
+
+
+def spread(
+    field: Field, codes: Sequence[int], number: int, rng: np.random.Generator
+) -> tuple[Spread, Int[np.ndarray, "point"], Bool[np.ndarray, "row point"]]:
+    """Spread points over all surfaces: ``number`` on the shared one and as densely on those of single videos.
+
+    Returns the points, on whose surface each lies (-1: the shared one) and where it stands, as `Covered.stands`.
+    """
+    shared, keep_own = surfaces.extract_scene(field, -1, field.lattice_m), list(codes) if field.fused else []
+    spreads, layers = [gaussians.spread(shared, number, rng)], [np.full(number, -1)]
+    for code in keep_own:
+        moved = surfaces.extract_moved(field, code)
+        count = round(moved.area_m2 / spreads[0].spacing_m ** 2)
+        if count:
+            spreads.append(gaussians.spread(moved, count, rng))
+            layers.append(np.full(count, code))
+    layer = np.concatenate(layers)
+    joined = (np.concatenate([getattr(part, name) for part in spreads]) for name in ("points", "normal", "color"))
+    together = Spread(*joined, spreads[0].spacing_m)
+    stands = np.stack([(layer == -1) | (layer == code) for code in (*codes, -1)])
+    for row, code in zip(stands, keep_own, strict=False):
+        own = field.fused.is_own(torch.from_numpy(together.points), code).numpy() & (layer == -1)
+        row[own] = surfaces.stands(field, together.points[own], code)
+    return together, layer, stands
+
+
+def watch(spread: Spread, stands: Bool[np.ndarray, "row point"], sequences: Sequence[Sequence4D], cover: Cover) -> Seen:
     """Average the pictures' colours at points; each video's exposure is fitted to the colours that the points have."""
     points, color = spread.points, spread.color
     videos = [sequence for sequence in sequences if sequence.video is not None]
@@ -71,7 +112,7 @@ def watch(spread: Spread, sequences: Sequence[Sequence4D], cover: Cover) -> Seen
     every = max(1, sum(len(usable_frames(sequence)) for sequence in videos) // cover.frames)
     for sequence in videos:
         sums, weights = np.zeros_like(color), np.zeros(len(points))
-        for look in _looks(spread, sequence, every, cover.reach_m):
+        for look in _looks(spread, stands[sequence.video], sequence, every, cover.reach_m):
             sums[look.shown] += look.shown_weight[:, None] * look.color
             weights[look.shown] += look.shown_weight
             through[look.through] += look.through_weight
@@ -108,14 +149,14 @@ class _Look:
     through_weight: Float[np.ndarray, "through"]
 
 
-def _looks(spread: Spread, sequence: Sequence4D, every: int, reach_m: float) -> Iterator[_Look]:
-    """Look at the points in some frames of a video; only surfaces that face the camera are shown, and nothing at the animal."""
+def _looks(spread: Spread, stands: np.ndarray, sequence: Sequence4D, every: int, reach_m: float) -> Iterator[_Look]:
+    """Look at the points that stand in a video in some of its frames; only what faces the camera is shown, and nothing at the animal."""
     clip, masks = sequence.recording.clip, sequence.recording.masks
     homogeneous = np.concatenate([spread.points, np.ones((len(spread.points), 1))], axis=1).astype(np.float32)
     for frame in usable_frames(sequence)[::every]:
         world_from_camera = sequence.motion.world_from_camera[frame]
         points_camera = homogeneous @ rigid.inverse(world_from_camera)[:3].T.astype(np.float32)
-        ahead = np.flatnonzero(points_camera[:, 2] > 0.2)
+        ahead = np.flatnonzero(stands & (points_camera[:, 2] > 0.2))
         pixel, z = cameras.project(points_camera[ahead], clip.intrinsics[frame])
         height, width = clip.color_size
         inside = (pixel >= 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
@@ -133,9 +174,9 @@ def _looks(spread: Spread, sequence: Sequence4D, every: int, reach_m: float) -> 
 
 
 def thin(
-    points: Float[np.ndarray, "point 3"], seen: Seen, number: int, cover: Cover, rng: np.random.Generator
+    points: Float[np.ndarray, "point 3"], layer: Int[np.ndarray, "point"], seen: Seen, number: int, cover: Cover, rng: np.random.Generator
 ) -> tuple[np.ndarray, Float[np.ndarray, "kept"]]:
-    """Choose about ``number`` points; returns their indices and how far the fourth of their neighbours is, metres.
+    """Choose about ``number`` points; returns their indices and how far the fourth of their neighbours on the same surface is, metres.
 
     The error of a cover with spacing s is about (slope of colours * s)^2 times how often it is looked at; for a given
     number of points it is least where their density goes with the slope and the root of the visits. What more pictures saw
@@ -153,8 +194,11 @@ def thin(
     order = np.argsort(_along_a_curve(points))
     steps = np.cumsum(share[order]) + rng.random()
     chosen = order[np.flatnonzero(np.diff(np.floor(steps), prepend=np.floor(steps[0] - share[order[0]])) > 0)]
-    fourth_m = cKDTree(points[chosen]).query(points[chosen], 5)[0][:, -1]
-    return chosen, np.minimum(fourth_m, np.quantile(fourth_m, cover.widest))
+    fourth_m = np.empty(len(chosen))
+    for one in np.unique(layer[chosen]):
+        here = points[chosen[layer[chosen] == one]]
+        fourth_m[layer[chosen] == one] = cKDTree(here).query(here, min(5, len(here)))[0].reshape(len(here), -1)[:, -1]
+    return chosen, np.clip(fourth_m, 0.001, np.quantile(fourth_m, cover.widest))
 
 
 def _along_a_curve(points: Float[np.ndarray, "point 3"], cell_m: float = 0.005) -> np.ndarray:

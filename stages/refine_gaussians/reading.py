@@ -9,7 +9,7 @@ import torch
 
 from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip, Masks
-from pipeline.models import fields, gaussians, motion, surfaces
+from pipeline.models import fields, gaussians, motion
 from pipeline.models.gaussians import Splats
 from stages.refine_gaussians import cover
 from stages.refine_gaussians.cover import Cover
@@ -55,11 +55,11 @@ def read_splats(
 ) -> Splats:
     """Cover the reconstruction's surfaces with Gaussians; the agent's take their skinning weights from its body."""
     found = fields.load(reconstruction)
-    room = surfaces.extract_scene(found.scene, -1, found.scene.lattice_m)
-    scene, appearance = cover.scene(room, counts.scene, sequences, looking, rng)
+    codes = [found.video_code(sequence.recording.id) for sequence in sequences if sequence.video is not None]
+    scene = cover.scene(found.scene, codes, counts.scene, sequences, looking, rng)
     agent = gaussians.from_mesh(meshes.read_ply(reconstruction / "agent.ply"), counts.agent, rng)
     with torch.no_grad():
         weights = found.body.weights(agent.means)
-    splats = Splats(scene, agent, weights, found.body.agent_from_bone_rest, len(appearance))
-    splats.appearance.data.copy_(torch.from_numpy(appearance))
+    splats = Splats(scene.gaussians, agent, weights, found.body.agent_from_bone_rest, len(codes), torch.from_numpy(scene.stands))
+    splats.appearance.data.copy_(torch.from_numpy(scene.appearance))
     return splats.to(device)

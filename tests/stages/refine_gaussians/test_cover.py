@@ -1,12 +1,17 @@
-"""A wall, plain on one side and checked on the other, in two videos of different light: colours, light and density are found."""
+"""A wall, plain on one side and checked on the other, in two videos of different light: colours, light and density are found;
+a board that stands elsewhere in each video is covered once for each.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from pipeline.models import gaussians
+from pipeline.models.fields import Field, FieldShape
+from pipeline.models.fused import NODES, Fused
 from pipeline.models.motion import Motion
 from pipeline.space.meshes import Mesh
 from stages.refine_gaussians import cover
@@ -16,6 +21,7 @@ from stages.refine_gaussians.refine import Sequence4D
 SIZE, FOCAL, WALL_M = (120, 160), 80.0, 1.5
 LIGHT = (1.0, 0.7)
 COVER = Cover(frames=8, plain=0.01, even=0.1)
+EVERYWHERE, SHARED = np.ones((3, 8000), bool), np.full(8000, -1)
 
 
 def paint(points: np.ndarray) -> np.ndarray:
@@ -54,7 +60,7 @@ def wall() -> gaussians.Spread:
 
 
 def test_pictures_tell_colour_and_light(wall):
-    seen = cover.watch(wall, [film(0), film(1)], COVER)
+    seen = cover.watch(wall, EVERYWHERE, [film(0), film(1)], COVER)
     shown = seen.weight > 0
     assert not shown[wall.points[:, 2] > WALL_M + 0.01].any(), "what faces away is not seen"
     assert shown[(np.abs(wall.points[:, :2]) < [1.2, 0.9]).all(1) & (wall.points[:, 2] < WALL_M + 0.01)].mean() > 0.99
@@ -68,17 +74,38 @@ def test_what_was_carried_away_is_left_out(wall):
     """The second layer stands half a metre before the wall: all pictures see through it."""
     ghost = wall.points[:, 2] > WALL_M + 0.01
     points = wall.points - ghost[:, None] * np.array([0, 0, 0.5])
-    seen = cover.watch(replace(wall, points=points), [film(0), film(1)], COVER)
-    kept, _ = cover.thin(points, seen, 2000, COVER, np.random.default_rng(0))
+    seen = cover.watch(replace(wall, points=points), EVERYWHERE, [film(0), film(1)], COVER)
+    kept, _ = cover.thin(points, SHARED, seen, 2000, COVER, np.random.default_rng(0))
     in_view = (np.abs(points[:, :2]) < [0.7, 0.5]).all(1)
     assert (in_view & ghost).sum() > 300 and not (in_view & ghost)[kept].any() and (in_view & ~ghost)[kept].any()
 
 
 def test_most_gaussians_lie_where_colours_change(wall):
-    seen = cover.watch(wall, [film(0), film(1)], COVER)
-    kept, spacing_m = cover.thin(wall.points, seen, 2000, COVER, np.random.default_rng(0))
+    seen = cover.watch(wall, EVERYWHERE, [film(0), film(1)], COVER)
+    kept, spacing_m = cover.thin(wall.points, SHARED, seen, 2000, COVER, np.random.default_rng(0))
     assert abs(len(kept) - 2000) < 40
     points = wall.points[kept]
     middle = (np.abs(points[:, :2]) < [1.0, 0.7]).all(1) & (points[:, 2] < WALL_M + 0.01)
     plain, checked = (middle & (sign * points[:, 0] > 0.1) for sign in (-1, 1))
     assert checked.sum() > 4 * plain.sum() > 0 and spacing_m[checked].mean() < 0.6 * spacing_m[plain].mean()
+
+
+def board(height_cells: float | None) -> torch.Tensor:
+    """Return a block that is cut by a level surface (None: empty)."""
+    block = torch.ones(NODES, NODES, NODES, 5)
+    if height_cells is not None:
+        block[..., 0] = ((torch.arange(NODES) - height_cells) / 2).clamp(-1, 1)[None, :, None]
+    return block
+
+
+def test_what_was_moved_stands_only_where_each_video_saw_it():
+    """Four blocks in a row: all share a floor in the first; video 0 has a board in the second, video 1 no floor and one in the third."""
+    table = torch.tensor([[1, 2, 0, 0], [3, 0, 2, 0], [1, 0, 0, 0]], dtype=torch.int32)[:, :, None, None]
+    blocks = torch.stack([board(None), board(4.5), board(2.5), board(None)]).half()
+    shape = FieldShape(low_m=(0, 0, 0), high_m=(1.28, 0.32, 0.32), voxel_m=(0.16,), videos=2, truncation_m=0.08)
+    field = Field(shape, 0.1, Fused(torch.zeros(3), 0.04, 0.08, table, blocks)).requires_grad_(False)
+    points, layer, stands = cover.spread(field, [0, 1], 300, np.random.default_rng(0))
+    block = (points.points[:, 0] // 0.32).astype(int)
+    assert [np.unique(block[layer == one]).tolist() for one in (-1, 0, 1)] == [[0], [1], [2]]
+    np.testing.assert_array_equal(stands, [layer <= 0, layer == 1, layer == -1])
+    np.testing.assert_allclose(points.points[layer >= 0, 1], 0.10, atol=0.003)

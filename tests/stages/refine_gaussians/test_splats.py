@@ -34,7 +34,7 @@ def test_file_has_rows_of_248_bytes_and_leaves_out_what_cannot_be_seen(tmp_path)
     with torch.no_grad():
         cloud.opacity_logit[3] = -20.0
         cloud.means[5, 0] = torch.nan
-    gaussians.save_ply(tmp_path / "a.ply", cloud)
+    gaussians.save_ply(tmp_path / "a.ply", cloud, gaussians.kept(cloud))
     data = (tmp_path / "a.ply").read_bytes()
     head = data[: data.index(b"end_header\n") + 11]
     assert b"element vertex 48" in head and len(data) - len(head) == 48 * 248
@@ -100,6 +100,6 @@ def test_what_is_out_of_view_can_be_left_out():
     camera[0, 3], camera[2, 3] = -0.4, 0.3
     seen = rasterize.in_view(splats.scene.means, splats.scene.log_scale, camera, intrinsics, 30, 40)
     assert 20 < len(seen) < 300
-    whole, part = (see(splats.place_scene(0, which), camera, intrinsics, 30, 40) for which in (slice(None), seen))
+    whole, part = (see(splats.place_scene(0, which), camera, intrinsics, 30, 40) for which in (None, seen))
     torch.testing.assert_close(part.color, whole.color)
     torch.testing.assert_close(part.coverage, whole.coverage)
