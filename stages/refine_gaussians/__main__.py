@@ -22,7 +22,7 @@ class Config:
 
     seed: int = 0
     """of all randomness"""
-    steps: int = 1500
+    steps: int = 1000
     """frames drawn, one a step"""
     counts: Counts = Counts()
     """numbers of Gaussians"""
