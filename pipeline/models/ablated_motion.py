@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from pipeline.models.longterm import ROOT, BaseNet, PoseNet, RouteNet, Sizes
+from pipeline.models.wayside import Seen
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Kind:
     route_turns: bool = True
     """RouteNet predicts orientations; else PoseNet does"""
     paper: bool = False
-    """RouteNet sees positions and orientations only; PoseNet has no `Strides` and learns along RouteNet's routes"""
+    """RouteNet makes no draft and sees positions, orientations and scene points only; PoseNet has no `Strides` and learns along such routes"""
     follows: bool = True
     """PoseNet is given the route"""
     one: bool = False
@@ -53,14 +54,14 @@ class Ablated(nn.Module):
         self.route, self.pose, self.base = route, pose, base
 
     def between(
-        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], points: Float[Tensor, "clip point 3"]
+        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], seen: Seen
     ) -> Float[Tensor, "clip frame channel"]:
         """Return t, r, p between first and last frames, in the clips' frames."""
         with torch.no_grad():
             if self.base is not None:
-                return self.base(start, end, points)
-            route = self.route(start, end, points)
-            return self.pose(start[:, ROOT:], end[:, ROOT:], route, points)
+                return self.base(start, end, seen)
+            route = self.route(start, end, seen)
+            return self.pose(start[:, ROOT:], end[:, ROOT:], route, seen.points)
 
     def save(self, path: Path) -> None:
         """Write the weights."""

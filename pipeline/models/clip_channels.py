@@ -1,7 +1,7 @@
 """Motions and bodies as the networks of `pipeline.models.longterm` see them, and back.
 
 A clip's frame lies half way between its first and last body. `encode_clips` gives channels (t, r, p) of 2-second motions and the
-scene points around them; `decode_clip` makes motion of channels; `encode_places` does the first for single bodies.
+scene around them; `decode_clip` makes motion of channels; `encode_places` does the first for single bodies.
 """
 
 from collections.abc import Sequence
@@ -18,6 +18,7 @@ from pipeline.models.longterm import BODY_REACH_M, REACH_M, ROOT
 from pipeline.models.perception import world_from_ego
 from pipeline.models.short_motions import Moving
 from pipeline.models.surroundings import Surroundings
+from pipeline.models.wayside import Seen, field_around
 from pipeline.space import rigid, rigid_torch
 
 MEET_M = 0.1
@@ -31,8 +32,8 @@ class Clips:
     world_from_clip: Float[np.ndarray, "clip 4 4"]
     channels: Float[Tensor, "clip frame channel"]
     """t, r, p"""
-    points: Float[Tensor, "clip point 3"]
-    """of the scene"""
+    seen: Seen
+    """the scene"""
     scene: Int[np.ndarray, "clip"]
     """index of the scene each is in"""
 
@@ -41,7 +42,7 @@ class Clips:
 
     def __getitem__(self, index: np.ndarray) -> "Clips":
         """Return some of the clips."""
-        return Clips(self.world_from_clip[index], self.channels[index], self.points[index], self.scene[index])
+        return Clips(self.world_from_clip[index], self.channels[index], self.seen[index], self.scene[index])
 
 
 def root_channels(a_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[Tensor, "*batch 9"]:
@@ -75,10 +76,14 @@ def encode_clips(
     points: int,
     rng: np.random.Generator,
 ) -> Clips:
-    """Turn short motions, or only their first and last frames, into channels; ``scene`` tells where each takes place."""
+    """Turn short motions, or only their first and last frames, into channels; ``scene`` tells where each takes place.
+
+    Without ``points`` nothing is seen.
+    """
     world_from_clip = clip_frames(root_world[:, 0], root_world[:, -1])
     root = root_channels(rigid.inverse(world_from_clip)[:, None] @ root_world)
-    seen = _points(world_from_clip, world_from_clip[:, :3, 3], scene, scenes, REACH_M, points, rng)
+    drawn = _points(world_from_clip, world_from_clip[:, :3, 3], scene, scenes, REACH_M, points, rng)
+    seen = Seen(drawn, field_around(world_from_clip, scene, scenes if points else []))
     return Clips(world_from_clip, torch.cat([root, p], dim=-1), seen, scene)
 
 

@@ -55,6 +55,10 @@ class Contacts:
         share[torch.from_numpy(self.foot), torch.arange(len(self.foot))] = 1
         return (share / share.sum(1, keepdim=True)) @ vertices_world
 
+    def lowest(self, distance_m: Float[Tensor, "frame vertex"]) -> Float[Tensor, "frame foot"]:
+        """Return how far each foot is from the scene, given the contact vertices' distances."""
+        return torch.stack([distance_m[:, np.flatnonzero(self.foot == foot)].min(1).values for foot in range(self.feet)], dim=1)
+
 
 def find_contacts(body: Body, motions: list[Moving], scenes: list[SignedDistance], *, most_frames: int = 400) -> Contacts:
     """Find the contact vertices of a body from motions, each in its scene, and group them to feet.

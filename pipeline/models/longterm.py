@@ -6,15 +6,17 @@ say how far the truth lies from the straight line between start and end; at both
 motions join without seams.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from pipeline.models import wayside
 from pipeline.models.bodies import LEVER_M
 from pipeline.models.short_motions import RATE_HZ, STEPS
+from pipeline.models.wayside import Seen
 from pipeline.space import rigid_torch
 
 ROOT = 9
@@ -122,15 +124,44 @@ class Between(nn.Module):
         end: Float[Tensor, "batch channel"],
         points: Float[Tensor, "batch point 3"],
         extra: Float[Tensor, "batch frame extra"] | None = None,
+        draft: Float[Tensor, "batch frame channel"] | None = None,
     ) -> Float[Tensor, "batch frame channel"]:
-        """Return the channels of all k + 1 frames, those of start and end at the ends."""
+        """Return the channels of all k + 1 frames, those of start and end at the ends: what is added to a draft, or to the line."""
         share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)[None, :, None].expand(len(start), -1, 1)
         line = torch.lerp(start[:, None], end[:, None], share)
         both = torch.cat([start, end], dim=-1)[:, None].expand(-1, STEPS + 1, -1)
         parts = [line, both, share, 4 * share * (1 - share)] + ([] if extra is None else [extra])
         features, _ = self.lstm(torch.cat(parts, dim=-1))
         code = self.point_net(points)[:, None].expand(-1, STEPS + 1, -1)
-        return line + ends_open(line) * self.out(torch.cat([features, code], dim=-1))
+        return (line if draft is None else draft) + ends_open(line) * self.out(torch.cat([features, code], dim=-1))
+
+
+class Drafted(nn.Module):
+    """A draft made without the scene, and its correction, made knowing what is beside each frame of the draft.
+
+    Distances beside the way that would be gone say what bends it; a code of all points around leaves that to be found.
+    """
+
+    def __init__(self, channels: int, extra: int, sizes: Sizes, seeing: bool):
+        super().__init__()
+        self.seeing = seeing
+        self.draft = Between(channels, extra, sizes, False)
+        smaller = replace(sizes, hidden=max(1, 2 * sizes.hidden // 3))
+        self.correction = Between(channels, wayside.READ + channels + 2 * ROOT, smaller, False)
+
+    def stages(
+        self,
+        start: Float[Tensor, "batch channel"],
+        end: Float[Tensor, "batch channel"],
+        seen: Seen,
+        extra: Float[Tensor, "batch frame extra"] | None = None,
+    ) -> list[Float[Tensor, "batch frame channel"]]:
+        """Return the draft and what it becomes, with r orthonormal."""
+        draft = rotations_of(self.draft(start, end, seen.points, extra))
+        still = draft.detach()
+        read = wayside.beside(seen.field, still[..., :3]) if self.seeing else still.new_zeros(*still.shape[:2], wayside.READ)
+        known = torch.cat([read, still, along(still[..., :ROOT])], dim=-1)
+        return [draft, rotations_of(self.correction(start, end, seen.points, known, still))]
 
 
 def ends_open(like: Float[Tensor, "batch frame channel"]) -> Float[Tensor, "frame 1"]:
@@ -148,25 +179,36 @@ def rotations_of(channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*b
 class RouteNet(nn.Module):
     """Positions and orientations between start and end (Eq. 1); or positions alone, orientations being left to PoseNet.
 
-    Beyond the paper it also sees the poses at both ends, which tell whether the body is on the move; not if ``blind``.
+    Beyond the paper it also sees the poses at both ends, which tell whether the body is on the move, and corrects a draft by
+    the distances beside it; as in the paper, by a code of the scene's points alone, if ``blind``.
     """
 
     def __init__(self, sizes: Sizes, *, seeing: bool = True, turns: bool = True, blind: bool = False):
         super().__init__()
-        self.turns, self.blind = turns, blind
-        self.between = Between(ROOT, 0 if blind else 2 * sizes.pose, sizes, seeing)
+        self.turns, self.blind, self.seeing = turns, blind, seeing
+        self.between = Between(ROOT, 0, sizes, seeing) if blind else Drafted(ROOT, 2 * sizes.pose, sizes, seeing)
+
+    def stages(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: Seen
+    ) -> list[Float[Tensor, "batch frame 9"]]:
+        """Return the routes that are made one after the other, the last of which counts."""
+        first, last = start[:, :ROOT], end[:, :ROOT]
+        if self.blind:
+            routes = [rotations_of(self.between(first, last, seen.points))]
+        else:
+            poses = torch.cat([start[:, ROOT:], end[:, ROOT:]], -1)[:, None].expand(-1, STEPS + 1, -1)
+            routes = self.between.stages(first, last, seen, poses)
+        if self.turns:
+            return routes
+        share = torch.linspace(0, 1, STEPS + 1, device=first.device)[None, :, None]
+        straight = torch.lerp(first[:, None, 3:], last[:, None, 3:], share)
+        return [rotations_of(torch.cat([route[..., :3], straight], dim=-1)) for route in routes]
 
     def forward(
-        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], points: Float[Tensor, "batch point 3"]
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: Seen
     ) -> Float[Tensor, "batch frame 9"]:
         """Return t and r of all frames; r on the straight line between the ends where the network does not turn."""
-        poses = None if self.blind else torch.cat([start[:, ROOT:], end[:, ROOT:]], -1)[:, None].expand(-1, STEPS + 1, -1)
-        start, end = start[:, :ROOT], end[:, :ROOT]
-        route = self.between(start, end, points, poses)
-        if not self.turns:
-            share = torch.linspace(0, 1, STEPS + 1, device=route.device)[None, :, None]
-            route = torch.cat([route[..., :3], torch.lerp(start[:, None, 3:], end[:, None, 3:], share)], dim=-1)
-        return rotations_of(route)
+        return self.stages(start, end, seen)[-1]
 
 
 class Strides(nn.Module):
@@ -253,14 +295,20 @@ def gait_way(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch fram
 
 
 class BaseNet(nn.Module):
-    """Route and poses from one network (ablation)."""
+    """Route and poses from one network (ablation), which also corrects its draft by the distances beside it."""
 
     def __init__(self, sizes: Sizes, *, seeing: bool = True):
         super().__init__()
-        self.between = Between(ROOT + sizes.pose, 0, sizes, seeing)
+        self.between = Drafted(ROOT + sizes.pose, 0, sizes, seeing)
+
+    def stages(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: Seen
+    ) -> list[Float[Tensor, "batch frame channel"]]:
+        """Return the motions that are made one after the other, the last of which counts."""
+        return self.between.stages(start, end, seen)
 
     def forward(
-        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], points: Float[Tensor, "batch point 3"]
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: Seen
     ) -> Float[Tensor, "batch frame channel"]:
         """Return t, r and p of all frames."""
-        return rotations_of(self.between(start, end, points))
+        return self.stages(start, end, seen)[-1]

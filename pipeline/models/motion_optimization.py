@@ -4,7 +4,7 @@
 function with the same `Settings` serves long-term motion, samples of the behaviour model and reconstructed motion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, assert_never
 
 import numpy as np
@@ -21,17 +21,28 @@ from pipeline.models.short_motions import RATE_HZ, Moving
 from pipeline.space import rigid_torch
 from pipeline.space.signed_distance import SignedDistance
 
+LIFTED = 4
+"""Frames before and after one that must be lifted in which the motion rises and sinks."""
+NEAR_M = 0.05
+"""Feet of a single body that are no further than this from the scene stand on it."""
+SETTLING = 80
+"""Steps that are enough for single bodies."""
+
 
 @dataclass(frozen=True)
 class Settings:
-    """Weights and length of the optimisation; every term is a mean over frames, in metres or square metres of motion."""
+    """Weights and length of the optimisation; every term is a mean over frames, in metres or square metres."""
 
     steps: int = 200
     """steps of Adam"""
     rate: float = 0.004
     """learning rate, metres and radians a step; falls to a tenth"""
-    foot: float = 120.0
+    foot: float = 3.0
     """a standing foot stays where it stands on average"""
+    give_m: float = 0.002
+    """nearer than this to that place the pull on it fades"""
+    ground: float = 1.5
+    """a standing foot touches what it stands on"""
     collision: float = 40.0
     """nothing is inside the scene, on average over vertices"""
     deepest: float = 4.0
@@ -91,53 +102,82 @@ def optimise(
 ) -> Moving:
     """Return the motion with all constraints weighed against each other; ``held`` frames stay as they are."""
     stance = Judge(physique.body, physique.contacts, scene).stance(moving, rate_hz, treading=True)
+    free = torch.ones(len(moving)) if held is None else torch.from_numpy(~held).float()
+    return _descended(moving, physique, scene, settings, stance, free, reach=LIFTED)
+
+
+def settled(bodies: Moving, physique: Physique, scene: SignedDistance, settings: Settings) -> Moving:
+    """Move single bodies, each on its own, out of what is solid and onto what is under their feet."""
+    with torch.no_grad():
+        feet = PosedSurface(physique.body, physique.contacts.vertices)(*tensors(bodies))
+        near = physique.contacts.lowest(scene.at(feet)).numpy() < NEAR_M
+    alone = replace(settings, foot=0.0, smooth=0.0, steps=min(settings.steps, SETTLING))
+    return _descended(bodies, physique, scene, alone, near, torch.ones(len(bodies)), reach=0)
+
+
+def _descended(
+    moving: Moving,
+    physique: Physique,
+    scene: SignedDistance,
+    settings: Settings,
+    stance: Bool[np.ndarray, "frame foot"],
+    free: Float[Tensor, "frame"],
+    *,
+    reach: int,
+) -> Moving:
     chosen = physique.body.spread(settings.vertices)
     count = len(chosen)
     surface = PosedSurface(physique.body, np.concatenate([chosen, physique.contacts.vertices]))
     correction = _Correction(moving, physique.poses)
-    free = torch.ones(len(moving), 1) if held is None else torch.from_numpy(~held).float()[:, None]
     phases = phase_means(stance)
     with torch.no_grad():
         given = surface(*correction())
-        correction.shift[:, 1] += free[:, 0] * lift(given[:, count:], scene)
+        correction.shift[:, 1] += free * lift(given[:, count:], scene, reach=reach)
     optimizer = torch.optim.Adam(correction.parameters(), lr=settings.rate)
     for step in range(settings.steps):
         for group in optimizer.param_groups:
             group["lr"] = settings.rate * (1 - 0.9 * step / settings.steps)
         points = surface(*correction())
-        body, touching = points[:, :count], points[:, count:]
         distance = scene.at(points)
-        feet, inside = physique.contacts.centres(touching), collision_error(distance, settings.margin_m)
+        feet, inside = physique.contacts.centres(points[:, count:]), collision_error(distance, settings.margin_m)
         total = (
-            settings.foot * foot_error(feet, phases).mean()
+            settings.foot * _mean(foot_error(feet, phases, settings.give_m))
+            + settings.ground * _mean(physique.contacts.lowest(distance[:, count:]).flatten()[phases[0]].abs())
             + settings.collision * inside.mean()
             + settings.deepest * inside.amax(dim=1).mean()
             + settings.contact * contact_error(distance[:, count:], settings.contact_scale_m).mean()
-            + settings.smooth * (smooth_error(body, settings.smoothness).mean() + smooth_error(feet, settings.smoothness).mean())
+            + settings.smooth * sum(_mean(smooth_error(each, settings.smoothness)) for each in (points[:, :count], feet))
             + settings.stay * ((points - given) ** 2).sum(-1).mean()
         )
         optimizer.zero_grad(set_to_none=True)
         total.backward()
         for parameter in correction.parameters():
-            parameter.grad *= free
+            parameter.grad *= free[:, None]
         optimizer.step()
     with torch.no_grad():
         root, bones = correction()
     return Moving(root.double().numpy(), bones.double().numpy())
 
 
-def lift(
-    touching: Float[Tensor, "frame vertex 3"], scene: SignedDistance, *, most_m: float = 0.2, step_m: float = 0.02
-) -> Float[Tensor, "frame"]:
-    """Return how far to raise each frame, smoothly, for contact vertices that are inside of something to come out on top.
+def _mean(values: Tensor) -> Tensor:
+    return values.sum() / max(values.numel(), 1)
 
-    The distance alone leads out on the nearest side: from a thin board often downwards. What is no way up within ``most_m`` is a wall.
+
+def lift(
+    touching: Float[Tensor, "frame vertex 3"], scene: SignedDistance, *, reach: int, most_m: float = 0.2, step_m: float = 0.02
+) -> Float[Tensor, "frame"]:
+    """Return how far to raise each frame for contact vertices that are inside of something to come out on top.
+
+    The distance alone leads out on the nearest side: from a thin board often downwards. What is no way up within ``most_m`` is a
+    wall. Rising and sinking is spread over ``reach`` frames on both sides.
     """
     heights = torch.arange(0, most_m, step_m)
     inside = torch.stack([scene.at(touching + height * torch.tensor([0.0, 1.0, 0.0])) < 0 for height in heights])  # height frame vertex
     first = torch.where(inside.all(0), 0, (~inside).float().argmax(0))
-    needed = ndimage.maximum_filter1d(heights[first].amax(1).numpy(), 9, mode="nearest")
-    return torch.from_numpy(ndimage.gaussian_filter1d(needed, 4.0, mode="nearest"))
+    needed = heights[first].amax(1).numpy()
+    if reach:
+        needed = ndimage.gaussian_filter1d(ndimage.maximum_filter1d(needed, 2 * reach + 1, mode="nearest"), reach, mode="nearest")
+    return torch.from_numpy(needed)
 
 
 def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Tensor, Tensor]:
@@ -148,15 +188,16 @@ def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Tensor, Tensor]
     return torch.from_numpy(flat), torch.from_numpy(number.reshape(-1)[flat] - 1)
 
 
-def foot_error(feet: Float[Tensor, "frame foot 3"], phases: tuple[Tensor, Tensor]) -> Float[Tensor, "stand"]:
-    """Return the squared distance of each standing foot from its mean place in that phase (E_foot)."""
+def foot_error(feet: Float[Tensor, "frame foot 3"], phases: tuple[Tensor, Tensor], give_m: float) -> Float[Tensor, "stand"]:
+    """Return the distance of each standing foot from its mean place in that phase (E_foot), even at nothing.
+
+    A distance and not its square, as in the paper: a foot is then at one place, not only near it.
+    """
     flat, phase = phases
-    if not len(flat):
-        return feet.sum()[None] * 0
     points = feet.flatten(0, 1)[flat]
     count = torch.bincount(phase).to(points)[:, None]
     mean = torch.zeros(len(count), 3).index_add(0, phase, points) / count
-    return ((points - mean[phase]) ** 2).sum(-1)
+    return (((points - mean[phase]) ** 2).sum(-1) + give_m**2).sqrt() - give_m
 
 
 def collision_error(distance_m: Float[Tensor, "frame vertex"], margin_m: float) -> Float[Tensor, "frame vertex"]:

@@ -16,12 +16,13 @@ from torch import Tensor
 
 from pipeline.models.bodies import Body, PoseSpace
 from pipeline.models.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
-from pipeline.models.contacts import Contacts, tensors
+from pipeline.models.contacts import Contacts
 from pipeline.models.longterm import ROOT, PoseNet, RouteNet, Sizes, StaticBody
-from pipeline.models.motion_optimization import Physique
+from pipeline.models.motion_optimization import Physique, Settings, settled
 from pipeline.models.plausibility import Judge
 from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, eased, joined, leaping
 from pipeline.models.surroundings import Surroundings
+from pipeline.models.wayside import Seen
 
 NETWORKS = ("static", "route", "pose")
 LEAP_M = 0.1
@@ -38,6 +39,8 @@ class Habits:
     """median distance of the root from the scene while it travels"""
     pace_m: float
     """median way of a two-second motion that travels"""
+    above_m: float
+    """how far the highest bone is above the root, median while it travels"""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class LongTerm:
             "frames": STEPS + 1,
             "bones": len(self.poses.rest),
             "sizes": asdict(self.sizes),
-            "seeing": self.route.between.point_net.seeing,
+            "seeing": self.route.seeing,
             "habits": asdict(self.habits),
             "contact_vertices": self.contacts.vertices.tolist(),
             "foot_of_contact_vertex": self.contacts.foot.tolist(),
@@ -97,7 +100,7 @@ class LongTerm:
         *,
         candidates: int = 8,
     ) -> Moving:
-        """Put a body at each place: of several that the CVAE draws, the one that stands in the scene best.
+        """Put a body at each place: of several that the CVAE draws, the one that stands in the scene best, `settled` there.
 
         A good body touches the scene, is not inside it, and stays near its place.
         """
@@ -116,25 +119,25 @@ class LongTerm:
             better = (cost < least)[:, None, None]
             best = made if best is None else _chosen(better, made, best)
             least = np.minimum(least, cost)
-        return best
+        return settled(best, self.physique(body), scene.distance, Settings())
 
     def short_motions(self, start: Moving, end: Moving, scene: Surroundings, rng: np.random.Generator) -> list[Moving]:
         """Return the 61 frames from each start body to its end body."""
         root = np.stack([start.world_from_agent, end.world_from_agent], axis=1)
         p = torch.stack([pose_channels(each.agent_from_bone, self.poses) for each in (start, end)], dim=1)
         ends = encode_clips(root, p, np.zeros(len(root), int), [scene], self.sizes.points, rng)
-        made = self.between(ends.channels[:, 0], ends.channels[:, 1], ends.points)
+        made = self.between(ends.channels[:, 0], ends.channels[:, 1], ends.seen)
         bones = np.stack([start.agent_from_bone, end.agent_from_bone], axis=1)
         parts = zip(made, ends.world_from_clip, bones, strict=True)
         return [decode_clip(channels, frame, self.poses, given) for channels, frame, given in parts]
 
     def between(
-        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], points: Float[Tensor, "clip point 3"]
+        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], seen: Seen
     ) -> Float[Tensor, "clip frame channel"]:
         """Return t, r, p between first and last frames, in the clips' frames."""
         with torch.no_grad():
-            route = self.route(start, end, points)
-            return self.pose(start[:, ROOT:], end[:, ROOT:], route, points)
+            route = self.route(start, end, seen)
+            return self.pose(start[:, ROOT:], end[:, ROOT:], route, seen.points)
 
     def long_motion(
         self,
@@ -177,21 +180,21 @@ def placed(channels: Float[Tensor, "body channel"], world_from_place: Float[np.n
 
 def habits_of(stretches: list[Moving], scenes: list[Surroundings], *, moving_m: float = 0.3) -> Habits:
     """Measure how a body moves; ``moving_m`` is the least way in two seconds that counts as travelling."""
-    clearance, pace = [], []
+    clearance, above, pace, travels = [], [], [], []
     for stretch, scene in zip(stretches, scenes, strict=True):
-        root = tensors(stretch)[0][:, :3, 3]
-        if len(root) <= STEPS:
-            continue
-        way = (root[STEPS:] - root[:-STEPS])[:, [0, 2]].norm(dim=1).numpy()
-        travels = way > moving_m
-        pace.append(way[travels])
-        clearance.append(scene.distance.at(root[STEPS // 2 : len(root) - STEPS // 2]).numpy()[travels])
-    if not sum(map(len, pace)):
-        lowest = [
-            float(scene.distance.at(tensors(stretch)[0][:, :3, 3]).median()) for stretch, scene in zip(stretches, scenes, strict=True)
-        ]
-        return Habits(float(np.median(lowest)), moving_m)
-    return Habits(float(np.median(np.concatenate(clearance))), float(np.median(np.concatenate(pace))))
+        root = stretch.world_from_agent[:, :3, 3]
+        way = np.linalg.norm((root[STEPS:] - root[:-STEPS])[:, [0, 2]], axis=1)
+        middle = slice(STEPS // 2, len(way) + STEPS // 2)
+        up = (stretch.world_from_agent[middle, 1:2, :3] @ np.swapaxes(stretch.agent_from_bone[middle, :, :3, 3], 1, 2))[:, 0]
+        clearance.append(scene.distance.at(torch.from_numpy(root[middle]).float()).numpy())
+        above.append(up.max(1))
+        pace.append(way)
+        travels.append(way > moving_m)
+    kept = np.concatenate(travels)
+    kept = kept if kept.any() else ~kept
+    found = (float(np.median(np.concatenate(each)[kept])) for each in (clearance, pace, above))
+    clearance_m, pace_m, above_m = found
+    return Habits(clearance_m, max(pace_m, moving_m), above_m)
 
 
 def _stacked(frames: list[Moving]) -> Moving:

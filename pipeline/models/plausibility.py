@@ -56,7 +56,7 @@ class Judge:
     def stance(self, motion: Moving, rate_hz: float = RATE_HZ, *, treading: bool = False) -> Bool[np.ndarray, "frame foot"]:
         """Tell which feet stand when, or with ``treading`` which should."""
         points = PosedSurface(self.body, self.contacts.vertices)(*tensors(motion))
-        centres, height = self.contacts.centres(points), _lowest(self.scene.at(points), self.contacts)
+        centres, height = self.contacts.centres(points), self.contacts.lowest(self.scene.at(points))
         return planted(centres.numpy(), height.numpy(), motion.world_from_agent[:, :3, 3], treading=treading, rate_hz=rate_hz)
 
     def fit_of(self, motion: Moving) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
@@ -76,7 +76,7 @@ class Judge:
         centres = self.contacts.centres(touching).numpy()
         both = stance[1:] & stance[:-1]
         speed = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1) * rate_hz
-        near = _lowest(depth[1:, self.contacts.vertices], self.contacts).numpy() < CONTACT_M
+        near = self.contacts.lowest(depth[1:, self.contacts.vertices]).numpy() < CONTACT_M
         least = np.where(near, speed, np.inf).min(axis=1, initial=np.inf)
         slide, least = speed[both], least[np.isfinite(least)]
         return Plausibility(
@@ -89,14 +89,13 @@ class Judge:
         )
 
 
-def _lowest(distance: Float[torch.Tensor, "frame vertex"], contacts: Contacts) -> Float[torch.Tensor, "frame foot"]:
-    return torch.stack([distance[:, np.flatnonzero(contacts.foot == foot)].min(1).values for foot in range(contacts.feet)], dim=1)
+def seams(body: Body, motion: Moving, every: int, vertices: int | None = 200) -> Float[np.ndarray, "seam vertex"]:
+    """Return, at every ``every``-th frame, how much further each vertex moves than in the frames beside it, metres.
 
-
-def seams(body: Body, motion: Moving, every: int, vertices: int = 200) -> Float[np.ndarray, "seam"]:
-    """Return the jump at every ``every``-th frame: how much further than in the frames beside it a vertex moves, metres."""
-    points = PosedSurface(body, body.spread(vertices))(*tensors(motion))
-    step = (points[1:] - points[:-1]).norm(dim=-1).numpy()
+    ``vertices`` spread over the surface are looked at; None: all.
+    """
+    surface = PosedSurface(body, None if vertices is None else body.spread(vertices))
     at = np.arange(every, len(motion) - 2, every)
-    beside = np.maximum(step[at - 2], step[at + 1])
-    return (np.maximum(step[at - 1], step[at]) - beside).clip(0).max(axis=1, initial=0.0)
+    points = surface(*tensors(motion[(at[:, None] + np.arange(-2, 3)).reshape(-1)])).unflatten(0, (len(at), 5))
+    step = (points[:, 1:] - points[:, :-1]).norm(dim=-1).numpy()
+    return (step[:, 1:3].max(1) - np.maximum(step[:, 0], step[:, 3])).clip(0)

@@ -24,6 +24,8 @@ RAISED_M = 0.15
 """A sub-goal whose body stands higher than this above the floor is on furniture and is reached by a leap."""
 SLACK = 1.35
 """How much longer than the usual pace a leg may be before another one is needed."""
+SOUGHT_M = 0.3
+"""How far above or below a raised sub-goal what carries a body there is looked for."""
 TURN_M = 0.2
 """A body that stops keeps this far from where it cannot walk, to have room to turn."""
 ABOUT_RAD = 1.7
@@ -64,13 +66,13 @@ class Floor:
     height_m: float
 
     @classmethod
-    def of(cls, scene: Surroundings, root_m: float, breadth_m: float = 0.16) -> "Floor":
-        """Find the free floor of a scene for a body whose root is ``root_m`` above ground."""
-        floor, grid = scene.floor_m, scene.distance
+    def of(cls, scene: Surroundings, habits: Habits, breadth_m: float = 0.16) -> "Floor":
+        """Find the free floor of a scene for a body, upright as it travels."""
+        floor, grid, root_m = scene.floor_m, scene.distance, habits.clearance_m
         low, span = grid.origin.double().numpy(), (np.array(grid.values.shape) - 1) * grid.voxel_m
         count = np.floor(span[[0, 2]] / CELL_M).astype(int) + 1
         x, z = (low[axis] + CELL_M * np.arange(n) for axis, n in zip((0, 2), count, strict=True))
-        levels = floor + np.linspace(0.7 * root_m, 1.5 * root_m, 4)
+        levels = floor + np.linspace(0.7 * root_m, root_m + max(habits.above_m, 0.5 * root_m), 5)
         points = np.stack(np.meshgrid(x, levels, z, indexing="ij"), axis=-1)
         above = grid.at(torch.from_numpy(points).float()).numpy()
         beneath = grid.at(torch.from_numpy(points[:, 0] * [1, 0, 1] + [0, floor, 0]).float()).numpy()
@@ -129,14 +131,15 @@ def legs(start: Float[np.ndarray, "4 4"] | None, subgoals: list[Subgoal], scene:
     """Return places two seconds apart through all sub-goals; without ``start`` the first sub-goal is where it begins."""
     if len(subgoals) < (1 if start is not None else 2):
         raise InputError("SIM-001", "too few sub-goals", f"{len(subgoals)}", "give at least two, or a start and one")
-    floor = Floor.of(scene, habits.clearance_m)
+    floor = Floor.of(scene, habits)
     for goal in subgoals:
         floor.refuse_outside(goal.position_world)
     root_m = floor.height_m + habits.clearance_m
-    points = [_standing(floor, subgoals[0].position_world, root_m) if start is None else _grounded(start[:3, 3], root_m)]
+    stand = [_standing(floor, scene, goal.position_world, habits.clearance_m) for goal in subgoals]
+    points = [stand.pop(0) if start is None else _grounded(start[:3, 3], root_m)]
     headings, marks, clock = [subgoals[0].heading_rad if start is None else _heading(start)], [0], 0.0
-    for goal in subgoals[1:] if start is None else subgoals:
-        added = _way(floor, points[-1], _standing(floor, goal.position_world, root_m), root_m, SLACK * habits.pace_m)
+    for goal, place in zip(subgoals[-len(stand) :], stand, strict=True):
+        added = _way(floor, points[-1], place, root_m, SLACK * habits.pace_m)
         count = len(added)
         spare = 0 if goal.time_s is None else max(0, round((goal.time_s - clock) / LEG_S) - count)
         points += [*added, *[added[-1]] * spare]
@@ -149,7 +152,7 @@ def legs(start: Float[np.ndarray, "4 4"] | None, subgoals: list[Subgoal], scene:
 
 def brought_in(subgoals: list[Subgoal], scene: Surroundings, habits: Habits) -> list[Subgoal]:
     """Move sub-goals that a model drew outside of the scene to the nearest place where a body can turn."""
-    floor = Floor.of(scene, habits.clearance_m)
+    floor = Floor.of(scene, habits)
     return [
         goal if floor.holds(goal.position_world) else replace(goal, position_world=floor.roomy(goal.position_world)) for goal in subgoals
     ]
@@ -171,10 +174,30 @@ def preferred(
     return found
 
 
-def _standing(floor: Floor, position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
-    """Return where a body stands that is to be at a position: there if on furniture, else where it has room to turn."""
+def _standing(floor: Floor, scene: Surroundings, position: Float[np.ndarray, "3"], clearance_m: float) -> Float[np.ndarray, "3"]:
+    """Return where a body stands that is to be at a position: on furniture if it is at home there, else where it has room to turn."""
+    root_m = floor.height_m + clearance_m
     grounded = _grounded(position, root_m)
+    if grounded[1] > root_m:
+        above = _on_top(scene, grounded, clearance_m)
+        grounded = _grounded(np.array([position[0], root_m if above is None else above, position[2]]), root_m)
     return floor.roomy(grounded) if grounded[1] == root_m else grounded
+
+
+def _on_top(scene: Surroundings, position: Float[np.ndarray, "3"], clearance_m: float) -> float | None:
+    """Return the height of the root nearest to a position's at which something carries the body and leaves it room; None: nowhere.
+
+    Where an animal has been there may be nothing now, or a board at its belly: furniture is moved, maps are not perfect.
+    """
+    heights = position[1] - clearance_m + np.arange(-SOUGHT_M, SOUGHT_M, 0.01)
+    column = np.stack([np.full_like(heights, position[0]), heights, np.full_like(heights, position[2])], axis=-1)
+    both = np.stack([column, column + np.array([0, clearance_m, 0])])
+    under, root = scene.distance.at(torch.from_numpy(both).float()).numpy()
+    carries = np.flatnonzero((under[:-1] < 0) & (under[1:] >= 0) & (root[1:] > clearance_m / 2)) + 1
+    if not len(carries):
+        return None
+    found = heights[carries] + clearance_m
+    return float(found[np.abs(found - position[1]).argmin()])
 
 
 def _grounded(position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:

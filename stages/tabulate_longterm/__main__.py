@@ -17,8 +17,8 @@ from stages.tabulate_longterm.lengths import Length
 class Config:
     """How much is measured."""
 
-    clips: int = 120
-    """Short motions of each source, evenly chosen among those that end more than 0.5 m from their start."""
+    clips: int = 300
+    """Short motions of each source, two by two, evenly chosen among those that end more than 0.5 m from their start."""
     optimised_clips: int = 24
     """How many of them are also optimised: of reconstructed motion ours alone, of the built-in world all methods."""
     optimisation: Settings = field(default_factory=Settings)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from pipeline import progress
 from pipeline.models import behavior
@@ -15,6 +15,7 @@ from pipeline.models.journeys import World
 from pipeline.models.longterm_examples import Cuts, Cutting, Lives, cut, encoded
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.scenes import Scenes
+from pipeline.models.short_motions import STEPS
 from pipeline.models.trajectories import TRAIN
 from pipeline.space import rigid
 from stages.tabulate_longterm import lengths, methods, scores, tables
@@ -33,15 +34,17 @@ def figures(prefix: str, source: Source, c: Any) -> dict[str, float | None]:
     lives, model = source.held_out, source.models.ours
     rng = np.random.default_rng(c.seed)
     cuts = chosen(cut(lives, Cutting(stride=10, resting=0.0), rng), c.clips)
+    if not len(cuts.start):
+        return {}
     clips = encoded(lives, cuts, model.poses, model.sizes.points, rng)
     known = scores.references(cuts.parts(lives), clips.scene, lives, model)
-    plain, made = {"truth": np.array([scores.score(each.truth, each, model.poses) for each in known])}, {}
+    plain, made = {"truth": scores.scored([each.truth for each in known], known, model)}, {}
     for name, method in methods.methods(source.models, lives, c.seed).items():
         made[name] = method(clips)
         plain[name] = scores.scores(made[name], clips, known, model, None)
         progress.log(f"{prefix}: {name}, MPJPE {plain[name][:, scores.METRICS.index('mpjpe_mm')].mean():.1f} mm")
-    plain |= {f"{name}_beyond_ours": plain[name] - plain["ours"] for name in methods.RIVALS if name in plain}
-    some = np.unique(np.linspace(0, len(clips) - 1, min(c.optimised_clips, len(clips))).astype(int))
+    plain |= {f"{name}_beyond_{than}": plain[name] - plain[than] for name, than in methods.BEYOND.items() if {name, than} <= set(plain)}
+    some = pairs(len(clips), c.optimised_clips)
     done = {}
     for name in methods.OPTIMISED if source.data is None else ("ours",):
         done[f"{name}_opt"] = scores.scores(made[name][some], clips[some], [known[index] for index in some], model, c.optimisation)
@@ -58,9 +61,19 @@ def figures(prefix: str, source: Source, c: Any) -> dict[str, float | None]:
 
 
 def chosen(cuts: Cuts, most: int) -> Cuts:
-    """Leave short motions out evenly until there are few enough."""
-    some = np.unique(np.linspace(0, len(cuts.start) - 1, min(most, len(cuts.start))).astype(int))
-    return Cuts(cuts.stretch[some], cuts.start[some])
+    """Take short motions two by two that follow each other, evenly until there are enough."""
+    known = set(zip(cuts.stretch.tolist(), cuts.start.tolist(), strict=True))
+    first = np.array([(stretch, start) in known for stretch, start in zip(cuts.stretch, cuts.start + STEPS, strict=True)], bool)
+    stretch, start = (np.repeat(each[first], 2) for each in (cuts.stretch, cuts.start))
+    start[1::2] += STEPS
+    some = pairs(len(start), most)
+    return Cuts(stretch[some], start[some])
+
+
+def pairs(count: int, most: int) -> Int[np.ndarray, "some"]:
+    """Return the numbers of at most ``most`` of ``count`` things that come two by two, evenly chosen."""
+    first = 2 * np.unique(np.linspace(0, max(count // 2 - 1, 0), min(most, count) // 2).astype(int))
+    return np.stack([first, first + 1], axis=1).reshape(-1)
 
 
 def blocked(clips: Clips, lives: Lives) -> Bool[np.ndarray, "clip"]:

@@ -18,8 +18,15 @@ Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """From clips, of which only first and last frames and the scene may be looked at, to all frames"""
 OPTIMISED = ("ours", "base", "route_cvae", "nearest")
 """Methods that are also judged after the optimisation."""
-RIVALS = ("base", "route_cvae", "nearest", "ours_no_scene")
-"""Methods whose errors beyond ours are told clip by clip, with intervals."""
+BEYOND = {
+    "base": "ours",
+    "route_cvae": "ours",
+    "nearest": "ours",
+    "ours_no_scene": "ours",
+    "route_t_pose_no_scene": "route_t_pose",
+    "base_no_scene": "base",
+}
+"""Methods whose errors beyond another's are told clip by clip, with intervals."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,7 @@ def methods(models: Models, lives: Lives, seed: int) -> dict[str, Method]:
     """Return every method by its name in the tables."""
 
     def by(net: LongTerm | Ablated) -> Method:
-        return lambda clips: net.between(clips.channels[:, 0], clips.channels[:, -1], clips.points)
+        return lambda clips: net.between(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
 
     trained = {"ours": by(models.ours)} | {name: by(net) for name, net in models.ablated.items()}
     return trained | {
@@ -48,7 +55,7 @@ def methods(models: Models, lives: Lives, seed: int) -> dict[str, Method]:
 def route_cvae(model: LongTerm, clips: Clips, lives: Lives, rng: np.random.Generator) -> Float[Tensor, "clip frame channel"]:
     """Follow RouteNet's route with a body of the CVAE in every frame, one z per clip (Route + CVAE)."""
     with torch.no_grad():
-        route = model.route(clips.channels[:, 0], clips.channels[:, -1], clips.points)
+        route = model.route(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
         made = []
         for index in range(len(clips)):
             roots = decode_clip(_with_pose(route[index], model), clips.world_from_clip[index], model.poses).world_from_agent

@@ -1,6 +1,7 @@
 """How near short motions are to the true ones, and how physical they are (Sec. 4.3 of the paper)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -13,19 +14,21 @@ from pipeline.models.contacts import tensors
 from pipeline.models.longterm_examples import Lives
 from pipeline.models.motion_optimization import Settings, optimise
 from pipeline.models.motion_synthesis import LongTerm
-from pipeline.models.plausibility import Judge
-from pipeline.models.short_motions import Moving
+from pipeline.models.plausibility import Judge, seams
+from pipeline.models.short_motions import STEPS, Moving, joined
 
 METRICS = (
-    "translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm", "end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share",
+    "translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm",
+    "end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share", "seam_share", "seam_worst_mm",
     "non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "least_slide_m_s",
 )  # fmt: skip
 """translation, orientation, pose: L1 x 100 of root position (m), of its rotation's first two columns, of the bones' channels
-(rad, m). MPJPE: origins of the bones. MPVPE: all vertices. end v2v: distance of the first and last mesh from the given ones,
-where one short motion joins the next. neighbour v2v: distance from the given ends to the made meshes one frame further in, which
-the true motion has too, as it moves (the paper says the first and, by its figure for true motion, measures the second). Share:
-of the body's length. Slide: median speed of standing
-feet in that clip; planted: share of frames in which any foot stands; least slide: speed of the foot that moves least."""
+(rad, m). MPJPE: origins of the bones. MPVPE: all vertices. Neighbour v2v, between one short motion and the next, three ways.
+End v2v, the paper's words: distance of the first and last mesh from the given ones. Neighbour v2v, the paper's figures, which for
+true motion are not nothing: distance from the given ends to the meshes one frame further in. Seam: how much further the
+vertices move at the frame where two short motions join than in the frames beside it, their mean and the worst of them.
+Share: of the body's length. Slide: median speed of standing feet in that clip; planted: share of frames in which any foot
+stands; least slide: speed of the foot that moves least."""
 MEDIANS = ("slide_m_s", "least_slide_m_s")
 """Metrics of which the tables give the median over clips, not the mean."""
 
@@ -41,15 +44,20 @@ class Reference:
     """as it was recorded"""
     judge: Judge
 
+    @cached_property
+    def mesh(self) -> Float[Tensor, "frame vertex 3"]:
+        """The true body."""
+        return self.judge.surface(*tensors(self.truth))
 
-def score(made: Moving, reference: Reference, poses: PoseSpace) -> Float[np.ndarray, "metric"]:
+
+def score(made: Moving, reference: Reference, poses: PoseSpace, seam_m: Float[np.ndarray, "vertex"]) -> Float[np.ndarray, "metric"]:
     """Measure one short motion; the feet that stand are those of the made motion itself."""
     body, truth = reference.judge.body, reference.truth
     stance = reference.judge.stance(made)
     worth = reference.judge.plausibility(made, stance)
-    meshes = [reference.judge.surface(*tensors(each)) for each in (made, truth)]
-    apart = (meshes[0] - meshes[1]).norm(dim=-1)
-    beside = float((meshes[0][NEXT_TO_ENDS] - meshes[1][ENDS]).norm(dim=-1).mean())
+    mesh = reference.judge.surface(*tensors(made))
+    apart = (mesh - reference.mesh).norm(dim=-1)
+    beside = float((mesh[NEXT_TO_ENDS] - reference.mesh[ENDS]).norm(dim=-1).mean())
     turn = np.abs(made.world_from_agent - truth.world_from_agent)[:, :3, :2].mean()
     joints = [each.world_from_agent[:, None] @ each.agent_from_bone for each in (made, truth)]
     rest = poses.rest.double().numpy()
@@ -64,6 +72,8 @@ def score(made: Moving, reference: Reference, poses: PoseSpace) -> Float[np.ndar
             float(apart[ENDS].mean()) / body.length_m,
             1000 * beside,
             beside / body.length_m,
+            seam_m.mean() / body.length_m,
+            1000 * seam_m.max(),
             worth.non_collision,
             worth.contact,
             1000 * worth.penetration_m,
@@ -77,14 +87,30 @@ def score(made: Moving, reference: Reference, poses: PoseSpace) -> Float[np.ndar
 def scores(
     channels: Float[Tensor, "clip frame channel"], clips: Clips, references: list[Reference], model: LongTerm, settings: Settings | None
 ) -> Float[np.ndarray, "clip metric"]:
-    """Measure the motions of one method on all clips, after the optimisation of all but the ends where ``settings`` are given."""
+    """Measure the motions of one method on all clips, two of which always follow each other, and the seams between those.
+
+    Where ``settings`` are given both are optimised as one motion, all but the given bodies at its ends and in its middle.
+    """
+    made = [
+        decode_clip(each, frame, model.poses, reference.truth[ENDS].agent_from_bone)
+        for each, frame, reference in zip(channels, clips.world_from_clip, references, strict=True)
+    ]
+    return scored(made, references, model, settings)
+
+
+def scored(
+    motions: list[Moving], references: list[Reference], model: LongTerm, settings: Settings | None = None
+) -> Float[np.ndarray, "clip metric"]:
+    """Measure motions that follow each other two by two."""
     rows = []
-    for made, frame, reference in zip(channels, clips.world_from_clip, references, strict=True):
-        moving = decode_clip(made, frame, model.poses, reference.truth[ENDS].agent_from_bone)
+    for start in range(0, len(motions), 2):
+        both, judge = joined(motions[start : start + 2]), references[start].judge
         if settings is not None:
-            held = np.isin(np.arange(len(moving)), (0, len(moving) - 1))
-            moving = optimise(moving, model.physique(reference.judge.body), reference.judge.scene, settings, held=held)
-        rows.append(score(moving, reference, model.poses))
+            held = np.arange(len(both)) % STEPS == 0
+            both = optimise(both, model.physique(judge.body), judge.scene, settings, held=held)
+        seam = seams(judge.body, both, STEPS, vertices=None)[0]
+        halves = both[: STEPS + 1], both[STEPS:]
+        rows += [score(half, known, model.poses, seam) for half, known in zip(halves, references[start : start + 2], strict=True)]
     return np.array(rows).reshape(-1, len(METRICS))
 
 

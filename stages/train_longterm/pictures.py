@@ -35,7 +35,7 @@ def shown(learned: Learned, lives: Parted, seed: int) -> Shown:
     rng = np.random.default_rng(seed)
     cuts = cut(where, Cutting(stride=15, resting=0.3, most_clips=TRIED), rng)
     clips = encoded(where, cuts, learned.model.poses, learned.model.sizes.points, rng)
-    made = learned.model.between(clips.channels[:, 0], clips.channels[:, -1], clips.points)
+    made = learned.model.between(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
     line = torch.lerp(clips.channels[:, :1], clips.channels[:, -1:], torch.linspace(0, 1, made.shape[1])[None, :, None])
     error, straight = (float((each - clips.channels)[..., :3].abs().mean()) for each in (made, line))
     gap, depth = _stills(learned, where, rng)

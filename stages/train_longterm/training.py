@@ -83,12 +83,13 @@ class Trainer:
 
 
 def fit_route(net: RouteNet, clips: Clips, trainer: Trainer, pace: Pace, name: str = "route") -> FitRecord:
-    """Fit a RouteNet (Eq. 3)."""
+    """Fit a RouteNet (Eq. 3), its draft alike."""
     w = trainer.weights
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
-        shift, turn = objectives.route_error(net(truth[:, 0], truth[:, -1], clips.points[index]), truth)
+        made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
+        shift, turn = map(sum, zip(*(objectives.route_error(each, truth) for each in made), strict=True))
         return {"translation": w.translation * shift} | ({"rotation": w.rotation * turn} if net.turns else {})
 
     return trainer.fitted(name, net, pace, loss, len(clips))
@@ -98,7 +99,7 @@ def made_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:
     """Return the routes that a RouteNet makes, which the paper's PoseNet learns along."""
     with torch.no_grad():
         ends, batches = clips.channels[:, [0, -1]], torch.arange(len(clips)).split(256)
-        return torch.cat([net(ends[rows, 0], ends[rows, 1], clips.points[rows]) for rows in batches])
+        return torch.cat([net(ends[rows, 0], ends[rows, 1], clips.seen[rows]) for rows in batches])
 
 
 def true_routes(clips: Clips, smooth_frames: float = 4.0) -> Float[Tensor, "clip frame 9"]:
@@ -116,7 +117,7 @@ def fit_pose(
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
-        made = net(truth[:, 0, ROOT:], truth[:, -1, ROOT:], routes[index], clips.points[index])
+        made = net(truth[:, 0, ROOT:], truth[:, -1, ROOT:], routes[index], clips.seen.points[index])
         terms = {"pose": w.pose * objectives.pose_error(made[..., ROOT:], truth[..., ROOT:], lever)}
         return terms | ({"rotation": w.rotation * objectives.route_error(made[..., :ROOT], truth[..., :ROOT])[1]} if net.turns else {})
 
@@ -124,14 +125,14 @@ def fit_pose(
 
 
 def fit_base(net: BaseNet, clips: Clips, trainer: Trainer, pace: Pace, name: str = "base") -> FitRecord:
-    """Fit a BaseNet."""
+    """Fit a BaseNet, its draft alike."""
     w, lever = trainer.weights, objectives.lever_of(trainer.poses)
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
-        made = net(truth[:, 0], truth[:, -1], clips.points[index])
-        shift, turn = objectives.route_error(made[..., :ROOT], truth[..., :ROOT])
-        pose = objectives.pose_error(made[..., ROOT:], truth[..., ROOT:], lever)
+        made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
+        shift, turn = map(sum, zip(*(objectives.route_error(each[..., :ROOT], truth[..., :ROOT]) for each in made), strict=True))
+        pose = sum(objectives.pose_error(each[..., ROOT:], truth[..., ROOT:], lever) for each in made)
         return {"translation": w.translation * shift, "rotation": w.rotation * turn, "pose": w.pose * pose}
 
     return trainer.fitted(name, net, pace, loss, len(clips))

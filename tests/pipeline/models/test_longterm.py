@@ -10,6 +10,7 @@ from pipeline.models.longterm_examples import Cutting, bodies, cut, encoded, fit
 from pipeline.models.motion_synthesis import LongTerm, habits_of
 from pipeline.models.short_motions import STEPS
 from pipeline.models.subgoals import Floor, Subgoal, legs, preferred
+from pipeline.models.wayside import FARTHEST_M, NEAREST_M, READ, Seen, beside
 from tests.pipeline.models import strider
 
 SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
@@ -48,17 +49,27 @@ def test_channels_and_motion_are_each_others_inverse(lives, model):
 
 
 def test_scene_points_lie_on_the_scene_near_the_clip(lives, clips):
-    world = torch.einsum("cij,cpj->cpi", torch.from_numpy(clips.world_from_clip[:, :3, :3]).float(), clips.points)
+    world = torch.einsum("cij,cpj->cpi", torch.from_numpy(clips.world_from_clip[:, :3, :3]).float(), clips.seen.points)
     world = world + torch.from_numpy(clips.world_from_clip[:, None, :3, 3]).float()
     assert lives.scenes[0].distance.at(world).abs().max() < 0.06
-    assert clips.points.norm(dim=-1).max() < 1.51
+    assert clips.seen.points.norm(dim=-1).max() < 1.51
+
+
+def test_distances_beside_a_route_are_those_of_the_scene(lives, clips):
+    read = beside(clips.seen.field, clips.channels[..., :3])
+    assert read.shape == (*clips.channels.shape[:2], READ)
+    frames = torch.from_numpy(clips.world_from_clip).float()
+    root = torch.einsum("cij,cfj->cfi", frames[:, :3, :3], clips.channels[..., :3]) + frames[:, None, :3, 3]
+    true = lives.scenes[0].distance.at(root).clamp(NEAREST_M, FARTHEST_M)
+    assert (read[..., 0] / 4 - true).abs().max() < 0.05
+    torch.testing.assert_close(read[..., READ // 2], 10 * (0.15 - read[..., 0] / 4).clamp_min(0), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["ours", *ablated_motion.KINDS])
 def test_short_motions_begin_and_end_as_given(model, clips, name):
     torch.manual_seed(1)
     made = model if name == "ours" else ablated_motion.build(ablated_motion.KINDS[name], SIZES)
-    frames = made.between(clips.channels[:, 0], clips.channels[:, -1], clips.points)
+    frames = made.between(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
     assert frames.shape == clips.channels.shape
     torch.testing.assert_close(frames[:, [0, -1]], clips.channels[:, [0, -1]], atol=1e-5, rtol=0)
     assert (frames[:, 30] - clips.channels[:, 30]).abs().max() > 1e-3
@@ -79,10 +90,10 @@ def test_strides_carry_a_pose_around_with_the_way_and_back_again(clips):
 
 def test_blind_networks_do_not_see_and_seeing_ones_do(clips):
     torch.manual_seed(2)
-    moved = clips.points + 0.5
+    moved = Seen(clips.seen.points + 0.5, clips.seen.field - 0.3)
     for name, differs in (("ours_no_scene", False), ("route_tr_pose", True), ("base", True), ("base_no_scene", False)):
         net = ablated_motion.build(ablated_motion.KINDS[name], SIZES)
-        pair = [net.between(clips.channels[:, 0], clips.channels[:, -1], points) for points in (clips.points, moved)]
+        pair = [net.between(clips.channels[:, 0], clips.channels[:, -1], seen) for seen in (clips.seen, moved)]
         assert (not torch.equal(*pair)) == differs, name
     assert not any(isinstance(p, torch.nn.Parameter) for p in PointNet(4, seeing=False).parameters())
 
@@ -90,7 +101,7 @@ def test_blind_networks_do_not_see_and_seeing_ones_do(clips):
 def test_a_saved_model_is_the_same_model(model, clips, tmp_path):
     model.save(tmp_path)
     again = LongTerm.load(tmp_path)
-    args = (clips.channels[:, 0], clips.channels[:, -1], clips.points)
+    args = (clips.channels[:, 0], clips.channels[:, -1], clips.seen)
     torch.testing.assert_close(again.between(*args), model.between(*args))
     torch.testing.assert_close(again.poses.basis, model.poses.basis)
     assert again.habits == model.habits
@@ -137,12 +148,12 @@ def test_legs_lead_around_the_block_and_are_on_time(lives, model):
     assert (np.abs(where[on_floor][:, [0, 2]]).max(1) > 0.4).all()
     np.testing.assert_allclose(places.world_from_agent[places.subgoal[1], :3, 2], [0, 0, -1], atol=1e-9)
     assert np.linalg.norm(np.diff(where[:, [0, 2]], axis=0), axis=1).max() <= 1.36 * model.habits.pace_m
-    floor = Floor.of(lives.scenes[0], strider.HIP_M)
+    floor = Floor.of(lives.scenes[0], model.habits)
     assert not floor.free[tuple(np.round((np.array([0.0, 0.0]) - floor.corner) / 0.08).astype(int))]
 
 
 def test_sub_goals_by_the_block_are_moved_to_where_a_body_can_turn_and_legs_lead_past_it(lives, model):
-    floor = Floor.of(lives.scenes[0], strider.HIP_M)
+    floor = Floor.of(lives.scenes[0], model.habits)
     beside, inside, far = (np.array([x, strider.HIP_M, 0.1]) for x in (0.5, 0.0, 1.2))
     for position in (beside, inside):
         moved = floor.roomy(position)
@@ -164,6 +175,15 @@ def test_preferred_places_are_where_the_animal_was():
     drawn = np.array([goal.position_world for goal in preferred(been, 200, np.random.default_rng(0))])
     assert set(map(tuple, np.round(drawn, 6))) == {(1.0, 0.2, 1.0), (-1.0, 0.4, 0.5)}
     assert (np.abs(np.diff(drawn[:, 0])) > 1).all()  # neighbours are apart
+
+
+def test_a_sub_goal_inside_of_furniture_is_put_on_top_of_it_and_one_in_the_air_on_the_floor(lives, model):
+    """The block of the strider's room reaches up to 0.5 m."""
+    goals = [Subgoal(np.array(place)) for place in ([-1.2, np.nan, 0.0], [0.0, 0.45, 0.0], [1.2, 0.9, 0.0])]
+    where = legs(None, goals, lives.scenes[0], model.habits)
+    top, floor = where.world_from_agent[where.subgoal[1:], :3, 3]
+    assert top[1] == pytest.approx(0.5 + strider.HIP_M, abs=0.04)
+    np.testing.assert_allclose(floor, [1.2, strider.HIP_M, 0.0], atol=0.01)
 
 
 def test_a_long_motion_goes_through_its_places(lives, model):

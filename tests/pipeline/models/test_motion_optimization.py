@@ -7,7 +7,17 @@ from scipy.ndimage import gaussian_filter1d
 
 from pipeline.models.bodies import PosedSurface, PoseSpace
 from pipeline.models.contacts import BRIEFEST, SWING_M_S2, find_contacts, tensors, with_time_to_swing
-from pipeline.models.motion_optimization import Physique, Settings, contact_error, foot_error, lift, optimise, phase_means, smooth_error
+from pipeline.models.motion_optimization import (
+    Physique,
+    Settings,
+    contact_error,
+    foot_error,
+    lift,
+    optimise,
+    phase_means,
+    settled,
+    smooth_error,
+)
 from pipeline.models.plausibility import Judge, seams
 from pipeline.models.short_motions import Moving, eased
 from pipeline.space import rigid
@@ -120,7 +130,8 @@ def test_terms_are_what_they_say():
     assert phase.tolist() == [0, 0, 2, 2, 1, 2]
     feet = torch.zeros(4, 2, 3)
     feet[1, 0, 0] = 0.2
-    torch.testing.assert_close(foot_error(feet, (flat, phase)), torch.tensor([0.01, 0.01, 0, 0, 0, 0]))
+    torch.testing.assert_close(foot_error(feet, (flat, phase), 1e-6), torch.tensor([0.1, 0.1, 0, 0, 0, 0]))
+    assert foot_error(feet, phase_means(np.zeros((4, 2), bool)), 0.002).shape == (0,)
     torch.testing.assert_close(contact_error(torch.tensor([0.0, 0.02, 100.0]), 0.02), torch.tensor([0.0, 0.5, 1.0]))
     even = torch.arange(5.0)[:, None, None].expand(5, 1, 3)
     assert smooth_error(even, "acceleration").sum() == 0
@@ -150,6 +161,17 @@ def test_feet_in_a_board_are_lifted_out_of_it_and_those_in_a_wall_are_not(lives)
     scene = lives.scenes[0].distance  # a floor at 0, a block up to 0.5, walls at 2
     depth = np.repeat([0.0, 0.06], 40)
     floor = torch.tensor(np.stack([np.full(80, 1.2), 0.005 - depth, np.full(80, 1.2)], axis=-1)[:, None]).float()
-    raised = lift(floor, scene).numpy()
+    raised = lift(floor, scene, reach=4).numpy()
     assert raised[0] == 0 and raised[-1] == pytest.approx(0.06, abs=0.025) and np.abs(np.diff(raised)).max() < 0.02
-    assert lift(torch.tensor([[[0.0, 0.1, 0.0]]]), scene) == 0, "0.4 m under the top of the block"
+    assert lift(torch.tensor([[[0.0, 0.1, 0.0]]]), scene, reach=0) == 0, "0.4 m under the top of the block"
+
+
+def test_single_bodies_come_out_of_the_floor_and_down_from_the_air(lives, physique):
+    still = lives.stretches[0][np.array([0, 40, 80])]
+    judge = Judge(lives.body, physique.contacts, lives.scenes[0].distance)
+    root = still.world_from_agent.copy()
+    root[:, 1, 3] += [-0.06, 0.0, 0.03]
+    done = settled(Moving(root, still.agent_from_bone), physique, judge.scene, SETTINGS)
+    gap, depth = judge.fit_of(done)
+    assert gap.max() < 0.006 and depth.max() < 0.006
+    assert len(settled(done[:1], physique, judge.scene, replace(SETTINGS, steps=2))) == 1

@@ -23,7 +23,7 @@ SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
 @dataclass(frozen=True)
 class Small:
     clips: int = 6
-    optimised_clips: int = 2
+    optimised_clips: int = 4
     optimisation: Settings = field(default_factory=lambda: Settings(steps=5, vertices=30))
     draws: int = 50
     seed: int = 0
@@ -47,14 +47,14 @@ def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
     lives, model = source.held_out, source.models.ours
     part = lives.stretches[0][:61]
     reference = scores.references([part], np.array([0]), lives, model)[0]
-    told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses), strict=True))
+    told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
     assert all(told[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
     assert told["contact"] == 1 and told["slide_m_s"] < 0.01 and told["planted"] > 0.5
     step = np.linalg.norm(np.diff(part.world_from_agent[:, :3, 3], axis=0)[[0, -1]], axis=1).mean()
     assert told["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
     root = part.world_from_agent.copy()
     root[:, :3, 3] += [0.03, 0.0, 0.04]
-    told = dict(zip(scores.METRICS, scores.score(Moving(root, part.agent_from_bone), reference, model.poses), strict=True))
+    told = dict(zip(scores.METRICS, scores.score(Moving(root, part.agent_from_bone), reference, model.poses, np.zeros(1)), strict=True))
     assert told["translation"] == pytest.approx(100 * 0.07 / 3)
     for name in ("mpjpe_mm", "mpvpe_mm"):
         assert told[name] == pytest.approx(50, abs=0.01)
@@ -70,7 +70,7 @@ def test_the_memory_bank_finds_itself(source):
 def test_route_and_cvae_keeps_the_route(source):
     some = source.models.bank[np.arange(2)]
     made = methods.route_cvae(source.models.ours, some, source.train, np.random.default_rng(0))
-    route = source.models.ours.route(some.channels[:, 0], some.channels[:, -1], some.points)
+    route = source.models.ours.route(some.channels[:, 0], some.channels[:, -1], some.seen)
     torch.testing.assert_close(made[..., :9], route)
     assert made.shape == some.channels.shape
 
@@ -85,10 +85,28 @@ def test_tables_hold_every_method_with_intervals(source):
     assert found["longterm/base_beyond_ours/mpjpe_mm"] == pytest.approx(apart)
     for method in ("ours", "ours_opt", "base_opt"):
         assert found[f"longterm/{method}/end_v2v_share"] < 1e-4, "given ends are kept, by the networks and by the optimisation"
+    assert found["longterm/ours_opt/seam_share"] < 0.05
     assert "longterm_unseen/ours/mpvpe_mm" in found and "longterm_unseen/ours_opt/mpvpe_mm" not in found
     text = tables.text(found)
     assert text.count("Table 1") == text.count("Table 4") == len({name.split("/")[0] for name in found})
     assert len(pictures.pictures(found)) == 1 and len(pictures.checks(found)) > 10
+
+
+def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
+    lives, model = source.held_out, source.models.ours
+    cuts = comparison.chosen(cut(lives, Cutting(stride=10, resting=0.0), np.random.default_rng(0)), 6)
+    assert len(cuts.start) == 6 and set(cuts.start[1::2] - cuts.start[::2]) == {60}
+    assert (cuts.stretch[1::2] == cuts.stretch[::2]).all()
+    assert comparison.pairs(7, 4).tolist() == [0, 1, 4, 5] and not len(comparison.pairs(0, 4))
+    parts = cuts.parts(lives)
+    known = scores.references(parts, np.zeros(6, int), lives, model)
+    seam = scores.METRICS.index("seam_share")
+    whole = scores.scored(parts, known, model)[:, seam]
+    moved = parts[1].world_from_agent.copy()
+    moved[1:, 0, 3] += 0.05
+    torn = scores.scored([parts[0], Moving(moved, parts[1].agent_from_bone), *parts[2:]], known, model)[:, seam]
+    assert whole.max() < 0.02 < (torn - whole)[:2].min()
+    np.testing.assert_array_equal(torn[2:], whole[2:])
 
 
 def test_minutes_are_measured(source):

@@ -66,13 +66,13 @@ def test_point_nets_start_from_given_weights(tmp_path):
     given = PointNet(SIZES.scene)
     save_file(given.state_dict(), tmp_path / "net.safetensors")
     settings = Settings(point_net=str(tmp_path / "net.safetensors"))
-    made = learning.fresh(lambda: learning.RouteNet(SIZES), settings)
+    made = learning.fresh(lambda: learning.PoseNet(SIZES), settings)
     for key, value in given.state_dict().items():
         assert torch.equal(value, made.between.point_net.state_dict()[key])
     with pytest.raises(InputError, match="LTM-002"):
-        learning.fresh(lambda: learning.RouteNet(SIZES), Settings(point_net=str(tmp_path / "none")))
+        learning.fresh(lambda: learning.PoseNet(SIZES), Settings(point_net=str(tmp_path / "none")))
     with pytest.raises(InputError, match="LTM-002"):
-        learning.fresh(lambda: learning.RouteNet(replace(SIZES, scene=8)), settings)
+        learning.fresh(lambda: learning.PoseNet(replace(SIZES, scene=8)), settings)
 
 
 def test_a_body_in_the_block_collides_and_one_in_the_air_has_no_contact(lives, learned):
