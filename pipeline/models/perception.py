@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from pipeline.files import arrays
+from pipeline.models.strides import ROOT, powered
 from pipeline.space import rigid
 
 Ego = Literal["yaw", "full", "world"]
@@ -26,6 +27,8 @@ GRID_SHAPE = (64, 8, 64)
 GRID_CELL_M = 0.1
 POSITION = 3
 """leading channels of a past frame, which tell the root's position; root rotation and bones follow"""
+PACE_CHANNELS = 3
+"""numbers of a code that tell the pace"""
 UPRIGHT = 0.2
 """shortest horizontal part of the head's direction that still tells the heading"""
 
@@ -258,10 +261,10 @@ class Perception(nn.Module):
 
 
 class Minds(nn.Module):
-    """Several perceptions side by side; the code of the whole is the codes of all, one after another, and the posture."""
+    """Several perceptions side by side; the code of the whole is the codes of all, one after another, pace and posture."""
 
     HELD_FRAMES = 3
-    """last frames whose mean is the posture"""
+    """last frames that tell the pace, and whose mean is the posture"""
 
     def __init__(self, size: PerceptionSize, count: int):
         super().__init__()
@@ -278,12 +281,13 @@ class Minds(nn.Module):
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
-        frames = past.unflatten(1, (self.minds[0].past.frames, -1))[:, -self.HELD_FRAMES :, POSITION:]
+        frames = past.unflatten(1, (self.minds[0].past.frames, -1))[:, -self.HELD_FRAMES :]
         codes = [mind(scene_grid, observer_past, past, keep) for mind in self.minds]
-        return torch.cat([*codes, self.posture(frames, keep[:, 2])], dim=-1)
+        return torch.cat([*codes, self.now(frames, keep[:, 2])], dim=-1)
 
-    def posture(self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]) -> Float[Tensor, "batch channel"]:
-        """Return the posture held in the last ``frames``, in scaled numbers; zeros where the past is not remembered."""
+    def now(self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]) -> Float[Tensor, "batch pace+channel"]:
+        """Return pace, a stride as paths are told in, and posture, in scaled numbers; zeros where the past is not remembered."""
         mind = self.minds[0]
-        scaled = (frames.mean(1) - mind.past.mean[POSITION:]) / mind.past.std[POSITION:]
-        return scaled * (keep * mind.sees[2])[:, None]
+        velocity = (frames[:, -1, :POSITION] - frames[:, 0, :POSITION]) * (mind.observer.rate_hz / (self.HELD_FRAMES - 1))
+        posture = ((frames.mean(1) - mind.past.mean) / mind.past.std)[:, POSITION:]
+        return torch.cat([powered(velocity, ROOT), posture], dim=-1) * (keep * mind.sees[2])[:, None]

@@ -5,7 +5,7 @@ into the world. Networks are met through `Networks`, which torch modules and ONN
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +24,8 @@ from pipeline.models.behavior import (
 from pipeline.models.diffusion import Schedule, guided, sample
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
 from pipeline.models.scenes import Ground, Scenes
-from pipeline.models.trajectories import Context
+from pipeline.models.strides import STRIDE, led
+from pipeline.models.trajectories import PAST, Context
 from pipeline.space import rigid
 
 Array = np.ndarray
@@ -120,6 +121,8 @@ class Codes:
     """of everything that is kept"""
     blind: Float[np.ndarray, "plan condition"]
     """of the same without the observer"""
+    start: Float[np.ndarray, "plan 3"]
+    """where the animal is now, in the ego frame"""
     ground: Ground | None
     """where goals and paths are kept to"""
 
@@ -169,7 +172,8 @@ class Sampler:
         if sampling.guidance != 1:
             keep[:, 1] = 0
             blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
-        return Codes(full, blind, observation.ground if sampling.clear and sampling.scene else None)
+        start = np.repeat(observation.past.reshape(len(observation), PAST, -1)[:, -1, :3], count, axis=0)
+        return Codes(full, blind, start, observation.ground if sampling.clear and sampling.scene else None)
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
@@ -179,52 +183,54 @@ class Sampler:
 
         pair = denoise(codes.full), denoise(codes.blind)
         x = self._drawn(*pair, (len(codes.full), 3), sampling, sampling.goal_steps, rng, lambda x: self.goals_cleared(codes, x))
-        return x * self.scaling.goal_std
+        return self.scaling.goal(x)
 
     def paths(
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 56 3"]:
         """Draw paths to goals; the reference of the guidance sees neither observer nor goal."""
-        control = (goal / self.scaling.goal_std).astype(np.float32)
+        control = self.scaling.scaled_goal(goal)
 
         def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
             return lambda x, t: self.networks.path(x, _filled(len(x), t), code, control, _filled((len(x), 1), keep))
 
         pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
-        shape = len(goal), *self.scaling.path_std.shape
+        shape = len(goal), STRIDE, self.scaling.path_std.shape[1]
         path = self._drawn(*pair, shape, sampling, sampling.sequence_steps, rng, lambda x: self.paths_cleared(codes, x))
-        return self.paths_finished(codes, path)
+        return self.paths_finished(codes, path, goal, sampling)
 
     def bodies(
         self, codes: Codes, path: Float[np.ndarray, "plan 56 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 56 channel"]:
         """Draw bodies along paths, which guidance never takes away."""
-        control = (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
+        control = self.scaling.told_path(path)
 
         def denoise(code: Array) -> Callable[[Array, float], Array]:
             return lambda x, t: self.networks.body(x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0))
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         pair = denoise(codes.full), denoise(codes.blind)
-        body = self._drawn(*pair, shape, sampling, sampling.sequence_steps, rng, spread=sampling.body_spread)
+        body = self._drawn(*pair, shape, replace(sampling, method="ddim"), sampling.sequence_steps, rng, spread=sampling.body_spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def goals_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Move scaled goals to where the agent may be."""
         if codes.ground is None:
             return scaled
-        return codes.ground.cleared((scaled * self.scaling.goal_std)[:, None])[:, 0] / self.scaling.goal_std
+        return self.scaling.scaled_goal(codes.ground.cleared(self.scaling.goal(scaled)[:, None])[:, 0])
 
-    def paths_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 3 frame"]) -> Float[np.ndarray, "plan 3 frame"]:
+    def paths_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 4 frame"]) -> Float[np.ndarray, "plan 4 frame"]:
         """Move scaled paths to where the agent may be."""
         if codes.ground is None:
             return scaled
-        return np.swapaxes(codes.ground.cleared(np.swapaxes(scaled * self.scaling.path_std, 1, 2)), 1, 2) / self.scaling.path_std
+        return self.scaling.bent(scaled, codes.start, codes.ground.cleared(self.scaling.path(scaled, codes.start)))
 
-    def paths_finished(self, codes: Codes, scaled: Float[np.ndarray, "plan 3 frame"]) -> Float[np.ndarray, "plan frame 3"]:
-        """Take the tremble out of scaled paths, keep them where the agent may be, and return them in metres."""
-        calm = np.einsum("cts,ncs->nct", self.scaling.path_smoother, scaled).astype(np.float32)
-        return np.swapaxes(self.paths_cleared(codes, calm) * self.scaling.path_std, 1, 2)
+    def paths_finished(
+        self, codes: Codes, scaled: Float[np.ndarray, "plan 4 frame"], goal: Float[np.ndarray, "plan 3"], sampling: Sampling
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Return scaled paths in metres, led to their goals as far as these are told, and kept where the agent may be."""
+        path = led(self.scaling.path(scaled, codes.start), codes.start, goal, float(sampling.goal) * min(sampling.guidance, 1.0))
+        return path if codes.ground is None else codes.ground.cleared(path)
 
     def _drawn(
         self,
@@ -238,12 +244,10 @@ class Sampler:
         spread: float | Array = 1.0,
     ) -> Array:
         def draw() -> Array:
-            return rng.standard_normal(shape, dtype=np.float32)
+            return (spread * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
 
         denoise = guided(full, blind, sampling.guidance)
-        x = sample(
-            denoise, (spread * draw()).astype(np.float32), self.schedule, method=sampling.method, count=count, draw=draw, correct=correct
-        )
+        x = sample(denoise, draw(), self.schedule, method=sampling.method, count=count, draw=draw, correct=correct)
         return x.astype(np.float32)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from pipeline.models.behavior import Architecture, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Array, Codes, Networks, Plan, Sampler
+from pipeline.models.strides import STRIDE
 
 MEAN, SPREAD = 0.0, 1.0
 """Steps at which a Gaussian's networks, shown no sample, tell its mean and the logarithm of its standard deviation."""
@@ -40,31 +41,31 @@ class GaussianSampler(Sampler):
 
     def planned(self, codes: Codes, sampling: Sampling, rng: np.random.Generator, goal: Array | None, path: Array | None) -> Plan:
         """Draw plans; the means lead from level to level."""
-        towards = self._goal(codes)[0] * self.scaling.goal_std if goal is None else goal
-        along = self._metres(self._path(codes, towards, sampling)[0]) if path is None else path
+        towards = self.scaling.goal(self._goal(codes)[0]) if goal is None else goal
+        along = self.scaling.path(self._path(codes, towards, sampling)[0], codes.start) if path is None else path
         goal = self.goals(codes, sampling, rng) if goal is None else goal
         path = self.paths(codes, towards, sampling, rng) if path is None else path
         return Plan(goal, path, self.bodies(codes, along, sampling, rng))
 
     def led(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to the mean goal."""
-        return self.paths(codes, self._goal(codes)[0] * self.scaling.goal_std, sampling, rng)
+        return self.paths(codes, self.scaling.goal(self._goal(codes)[0]), sampling, rng)
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
-        return self.goals_cleared(codes, self._drawn_from(self._goal(codes), rng)) * self.scaling.goal_std
+        return self.scaling.goal(self.goals_cleared(codes, self._drawn_from(self._goal(codes), rng)))
 
     def paths(
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to goals."""
-        return self.paths_finished(codes, self._drawn_from(self._path(codes, goal, sampling), rng))
+        return self.paths_finished(codes, self._drawn_from(self._path(codes, goal, sampling), rng), goal, sampling)
 
     def bodies(
         self, codes: Codes, path: Float[np.ndarray, "plan frame 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths."""
-        control = (np.swapaxes(path, 1, 2) / self.scaling.path_std).astype(np.float32)
+        control = self.scaling.told_path(path)
         nothing = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         told = [self.networks.body(nothing, _step(nothing, t), codes.full, control, _kept(nothing, 1.0)) for t in (MEAN, SPREAD)]
         return np.swapaxes(self._drawn_from(told, rng, sampling.body_spread), 1, 2) * self.scaling.body_std + self.scaling.body_mean
@@ -74,17 +75,14 @@ class GaussianSampler(Sampler):
         return [self.networks.goal(nothing, _step(nothing, t), codes.full) for t in (MEAN, SPREAD)]
 
     def _path(self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling) -> list[Array]:
-        control = (goal / self.scaling.goal_std).astype(np.float32)
-        nothing = np.zeros((len(goal), *self.scaling.path_std.shape), np.float32)
+        control = self.scaling.scaled_goal(goal)
+        nothing = np.zeros((len(goal), STRIDE, self.scaling.path_std.shape[1]), np.float32)
         keep = _kept(nothing, float(sampling.goal))
         return [self.networks.path(nothing, _step(nothing, t), codes.full, control, keep) for t in (MEAN, SPREAD)]
 
     def _drawn_from(self, told: list[Array], rng: np.random.Generator, spread: float = 1.0) -> Array:
         mean, log_std = told
         return mean + spread * np.exp(np.clip(log_std, *LOG_STD)) * rng.standard_normal(mean.shape, dtype=np.float32)
-
-    def _metres(self, path: Array) -> Float[np.ndarray, "plan frame 3"]:
-        return np.swapaxes(path * self.scaling.path_std, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -95,8 +93,8 @@ class OneStageSampler(Sampler):
         """Draw plans. A given goal or path cannot steer a model without stages."""
         assert goal is None and path is None, "a one-stage model takes no goal and no path"
         whole = self._whole(codes, sampling, rng)
-        path = self.paths_finished(codes, whole[:, :3])
-        body = np.swapaxes(whole[:, 3:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
+        path = self._path(codes, whole)
+        body = np.swapaxes(whole[:, STRIDE:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
         return Plan(path[:, -1], path, body)
 
     def led(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
@@ -105,7 +103,11 @@ class OneStageSampler(Sampler):
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw whole plans and keep where they end."""
-        return self.paths_finished(codes, self._whole(codes, sampling, rng)[:, :3])[:, -1]
+        return self._path(codes, self._whole(codes, sampling, rng))[:, -1]
+
+    def _path(self, codes: Codes, whole: Array) -> Float[np.ndarray, "plan frame 3"]:
+        path = self.scaling.path(whole[:, :STRIDE], codes.start)
+        return path if codes.ground is None else codes.ground.cleared(path)
 
     def _whole(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Array:
         frames = self.scaling.path_std.shape[1]
@@ -115,10 +117,10 @@ class OneStageSampler(Sampler):
             return lambda x, t: self.networks.body(x, _step(x, t), code, control, _kept(x, 0.0))
 
         def correct(x: Array) -> Array:
-            return np.concatenate([self.paths_cleared(codes, x[:, :3]), x[:, 3:]], axis=1)
+            return np.concatenate([self.paths_cleared(codes, x[:, :STRIDE]), x[:, STRIDE:]], axis=1)
 
-        shape = (len(codes.full), 3 + len(self.scaling.body_mean), frames)
-        spread = np.array([1.0] * 3 + [sampling.body_spread] * len(self.scaling.body_mean))[:, None]
+        shape = (len(codes.full), STRIDE + len(self.scaling.body_mean), frames)
+        spread = np.array([1.0] * STRIDE + [sampling.body_spread] * len(self.scaling.body_mean))[:, None]
         return self._drawn(denoise(codes.full), denoise(codes.blind), shape, sampling, sampling.sequence_steps, rng, correct, spread)
 
 

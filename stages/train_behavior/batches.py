@@ -12,12 +12,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import convolve1d
 from torch import Tensor
 
-from pipeline.models.behavior import Architecture, Scaling, channels_from_bones, smoother_from_paths
+from pipeline.models.behavior import Architecture, Scaling, channels_from_bones
 from pipeline.models.perception import FeatureVolume, Minds, grid_points_ego, world_from_ego
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, BehaviorData
+from pipeline.models.strides import GOAL_POWER, powered, strides_from_path
+from pipeline.models.trajectories import PAST, RATE_HZ, BehaviorData
 from pipeline.space import rigid, rigid_torch
 
+NEAR_M, COMING_M_S = 2.0, 0.4
+"""distance and pace of an observer that comes up"""
 ENOUGH = 8192
 """Windows that tell means and spreads."""
 
@@ -38,6 +41,9 @@ class Augmentation:
     """standard deviation of noise on the remembered motion, in its own standard deviations"""
     hide_bones: float = 0.5
     """probability that a sample's remembered bones are hidden"""
+    approached: float = 0.1
+    """share of samples drawn from windows that begin with a person coming up, which are few and matter; what follows is as
+    likely in them as ever"""
 
     @property
     def largest_turn_rad(self) -> float:
@@ -65,6 +71,8 @@ class Windows:
     frame: Int[Tensor, "window 64"]
     scene: Int[Tensor, "window"]
     """number of the window's feature volume"""
+    approached: Int[Tensor, "some"]
+    """windows that begin with a person coming up"""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -96,13 +104,18 @@ class Batch:
     observer_past: Float[Tensor, "batch frame*3"]
     past: Float[Tensor, "batch frame*channel"]
     held: Float[Tensor, "batch frame channel"]
-    """root rotation and bones of the frames that tell the posture, as they were"""
+    """root and bones of the frames that tell pace and posture, as they were"""
     bones_keep: Float[Tensor, "batch"]
     mirrored: Bool[Tensor, "batch"]
+    chosen: Bool[Tensor, "batch"]
+    """drawn for their observer, who is always perceived then: without, they would tell wrong odds"""
     goal: Float[Tensor, "batch 3"]
     track: Float[Tensor, "batch 3 56"]
-    """the path in units of the goal"""
-    path: Float[Tensor, "batch 3 56"]
+    """where the animal is in each frame, told as a goal is"""
+    path: Float[Tensor, "batch 4 56"]
+    """its strides"""
+    places: Float[Tensor, "batch 3 56"]
+    """the path as a body is told it"""
     body: Float[Tensor, "batch channel 56"]
 
     def to(self, device: torch.device) -> "Batch":
@@ -162,7 +175,16 @@ def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], arch
     frame = world_from_ego(agent[rows[:, PAST - 1]], architecture.ego)
     number = scenes.number(data.video[index], len(index))
     tables = (torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, bones, frame))
-    return Windows(*tables, torch.from_numpy(rows), torch.from_numpy(number))
+    near = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST]]) & (architecture.blind_to != "observer")
+    return Windows(*tables, torch.from_numpy(rows), torch.from_numpy(number), torch.from_numpy(np.flatnonzero(near)))
+
+
+def approached(agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray, "window 8 3"]) -> Bool[np.ndarray, "window"]:
+    """Tell in which windows the observer, at most `NEAR_M` from the animal, comes up at `COMING_M_S` or more."""
+    away = (agent[:, None] - observer)[..., [0, 2]]
+    distance = np.linalg.norm(away[:, -1], axis=-1)
+    walked = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (RATE_HZ / (PAST - 1))
+    return (distance < NEAR_M) & ((walked * away[:, -1]).sum(-1) > COMING_M_S * distance)
 
 
 def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
@@ -178,10 +200,18 @@ def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
     whole = body_statistics(tracks.rotation[:, PAST:], windows.bones[rows[:, PAST:].unique()], turn_rad)
-    scaling = Scaling(path_std[:, -1], path_std, *whole, smoother_from_paths(np.swapaxes(future, 1, 2) / path_std))
+    strides = strides_from_path(tracks.root[:, PAST:], tracks.root[:, PAST - 1])[..., :3].double().numpy()
+    stride_std = np.array([*_spread(strides.reshape(-1, 3)), 1.0])
+    scaling = Scaling(_spread(powered(future[:, -1], GOAL_POWER)), stride_std, path_std, *whole)
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
     position = tracks.root[:, :PAST].std().clip(0.05).expand(3)
     return Statistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
+
+
+def _spread(way: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
+    """Return the root mean square of ways, both horizontal axes alike."""
+    square = (way**2).mean(0)
+    return np.sqrt([square[::2].mean(), square[1], square[::2].mean()]).clip(0.05)
 
 
 def body_statistics(
@@ -216,6 +246,9 @@ def draw_batch(
         return torch.rand(*shape, generator=generator)
 
     index = torch.randint(len(windows), (size,), generator=generator)
+    chosen = (uniform(size) < augmentation.approached) & (len(windows.approached) > 0)
+    often = torch.randint(max(len(windows.approached), 1), (size,), generator=generator)
+    index[chosen] = windows.approached[often[chosen]]
     side = 1.0 - 2.0 * (uniform(size) < augmentation.mirror).float()
     reach = torch.where(uniform(size) < augmentation.turn, torch.pi, augmentation.yaw_rad)
     yaw = (uniform(size) * 2 - 1) * reach
@@ -230,19 +263,24 @@ def draw_batch(
     frames = windows.frame[index]
     remembered = body_channels(rotation[:, :PAST], windows.bones[frames[:, :PAST]])
     past = torch.cat([root[:, :PAST], remembered], dim=-1)
+    held = past[:, -Minds.HELD_FRAMES :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
     body = body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
-    device, goal_std = scene.points.device, torch.from_numpy(scaling.goal_std).float()
+    device, future = scene.points.device, root[:, PAST:]
+    track = powered(future, GOAL_POWER) / torch.from_numpy(scaling.goal_std).float()
+    strides = strides_from_path(future, root[:, PAST - 1]) / torch.from_numpy(scaling.stride_std).float()
     return Batch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
         observer.flatten(1),
         past.flatten(1),
-        remembered[:, -Minds.HELD_FRAMES :],
+        held,
         ((uniform(size) >= augmentation.hide_bones) & (side > 0)).float(),
         side < 0,
-        root[:, -1] / goal_std,
-        (root[:, PAST:] / goal_std).mT,
-        root[:, PAST:].mT / torch.from_numpy(scaling.path_std).float(),
+        chosen,
+        track[:, -1],
+        track.mT,
+        strides.mT,
+        future.mT / torch.from_numpy(scaling.path_std).float(),
         (body / torch.from_numpy(scaling.body_std).float()).mT,
     ).to(device)

@@ -15,6 +15,7 @@ from pipeline.models.behavior import Architecture, BehaviorNets, Sampling, Scali
 from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.planning import Observation, Sampler, TorchNetworks
+from pipeline.models.strides import STRIDE
 from pipeline.models.trajectories import PAST
 
 NETWORKS = ("perception", "goal", "path", "body")
@@ -92,7 +93,7 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
         case "goal":
             return {"x": (3,)} | step, "epsilon"
         case "path":
-            return {"x": (3, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
+            return {"x": (STRIDE, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
         case _:
             return {"x": (a.body_channels, a.future)} | step | {"control": (3, a.future), "keep": (1,)}, "epsilon"
 
@@ -113,7 +114,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
     observation = golden_observation(architecture)
     sampling = Sampling(method="ddim", goal_steps=10, sequence_steps=10)
     noise = np.random.default_rng(0)
-    shapes = {"goal": (1, 3), "path": (1, 3, architecture.future), "body": (1, architecture.body_channels, architecture.future)}
+    shapes = {"goal": (1, 3), "path": (1, STRIDE, architecture.future), "body": (1, architecture.body_channels, architecture.future)}
     drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}
     plans = {f"guidance_{s:g}": sampler.plan(observation, Sampling("ddim", 10, 10, s), np.random.default_rng(0)) for s in (1.0, 0.5)}
     return {

@@ -61,7 +61,7 @@ def losses(
 
     path_rows, body_rows, known = sequence_rows(batch, objective.sequence_share)
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
-    towards, along = batch.goal[path_rows], batch.path[body_rows]
+    towards, along = batch.goal[path_rows], batch.places[body_rows]
     path = error(lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows])
     body = error(lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows])
     return {"goal": goal.mean(), "path": path.mean(), "body": mean_of_known(body, known)}
@@ -87,9 +87,10 @@ def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor,
 def perceive(nets: BehaviorNets, batch: Batch, objective: Objective, generator: torch.Generator) -> Float[Tensor, "batch condition"]:
     """Encode a batch, dropping scene, observer and past independently, for every mind alike."""
     keep = kept(len(batch.goal), 3, objective.drop, generator).to(batch.goal.device)
+    keep[:, 1] = torch.maximum(keep[:, 1], batch.chosen.float())
     codes = [mind.training_code(batch.scene, batch.observer_past, batch.past, keep, batch.bones_keep) for mind in nets.perception]
     code = nn.functional.dropout(torch.cat(codes, dim=-1), objective.code_dropout)
-    return torch.cat([code, nets.perception.posture(batch.held, keep[:, 2])], dim=-1)
+    return torch.cat([code, nets.perception.now(batch.held, keep[:, 2])], dim=-1)
 
 
 def goal_error(

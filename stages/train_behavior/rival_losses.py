@@ -10,6 +10,7 @@ from torch import Tensor
 from pipeline.models.behavior import BehaviorNets
 from pipeline.models.diffusion import Schedule
 from pipeline.models.rivals import LOG_STD, MEAN, SPREAD
+from pipeline.models.strides import STRIDE
 from stages.train_behavior.batches import Batch
 from stages.train_behavior.objective import Denoise, Objective, kept, mean_of_known, perceive, sequence_rows, squared_error
 
@@ -24,7 +25,7 @@ def gaussian_losses(
         goal = negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal)
     path_rows, body_rows, known = sequence_rows(batch, objective.sequence_share)
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
-    towards, along = batch.goal[path_rows], batch.path[body_rows]
+    towards, along = batch.goal[path_rows], batch.places[body_rows]
     path = negative_log_likelihood(lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows])
     body = negative_log_likelihood(lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows])
     return {"goal": goal.mean(), "path": path.mean(), "body": mean_of_known(body, known)}
@@ -47,7 +48,7 @@ def one_stage_losses(
     known = ~batch.mirrored
     seen = torch.where(known[:, None, None], batch.body, torch.zeros_like(batch.body))
     whole = torch.cat([batch.path, seen], dim=1)
-    nothing = torch.zeros_like(batch.path), torch.zeros(len(code), 1, device=code.device)
+    nothing = torch.zeros_like(batch.places), torch.zeros(len(code), 1, device=code.device)
     error = squared_error(lambda x, t: nets.body(x, t, code, *nothing), whole, schedule, objective.weighting, generator)
-    body = error[:, 3:] * known[:, None, None]
-    return {"path": error[:, :3].mean(), "body": body.sum() / max(int(known.sum()) * body[0].numel(), 1)}
+    body = error[:, STRIDE:] * known[:, None, None]
+    return {"path": error[:, :STRIDE].mean(), "body": body.sum() / max(int(known.sum()) * body[0].numel(), 1)}

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 
 from pipeline.files import arrays, meshes
-from pipeline.models.behavior import Architecture, BehaviorNets, Scaling, smoother_from_paths
+from pipeline.models.behavior import Architecture, BehaviorNets, Scaling
 from pipeline.models.diffusion import Schedule, noised
+from pipeline.models.strides import GOAL_POWER, powered, strides_from_path
 from pipeline.models.trajectories import FUTURE, BehaviorData, Trajectory
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
@@ -110,8 +111,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
     channels = architecture.body_channels
     mean = np.zeros(channels)
     mean[[0, 4]] = 1.0
-    straight = np.random.default_rng(0).standard_normal((200, 3, 1)) * grow
-    return nets, Scaling(np.ones(3), path_std, mean, np.full(channels, 0.05), smoother_from_paths(straight))
+    return nets, Scaling(np.ones(3), np.ones(4), path_std, mean, np.full(channels, 0.05))
 
 
 def _teach_paths(nets: BehaviorNets, architecture: Architecture, schedule: Schedule, steps: int = 100) -> None:
@@ -120,9 +120,10 @@ def _teach_paths(nets: BehaviorNets, architecture: Architecture, schedule: Sched
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
         goal = torch.randn(32, 3)
-        path = goal[:, :, None].expand(-1, -1, FUTURE) + 0.05 * torch.randn(32, 3, FUTURE)
+        place = powered(goal, 1 / GOAL_POWER)[:, None] * torch.arange(1, FUTURE + 1)[:, None] / FUTURE
+        path = strides_from_path(place, torch.zeros(32, 3)).mT + 0.05 * torch.randn(32, 4, FUTURE)
         t = torch.randint(schedule.steps, (32,))
-        noise = torch.randn(32, 3, FUTURE)
+        noise = torch.randn(32, 4, FUTURE)
         x = noised(path, noise, alpha_bar[t][:, None, None])
         told = nets.path(x, t.float(), torch.randn(32, architecture.condition), goal, torch.ones(32, 1))
         loss = (told - noise).square().mean()

@@ -22,14 +22,9 @@ EFFORT = Effort(samples=4, trials=2, stride=20, plan_trials=1, plan_stride=30, s
 QUICK = Sampling(goal_steps=2, sequence_steps=2)
 
 
-def as_drawn(frames: int) -> np.ndarray:
-    """Return a smoother that takes nothing away."""
-    return np.tile(np.eye(frames), (3, 1, 1))
-
-
 def untrained(architecture):
     channels = architecture.body_channels
-    scaling = Scaling(np.ones(3), np.ones((3, architecture.future)), np.zeros(channels), np.ones(channels), as_drawn(architecture.future))
+    scaling = Scaling(np.ones(3), np.ones(4), np.ones((3, architecture.future)), np.zeros(channels), np.ones(channels))
     sampler = rivals.sampler_of(architecture, TorchNetworks(BehaviorNets(architecture)), STANDARD, scaling)
     return Ats(sampler, Scenes.of(room()), REST, architecture.ego, QUICK)
 
@@ -116,15 +111,18 @@ def test_a_gaussian_draws_what_its_networks_tell():
             return np.full_like(x, 2.0 if t[0] == rivals.MEAN else np.log(0.5))
 
         def path(self, x, t, condition, control, keep):
-            return np.broadcast_to(control[:, :, None], x.shape) if t[0] == rivals.MEAN else np.full_like(x, -9)
+            return np.ones_like(x) if t[0] == rivals.MEAN else np.full_like(x, -9)
 
-    sampler = rivals.GaussianSampler(Told(), STANDARD, Scaling(np.full(3, 3.0), np.ones((3, 56)), np.zeros(6), np.ones(6), as_drawn(56)))
+    scaling = Scaling(np.full(3, 0.3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6))
+    sampler = rivals.GaussianSampler(Told(), STANDARD, scaling)
     codes = sampler.codes(behavior_observation(), Sampling(), 4000)
     goals = sampler.goals(codes, Sampling(), np.random.default_rng(0))
-    np.testing.assert_allclose([goals.mean(), goals.std()], [6, 1.5], rtol=0.03)
+    drawn = scaling.scaled_goal(goals)
+    np.testing.assert_allclose([drawn.mean(), drawn.std()], [2, 0.5], rtol=0.03)
     course = sampler.course(behavior_observation(), Sampling(), np.random.default_rng(0), count=8)
-    np.testing.assert_allclose(course, 2.0, atol=0.05)
+    np.testing.assert_allclose(course[:, -1], scaling.goal(np.full((8, 3), 2.0)), atol=1e-5)
+    np.testing.assert_allclose(np.diff(course, axis=1), np.broadcast_to(course[:, -1:] / 56, (8, 55, 3)), atol=0.01)
 
 
 def behavior_observation():
-    return Observation(np.zeros((1, 16, 64, 8, 64), np.float32), np.zeros((1, 24), np.float32), np.zeros((1, 8), np.float32))
+    return Observation(np.zeros((1, 16, 64, 8, 64), np.float32), np.zeros((1, 24), np.float32), np.zeros((1, 72), np.float32))

@@ -24,10 +24,10 @@ def simulator():
     mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
     scaling = Scaling(
         np.array([0.3, 0.01, 0.3]),
+        np.array([0.5, 0.1, 0.5, 1.0]),
         np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
         mean,
         np.full(channels, 0.05),
-        np.tile(np.eye(56), (3, 1, 1)),
     )
     volume = room()
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)

@@ -16,6 +16,7 @@ from pipeline.models.trajectories import TRAIN
 from stages.train_behavior.batches import (
     Augmentation,
     SceneSampler,
+    approached,
     draw_batch,
     statistics_from_windows,
     windows_from_data,
@@ -28,7 +29,7 @@ from stages.train_behavior.export import (
     signature,
     write_contract,
 )
-from stages.train_behavior.objective import Objective, goal_error, losses
+from stages.train_behavior.objective import Objective, goal_error, losses, perceive
 from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.training import Optimization, Settings, initial_nets, train, two_cosines
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
@@ -57,7 +58,7 @@ def drawn(windows, augmentation, seed=0):
 def test_targets_have_unit_scale(windows):
     index = torch.arange(len(windows))
     scaling = statistics_from_windows(windows, 0.0).scaling
-    goal = windows.tracks(index).root[:, -1].numpy() / scaling.goal_std
+    goal = scaling.scaled_goal(windows.tracks(index).root[:, -1].numpy())
     assert np.sqrt((goal[:, [0, 2]] ** 2).mean()) == pytest.approx(1, abs=1e-3)
     path = windows.tracks(index).root[:, 8:].numpy().swapaxes(1, 2) / scaling.path_std
     np.testing.assert_allclose(np.sqrt((path[:, [0, 2]] ** 2).mean((0, 1)))[5:], 1, atol=1e-3)
@@ -77,10 +78,31 @@ def test_turning_and_mirroring_move_everything_together(windows):
             torch.testing.assert_close(ours[:, [0, 2]].norm(dim=1), theirs[:, [0, 2]].norm(dim=1), atol=1e-4, rtol=1e-4)
             torch.testing.assert_close(ours[:, 1], theirs[:, 1])
         between = [
-            b.observer_past[:, -3:] - b.goal * torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal_std).float()
+            b.observer_past[:, -3:] - torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal(b.goal.numpy())).float()
             for b in (plain, moved)
         ]
         torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
+
+
+def test_approaches_are_drawn_more_often_and_then_perceived(windows):
+    coming = replace(windows, approached=torch.tensor([7]))
+    batch, _ = drawn(coming, replace(PLAIN, approached=1.0))
+    assert batch.chosen.all() and (batch.goal == batch.goal[0]).all()
+    nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0)
+    seen, unseen = (
+        perceive(nets, replace(batch, chosen=chosen), Objective(drop=1.0, code_dropout=0.0), torch.Generator().manual_seed(0))
+        for chosen in (batch.chosen, ~batch.chosen)
+    )
+    assert (seen != unseen).any(1).all() and (unseen == unseen[0]).all()
+    assert not drawn(replace(windows, approached=torch.zeros(0, dtype=torch.long)), PLAIN)[0].chosen.any()
+
+
+def test_only_who_comes_up_and_is_near_approaches():
+    agent = np.zeros((4, 3))
+    walk, here = np.linspace(1, 0, 8)[:, None] * [0.0, 0.0, 0.7], np.array([0.0, 1.2, 1.0])
+    far = np.array([0.0, 0.0, 2.0])
+    observer = np.stack([here + walk, here + walk + far, here + walk[::-1], here + 0 * walk])
+    assert approached(agent, observer).tolist() == [True, False, False, False]
 
 
 def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):

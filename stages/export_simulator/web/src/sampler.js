@@ -3,6 +3,7 @@
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
+import { STRIDE, goalFrom, led, pathFrom, scaledGoal } from './strides.js';
 
 const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
 const SOONEST = 6; // frames that a visitor's goal leaves at least
@@ -25,7 +26,9 @@ export class Sampler {
       keep: [Float32Array.of(keep.scene, observer, keep.past), [1, 3]],
     });
     const full = await perceive(keep.observer);
-    return { full, blind: interactivity === 1 ? full : await perceive(0) };
+    const last = observation.past.length / this.contract.past_frames;
+    const start = Array.from(observation.past.slice(-last).slice(0, 3));
+    return { full, start, blind: interactivity === 1 ? full : await perceive(0) };
   }
 
   // Scaled goals, `count` of them, three numbers each.
@@ -39,27 +42,38 @@ export class Sampler {
   async paths(codes, goals, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) => this.networks.path({
-      x: [x, [count, 3, this.frames]], ...this.step(count, t, code),
+      x: [x, [count, STRIDE, this.frames]], ...this.step(count, t, code),
       control: [goals, [count, 3]], keep: [new Float32Array(count).fill(keep), [count, 1]],
     });
     const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
-    return this.calm(drawn);
+    const pull = commanded ? 1 : keepGoal * Math.min(interactivity, 1);
+    return this.walked(drawn, goals, codes.start, pull);
   }
 
-  // Scaled paths without the tremble that recorded ones do not have.
-  calm(paths) {
-    const { path_smoother: smoother } = this.contract.scaling;
-    const place = (row, i) => smoother[row % 3][i].reduce((sum, weight, j) => sum + weight * paths[row * this.frames + j], 0);
-    return paths.map((_, at) => place(Math.floor(at / this.frames), at % this.frames));
+  // Scaled places [3, frames] that scaled strides lead to, bent towards scaled goals.
+  walked(strides, goals, start, pull) {
+    const { goal_std: goal, stride_std: deviation } = this.contract.scaling;
+    const each = Array.from({ length: goals.length / 3 }, (_, i) => {
+      const mine = strides.subarray(i * STRIDE * this.frames, (i + 1) * STRIDE * this.frames);
+      const path = pathFrom(mine, this.frames, deviation, start, this.contract.rate_hz);
+      return this.scaledPath(led(path, start, goalFrom(goals.subarray(3 * i, 3 * i + 3), goal), pull));
+    });
+    return Float32Array.from(each.flat());
   }
 
-  // A scaled body [channels, frames] along a scaled path, drawn from fainter noise than goals and paths are.
-  body(codes, path, { noise, steps, interactivity, method, draw }) {
+  // Places as a body is told them.
+  scaledPath(places) {
+    const { path_std: spread } = this.contract.scaling;
+    return [0, 1, 2].flatMap((axis) => places.map((place, i) => place[axis] / spread[axis][i]));
+  }
+
+  // A scaled body [channels, frames] along a scaled path, drawn from fainter noise than goals and paths are, and no other.
+  body(codes, path, { noise, steps, interactivity }) {
     const denoise = (code) => (x, t) => this.networks.body({
       x: [x, [1, this.channels, this.frames]], ...this.step(1, t, code), control: [path, [1, 3, this.frames]], keep: [Float32Array.of(1), [1, 1]],
     });
     const faint = noise.map((value) => value * this.contract.sampling.body_spread);
-    return this.run(denoise(codes.full), denoise(codes.blind), faint, { method, count: steps, draw, interactivity });
+    return this.run(denoise(codes.full), denoise(codes.blind), faint, { method: 'ddim', count: steps, interactivity });
   }
 
   step(count, t, code) {
@@ -89,8 +103,8 @@ export class Sampler {
   }
 
   goalsInWorld(frame, scaled) {
-    const scale = this.contract.scaling.goal_std;
-    return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, [0, 1, 2].map((axis) => scaled[3 * i + axis] * scale[axis])));
+    const deviation = this.contract.scaling.goal_std;
+    return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, goalFrom(scaled.subarray(3 * i, 3 * i + 3), deviation)));
   }
 
   // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, path}.
@@ -106,7 +120,7 @@ export class Sampler {
     const goals = this.goalsInWorld(frame, scaled);
     const tried = commanded ? Array(Math.min(CANDIDATES, question.samples)).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
     const targets = Float32Array.from(tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))));
-    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(3 * this.frames * tried.length) });
+    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(STRIDE * this.frames * tried.length) });
     if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
     const path = paths.slice(3 * this.frames * best, 3 * this.frames * (best + 1));
@@ -122,8 +136,8 @@ export class Sampler {
   // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the animal's pace
   // would be, and stays.
   meet(path, goal) {
-    const { goal_std: scale, path_std: spread } = this.contract.scaling;
-    const target = [0, 1, 2].map((axis) => goal[axis] * scale[axis]);
+    const { goal_std: deviation, path_std: spread } = this.contract.scaling;
+    const target = goalFrom(goal, deviation);
     const arrival = Math.min(this.frames - 1, Math.max(SOONEST, Math.ceil((Math.hypot(target[0], target[2]) / this.pace) * this.contract.rate_hz)));
     for (const axis of [0, 2]) {
       const missing = target[axis] - path[axis * this.frames + arrival] * spread[axis][arrival];
@@ -137,10 +151,7 @@ export class Sampler {
   // A plan along places that the visitor has drawn, points of the world, one a frame.
   async followed(frame, codes, places, options) {
     const egoFromWorld = inverse(frame);
-    const path = new Float32Array(3 * this.frames);
-    places.forEach((place, i) => apply(egoFromWorld, place).forEach((value, axis) => {
-      path[axis * this.frames + i] = value / this.contract.scaling.path_std[axis][i];
-    }));
+    const path = Float32Array.from(this.scaledPath(places.map((place) => apply(egoFromWorld, place))));
     return { goals: [places.at(-1)], chosen: 0, ...(await this.embodied(frame, codes, path, options)) };
   }
 
@@ -173,10 +184,10 @@ export class Sampler {
 
   // The visitor's goal in scaled units, not further than the animal goes in one plan.
   leg(frame, aim) {
-    const scale = this.contract.scaling.goal_std;
+    const deviation = this.contract.scaling.goal_std;
     const [x, , z] = apply(inverse(frame), aim);
-    const share = Math.min(1, (FURTHEST * scale[0]) / Math.max(1e-6, Math.hypot(x, z)));
-    return Float32Array.of((x * share) / scale[0], 0, (z * share) / scale[2]);
+    const share = Math.min(1, FURTHEST / Math.max(1e-6, Math.hypot(...scaledGoal([x, 0, z], deviation))));
+    return Float32Array.from(scaledGoal([x, 0, z], deviation), (value) => value * share);
   }
 
   // Metres and channels, frame by frame.
@@ -213,7 +224,7 @@ export class Sampler {
       const path = await this.paths(codes, goal, { ...options, steps: golden.sampling.sequence_steps, noise: noise('path') });
       const body = await this.body(codes, path, { ...options, steps: golden.sampling.sequence_steps, noise: noise('body') });
       const { positions, bodies } = this.unscaled(path, body);
-      plans[name] = { goal: Array.from(goal, (value, axis) => value * this.contract.scaling.goal_std[axis]), path: positions, body: bodies };
+      plans[name] = { goal: goalFrom(goal, this.contract.scaling.goal_std), path: positions, body: bodies };
     }
     return plans;
   }
