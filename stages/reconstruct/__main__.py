@@ -42,7 +42,7 @@ class Config:
     """what the scene's field learns on: fused depth, or nothing (baselines)"""
     fusion: Fusion = Fusion()
     """how depth is fused"""
-    agent_step_m: float = 0.015
+    agent_step_m: float = 0.01
     """resolution of the extracted agent, metres"""
     longest_gap_s: float = 2.0
     """the agent's pose is interpolated over gaps up to this long, seconds"""

@@ -14,7 +14,7 @@ from pipeline.models.fused import Fused
 from pipeline.models.motion import MotionTable
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
-from stages.reconstruct.problem import Problem, RaysByFrame, Surface, frame_table
+from stages.reconstruct.problem import Joints, Problem, RaysByFrame, Surface, frame_table
 from stages.reconstruct.rays import Source, Store, join
 
 
@@ -125,17 +125,22 @@ def build(
     by_frame = RaysByFrame.of(store.agent.frame, len(camera))
     usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
+    body = Body(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape)
+    surface = Surface.of(template.mesh, template.feature, np.random.default_rng(seed))
+    with torch.no_grad():
+        joints = Joints.of(surface.points, body.weights(surface.points))
     problem = Problem(
         store=store,
         scene=scene_field(videos, shapes, fused),
         agent=Field(agent_shape, free_m=0.1),
-        body=Body(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape),
+        body=body,
         motion=MotionTable(
             torch.from_numpy(camera), torch.from_numpy(agent), rest, lengths, [v.camera_free for v in videos], shapes.knot_frames
         ),
         video=frame_table(lengths),
         has_scene=has_scene,
-        surface=Surface.of(template.mesh, template.feature, np.random.default_rng(seed)),
+        surface=surface,
+        joints=joints,
         agent_frames=usable_frames,
         agent_rays=by_frame,
         trust=torch.from_numpy(trust).float(),
@@ -227,5 +232,5 @@ def _moved(problem: Problem, device: str) -> Problem:
         module.to(device)
     store = Store(problem.store.scene.to(device), problem.store.agent.to(device), problem.store.views.to(device))
     by_frame = RaysByFrame(problem.agent_rays.start.to(device), problem.agent_rays.count.to(device))
-    moved = {name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "agent_frames", "trust")}
+    moved = {name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "joints", "agent_frames", "trust")}
     return Problem(store=store, **problem.modules(), agent_rays=by_frame, **moved)

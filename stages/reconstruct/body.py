@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from pipeline.space import cameras, rigid_torch
 from stages.reconstruct import losses
-from stages.reconstruct.problem import Problem, RaysByFrame, neighbours, pick
+from stages.reconstruct.problem import Problem, RaysByFrame, pick
 from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
 from stages.reconstruct.scene import Terms
 from stages.reconstruct.settings import Weights
@@ -25,6 +25,10 @@ OUTLIER_M = 0.1
 """measured points this far from the agent count half; all keep pulling, or the body could hide behind the scene"""
 ROOT_M, ROOT_RAD = 0.05, 0.05
 """registered roots are about this good"""
+EDGE_M = 0.01
+"""masks' edges are about this good"""
+STILL = 0.01
+"""steps of bones and root below this, radians and decimetres, count as none"""
 COVER_M = 0.015
 """a masked pixel is covered when a sample of the posed surface is seen this near to it"""
 MARGIN_M = 0.03
@@ -77,7 +81,7 @@ def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, g
 
 
 def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, generator: Generator, masked: Rays | None = None) -> Terms:
-    """Keep the posed surface inside the mask, unless something stands before it, and out of space seen free.
+    """Keep the posed surface inside the mask, unless something stands before it, and out of space seen free and of solid things.
 
     Rays ``[frame * ray]`` on the mask, with or without depth, must be covered too.
     """
@@ -91,7 +95,7 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
         inside_picture = ((pixel >= 0) & (pixel <= views.size_px[pose.frame, None])).all(-1)
         in_view = inside_picture & (depth > 0.1)
         hidden = (measured > 0) & (measured < depth - MARGIN_M)
-    outside_m = functional.relu(outside_px) * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None]
+    outside_m = functional.relu(outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None] - EDGE_M)
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
@@ -99,9 +103,19 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
         "outside": (weights.outside, (trust * outside_m / DECIMETRE)[in_view & ~hidden]),
         "in front": (weights.in_front, (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
     }
+    if problem.scene.fused:
+        terms["solid"] = (weights.solid, (trust * buried_m(problem, pose, posed[:, ::2]) / DECIMETRE)[problem.has_scene[pose.frame]])
     if masked is not None:
         terms["cover"] = (weights.cover, trust * bare_m(points, masked) / DECIMETRE)
     return terms
+
+
+def buried_m(problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"]) -> Float[Tensor, "frame point"]:
+    """Measure how deep points lie below the scene's surface as each frame's video saw it: feet stand on the ground."""
+    world = rigid_torch.apply(pose.world_from_agent, points_agent)
+    video = problem.video[pose.frame][:, None].expand(world.shape[:2])
+    video = torch.where(problem.has_scene[pose.frame, None], video, -1)
+    return functional.relu(-problem.scene.distance_at(world.reshape(-1, 3), video.reshape(-1))).view(world.shape[:2])
 
 
 def bare_m(points_camera: Float[Tensor, "frame point 3"], masked: Rays) -> Float[Tensor, "frame ray"]:
@@ -116,26 +130,39 @@ def bare_m(points_camera: Float[Tensor, "frame point 3"], masked: Rays) -> Float
 
 
 def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: Weights) -> Terms:
-    """Keep bones together, near rest, and moving smoothly within runs of consecutive frames."""
-    rest = problem.body.agent_from_bone_rest
-    first, second = neighbours(rest)
+    """Keep bones together where they meet, near rest, and moving smoothly and seldom within runs of consecutive frames."""
+    rest, joints = problem.body.agent_from_bone_rest, problem.joints
     motion = pose.agent_from_bone @ rigid_torch.inverse(rest)
-    centre = rest[:, :3, 3]
-    carried = (motion[:, first, :3, :3] @ centre[second][..., None])[..., 0] + motion[:, first, :3, 3]
-    torn = (carried - pose.agent_from_bone[:, second, :3, 3]) / DECIMETRE
+
+    def carried(bone: Int[Tensor, "joint"]) -> Float[Tensor, "frame joint 3"]:
+        return (motion[:, bone, :3, :3] @ joints.place[..., None])[..., 0] + motion[:, bone, :3, 3]
+
+    torn = (carried(joints.first) - carried(joints.second)) / DECIMETRE
     root = rigid_torch.inverse(problem.motion.initial_agent[pose.frame]) @ pose.world_from_agent
-    trace = root[:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
     terms = {
-        "root": (weights.root, (root[:, :3, 3] / ROOT_M).square().sum(-1) + (3 - trace) / ROOT_RAD**2),
+        "root": (weights.root, (root[:, :3, 3] / ROOT_M).square().sum(-1) + _turned(root) / ROOT_RAD**2),
         "rigidity": (weights.rigidity, torn.square().sum(-1)),
         "rest": (weights.rest, twist.square().sum(-1) + 20 * twist.mean(1, keepdim=True).square().sum(-1)),
     }
     if run >= 3:
-        bend = torch.diff(twist.view(-1, run, *twist.shape[1:]), n=2, dim=1)
-        path = torch.diff(pose.world_from_agent[:, :3].reshape(-1, run, 12), n=2, dim=1)
-        terms["smoothness"] = (weights.smoothness, bend.square().sum(-1))
+        bend, roots = twist.view(-1, run, *twist.shape[1:]), pose.world_from_agent.reshape(-1, run, 4, 4)
+        path = torch.diff(roots[:, :, :3].flatten(2), n=2, dim=1)
+        step = rigid_torch.inverse(roots[:, :-1]) @ roots[:, 1:]
+        terms["smoothness"] = (weights.smoothness, torch.diff(bend, n=2, dim=1).square().sum(-1))
         terms["root smoothness"] = (4 * weights.smoothness, path.square().sum(-1))
+        terms["still"] = (weights.still, _size(torch.diff(bend, dim=1).square().sum(-1)))
+        terms["root still"] = (0.5 * weights.still, _size((step[..., :3, 3] / DECIMETRE).square().sum(-1) + _turned(step)))
     return terms
+
+
+def _turned(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
+    """Return the squared angle of small rotations."""
+    return 3 - motion[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
+def _size(squared: Float[Tensor, "*step"]) -> Float[Tensor, "*step"]:
+    """Turn squares to lengths, smooth at 0: what rests most of the time may leap at others."""
+    return (squared.clamp_min(0) + STILL**2).sqrt() - STILL
 
 
 def _bilinear(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:
@@ -187,6 +214,7 @@ class ChunkLoss(torch.nn.Module):
         )
         rays = problem.store.agent.at(self.masked[self.masked_rays.pick(seen.frame, self.rays, generator).flatten()])
         terms = measured_terms(problem, seen, rays, self.weights, generator, near=0)
+        del terms["agent feature"]  # their cells mix thin limbs with what is behind
         terms |= surface_terms(problem, seen, self.points, self.weights, generator, rays)
         terms |= prior_terms(problem, pose, self.bone, len(self.frame), self.weights)
         return losses.weighted(terms)

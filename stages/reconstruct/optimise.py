@@ -94,7 +94,7 @@ def _pose_chunk(problem: Problem, plan: Plan, frame: torch.Tensor, name: str) ->
     held = [problem.agent, problem.body, problem.scene]
     for module in held:
         module.requires_grad_(False)
-    chunk = ChunkLoss(problem, frame, plan.weights, plan.batches.agent_rays, plan.batches.posed_points)
+    chunk = ChunkLoss(problem, frame, plan.weights, plan.batches.posed_rays, plan.batches.posed_points)
     steps = plan.steps.body
     fit(
         modules={"chunk": _Learned(chunk)},

@@ -30,6 +30,7 @@ class Problem:
     has_scene: Bool[Tensor, "frame"]
     """False for the turnaround: its world is the agent"""
     surface: "Surface"
+    joints: "Joints"
     agent_frames: Int[Tensor, "frame"]
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
@@ -102,6 +103,33 @@ class RaysByFrame:
 
 
 @dataclass(frozen=True)
+class Joints:
+    """Where bones meet: pairs that move the same skin, however near other limbs may stand, and the places that both must carry alike."""
+
+    first: Int[Tensor, "joint"]
+    second: Int[Tensor, "joint"]
+    place: Float[Tensor, "joint 3"]
+    """at rest, agent frame, metres"""
+
+    @classmethod
+    def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"], most: int = 4, least: float = 0.02) -> "Joints":
+        """Tie each bone to those with which it shares most skin: up to ``most``, of a share of at least ``least``, but always one."""
+        share = weights.T @ weights
+        size = share.diagonal().sqrt().clamp_min(1e-6)
+        share = (share / size[:, None] / size).fill_diagonal_(0)
+        ranked = share.argsort(dim=1, descending=True)
+        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :most], True) & (share > least)
+        tied = tied.scatter_(1, ranked[:, :1], True)
+        first, second = torch.nonzero((tied | tied.T).triu(1), as_tuple=True)
+        both = weights[:, first] * weights[:, second]
+        return cls(first, second, both.T @ points / both.sum(0).clamp_min(1e-9)[:, None])
+
+    def to(self, device: str) -> "Joints":
+        """Move all to a device."""
+        return Joints(self.first.to(device), self.second.to(device), self.place.to(device))
+
+
+@dataclass(frozen=True)
 class Surface:
     """The agent template: samples of its surface and of the space around it."""
 
@@ -158,14 +186,6 @@ class Surface:
 def pick(count: int, number: int, generator: Generator, device: torch.device) -> Int[Tensor, "sample"]:
     """Choose indices below ``count`` at random, with repetition."""
     return torch.randint(count, (number,), generator=generator).to(device)
-
-
-def neighbours(agent_from_bone_rest: Float[Tensor, "bone 4 4"], number: int = 4) -> tuple[Int[Tensor, "pair"], Int[Tensor, "pair"]]:
-    """Pair every bone with the bones nearest to it at rest."""
-    centre = agent_from_bone_rest[:, :3, 3]
-    order = torch.cdist(centre, centre).argsort(dim=-1)[:, 1 : number + 1]
-    first = torch.arange(len(centre), device=centre.device)[:, None].expand_as(order)
-    return first.flatten(), order.flatten()
 
 
 def frame_table(lengths: Sequence[int]) -> Int[Tensor, "frame"]:

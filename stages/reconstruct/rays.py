@@ -103,6 +103,8 @@ class Sampling:
     agent_per_frame: int
     ring_px: int = 10
     """width of the ring around the mask, colour pixels"""
+    ring_share: float = 0.25
+    """share of the pixels kept for the agent that lie in the ring, if the mask is large enough"""
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
             scene.append(reader.read(_choose(mask == NOT_AGENT, sampling.scene_per_frame, rng), rng))
         if seen:
             reader = _Reader(source, frame, mask, thin_depth(source.clip, frame), slope)
-            agent.append(reader.read(_choose(near, sampling.agent_per_frame, rng), rng))
+            agent.append(reader.read(choose_on_agent(mask, near, sampling, rng), rng))
         small = tuple(size // THUMBNAIL for size in mask.shape)
         depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16))
         outsides.append(distance_outside(mask, small) if seen else np.full(small, FAR_PX, np.float16))
@@ -245,6 +247,21 @@ def _choose(allowed: Bool[np.ndarray, "height width"], count: int, rng: Generato
     flat = np.flatnonzero(allowed)
     picked = np.sort(rng.choice(flat, min(count, len(flat)), replace=False))
     return np.stack(np.unravel_index(picked, allowed.shape), axis=-1)
+
+
+def choose_on_agent(
+    mask: UInt8[np.ndarray, "height width"], near: Bool[np.ndarray, "height width"], sampling: Sampling, rng: Generator
+) -> Int[np.ndarray, "ray 2"]:
+    """Choose pixels (row, column) on the agent, where it is thin more densely, and in the ring around it."""
+    count = sampling.agent_per_frame
+    inside = cv2.distanceTransform((mask == AGENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3).ravel()
+    flat = np.flatnonzero(inside)
+    wanted = min(count - int(count * sampling.ring_share), len(flat))
+    density = 1 / inside[flat]
+    on_mask = rng.choice(flat, wanted, replace=False, p=density / density.sum()) if wanted else flat
+    around = np.flatnonzero(near.ravel() & (inside == 0))
+    beside = rng.choice(around, min(count - wanted, len(around)), replace=False)
+    return np.stack(np.unravel_index(np.sort(np.concatenate([on_mask, beside])), mask.shape), axis=-1)
 
 
 class _Reader:

@@ -36,10 +36,14 @@ class Weights:
     """masked pixels that the posed surface leaves bare, per decimetre"""
     in_front: float = 0.5
     """posed surface in space seen free, per decimetre"""
-    rigidity: float = 10.0
-    """neighbouring bones agree where they meet, per decimetre"""
+    solid: float = 2.0
+    """posed surface inside solid things, the ground above all, per decimetre"""
+    rigidity: float = 5.0
+    """bones agree where they meet, per decimetre"""
     smoothness: float = 0.3
     """accelerations of root and bones"""
+    still: float = 0.1
+    """steps of the bones, not squared: most of the time most of an animal rests; those of the root count half"""
     rest: float = 0.05
     """bones stay near rest"""
     drift: float = 0.1
@@ -86,10 +90,12 @@ class Batches:
     """frames of each stretch"""
     agent_rays: int = 32
     """rays on the agent per frame and step"""
+    posed_rays: int = 64
+    """the same while the template is posed"""
     surface_points: int = 96
     """points of the agent's surface per frame and step"""
     posed_points: int = 256
-    """the same while the template is posed"""
+    """and while the template is posed"""
     near: int = 4
     """samples of a ray near its measured depth"""
     free: int = 3

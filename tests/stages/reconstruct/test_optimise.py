@@ -8,13 +8,14 @@ import torch
 import trimesh
 
 from pipeline.models import fields
-from pipeline.models.fields import Reconstruction
+from pipeline.models.fields import Field, FieldShape, Reconstruction
+from pipeline.models.fused import Fused
 from pipeline.space import cameras, rigid, rigid_torch
 from pipeline.space.meshes import Mesh
 from stages.reconstruct import assemble, body, optimise, results
 from stages.reconstruct.assemble import Shapes, Template, Video
 from stages.reconstruct.body import Pose
-from stages.reconstruct.problem import RaysByFrame
+from stages.reconstruct.problem import Joints, RaysByFrame
 from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, Store, Views, distance_outside
 from stages.reconstruct.settings import Batches, Rates, Steps, Weights
 
@@ -147,6 +148,39 @@ def test_bare_masked_pixels_draw_the_surface_to_them():
     assert bare(home) < 0.2 * bare(shift), "registered roots are off by as much"
     bare(shift).backward()
     assert torch.nn.functional.cosine_similarity(-shift.grad, home, dim=0) > 0.7
+
+
+def test_what_is_buried_in_the_ground_is_lifted():
+    """A floor 10 cm below the ball's middle: its underside lies as deep as it lies below that, and is drawn up."""
+    found, _ = problem()
+    height = torch.linspace(-0.4, 0.4, 9).view(1, 9, 1, 1).expand(9, 9, 9, 1) + 0.1
+    block = torch.cat([(height / 0.2).clamp(-1, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
+    table = torch.ones(2, 1, 1, 1, dtype=torch.int32)
+    floor = Fused(torch.full((3,), -0.4), 0.1, 0.2, table, torch.stack([torch.ones(9, 9, 9, 5), block]).half())
+    shape = FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2)
+    found = replace(found, scene=Field(shape, free_m=0.1, fused=floor))
+    pose, shift = Pose.of(found, found.agent_frames[:2]), torch.zeros(3, requires_grad=True)
+    pose = replace(pose, world_from_agent=rigid_torch.make(torch.eye(3), shift).expand(2, 4, 4))
+    points = found.surface.points[:200].expand(2, -1, -1)
+    buried = body.buried_m(found, pose, points)
+    torch.testing.assert_close(buried, (-0.1 - points[..., 1]).clamp(0, 0.2), atol=2e-3, rtol=0)
+    buried.mean().backward()
+    assert -shift.grad[1] > 10 * shift.grad[[0, 2]].abs().max()
+
+
+def test_bones_are_tied_along_limbs_and_not_across_them():
+    """Two legs nearer to each other than their own bones: each hangs on its own hip."""
+    heights = torch.tensor([0.0, -0.1, -0.2])
+    side = torch.tensor([-0.02, 0.02])
+    centre = torch.stack([side[:, None].expand(2, 3), heights.expand(2, 3), torch.zeros(2, 3)], dim=-1).view(6, 3)
+    points = torch.cat([torch.stack([x.expand(60), torch.linspace(0, -0.25, 60), torch.zeros(60)], dim=-1) for x in side])
+    across = (points[:, None, 0] * centre[:, 0] < 0) & (points[:, None, 1] < -0.05)
+    weights = (-torch.cdist(points, centre).square() / 0.05**2 - 1e3 * across).softmax(-1)
+    joints = Joints.of(points, weights)
+    pairs = set(zip(joints.first.tolist(), joints.second.tolist(), strict=True))
+    assert {(0, 1), (1, 2), (3, 4), (4, 5), (0, 3)} <= pairs and not pairs & {(1, 4), (1, 5), (2, 4), (2, 5)}
+    knee = joints.place[[pair == (1, 2) for pair in zip(joints.first.tolist(), joints.second.tolist(), strict=True)]]
+    torch.testing.assert_close(knee, torch.tensor([[-0.02, -0.15, 0.0]]), atol=0.01, rtol=0)
 
 
 def test_fields_come_back_from_files_as_they_went(solved, tmp_path):

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from stages.reconstruct.rays import AGENT, FAR_PX, NOT_AGENT, THUMBNAIL, UNKNOWN, distance_outside
+from stages.reconstruct.rays import (
+    AGENT,
+    FAR_PX,
+    NOT_AGENT,
+    THUMBNAIL,
+    UNKNOWN,
+    Sampling,
+    choose_on_agent,
+    distance_outside,
+    near_agent,
+)
 
 
 @pytest.mark.parametrize(("radius_px", "label"), [(9.0, AGENT), (25.0, AGENT), (25.0, UNKNOWN)])
@@ -20,3 +30,19 @@ def test_distance_from_the_mask_is_that_of_the_thumbnail_pixels_middle(radius_px
 
 def test_without_a_mask_everything_is_far():
     assert (distance_outside(np.zeros((8, 8), np.uint8), (2, 2)) == FAR_PX).all()
+
+
+@pytest.mark.parametrize("count", [150, 4000])
+def test_thin_limbs_are_looked_at_as_much_as_the_trunk(count):
+    mask = np.zeros((100, 100), np.uint8)
+    mask[20:60, 20:60] = mask[60:90, 38:42] = AGENT  # a leg four pixels wide
+    sampling = Sampling(0, count, ring_px=5)
+    near = near_agent(mask, sampling.ring_px)
+    row, column = choose_on_agent(mask, near, sampling, np.random.default_rng(0)).T
+    assert len(set(zip(row, column, strict=True))) == len(row) == min(count, near.sum()), "none twice, as many as there are"
+    assert near[row, column].all()
+    on_mask = mask[row, column] == AGENT
+    assert abs(on_mask.sum() - min(0.75 * count, (mask == AGENT).sum())) <= 1
+    if count < on_mask.sum() + (mask == AGENT).sum():
+        share = (row[on_mask] >= 60).mean()
+        assert share > 2 * (mask[60:] == AGENT).sum() / (mask == AGENT).sum(), "a leg's pixels count more than a trunk's"
