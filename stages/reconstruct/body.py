@@ -4,7 +4,7 @@ They serve twice: `pose_chunk` poses the template to the frames before the field
 the same terms while everything learns.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -69,15 +69,17 @@ def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, g
     color, feature = problem.agent.look(encoded.view(len(rays), 1 + near, -1)[:, 0])
     good = (rays.label == AGENT) & (rays.depth > 0)
     trust = problem.trust[rays.frame] / (1 + distance[:, 0].detach().abs() / OUTLIER_M)
-    at_depth = points.view(frames, number, 1 + near, 3)[:, :, 0]
-    back = problem.body.pose(rest.view(frames, number, 1 + near, 3)[:, :, 0], pose.agent_from_bone)
-    cycle = (back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2
-    return {
+    terms = {
         "agent distance": (weights.agent_distance, (trust[:, None] * losses.truncated_distance(distance, target, REACH_M))[good]),
         "agent color": (weights.color, (trust * losses.color(color, rays.color / 255))[good]),
-        "agent feature": (weights.feature, (trust * losses.feature(feature, rays.feature / 127))[good]),
-        "cycle": (weights.cycle, cycle[good]),
     }
+    if weights.feature:
+        terms["agent feature"] = (weights.feature, (trust * losses.feature(feature, rays.feature / 127))[good])
+    if weights.cycle:
+        at_depth, back_to = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
+        back = problem.body.pose(back_to, pose.agent_from_bone)
+        terms["cycle"] = (weights.cycle, ((back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2)[good])
+    return terms
 
 
 def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, generator: Generator, masked: Rays | None = None) -> Terms:
@@ -104,7 +106,7 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
         "in front": (weights.in_front, (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
     }
     if problem.scene.fused:
-        terms["solid"] = (weights.solid, (trust * buried_m(problem, pose, posed[:, ::2]) / DECIMETRE)[problem.has_scene[pose.frame]])
+        terms["solid"] = (weights.solid, (trust * buried_m(problem, pose, posed[:, ::4]) / DECIMETRE)[problem.has_scene[pose.frame]])
     if masked is not None:
         terms["cover"] = (weights.cover, trust * bare_m(points, masked) / DECIMETRE)
     return terms
@@ -185,12 +187,16 @@ def _normalized(images: Tensor, pixel: Float[Tensor, "frame point 2"]) -> Float[
 
 
 class ChunkLoss(torch.nn.Module):
-    """Poses the template in consecutive frames of one video: the field and the skin are held, root and bones move."""
+    """Poses the template in consecutive frames of one video: the field and the skin are held, root and bones move.
+
+    Features do not help here, whose cells mix thin limbs with what is behind, nor do cycles, since the skin is held.
+    """
 
     def __init__(self, problem: Problem, frame: Int[Tensor, "frame"], weights: Weights, rays: int, points: int, root_share: float = 0.25):
         """Bones start to move after ``root_share`` of the steps."""
         super().__init__()
-        self.problem, self.frame, self.weights, self.rays, self.points, self.root_share = problem, frame, weights, rays, points, root_share
+        self.problem, self.frame, self.rays, self.points, self.root_share = problem, frame, rays, points, root_share
+        self.weights = replace(weights, feature=0.0, cycle=0.0)
         self.masked = torch.nonzero(problem.store.agent.label == AGENT)[:, 0]
         self.masked_rays = RaysByFrame.of(problem.store.agent.frame[self.masked], len(problem.video))
         self.seen = torch.isin(frame, problem.agent_frames) & (self.masked_rays.count[frame] > 0)
@@ -214,7 +220,6 @@ class ChunkLoss(torch.nn.Module):
         )
         rays = problem.store.agent.at(self.masked[self.masked_rays.pick(seen.frame, self.rays, generator).flatten()])
         terms = measured_terms(problem, seen, rays, self.weights, generator, near=0)
-        del terms["agent feature"]  # their cells mix thin limbs with what is behind
         terms |= surface_terms(problem, seen, self.points, self.weights, generator, rays)
         terms |= prior_terms(problem, pose, self.bone, len(self.frame), self.weights)
         return losses.weighted(terms)

@@ -90,11 +90,11 @@ class Batches:
     """frames of each stretch"""
     agent_rays: int = 32
     """rays on the agent per frame and step"""
-    posed_rays: int = 64
+    posed_rays: int = 48
     """the same while the template is posed"""
     surface_points: int = 96
     """points of the agent's surface per frame and step"""
-    posed_points: int = 256
+    posed_points: int = 192
     """and while the template is posed"""
     near: int = 4
     """samples of a ray near its measured depth"""
