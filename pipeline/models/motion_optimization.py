@@ -55,7 +55,7 @@ class Settings:
     """neighbouring meshes"""
     smoothness: Literal["acceleration", "velocity"] = "acceleration"
     """what is kept small between neighbouring meshes; the paper's is the velocity, which also slows the animal down"""
-    stay: float = 1.0
+    stay: float = 6.0
     """stay near the motion that was given"""
     vertices: int = 300
     """vertices of the surface that collision and smoothness look at"""
