@@ -52,7 +52,7 @@ class Weights:
     """corrections of cameras are small, per centimetre"""
     root: float = 0.005
     """the agent's root stays near the registered one, per 5 cm and 3 degrees"""
-    template: float = 2.0
+    template: float = 10.0
     """the agent's field stays near its template, in shape and colour"""
 
 
