@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from pipeline.models.behavior import BehaviorNets
-from pipeline.models.perception import FeatureVolume, world_from_ego
+from pipeline.models.perception import PACE_CHANNELS, FeatureVolume, world_from_ego
 from pipeline.models.planning import observe
 from pipeline.models.trajectories import Context
 from pipeline.space import rigid
@@ -62,8 +62,9 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
 
 
 def alike(code: torch.Tensor) -> list[bool]:
-    """Tell of scene, observer and past whether two agents' codes are alike; the posture must be so where the past is."""
-    minds, posture = code.split([code.shape[1] - ARCHITECTURE.body_channels, ARCHITECTURE.body_channels], dim=1)
+    """Tell of scene, observer and past whether two agents' codes are alike; pace and posture must be so where the past is."""
+    now = PACE_CHANNELS + ARCHITECTURE.body_channels
+    minds, posture = code.split([code.shape[1] - now, now], dim=1)
     parts = minds.unflatten(1, (ARCHITECTURE.minds, 3, -1))
     same = ((parts[0] - parts[1]).abs().amax((0, 2)) < 1e-7).tolist()
     assert bool((posture[0] == posture[1]).all()) == same[2]
