@@ -28,6 +28,8 @@ SOUGHT_M = 0.3
 """How far above or below a raised sub-goal what carries a body there is looked for."""
 TURN_M = 0.2
 """A body that stops keeps this far from where it cannot walk, to have room to turn."""
+LANDING = 2.6
+"""A leap begins and ends, if it can, so many heights of the root away from where a body cannot walk: it falls at its full length."""
 ABOUT_RAD = 1.7
 """A turn of more than this takes a body at rest two legs."""
 MORE_LEGS = 4
@@ -90,6 +92,14 @@ class Floor:
         place = self.corner + CELL_M * cell
         stays = np.abs(place - position[[0, 2]]).max() <= CELL_M / 2
         return np.asarray(position) if stays else np.array([place[0], position[1], place[1]])
+
+    def landing(self, position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
+        """Return where a leap to or from a position meets the ground: near, but each metre that is missing to `LANDING` counts as two."""
+        cells = np.argwhere(self.room_m > min(TURN_M, self.room_m.max() / 2))
+        off = np.linalg.norm(self.corner + CELL_M * cells - np.asarray(position)[[0, 2]], axis=1)
+        missing = np.maximum(0, LANDING * (root_m - self.height_m) - self.room_m[tuple(cells.T)])
+        place = self.corner + CELL_M * cells[np.argmin(off + 2 * missing)]
+        return np.array([place[0], position[1], place[1]])
 
     def blocked_m(self, way: Float[np.ndarray, "point 3"]) -> float:
         """Return how much of a polyline does not lead over free floor, metres."""
@@ -210,7 +220,7 @@ def _grounded(position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarr
 def _way(floor: Floor, start: np.ndarray, end: np.ndarray, root_m: float, longest_m: float) -> list[Float[np.ndarray, "3"]]:
     """Return the ends of the legs from one root position to another; onto furniture and down from it in one leap."""
     leaps = [abs(place[1] - root_m) > 1e-6 for place in (start, end)]
-    ground = floor.way(*(floor.roomy(place) if leap else place for place, leap in zip((start, end), leaps, strict=True)))
+    ground = floor.way(*(floor.landing(place, root_m) if leap else place for place, leap in zip((start, end), leaps, strict=True)))
     ground = np.column_stack([ground[:, 0], np.full(len(ground), root_m), ground[:, 1]])
     walked = np.concatenate([ground[:0] if leaps[0] else start[None], ground, ground[:0] if leaps[1] else end[None]])
     return [*([walked[0]] if leaps[0] else []), *_parted(floor, walked, longest_m), *([end] if leaps[1] else [])]

@@ -159,6 +159,9 @@ def test_sub_goals_by_the_block_are_moved_to_where_a_body_can_turn_and_legs_lead
         moved = floor.roomy(position)
         assert 0.55 < np.abs(moved[[0, 2]]).max() < 0.9
     np.testing.assert_array_equal(floor.roomy(far), far)
+    root_m = floor.height_m + model.habits.clearance_m
+    landed = floor.landing(np.array([0.1, 0.7, 0.0]), root_m)
+    assert np.abs(landed[[0, 2]]).max() > np.abs(floor.roomy(np.array([0.1, root_m, 0.0]))[[0, 2]]).max(), "a leap needs more room"
     places = legs(None, [Subgoal(np.array([-0.75, np.nan, 0.0])), Subgoal(np.array([0.75, np.nan, 0.0]))], lives.scenes[0], model.habits)
     assert floor.blocked_m(places.world_from_agent[[0, -1], :3, 3]) > 0.7
     assert floor.blocked_m(places.world_from_agent[:, :3, 3]) < 0.1
