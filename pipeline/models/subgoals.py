@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from skimage.graph import route_through_array
 
@@ -95,7 +95,7 @@ class Floor:
 
     def landing(self, position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
         """Return where a leap to or from a position meets the ground: near, but each metre that is missing to `LANDING` counts as two."""
-        cells = np.argwhere(self.room_m > min(TURN_M, self.room_m.max() / 2))
+        cells = self._cells(self.room_m > min(TURN_M, self.room_m.max() / 2))
         off = np.linalg.norm(self.corner + CELL_M * cells - np.asarray(position)[[0, 2]], axis=1)
         missing = np.maximum(0, LANDING * (root_m - self.height_m) - self.room_m[tuple(cells.T)])
         place = self.corner + CELL_M * cells[np.argmin(off + 2 * missing)]
@@ -109,10 +109,14 @@ class Floor:
         cells = np.clip(np.rint((points - self.corner) / CELL_M).astype(int), 0, np.array(self.free.shape) - 1)
         return float((~self.free[tuple(cells.T)]).sum() * CELL_M / 4)
 
-    def _nearest(self, wanted: Bool[np.ndarray, "x z"], position: Float[np.ndarray, "3"]) -> tuple[int, int]:
+    def _cells(self, wanted: Bool[np.ndarray, "x z"]) -> Int[np.ndarray, "cell 2"]:
         cells = np.argwhere(wanted)
         if not len(cells):
             raise InputError("SIM-003", "there is no free floor in this scene", "", "give sub-goals in a scene that shows its floor")
+        return cells
+
+    def _nearest(self, wanted: Bool[np.ndarray, "x z"], position: Float[np.ndarray, "3"]) -> tuple[int, int]:
+        cells = self._cells(wanted)
         off = self.corner + CELL_M * cells - np.asarray(position)[[0, 2]]
         return tuple(int(v) for v in cells[np.argmin((off**2).sum(1))])
 

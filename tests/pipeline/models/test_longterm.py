@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.errors import InputError
 from pipeline.models import ablated_motion, simulated_lives
 from pipeline.models.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
 from pipeline.models.contacts import find_contacts
@@ -165,6 +166,12 @@ def test_sub_goals_by_the_block_are_moved_to_where_a_body_can_turn_and_legs_lead
     places = legs(None, [Subgoal(np.array([-0.75, np.nan, 0.0])), Subgoal(np.array([0.75, np.nan, 0.0]))], lives.scenes[0], model.habits)
     assert floor.blocked_m(places.world_from_agent[[0, -1], :3, 3]) > 0.7
     assert floor.blocked_m(places.world_from_agent[:, :3, 3]) < 0.1
+
+
+def test_a_scene_without_free_floor_is_refused_for_leaps_too():
+    nowhere = Floor(np.zeros((3, 3), bool), np.zeros((3, 3)), np.zeros(2), 0.0)
+    with pytest.raises(InputError, match="SIM-003"):
+        nowhere.landing(np.zeros(3), 0.2)
 
 
 def test_a_body_at_rest_turns_about_in_two_legs(lives, model):
