@@ -126,6 +126,10 @@ class Codes:
     ground: Ground | None
     """where goals and paths are kept to"""
 
+    def cleared(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan frame 3"]:
+        """Keep paths in metres where the agent may be."""
+        return path if self.ground is None else self.ground.cleared(path)
+
 
 @dataclass(frozen=True)
 class Sampler:
@@ -230,7 +234,7 @@ class Sampler:
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Return scaled paths in metres, led to their goals as far as these are told, and kept where the agent may be."""
         path = led(self.scaling.path(scaled, codes.start), codes.start, goal, float(sampling.goal) * min(sampling.guidance, 1.0))
-        return path if codes.ground is None else codes.ground.cleared(path)
+        return codes.cleared(path)
 
     def _drawn(
         self,

@@ -21,23 +21,25 @@ class Mesh:
     @property
     def area_m2(self) -> float:
         """Area of all faces."""
-        corner = self.vertices[self.faces].astype(np.float64)
-        return float(np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2)
+        return float(np.linalg.norm(_doubled_areas(self.vertices[self.faces].astype(np.float64)), axis=-1).sum() / 2)
 
     def face_normals(self) -> Float[np.ndarray, "face 3"]:
         """Return unit normals; zero for degenerate faces."""
-        corner = self.vertices[self.faces]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal = _doubled_areas(self.vertices[self.faces])
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
     def vertex_normals(self) -> Float[np.ndarray, "vertex 3"]:
         """Return unit normals, the area-weighted mean of the faces around each vertex."""
-        corner = self.vertices[self.faces]
-        area_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        area_normal = _doubled_areas(self.vertices[self.faces])
         normal = np.zeros_like(self.vertices, dtype=np.float64)
         for index in range(3):
             np.add.at(normal, self.faces[:, index], area_normal)
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+
+
+def _doubled_areas(corner: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face 3"]:
+    """Return the normals of triangles, twice as long as their areas."""
+    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
 @dataclass(frozen=True)

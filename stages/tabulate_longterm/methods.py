@@ -18,14 +18,9 @@ Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """From clips, of which only first and last frames and the scene may be looked at, to all frames"""
 OPTIMISED = ("ours", "base", "route_cvae", "nearest")
 """Methods that are also judged after the optimisation."""
-BEYOND = {
-    "base": "ours",
-    "route_cvae": "ours",
-    "nearest": "ours",
-    "ours_no_scene": "ours",
-    "route_t_pose_no_scene": "route_t_pose",
-    "base_no_scene": "base",
-}
+SEEING = {"ours": "ours_no_scene", "route_t_pose": "route_t_pose_no_scene", "base": "base_no_scene"}
+"""Methods that see the scene, and the same that do not; the routes of `route_tr_pose` are those of ours."""
+BEYOND = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {blind: seeing for seeing, blind in SEEING.items()}
 """Methods whose errors beyond another's are told clip by clip, with intervals."""
 
 

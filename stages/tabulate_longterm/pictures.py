@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 from pipeline import figures as drawing
 from pipeline.models.intervals import names_of
 from pipeline.qa import Check, Picture
+from stages.tabulate_longterm.methods import SEEING
 
 QUALITY = {
     "good": "ours ahead of every rival, and physical after the optimisation at little more error",
     "bad": "a rival ahead, feet that slide, bodies inside furniture",
 }
 RIVALS = ("base", "route_cvae", "nearest")
-SEEING = (("ours", "ours_no_scene"), ("route_t_pose", "route_t_pose_no_scene"), ("base", "base_no_scene"))
-"""Methods that see the scene, and the same that do not; the routes of `route_tr_pose` are those of ours."""
 
 
 def checks(figures: Mapping[str, float | None]) -> list[Check]:
@@ -38,7 +37,7 @@ def checks(figures: Mapping[str, float | None]) -> list[Check]:
                 "",
                 1.0,
             )
-            for name, blind in SEEING
+            for name, blind in SEEING.items()
         ),
         Check("non-collision, optimised", of("longterm/ours_opt/non_collision"), "share", 0.995, better="higher"),
         Check("contact, optimised", of("longterm/ours_opt/contact"), "share", 0.97, better="higher"),
