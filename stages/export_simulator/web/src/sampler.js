@@ -3,7 +3,7 @@
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
-import { STRIDE, goalFrom, led, pathFrom, scaledGoal } from './strides.js';
+import { goalFrom, led, pathFrom, scaledGoal } from './strides.js';
 
 const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
 const SOONEST = 6; // frames that a visitor's goal leaves at least
@@ -14,6 +14,7 @@ export class Sampler {
   constructor(contract, networks, senses) {
     Object.assign(this, { contract: contract.behavior, heights: contract.agent.root_height_m, pace: contract.agent.pace_m_s, networks, senses });
     this.frames = this.contract.future_frames;
+    this.stride = this.contract.strides.numbers;
     this.channels = this.contract.scaling.body_mean.length;
   }
 
@@ -42,7 +43,7 @@ export class Sampler {
   async paths(codes, goals, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) => this.networks.path({
-      x: [x, [count, STRIDE, this.frames]], ...this.step(count, t, code),
+      x: [x, [count, this.stride, this.frames]], ...this.step(count, t, code),
       control: [goals, [count, 3]], keep: [new Float32Array(count).fill(keep), [count, 1]],
     });
     const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
@@ -51,14 +52,23 @@ export class Sampler {
   }
 
   // Scaled places [3, frames] that scaled strides lead to, bent towards scaled goals.
-  walked(strides, goals, start, pull) {
-    const { goal_std: goal, stride_std: deviation } = this.contract.scaling;
+  walked(drawn, goals, start, pull) {
+    const { contract: { scaling, strides: told, rate_hz: rate }, frames } = this;
     const each = Array.from({ length: goals.length / 3 }, (_, i) => {
-      const mine = strides.subarray(i * STRIDE * this.frames, (i + 1) * STRIDE * this.frames);
-      const path = pathFrom(mine, this.frames, deviation, start, this.contract.rate_hz);
-      return this.scaledPath(led(path, start, goalFrom(goals.subarray(3 * i, 3 * i + 3), goal), pull));
+      const mine = drawn.subarray(i * this.stride * frames, (i + 1) * this.stride * frames);
+      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, told);
+      return this.scaledPath(led(path, start, this.goal(goals, i), pull));
     });
     return Float32Array.from(each.flat());
+  }
+
+  // The i-th of scaled goals in metres, and back.
+  goal(scaled, i = 0) {
+    return goalFrom(scaled.subarray(3 * i, 3 * i + 3), this.contract.scaling.goal_std, this.contract.strides);
+  }
+
+  scaled(goal) {
+    return scaledGoal(goal, this.contract.scaling.goal_std, this.contract.strides);
   }
 
   // Places as a body is told them.
@@ -103,8 +113,7 @@ export class Sampler {
   }
 
   goalsInWorld(frame, scaled) {
-    const deviation = this.contract.scaling.goal_std;
-    return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, goalFrom(scaled.subarray(3 * i, 3 * i + 3), deviation)));
+    return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, this.goal(scaled, i)));
   }
 
   // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, path}.
@@ -120,7 +129,7 @@ export class Sampler {
     const goals = this.goalsInWorld(frame, scaled);
     const tried = commanded ? Array(Math.min(CANDIDATES, question.samples)).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
     const targets = Float32Array.from(tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))));
-    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(STRIDE * this.frames * tried.length) });
+    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(this.stride * this.frames * tried.length) });
     if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
     const path = paths.slice(3 * this.frames * best, 3 * this.frames * (best + 1));
@@ -136,8 +145,8 @@ export class Sampler {
   // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the animal's pace
   // would be, and stays.
   meet(path, goal) {
-    const { goal_std: deviation, path_std: spread } = this.contract.scaling;
-    const target = goalFrom(goal, deviation);
+    const { path_std: spread } = this.contract.scaling;
+    const target = this.goal(goal);
     const arrival = Math.min(this.frames - 1, Math.max(SOONEST, Math.ceil((Math.hypot(target[0], target[2]) / this.pace) * this.contract.rate_hz)));
     for (const axis of [0, 2]) {
       const missing = target[axis] - path[axis * this.frames + arrival] * spread[axis][arrival];
@@ -184,10 +193,10 @@ export class Sampler {
 
   // The visitor's goal in scaled units, not further than the animal goes in one plan.
   leg(frame, aim) {
-    const deviation = this.contract.scaling.goal_std;
     const [x, , z] = apply(inverse(frame), aim);
-    const share = Math.min(1, FURTHEST / Math.max(1e-6, Math.hypot(...scaledGoal([x, 0, z], deviation))));
-    return Float32Array.from(scaledGoal([x, 0, z], deviation), (value) => value * share);
+    const whole = this.scaled([x, 0, z]);
+    const share = Math.min(1, FURTHEST / Math.max(1e-6, Math.hypot(...whole)));
+    return Float32Array.from(whole, (value) => value * share);
   }
 
   // Metres and channels, frame by frame.
@@ -224,7 +233,7 @@ export class Sampler {
       const path = await this.paths(codes, goal, { ...options, steps: golden.sampling.sequence_steps, noise: noise('path') });
       const body = await this.body(codes, path, { ...options, steps: golden.sampling.sequence_steps, noise: noise('body') });
       const { positions, bodies } = this.unscaled(path, body);
-      plans[name] = { goal: goalFrom(goal, this.contract.scaling.goal_std), path: positions, body: bodies };
+      plans[name] = { goal: this.goal(goal), path: positions, body: bodies };
     }
     return plans;
   }

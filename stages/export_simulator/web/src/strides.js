@@ -1,27 +1,25 @@
-// Goals and paths as the numbers that are diffused. Counterpart of pipeline/models/strides.py.
-
-export const STRIDE = 4;
-const BREATH = 0.3;
-const [ROOT, GOAL_POWER] = [0.5, 0.7];
-const FAINT = 1e-12;
+// Goals and paths as the numbers that are diffused. Counterpart of pipeline/models/strides.py, whose powers and breath
+// come with the contract: {numbers, root_power, goal_power, breath, faint_m2}.
 
 // The same direction, the length raised to a power.
-export function powered(way, power) {
-  const factor = (way.reduce((sum, value) => sum + value * value, 0) + FAINT) ** ((power - 1) / 2);
+function powered(way, power, faint) {
+  const factor = (way.reduce((sum, value) => sum + value * value, 0) + faint) ** ((power - 1) / 2);
   return way.map((value) => value * factor);
 }
 
 // Goals in metres as they are diffused, and back.
-export const scaledGoal = (goal, deviation) => powered(goal, GOAL_POWER).map((value, axis) => value / deviation[axis]);
-export const goalFrom = (scaled, deviation) => powered(Array.from(scaled, (value, axis) => value * deviation[axis]), 1 / GOAL_POWER);
+export const scaledGoal = (goal, deviation, told) => powered(goal, told.goal_power, told.faint_m2).map((value, axis) => value / deviation[axis]);
+export const goalFrom = (scaled, deviation, told) => (
+  powered(Array.from(scaled, (value, axis) => value * deviation[axis]), 1 / told.goal_power, told.faint_m2)
+);
 
-// The places that scaled strides [4, frames] lead to, one after another, from `start` on.
-export function pathFrom(scaled, frames, deviation, start, rate) {
+// The places that scaled strides [numbers, frames] lead to, one after another, from `start` on.
+export function pathFrom(scaled, frames, deviation, start, rate, told) {
   let place = start;
   return Array.from({ length: frames }, (_, i) => {
-    const stays = scaled[3 * frames + i] > 0 ? 1 : BREATH;
+    const stays = scaled[3 * frames + i] > 0 ? 1 : told.breath;
     const root = [0, 1, 2].map((axis) => scaled[axis * frames + i] * deviation[axis] * stays);
-    place = powered(root, 1 / ROOT).map((value, axis) => place[axis] + value / rate);
+    place = powered(root, 1 / told.root_power, told.faint_m2).map((value, axis) => place[axis] + value / rate);
     return place;
   });
 }
@@ -31,7 +29,7 @@ export function led(path, start, goal, pull) {
   let way = 0;
   const gone = path.map((place, i) => (way += distance(place, i ? path[i - 1] : start)));
   const missing = goal.map((value, axis) => value - path.at(-1)[axis]);
-  const longest = Math.max(Math.hypot(...missing), way, FAINT);
+  const longest = Math.max(Math.hypot(...missing), way, Number.EPSILON);
   return path.map((place, i) => place.map((value, axis) => value + (missing[axis] * pull * gone[i]) / longest));
 }
 
