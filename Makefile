@@ -12,10 +12,11 @@ endif
 PYTHON := .venv/bin/python
 PLAN   := $(PYTHON) -SE -m pipeline.plan
 RUN    := $(PYTHON) -SE -m pipeline.run $(if $(PROCESSES),--processes $(PROCESSES))
-AGENTS := $(patsubst agents/%.toml,%,$(wildcard agents/*.toml))
+COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras test doctor clean
+AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/*.toml)))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
-.PHONY: help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras test doctor clean FORCE
+.PHONY: $(COMMANDS) FORCE
 # Where an agent's, or its variant's, own things stand; what a variant does not touch is its agent's (`INPUTS` knows).
 ANIMAL := $(or $(AGENT),cat)
 HOME_OF := build/$(ANIMAL)$(if $(VARIANT),/variants/$(VARIANT))
@@ -24,7 +25,7 @@ INPUTS = inputs=$$($(PLAN) inputs $(HOME_OF:build/%=%) $1)
 NESTING := --no-print-directory NESTED=1
 
 help:
-	@sed 's/make cat/make $(ANIMAL)/' pipeline/help.txt
+	@sed 's/cat/$(ANIMAL)/g' pipeline/help.txt
 	@echo 'agents: $(AGENTS)'
 
 include $(WANTED:%=build/%$(if $(TABLES),/tables)$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
@@ -54,7 +55,7 @@ longterm-tables: .venv/.ok
 	@cat build/$(ANIMAL)/longterm_tables/tables.txt
 
 new: .venv/.ok
-	@$(PLAN) new '$(AGENT)'
+	@$(PLAN) new "$$AGENT" $(COMMANDS)
 
 annotate: .venv/.ok
 	@$(PYTHON) -m stages.annotate build/$(ANIMAL) --clicks captures/$(ANIMAL)/clicks.json
@@ -101,4 +102,4 @@ clean:
 	  set -- $(subst /, ,$@); echo "error: REC-007 '$@' belongs to variant $$4 of $$2 and is not there yet" >&2; \
 	  echo "  -> one variant: make $$2.$$5 VARIANT=$$4; a table with all it compares: make $$5-tables AGENT=$$2" >&2; exit 2;; esac
 	@echo "error: REC-007 nobody knows how to make '$@'" >&2
-	@echo "  -> agents: $(AGENTS); a new one: make new AGENT=<name>; artifacts and all else: make help" >&2; exit 2
+	@echo "  -> $(if $(filter $(AGENTS:%=%.%),$@),artifacts: $$($(PYTHON) -SE -c 'from pipeline import dag; print(*dag.NODES)'),agents: $(AGENTS); a new one: make new AGENT=<name>); all else: make help" >&2; exit 2

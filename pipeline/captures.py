@@ -12,7 +12,7 @@ from typing import Any
 from pipeline import config, dag
 from pipeline.dag import Flow
 from pipeline.errors import InputError
-from pipeline.recordings.formats import format_of
+from pipeline.recordings.formats import UNDERSTOOD, format_of
 from pipeline.videos import ROLES, SPLITS, Role, Split, Video
 
 SIDECAR = ".toml"
@@ -58,6 +58,15 @@ def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
     found, kinds = find(folder, flow), {"", *(f".{kind}" for node in dag.FLOW for kind in node.sidecars)}
     known = {*found, *(f"{name}{kind}{SIDECAR}" for name in found for kind in kinds)} | {name for node in dag.FLOW for name in node.beside}
     return sorted(path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith("."))
+
+
+def refuse_strangers(folder: Path, flow: Flow) -> None:
+    """Raise CAP-003 where something was put into `folder`, but nothing that a flow can begin with."""
+    strangers = [name for name in not_understood(folder, flow) if not name.endswith(SIDECAR)] if folder.is_dir() else []
+    if strangers:
+        what = f"holds no recording of a known format, only {', '.join(map(repr, strangers))}"
+        known = UNDERSTOOD if flow == "recordings" else "tables of motion, CSV or NPZ"
+        raise InputError("CAP-003", what, str(folder), f"known: {known}; or empty the folder for the built-in capture")
 
 
 def telling_meters(folder: Path, video: Video, videos: Iterable[Video]) -> list[Video]:

@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 from pipeline.errors import InputError
 
 C = TypeVar("C")
+_PLAIN = {"bool": bool, "int": int, "float": float, "str": str, "tuple": tuple, "Literal": typing.Literal}
+"""What an annotation may be made of to be checked without its module."""
 
 
 def load(config: type[C], path: Path) -> C:
@@ -51,6 +53,15 @@ def refuse_unknown(table: Mapping[str, Any], known: typing.Collection[str], *, w
     for key in table:
         if key not in known:
             raise InputError("REC-001", f"unknown {kind} {key!r}", where, f"known: {', '.join(sorted(known)) or 'none'}")
+
+
+def refuse_misfit(value: Any, kind: str, *, where: str) -> None:
+    """Raise REC-002 when `value` is not of the type that the annotation `kind` spells; one with other names is not judged."""
+    try:
+        hint = eval(kind, {"__builtins__": {}}, _PLAIN)
+    except NameError:
+        return
+    _checked(hint, value, where)
 
 
 def _checked(hint: Any, value: Any, where: str) -> Any:

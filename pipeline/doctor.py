@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pipeline import captures
+from pipeline import captures, config, recipes
+from pipeline.errors import InputError
 
 LIBRARIES = ("torch", "numpy", "scipy", "cv2", "pycolmap", "OpenEXR", "av", "lzfse", "numba", "embreex", "trimesh",
              "kornia", "onnxruntime", "onnxscript", "pygltflib", "skimage", "safetensors", "matplotlib", "jinja2")  # fmt: skip
@@ -87,8 +88,13 @@ def browser() -> Finding:
 
 def recordings() -> Finding:
     """Count the recordings of every agent."""
-    agents = sorted(path.stem for path in Path("agents").glob("*.toml"))
-    counts = {name: len(captures.find(Path("captures", name))) for name in agents}
+    counts = {}
+    for recipe in sorted(Path("agents").glob("*.toml")):
+        try:
+            flow = recipes.flow(config.read_table(recipe).get(recipes.FLOW_TABLE, {}), str(recipe))
+        except InputError as error:
+            return Finding("recordings", "warn", str(error))
+        counts[recipe.stem] = len(captures.find(Path("captures", recipe.stem), flow))
     return Finding("recordings", "ok", ", ".join(f"{name}: {count or 'built-in'}" for name, count in counts.items()))
 
 

@@ -3,7 +3,7 @@
     python -SE -m pipeline.plan plan HOME             HOME is an agent, <agent>/variants/<name>, or <agent>/tables
     python -SE -m pipeline.plan redo HOME ARTIFACT    have one artifact made again
     python -SE -m pipeline.plan inputs HOME ARTIFACT...   the options that name these artifacts to a stage run by hand
-    python -SE -m pipeline.plan new AGENT             a recipe and a capture folder for a new animal
+    python -SE -m pipeline.plan new AGENT [TAKEN...]  a recipe and a capture folder for a new animal of another name than these
 
 Every check of the user's input happens before anything is written; a file is rewritten only when its content
 changes, so that its age tells Make what is to be looked at. Standard library only: it runs at every `make`.
@@ -36,6 +36,7 @@ def read(home: Home, cache: sources.Cache) -> Plan:
         said = captures.remarks(folder, names, recipe.get(recipes.VIDEOS_TABLE, {}), where)
         hashes = {name: _digest_of_recording(folder / name, cache) for name in names}
     else:
+        captures.refuse_strangers(folder, flow)
         said = recipes.builtin_remarks(flow, recipe, cache, where)
         hashes = dict.fromkeys(said)
     videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
@@ -103,9 +104,11 @@ def inputs(home: Home, names: Sequence[str]) -> str:
     return " ".join(f"--{name.replace('_', '-')} {known[name].parent if name in several else known[name]}" for name in names)
 
 
-def new_agent(name: str) -> None:
+def new_agent(name: str, taken: Sequence[str] = ()) -> None:
     """Write the recipe and the capture folder of a new animal; an existing recipe stays as it is."""
     home = Home.parse(name)
+    if name in taken:
+        raise InputError("REC-004", f"`make {name}` means something else already", remedy="take another name")
     recipe = Path("agents", f"{home.agent}.toml")
     if not recipe.exists():
         template = Path("agents", "cat.toml").read_text()
@@ -200,8 +203,8 @@ def main(arguments: list[str]) -> int:
                 mark_redo(Home.parse(home), name)
             case ["inputs", home, *names]:
                 print(inputs(Home.parse(home), names))
-            case ["new", name]:
-                new_agent(name)
+            case ["new", name, *taken]:
+                new_agent(name, taken)
             case _:
                 print(__doc__, file=sys.stderr)
                 return 2

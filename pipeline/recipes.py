@@ -27,10 +27,11 @@ class Trial:
 
 
 def read(path: Path, cache: sources.Cache) -> tuple[dict[str, Any], str]:
-    """Read a recipe or an overlay and refuse tables and keys that no stage knows."""
+    """Read a recipe or an overlay and refuse tables and keys that no stage knows, and values of a kind that it does not want."""
     if not path.is_file():
         known = ", ".join(sorted(other.stem for other in path.parent.glob("*.toml"))) or "none"
-        raise InputError("REC-005", "there is no such recipe", str(path), f"known: {known}; a new animal: make new AGENT=...")
+        remedy = f"known: {known}" + ("" if path.parent.name == "variants" else "; a new animal: make new AGENT=...")
+        raise InputError("REC-005", "there is no such recipe", str(path), remedy)
     recipe = config.read_table(path)
     stages = {dag.table_of(node): node for node in reversed(dag.FLOW)}
     config.refuse_unknown(recipe, {*stages, VIDEOS_TABLE, FLOW_TABLE}, where=str(path), kind="table")
@@ -39,8 +40,22 @@ def read(path: Path, cache: sources.Cache) -> tuple[dict[str, Any], str]:
             raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
         known = sources.settings(stages[name].stage, cache) if name in stages else None
         if known is not None:
-            config.refuse_unknown(table, set(known) - set(stages[name].fixed), where=f"{path}: [{name}]")
+            free = {key: setting for key, setting in known.items() if key not in stages[name].fixed}
+            _refuse_misfits(table, free, f"{path}: [{name}]", cache)
     return recipe, str(path)
+
+
+def _refuse_misfits(table: Mapping[str, Any], known: Mapping[str, sources.Setting], where: str, cache: sources.Cache) -> None:
+    """Raise REC-001 or REC-002 for the first key that does not fit, in inner tables too."""
+    config.refuse_unknown(table, known, where=where)
+    for key, value in table.items():
+        inner = sources.inner(known[key], cache)
+        if inner is None:
+            config.refuse_misfit(value, known[key].kind, where=f"{where}: {key}")
+        elif isinstance(value, Mapping):
+            _refuse_misfits(value, inner, f"{where}: {key}", cache)
+        else:
+            raise InputError("REC-002", f"{value!r} is no table", f"{where}: {key}", f"keys in it: {', '.join(sorted(inner))}")
 
 
 def flow(table: Mapping[str, Any], where: str) -> Flow:
@@ -54,7 +69,7 @@ def flow(table: Mapping[str, Any], where: str) -> Flow:
 
 def trials(table: Mapping[str, Any], cache: sources.Cache) -> Iterator[Trial]:
     """Yield every trained method of the tables with every seed; a method is a variant of that name."""
-    settings = {**(sources.settings(TABLES_STAGE, cache) or {}), **table}
+    settings = {**_defaults(TABLES_STAGE, cache), **table}
     count, methods = _count(settings, "seeds", TABLES_STAGE), settings.get("methods", ())
     if not isinstance(methods, list | tuple) or not all(isinstance(method, str) for method in methods):
         raise InputError("REC-002", f"{methods!r} is no list of methods", f"[{TABLES_STAGE}]: methods", 'write ["ats", ...]')
@@ -75,16 +90,22 @@ def merged(table: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, An
 def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], cache: sources.Cache, where: str) -> dict[str, captures.Remarks]:
     """Return the built-in capture's recordings; an override may change them as it may a user's."""
     node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
-    settings = {**(sources.settings(node.stage, cache) or {}), **recipe.get(dag.table_of(node), {})}
+    settings = {**_defaults(node.stage, cache), **recipe.get(dag.table_of(node), {})}
     if begins == "recordings":
         said = captures.builtin(*(_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions")))
     else:
         said = captures.builtin_lives(*(_count(settings, key, where) for key in ("homes", "sessions_per_home")))
-    config.refuse_unknown(overrides, said, where=f"{where}: [videos]", kind="recording")
+    for name in (name for name in overrides if name not in said):
+        remedy = f"copy it into captures/, beside the others; without any, the built-in capture has {', '.join(said)}"
+        raise InputError("REC-001", f"unknown recording {name!r}", f"{where}: [videos]", remedy)
     given = {name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()}
     return {
         name: config.from_table(captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]") for name in said
     }
+
+
+def _defaults(stage: str, cache: sources.Cache) -> dict[str, Any]:
+    return {key: setting.default for key, setting in (sources.settings(stage, cache) or {}).items()}
 
 
 def _count(settings: Mapping[str, Any], key: str, where: str) -> int:

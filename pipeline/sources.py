@@ -20,13 +20,25 @@ class Source:
     digest: str
     imports: tuple[str, ...]
     """Local modules that it may import, dotted."""
-    settings: dict[str, dict[str, Any]]
-    """Per dataclass: its fields' defaults, None where they are no literals."""
+    settings: dict[str, dict[str, list[Any]]]
+    """Per dataclass and field: its type as written, and its default, None where that is no literal."""
     bases: dict[str, list[str]]
     """Per dataclass: what it inherits from, as written."""
 
 
-READER = 2
+@dataclass(frozen=True)
+class Setting:
+    """One field of a dataclass of settings."""
+
+    kind: str
+    """Its type, as written."""
+    default: Any
+    """None where it is no literal."""
+    module: str
+    """Declares the field, and knows the names in `kind`."""
+
+
+READER = 3
 """Raise it when more is read of a file, so that what was read before is read again."""
 
 
@@ -62,14 +74,17 @@ def digest(stage: str, cache: Cache) -> str:
     return artifact.digest_of([seen, _assets(Path("stages") / stage, cache)])
 
 
-def settings(stage: str, cache: Cache) -> dict[str, Any] | None:
-    """Return the fields of the stage's `Config`, inherited ones included, and their literal defaults, or None if it
-    cannot be told.
-    """
+def settings(stage: str, cache: Cache) -> dict[str, Setting] | None:
+    """Return the fields of the stage's `Config`, inherited ones included, or None if they cannot be told."""
     return _fields(f"stages.{stage}.__main__", "Config", cache)
 
 
-def _fields(module: str, name: str, cache: Cache) -> dict[str, Any] | None:
+def inner(setting: Setting, cache: Cache) -> dict[str, Setting] | None:
+    """Return the fields of the dataclass that a setting is of, or None where it is of another type."""
+    return _fields(setting.module, setting.kind, cache)
+
+
+def _fields(module: str, name: str, cache: Cache) -> dict[str, Setting] | None:
     """Return the fields of the class `name` that a module defines or imports; `room.Options` is looked up in `room`."""
     path = _path_of(module)
     if path is None:
@@ -77,7 +92,8 @@ def _fields(module: str, name: str, cache: Cache) -> dict[str, Any] | None:
     source = Source(**cache.get(path, _read))
     if name in source.settings:
         inherited = [_fields(module, base, cache) or {} for base in source.bases[name]]
-        return {key: value for fields in (*inherited, source.settings[name]) for key, value in fields.items()}
+        own = {key: Setting(kind, default, module) for key, (kind, default) in source.settings[name].items()}
+        return {key: setting for fields in (*inherited, own) for key, setting in fields.items()}
     home, _, name = name.rpartition(".")
     suffix = f".{home or name}"
     found = (_fields(other if home else other.removesuffix(suffix), name, cache) for other in source.imports if other.endswith(suffix))
@@ -115,7 +131,7 @@ def _read(path: Path) -> dict[str, Any]:
     imports = {name for node in ast.walk(tree) for name in _imported(node) if name.startswith(("pipeline", "stages"))}
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
     bases = {cls.name: [ast.unparse(base) for base in cls.bases] for cls in classes}
-    fields = {cls.name: {n.target.id: _literal(n.value) for n in cls.body if isinstance(n, ast.AnnAssign)} for cls in classes}
+    fields = {cls.name: dict(_field(node) for node in cls.body if isinstance(node, ast.AnnAssign)) for cls in classes}
     for node in ast.walk(tree):
         _drop_docstrings(node)
     return asdict(Source(artifact.digest_of(ast.dump(tree)), tuple(sorted(imports)), fields, bases))
@@ -139,8 +155,9 @@ def _drop_docstrings(node: ast.AST) -> None:
         node.body = kept or [ast.Pass()]
 
 
-def _literal(value: ast.expr | None) -> Any:
+def _field(node: ast.AnnAssign) -> tuple[str, list[Any]]:
     try:
-        return None if value is None else ast.literal_eval(value)
+        default = None if node.value is None else ast.literal_eval(node.value)
     except ValueError:
-        return None
+        default = None
+    return ast.unparse(node.target), [ast.unparse(node.annotation), default]

@@ -99,8 +99,11 @@ def test_file_names_are_never_executed(house):
         (["plan", "toy"], {"agents/toy.toml": "[scene_localizer]\ntarget = 'agent'\n"}, "REC-001"),
         (["plan", "toy"], {"agents/toy.toml": "seed = 1\n"}, "REC-001"),
         (["plan", "toy"], {"agents/toy.toml": "segment_agent = 1\n"}, "REC-002"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agent]\nseed = '1'\n"}, "REC-002"),
         (["plan", "toy"], {"agents/toy.toml": "[segment_agent\n"}, "REC-003"),
         (["plan", "toy"], {"agents/toy.toml": "[videos.'other.r3d']\nsplit = 'test'\n"}, "REC-001"),
+        (["new", "clean", "test", "clean"], {}, "REC-004"),
+        (["plan", "toy"], {"captures/toy/session.heic": "x"}, "CAP-003"),
         (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
     ],
 )
@@ -210,4 +213,4 @@ def test_inherited_settings_may_be_set(monkeypatch):
     sources._path_of.cache_clear()
     found = sources.settings("register_videos", sources.Cache())
     assert {"seed", "vote", "align", "begin"} <= set(found)
-    assert found["begin"] == "votes"
+    assert found["begin"].default == "votes"

@@ -42,6 +42,21 @@ def test_a_count_of_recordings_of_the_wrong_type_is_refused():
         recipes.builtin_remarks("recordings", {"synthesize_capture": {"session_count": "two"}}, sources.Cache(), "agents/toy.toml")
 
 
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("[train_behavior.training.optimization]\nstepz = 1", "optimization: unknown key 'stepz'"),
+        ("[train_behavior.training.optimization]\nsteps = 1.5", "optimization: steps: 1.5"),
+        ("[train_behavior]\ntraining = 3", "training: 3 is no table"),
+        ("[segment_agent]\nbackend = 'sam'", "backend: 'sam'"),
+    ],
+)
+def test_inner_tables_are_checked_before_anything_is_built(tmp_path, text, where):
+    (tmp_path / "cat.toml").write_text(text)
+    with pytest.raises(InputError, match=f"REC-00[12] .*{where}"):
+        recipes.read(tmp_path / "cat.toml", sources.Cache())
+
+
 def test_tables_of_motion_need_no_recordings(tmp_path):
     house = checkout.create(tmp_path)
     house.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')
