@@ -93,6 +93,12 @@ def digests(folder: Path) -> dict[str, str]:
     return {name: digest_of_file(folder / name) for name in names if name not in (MANIFEST, STAMP)}
 
 
+def damaged(folder: Path) -> list[str]:
+    """Return the files of the finished artifact at `folder` that are not what was written, or are gone."""
+    manifest, found = read_manifest(folder), digests(folder)
+    return [name for name, digest in manifest.files.items() if found.get(name) != digest] if manifest else []
+
+
 def digest_of_file(path: Path) -> str:
     """Return the sha256 of one file's bytes."""
     with path.open("rb") as file:

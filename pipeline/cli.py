@@ -6,8 +6,8 @@ and turns `InputError` into one message and exit code 2. `Task` is all that a fr
 
 import argparse
 import dataclasses
-import errno
 import os
+import signal
 import sys
 import typing
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +17,7 @@ from typing import Any
 
 from pipeline import artifact, dag, videos
 from pipeline import config as configuration
-from pipeline.errors import InputError
+from pipeline.errors import InputError, disk_told
 from pipeline.videos import Role, Split, Video
 
 
@@ -118,19 +118,13 @@ def enter(
     given = parser.parse_args()
     stage = Path(sys.argv[0]).parent.name
     try:
-        run(_task(given, stage, config, reads + optional, options))
+        with disk_told(str(given.out)):
+            run(_task(given, stage, config, reads + optional, options))
     except InputError as error:
-        sys.exit(_told(error))
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        where = str(error.filename or given.out)
-        sys.exit(_told(InputError("SYS-001", "the disk is full", where, "free some space and run the same again")))
-
-
-def _told(error: InputError) -> int:
-    print(f"error: {error}", file=sys.stderr, flush=True)
-    return 2
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
 
 
 def _parser(doc: str, reads: tuple[str, ...], optional: tuple[str, ...]) -> argparse.ArgumentParser:

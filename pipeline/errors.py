@@ -1,7 +1,11 @@
 """The one error that a user can cause and therefore can repair.
 
-Everything else that goes wrong is a broken promise of ours: an `assert` or a plain traceback.
+Everything else that goes wrong is a broken promise of ours: an `assert` or a plain traceback. Standard library only.
 """
+
+import contextlib
+import errno
+from collections.abc import Iterator
 
 
 class InputError(Exception):
@@ -18,3 +22,18 @@ class InputError(Exception):
         place = f"{self.where}: " if self.where else ""
         advice = f"\n  -> {self.remedy}" if self.remedy else ""
         return f"{self.code} {place}{self.what}{advice}"
+
+
+@contextlib.contextmanager
+def disk_told(where: str) -> Iterator[None]:
+    """Turn an `OSError` that the user can cure into an `InputError`: SYS-001 (full), SYS-003 (forbidden)."""
+    try:
+        yield
+    except OSError as error:
+        place = str(error.filename or where)
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise InputError("SYS-001", "the disk is full", place, "free some space and run the same again") from error
+        if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            remedy = "look at who owns it and whether the disk is mounted read-only, then run the same again"
+            raise InputError("SYS-003", f"cannot be used: {error.strerror}", place, remedy) from error
+        raise

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import artifact, captures, dag, recipes, sources
-from pipeline.errors import InputError
+from pipeline.errors import InputError, disk_told
 from pipeline.jobs import Home, Job, Plan, jobs, lock_file, redo_mark, seen
 
 
@@ -196,18 +196,19 @@ def _plan(home: Home) -> None:
 def main(arguments: list[str]) -> int:
     """Run the command line of the planner; returns its exit code."""
     try:
-        match arguments:
-            case ["plan", home]:
-                _plan(Home.parse(home))
-            case ["redo", home, name]:
-                mark_redo(Home.parse(home), name)
-            case ["inputs", home, *names]:
-                print(inputs(Home.parse(home), names))
-            case ["new", name, *taken]:
-                new_agent(name, taken)
-            case _:
-                print(__doc__, file=sys.stderr)
-                return 2
+        with disk_told("build"):
+            match arguments:
+                case ["plan", home]:
+                    _plan(Home.parse(home))
+                case ["redo", home, name]:
+                    mark_redo(Home.parse(home), name)
+                case ["inputs", home, *names]:
+                    print(inputs(Home.parse(home), names))
+                case ["new", name, *taken]:
+                    new_agent(name, taken)
+                case _:
+                    print(__doc__, file=sys.stderr)
+                    return 2
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -8,7 +8,6 @@ atomically -> record -> stamp. Exit codes: the stage's own (2 bad input, 75 stop
 """
 
 import argparse
-import errno
 import json
 import os
 import platform
@@ -24,7 +23,7 @@ from types import FrameType
 from typing import Any
 
 from pipeline import artifact, jobs, processes
-from pipeline.errors import InputError
+from pipeline.errors import InputError, disk_told
 
 LEAST_FREE_BYTES = 1 << 29
 """A stage does not begin on a disk with less than this free."""
@@ -35,6 +34,8 @@ GRACE_S = 30
 EXPLAINED = {
     75: "stopped after saving; run the same again to go on",
     76: "training diverged; its diagnosis stands above",
+    128 + signal.SIGINT: "stopped; run the same again to go on",
+    128 + signal.SIGTERM: "stopped; run the same again to go on",
     128 + signal.SIGKILL: "killed; if nobody did it, the memory was full: close other programs, or build with -j1",
 }
 
@@ -116,6 +117,8 @@ def _do(job: dict[str, Any], key: str, resume: Path, together: int) -> int:
     seconds = time.time() - start
     if code:
         _say(job["id"], EXPLAINED.get(code, f"failed with exit code {code}"))
+        if code not in EXPLAINED:
+            _tell_damage(job)
         return code
     made = artifact.read_manifest(out)
     assert made is not None and made.key == key, f"{job['stage']} ended well without writing {out}"
@@ -131,6 +134,16 @@ def _do(job: dict[str, Any], key: str, resume: Path, together: int) -> int:
     artifact.write_if_changed(_record(job), json.dumps(record, indent=1, sort_keys=True) + "\n")
     _say(job["id"], f"done in {seconds:.1f} s, peak {peak_mb:.0f} MB{_quality(out)}")
     return 0
+
+
+def _tell_damage(job: dict[str, Any]) -> None:
+    """Say which inputs are not what was written, for which alone a stage may have failed."""
+    for folder in (Path(entry["path"]) for entry in job["inputs"]):
+        if changed := artifact.damaged(folder):
+            what = "has been damaged, changed or deleted since it was made"
+            error = InputError("ART-005", what, str(folder / changed[0]), f"rm -r {folder}, and run the same again")
+            for line in f"error: {error}".splitlines():
+                _say(job["id"], line)
 
 
 def _spawn(job: dict[str, Any], command: list[str]) -> tuple[int, float]:
@@ -222,14 +235,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("job")
     given = parser.parse_args(arguments)
     try:
-        return run(given.home, given.job, given.processes)
+        with disk_told(given.job):
+            return run(given.home, given.job, given.processes)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        print(f"error: {InputError('SYS-001', 'the disk is full', given.job, 'free some space and run the same again')}", file=sys.stderr)
         return 2
 
 

@@ -63,7 +63,8 @@ def write_gray(path: Path, image: UInt8[np.ndarray, "height width"]) -> None:
 def read_depth(path: Path, channel: str | None = "Z") -> Float[np.ndarray, "height width"]:
     """Read a depth EXR as float32 metres, 0 where the value is not finite, not positive or absurdly far.
 
-    Without a ``channel`` the file must have exactly one.     Raises InputError CAP-022 for files that are not EXR, ask for too many pixels or lack the channel.
+    Without a ``channel`` the file must have exactly one. Raises InputError CAP-022 for files that are not EXR, ask for too
+    many pixels or lack the channel.
     """
     _check_exr_size(Path(path))
     try:

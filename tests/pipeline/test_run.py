@@ -113,6 +113,16 @@ def test_a_failing_stage_keeps_the_old_result_and_its_code(house):
     assert not leftovers(house)
 
 
+def test_a_damaged_input_is_named_when_a_stage_fails(house):
+    house.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
+    data = house.folder / "build/toy/behavior_data"
+    (data / "1.bin").write_bytes(b"cut")
+    failed = house.make("toy.behavior")
+    assert failed.returncode == 2
+    assert "error: ART-005 build/toy/behavior_data/1.bin" in failed.stderr
+    assert "rm -r build/toy/behavior_data" in failed.stderr
+
+
 def test_an_unfinished_input_is_named(house):
     (house.folder / "build/toy/reconstruction/manifest.json").unlink()
     refused = house.python("pipeline.run", "toy", "splats")
