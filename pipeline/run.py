@@ -161,7 +161,8 @@ def _spawn(job: dict[str, Any], command: list[str]) -> tuple[int, float]:
         child.terminate()
         threading.Timer(GRACE_S, child.kill).start()
 
-    old = signal.signal(signal.SIGTERM, stop)
+    old = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
+    old[signal.SIGINT] = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the child has its own; what it saves is waited for
     reader = threading.Thread(target=_forward, args=(job["id"], child.stdout), daemon=True)
     reader.start()
     watchdog = threading.Timer(LONGEST_S, child.kill)
@@ -169,11 +170,10 @@ def _spawn(job: dict[str, Any], command: list[str]) -> tuple[int, float]:
     watchdog.start()
     try:
         _, status, usage = os.wait4(child.pid, 0)
-    except KeyboardInterrupt:  # the child has had its own; what it saved is kept
-        _, status, usage = os.wait4(child.pid, 0)
     finally:
         watchdog.cancel()
-        signal.signal(signal.SIGTERM, old)
+        for number, handler in old.items():
+            signal.signal(number, handler)
     reader.join(timeout=2)
     code = os.waitstatus_to_exitcode(status)
     child.returncode = code
@@ -240,6 +240,8 @@ def main(arguments: list[str]) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
 
 
 if __name__ == "__main__":

@@ -85,7 +85,7 @@ class Movie:
         try:
             container = av.open(str(self._path))
         except (av.error.FFmpegError, OSError) as error:
-            raise damaged(self.where, f"not a readable video: {error}") from error
+            raise damaged(self.where, f"not a readable video: {error.strerror or error}") from error
         with container:
             if not container.streams.video:
                 raise no_frames(self.where, "the file holds no pictures")

@@ -41,7 +41,7 @@ def check(files: Sequence[tuple[Path, Role]], samples: int, rng: np.random.Gener
             look = looking.look(open_recording(path), samples, max_depth_m=MAX_DEPTH_M)
         except InputError as error:
             found = (Problem(error.code, error.what, error.remedy),)
-            yield Verdict(path.name, role, None, found, telling.refused(path.name, role, error))
+            yield Verdict(path.name, role, None, found, telling.refused(path, role, error))
             continue
         seen = _seen(look, role, room, rng)
         found = tuple(problems(seen, role))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.videos import Role
@@ -26,9 +27,10 @@ def told(name: str, role: Role, seen: Seen, found: Sequence[Problem]) -> str:
     return "\n".join(lines if found else [*lines, "  good"])
 
 
-def refused(name: str, role: Role, error: InputError) -> str:
-    """Return why a recording cannot be used."""
-    return f"{name}  {role}\n  {error.code} {error.what}\n    -> {error.remedy}"
+def refused(path: Path, role: Role, error: InputError) -> str:
+    """Return why a recording cannot be used, and for which of its files."""
+    file = error.where.removeprefix(str(path)).lstrip("/:") if error.where.startswith(str(path)) else ""
+    return f"{path.name}  {role}\n  {error.code} {f'{file}: ' if file else ''}{error.what}\n    -> {error.remedy}"
 
 
 def _turn(seen: Seen) -> str:

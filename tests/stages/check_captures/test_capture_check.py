@@ -192,10 +192,12 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
     assert "CAP-042" in capsys.readouterr().err
     _made().write(tmp_path / "walkthrough.r3d")
     (tmp_path / "broken.r3d").write_bytes(b"PK")
+    (tmp_path / "exported").mkdir()
+    (tmp_path / "exported/metadata.json").write_text("{")
     (tmp_path / "notes.txt").write_text("x")
     assert front.main([str(tmp_path)]) == 2
     told = capsys.readouterr().out
-    for expected in ("Record3D .r3d", "CAP-031", "CAP-001", "notes.txt", "CAP-003", "CAP-040", "turnaround"):
+    for expected in ("Record3D .r3d", "CAP-031", "CAP-001", "CAP-004 metadata.json: ", "notes.txt", "CAP-003", "CAP-040", "turnaround"):
         assert expected in told, told
 
 
