@@ -6,10 +6,13 @@ from matplotlib.figure import Figure
 
 from pipeline import figures
 from pipeline.qa import Check, Picture
+from pipeline.space import rigid
 from stages.read_trajectories.life import Life
 
 FASTEST_M_S = 12.0
 """Hardly any animal at home is faster."""
+FASTEST_RAD_S = 10.0
+"""Nor does any turn faster; degrees that are read as radians do."""
 
 
 def pictures(life: Life) -> list[Picture]:
@@ -36,10 +39,13 @@ def checks(life: Life) -> list[Check]:
     step = np.diff(life.timestamp_s)
     speed = np.linalg.norm(np.diff(life.world_from_agent[:, :3, 3], axis=0), axis=-1) / np.maximum(step, 1e-6)
     within = speed[(step < 1.0) & np.isfinite(speed)]
+    rotation = life.world_from_agent[:, :3, :3]
+    turning = (rigid.rotation_angle(rotation[:-1], rotation[1:]) / np.maximum(step, 1e-6))[(step < 1.0) & np.isfinite(speed)]
     voxel, known = life.volume.voxel(np.nan_to_num(life.world_from_agent[:, :3, 3]))
     solid = (life.volume.occupancy[tuple(voxel.T)] == 1) & known
     return [
         Check("seconds", float(step[step < 1.0].sum()), "s", 20, 6.4, "higher"),
         Check("speed, 99 % below", float(np.quantile(within, 0.99)) if len(within) else None, "m/s", FASTEST_M_S),
+        Check("turning, 99 % below", float(np.quantile(turning, 0.99)) if len(turning) else None, "rad/s", FASTEST_RAD_S),
         Check("positions in obstacles", float(solid.mean()), "share", 0.01, 0.2),
     ]

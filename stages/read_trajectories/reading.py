@@ -27,12 +27,15 @@ class Reading:
 
 
 def read(path: Path, reading: Reading) -> Life:
-    """Read a recording of any kind. Raises TRJ-001, TRJ-002, ART-010."""
+    """Read a recording of any kind. Raises TRJ-001, TRJ-002."""
     if path.is_dir():
         return _from_csv(path / "trajectory.csv", path / "obstacles.csv", reading)
     if path.suffix.lower() == ".csv":
         return _from_csv(path, None, reading)
-    stored = arrays.load(path)
+    try:
+        stored = arrays.load(path)
+    except InputError as error:
+        raise InputError("TRJ-001", error.what, str(path), "save it again with numpy.savez, arrays of numbers only") from error
     return _from_life(stored) if set(LIFE) <= set(stored) else _from_joints(path, stored, reading.skeleton)
 
 

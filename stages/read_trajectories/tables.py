@@ -12,29 +12,40 @@ from stages.read_trajectories.life import NOBODY_M, nobody, one_after_another
 
 NEEDED = ("time", "x", "y", "z", "heading")
 OBSERVER = ("observer_x", "observer_y", "observer_z")
+LONGEST_STEP_S = 1.0
+"""Rows that are typically further apart tell no motion: their times are no seconds."""
+SURPLUS = "more cells than the header"
 
 
 def columns(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
-    """Read a CSV table by column. Raises TRJ-001 when a needed column is missing or a row is short."""
+    """Read a CSV table by column, names in lower case; cells that a short row lacks are empty.
+
+    Raises TRJ-001 when a needed column is missing or a row has more cells than the header.
+    """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            found = {name.strip(): [] for name in rows.fieldnames or ()}
+            rows = csv.DictReader(file, skipinitialspace=True, restkey=SURPLUS)
+            found = {name.strip().lower(): [] for name in rows.fieldnames or ()}
             for row in rows:
+                if SURPLUS in row:
+                    remedy = "commas between cells, points in numbers"
+                    raise InputError("TRJ-001", f"line {rows.line_num} has {SURPLUS}", str(path), remedy)
                 for name, value in row.items():
-                    found[name.strip()].append((value or "").strip())
-    except (UnicodeDecodeError, csv.Error, KeyError, AttributeError) as error:
+                    found[name.strip().lower()].append((value or "").strip())
+    except (UnicodeDecodeError, csv.Error) as error:
         raise InputError("TRJ-001", f"cannot be read as CSV: {error}", str(path), "save it as comma-separated UTF-8") from error
     missing = [name for name in needed if name not in found]
     if missing:
-        raise InputError("TRJ-001", f"has no column {', '.join(missing)}", str(path), f"columns: {', '.join(needed)}")
+        remedy = f"name the columns {','.join(needed)} in the first line, with commas; it says {','.join(found) or 'nothing'}"
+        raise InputError("TRJ-001", f"has no column {', '.join(missing)}", str(path), remedy)
     return found
 
 
 def numbers(path: Path, table: dict[str, list[str]], name: str) -> Float[np.ndarray, "row"]:
-    """Return a column as numbers; empty cells are NaN. Raises TRJ-001 for anything else."""
+    """Return a column as numbers; empty and infinite cells are NaN. Raises TRJ-001 for anything else."""
     try:
-        return np.array([float(value) if value else np.nan for value in table[name]])
+        found = np.array([float(value) if value else np.nan for value in table[name]])
+        return np.where(np.isinf(found), np.nan, found)
     except ValueError as error:
         raise InputError(
             "TRJ-001", f"column {name} is not numeric: {error}", str(path), "one number per cell, metres or seconds"
@@ -46,7 +57,7 @@ def motion_from_csv(
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame 4 4"]]:
     """Return times, ``world_from_agent`` and ``world_from_camera``; ids follow each other on one clock.
 
-    Rows without a position are frames in which the animal was not seen (NaN).
+    Rows without a position are frames in which the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
     """
     table = columns(path, NEEDED)
     observed = any(name in table for name in OBSERVER)
@@ -58,8 +69,7 @@ def motion_from_csv(
     names = table.get("id", [""] * len(value["time"]))
     rows = [np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)]
     rows = [mine[np.argsort(value["time"][mine], kind="stable")] for mine in rows]
-    if any((np.diff(value["time"][mine]) <= 0).any() for mine in rows):
-        raise InputError("TRJ-001", "two rows of one id have the same time", str(path), "give each animal or clip an id of its own")
+    _refuse_impossible_times(path, [value["time"][mine] for mine in rows])
     order = np.concatenate(rows)
     turn = np.zeros((len(order), 3))
     turn[:, 1] = value["heading"][order]
@@ -70,3 +80,15 @@ def motion_from_csv(
         seen = np.stack([value[name][order] for name in OBSERVER], axis=-1)
         camera[:, :3, 3] = np.where(np.isfinite(seen), seen, NOBODY_M)
     return one_after_another([value["time"][mine] for mine in rows]), agent, camera
+
+
+def _refuse_impossible_times(path: Path, clips: list[Float[np.ndarray, "row"]]) -> None:
+    """Raise TRJ-001 for sorted times, one array per id, of which two are the same, or which can be no seconds."""
+    for time in clips:
+        step = np.diff(time)
+        if (step == 0).any():
+            what = f"two rows of one id have the same time, {time[1:][step == 0][0]:g} s"
+            raise InputError("TRJ-001", what, str(path), "give each animal or clip an id of its own")
+        if len(step) and np.median(step) > LONGEST_STEP_S:
+            what = f"its rows are typically {np.median(step):g} s apart"
+            raise InputError("TRJ-001", what, str(path), "write times in seconds, several rows per second")

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.errors import InputError
 from pipeline.space import rigid
-from stages.read_trajectories import captured
+from stages.read_trajectories import captured, pictures
 from stages.read_trajectories.captured import Skeleton
 from stages.read_trajectories.life import APART_S, NOBODY_M
 from stages.read_trajectories.reading import Reading, read
@@ -94,7 +94,10 @@ def test_clips_of_joints_stand_on_the_floor(tmp_path):
         ("id,time,x,y,z,heading\na,zero,0,0,0,0\n", "TRJ-001.*time is not numeric"),
         ("id,time,x,y,z,heading\n", "TRJ-002"),
         ("id,time,x,y,z,heading\na,0,,,,\n", "TRJ-002.*no position"),
+        ("Time,X,Y,Z,Heading\n0,inf,0,0,0\n", "TRJ-002.*no position"),
         ("id,time,x,y,z,heading\na,1,0,0,0,0\na,1,1,0,0,0\n", "TRJ-001.*same time"),
+        ("time,x,y,z,heading\n0,0,0,0,0\n100,0,0,0,0\n", "TRJ-001.*100 s apart"),
+        ("time;x;y;z;heading\n0,1;0,0;0,0;0,0;0,0\n", "TRJ-001.*line 2 has more cells"),
         ("time,x,y,z,heading,observer_x\n0,0,0,0,0,0\n", "TRJ-001.*no column observer_y, observer_z"),
     ],
 )
@@ -109,6 +112,19 @@ def test_arrays_that_are_no_joints_are_refused(tmp_path, stored):
     np.savez(tmp_path / "t.npz", **stored)
     with pytest.raises(InputError, match="TRJ-001.*no joint positions"):
         read(tmp_path / "t.npz", READING)
+
+
+def test_a_file_that_is_no_archive_of_arrays_is_refused(tmp_path):
+    (tmp_path / "t.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match="TRJ-001.*no.* zip"):
+        read(tmp_path / "t.npz", READING)
+
+
+@pytest.mark.parametrize(("unit", "status"), [(1.0, "ok"), (180 / np.pi, "warn")])
+def test_degrees_turn_too_fast(tmp_path, unit, status):
+    rows = [f"{0.1 * i},{0.01 * i},0,0,{0.05 * np.sin(i) * unit}" for i in range(100)]
+    found = {check.name: check.status for check in pictures.checks(read(table(tmp_path / "t.csv", rows, "time,x,y,z,heading"), READING))}
+    assert found["turning, 99 % below"] == status
 
 
 def test_joints_that_are_not_known_are_refused(tmp_path):
