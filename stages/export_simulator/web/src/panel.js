@@ -69,11 +69,9 @@ export function buildPanel(state, clips, on) {
   at('slow').addEventListener('click', () => change('speed', state.speed === 1 ? 0.3 : 1));
   sync.push(() => at('slow').setAttribute('aria-pressed', state.speed !== 1));
 
-  at('panel-toggle').addEventListener('click', () => {
-    const closed = at('panel').classList.toggle('closed');
-    at('panel-toggle').setAttribute('aria-expanded', !closed);
-  });
-  if (innerWidth < 720) at('panel').classList.add('closed');
+  const fold = () => at('panel-toggle').setAttribute('aria-expanded', !at('panel').classList.toggle('closed'));
+  at('panel-toggle').addEventListener('click', fold);
+  if (matchMedia('(max-width: 720px), (max-height: 520px)').matches) fold();  // as in style.css
   sync.forEach((update) => update());
   return { refresh: () => sync.forEach((update) => update()) };
 }
