@@ -1,9 +1,11 @@
 """The rules of the house: floors, sizes, docstrings, doors, and a declaration that fits the programs."""
 
 import ast
+import builtins
 import importlib
 import re
 import subprocess
+import symtable
 import sys
 from functools import cache
 from pathlib import Path
@@ -100,6 +102,20 @@ def test_names_and_marks(path):
     assert not re.search(r"\b(TODO|FIXME|XXX)\b", path.read_text()), "no marks for later"
     for node in ast.walk(tree_of(path)):
         assert not (isinstance(node, ast.ExceptHandler) and node.type is None), f"line {node.lineno}: bare except"
+
+
+def undefined(table: symtable.SymbolTable, known: set[str]) -> set[str]:
+    """Return the names that a scope or one within it reads from the module, and that are not there."""
+    here = {symbol.get_name() for symbol in table.get_symbols() if symbol.is_global() and symbol.is_referenced()}
+    return (here - known).union(*(undefined(inner, known) for inner in table.get_children()))
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_every_name_is_defined(path):
+    """The linter cannot tell: to it the shapes of arrays in annotations are names as well."""
+    module = symtable.symtable(path.read_text(), str(path), "exec")
+    own = {symbol.get_name() for symbol in module.get_symbols() if symbol.is_assigned() or symbol.is_imported()}
+    assert not undefined(module, {*own, *dir(builtins), "__file__"})
 
 
 @pytest.mark.parametrize("path", FRONTS, ids=stage_of)

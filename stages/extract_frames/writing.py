@@ -12,7 +12,7 @@ from pipeline import qa
 from pipeline.errors import InputError
 from pipeline.files import arrays, images, meshes
 from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, Frame, Plan, quality_of
-from pipeline.recordings.recording import Recording
+from pipeline.recordings.recording import Recording, damaged
 
 MOST_LOST = 0.5
 """share of damaged pictures (0..1) beyond which a recording is refused"""

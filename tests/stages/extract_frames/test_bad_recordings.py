@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline import cli
+from pipeline.errors import InputError
 from pipeline.files import images
 from pipeline.recordings import lzfse_blocks
 from stages.extract_frames import __main__ as front
+from stages.extract_frames import writing
 from tests.stages.extract_frames.made_recordings import walk, write_zip
 
 
@@ -94,6 +96,11 @@ def test_flipped_bytes_are_refused(tmp_path, monkeypatch, capsys):
     data[at : at + 8] = bytes(8)
     path.write_bytes(data)
     assert "CAP-001" in _refused(path, tmp_path, monkeypatch, capsys)
+
+
+def test_a_video_that_is_mostly_damaged_is_refused(tmp_path):
+    with pytest.raises(InputError, match="CAP-001.*3 of 4 pictures"):
+        writing.write_frames(tmp_path, [None] * 3, total=4, min_depth_valid=0.2, where="a.mp4")
 
 
 def test_a_linked_member_is_refused(tmp_path, monkeypatch, capsys):
