@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 class Sparse:
     """One model: registered keyframes, points in the model's frame (arbitrary scale) and what sees them."""
 
-    frame: Int[np.ndarray, "key"]
+    frame: Int[np.ndarray, key]
     model_from_camera: Float[np.ndarray, "key 4 4"]
     points_model: Float[np.ndarray, "point 3"]
-    observed_point: Int[np.ndarray, "observation"]
-    observed_key: Int[np.ndarray, "observation"]
+    observed_point: Int[np.ndarray, observation]
+    observed_key: Int[np.ndarray, observation]
     observed_pixel: Float[np.ndarray, "observation 2"]
     reprojection_px: float
     reconstruction: pycolmap.Reconstruction

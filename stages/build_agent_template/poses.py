@@ -61,5 +61,5 @@ def depth_labels(labels: UInt8[np.ndarray, "height width"], size: tuple[int, int
 def _without_strays(points: Float[np.ndarray, "point 3"], middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "point 3"]:
     """Leave out points much farther from the middle than nearly all others."""
     distance = np.linalg.norm(points - middle, axis=1)
-    near: Bool[np.ndarray, "point"] = distance < 1.3 * np.quantile(distance, 0.98)
+    near = distance < 1.3 * np.quantile(distance, 0.98)
     return points[near]
