@@ -75,7 +75,7 @@ export: .venv/.ok
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
 simulate: .venv/.ok
-	@test -z '$(SUBGOALS)' || test -f '$(SUBGOALS)' || { echo "error: SIM-004 $(SUBGOALS): there is no such file" >&2; exit 2; }
+	@test -z '$(SUBGOALS)' || test -f '$(SUBGOALS)' || { { echo "error: SIM-004 $(SUBGOALS): there is no such file"; echo "  -> write it as docs/long_motion.md tells"; } >&2; exit 2; }
 	@$(MAKE) $(NESTING) $(ANIMAL).$(if $(SUBGOALS),longterm,behavior)
 	@$(call INPUTS,$(if $(SUBGOALS),longterm reconstruction,behavior) behavior_data) && \
 	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals $(SUBGOALS)) --out $(HOME_OF)/take

@@ -46,12 +46,18 @@ class Task:
 
     @property
     def device(self) -> str:
-        """`cpu` or `cuda`; `auto` takes CUDA where there is a usable one."""
-        if self.requested_device != "auto":
-            return self.requested_device
+        """`cpu` or `cuda`; `auto` takes CUDA where there is a usable one. Raises DEP-002 where it is asked for in vain."""
+        if self.requested_device == "cpu":
+            return "cpu"
         import torch  # late: it costs seconds, and many stages need none
 
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        if torch.cuda.is_available():
+            return "cuda"
+        if self.requested_device == "cuda":
+            raise InputError(
+                "DEP-002", "there is no CUDA device that torch can use", "--device cuda", "give --device cpu, or see make doctor"
+            )
+        return "cpu"
 
     def has(self, name: str) -> bool:
         """Tell whether the optional input `name` was given."""

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from pipeline.errors import InputError
+
 Role = Literal["walkthrough", "turnaround", "session", "heldout"]
 Split = Literal["train", "test", "none"]
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -34,5 +36,8 @@ class Video:
 
 
 def read(path: Path) -> tuple[Video, ...]:
-    """Read `videos.json`."""
-    return tuple(Video(**entry) for entry in json.loads(path.read_text()))
+    """Read `videos.json`. Raises `InputError` ART-003 for anything else."""
+    try:
+        return tuple(Video(**entry) for entry in json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError("ART-003", "is no list of recordings", str(path), "give build/<agent>/plan/videos.json") from error

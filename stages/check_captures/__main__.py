@@ -53,6 +53,7 @@ def _files(folder: Path, recipe: Path) -> list[tuple[Path, Role]]:
     """Return the recordings and their roles, from names, sidecars and the recipe."""
     names = captures.find(folder)
     if not names:
+        captures.refuse_strangers(folder)
         what = "there are no recordings; make builds from the built-in capture"
         raise InputError("CAP-042", what, str(folder), "copy recordings there (README: your own animal)")
     overrides = config.read_table(recipe).get("videos", {}) if recipe.is_file() else {}
