@@ -27,8 +27,8 @@ SHARE = 0.15
 """A vertex that touches in this share of the frames is a contact vertex."""
 FOOT_M = 0.035
 """Contact vertices closer than this at rest belong to the same foot."""
-SWING_M_S2 = 30.0
-"""Acceleration that a swinging foot may need: a step of 10 cm takes 0.14 s."""
+SWING_M_S2 = 15.0
+"""Acceleration that a swinging foot may need: a step of 10 cm takes 0.2 s."""
 STRIDE_M = 0.25
 """A foot that glides further than this in one phase should stand more than once."""
 BRIEFEST = 3

@@ -37,21 +37,21 @@ class Settings:
     """steps of Adam"""
     rate: float = 0.004
     """learning rate, metres and radians a step; falls to a tenth"""
-    foot: float = 3.0
+    foot: float = 5.0
     """a standing foot stays where it stands on average"""
     give_m: float = 0.002
     """nearer than this to that place the pull on it fades"""
     ground: float = 1.5
     """a standing foot touches what it stands on"""
-    collision: float = 40.0
+    collision: float = 60.0
     """nothing is inside the scene, on average over vertices"""
-    deepest: float = 4.0
+    deepest: float = 6.0
     """nor is the deepest vertex of any frame"""
     contact: float = 0.02
     """contact vertices near the scene touch it"""
     contact_scale_m: float = 0.02
     """distance at which the Geman-McClure function lets go"""
-    smooth: float = 70.0
+    smooth: float = 140.0
     """neighbouring meshes"""
     smoothness: Literal["acceleration", "velocity"] = "acceleration"
     """what is kept small between neighbouring meshes; the paper's is the velocity, which also slows the animal down"""

@@ -20,9 +20,10 @@ from pipeline.models.contacts import Contacts
 from pipeline.models.longterm import ROOT, PoseNet, RouteNet, Sizes, StaticBody
 from pipeline.models.motion_optimization import Physique, Settings, settled
 from pipeline.models.plausibility import Judge
-from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, eased, joined, leaping
+from pipeline.models.short_motions import RATE_HZ, STEPS, Moving, eased, evenly_turned, joined, leaping
 from pipeline.models.surroundings import Surroundings
 from pipeline.models.wayside import Seen
+from pipeline.space import rigid
 
 NETWORKS = ("static", "route", "pose")
 LEAP_M = 0.1
@@ -41,6 +42,8 @@ class Habits:
     """median way of a two-second motion that travels"""
     above_m: float
     """how far the highest bone is above the root, median while it travels"""
+    turn_rad: float
+    """how far the root turns from one frame to the next, 99th percentile"""
 
 
 @dataclass(frozen=True)
@@ -162,7 +165,8 @@ class LongTerm:
             bodies = self._passed(bodies, np.flatnonzero(~drawn), scene, rng)
         rise = np.abs(np.diff(world_from_agent[:, 1, 3]))
         parts = zip(self.short_motions(bodies[:-1], bodies[1:], scene, rng), rise > LEAP_M, strict=True)
-        return eased(joined([leaping(part) if leaps else part for part, leaps in parts])), bodies
+        made = eased(joined([leaping(part) if leaps else part for part, leaps in parts]))
+        return evenly_turned(made, self.habits.turn_rad), bodies
 
     def _passed(self, bodies: Moving, passing: Int[np.ndarray, "place"], scene: Surroundings, rng: np.random.Generator) -> Moving:
         middle = _stacked([part[STEPS // 2] for part in self.short_motions(bodies[:-1], bodies[1:], scene, rng)])
@@ -179,8 +183,11 @@ def placed(channels: Float[Tensor, "body channel"], world_from_place: Float[np.n
 
 
 def habits_of(stretches: list[Moving], scenes: list[Surroundings], *, moving_m: float = 0.3) -> Habits:
-    """Measure how a body moves; ``moving_m`` is the least way in two seconds that counts as travelling."""
-    clearance, above, pace, travels = [], [], [], []
+    """Measure how a body moves; ``moving_m`` is the least way in two seconds that counts as travelling.
+
+    Half a turn within a second counts as possible for any body, also for one that was only seen to rest.
+    """
+    clearance, above, pace, travels, turn = [], [], [], [], []
     for stretch, scene in zip(stretches, scenes, strict=True):
         root = stretch.world_from_agent[:, :3, 3]
         way = np.linalg.norm((root[STEPS:] - root[:-STEPS])[:, [0, 2]], axis=1)
@@ -190,11 +197,13 @@ def habits_of(stretches: list[Moving], scenes: list[Surroundings], *, moving_m: 
         above.append(up.max(1))
         pace.append(way)
         travels.append(way > moving_m)
+        turn.append(rigid.rotation_angle(stretch.world_from_agent[:-1, :3, :3], stretch.world_from_agent[1:, :3, :3]))
     kept = np.concatenate(travels)
     kept = kept if kept.any() else ~kept
     found = (float(np.median(np.concatenate(each)[kept])) for each in (clearance, pace, above))
     clearance_m, pace_m, above_m = found
-    return Habits(clearance_m, max(pace_m, moving_m), above_m)
+    turn_rad = max(float(np.percentile(np.concatenate(turn), 99)), np.pi / RATE_HZ)
+    return Habits(clearance_m, max(pace_m, moving_m), above_m, turn_rad)
 
 
 def _stacked(frames: list[Moving]) -> Moving:

@@ -1,7 +1,8 @@
 """Motion at 30 fps and its 2-second pieces, in which long-term motion is learned and made.
 
 `Moving` is a stretch of motion of one body; `resampled` brings a trajectory to 30 fps (spline on positions, slerp on
-rotations), `stretches` cuts it where frames are missing; `eased` smooths where short motions were `joined`.
+rotations), `stretches` cuts it where frames are missing; `eased` smooths where short motions were `joined`, `evenly_turned`
+takes the time for a turn that an animal needs.
 """
 
 from collections.abc import Sequence
@@ -71,6 +72,22 @@ def eased(motion: Moving, every: int = STEPS, reach: int = 6) -> Moving:
     kept = np.flatnonzero((away == 0) | (away > reach))
     bones = [_at(kept, motion.agent_from_bone[kept, bone], frame) for bone in range(motion.agent_from_bone.shape[1])]
     return Moving(_at(kept, motion.world_from_agent[kept], frame), np.stack(bones, axis=1))
+
+
+def evenly_turned(motion: Moving, most_rad: float) -> Moving:
+    """Spread turns of the root that are faster than ``most_rad`` a frame over the frames before and after; positions and poses stay.
+
+    Asked to face about within two seconds, networks that give orientations as two vectors flip within a frame or two.
+    """
+    rotation = Rotation.from_matrix(motion.world_from_agent[:, :3, :3])
+    turned = np.concatenate([[0.0], np.cumsum((rotation[:-1].inv() * rotation[1:]).magnitude())])
+    frame = np.arange(len(motion))
+    ramp = max(most_rad, turned[-1] / max(len(motion) - 1, 1)) * frame
+    late, early = np.minimum.accumulate(turned - ramp) + ramp, np.maximum.accumulate((turned - ramp)[::-1])[::-1] + ramp
+    wanted = np.clip((late + early) / 2, turned[-1] - ramp[::-1], ramp)
+    roots = motion.world_from_agent.copy()
+    roots[:, :3, :3] = Slerp(frame, rotation)(np.interp(wanted, turned + 1e-9 * frame, frame)).as_matrix()
+    return Moving(roots, motion.agent_from_bone)
 
 
 def resampled(timestamp_s: Float[np.ndarray, "frame"], moving: Moving, rate_hz: float = RATE_HZ) -> Moving:

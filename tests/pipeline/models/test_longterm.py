@@ -52,7 +52,8 @@ def test_channels_and_motion_are_each_others_inverse(lives, model):
 def test_scene_points_lie_on_the_scene_near_the_clip(lives, clips):
     world = torch.einsum("cij,cpj->cpi", torch.from_numpy(clips.world_from_clip[:, :3, :3]).float(), clips.seen.points)
     world = world + torch.from_numpy(clips.world_from_clip[:, None, :3, 3]).float()
-    assert lives.scenes[0].distance.at(world).abs().max() < 0.06
+    open_to_a_body = (world[..., 1] > 0.01) | (world[..., [0, 2]].abs().amax(-1) > 0.41)  # the block is let into the floor
+    assert lives.scenes[0].distance.at(world)[open_to_a_body].abs().max() < 0.06
     assert clips.seen.points.norm(dim=-1).max() < 1.51
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.models.short_motions import Moving, joined, leaping, resampled, stretches
+from pipeline.models.short_motions import Moving, evenly_turned, joined, leaping, resampled, stretches
 from pipeline.models.trajectories import Trajectory
 from pipeline.space import rigid
 
@@ -48,3 +48,14 @@ def test_a_leap_goes_up_before_across_and_down_after():
         np.testing.assert_allclose(place[[0, -1]], roots[[0, -1], :3, 3], atol=1e-9)
         assert place[place[:, 0] > 0.2, 1].min() > 0.4, "over the edge it is up"
         assert np.linalg.norm(np.diff(place, 2, axis=0), axis=1).max() < 0.02
+
+
+def test_a_flip_becomes_a_turn_that_takes_its_time():
+    yaw = np.where(np.arange(61) < 30, 0.0, 3.0) + np.linspace(0, 0.1, 61)
+    roots = rigid.make(rigid.rotation_from_vector(yaw[:, None] * [0.0, 1.0, 0.0]), np.zeros((61, 3)))
+    made = evenly_turned(Moving(roots, roots[:, None]), 0.2).world_from_agent[:, :3, :3]
+    assert rigid.rotation_angle(made[:-1], made[1:]).max() < 0.2 + 1e-6
+    np.testing.assert_allclose(made[[0, -1]], roots[[0, -1], :3, :3], atol=1e-6)
+    assert rigid.rotation_angle(made[30], roots[0, :3, :3]) == pytest.approx(1.55, abs=0.2), "half of it half way"
+    slow = Moving(turning(np.arange(61) / 30), roots[:, None])
+    np.testing.assert_allclose(evenly_turned(slow, 0.2).world_from_agent, slow.world_from_agent, atol=1e-6)
