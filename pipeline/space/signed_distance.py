@@ -31,11 +31,11 @@ class SignedDistance:
 
     def at(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Interpolate trilinearly; beyond the grid the border's value holds."""
-        last = torch.tensor(self.values.shape, dtype=points_world.dtype, device=points_world.device) - 1
-        place = 2 * (points_world - self.origin.to(points_world)) / (self.voxel_m * last) - 1
-        grid = place.flip(-1).reshape(1, -1, 1, 1, 3)  # grid_sample counts the last axis first
-        values = self.values.to(points_world)[None, None]
-        read = functional.grid_sample(values, grid, mode="bilinear", padding_mode="border", align_corners=True)
+        scale = 2 / (self.voxel_m * (torch.tensor(self.values.shape) - 1)).to(points_world)
+        offset = -1 - scale * self.origin.to(points_world)
+        place = torch.addcmul(offset, points_world, scale).reshape(1, -1, 1, 1, 3)
+        values = self.values.to(points_world).permute(2, 1, 0)[None, None]  # grid_sample counts the last axis first
+        read = functional.grid_sample(values, place, mode="bilinear", padding_mode="border", align_corners=True)
         return read.reshape(points_world.shape[:-1])
 
 
