@@ -9,14 +9,14 @@ from typing import Literal, assert_never
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
 from pipeline.models.behavior import channels_from_bones
 from pipeline.models.bodies import Body, PosedSurface, PoseSpace
 from pipeline.models.contacts import Contacts, tensors
-from pipeline.models.plausibility import Judge
+from pipeline.models.plausibility import SOLID_M, Judge
 from pipeline.models.short_motions import RATE_HZ, Moving
 from pipeline.space import rigid_torch
 from pipeline.space.signed_distance import SignedDistance
@@ -27,6 +27,8 @@ NEAR_M = 0.05
 """Feet of a single body that are no further than this from the scene stand on it."""
 SETTLING = 80
 """Steps that are enough for single bodies."""
+FRAMES_AT_ONCE = 100
+"""In so many frames at a time the whole surface is looked at."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +47,16 @@ class Settings:
     """a standing foot touches what it stands on"""
     collision: float = 60.0
     """nothing is inside the scene, on average over vertices"""
+    growth: float = 0.05
+    """how much more a frame's collision counts after each step of the second half in which any vertex is still in what is solid;
+    the deepest alone says nothing where all of a thing's breadth is covered, as when a tail meets a chair's leg"""
     deepest: float = 6.0
     """nor is the deepest vertex of any frame"""
     contact: float = 0.02
     """contact vertices near the scene touch it"""
     contact_scale_m: float = 0.02
     """distance at which the Geman-McClure function lets go"""
-    smooth: float = 140.0
+    smooth: float = 180.0
     """neighbouring meshes"""
     smoothness: Literal["acceleration", "velocity"] = "acceleration"
     """what is kept small between neighbouring meshes; the paper's is the velocity, which also slows the animal down"""
@@ -127,27 +132,33 @@ def _descended(
 ) -> Moving:
     chosen = physique.body.spread(settings.vertices)
     count = len(chosen)
-    surface = PosedSurface(physique.body, np.concatenate([chosen, physique.contacts.vertices]))
+    watched = np.concatenate([chosen, physique.contacts.vertices])
+    surface, both = PosedSurface(physique.body, watched), len(watched)
     correction = _Correction(moving, physique.poses)
     phases = phase_means(stance)
     with torch.no_grad():
         given = surface(*correction())
         correction.shift[:, 1] += free * lift(given[:, count:], scene, reach=reach)
+    pressure = torch.ones(len(moving), 1)
     optimizer = torch.optim.Adam(correction.parameters(), lr=settings.rate)
     for step in range(settings.steps):
         for group in optimizer.param_groups:
             group["lr"] = settings.rate * (1 - 0.9 * step / settings.steps)
+        if step == settings.steps // 2:
+            surface = PosedSurface(physique.body, np.concatenate([watched, _deepest(physique.body, correction, scene)]))
         points = surface(*correction())
         distance = scene.at(points)
-        feet, inside = physique.contacts.centres(points[:, count:]), collision_error(distance, settings.margin_m)
+        feet, inside = physique.contacts.centres(points[:, count:both]), collision_error(distance, settings.margin_m)
+        if step >= settings.steps // 2:
+            pressure = pressure * (1 + settings.growth * (inside.detach().amax(dim=1, keepdim=True) > settings.margin_m + SOLID_M))
         total = (
             settings.foot * _mean(foot_error(feet, phases, settings.give_m))
-            + settings.ground * _mean(physique.contacts.lowest(distance[:, count:]).flatten()[phases[0]].abs())
-            + settings.collision * inside.mean()
+            + settings.ground * _mean(physique.contacts.lowest(distance[:, count:both]).flatten()[phases[0]].abs())
+            + settings.collision * (pressure * inside).mean()
             + settings.deepest * inside.amax(dim=1).mean()
-            + settings.contact * contact_error(distance[:, count:], settings.contact_scale_m).mean()
+            + settings.contact * contact_error(distance[:, count:both], settings.contact_scale_m).mean()
             + settings.smooth * sum(_mean(smooth_error(each, settings.smoothness)) for each in (points[:, :count], feet))
-            + settings.stay * ((points - given) ** 2).sum(-1).mean()
+            + settings.stay * ((points[:, :both] - given) ** 2).sum(-1).mean()
         )
         optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -157,6 +168,16 @@ def _descended(
     with torch.no_grad():
         root, bones = correction()
     return Moving(root.double().numpy(), bones.double().numpy())
+
+
+@torch.no_grad()
+def _deepest(body: Body, correction: _Correction, scene: SignedDistance) -> Int[np.ndarray, "vertex"]:
+    """Return the vertices of the whole surface that are deepest inside the scene in any frame that still is."""
+    surface, found = PosedSurface(body), []
+    for root, bones in zip(*(each.split(FRAMES_AT_ONCE) for each in correction()), strict=True):
+        nearest = scene.at(surface(root, bones)).min(dim=1)
+        found.append(nearest.indices[nearest.values < -SOLID_M])
+    return torch.cat(found).unique().numpy()
 
 
 def _mean(values: Tensor) -> Tensor:

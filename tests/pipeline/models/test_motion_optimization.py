@@ -123,6 +123,18 @@ def test_a_motion_pushed_into_the_block_comes_out(lives, physique):
     assert judge.plausibility(done, stance).deepest_m < 0.02
 
 
+def test_what_nobody_looks_at_comes_out_of_a_board_too(lives, physique):
+    """Of the trunk one vertex is looked at, on the far side."""
+    board = strider.merged(strider.room(), strider.box([0.85, 0.17, -1], [1.3, 0.6, 1]))
+    scene = replace(lives.scenes[0], mesh=board).distance
+    walk = strider.striding(np.array([[0.82, 0, -0.3], [0.82, 0, 0.3]]), 1.0)
+    deepest = [
+        float(-scene.at(PosedSurface(lives.body)(*tensors(each))).min())
+        for each in (walk, optimise(walk, physique, scene, replace(SETTINGS, steps=100, vertices=1)))
+    ]
+    assert deepest[0] > 0.03 and deepest[1] < 0.005
+
+
 def test_terms_are_what_they_say():
     stance = np.array([[1, 0], [1, 1], [0, 1], [1, 1]], bool)
     flat, phase = phase_means(stance)
