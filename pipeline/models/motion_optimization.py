@@ -145,7 +145,7 @@ def _descended(
         for group in optimizer.param_groups:
             group["lr"] = settings.rate * (1 - 0.9 * step / settings.steps)
         if step == settings.steps // 2:
-            surface = PosedSurface(physique.body, np.concatenate([watched, _deepest(physique.body, correction, scene)]))
+            surface = PosedSurface(physique.body, np.concatenate([watched, _inside(physique.body, correction, scene, both)]))
         points = surface(*correction())
         distance = scene.at(points)
         feet, inside = physique.contacts.centres(points[:, count:both]), collision_error(distance, settings.margin_m)
@@ -171,13 +171,13 @@ def _descended(
 
 
 @torch.no_grad()
-def _deepest(body: Body, correction: _Correction, scene: SignedDistance) -> Int[np.ndarray, "vertex"]:
-    """Return the vertices of the whole surface that are deepest inside the scene in any frame that still is."""
-    surface, found = PosedSurface(body), []
+def _inside(body: Body, correction: _Correction, scene: SignedDistance, most: int) -> Int[np.ndarray, "vertex"]:
+    """Return vertices of the whole surface that are inside the scene in any frame, evenly left out beyond ``most``."""
+    surface, deepest = PosedSurface(body), torch.full((len(body.mesh.vertices),), np.inf)
     for root, bones in zip(*(each.split(FRAMES_AT_ONCE) for each in correction()), strict=True):
-        nearest = scene.at(surface(root, bones)).min(dim=1)
-        found.append(nearest.indices[nearest.values < -SOLID_M])
-    return torch.cat(found).unique().numpy()
+        deepest = torch.minimum(deepest, scene.at(surface(root, bones)).amin(dim=0))
+    found = np.flatnonzero(deepest.numpy() < -SOLID_M)
+    return found[:: max(1, int(np.ceil(len(found) / most)))]
 
 
 def _mean(values: Tensor) -> Tensor:
