@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt, gaussian_filter1d
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
 from skimage.graph import route_through_array
 
 from pipeline.errors import InputError
@@ -69,7 +69,7 @@ class Floor:
 
     @classmethod
     def of(cls, scene: Surroundings, habits: Habits, breadth_m: float = 0.16) -> "Floor":
-        """Find the free floor of a scene for a body, upright as it travels."""
+        """Find the free floor of a scene for a body, upright as it travels: the largest that can be walked in one piece."""
         floor, grid, root_m = scene.floor_m, scene.distance, habits.clearance_m
         low, span = grid.origin.double().numpy(), (np.array(grid.values.shape) - 1) * grid.voxel_m
         count = np.floor(span[[0, 2]] / CELL_M).astype(int) + 1
@@ -79,6 +79,8 @@ class Floor:
         above = grid.at(torch.from_numpy(points).float()).numpy()
         beneath = grid.at(torch.from_numpy(points[:, 0] * [1, 0, 1] + [0, floor, 0]).float()).numpy()
         free = (above.min(1) > np.minimum(breadth_m / 2, 0.6 * root_m)) & (np.abs(beneath) < 0.1)
+        area, _ = label(free, np.ones((3, 3)))
+        free &= area == np.bincount(area[free], minlength=1).argmax()
         return cls(free, CELL_M * distance_transform_edt(free), low[[0, 2]], floor)
 
     def cell(self, position: Float[np.ndarray, "3"]) -> tuple[int, int]:

@@ -5,8 +5,8 @@ position = [1.2, 0.8]        # x and z on the floor, or x, y, z of the body's ce
 heading_deg = 90             # optional: about +y, 0 looks along +z, 90 along +x
 time_s = 12.0                # optional: when to be there; not before the animal can be
 
-A place on the floor without room to turn, by a wall or inside of furniture, is moved to the nearest that has it: `take.json`
-tells where to.
+A place on the floor without room to turn, by a wall or inside of furniture, or without a way to it, is moved to the nearest that
+has both: `take.json` tells where to.
 """
 
 from collections.abc import Mapping

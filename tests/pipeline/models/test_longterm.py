@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -167,6 +169,13 @@ def test_sub_goals_by_the_block_are_moved_to_where_a_body_can_turn_and_legs_lead
     places = legs(None, [Subgoal(np.array([-0.75, np.nan, 0.0])), Subgoal(np.array([0.75, np.nan, 0.0]))], lives.scenes[0], model.habits)
     assert floor.blocked_m(places.world_from_agent[[0, -1], :3, 3]) > 0.7
     assert floor.blocked_m(places.world_from_agent[:, :3, 3]) < 0.1
+
+
+def test_a_place_within_a_pen_is_moved_out_of_it(lives, model):
+    fence = [strider.box(*sides) for sides in (([-2, -0.1, 0.7], [-0.6, 0.5, 0.8]), ([-0.7, -0.1, 0.7], [-0.6, 0.5, 2]))]
+    floor = Floor.of(replace(lives.scenes[0], mesh=strider.merged(strider.room(), *fence)), model.habits)
+    moved = floor.roomy(np.array([-1.2, strider.HIP_M, 1.3]))
+    assert moved[0] > -0.6 or moved[2] < 0.7
 
 
 def test_a_scene_without_free_floor_is_refused_for_leaps_too():
