@@ -162,10 +162,10 @@ def builtin(session_count: int, heldout_of: int, foreign_sessions: int = 0) -> d
     return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}
 
 
-def builtin_lives(homes: int, sessions_per_home: int) -> dict[str, Remarks]:
+def builtin_lives(homes: int, sessions_per_home: int, test_sessions: int) -> dict[str, Remarks]:
     """Return the recordings that `synthesize_capture.lives` writes; those of the last home are the test."""
-    names = [f"session-{number + 1:02d}.npz" for number in range(homes * sessions_per_home)]
-    return {name: Remarks(split="test" if name in names[(homes - 1) * sessions_per_home :] else "train") for name in names}
+    trained = (homes - 1) * sessions_per_home
+    return {f"session-{n + 1:02d}.npz": Remarks(split="train" if n < trained else "test") for n in range(trained + test_sessions)}
 
 
 def _is_table(path: Path) -> bool:

@@ -30,7 +30,7 @@ EXIT_DIVERGED = 76
 
 @dataclass(frozen=True)
 class FitRecord:
-    """The loss terms of every step, as weighted in the sum; NaN where a broken step was skipped."""
+    """The loss terms of every step, as weighted in the sum; NaN where a broken step was skipped or the loss had no such term."""
 
     terms: dict[str, Float[np.ndarray, "step"]]
     rolled_back: int
@@ -38,7 +38,8 @@ class FitRecord:
 
     def total(self) -> Float[np.ndarray, "step"]:
         """Return the sum of all terms per step."""
-        return np.sum(list(self.terms.values()), axis=0)
+        each = np.array(list(self.terms.values()))
+        return np.where(np.isnan(each).all(0), np.nan, np.nansum(each, axis=0))
 
 
 def fit(
@@ -128,8 +129,8 @@ class _Loop:
             if self.broken >= BROKEN_IN_A_ROW:
                 self._fall_back(told, float(norm))
                 return False
-        for name, value in told.items():
-            self.terms.setdefault(name, [math.nan] * self.step).append(value if self.broken == 0 else math.nan)
+        for name in self.terms | told:
+            self.terms.setdefault(name, [math.nan] * self.step).append(told.get(name, math.nan) if self.broken == 0 else math.nan)
         self.step += 1
         return True
 

@@ -51,7 +51,6 @@ class Architecture:
     blind_to: Blind = "nothing"
     unet_width: int = 16
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
-    goal_from: Literal["scene_observer", "all"] = "all"
     goal_hidden: int = 128
     goal_layers: int = 6
     family: Literal["diffusion", "gaussian", "one_stage"] = "diffusion"
@@ -73,11 +72,6 @@ class Architecture:
     def condition(self) -> int:
         """Length of the perception code of all minds, of the pace and of the posture that is held now."""
         return 3 * self.code * self.minds + PACE_CHANNELS + self.body_channels
-
-    @property
-    def goal_condition(self) -> int:
-        """How much of a mind's code the goal depends on: all of it, or scene and observer, which come first."""
-        return (3 if self.goal_from == "all" else 2) * self.code
 
     @property
     def perception(self) -> PerceptionSize:
@@ -167,7 +161,7 @@ class BehaviorNets(nn.Module):
         super().__init__()
         a = architecture
         self.perception = Minds(a.perception, a.minds)
-        self.goal = GoalMLP(a.goal_condition, a.goal_hidden, a.goal_layers, schedule, minds=a.minds, code=3 * a.code)
+        self.goal = GoalMLP(3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds)
         body = a.body_channels + (STRIDE if a.family == "one_stage" else 0)
         match a.control:
             case "unet":

@@ -29,6 +29,8 @@ POSITION = 3
 """leading channels of a past frame, which tell the root's position; root rotation and bones follow"""
 PACE_CHANNELS = 3
 """numbers of a code that tell the pace"""
+CLOSE_M, WELL_INSIDE = 1.5, 4.0
+"""distance about which an observer's is told, and how fast, in radii, telling begins within the radius"""
 UPRIGHT = 0.2
 """shortest horizontal part of the head's direction that still tells the heading"""
 
@@ -144,14 +146,15 @@ class VolumeScene(nn.Module):
 class ObserverEncoder(nn.Module):
     """Encode the observer's past positions (Eq. 12) through features that vanish towards ``radius_m``.
 
-    Beyond the radius all features are zero, so that a far observer and none at all are the same to the agent: the code
+    Distance and pace of coming up are told frame by frame in metres and m/s, well inside the radius undamped: whether
+    the animal minds hangs on them, and to learn them from positions takes thousands of steps. Beyond the radius all features are zero, so that a far observer and none at all are the same to the agent: the code
     of zero features is also the learned null.
     """
 
     def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
         super().__init__()
         self.frames, self.radius_m, self.rate_hz = frames, radius_m, rate_hz
-        self.layers = mlp((frames * 3 + 3, hidden, hidden, code))
+        self.layers = mlp((frames * 5 + 2, hidden, hidden, code))
 
     def forward(self, observer_past: Float[Tensor, "batch frame*3"], keep: Float[Tensor, "batch"]) -> Float[Tensor, "batch code"]:
         position = observer_past.unflatten(1, (self.frames, 3))[:, :, ::2]
@@ -162,11 +165,17 @@ class ObserverEncoder(nn.Module):
         closing = -(velocity * direction[:, -1]).sum(-1, keepdim=True)
         seen = torch.cat([direction * nearness[..., None], nearness[..., None]], dim=-1).flatten(1)
         moving = torch.cat([velocity, closing], dim=-1) * nearness[:, -1:]
-        return self.layers(torch.cat([seen, moving.clamp(-2, 2)], dim=-1) * keep[:, None])
+        inside = (nearness * WELL_INSIDE).clamp_max(1)
+        close = (CLOSE_M - distance).clamp_min(-CLOSE_M) * (2 * inside)
+        coming = -(position.diff(dim=1) * self.rate_hz * direction[:, 1:]).sum(-1).clamp(-2, 2) * (1.5 * inside[:, 1:])
+        return self.layers(torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1) * keep[:, None])
 
 
 class PastEncoder(nn.Module):
-    """Encode the agent's own past: root poses in the ego frame and bones (Eq. 13), normalised inside."""
+    """Encode the agent's own past: root poses in the ego frame, their changes, and bones (Eq. 13), normalised inside."""
+
+    CHANGE = 3.0
+    """how much larger changes from frame to frame are told, and where they end"""
 
     def __init__(self, frames: int, channels: int, hidden: int, code: int):
         super().__init__()
@@ -174,7 +183,7 @@ class PastEncoder(nn.Module):
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("std", torch.ones(channels))
         self.bones = nn.Linear(frames * (channels - 9), 32)
-        self.layers = mlp((frames * 9 + 32, hidden, hidden, code))
+        self.layers = mlp(((2 * frames - 1) * 9 + 32, hidden, hidden, code))
 
     def forward(
         self, past: Float[Tensor, "batch frame*channel"], bones_keep: Float[Tensor, "batch"] | None = None
@@ -184,7 +193,9 @@ class PastEncoder(nn.Module):
         bones = past[:, :, 9:].flatten(1)
         if bones_keep is not None:
             bones = bones * bones_keep[:, None]
-        return self.layers(torch.cat([past[:, :, :9].flatten(1), self.bones(bones)], dim=-1))
+        root = past[:, :, :9]
+        change = (root.diff(dim=1) * self.CHANGE).clamp(-self.CHANGE, self.CHANGE)
+        return self.layers(torch.cat([root.flatten(1), change.flatten(1), self.bones(bones)], dim=-1))
 
 
 @dataclass(frozen=True)

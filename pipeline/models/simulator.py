@@ -1,22 +1,21 @@
 """The behaviour model as an environment: `reset(seed)`, then `step(observer)` ten times a second.
 
 Each step plays one frame of the current plan. Every ``replan_frames`` a new plan is sampled from the last 8 frames and
-faded in over ``fade_frames``. Of several plans the first that stays in allowed voxels is taken, so that chaining does
-not drift through walls.
+faded in over ``fade_frames``. Where a plan leaves the allowed voxels, others are drawn and the best is taken, so that
+chaining does not drift through walls. `Flock` lets many animals live at once, `Simulator` one.
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
+from jaxtyping import Bool, Float, Int
 
 from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels, channels_from_bones
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
-from pipeline.models.planning import Sampler, observe
+from pipeline.models.planning import Observation, Sampler, observe
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Context
+from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context
 from pipeline.space import rigid
 
 
@@ -42,19 +41,82 @@ class Chaining:
     fade_frames: int = 4
     """frames over which the next plan is faded in"""
     candidates: int = 8
-    """plans drawn, of which the first allowed one is taken"""
+    """plans drawn at most, of which the first allowed one is taken"""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Consecutive poses of the animal: root, and bone channels as in `behavior.json`."""
+    """Consecutive poses of animals: root, and bone channels as in `behavior.json`."""
 
-    root: Float[np.ndarray, "frame 4 4"]
-    bones: Float[np.ndarray, "frame channel"]
+    root: Float[np.ndarray, "*animal frame 4 4"]
+    bones: Float[np.ndarray, "*animal frame channel"]
+
+    def __getitem__(self, part: slice) -> "Frames":
+        """Return some of the frames."""
+        return Frames(self.root[..., part, :, :], self.bones[..., part, :])
+
+
+class Flock:
+    """Animals that live at once, each in the scene of its recording, none of which the others see."""
+
+    def __init__(
+        self, sampler: Sampler, scenes: Scenes, rest: Float[np.ndarray, "bone 4 4"], ego: Ego, *, sampling: Sampling, chaining: Chaining
+    ):
+        self.sampler, self.scenes, self.rest, self.ego = sampler, scenes, rest, ego
+        self.sampling, self.chaining = sampling, chaining
+
+    def begin(self, context: Context, rng: np.random.Generator) -> None:
+        """Go on from what was, one animal per window."""
+        bones, self.video, self.rng = channels_from_bones(context.agent_from_bone, self.rest), context.video, rng
+        past = Frames(context.world_from_agent, bones)
+        self.past = deque((past[frame : frame + 1] for frame in range(PAST)), PAST)
+        self.observer = deque(np.swapaxes(context.observer_world, 0, 1), PAST)
+        self.played = 0
+        self.plan, self.goal, self.blocked = self._planned()
+
+    def step(self, observer: Float[np.ndarray, "animal 3"]) -> Frames:
+        """Let 0.1 s pass with the observers at these positions (metres, world), and return the frame that comes of it."""
+        self.observer.append(np.asarray(observer, float))
+        if self.played >= self.chaining.replan_frames:
+            rest_of_plan = self.plan[self.played :]
+            self.plan, self.goal, self.blocked = self._planned()
+            self.plan = faded(rest_of_plan, self.plan, self.chaining.fade_frames)
+            self.played = 0
+        self.past.append(self.plan[self.played : self.played + 1])
+        self.played += 1
+        return self.past[-1]
+
+    def _planned(self) -> tuple[Frames, Float[np.ndarray, "animal 3"], Float[np.ndarray, "animal"]]:
+        """Draw a plan for each animal, and more where it is blocked, of which the first that is blocked least is taken."""
+        root = np.concatenate([frame.root for frame in self.past], axis=1)
+        bones = bones_from_channels(np.concatenate([frame.bones for frame in self.past], axis=1), self.rest)
+        observation = observe(Context(root, bones, np.stack(self.observer, axis=1), self.video), self.scenes, self.rest, self.ego)
+        frame = world_from_ego(root[:, -1], self.ego)
+        goal, path, blocked = self._courses(observation, frame, np.arange(len(root)), 1)
+        again = np.flatnonzero(blocked)
+        if len(again) and self.chaining.candidates > 1:
+            others = self._courses(observation, frame, again, self.chaining.candidates - 1)
+            better = others[2] < blocked[again]
+            for mine, other in zip((goal, path, blocked), others, strict=True):
+                mine[again[better]] = other[better]
+        plan = self.sampler.plan(observation, self.sampling, self.rng, goal=goal, path=path)
+        return Frames(plan.world_from_agent(frame), plan.body[..., ROOT_CHANNELS:]), rigid.apply(frame, plan.goal[:, None])[:, 0], blocked
+
+    def _courses(
+        self, observation: Observation, frame: Float[np.ndarray, "animal 4 4"], some: Int[np.ndarray, "some"], count: int
+    ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some 56 3"], Float[np.ndarray, "some"]]:
+        """Return the least blocked of ``count`` goals and paths for some of the animals, and how much of it is not allowed."""
+        codes = self.sampler.codes(observation[some], self.sampling, count)
+        goals = self.sampler.goals(codes, self.sampling, self.rng)
+        paths = self.sampler.paths(codes, goals, self.sampling, self.rng)
+        world = rigid.apply(np.repeat(frame[some], count, axis=0), paths).reshape(len(some), count, -1, 3)
+        blocked = self.scenes.inside_solid(world, None if self.video is None else self.video[some]).mean(-1)
+        best = np.arange(len(some)) * count + blocked.argmin(1)
+        return goals[best], paths[best], blocked.min(1)
 
 
 class Simulator:
-    """A gymnasium-style environment; the action is the observer's position in the world."""
+    """A gymnasium-style environment of one animal; the action is the observer's position in the world."""
 
     def __init__(
         self,
@@ -67,75 +129,39 @@ class Simulator:
         sampling: Sampling,
         chaining: Chaining,
     ):
-        self.sampler, self.data, self.volume, self.allowed, self.ego = sampler, data, volume, allowed, ego
-        self.scenes = Scenes((volume,), (allowed,), np.zeros(1, int))
-        self.sampling, self.chaining, self.rest = sampling, chaining, data.agent_from_bone_rest
+        self.data, self.rest = data, data.agent_from_bone_rest
+        scenes = Scenes((volume,), (allowed,), np.zeros(1, int))
+        self.flock = Flock(sampler, scenes, self.rest, ego, sampling=sampling, chaining=chaining)
 
     def reset(self, seed: int, observer: Float[np.ndarray, "3"] | None = None) -> State:
         """Begin at a random training window, with the observer of then or one that has stood at ``observer``."""
-        self.rng = np.random.default_rng(seed)
-        window = self.rng.choice(np.flatnonzero(self.data.split == 0))
-        context, _ = self.data.windows(np.array([window]))
-        bones = channels_from_bones(context.agent_from_bone[0], self.rest)
-        self.past = deque((Frames(context.world_from_agent[0, f : f + 1], bones[f : f + 1]) for f in range(PAST)), PAST)
-        seen = context.observer_world[0] if observer is None else np.tile(observer, (PAST, 1))
-        self.observer = deque(seen, PAST)
-        self.frame, self.played = 0, 0
-        self.plan, self.goal, self.blocked = self._planned()
-        return self._state()
+        rng = np.random.default_rng(seed)
+        context, _ = self.data.windows(rng.choice(self.data.indices(TRAIN), 1))
+        seen = context.observer_world if observer is None else np.tile(np.asarray(observer, float), (1, PAST, 1))
+        self.flock.begin(replace(context, observer_world=seen, video=None), rng)
+        self.frame = 0
+        return self._state(self.flock.past[-1])
 
     def step(self, observer: Float[np.ndarray, "3"]) -> State:
         """Let 0.1 s pass with the observer at this position (metres, world)."""
-        self.observer.append(np.asarray(observer, float))
-        if self.played >= self.chaining.replan_frames:
-            rest_of_plan = Frames(self.plan.root[self.played :], self.plan.bones[self.played :])
-            self.plan, self.goal, self.blocked = self._planned()
-            self.plan = faded(rest_of_plan, self.plan, self.chaining.fade_frames)
-            self.played = 0
-        self.past.append(Frames(self.plan.root[self.played : self.played + 1], self.plan.bones[self.played : self.played + 1]))
-        self.played, self.frame = self.played + 1, self.frame + 1
-        return self._state()
+        now = self.flock.step(np.asarray(observer, float)[None])
+        self.frame += 1
+        return self._state(now)
 
-    def _planned(self) -> tuple[Frames, Float[np.ndarray, "3"], float]:
-        """Draw candidates and take the first of those that are blocked least."""
-        root = np.concatenate([frame.root for frame in self.past])
-        bones = bones_from_channels(np.concatenate([frame.bones for frame in self.past]), self.rest)
-        observation = observe(Context(root[None], bones[None], np.array(self.observer)[None]), self.scenes, self.rest, self.ego)
-        frame = world_from_ego(root[-1:], self.ego)
-        codes = self.sampler.codes(observation, self.sampling, self.chaining.candidates)
-        goals = self.sampler.goals(codes, self.sampling, self.rng)
-        paths = self.sampler.paths(codes, goals, self.sampling, self.rng)
-        blocked = blocked_share(rigid.apply(frame, paths), self.volume, self.allowed)
-        best = int(np.argmin(blocked))
-        given = {"goal": goals[best : best + 1], "path": paths[best : best + 1]}
-        plan = self.sampler.plan(observation, self.sampling, self.rng, **given)
-        chosen = Frames(plan.world_from_agent(frame)[0], plan.body[0][:, ROOT_CHANNELS:])
-        return chosen, rigid.apply(frame[0], plan.goal)[0], float(blocked[best])
-
-    def _state(self) -> State:
-        now = self.past[-1]
-        bones = bones_from_channels(now.bones[0], self.rest)
-        return State(self.frame / RATE_HZ, now.root[0], bones, self.goal, self.blocked)
-
-
-def blocked_share(
-    path_world: Float[np.ndarray, "plan 56 3"], volume: FeatureVolume, allowed: Bool[np.ndarray, "x y z"]
-) -> Float[np.ndarray, "plan"]:
-    """Return the share of each path that lies in voxels that are not allowed; outside the volume nothing is."""
-    voxel, inside = volume.voxel(path_world)
-    return 1.0 - (allowed[tuple(np.moveaxis(voxel, -1, 0))].astype(bool) & inside).mean(-1)
+    def _state(self, now: Frames) -> State:
+        bones = bones_from_channels(now.bones[0, 0], self.rest)
+        return State(self.frame / RATE_HZ, now.root[0, 0], bones, self.flock.goal[0], float(self.flock.blocked[0]))
 
 
 def faded(old: Frames, new: Frames, frames: int) -> Frames:
     """Blend the beginning of a new plan with the continuation of the old one, which it leaves smoothly."""
-    count = min(frames, len(old.root), FUTURE)
+    count = min(frames, old.root.shape[-3], new.root.shape[-3])
     if count <= 0:
         return new
-    share = (np.arange(count) + 1.0) / (count + 1)
-    turn = np.swapaxes(old.root[:count, :3, :3], 1, 2) @ new.root[:count, :3, :3]
-    part = Rotation.from_rotvec(Rotation.from_matrix(turn).as_rotvec() * share[:, None]).as_matrix()
-    position = old.root[:count, :3, 3] * (1 - share[:, None]) + new.root[:count, :3, 3] * share[:, None]
+    old, begin, share = old[:count], new[:count], ((np.arange(count) + 1.0) / (count + 1))[:, None]
+    turn = rigid.vector_from_rotation(np.swapaxes(old.root[..., :3, :3], -1, -2) @ begin.root[..., :3, :3])
+    position = old.root[..., :3, 3] * (1 - share) + begin.root[..., :3, 3] * share
     root, bones = new.root.copy(), new.bones.copy()
-    root[:count] = rigid.make(old.root[:count, :3, :3] @ part, position)
-    bones[:count] = old.bones[:count] * (1 - share[:, None]) + new.bones[:count] * share[:, None]
+    root[..., :count, :, :] = rigid.make(old.root[..., :3, :3] @ rigid.rotation_from_vector(turn * share), position)
+    bones[..., :count, :] = old.bones * (1 - share) + begin.bones * share
     return Frames(root, bones)

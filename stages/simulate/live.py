@@ -88,7 +88,7 @@ class Live:
 
     def step(self) -> None:
         """Let 0.1 s pass with the person where the visitor has put it."""
-        self.simulator.sampling = replace(self.simulator.sampling, guidance=float(self.interactivity.value))
+        self.simulator.flock.sampling = replace(self.simulator.flock.sampling, guidance=float(self.interactivity.value))
         position = np.array(self.person.position, float)
         self.states.append(self.simulator.step(position))
         self.seen.append(position)
@@ -121,7 +121,7 @@ class Live:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        self.interactivity = gui.add_slider("interactivity", 0.0, 1.0, 0.05, float(np.clip(self.simulator.sampling.guidance, 0, 1)))
+        self.interactivity = gui.add_slider("interactivity", 0.0, 1.0, 0.05, float(np.clip(self.simulator.flock.sampling.guidance, 0, 1)))
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
         gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())

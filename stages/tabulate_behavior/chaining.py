@@ -1,15 +1,13 @@
 """Plans chained for minutes beside the observer of a test recording: does the animal stay, and move as it does?"""
 
-from dataclasses import replace
-
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.stats import ks_2samp
 
 from pipeline.models.predictors import Ats
 from pipeline.models.scenes import Scenes
-from pipeline.models.simulator import Chaining, Simulator
-from pipeline.models.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData
+from pipeline.models.simulator import Chaining, Flock
+from pipeline.models.trajectories import PAST, RATE_HZ, TEST, BehaviorData
 
 REST_M_S = 0.05
 """speed below which an animal rests: it breathes, and reconstructions err by more"""
@@ -21,10 +19,11 @@ def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds
     Truth against truth compares each test recording (each half, if there is one) with the others. ``moving`` counts all
     speeds of an animal that rests as one.
     """
-    videos = sorted({int(video) for video in data.video[data.split == TEST]})
-    recorded = [data.trajectories[data.videos[video]] for video in videos]
-    lived = [_rollout(ats, data, scenes, videos[number % len(videos)], seconds, seed + number) for number in range(count)]
-    solid = [scenes.inside_solid(life[None], np.array([videos[n % len(videos)]])).mean() for n, life in enumerate(lived)]
+    rng, test = np.random.default_rng(seed), data.indices(TEST)
+    chosen = test[(np.arange(count) * len(test)) // count + rng.integers(max(len(test) // count, 1), size=count)]
+    lived = rollouts(ats, data, scenes, chosen, seconds, rng)
+    solid = scenes.inside_solid(lived, data.video[chosen]).mean(1)
+    recorded = [data.trajectories[data.videos[video]] for video in np.unique(data.video[test])]
     true = [_speeds(t.world_from_agent[t.valid, :3, 3]) for t in recorded]
     speeds, whole = [_speeds(life) for life in lived], np.concatenate(true)
     return {
@@ -43,22 +42,19 @@ def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds
     }
 
 
-def _rollout(ats: Ats, data: BehaviorData, scenes: Scenes, video: int, seconds: float, seed: int) -> Float[np.ndarray, "frame 3"]:
-    """Let the model live in the home of a test recording, with its observer walking as recorded, over and over."""
-    number = int(scenes.number(np.array([video]), 1)[0])
-    mine = data.video == video
-    there = replace(data, video=data.video[mine], start=data.start[mine], split=np.full(int(mine.sum()), TRAIN))
-    simulator = Simulator(
-        ats.sampler, there, scenes.volumes[number], scenes.allowed[number], ats.ego, sampling=ats.sampling, chaining=Chaining()
-    )
-    state = simulator.reset(seed)
-    walk = data.trajectories[data.videos[video]].world_from_camera[:, :3, 3]
-    begin = int(np.random.default_rng(seed).integers(len(walk)))
-    path = [state.world_from_agent[:3, 3]]
+def rollouts(
+    ats: Ats, data: BehaviorData, scenes: Scenes, window: Int[np.ndarray, "life"], seconds: float, rng: np.random.Generator
+) -> Float[np.ndarray, "life frame 3"]:
+    """Let the model go on from some windows, in their homes, with their observers walking as recorded, over and over."""
+    flock = Flock(ats.sampler, scenes, data.agent_from_bone_rest, ats.ego, sampling=ats.sampling, chaining=Chaining())
+    context, _ = data.windows(window)
+    walks = [data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]]
+    flock.begin(context, rng)
+    path = [context.world_from_agent[:, -1, :3, 3]]
     for step in range(round(seconds * RATE_HZ)):
-        state = simulator.step(walk[(begin + step) % len(walk)])
-        path.append(state.world_from_agent[:3, 3])
-    return np.array(path)
+        seen = [walk[(start + PAST + step) % len(walk)] for walk, start in zip(walks, data.start[window], strict=True)]
+        path.append(flock.step(np.array(seen)).root[:, 0, :3, 3])
+    return np.stack(path, axis=1)
 
 
 def _speeds(path: Float[np.ndarray, "frame 3"]) -> Float[np.ndarray, "step"]:

@@ -71,6 +71,7 @@ def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]])
     table = {}
     for method, terms in curves.items():
         for name, loss in terms.items():
+            loss = loss[:, ~np.isnan(loss).all(0)]
             tenth = max(loss.shape[1] // 10, 1)
             before, last = np.nanmean(loss[:, -2 * tenth : -tenth]), np.nanmean(loss[:, -tenth:])
             table[f"behavior/{method}/{name}_loss_last_tenth"] = float(last)

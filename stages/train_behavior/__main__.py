@@ -40,8 +40,6 @@ class Config:
     """Perceptions and goal networks that learn apart and whose answers are averaged: fewer minutes of video by heart."""
     blind_to: Literal["nothing", "scene", "observer", "past"] = "nothing"
     """Ablation: a condition that the model never perceives."""
-    goal_from: Literal["scene_observer", "all"] = "all"
-    """What goals depend on; the paper's `all` includes the past."""
     observer_radius_m: float = 4.0
     """Horizontal distance in metres from which on an observer is as good as none."""
     unet_width: int = 16

@@ -19,8 +19,10 @@ from pipeline.models.strides import GOAL_POWER, powered, strides_from_path
 from pipeline.models.trajectories import PAST, RATE_HZ, BehaviorData
 from pipeline.space import rigid, rigid_torch
 
-NEAR_M, COMING_M_S = 2.0, 0.4
+NEAR_M, COMING_M_S = 2.4, 0.4
 """distance and pace of an observer that comes up"""
+BIN_M, AS_OFTEN = 0.2, 8
+"""distances that approaches are told apart by, and how often a window may count so that rare distances are asked as often"""
 ENOUGH = 8192
 """Windows that tell means and spreads."""
 
@@ -42,8 +44,8 @@ class Augmentation:
     hide_bones: float = 0.5
     """probability that a sample's remembered bones are hidden"""
     approached: float = 0.1
-    """share of samples drawn from windows that begin with a person coming up, which are few and matter; what follows is as
-    likely in them as ever"""
+    """share of samples drawn from windows that begin with a person coming up, from near and from far alike, which are few and
+    matter; what follows is as likely in them as ever"""
 
     @property
     def largest_turn_rad(self) -> float:
@@ -72,7 +74,7 @@ class Windows:
     scene: Int[Tensor, "window"]
     """number of the window's feature volume"""
     approached: Int[Tensor, "some"]
-    """windows that begin with a person coming up"""
+    """windows that begin with a person coming up, those at rare distances several times"""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -175,16 +177,24 @@ def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], arch
     frame = world_from_ego(agent[rows[:, PAST - 1]], architecture.ego)
     number = scenes.number(data.video[index], len(index))
     tables = (torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, bones, frame))
-    near = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST]]) & (architecture.blind_to != "observer")
-    return Windows(*tables, torch.from_numpy(rows), torch.from_numpy(number), torch.from_numpy(np.flatnonzero(near)))
+    met = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST]])
+    met = met[:0] if architecture.blind_to == "observer" else met
+    return Windows(*tables, torch.from_numpy(rows), torch.from_numpy(number), torch.from_numpy(met))
 
 
-def approached(agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray, "window 8 3"]) -> Bool[np.ndarray, "window"]:
-    """Tell in which windows the observer, at most `NEAR_M` from the animal, comes up at `COMING_M_S` or more."""
+def approached(agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray, "window 8 3"]) -> Int[np.ndarray, "some"]:
+    """Return the windows in which the observer, at most `NEAR_M` from the animal, comes up at `COMING_M_S` or more.
+
+    Those at distances that are rare are named several times: an animal learns no rule from what it is hardly asked.
+    """
     away = (agent[:, None] - observer)[..., [0, 2]]
     distance = np.linalg.norm(away[:, -1], axis=-1)
     walked = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (RATE_HZ / (PAST - 1))
-    return (distance < NEAR_M) & ((walked * away[:, -1]).sum(-1) > COMING_M_S * distance)
+    met = np.flatnonzero((distance < NEAR_M) & ((walked * away[:, -1]).sum(-1) > COMING_M_S * distance))
+    each = (distance[met] / BIN_M).astype(int)
+    most = np.bincount(each).max(initial=0)
+    parts = [met[each == number] for number in np.unique(each)]
+    return np.concatenate([met[:0], *(np.resize(part, min(most, AS_OFTEN * len(part))) for part in parts)])
 
 
 def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
@@ -238,9 +248,14 @@ def draw_batch(
     augmentation: Augmentation,
     size: int,
     generator: torch.Generator,
+    *,
+    bodies: bool = True,
 ) -> Batch:
-    """Draw windows with replacement and augment each on its own, on the CPU; the batch lands where the scene lies."""
-    scaling = statistics.scaling
+    """Draw windows with replacement and augment each on its own, on the CPU; the batch lands where the scene lies.
+
+    Without ``bodies``, which take the longest, those have no frames.
+    """
+    scaling, posed = statistics.scaling, slice(PAST, None if bodies else PAST)
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -266,7 +281,7 @@ def draw_batch(
     held = past[:, -Minds.HELD_FRAMES :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
-    body = body_channels(rotation[:, PAST:], windows.bones[frames[:, PAST:]]) - torch.from_numpy(scaling.body_mean).float()
+    body = body_channels(rotation[:, posed], windows.bones[frames[:, posed]]) - torch.from_numpy(scaling.body_mean).float()
     device, future = scene.points.device, root[:, PAST:]
     track = powered(future, GOAL_POWER) / torch.from_numpy(scaling.goal_std).float()
     strides = strides_from_path(future, root[:, PAST - 1]) / torch.from_numpy(scaling.stride_std).float()

@@ -15,6 +15,8 @@ from stages.train_behavior.batches import Batch
 
 Denoise = Callable[[Tensor, Tensor], Tensor]
 """From noisy samples and their steps to the noise"""
+Part = Literal["goals", "sequences", "all"]
+"""What learns: perception and goals; path and body, of a perception that rests; or all at once"""
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,10 @@ class Objective:
     weighting: Literal["noise", "velocity"] = "velocity"
     """which error counts evenly at all steps: that of the noise, as in the paper, or that of the velocity, which gives
     the noisy steps, where the outline is decided, their share"""
-    sequence_share: float = 0.5
-    """share of a batch's windows from which path and body, whose networks cost the most, learn in a step"""
+    path_share: float = 0.5
+    """share of a batch's windows from which paths, whose network costs much, learn in a step"""
+    body_share: float = 0.5
+    """share of a batch's windows from which bodies, whose network costs the most, learn in a step"""
     goal_draws: int = 8
     """noise levels drawn per window for the goal, whose network is small"""
     earlier_share: float = 0.7
@@ -45,37 +49,38 @@ def losses(
     objective: Objective,
     generator: torch.Generator,
     *,
-    goals: bool = True,
+    part: Part = "all",
 ) -> dict[str, Tensor]:
     """Return the weighted mean squared error of the predicted noise, per network.
 
-    Without ``goals`` perception and goal network rest: their weights get no gradient, and the goal's error only tells.
+    Only what learns has an error.
     """
-    with contextlib.nullcontext() if goals else torch.no_grad():
+    with torch.no_grad() if part == "sequences" else contextlib.nullcontext():
         code = perceive(nets, batch, objective, generator)
-    with contextlib.nullcontext() if goals else torch.no_grad():
-        goal = goal_error(nets, batch, code, schedule, objective, generator)
+    told = {} if part == "sequences" else {"goal": goal_error(nets, batch, code, schedule, objective, generator).mean()}
+    if part == "goals":
+        return told
 
     def error(denoise: Denoise, clean: Tensor) -> Tensor:
         return squared_error(denoise, clean, schedule, objective.weighting, generator)
 
-    path_rows, body_rows, known = sequence_rows(batch, objective.sequence_share)
+    path_rows, body_rows, known = sequence_rows(batch, objective)
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
     towards, along = batch.goal[path_rows], batch.places[body_rows]
     path = error(lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows])
     body = error(lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows])
-    return {"goal": goal.mean(), "path": path.mean(), "body": mean_of_known(body, known)}
+    return told | {"path": path.mean(), "body": mean_of_known(body, known)}
 
 
-def sequence_rows(batch: Batch, share: float) -> tuple[Int[Tensor, "path"], Int[Tensor, "body"], Bool[Tensor, "body"]]:
+def sequence_rows(batch: Batch, objective: Objective) -> tuple[Int[Tensor, "path"], Int[Tensor, "body"], Bool[Tensor, "body"]]:
     """Return the windows from which paths learn, those from which bodies learn, and which of the latter tell true bones.
 
-    Both are always as many, for kernels are made anew for every size. Mirrored windows, whose bones nobody knows, come
-    last among the bodies.
+    Both are always as many in every step, for kernels are made anew for every size. Mirrored windows, whose bones nobody
+    knows, come last among the bodies.
     """
-    count = max(round(len(batch.goal) * share), 1)
-    body = torch.argsort(batch.mirrored.int(), stable=True)[:count]
-    return torch.arange(count, device=body.device), body, ~batch.mirrored[body]
+    paths, bodies = (max(round(len(batch.goal) * share), 1) for share in (objective.path_share, objective.body_share))
+    body = torch.argsort(batch.mirrored.int(), stable=True)[:bodies]
+    return torch.arange(paths, device=body.device), body, ~batch.mirrored[body]
 
 
 def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor, "row"]) -> Float[Tensor, ""]:

@@ -52,7 +52,8 @@ def pictures(sampler: Sampler, moments: Moments, scenes: Scenes, record: FitReco
 
 def checks(record: FitRecord, reactions: Reactions, onnx_difference: float) -> list[Check]:
     """Judge the training."""
-    last = {name: float(np.nanmean(values[-max(len(values) // 10, 1) :])) for name, values in record.terms.items()}
+    learned = {name: values[np.isfinite(values)] for name, values in record.terms.items()}
+    last = {name: float(values[-max(len(values) // 10, 1) :].mean()) for name, values in learned.items()}
     return [
         *(Check(f"{name}: squared error of the noise, last tenth", value, "", 0.9) for name, value in last.items()),
         Check("goals move away from an approaching observer", reactions.away_m, "m", 0.1, None, "higher"),

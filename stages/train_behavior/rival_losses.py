@@ -12,23 +12,26 @@ from pipeline.models.diffusion import Schedule
 from pipeline.models.rivals import LOG_STD, MEAN, SPREAD
 from pipeline.models.strides import STRIDE
 from stages.train_behavior.batches import Batch
-from stages.train_behavior.objective import Denoise, Objective, kept, mean_of_known, perceive, sequence_rows, squared_error
+from stages.train_behavior.objective import Denoise, Objective, Part, kept, mean_of_known, perceive, sequence_rows, squared_error
 
 
 def gaussian_losses(
-    nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator, *, goals: bool = True
+    nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator, *, part: Part = "all"
 ) -> dict[str, Tensor]:
     """Return the negative log-likelihood per number of goal, path and body, each given the level above it."""
     del schedule
-    with contextlib.nullcontext() if goals else torch.no_grad():
+    with torch.no_grad() if part == "sequences" else contextlib.nullcontext():
         code = perceive(nets, batch, objective, generator)
-        goal = negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal)
-    path_rows, body_rows, known = sequence_rows(batch, objective.sequence_share)
+        goal = negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal).mean()
+    told = {} if part == "sequences" else {"goal": goal}
+    if part == "goals":
+        return told
+    path_rows, body_rows, known = sequence_rows(batch, objective)
     steered = kept(len(code), 1, objective.drop, generator).to(code.device)
     towards, along = batch.goal[path_rows], batch.places[body_rows]
     path = negative_log_likelihood(lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows])
     body = negative_log_likelihood(lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows])
-    return {"goal": goal.mean(), "path": path.mean(), "body": mean_of_known(body, known)}
+    return told | {"path": path.mean(), "body": mean_of_known(body, known)}
 
 
 def negative_log_likelihood(tell: Denoise, clean: Float[Tensor, "batch ..."]) -> Float[Tensor, "batch ..."]:
@@ -40,10 +43,10 @@ def negative_log_likelihood(tell: Denoise, clean: Float[Tensor, "batch ..."]) ->
 
 
 def one_stage_losses(
-    nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator, *, goals: bool = True
+    nets: BehaviorNets, batch: Batch, schedule: Schedule, objective: Objective, generator: torch.Generator, *, part: Part = "all"
 ) -> dict[str, Tensor]:
     """Return the denoising errors of path and body as one sequence without control; perception learns with them."""
-    del goals
+    assert part == "all", "a model of one stage has no goals that could learn before"
     code = perceive(nets, batch, objective, generator)
     known = ~batch.mirrored
     seen = torch.where(known[:, None, None], batch.body, torch.zeros_like(batch.body))

@@ -20,7 +20,7 @@ from stages.train_behavior.batches import (
     statistics_from_windows,
     windows_from_data,
 )
-from stages.train_behavior.objective import Objective, losses
+from stages.train_behavior.objective import Objective, Part, losses
 from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
 
 _STEPS = 2.0**12
@@ -30,12 +30,14 @@ _STEPS = 2.0**12
 class Optimization:
     """How long and how fast."""
 
-    steps: int = 900
+    steps: int = 1000
     goal_steps: int = 200
-    """first steps, in which perception and goals are trained too; then both rest, for they learn minutes of video by heart
-    long before path and body are good"""
+    """first steps, in which perception and goals are trained alone; then both rest, for they learn minutes of video by heart
+    long before path and body are good. 0 = all are trained together throughout, as models of one stage always are"""
     batch: int = 64
     """windows per step"""
+    goal_batch: int = 64
+    """windows per step while perception and goals are trained alone"""
     rate: float = 2e-3
     """peak learning rate of AdamW"""
     weight_decay: float = 0.05
@@ -86,18 +88,22 @@ def train(
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(scenes, architecture.scene_stride, device)
     pace = settings.optimization
+    goal_steps = 0 if architecture.family == "one_stage" else pace.goal_steps
     optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay, fused=True)
 
     def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        batch = draw_batch(windows, scene, statistics, settings.augmentation, pace.batch, generator)
-        return minimised(nets, batch, schedule, settings.objective, generator, goals=step < pace.goal_steps)
+        part: Part = "all" if goal_steps == 0 else "goals" if step < goal_steps else "sequences"
+        size = pace.goal_batch if part == "goals" else pace.batch
+        batch = draw_batch(windows, scene, statistics, settings.augmentation, size, generator, bodies=part != "goals")
+        return minimised(nets, batch, schedule, settings.objective, generator, part=part)
 
     def after_step(step: int) -> None:
-        decay = min(pace.average, (step + 1) / (step + 10))
+        begun = step - goal_steps if step >= goal_steps else step
+        decay = min(pace.average, (begun + 1) / (begun + 10))
         with torch.no_grad():
             for mean, parameter in zip(average.parameters(), nets.parameters(), strict=True):
                 mean.lerp_(parameter, 1 - decay)
-        if step + 1 == pace.goal_steps:
+        if step + 1 == goal_steps:
             nets.perception.load_state_dict(average.perception.state_dict())
             nets.goal.load_state_dict(average.goal.state_dict())
 
@@ -109,7 +115,7 @@ def train(
         seed=seed,
         resume=resume,
         save_every=pace.save_every,
-        schedule=lambda progress: two_cosines(progress, pace.goal_steps / pace.steps),
+        schedule=lambda progress: two_cosines(progress, goal_steps / pace.steps),
         label="behaviour",
         clip_norm=1.0,
         after_step=after_step,

@@ -19,10 +19,12 @@ class Config:
 
     seed: int = 0
     """Decides everything: homes, behaviour, the person's walks."""
-    homes: int = 8
+    homes: int = 22
     """Homes, differently furnished; the last one is for the test."""
-    sessions_per_home: int = 3
-    """Sessions in each home, with its loose things elsewhere each time."""
+    sessions_per_home: int = 1
+    """Sessions in each home but the last, with its loose things elsewhere each time."""
+    test_sessions: int = 12
+    """Sessions in the last home: more of them narrow the intervals of all that is judged there."""
     session_s: float = 150.0
     """Length of a session, seconds."""
     approaches: int = 400
@@ -34,9 +36,9 @@ def run(task: cli.Task) -> None:
     c: Config = task.config
     homes = [dwellings.furnish_otherwise(np.random.default_rng([c.seed, 10, number])) for number in range(c.homes)]
     lived = {}
-    for number in range(c.homes * c.sessions_per_home):
-        rng = np.random.default_rng([c.seed, 11, number])
-        lived[f"session-{number + 1:02d}"] = lives.lived(homes[number // c.sessions_per_home].rearranged(rng), rng, c.session_s)
+    for number in range((c.homes - 1) * c.sessions_per_home + c.test_sessions):
+        rng, home = np.random.default_rng([c.seed, 11, number]), homes[min(number // c.sessions_per_home, c.homes - 1)]
+        lived[f"session-{number + 1:02d}"] = lives.lived(home.rearranged(rng), rng, c.session_s)
     progress.log(f"{len(lived)} sessions of {c.session_s:g} s in {c.homes} homes")
     met = approaches.scripted(homes[-1], np.random.default_rng([c.seed, 12]), c.approaches) if c.approaches else None
     with task.create() as folder:

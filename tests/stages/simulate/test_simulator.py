@@ -1,5 +1,6 @@
 import sys
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from pipeline.files import glb
 from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Sampler, TorchNetworks
-from pipeline.models.simulator import Chaining, Frames, Simulator, blocked_share, faded
+from pipeline.models.simulator import Chaining, Frames, Simulator, faded
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.simulate.live import Live, Look
@@ -48,13 +49,15 @@ def test_same_seed_same_life_and_it_goes_on(simulator):
     assert states[-1].agent_from_bone.shape == (3, 4, 4)
 
 
-def test_paths_through_walls_count_as_blocked():
-    volume = room()
-    inside = np.tile([0.0, 0.3, 0.0], (56, 1))
-    across = np.linspace([0.0, 0.3, 0.0], [4.0, 0.3, 0.0], 56)
-    share = blocked_share(np.stack([inside, across]), volume, volume.occupancy == 0)
-    assert share[0] == 0
-    assert 0.4 < share[1] < 0.6
+def test_animals_of_a_flock_go_on_from_their_own_windows(simulator):
+    context, _ = simulator.data.windows(np.array([0, 40, 80]))
+    flock = simulator.flock
+    flock.begin(replace(context, video=None), np.random.default_rng(0))
+    lives = np.concatenate([flock.step(context.observer_world[:, -1]).root for _ in range(10)], axis=1)
+    assert lives.shape == (3, 10, 4, 4) and flock.blocked.shape == (3,)
+    start = context.world_from_agent[:, -1, :3, 3]
+    assert (np.linalg.norm(lives[:, 0, :3, 3] - start, axis=-1) < 0.3).all()
+    assert np.linalg.norm(start[:, None] - start, axis=-1)[~np.eye(3, dtype=bool)].min() > 0.1
 
 
 def test_fading_leaves_the_old_plan_and_reaches_the_new_one():
@@ -105,7 +108,7 @@ def test_live_view_answers_and_keeps_its_take(simulator):
     here.interactivity.value = 0.25
     here.person.position = (0.4, 1.3, 0.2)
     take = here.run(stopped=lambda: len(here.states) >= 4)
-    assert len(take.timestamp_s) == 4 and simulator.sampling.guidance == 0.25
+    assert len(take.timestamp_s) == 4 and simulator.flock.sampling.guidance == 0.25
     np.testing.assert_allclose(take.observer_world[-1], [0.4, 1.3, 0.2], atol=1e-6)
     np.testing.assert_allclose(here.animal.position, take.world_from_agent[-1, :3, 3], atol=1e-6)
 

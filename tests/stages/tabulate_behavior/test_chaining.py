@@ -16,7 +16,7 @@ class Breathing:
     """A sampler whose animal stays where it is and breathes."""
 
     def codes(self, observation, sampling, count=1):
-        return count
+        return count * len(observation)
 
     def goals(self, count, sampling, rng):
         return np.zeros((count, 3))

@@ -14,6 +14,7 @@ from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN
 from stages.train_behavior.batches import (
+    AS_OFTEN,
     Augmentation,
     SceneSampler,
     approached,
@@ -102,7 +103,15 @@ def test_only_who_comes_up_and_is_near_approaches():
     walk, here = np.linspace(1, 0, 8)[:, None] * [0.0, 0.0, 0.7], np.array([0.0, 1.2, 1.0])
     far = np.array([0.0, 0.0, 2.0])
     observer = np.stack([here + walk, here + walk + far, here + walk[::-1], here + 0 * walk])
-    assert approached(agent, observer).tolist() == [True, False, False, False]
+    assert approached(agent, observer).tolist() == [0]
+
+
+def test_approaches_from_rare_distances_are_asked_as_often():
+    walk = np.linspace(1, 0, 8)[:, None] * [0.0, 0.0, 0.7]
+    distance = np.r_[np.full(20, 0.5), np.full(4, 1.5), 2.1]
+    observer = walk + distance[:, None, None] * [0.0, 0.0, 1.0]
+    asked = distance[approached(np.zeros((25, 3)), observer)]
+    assert [(asked == near).sum() for near in (0.5, 1.5, 2.1)] == [20, 20, AS_OFTEN]
 
 
 def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):
@@ -128,7 +137,8 @@ def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatc
     settings = Settings(Optimization(steps=8, goal_steps=4, batch=8, save_every=3))
     whole = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3)
     assert set(whole.record.terms) == {"goal", "path", "body"}
-    assert all(np.isfinite(values).all() for values in whole.record.terms.values())
+    learned = {name: np.flatnonzero(np.isfinite(values)).tolist() for name, values in whole.record.terms.items()}
+    assert learned == {"goal": [0, 1, 2, 3], "path": [4, 5, 6, 7], "body": [4, 5, 6, 7]}
     restore = fit._Loop.advance
 
     def interrupted(self, *arguments):
@@ -223,16 +233,15 @@ def test_learning_rate_falls_twice():
     assert two_cosines(0.99, 2.5) < 0.05
 
 
-def test_perception_and_goals_rest_in_the_second_part(data, windows):
+def test_each_part_of_training_moves_its_own_networks(data, windows):
     batch, _ = drawn(windows, Augmentation())
     nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 3.0), 0)
-    for goals in (True, False):
+    parts = {"goals": {"perception", "goal"}, "sequences": {"path", "body"}, "all": {"perception", "goal", "path", "body"}}
+    for part, learning in parts.items():
         nets.zero_grad(set_to_none=True)
         generator = torch.Generator().manual_seed(0)
-        sum(losses(nets, batch, Schedule(), Objective(), generator, goals=goals).values()).backward()
-        for part, learns in (("perception", goals), ("goal", goals), ("path", True), ("body", True)):
-            moved = [parameter.grad is not None for parameter in getattr(nets, part).parameters()]
-            assert any(moved) == learns, part
+        sum(losses(nets, batch, Schedule(), Objective(), generator, part=part).values()).backward()
+        assert {name.split(".")[0] for name, parameter in nets.named_parameters() if parameter.grad is not None} == learning
 
 
 class Asked:
