@@ -61,7 +61,7 @@ annotate: .venv/.ok
 	@$(PYTHON) -m stages.annotate build/$(ANIMAL) --clicks captures/$(ANIMAL)/clicks.json
 
 capture-check: .venv/.ok
-	@$(PYTHON) -m stages.check_captures captures/$(ANIMAL)
+	@$(PYTHON) -m stages.check_captures 'captures/$(ANIMAL)'
 
 # One format for another program, after the simulator; with a take of `make simulate` as one motion more.
 export: .venv/.ok
@@ -78,7 +78,7 @@ simulate: .venv/.ok
 	@test -z '$(SUBGOALS)' || test -f '$(SUBGOALS)' || { { echo "error: SIM-004 $(SUBGOALS): there is no such file"; echo "  -> write it as docs/long_motion.md tells"; } >&2; exit 2; }
 	@$(MAKE) $(NESTING) $(ANIMAL).$(if $(SUBGOALS),longterm,behavior)
 	@$(call INPUTS,$(if $(SUBGOALS),longterm reconstruction,behavior) behavior_data) && \
-	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals $(SUBGOALS)) --out $(HOME_OF)/take
+	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals '$(SUBGOALS)') --out $(HOME_OF)/take
 
 serve: .venv/.ok
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator
