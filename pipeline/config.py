@@ -6,6 +6,7 @@ unknown keys and ill-typed values are refused with what is known. Standard libra
 
 import dataclasses
 import json
+import math
 import tomllib
 import types
 import typing
@@ -42,9 +43,11 @@ def read_table(path: Path) -> dict[str, Any]:
 
 def from_table(config: type[C], table: Mapping[str, Any], *, where: str) -> C:
     """Check `table` against the fields of the dataclass `config` and build it; nested tables likewise."""
-    known = [field.name for field in dataclasses.fields(config)]
-    refuse_unknown(table, known, where=where)
+    defaults = {field.name: field.default for field in dataclasses.fields(config)}
+    refuse_unknown(table, defaults, where=where)
     hints = typing.get_type_hints(config)
+    for key, value in table.items():
+        refuse_impossible(value, defaults[key], where=f"{where}: {key}")
     return config(**{key: _checked(hints[key], value, f"{where}: {key}") for key, value in table.items()})
 
 
@@ -53,6 +56,14 @@ def refuse_unknown(table: Mapping[str, Any], known: typing.Collection[str], *, w
     for key in table:
         if key not in known:
             raise InputError("REC-001", f"unknown {kind} {key!r}", where, f"known: {', '.join(sorted(known)) or 'none'}")
+
+
+def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
+    """Raise REC-002 for a number that is not finite, negative where the default is above 0, or a rate of 0."""
+    numbers = isinstance(value, int | float) and isinstance(default, int | float)
+    stands_still = where.endswith("_hz") and value == 0
+    if (isinstance(value, float) and not math.isfinite(value)) or (numbers and default > 0 and (value < 0 or stands_still)):
+        raise InputError("REC-002", f"{value!r} cannot be", where, f"give a number as the default is, {default!r}")
 
 
 def refuse_misfit(value: Any, kind: str, *, where: str) -> None:

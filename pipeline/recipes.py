@@ -51,6 +51,7 @@ def _refuse_misfits(table: Mapping[str, Any], known: Mapping[str, sources.Settin
     for key, value in table.items():
         inner = sources.inner(known[key], cache)
         if inner is None:
+            config.refuse_impossible(value, known[key].default, where=f"{where}: {key}")
             config.refuse_misfit(value, known[key].kind, where=f"{where}: {key}")
         elif isinstance(value, Mapping):
             _refuse_misfits(value, inner, f"{where}: {key}", cache)

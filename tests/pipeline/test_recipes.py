@@ -48,6 +48,9 @@ def test_a_count_of_recordings_of_the_wrong_type_is_refused():
         ("[train_behavior.training.optimization]\nstepz = 1", "optimization: unknown key 'stepz'"),
         ("[train_behavior.training.optimization]\nsteps = 1.5", "optimization: steps: 1.5"),
         ("[train_behavior]\ntraining = 3", "training: 3 is no table"),
+        ("[extract_frames]\nrate_hz = 0", "rate_hz: 0 cannot be"),
+        ("[extract_frames]\nmax_depth_m = -1.0", "max_depth_m: -1.0 cannot be"),
+        ("[extract_frames]\nmax_depth_m = nan", "max_depth_m: nan cannot be"),
         ("[segment_agent]\nbackend = 'sam'", "backend: 'sam'"),
     ],
 )
