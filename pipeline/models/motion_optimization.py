@@ -144,7 +144,7 @@ def _descended(
     for step in range(settings.steps):
         for group in optimizer.param_groups:
             group["lr"] = settings.rate * (1 - 0.9 * step / settings.steps)
-        if step == settings.steps // 2:
+        if step in (settings.steps // 2, 3 * settings.steps // 4):
             surface = PosedSurface(physique.body, np.concatenate([watched, _inside(physique.body, correction, scene, both)]))
         points = surface(*correction())
         distance = scene.at(points)
