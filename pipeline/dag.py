@@ -104,7 +104,7 @@ FLOW: tuple[Node, ...] = (
          fixed={"target": "scene"}, gpu=1),
     Node("agent_localizer", "train_localizer", ("agent_template",), fixed={"target": "agent"}, gpu=1),
     Node("video_poses", "register_videos",
-         ("frames", "masks", "features", "scene_template", "agent_template", "scene_localizer", "agent_localizer"),
+         ("frames", "masks", "scene_template", "agent_template", "scene_localizer", "agent_localizer"),
          roles=("session",), gpu=1),
     Node("registration", "gather_registration", merging("video_poses")),
     Node("reconstruction", "reconstruct",

@@ -38,8 +38,6 @@ class Trajectory:
     source: Literal["colmap", "odometry"]
     reason: str
     registered: Int[np.ndarray, "key"]
-    scale_m: float | None
-    """Metres per unit of the sparse model."""
     scale_spread: float | None
     """Robust relative standard deviation of depth over SfM depth."""
     odometry_scale: float | None
@@ -112,7 +110,7 @@ def choose_start(
     """
     odometry = clip.odometry_from_camera
     gap = {} if odometry is None else {"odometry": depth_gap(keyframes, odometry[frames])}
-    scale = spread = ratio = None
+    spread = ratio = None
     poses, reason = None, "no model came out"
     measured = None if sparse is None else metric_scale(sparse, clip)
     if sparse is not None and measured is None:
@@ -131,8 +129,8 @@ def choose_start(
     if poses is None and odometry is None:
         return None
     if poses is None or (reason and odometry is not None):
-        return Trajectory(odometry, "odometry", reason, registered, scale, spread, ratio, gap)
-    return Trajectory(poses, "colmap", reason, registered, scale, spread, ratio, gap)
+        return Trajectory(odometry, "odometry", reason, registered, spread, ratio, gap)
+    return Trajectory(poses, "colmap", reason, registered, spread, ratio, gap)
 
 
 def _refutation(registered, spread, gap, options):

@@ -73,7 +73,7 @@ def build(
         world_from_camera=poses,
         registered=np.nan_to_num(gap, nan=np.inf) < 0.1,
         gap_m=gap,
-        start=anchor.Trajectory(poses, "odometry", "", np.arange(len(clip)), scale, None, None, {}),
+        start=anchor.Trajectory(poses, "odometry", "", np.arange(len(clip)), None, None, {}),
         keyframes=len(clip),
         reprojection_px=None,
         gravity=gravity,

@@ -1,4 +1,4 @@
-"""What every export says about itself: `export.json` and the check in `qa.json`; and how optional libraries are met."""
+"""What every export says about itself in `export.json`; and how optional libraries are met."""
 
 import importlib
 import importlib.metadata
@@ -8,8 +8,6 @@ from pathlib import Path
 from types import ModuleType
 
 from pipeline.errors import InputError
-
-WARN_MM = 15.0
 
 
 @dataclass(frozen=True)

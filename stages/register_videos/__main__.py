@@ -56,5 +56,4 @@ if __name__ == "__main__":
         run,
         config=Config,
         reads=("frames", "masks", "scene_template", "agent_template", "scene_localizer", "agent_localizer"),
-        optional=("features",),
     )

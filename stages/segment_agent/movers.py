@@ -54,7 +54,6 @@ class Candidate:
     area_m2: float
     radius_m: float
     """distance from the centre that holds 95 % of the points"""
-    depth_m: float
     conviction: float = 1.0
     """mean probability of its points"""
 
@@ -92,7 +91,7 @@ def candidates(
         centre = np.median(points, axis=0)
         radius = float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95))
         if radius < options.largest_m:
-            found.append(Candidate(centre, area, radius, float(np.sqrt(np.median(area_m2[own]))), float(probability[own].mean())))
+            found.append(Candidate(centre, area, radius, float(probability[own].mean())))
     return sorted(found, key=lambda candidate: -candidate.area_m2)[: options.candidates]
 
 

@@ -23,7 +23,6 @@ class Trajectory:
     """Camera poses in a world of the recording's own, +y up."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
-    from_odometry: bool
     alignments: int
     residual_m: float
 
@@ -42,7 +41,7 @@ def steady(clip: Clip, flow: Path, options: Straightening, rng: np.random.Genera
     found = straighten(view, poses, options)
     level_known = clip.odometry_from_camera is not None and clip.gravity_known
     poses = found.world_from_camera if level_known else level(view, found.world_from_camera)
-    return Trajectory(poses, clip.odometry_from_camera is not None, found.edges, found.residual_m)
+    return Trajectory(poses, found.edges, found.residual_m)
 
 
 def motion_from_flow(

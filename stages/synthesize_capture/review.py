@@ -29,12 +29,11 @@ class Manner:
     """Share of quick approaches within 1.5 m that it runs from within a second; NaN without approaches."""
     flees_when_left_alone: float
     """Share of seconds beyond 2.2 m, or beside someone who stands still, in which it begins to run."""
-    approaches_per_minute: float
 
 
 def manner(sessions: list[SessionTrajectories]) -> Manner:
     """Measure the animal's manner over sessions."""
-    moving, ran, alone, came, seconds = [], [], [], 0, 0.0
+    moving, ran, alone = [], [], []
     for lived in sessions:
         speed = lived.animal.speed()
         reach = round(WINDOW_S / STEP_S)
@@ -43,9 +42,7 @@ def manner(sessions: list[SessionTrajectories]) -> Manner:
         ran += [bool(flee[max(start - 15, 0) : start + 30].any()) for start in np.flatnonzero(_begins(_pressed(lived)))]
         away = ~_pressed(lived) & (_distance(lived) > 1.6)
         alone += [bool(flee[start : start + 30].any()) for start in range(0, len(flee), 30) if away[max(start - 20, 0) : start + 30].all()]
-        came += int(_begins(lived.reason == REASONS.index("approach")).sum())
-        seconds += lived.animal.timestamp_s[-1]
-    return Manner(_mean(moving), _mean(ran), _mean(alone), 60 * came / max(seconds, 1e-6))
+    return Manner(_mean(moving), _mean(ran), _mean(alone))
 
 
 def report_quality(folder: Path, scripts: list[Script], made: list[Made]) -> None:

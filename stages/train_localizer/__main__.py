@@ -63,4 +63,4 @@ def run(task: cli.Task) -> None:
 
 
 if __name__ == "__main__":
-    cli.enter(__doc__, run, config=Config, optional=("scene_template", "agent_template", "feature_basis", "frames"))
+    cli.enter(__doc__, run, config=Config, optional=("scene_template", "agent_template", "frames"))

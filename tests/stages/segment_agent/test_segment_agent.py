@@ -78,7 +78,7 @@ def test_a_recording_without_odometry_still_works(tmp_path):
 
 
 def candidate(x, area=0.03):
-    return Candidate(np.array([x, 0.0, 0.0]), area, 0.2, 2.0)
+    return Candidate(np.array([x, 0.0, 0.0]), area, 0.2)
 
 
 def test_the_track_prefers_a_steady_mover_to_larger_flashes():
