@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.errors import InputError
-from pipeline.files import arrays
+from pipeline.files import arrays, gaussian_rows
 from pipeline.models import rasterize, skinning
 from pipeline.models.skinning import blend
 from pipeline.space import rigid_torch
@@ -25,10 +24,6 @@ BAND0 = 0.28209479177387814
 """value of the constant spherical harmonic"""
 THICKEST_M = 0.004
 """a surface's Gaussians are no thicker, or wide ones would stand out of it"""
-COLUMNS = (
-    ["x", "y", "z", "nx", "ny", "nz"] + [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(45)]
-    + ["opacity"] + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -225,16 +220,7 @@ def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> 
         table = torch.cat(
             [gaussians.means, normals, gaussians.band0, rest, gaussians.opacity_logit[:, None], gaussians.log_scale, rotation], dim=-1
         )
-        table = table[which].cpu().numpy().astype("<f4")
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(table)}",
-        *(f"property float {name}" for name in COLUMNS),
-        "end_header",
-        "",
-    ]
-    Path(path).write_bytes("\n".join(header).encode() + table.tobytes())
+    gaussian_rows.write(path, table[which].cpu().numpy())
 
 
 @torch.no_grad()
@@ -251,12 +237,7 @@ def kept(gaussians: Gaussians) -> Tensor:
 
 def load_ply(path: Path) -> Gaussians:
     """Read what `save_ply` wrote. Raises `InputError` ART-021 for any other file."""
-    data = Path(path).read_bytes()
-    end = data.find(b"end_header\n") + len(b"end_header\n")
-    names = [line.split()[-1] for line in data[:end].decode("ascii", "replace").splitlines() if line.startswith("property float ")]
-    if names != COLUMNS or (len(data) - end) % 248:
-        raise InputError("ART-021", what="not a 3D Gaussian file of 62 floats a row", where=str(path), remedy="rebuild `splats`")
-    table = torch.from_numpy(np.frombuffer(data, "<f4", offset=end).reshape(-1, 62).copy())
+    table = torch.from_numpy(gaussian_rows.read(path).copy())
     return Gaussians(table[:, :3], table[:, 58:62], table[:, 55:58], table[:, 54].sigmoid(), table[:, 6:9] * BAND0 + 0.5)
 
 

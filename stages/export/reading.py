@@ -8,14 +8,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.files import arrays, images
+from pipeline.files import arrays, gaussian_rows, images
 from pipeline.files import glb as gltf
 from pipeline.files.glb import Action, Skin
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 
 Influences = Literal["4", "8"]
-_COLUMNS = 62
 
 
 @dataclass(frozen=True)
@@ -139,11 +138,7 @@ def occupancy(behavior_data: Path) -> Occupancy:
 
 def gaussians(splats: Path) -> dict[str, Float[np.ndarray, "point 62"]]:
     """Read both clouds as standard rows."""
-    rows = {}
-    for name in ("scene", "agent"):
-        _, _, data = (splats / f"{name}.ply").read_bytes().partition(b"end_header\n")
-        rows[name] = np.frombuffer(data, "<f4").reshape(-1, _COLUMNS)
-    return rows
+    return {name: gaussian_rows.read(splats / f"{name}.ply") for name in ("scene", "agent")}
 
 
 def _resampled(action: Action, rate_hz: float) -> Action:

@@ -1,10 +1,11 @@
-"""3D Gaussian files: 62 floats (248 bytes) a row, opacity as logit, scale as natural log, rotation wxyz."""
+"""Standard files of 3D Gaussians."""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.files import gaussian_rows
 from pipeline.models import gaussians
 from stages.export.writing import Told
 
@@ -17,8 +18,6 @@ def write(folder: Path, clouds: dict[str, Float[np.ndarray, "point 62"]]) -> Tol
         opacity = 1 / (1 + np.exp(-rows[:, _OPACITY].astype(np.float64)))
         kept = rows[np.isfinite(rows).all(1) & (opacity >= 1 / 255)].copy()
         kept[:, _ROTATION] /= np.linalg.norm(kept[:, _ROTATION], axis=1, keepdims=True)
-        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(kept)}"]
-        head += [*(f"property float {column}" for column in gaussians.COLUMNS), "end_header", ""]
-        (folder / f"{name}.ply").write_bytes("\n".join(head).encode() + kept.astype("<f4").tobytes())
+        gaussian_rows.write(folder / f"{name}.ply", kept)
         assert len(gaussians.load_ply(folder / f"{name}.ply")) == len(kept)
     return Told("own writer", {}, "the project's own reader; the layout is that of the 3DGS reference viewer", "metres, +y up")

@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.errors import InputError
-from pipeline.files import arrays, meshes
+from pipeline.files import arrays, gaussian_rows, meshes
 from pipeline.models.trajectories import BehaviorData
 from pipeline.space.meshes import Mesh
 from stages.export_simulator.actions import Motion, cut, longest_run
 
 NETWORKS = ("perception", "goal", "path", "body")
-_GAUSSIAN_COLUMNS = 62
 _SHORTEST_CLIP_FRAMES = 16
 
 
@@ -94,22 +93,7 @@ def motions(behavior_data: Path) -> list[Motion]:
 def gaussians(splats: Path) -> Gaussians:
     """Read room and animal as Gaussians, and the animal's skin."""
     weights = arrays.load(splats / "splats.npz", names=("agent_weights",))["agent_weights"]
-    return Gaussians(rows_of_gaussians(splats / "scene.ply"), rows_of_gaussians(splats / "agent.ply"), weights)
-
-
-def rows_of_gaussians(path: Path) -> Float[np.ndarray, "point 62"]:
-    """Read a standard file of 3D Gaussians, 62 floats a row. Raises InputError ART-021 when it is something else."""
-    data = path.read_bytes()
-    head, mark, rows = data.partition(b"end_header\n")
-    properties = head.count(b"property float ")
-    if not mark or b"binary_little_endian" not in head or properties != _GAUSSIAN_COLUMNS or len(rows) % (4 * _GAUSSIAN_COLUMNS):
-        raise InputError(
-            "ART-021",
-            f"not a file of 3D Gaussians with {_GAUSSIAN_COLUMNS} floats a row",
-            str(path),
-            "rebuild `splats`",
-        )
-    return np.frombuffer(rows, "<f4").reshape(-1, _GAUSSIAN_COLUMNS)
+    return Gaussians(gaussian_rows.read(splats / "scene.ply"), gaussian_rows.read(splats / "agent.ply"), weights)
 
 
 def minds(behavior: Path, behavior_data: Path) -> Minds:
