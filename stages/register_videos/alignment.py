@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.files.clips import Clip, Masks
 from pipeline.progress import track
 from pipeline.space import cameras, relax, rigid, surface
-from pipeline.space.meshes import Mesh, RayCaster, render_view
+from pipeline.space.meshes import Mesh, RayCaster
+from stages.register_videos.comparing import compare
 from stages.register_videos.votes import Votes
 
 
@@ -177,16 +178,11 @@ def picture_contacts(
     options: AlignOptions,
 ) -> relax.Contacts | None:
     """Tie one frame to the template by optical flow from its rendering to the picture, across the viewing rays."""
-    size = (clip.color_size[0] // 2, clip.color_size[1] // 2)
-    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
-    rendered, hits = render_view(caster, world_from_camera, intrinsics, *size)
-    color = hits.interpolate(caster.mesh, caster.mesh.color).reshape(*size, 3)
-    real = cv2.resize(clip.color(frame), size[::-1], interpolation=cv2.INTER_AREA)
-    hidden = cv2.resize((masks[frame] > 0).astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
-    known = (rendered > 0) & ~hidden
+    seen = compare(clip, masks, caster, frame, world_from_camera)
+    known, size, intrinsics = seen.known, seen.known.shape, seen.intrinsics
     if known.mean() < 0.1:
         return None
-    flow, astray_px = _flow(even(color, known), even(real, known))
+    flow, astray_px = _flow(even(seen.rendered, known), even(seen.recorded, known))
     rows, columns = np.mgrid[4 : size[0] - 4 : options.picture_stride_px, 4 : size[1] - 4 : options.picture_stride_px].reshape(2, -1)
     start = np.stack([columns, rows], axis=-1) + 0.5
     end = start + flow[rows, columns]
@@ -199,13 +195,13 @@ def picture_contacts(
         known[rows, columns]
         & (pixel > 0).all(1)
         & (pixel < limit).all(1)
-        & (np.abs(z - rendered[rows, columns]) < 0.12)
+        & (np.abs(z - seen.depth[rows, columns]) < 0.12)
         & (np.abs(flow[rows, columns]).max(1) < 12)
         & (astray_px[rows, columns] < options.picture_return_px)
     )
     if good.sum() < 20:
         return None
-    mapped = rigid.apply(world_from_camera, (cameras.unproject(start, intrinsics) * rendered[rows, columns][:, None])[good])
+    mapped = rigid.apply(world_from_camera, (cameras.unproject(start, intrinsics) * seen.depth[rows, columns][:, None])[good])
     return _sideways(frame, ray[good] * z[good, None], mapped, world_from_camera, options.picture_px / intrinsics[0, 0])
 
 
