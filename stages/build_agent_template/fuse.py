@@ -7,12 +7,11 @@ What hardly any frame sees through is inside the body; below the ground is outsi
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-import cv2
 import fast_simplification
 import numpy as np
 import scipy.ndimage
 import trimesh
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from skimage import measure
 
 from pipeline.files.clips import Clip, Masks
@@ -57,36 +56,36 @@ class Body:
 def fuse(clip: Clip, masks: Masks, circle: Circle, options: Fusion) -> Body:
     """Fuse and carve all frames that show the animal, then extract the largest closed surface.
 
-    Where a limb moved, the frames in which it stood alike decide.
+    Where a limb moved, the frames in which it stood alike decide; what lies farther out on it, as a tail's tip, moves more,
+    and of these frames again those decide in which that stood alike.
     """
-    seen = np.flatnonzero(masks.visible).tolist()
-    volume, silhouettes = _gathered(clip, masks, circle, options, seen)
+    points = {int(frame): _on_animal(clip, masks, circle, int(frame)) for frame in np.flatnonzero(masks.visible)}
+    volume = enclose(_without_strays(np.concatenate(list(points.values()))), voxel_m=options.voxel_m, truncation_m=options.truncation_m)
+    silhouettes = _gather(clip, masks, circle, volume, points)
     beside, below = silhouettes.share_beside(), _below(volume, circle)
     body = extract(volume, beside, below, options)
-    points = {frame: _on_animal(clip, masks, circle, frame) for frame in seen}
     above = {frame: circle.ground.above(each) for frame, each in points.items()}
-    limb = find_limb(points, above, body.inside_world, options.moving)
-    if limb is None:
-        return body
-    alike, outlines = _gathered(clip, masks, circle, options, limb.frames.tolist(), thin=True)
-    there = space_of(limb, volume, options.moving)
-    volume.distance[there], volume.weight[there] = alike.distance[there], alike.weight[there]
-    return extract(volume, np.where(there, outlines.share_beside(), beside), below, options)
+    while (limb := find_limb(points, above, body.inside_world, options.moving)) is not None and len(limb.frames) < len(points):
+        points = {frame: points[frame] for frame in limb.frames.tolist()}
+        alike = Volume(volume.origin, volume.weight.shape, volume.voxel_m, volume.truncation_m)
+        outlines = _gather(clip, masks, circle, alike, points)
+        there = space_of(limb, volume, options.moving)
+        volume.distance[there], volume.weight[there] = alike.distance[there], alike.weight[there]
+        beside = np.where(there, outlines.share_beside(), beside)
+        body = extract(volume, beside, below, options)
+    return body
 
 
-def _gathered(
-    clip: Clip, masks: Masks, circle: Circle, options: Fusion, frames: Iterable[int], thin: bool = False
-) -> tuple[Volume, Silhouettes]:
-    """Fuse the animal's depth and its outlines in some frames; ``thin`` keeps depth that the sensor doubts where neighbours agree."""
-    volume = enclose(circle.points_world, voxel_m=options.voxel_m, truncation_m=options.truncation_m)
+def _gather(clip: Clip, masks: Masks, circle: Circle, volume: Volume, frames: Iterable[int]) -> Silhouettes:
+    """Fuse the animal's depth in some frames into a volume and count its outlines; depth that the sensor doubts stays where neighbours agree."""
     silhouettes = Silhouettes(volume.origin, volume.weight.shape, volume.voxel_m)
     for frame in frames:
         pose, intrinsics = circle.world_from_camera[frame], clip.depth_intrinsics[frame]
         labels, depth = depth_labels(masks[frame], clip.depth_size), clip.depth(frame)
         silhouettes.add(labels, depth, intrinsics, pose)
-        trusted = np.where(supported(depth), depth, 0) if thin else _trusted(depth, clip.confidence(frame))
-        volume.integrate(np.where(labels == 255, trusted, 0), intrinsics, clip.color(frame), clip.intrinsics[frame], pose)
-    return volume, silhouettes
+        own = np.where((labels == 255) & supported(depth), depth, 0)
+        volume.integrate(own, intrinsics, clip.color(frame), clip.intrinsics[frame], pose)
+    return silhouettes
 
 
 def _on_animal(clip: Clip, masks: Masks, circle: Circle, frame: int) -> Float[np.ndarray, "point 3"]:
@@ -94,6 +93,12 @@ def _on_animal(clip: Clip, masks: Masks, circle: Circle, frame: int) -> Float[np
     depth = clip.depth(frame)
     own = (depth_labels(masks[frame], clip.depth_size) == 255) & supported(depth)
     return rigid.apply(circle.world_from_camera[frame], cameras.back_project(depth, clip.depth_intrinsics[frame])[own].astype(float))
+
+
+def _without_strays(points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 3"]:
+    """Leave out points much farther from the middle than nearly all others."""
+    distance = np.linalg.norm(points_world - np.median(points_world, axis=0), axis=1)
+    return points_world[distance < 1.6 * np.quantile(distance, 0.98)]
 
 
 def extract(volume: Volume, share_beside: Float[np.ndarray, "x y z"], below_ground: Bool[np.ndarray, "x y z"], options: Fusion) -> Body:
@@ -131,13 +136,6 @@ def thin(mesh: trimesh.Trimesh, vertices: int) -> tuple[Float[np.ndarray, "verte
         trimesh.repair.fill_holes(result)
     trimesh.repair.fix_normals(result)
     return np.asarray(result.vertices), np.asarray(result.faces)
-
-
-def _trusted(depth: Float[np.ndarray, "height width"], confidence: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Drop depth (0 = unknown) of low confidence and flying pixels at steps."""
-    around = np.ones((3, 3), np.uint8)
-    step = cv2.dilate(depth, around) - cv2.erode(depth, around)
-    return np.where((confidence > 0) & (step < 0.06 + 0.02 * depth), depth, 0)
 
 
 def _below(volume: Volume, circle: Circle) -> Bool[np.ndarray, "x y z"]:

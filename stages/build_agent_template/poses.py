@@ -16,11 +16,10 @@ STRIDE = 2
 
 @dataclass(frozen=True)
 class Circle:
-    """The turnaround in a world of its own, +y up, with the ground the animal stands on and points of its surface."""
+    """The turnaround in a world of its own, +y up, with the ground the animal stands on."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     ground: Ground
-    points_world: Float[np.ndarray, "point 3"]
     straightened: Straightened
 
 
@@ -46,9 +45,8 @@ def walk_around(clip: Clip, masks: Masks, options: Straightening) -> Circle:
         known = seen.points[..., 2] > 0
         animal.append(points[known & (label == 255)])
         floor.append(points[known & (label == 0) & (up > 0.9)])
-    animal, floor = np.concatenate(animal), np.concatenate(floor)
-    middle = np.median(animal, axis=0)
-    return Circle(poses, fit_ground(floor, middle, reach_m=0.4), _without_strays(animal, middle), straightened)
+    middle = np.median(np.concatenate(animal), axis=0)
+    return Circle(poses, fit_ground(np.concatenate(floor), middle, reach_m=0.4), straightened)
 
 
 def depth_labels(labels: UInt8[np.ndarray, "height width"], size: tuple[int, int]) -> UInt8[np.ndarray, "depth_height depth_width"]:
@@ -56,10 +54,3 @@ def depth_labels(labels: UInt8[np.ndarray, "height width"], size: tuple[int, int
     rows = ((np.arange(size[0]) + 0.5) * labels.shape[0] / size[0]).astype(int)
     columns = ((np.arange(size[1]) + 0.5) * labels.shape[1] / size[1]).astype(int)
     return labels[rows[:, None], columns]
-
-
-def _without_strays(points: Float[np.ndarray, "point 3"], middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "point 3"]:
-    """Leave out points much farther from the middle than nearly all others."""
-    distance = np.linalg.norm(points - middle, axis=1)
-    near = distance < 1.3 * np.quantile(distance, 0.98)
-    return points[near]

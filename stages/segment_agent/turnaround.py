@@ -16,8 +16,8 @@ from pipeline.files.clips import Clip
 from pipeline.space import rigid
 from pipeline.space.depth_alignment import depth_view
 from pipeline.space.ground import Ground, fit_ground
+from pipeline.space.thin_depth import supported
 from stages.segment_agent.evidence import Evidence, Judge
-from stages.segment_agent.free_space import usable_depth
 from stages.segment_agent.windows import Sphere, Window
 
 
@@ -111,10 +111,11 @@ def find_cluster(points_world: Float[np.ndarray, "point 3"], focus: Float[np.nda
 def _points_near(
     clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, options: Turnaround, frames: Iterable[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read points within reach of the focus and whether they face upward."""
+    """Read points within reach of the focus, tails and ears too, and whether they face upward."""
     points, level = [], []
     for frame in frames:
-        depth = usable_depth(clip, frame)
+        depth = clip.depth(frame)
+        depth = np.where(supported(depth), depth, 0)
         view = depth_view(depth, clip.depth_intrinsics[frame], depth > 0, 2)
         world = rigid.apply(world_from_camera[frame], view.points.reshape(-1, 3).astype(float))
         up = (view.normals.reshape(-1, 3) @ world_from_camera[frame, :3, :3].T)[:, 1]
