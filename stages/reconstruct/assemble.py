@@ -14,6 +14,7 @@ from pipeline.models.fused import Fused
 from pipeline.models.motion import MotionTable
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
+from stages.reconstruct.limbs import Limbs
 from stages.reconstruct.problem import Joints, Problem, RaysByFrame, Surface, frame_table
 from stages.reconstruct.rays import Source, Store, join
 
@@ -128,7 +129,8 @@ def build(
     body = Body(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape)
     surface = Surface.of(template.mesh, template.feature, np.random.default_rng(seed))
     with torch.no_grad():
-        joints = Joints.of(surface.points, body.weights(surface.points))
+        skin = body.weights(surface.points)
+        joints, limbs = Joints.of(surface.points, skin), Limbs.of(surface.points, skin, rest)
     problem = Problem(
         store=store,
         scene=scene_field(videos, shapes, fused),
@@ -141,6 +143,7 @@ def build(
         has_scene=has_scene,
         surface=surface,
         joints=joints,
+        limbs=limbs,
         agent_frames=usable_frames,
         agent_rays=by_frame,
         trust=torch.from_numpy(trust).float(),
@@ -232,5 +235,7 @@ def _moved(problem: Problem, device: str) -> Problem:
         module.to(device)
     store = Store(problem.store.scene.to(device), problem.store.agent.to(device), problem.store.views.to(device))
     by_frame = RaysByFrame(problem.agent_rays.start.to(device), problem.agent_rays.count.to(device))
-    moved = {name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "joints", "agent_frames", "trust")}
+    moved = {
+        name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "joints", "limbs", "agent_frames", "trust")
+    }
     return Problem(store=store, **problem.modules(), agent_rays=by_frame, **moved)

@@ -1,10 +1,10 @@
 """The agent's losses: masked depth against its field, its posed surface against picture and mask, and priors on motion.
 
-They serve twice: `pose_chunk` poses the template to the frames before the field learns, and the joint phase uses
-the same terms while everything learns.
+They serve twice: `posing` poses the template to the frames before the field learns, and the joint phase uses the same
+terms while everything learns.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from pipeline.space import cameras, rigid_torch
 from stages.reconstruct import losses
-from stages.reconstruct.problem import Problem, RaysByFrame, pick
+from stages.reconstruct.problem import Problem, pick
 from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
 from stages.reconstruct.scene import Terms
 from stages.reconstruct.settings import Weights
@@ -184,42 +184,3 @@ def _nearest(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "
 def _normalized(images: Tensor, pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point 2"]:
     size = torch.tensor([images.shape[2], images.shape[1]], device=pixel.device, dtype=torch.float32) * THUMBNAIL
     return (pixel / size * 2 - 1).clamp(-4, 4)
-
-
-class ChunkLoss(torch.nn.Module):
-    """Poses the template in consecutive frames of one video: the field and the skin are held, root and bones move.
-
-    Features do not help here, whose cells mix thin limbs with what is behind, nor do cycles, since the skin is held.
-    """
-
-    def __init__(self, problem: Problem, frame: Int[Tensor, "frame"], weights: Weights, rays: int, points: int, root_share: float = 0.25):
-        """Bones start to move after ``root_share`` of the steps."""
-        super().__init__()
-        self.problem, self.frame, self.rays, self.points, self.root_share = problem, frame, rays, points, root_share
-        self.weights = replace(weights, feature=0.0, cycle=0.0)
-        self.masked = torch.nonzero(problem.store.agent.label == AGENT)[:, 0]
-        self.masked_rays = RaysByFrame.of(problem.store.agent.frame[self.masked], len(problem.video))
-        self.seen = torch.isin(frame, problem.agent_frames) & (self.masked_rays.count[frame] > 0)
-        self.root = torch.nn.Parameter(problem.motion.root.detach()[frame].clone())
-        self.bone = torch.nn.Parameter(problem.motion.bone.detach()[frame].clone())
-
-    def pose(self, bones_move: bool = True) -> Pose:
-        """Return the current poses."""
-        motion = self.problem.motion
-        with torch.no_grad():
-            world_from_camera = motion.world_from_camera(self.frame)
-        bone = self.bone if bones_move else self.bone.detach()
-        root = motion.initial_agent[self.frame] @ rigid_torch.se3_exp(self.root)
-        return Pose(self.frame, world_from_camera, root, motion.agent_from_bone_rest @ rigid_torch.se3_exp(bone))
-
-    def loss(self, progress: float, generator: Generator) -> dict[str, Tensor]:
-        """Return the weighted terms over all frames of the chunk."""
-        problem, pose = self.problem, self.pose(progress >= self.root_share)
-        seen = Pose(
-            self.frame[self.seen], pose.world_from_camera[self.seen], pose.world_from_agent[self.seen], pose.agent_from_bone[self.seen]
-        )
-        rays = problem.store.agent.at(self.masked[self.masked_rays.pick(seen.frame, self.rays, generator).flatten()])
-        terms = measured_terms(problem, seen, rays, self.weights, generator, near=0)
-        terms |= surface_terms(problem, seen, self.points, self.weights, generator, rays)
-        terms |= prior_terms(problem, pose, self.bone, len(self.frame), self.weights)
-        return losses.weighted(terms)

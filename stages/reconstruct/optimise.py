@@ -14,8 +14,8 @@ from torch import nn
 
 from pipeline import together
 from pipeline.fit import FitRecord, fit
-from stages.reconstruct.body import ChunkLoss
 from stages.reconstruct.joint import JointLoss, TemplateLoss
+from stages.reconstruct.posing import Chunk, ChunkLoss
 from stages.reconstruct.problem import Problem
 from stages.reconstruct.scene import SceneLoss
 from stages.reconstruct.settings import Batches, Rates, Steps, Weights
@@ -94,14 +94,12 @@ def _pose_chunk(problem: Problem, plan: Plan, frame: torch.Tensor, name: str) ->
     held = [problem.agent, problem.body, problem.scene]
     for module in held:
         module.requires_grad_(False)
-    chunk = ChunkLoss(problem, frame, plan.weights, plan.batches.posed_rays, plan.batches.posed_points)
-    steps = plan.steps.body
+    chunk, steps = Chunk(problem, frame), plan.steps.body
+    loss = ChunkLoss(problem, chunk, plan.weights, plan.batches)
     fit(
-        modules={"chunk": _Learned(chunk)},
-        optimizer=torch.optim.AdamW(
-            [{"params": [chunk.root, chunk.bone], "lr": plan.rates.body, "weight_decay": 0.0, "betas": (0.8, 0.99)}]
-        ),
-        loss=lambda step, generator: chunk.loss(step / steps, generator),
+        modules={"chunk": chunk},
+        optimizer=torch.optim.AdamW(chunk.groups(plan.rates)),
+        loss=lambda step, generator: loss(step / steps, generator),
         steps=steps,
         seed=_seed(plan.seed, name),
         resume=plan.resume / name if plan.resume else None,
@@ -109,19 +107,9 @@ def _pose_chunk(problem: Problem, plan: Plan, frame: torch.Tensor, name: str) ->
         schedule=cosine,
         label=name,
     )
-    with torch.no_grad():
-        problem.motion.root[frame] = chunk.root
-        problem.motion.bone[frame] = chunk.bone
+    chunk.write(problem)
     for module in held:
         module.requires_grad_(True)
-
-
-class _Learned(nn.Module):
-    """The two tables of a chunk, without the modules that it reads."""
-
-    def __init__(self, chunk: ChunkLoss):
-        super().__init__()
-        self.root, self.bone = chunk.root, chunk.bone
 
 
 def field_groups(field: nn.Module, rates: Rates) -> list[dict]:

@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.models.fields import Body, Field
 from pipeline.models.motion import MotionTable
 from pipeline.space.meshes import Mesh
+from stages.reconstruct.limbs import Limbs, shared_skin
 from stages.reconstruct.rays import Store
 
 
@@ -31,6 +32,7 @@ class Problem:
     """False for the turnaround: its world is the agent"""
     surface: "Surface"
     joints: "Joints"
+    limbs: Limbs
     agent_frames: Int[Tensor, "frame"]
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
@@ -114,9 +116,7 @@ class Joints:
     @classmethod
     def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"], most: int = 4, least: float = 0.02) -> "Joints":
         """Tie each bone to those with which it shares most skin: up to ``most``, of a share of at least ``least``, but always one."""
-        share = weights.T @ weights
-        size = share.diagonal().sqrt().clamp_min(1e-6)
-        share = (share / size[:, None] / size).fill_diagonal_(0)
+        share = shared_skin(weights)
         ranked = share.argsort(dim=1, descending=True)
         tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :most], True) & (share > least)
         tied = tied.scatter_(1, ranked[:, :1], True)

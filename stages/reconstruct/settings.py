@@ -126,7 +126,9 @@ class Rates:
     camera: float = 5e-5
     """corrections of cameras, metres and radians"""
     body: float = 2e-2
-    """root and bones while the template is posed, metres and radians"""
+    """the root and slow turns of limbs while the template is posed, metres and radians"""
+    body_frame: float = 1e-2
+    """bones, and turns of limbs from frame to frame, the same"""
     motion: float = 5e-4
     """root and bones in the second phase, metres and radians"""
     agent: float = 0.2

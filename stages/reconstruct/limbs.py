@@ -1,0 +1,88 @@
+"""Limbs as a tree of bones: what turns a thigh turns the whole leg, so that one number lifts a tail.
+
+Bones lie in no order and know no parents. The tree that shares most skin gives both, from the middle of the body outward.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from torch import Tensor, nn
+
+from pipeline.space import rigid_torch
+
+NEVER = 1e-9
+"""share of skin from which on bones count as strangers"""
+
+
+def shared_skin(weights: Float[Tensor, "point bone"]) -> Float[Tensor, "bone bone"]:
+    """Return how much skin bones share, 0..1; none with themselves."""
+    share = weights.T @ weights
+    size = share.diagonal().sqrt().clamp_min(1e-6)
+    return (share / size[:, None] / size).fill_diagonal_(0)
+
+
+@dataclass(frozen=True)
+class Limbs:
+    """Which bone hangs on which, and where it turns."""
+
+    order: Int[Tensor, "bone"]
+    """from the middle of the body outward, parents before children"""
+    parent: Int[Tensor, "bone"]
+    """of each bone in that order, as a place in that order; the middle's is itself"""
+    joint: Float[Tensor, "bone 3"]
+    """where each bone in that order meets its parent, at rest, agent frame, metres"""
+
+    @classmethod
+    def of(
+        cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"], agent_from_bone_rest: Float[Tensor, "bone 4 4"]
+    ) -> "Limbs":
+        """Hang each bone, seen from the one nearest to the agent's origin, on that with which it shares most skin."""
+        strangeness = -np.log(shared_skin(weights).double().numpy().clip(NEVER, 0.999))
+        tree = minimum_spanning_tree(strangeness)
+        centre = agent_from_bone_rest[:, :3, 3]
+        order, parent = breadth_first_order(tree + tree.T, int(centre.norm(dim=-1).argmin()), directed=False)
+        order = torch.from_numpy(order).long()
+        parent = torch.from_numpy(parent).long()[order]
+        parent[0] = order[0]
+        both = weights[:, order] * weights[:, parent] + NEVER
+        return cls(order, order.argsort()[parent], both.T @ points / both.sum(0)[:, None])
+
+    def motion(self, turn: Float[Tensor, "frame bone 3"]) -> Float[Tensor, "frame bone 4 4"]:
+        """Carry each bone by its own turn (rotation vector about its joint) and by those of all that it hangs on; agent frame.
+
+        The middle stays: it turns with the root.
+        """
+        rotation = rigid_torch.so3_exp(turn[:, self.order])
+        local = rigid_torch.make(rotation, self.joint - (rotation @ self.joint[..., None])[..., 0])
+        moved = [torch.eye(4, device=turn.device).expand(len(turn), 4, 4)]
+        for place in range(1, len(self.order)):
+            moved.append(moved[int(self.parent[place])] @ local[:, place])
+        return torch.stack(moved, dim=1)[:, self.order.argsort()]
+
+    def to(self, device: str) -> "Limbs":
+        """Move all to a device."""
+        return Limbs(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+
+class Waves(nn.Module):
+    """A motion over consecutive frames as the sum of slower and quicker ones: knots on several time scales, linear between them.
+
+    What moves for a second is found at once by the slow ones, frame by frame it would take many steps.
+    """
+
+    def __init__(self, frames: int, bones: int, knot_frames: tuple[int, ...]):
+        super().__init__()
+        self.each = nn.Parameter(torch.zeros(frames, bones, 3))
+        self.knots = nn.ParameterList(nn.Parameter(torch.zeros((frames - 1) // span + 2, bones, 3)) for span in knot_frames)
+        self.knot_frames = knot_frames
+
+    def forward(self) -> Float[Tensor, "frame bone 3"]:
+        """Return the sum in every frame."""
+        total, frame = self.each, torch.arange(len(self.each), device=self.each.device)
+        for span, knots in zip(self.knot_frames, self.knots, strict=True):
+            before, share = frame // span, ((frame % span) / span)[:, None, None]
+            total = total + torch.lerp(knots[before], knots[before + 1], share)
+        return total

@@ -1,0 +1,81 @@
+"""Pose the template in consecutive frames of one video: root, limbs and single bones move, field and skin are held."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Generator, Tensor, nn
+from torch.nn import functional
+
+from pipeline.space import rigid, rigid_torch
+from stages.reconstruct import losses
+from stages.reconstruct.body import Pose, measured_terms, prior_terms, surface_terms
+from stages.reconstruct.limbs import Waves
+from stages.reconstruct.problem import Problem, RaysByFrame
+from stages.reconstruct.rays import AGENT
+from stages.reconstruct.settings import Batches, Rates, Weights
+
+KNOT_FRAMES = (32, 8)
+"""limbs turn on these time scales, and frame by frame"""
+ROOT_SHARE = 0.25
+"""of the steps in which the root moves alone"""
+
+
+class Chunk(nn.Module):
+    """What moves in a stretch of frames: the root, the limbs' turns, and each bone by itself."""
+
+    def __init__(self, problem: Problem, frame: Int[Tensor, "frame"]):
+        super().__init__()
+        self.frame, motion = frame, problem.motion
+        self.root = nn.Parameter(motion.root.detach()[frame].clone())
+        self.bone = nn.Parameter(motion.bone.detach()[frame].clone())
+        self.turn = Waves(len(frame), motion.bone.shape[1], KNOT_FRAMES).to(problem.device)
+
+    def groups(self, rates: Rates) -> list[dict]:
+        """Return what learns, with its rates."""
+        shared = {"weight_decay": 0.0, "betas": (0.8, 0.99)}
+        slow, quick = [self.root, *self.turn.knots], [self.bone, self.turn.each]
+        return [{"params": slow, "lr": rates.body, **shared}, {"params": quick, "lr": rates.body_frame, **shared}]
+
+    def pose(self, problem: Problem, bones_move: bool = True) -> tuple[Pose, Float[Tensor, "frame twist 6"]]:
+        """Return the current poses, and the twists that keep near rest: those of bones, and the limbs' turns."""
+        motion, turn, bone = problem.motion, self.turn(), self.bone
+        if not bones_move:
+            turn, bone = turn.detach(), bone.detach()
+        with torch.no_grad():
+            world_from_camera = motion.world_from_camera(self.frame)
+        root = motion.initial_agent[self.frame] @ rigid_torch.se3_exp(self.root)
+        bones = problem.limbs.motion(turn) @ motion.agent_from_bone_rest @ rigid_torch.se3_exp(bone)
+        return Pose(self.frame, world_from_camera, root, bones), torch.cat([bone, functional.pad(turn, (0, 3))], dim=1)
+
+    @torch.no_grad()
+    def write(self, problem: Problem) -> None:
+        """Write root and bones into the motion table."""
+        pose, _ = self.pose(problem)
+        bone = rigid_torch.inverse(problem.motion.agent_from_bone_rest) @ pose.agent_from_bone
+        problem.motion.root[self.frame] = self.root
+        problem.motion.bone[self.frame] = torch.from_numpy(rigid.log(bone.double().cpu().numpy())).to(self.bone)
+
+
+class ChunkLoss:
+    """What the poses of a stretch of frames lack.
+
+    Features do not help here, whose cells mix thin limbs with what is behind, nor do cycles, since the skin is held.
+    """
+
+    def __init__(self, problem: Problem, chunk: Chunk, weights: Weights, batches: Batches):
+        self.problem, self.chunk, self.batches = problem, chunk, batches
+        self.weights = replace(weights, feature=0.0, cycle=0.0)
+        self.masked = torch.nonzero(problem.store.agent.label == AGENT)[:, 0]
+        self.masked_rays = RaysByFrame.of(problem.store.agent.frame[self.masked], len(problem.video))
+        self.seen = torch.isin(chunk.frame, problem.agent_frames) & (self.masked_rays.count[chunk.frame] > 0)
+
+    def __call__(self, progress: float, generator: Generator) -> dict[str, Tensor]:
+        """Return the weighted terms over all frames of the chunk."""
+        problem, seen, (pose, twist) = self.problem, self.seen, self.chunk.pose(self.problem, progress >= ROOT_SHARE)
+        shown = Pose(pose.frame[seen], pose.world_from_camera[seen], pose.world_from_agent[seen], pose.agent_from_bone[seen])
+        rays = problem.store.agent.at(self.masked[self.masked_rays.pick(shown.frame, self.batches.posed_rays, generator).flatten()])
+        terms = measured_terms(problem, shown, rays, self.weights, generator, near=0)
+        terms |= surface_terms(problem, shown, self.batches.posed_points, self.weights, generator, rays)
+        terms |= prior_terms(problem, pose, twist, len(pose.frame), self.weights)
+        return losses.weighted(terms)
