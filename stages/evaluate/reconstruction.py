@@ -1,6 +1,6 @@
 """The 4D reconstruction against truth: held-out views, agent roots, followed points, surfaces."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -141,12 +141,9 @@ def _skin(folders: Reconstructed) -> tuple[Mesh, Skin]:
 def track_distances(
     folders: Reconstructed, sessions: Sequence[Recorded], motions: dict, turnaround: Recorded, frames: Frames
 ) -> list[np.ndarray]:
-    """Follow surface points that are matched to truth once, in the turnaround's middle frame; return distances per visible frame, metres."""
+    """Follow surface points that are matched to truth once, in the turnaround; return distances per visible frame, metres."""
     skin = _skin(folders)[1].only(arrays.load(folders.reconstruction / "tracks.npz")["vertex_index"])
-    middle = len(turnaround.clip) // 2
-    true_agent_from_world = rigid.inverse(turnaround.truth.world_from_agent[middle])
-    true_vertices = rigid.apply(true_agent_from_world, turnaround.truth.vertices_world(middle))
-    partner = surfaces.matched_once(skin.points_agent, rigid.apply(frames.agent_from_true_agent, true_vertices))
+    partner = surfaces.matched_once(skin.points_agent, _at_rest(turnaround, frames))
     distances = []
     for each in sessions:
         motion = motions[each.video.id]
@@ -155,6 +152,14 @@ def track_distances(
             ours = _posed(skin, motion, frame)
             distances.append(np.full(len(partner), np.inf) if ours is None else np.linalg.norm(ours - true, axis=1))
     return distances
+
+
+def _at_rest(turnaround: Recorded, frames: Frames, every: int = 8) -> Iterator[np.ndarray]:
+    """Return the true surface of some frames of the turnaround, in our agent frame: its tail may swing meanwhile."""
+    truth = turnaround.truth
+    for frame in range(0, len(turnaround.clip), every):
+        in_agent = rigid.apply(rigid.inverse(truth.world_from_agent[frame]), truth.vertices_world(frame))
+        yield rigid.apply(frames.agent_from_true_agent, in_agent)
 
 
 def _posed(skin: Skin, motion: Motion | None, frame: int) -> np.ndarray | None:

@@ -1,6 +1,6 @@
 """Surfaces against truth: points followed on the animal, chamfer distances of scene and animal."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,10 +46,11 @@ class Skin:
 
 
 def matched_once(
-    points_agent: Float[np.ndarray, "point 3"], true_vertices_agent: Float[np.ndarray, "vertex 3"]
+    points_agent: Float[np.ndarray, "point 3"], true_vertices_agent: Iterable[Float[np.ndarray, "vertex 3"]]
 ) -> Int[np.ndarray, "point"]:
-    """Match our points to true vertices of one turnaround frame; both in our agent frame. Never matched again."""
-    return KDTree(true_vertices_agent).query(points_agent)[1]
+    """Match our points at rest to true vertices in that frame of several whose surface lies nearest to them; all in our agent frame."""
+    answers = [KDTree(vertices).query(points_agent) for vertices in true_vertices_agent]
+    return min(answers, key=lambda answer: answer[0].mean())[1]
 
 
 def track_figures(distances: Sequence[Float[np.ndarray, "point"]]) -> Figures:
