@@ -58,8 +58,8 @@ class Limbs:
         rotation = rigid_torch.so3_exp(turn[:, self.order])
         local = rigid_torch.make(rotation, self.joint - (rotation @ self.joint[..., None])[..., 0])
         moved = [torch.eye(4, device=turn.device).expand(len(turn), 4, 4)]
-        for place in range(1, len(self.order)):
-            moved.append(moved[int(self.parent[place])] @ local[:, place])
+        for place, parent in enumerate(self.parent.tolist()[1:], start=1):
+            moved.append(moved[parent] @ local[:, place])
         return torch.stack(moved, dim=1)[:, self.order.argsort()]
 
     def to(self, device: str) -> "Limbs":
