@@ -92,9 +92,10 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
         place = (torch.rand(128, 1, 3) * 2 - 1) * torch.tensor([3.0, 0.3, 3.0]) + torch.tensor([0.0, 1.2, 0.0])
-        observer = place.expand(-1, 8, 3)
         level = place[:, 0] * torch.tensor([1.0, 0.0, 1.0])
         distance = level.norm(dim=-1, keepdim=True)
+        pace_m_s = torch.rand(128, 1, 1) * 1.2  # that of walking up; it does not matter either
+        observer = place + level[:, None] / distance[:, None] * pace_m_s * torch.arange(0.7, -0.05, -0.1)[:, None]
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter

@@ -115,7 +115,8 @@ def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
     """Of 200 approaches as many drive goals away as in Python, with the same noise; the goals themselves agree as well."""
     met = twins.approaches(BehaviorData.load(build / "behavior_data"), 200, np.random.default_rng(0))
     here, there = twins.asked_of_the_page(page, met, 5), twins.asked_of_python(build, build / "simulator", met, 5)
-    assert there.rate(met.side) > 0.9 and 0.2 < there.rate(met.side, 0.4) < 0.8, "most goals shift away, not all of them far"
+    assert 0.6 < there.rate(met.side) < 0.85, "goals shift away from whoever is nearer than 1.8 m, which are 70 %"
+    assert 0.2 < there.rate(met.side, 0.4) < 0.8, "not all of them far"
     for further_m in (0.1, 0.3, 0.4, 0.5):
         assert abs(here.rate(met.side, further_m) - there.rate(met.side, further_m)) < 0.03
     assert np.median(np.abs(here.near - there.near)) < 1e-3, "metres"
