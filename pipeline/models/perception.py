@@ -147,8 +147,9 @@ class ObserverEncoder(nn.Module):
     """Encode the observer's past positions (Eq. 12) through features that vanish towards ``radius_m``.
 
     Distance and pace of coming up are told frame by frame in metres and m/s, well inside the radius undamped: whether
-    the animal minds hangs on them, and to learn them from positions takes thousands of steps. Beyond the radius all features are zero, so that a far observer and none at all are the same to the agent: the code
-    of zero features is also the learned null.
+    the animal minds hangs on them, and to learn them from positions takes thousands of steps. Beyond the radius all
+    features are zero, so that a far observer and none at all are the same to the agent: the code of zero features is also
+    the learned null.
     """
 
     def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
