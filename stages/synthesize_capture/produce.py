@@ -4,7 +4,6 @@ Each is a function of its script alone, so order and number of workers change no
 """
 
 import json
-from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,14 +42,11 @@ def produce(scripts: list[Script], creature: Animal, recordings: Path, truth: Pa
     order = sorted(range(len(scripts)), key=lambda index: -len(scripts[index].timestamp_s))
     jobs = [(scripts[index], creature, recordings, truth) for index in order]
     if workers <= 1:
-        made = [record(*job) for job in jobs]
+        done = ((number, record(*job)) for number, job in enumerate(jobs))
     else:
-        with processes.pool(workers) as pool:
-            futures = [pool.submit(record, *job) for job in jobs]
-            for _ in progress.track(as_completed(futures), "recordings", total=len(futures)):
-                pass
-            made = [future.result() for future in futures]
-    return [made[order.index(index)] for index in range(len(scripts))]
+        done = processes.unordered(record, jobs, workers)
+    made = {order[number]: each for number, each in progress.track(done, "recordings", total=len(jobs))}
+    return [made[index] for index in range(len(scripts))]
 
 
 def record(script: Script, creature: Animal, recordings: Path, truth_folder: Path) -> Made:
