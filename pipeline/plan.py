@@ -10,6 +10,7 @@ changes, so that its age tells Make what is to be looked at. Standard library on
 """
 
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -126,10 +127,14 @@ def _digest_of_recording(path: Path, cache: sources.Cache) -> str:
 
 
 def _known_ids(base: Home) -> dict[str, str]:
+    """Return the ids handed out so far, by file name; a file that holds anything else is written anew, as a lost one is."""
     try:
-        return json.loads((base.plan / "ids.json").read_text())
+        known = json.loads((base.plan / "ids.json").read_text())
     except (FileNotFoundError, ValueError):
         return {}
+    ids = list(known.values()) if isinstance(known, dict) else [None]
+    sound = all(isinstance(id, str) and re.fullmatch(r"v[0-9]{3,}", id) for id in ids) and len(set(ids)) == len(ids)
+    return known if sound else {}
 
 
 def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any]) -> frozenset[str]:
@@ -169,9 +174,10 @@ def _json(value: Any) -> str:
 def _cache(home: Home) -> sources.Cache:
     """Return what earlier runs of the planner read, by size and time of the files; lost, it only costs time."""
     try:
-        return sources.Cache(json.loads((home.plan / "cache.json").read_text()))
+        known = json.loads((home.plan / "cache.json").read_text())
     except (FileNotFoundError, ValueError):
-        return sources.Cache()
+        known = {}
+    return sources.Cache(known if sources.fits(known) else {})
 
 
 def _plan(home: Home) -> None:
@@ -181,7 +187,7 @@ def _plan(home: Home) -> None:
     with artifact.held(home.base.folder / "plan.lock"):
         for plan in planned:
             write(plan, cache)
-        artifact.write_if_changed((home.plan / "cache.json"), json.dumps(cache.fresh))
+        artifact.write_if_changed(home.plan / "cache.json", json.dumps(cache.fresh, sort_keys=True))
     folder = Path("captures", home.agent)
     if planned[0].builtin:
         print(f"[{home}] nothing in {folder}/: building from the built-in synthetic capture")

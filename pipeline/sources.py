@@ -6,7 +6,7 @@ comments, docstrings or layout; `settings` are the fields of its `Config`. Stand
 
 import ast
 import functools
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,14 @@ class Cache:
             entry = {"mark": mark, "value": read(path)}
         self.fresh[str(path)] = entry
         return entry["value"]
+
+
+def fits(known: Any) -> bool:
+    """Tell whether this is what a `Cache` kept."""
+    entries = known.values() if isinstance(known, dict) else [None]
+    values = [entry["value"] if isinstance(entry, dict) and entry.keys() == {"mark", "value"} else None for entry in entries]
+    names = {field.name for field in fields(Source)}
+    return all(isinstance(value, str) or (isinstance(value, dict) and value.keys() == names) for value in values)
 
 
 def digest(stage: str, cache: Cache) -> str:

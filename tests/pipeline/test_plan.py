@@ -52,6 +52,17 @@ def test_ids_stay_and_are_never_reused():
     assert later["0.r3d"].id == "v005"
 
 
+def test_what_was_written_down_is_written_anew_when_it_is_broken(house):
+    house.python("pipeline.plan", "plan", "toy")
+    sound = {name: house.folder / f"build/toy/plan/{name}" for name in ("ids.json", "cache.json", "rules.mk")}
+    before = {name: path.read_bytes() for name, path in sound.items()}
+    for broken in ("[]", '{"a": 1}', '{"a": {"mark": [], "value": {}}}'):
+        for name in ("ids.json", "cache.json"):
+            sound[name].write_text(broken)
+        assert house.python("pipeline.plan", "plan", "toy").stderr == ""
+        assert {name: path.read_bytes() for name, path in sound.items()} == before
+
+
 @pytest.mark.parametrize("missing", ["walkthrough", "turnaround", "session"])
 def test_a_partial_capture_is_refused(missing):
     names = [name for name in ("walkthrough.r3d", "turnaround.r3d", "session.r3d") if not name.startswith(missing)]
