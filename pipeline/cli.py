@@ -100,7 +100,11 @@ class Task:
             yield folder
 
     def _opened(self, path: Path, name: str) -> Path:
-        self.contents[name] = artifact.opened(path, name).content
+        made, kind = artifact.opened(path, name), name.partition("/")[0]
+        maker = dag.NODES[kind].stage.rpartition(".")[2] if kind in dag.NODES else made.stage
+        if made.stage != maker:
+            raise InputError("ART-006", f"is no {kind}: {made.stage} wrote it", str(path), f"give what {maker} wrote")
+        self.contents[name] = made.content
         return path
 
 

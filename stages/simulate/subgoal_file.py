@@ -28,8 +28,11 @@ class Written:
     """One `[[subgoal]]`."""
 
     position: tuple[float, ...]
+    """x and z on the floor, or x, y, z of the body's centre; metres, world."""
     heading_deg: float | None = None
+    """Where the head points: about +y, 0 along +z, 90 along +x; None: as it comes."""
     time_s: float | None = None
+    """When to be there, seconds from the beginning; None: as fast as usual."""
 
 
 def tables(table: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:

@@ -3,9 +3,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from safetensors import SafetensorError
 
 from pipeline import progress
 from pipeline.errors import InputError
@@ -26,6 +27,10 @@ from stages.simulate.chained_goals import chained_goals
 from stages.simulate.live import Live, Look
 from stages.simulate.observers import Observer, scripted
 from stages.simulate.rollout import rollout, write_take
+
+T = TypeVar("T")
+MOVED_M = 0.25
+"""A sub-goal that is met further off than this counts as moved."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +108,8 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
         been = np.concatenate([trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in learned])
         subgoals = preferred(been, c.subgoal_count + 1, rng)
     made = journeys.travel(world, subgoals, c.optimisation if c.optimise else None, rng)
+    asked = np.stack([goal.position_world for goal in subgoals])
+    moved = int((np.nan_to_num(np.abs(asked - made.subgoals_world)).max(1) > MOVED_M).sum())
 
     def write(folder: Path) -> None:
         journey_files.write_journey(folder, made, world.body)
@@ -113,22 +120,32 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
     worth = made.after
     said = f"{made.timestamp_s[-1]:.0f} s through {len(subgoals)} sub-goals; {worth.non_collision:.2%} free of collision, "
     said += f"{worth.contact:.1%} in contact, feet slide {100 * worth.slide_m_s:.1f} cm/s, largest seam {100 * made.largest_seam_m:.1f} cm"
+    said += f"; {moved} sub-goals moved to where the animal can be: take.json tells where to" if moved else ""
     return Made(said, write)
 
 
 def _world(given: Mapping[str, Path], data: BehaviorData) -> World:
-    model, reconstruction = LongTerm.load(_needed(given, "longterm")), _needed(given, "reconstruction")
+    model, reconstruction = _loaded(LongTerm.load, _needed(given, "longterm")), _needed(given, "reconstruction")
     roots = np.concatenate([trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in data.trajectories.values()])
     scene = Surroundings.for_motion(meshes.read_ply(reconstruction / "scene.ply"), roots)
     return World(model, load_body(reconstruction), scene)
 
 
 def _simulator(given: Mapping[str, Path], data: BehaviorData, c: Any, chaining: Any, device: str) -> Simulator:
-    architecture, nets, scaling, schedule, _ = behavior.load(_needed(given, "behavior"))
+    architecture, nets, scaling, schedule, _ = _loaded(behavior.load, _needed(given, "behavior"))
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
     volume = FeatureVolume.load(given["behavior_data"] / "volume.npz")
     allowed = arrays.load(given["behavior_data"] / "volume.npz", ("allowed",))["allowed"]
     return Simulator(sampler, data, volume, allowed, architecture.ego, sampling=c.sampling, chaining=chaining)
+
+
+def _loaded(load: Callable[[Path], T], folder: Path) -> T:
+    """Load a trained model; by hand any may be given, so one that another version wrote is told as such."""
+    try:
+        return load(folder)
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
+        what = f"is no model as this version writes it ({type(error).__name__}: {' '.join(str(error).split())[:120]})"
+        raise InputError("ART-007", what, str(folder), "build it again with this version: make <agent>.<artifact>.redo") from error
 
 
 def _observer(data: BehaviorData, c: Any) -> Observer:

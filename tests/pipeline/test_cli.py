@@ -95,8 +95,11 @@ def test_an_input_must_be_finished(stage, tmp_path):
     (tmp_path / "frames" / "v002").mkdir(parents=True)
     call = ("--out", "out", "--frames", "frames", "--videos", "videos.json")
     assert stage(*call).stderr.startswith("error: ART-001 frames/v002")
-    with artifact.create(tmp_path / "frames/v002", stage="s", config={}, inputs={}) as folder:
-        (folder / "x").write_text("x")
+    for wrote in ("segment_agent", "extract_frames"):
+        with artifact.create(tmp_path / "frames/v002", stage=wrote, config={}, inputs={}) as folder:
+            (folder / "x").write_text("x")
+        if wrote == "segment_agent":
+            assert stage(*call).stderr.startswith("error: ART-006 frames/v002: is no frames: segment_agent wrote it")
     assert stage(*call).returncode == 0
     assert (tmp_path / "out/found.txt").read_text() == "v002"
     content = artifact.opened(tmp_path / "frames/v002", "").content

@@ -16,7 +16,7 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page
 
-from pipeline import artifact, config
+from pipeline import artifact, config, dag
 from pipeline.cli import Task
 from pipeline.files import arrays
 from pipeline.models.trajectories import BehaviorData
@@ -40,7 +40,7 @@ def simulator(tmp_path_factory: pytest.TempPathFactory) -> Path:
     raw, build = tmp_path_factory.mktemp("raw"), tmp_path_factory.mktemp("build")
     small_world.write(raw)
     for name in READS:
-        with artifact.create(build / name, stage=name, config={}, inputs={}) as folder:
+        with artifact.create(build / name, stage=dag.NODES[name].stage, config={}, inputs={}) as folder:
             shutil.copytree(raw / name, folder, dirs_exist_ok=True)
     paths = {name: build / name for name in READS}
     task = Task("export_simulator", Config(name="tube"), build / "simulator", None, (), None, 1, None, paths, "cpu")

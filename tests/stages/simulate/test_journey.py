@@ -15,7 +15,7 @@ from pipeline.models.motion_optimization import Settings
 from pipeline.models.motion_synthesis import LongTerm, habits_of
 from pipeline.models.short_motions import Moving
 from pipeline.models.subgoals import Subgoal
-from stages.simulate import journey_files, subgoal_file
+from stages.simulate import journey_files, subgoal_file, takes
 from tests.pipeline.models import strider
 
 SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
@@ -92,8 +92,9 @@ def test_one_sub_goal_is_too_few(world):
         journeys.travel(world, [Subgoal(np.zeros(3))], None, np.random.default_rng(0))
 
 
-def test_a_sub_goal_outside_the_scene_is_refused(world):
-    goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([100.0, np.nan, -1.0]))]
+@pytest.mark.parametrize("place", [(100.0, np.nan, -1.0), (1.2, 50.0, -1.0), (1.2, -50.0, -1.0)])
+def test_a_sub_goal_outside_the_scene_is_refused(world, place):
+    goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array(place))]
     with pytest.raises(InputError, match="SIM-003"):
         journeys.travel(world, goals, None, np.random.default_rng(0))
 
@@ -119,3 +120,12 @@ def test_recorded_motion_becomes_physical(world, tmp_path):
     assert json.loads((tmp_path / "take.json").read_text())["subgoals_world"] == []
     left = journeys.stayed(world, walk, None)
     assert left.moving is walk and left.before == left.after
+
+
+def test_a_model_of_another_version_is_told(world, tmp_path):
+    world.model.save(tmp_path)
+    document = json.loads((tmp_path / "longterm.json").read_text())
+    assert takes._loaded(LongTerm.load, tmp_path).habits == world.model.habits
+    (tmp_path / "longterm.json").write_text(json.dumps({**document, "habits": {"gait_m": 1}}))
+    with pytest.raises(InputError, match="ART-007.*gait_m"):
+        takes._loaded(LongTerm.load, tmp_path)
