@@ -26,6 +26,8 @@ SLACK = 1.35
 """How much longer than the usual pace a leg may be before another one is needed."""
 SOUGHT_M = 0.3
 """How far above or below a raised sub-goal what carries a body there is looked for."""
+BEYOND_M = 1.0
+"""No root is further above or below all surfaces of a scene."""
 TURN_M = 0.2
 """A body that stops keeps this far from where it cannot walk, to have room to turn."""
 LANDING = 2.6
@@ -65,7 +67,12 @@ class Floor:
     room_m: Float[np.ndarray, "x z"]
     """distance from where it cannot"""
     corner: Float[np.ndarray, "2"]
+    """x and z of the first cell, world"""
     height_m: float
+    """of the floor, world"""
+    lowest_m: float
+    highest_m: float
+    """heights between which a root may be, world"""
 
     @classmethod
     def of(cls, scene: Surroundings, habits: Habits, breadth_m: float = 0.16) -> "Floor":
@@ -81,7 +88,8 @@ class Floor:
         free = (above.min(1) > np.minimum(breadth_m / 2, 0.6 * root_m)) & (np.abs(beneath) < 0.1)
         area, _ = label(free, np.ones((3, 3)))
         free &= area == np.bincount(area[free], minlength=1).argmax()
-        return cls(free, CELL_M * distance_transform_edt(free), low[[0, 2]], floor)
+        heights = np.asarray(scene.mesh.vertices)[:, 1]
+        return cls(free, CELL_M * distance_transform_edt(free), low[[0, 2]], floor, heights.min() - BEYOND_M, heights.max() + BEYOND_M)
 
     def cell(self, position: Float[np.ndarray, "3"]) -> tuple[int, int]:
         """Return the free cell nearest to a position."""
@@ -123,16 +131,18 @@ class Floor:
         return tuple(int(v) for v in cells[np.argmin((off**2).sum(1))])
 
     def holds(self, position: Float[np.ndarray, "3"]) -> bool:
-        """Tell whether a position is within the scene's edges."""
-        place = (np.asarray(position)[[0, 2]] - self.corner) / CELL_M
-        return bool(np.all(place >= 0) and np.all(place <= self.free.shape))
+        """Tell whether a position is within the scene's edges; one without height, if x and z are."""
+        place, height_m = (np.asarray(position)[[0, 2]] - self.corner) / CELL_M, position[1]
+        within = np.isnan(height_m) or self.lowest_m <= height_m <= self.highest_m
+        return bool(np.all(place >= 0) and np.all(place <= self.free.shape) and within)
 
     def refuse_outside(self, position: Float[np.ndarray, "3"]) -> None:
         """Raise SIM-003 for a position beyond the scene's edges."""
         if not self.holds(position):
             low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
-            room = f"x {low[0]:.1f} .. {high[0]:.1f} m, z {low[1]:.1f} .. {high[1]:.1f} m"
-            where = f"x {position[0]:g}, z {position[2]:g}"
+            heights = f"y {self.lowest_m:.1f} .. {self.highest_m:.1f} m (floor {self.height_m:.1f} m)"
+            room = f"x {low[0]:.1f} .. {high[0]:.1f} m, {heights}, z {low[1]:.1f} .. {high[1]:.1f} m"
+            where = ", ".join(f"{axis} {value:g}" for axis, value in zip("xyz", position, strict=True) if not np.isnan(value))
             raise InputError("SIM-003", "a sub-goal lies outside the scene", where, f"the scene: {room}")
 
     def way(self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "point 2"]:
@@ -170,7 +180,8 @@ def brought_in(subgoals: list[Subgoal], scene: Surroundings, habits: Habits) -> 
     """Move sub-goals that a model drew outside of the scene to the nearest place where a body can turn."""
     floor = Floor.of(scene, habits)
     return [
-        goal if floor.holds(goal.position_world) else replace(goal, position_world=floor.roomy(goal.position_world)) for goal in subgoals
+        goal if floor.holds(goal.position_world) else replace(goal, position_world=floor.roomy(goal.position_world * [1, np.nan, 1]))
+        for goal in subgoals
     ]
 
 

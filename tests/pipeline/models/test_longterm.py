@@ -179,7 +179,7 @@ def test_a_place_within_a_pen_is_moved_out_of_it(lives, model):
 
 
 def test_a_scene_without_free_floor_is_refused_for_leaps_too():
-    nowhere = Floor(np.zeros((3, 3), bool), np.zeros((3, 3)), np.zeros(2), 0.0)
+    nowhere = Floor(np.zeros((3, 3), bool), np.zeros((3, 3)), np.zeros(2), 0.0, 0.0, 1.0)
     with pytest.raises(InputError, match="SIM-003"):
         nowhere.landing(np.zeros(3), 0.2)
 
