@@ -34,8 +34,8 @@ class Finding:
 
 def python() -> Finding:
     """Check the interpreter."""
-    good = sys.version_info[:2] >= (3, 11)
-    return Finding("python", "ok" if good else "fail", f"{sys.version.split()[0]} ({'' if good else 'needs '}3.11 or newer)")
+    good = (3, 11) <= sys.version_info[:2] < (3, 14)
+    return Finding("python", "ok" if good else "fail", f"{sys.version.split()[0]} (3.11 to 3.13 {'will do' if good else 'is needed'})")
 
 
 def libraries() -> Finding:
