@@ -11,26 +11,25 @@ from pipeline.models.describers import Describer
 from pipeline.models.features import CHANNELS, FeatureBasis
 from stages.extract_features import pictures
 
+STRIDE_PX = 8
+"""Distance between features, colour pixels; what reads them counts on it."""
+
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of feature extraction."""
-
-    stride_px: int = 8
-    """Distance between features, colour pixels; readers expect 8."""
+    """Nothing to set: the descriptor is chosen where its basis is fitted."""
 
 
 def run(task: cli.Task) -> None:
     """Extract one video's features."""
-    settings: Config = task.config
     clip, basis = Clip.open(task.input("frames")), FeatureBasis.load(task.input("feature_basis"))
     describe = Describer.load(task.input("feature_basis")).open(lambda: task.device)
     numbers = progress.track(range(len(clip)), "features: frames")
-    shape = (len(clip), *(side // settings.stride_px for side in clip.color_size), CHANNELS)
+    shape = (len(clip), *(side // STRIDE_PX for side in clip.color_size), CHANNELS)
     with task.create() as folder:
         with arrays.Rows(folder / "features.npz", features=(shape, np.float16)) as table:
             for i in numbers:
-                table.append(features=basis.project(describe(clip.color(i), settings.stride_px)).astype(np.float16))
+                table.append(features=basis.project(describe(clip.color(i), STRIDE_PX)).astype(np.float16))
         pictures.report_quality(folder, clip, arrays.open_lazily(folder / "features.npz", "features"))
 
 

@@ -16,7 +16,8 @@ HEIGHT_PX = 200
 def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame height width 16"]) -> None:
     """Write the stage's own judgement."""
     shown = np.unique(np.linspace(0, len(clip) - 1, SHOWN_FRAMES).astype(int))
-    columns = [np.concatenate([_resized(clip.color(int(i))), _resized(as_colors(features[i]))], axis=0) for i in shown]
+    width_px = max(round(clip.color_size[1] * HEIGHT_PX / clip.color_size[0]), 1)
+    columns = [np.concatenate([_resized(clip.color(int(i)), width_px), _resized(as_colors(features[i]), width_px)]) for i in shown]
     steady = [np.einsum("hwc,hwc->hw", *features[i : i + 2].astype(np.float32)) for i in range(len(features) - 1)]
     qa.write(
         folder,
@@ -32,6 +33,6 @@ def as_colors(features: Float[np.ndarray, "height width 16"]) -> UInt8[np.ndarra
     return np.clip(128 + 220 * features[..., :3].astype(np.float32), 0, 255).astype(np.uint8)
 
 
-def _resized(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-    width = round(image.shape[1] * HEIGHT_PX / image.shape[0])
-    return cv2.resize(image, (width, HEIGHT_PX), interpolation=cv2.INTER_AREA)
+def _resized(image: UInt8[np.ndarray, "height width 3"], width_px: int) -> UInt8[np.ndarray, "200 width 3"]:
+    """Bring a picture and its features, which leave out what is no whole cell of it, to one size."""
+    return cv2.resize(image, (width_px, HEIGHT_PX), interpolation=cv2.INTER_AREA)

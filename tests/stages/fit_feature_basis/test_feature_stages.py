@@ -24,7 +24,8 @@ def _write_clip(folder, seed):
         images.write_depth(inside / "depth" / "000000.exr", np.ones((8, 6)))
         for i in range(3):
             small = rng.integers(0, 255, (24, 18, 3), dtype=np.uint8)
-            images.write_color(inside / "color" / f"{i:06d}.jpg", cv2.resize(small, (72, 96)))
+            picture = cv2.resize(small, (78, 101))  # no whole number of cells
+            images.write_color(inside / "color" / f"{i:06d}.jpg", picture)
         eye = np.tile(np.eye(3), (3, 1, 1))
         table = dict(timestamp_s=np.arange(3) / 10, intrinsics=eye, depth_intrinsics=eye)
         arrays.save(inside / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(3, np.float32))
@@ -54,7 +55,7 @@ def world(tmp_path):
 
 def _run(front, monkeypatch, reads, **options):
     argv = [
-        front.__package__.split(".")[-1],
+        f"{front.__package__.split('.')[-1]}/__main__.py",
         *(part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))),
     ]
     monkeypatch.setattr(sys, "argv", argv)
@@ -67,7 +68,7 @@ def test_basis_ignores_the_test_video_and_features_follow_it(world, monkeypatch)
     before = (world / "basis" / "basis.npz").read_bytes()
     test_video = world / "frames" / "v003"
     for i in range(3):
-        images.write_color(test_video / "color" / f"{i:06d}.jpg", np.zeros((96, 72, 3), np.uint8))
+        images.write_color(test_video / "color" / f"{i:06d}.jpg", np.zeros((101, 78, 3), np.uint8))
     _run(fit, monkeypatch, ("frames",), **common, out=world / "again")
     assert (world / "again" / "basis.npz").read_bytes() == before
     _run(
