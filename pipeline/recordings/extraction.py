@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from pipeline.errors import InputError
 from pipeline.files import images
 from pipeline.recordings import conventions
 from pipeline.recordings.conventions import SelfCheck
@@ -27,6 +28,10 @@ LEAST_TRACKED = 0.8
 MEASURED, RELATIVE = "measured", "relative"
 UPRIGHT_VIEWS = 12
 """frames whose depth tells what is up where no sensor did"""
+UNIT_VIEWS = 5
+"""frames whose depth tells whether it can be metres"""
+NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
+"""typical depth is not below the one, metres, nor above the other, in units of the farthest that is used"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
 """mean brightness (0..1) below which a picture loses quality"""
@@ -74,10 +79,12 @@ class Frame:
 def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pairs: int, max_side_px: int) -> Plan:
     """Choose frames, check the poses on the depth, find the upright turn and the size of the pictures.
 
-    Raises InputError CAP-006 for a recording without depth.
+    Raises InputError CAP-006 for a recording without depth, CAP-004 and CAP-008 for intrinsics and depth that cannot be.
     """
     if recording.depth_size is None or recording.intrinsics is None:
         raise no_depth(recording.where, f"{recording.kind}; an animal moves, so that pictures alone do not tell how far away it is")
+    _refuse_other_pictures(recording)
+    _refuse_other_unit(recording, max_depth_m)
     depth_size = reduced_size(recording.depth_size, MAX_DEPTH_SIDE_PX)
     depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, depth_size)
     used, pose, lost = _tracked(recording)
@@ -119,6 +126,25 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
         quarter_turns=turns,
         self_check=check,
     )
+
+
+def _refuse_other_pictures(recording: Recording) -> None:
+    """Raise CAP-004 for intrinsics whose centre lies outside of the picture: those of another resolution, or of one turned."""
+    (height, width), center = recording.color_size, np.median(recording.intrinsics[:, :2, 2], axis=0)
+    if not ((center > 0) & (center < (width, height))).all():
+        why = f"the intrinsics' centre, {center[0]:.0f} {center[1]:.0f}, lies outside of pictures of {width} x {height}"
+        raise broken_metadata(recording.where, why)
+
+
+def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
+    """Raise CAP-008 for depth that is typically farther or nearer than any sensor would be used at: written in another unit."""
+    shown = recording.index[np.unique(np.linspace(0, len(recording.index) - 1, UNIT_VIEWS).astype(int))]
+    depth = np.concatenate([recording.read_depth(int(number)).ravel() for number in shown])
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    typical_m = float(np.median(depth)) if len(depth) else max_depth_m
+    if not NEAREST_TYPICAL_M < typical_m < FARTHEST_TYPICAL * max_depth_m:
+        what = f"depth is typically {typical_m:.3g} m, where up to {max_depth_m:g} m are used"
+        raise InputError("CAP-008", what, recording.where, "16-bit PNG holds millimetres, EXR metres; record things within 5 m")
 
 
 def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.ndarray, "used 7"] | None, str]:

@@ -80,6 +80,12 @@ class Look:
         return float(np.mean([(shot.depth > 0).mean() if shot.depth.size else 0.0 for shot in self.shots]))
 
     @property
+    def depth_m(self) -> float:
+        """Typical depth, metres; NaN where none is known."""
+        known = np.concatenate([shot.depth[shot.depth > 0] for shot in self.shots] or [np.zeros(0)])
+        return float(np.median(known)) if len(known) else np.nan
+
+    @property
     def beyond(self) -> float:
         """Share of depth beyond the sensor's range, 0..1."""
         return float(np.mean([shot.beyond for shot in self.shots]))

@@ -16,7 +16,7 @@ def told(name: str, role: Role, seen: Seen, found: Sequence[Problem]) -> str:
     lines = [f"{name}  {role}, {recording.kind}", f"  {look.duration_s:.1f} s, {look.rate_hz:.1f} fps, {width} x {height}, {_turn(seen)}"]
     lines.append(f"  pictures: dark {look.dark:.0%}, blurred {look.blurred:.0%}")
     if look.plan is not None:
-        lines[-1] += f"; depth: known {look.depth_valid:.0%}, beyond range {look.beyond:.0%}"
+        lines[-1] += f"; depth: typically {look.depth_m:.1f} m, known {look.depth_valid:.0%}, beyond range {look.beyond:.0%}"
         lines.append(f"  device poses: {_poses(seen)}")
     if seen.placed is not None:
         lines.append(f"  found in the walk-through: {seen.placed:.0%} of the frames")

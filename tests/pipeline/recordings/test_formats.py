@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from pipeline.errors import InputError
+from pipeline.files import images
 from pipeline.recordings import extraction, stray_scanner, tum
 from pipeline.recordings.formats import format_of, open_recording
 from pipeline.recordings.movies import Movie
@@ -169,6 +170,20 @@ def _no_intrinsics(path, made):
     return path
 
 
+def _millimetres_as_metres(path, made):
+    made_formats.video_and_depth(path, made)
+    for number in range(6):
+        (path / f"depth/{number:06d}.png").unlink(missing_ok=True)
+        images.write_depth(path / f"depth/{number:06d}.exr", 100 * made.depth(number))
+    return path
+
+
+def _intrinsics_of_another_size(path, made):
+    made_formats.video_and_depth(path, made)
+    (path / "intrinsics.txt").write_text("3000 3000 1920 1080")
+    return path
+
+
 def _constant_rows(path, made):
     made_formats.stray(path, made)
     for file in (path / "depth").iterdir():
@@ -215,6 +230,8 @@ FAULTS = {
     "CAP-006": _no_depth,
     "CAP-007": _unmatched,
     "CAP-008": _other_depth_size,
+    "CAP-004  ": _intrinsics_of_another_size,
+    "CAP-008 ": _millimetres_as_metres,
     "CAP-009": _constant_rows,
     "CAP-010": lambda path, made: made_formats.nerfcapture_zip(path.with_suffix(".zip"), made),
     "CAP-011": _no_intrinsics,
