@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from pipeline.errors import InputError
 from pipeline.files.clips import Clip, Masks
 from pipeline.space import rigid
 from pipeline.space.depth_alignment import DepthView, depth_view
@@ -12,6 +13,8 @@ from pipeline.space.ground import Ground, fit_ground
 from pipeline.space.straightening import Straightened, Straightening, chain, level, straighten
 
 STRIDE = 2
+LEAST_POINTS = 200
+"""points of depth, over some 40 frames at that stride, without which nothing can be told"""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,10 @@ class Circle:
 
 
 def walk_around(clip: Clip, masks: Masks, options: Straightening) -> Circle:
-    """Place all cameras by the whole still scene, the animal included; the ground is the level surface around it."""
+    """Place all cameras by the whole still scene, the animal included; the ground is the level surface around it.
+
+    Raises InputError AGT-001 where hardly any depth was measured on the animal, or on a level surface.
+    """
 
     def view(frame: int) -> DepthView:
         return depth_view(clip.depth(frame), clip.depth_intrinsics[frame], clip.confidence(frame) > 0, STRIDE)
@@ -45,8 +51,12 @@ def walk_around(clip: Clip, masks: Masks, options: Straightening) -> Circle:
         known = seen.points[..., 2] > 0
         animal.append(points[known & (label == 255)])
         floor.append(points[known & (label == 0) & (up > 0.9)])
-    middle = np.median(np.concatenate(animal), axis=0)
-    return Circle(poses, fit_ground(np.concatenate(floor), middle, reach_m=0.4), straightened)
+    on_animal, on_floor = np.concatenate(animal), np.concatenate(floor)
+    if min(len(on_animal), len(on_floor)) < LEAST_POINTS:
+        what = f"only {len(on_animal)} points of depth were measured on the animal and {len(on_floor)} on level ground"
+        remedy = "circle it from about 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
+        raise InputError("AGT-001", what, str(masks.folder), remedy)
+    return Circle(poses, fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=0.4), straightened)
 
 
 def depth_labels(labels: UInt8[np.ndarray, "height width"], size: tuple[int, int]) -> UInt8[np.ndarray, "depth_height depth_width"]:

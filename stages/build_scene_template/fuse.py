@@ -16,6 +16,9 @@ from pipeline.space import cameras, relax, rigid, surface, tsdf
 from pipeline.space.meshes import Mesh
 from stages.build_scene_template.refine import RefineOptions, odometry_edges
 
+MOST_VOXELS = 150_000_000
+"""More would take over 4 GB."""
+
 
 @dataclass(frozen=True)
 class FuseOptions:
@@ -42,9 +45,15 @@ class FuseOptions:
 
 
 def fuse(clip: Clip, frames: Int[np.ndarray, "view"], world_from_camera: Float[np.ndarray, "frame 4 4"], options: FuseOptions) -> Mesh:
-    """Integrate the frames into one volume and extract what was seen."""
+    """Integrate the frames into one volume and extract what was seen. Raises InputError MAP-005 where that is too large."""
     scans = [surface.scan(clip.depth(int(f)), clip.depth_intrinsics[f], stride=12, furthest_m=options.furthest_m) for f in frames[::4]]
     points = np.concatenate([rigid.apply(world_from_camera[f], scan.points_camera) for f, scan in zip(frames[::4], scans, strict=True)])
+    extent_m = np.ptp(np.quantile(points, [0.001, 0.999], axis=0), axis=0)
+    if np.prod(extent_m / options.voxel_m) > MOST_VOXELS:
+        what = f"the walk-through spans {' x '.join(f'{side:.0f}' for side in extent_m)} m: too much for voxels of {options.voxel_m:g} m"
+        raise InputError(
+            "MAP-005", what, str(clip.folder), "walk through one room, or set a larger voxel_m in [build_scene_template.fusion]"
+        )
     volume = tsdf.enclose(points, voxel_m=options.voxel_m, truncation_m=options.truncation_m)
     for frame in track(frames.tolist(), "fusing frames"):
         depth = clip.depth(frame)

@@ -14,6 +14,7 @@ from pipeline.files.clips import Clip
 from pipeline.space import rigid
 from stages.build_agent_template.bones import Skeleton, lay_bones
 from stages.build_agent_template.carve import Silhouettes
+from stages.build_agent_template.poses import depth_labels, walk_around
 from stages.build_agent_template.template import Options, build
 
 _spec = importlib.util.spec_from_file_location("room_with_animal", Path(__file__).parent.parent / "room_with_animal.py")
@@ -127,3 +128,14 @@ def test_too_few_frames_are_refused(turnaround):
     few = TrueMasks(np.where(np.arange(36)[:, None, None] < 5, masks.masks, False), masks.folder)
     with pytest.raises(InputError, match="AGT-001"):
         build(clip, few, features, Options(), np.random.default_rng(0))
+
+
+def test_an_animal_without_depth_is_refused(turnaround):
+    clip, masks, _, _ = turnaround
+
+    class Blind(Clip):
+        def depth(self, frame):
+            return np.where(depth_labels(masks[frame], self.depth_size) == 255, 0, super().depth(frame))
+
+    with pytest.raises(InputError, match="AGT-001.*only 0 points"):
+        walk_around(Blind(**vars(clip)), masks, Options().straightening)

@@ -141,3 +141,9 @@ def test_false_matches_are_dropped_by_depth(clip, tmp_path):
     kept, all_pairs = matches.confirm(clip, tmp_path / "database.db", matches.ConfirmOptions(), np.random.default_rng(0))
     assert all_pairs == len(pairs)
     assert kept == len(pairs) - 1, "the scrambled pair goes, the others stay"
+
+
+def test_more_than_a_home_is_refused(clip, monkeypatch):
+    monkeypatch.setattr(fuse, "MOST_VOXELS", 1000)
+    with pytest.raises(InputError, match="MAP-005.*the walk-through spans"):
+        fuse.fuse(clip, np.arange(0, 48, 4), clip.truth, fuse.FuseOptions(voxel_m=0.05))
