@@ -216,8 +216,12 @@ def _quality(out: Path) -> str:
         report = json.loads((out / "qa.json").read_text())
     except (FileNotFoundError, ValueError):
         return ""
-    worries = [f"{check['name']} {check['value']} {check['unit']}".strip() for check in report["checks"] if check["status"] != "ok"]
+    worries = [f"{check['name']} {_short(check['value'])} {check['unit']}".strip() for check in report["checks"] if check["status"] != "ok"]
     return f", quality {report['status']}" + (f": {'; '.join(worries)}" if worries else "")
+
+
+def _short(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
 
 
 def _commit() -> str | None:
