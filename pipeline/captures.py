@@ -162,10 +162,10 @@ def builtin(session_count: int, heldout_of: int, foreign_sessions: int = 0) -> d
     return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}
 
 
-def builtin_lives(homes: int, sessions_per_home: int, test_sessions: int) -> dict[str, Remarks]:
-    """Return the recordings that `synthesize_capture.lives` writes; those of the last home are the test."""
-    trained = (homes - 1) * sessions_per_home
-    return {f"session-{n + 1:02d}.npz": Remarks(split="train" if n < trained else "test") for n in range(trained + test_sessions)}
+def builtin_lives(homes: int, sessions_per_home: int, test_homes: int, test_sessions: int) -> dict[str, Remarks]:
+    """Return the recordings that `synthesize_capture.lives` writes; those of the last homes are the test."""
+    splits: list[Split] = ["train"] * (homes * sessions_per_home) + ["test"] * (test_homes * test_sessions)
+    return {f"session-{number:02d}.npz": Remarks(split=split) for number, split in enumerate(splits, start=1)}
 
 
 def _is_table(path: Path) -> bool:

@@ -95,7 +95,9 @@ def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], cache: sources.Cach
     if begins == "recordings":
         said = captures.builtin(*(_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions")))
     else:
-        said = captures.builtin_lives(*(_count(settings, key, where) for key in ("homes", "sessions_per_home", "test_sessions")))
+        said = captures.builtin_lives(
+            *(_count(settings, key, where) for key in ("homes", "sessions_per_home", "test_homes", "test_sessions"))
+        )
     for name in (name for name in overrides if name not in said):
         remedy = f"copy it into captures/, beside the others; without any, the built-in capture has {', '.join(said)}"
         raise InputError("REC-001", f"unknown recording {name!r}", f"{where}: [videos]", remedy)

@@ -16,7 +16,7 @@ from torch import nn
 
 from pipeline.models.body_denoiser import TOLD, BodyDenoiser
 from pipeline.models.concatenation import ConcatenationUNet
-from pipeline.models.denoisers import ControlUNet, GoalMLP
+from pipeline.models.denoisers import ControlUNet, FreeUNet, GoalMLP
 from pipeline.models.diffusion import STANDARD, Schedule
 from pipeline.models.perception import (
     GRID_CELL_M,
@@ -162,16 +162,17 @@ class BehaviorNets(nn.Module):
         a = architecture
         self.perception = Minds(a.perception, a.minds)
         self.goal = GoalMLP(3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds)
-        body = a.body_channels + (STRIDE if a.family == "one_stage" else 0)
         match a.control:
             case "unet":
                 self.path = ControlUNet(STRIDE, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
-                along = ControlUNet(body, TOLD, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                along = ControlUNet(a.body_channels, TOLD, a.condition, a.unet_width, a.unet_multipliers, schedule)
             case "concatenation":
                 self.path = ConcatenationUNet(STRIDE, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
-                along = ConcatenationUNet(body, TOLD * a.future, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                along = ConcatenationUNet(a.body_channels, TOLD * a.future, a.condition, a.unet_width, a.unet_multipliers, schedule)
             case _:
                 assert_never(a.control)
+        if a.family == "one_stage":  # one network for path and body, which nothing steers
+            along = FreeUNet(STRIDE + a.body_channels, a.condition, a.unet_width, a.unet_multipliers, schedule)
         self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
 
 

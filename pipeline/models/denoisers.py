@@ -188,3 +188,27 @@ class ControlUNet(nn.Module):
         side = self.side(control, embedding)
         added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
         return self.noise(x, self.out(self.main(x, embedding, added)[-1]), t)
+
+
+class FreeUNet(nn.Module):
+    """Denoise a sequence that nothing steers; called as `ControlUNet` is, and as good as one whose control is never kept."""
+
+    def __init__(
+        self, channels: int, condition: int, width: int = 32, multipliers: tuple[int, ...] = (1, 2, 4), schedule: Schedule = STANDARD
+    ):
+        super().__init__()
+        self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
+        self.embedding = Embedding(nn.Linear(condition, EMBEDDING))
+        self.main = UNet(channels, widths, EMBEDDING)
+        self.out = nn.Conv1d(widths[0], channels, 1)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch ..."],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch channel frame"]:
+        del control, keep
+        return self.noise(x, self.out(self.main(x, self.embedding(t, condition))[-1]), t)

@@ -1,8 +1,11 @@
 """The person with the phone: follows the animal, walks up to it, stands, steps back, strolls.
 
-A small random state machine. Approaches come every 8 to 10 s so that what the animal does about
-people can be learnt from minutes of video. Positions (x, z) on the floor in metres, yaw about +y.
+A small random state machine. Who films comes up every 8 to 10 s so that what the animal does about people can be learnt
+from minutes of video, mostly from where the animal came to; who lives there leaves it alone for longer, goes off again,
+and comes up from across the room. Positions (x, z) on the floor in metres, yaw about +y.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -10,14 +13,45 @@ from jaxtyping import Float
 from stages.synthesize_capture.navigation import Floor, Ground, Walker
 
 REACTION_S = 0.28
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How a person moves; ranges are drawn from evenly, times in seconds, paces in m/s."""
+
+    watch_s: Range = (7.0, 9.0)
+    approach_s: Range = (2.0, 3.0)
+    approach_pace: Range = (0.9, 1.2)
+    retreat_s: Range = (1.4, 2.2)
+    retreat_pace: Range = (0.6, 0.85)
+    far_m: float = 2.7
+    """from farther off the animal is not walked up to, but strolled to a film's distance first"""
+    stays: float = 0.8
+    """probability to stand where an approach ended, rather than to step back"""
+    comes_up: float = 0.88
+    """probability to walk up after standing, rather than to stroll"""
+
+
+FILMING = Habits()
+AT_HOME = Habits(
+    watch_s=(4.0, 20.0),
+    approach_s=(4.0, 6.0),
+    approach_pace=(0.8, 1.3),
+    retreat_s=(2.0, 4.0),
+    retreat_pace=(0.7, 1.1),
+    far_m=4.0,
+    stays=0.1,
+    comes_up=0.95,
+)
 
 
 class Observer:
     """A person who films; `step` moves it once, `looks_at` is what the phone points to."""
 
-    def __init__(self, floor: Floor, position: Ground, rng: np.random.Generator):
+    def __init__(self, floor: Floor, position: Ground, rng: np.random.Generator, habits: Habits = FILMING):
         self.walker = Walker(floor, floor.nearest(position), 0.0, turn_rate=2.6, acceleration=2.2)
-        self.rng = rng
+        self.rng, self.habits = rng, habits
         self.mode, self.left_s, self.pace, self.since_plan_s = "watch", rng.uniform(1.0, 2.0), 0.0, 0.0
         self.velocity = np.zeros(2)
         self.looks_at: Float[np.ndarray, 3] | None = None
@@ -47,6 +81,7 @@ class Observer:
 
     def _choose(self, animal: Ground) -> None:
         """Take up the next mode."""
+        habits = self.habits
         self.walker.stop()
         self.pace = 0.0
         after = {
@@ -55,17 +90,17 @@ class Observer:
             "retreat": ("watch", "approach"),
             "stroll": ("approach", "watch"),
         }
-        chance = {"approach": 0.8, "watch": 0.88, "retreat": 1.0, "stroll": 0.2}[self.mode]
-        far = self.mode != "stroll" and np.linalg.norm(self.walker.position - animal) > 2.7
+        chance = {"approach": habits.stays, "watch": habits.comes_up, "retreat": 1.0, "stroll": 0.2}[self.mode]
+        far = self.mode != "stroll" and np.linalg.norm(self.walker.position - animal) > habits.far_m
         self.mode = "stroll" if far else after[self.mode][0 if self.rng.random() < chance else 1]
         match self.mode:
             case "watch":
-                self.left_s = self.rng.uniform(7.0, 9.0)
+                self.left_s = self.rng.uniform(*habits.watch_s)
             case "approach":
-                self.left_s, self.pace = self.rng.uniform(2.0, 3.0), self.rng.uniform(0.9, 1.2)
+                self.left_s, self.pace = self.rng.uniform(*habits.approach_s), self.rng.uniform(*habits.approach_pace)
                 self._plan_approach(animal)
             case "retreat":
-                self.left_s, self.pace = self.rng.uniform(1.4, 2.2), self.rng.uniform(0.6, 0.85)
+                self.left_s, self.pace = self.rng.uniform(*habits.retreat_s), self.rng.uniform(*habits.retreat_pace)
                 self._go_by(
                     animal,
                     lambda center: (

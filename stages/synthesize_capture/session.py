@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from stages.synthesize_capture.navigation import floor_for
-from stages.synthesize_capture.observer import Observer
+from stages.synthesize_capture.observer import FILMING, Habits, Observer
 from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, Seen
 from stages.synthesize_capture.room import Room
 
@@ -52,7 +52,7 @@ class SessionTrajectories:
     """Index into `policy.REASONS`."""
 
 
-def simulate_session(room: Room, rng: np.random.Generator, duration_s: float) -> SessionTrajectories:
+def simulate_session(room: Room, rng: np.random.Generator, duration_s: float, habits: Habits = FILMING) -> SessionTrajectories:
     """Simulate one session in a room; the same generator state gives the same session."""
     animal_floor = floor_for(room.footprints(), breadth_m=ANIMAL_BREADTH_M, height_m=ANIMAL_HEIGHT_M)
     person_floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
@@ -60,7 +60,7 @@ def simulate_session(room: Room, rng: np.random.Generator, duration_s: float) ->
     centers = animal_floor.centers()
     begin = centers[np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))]
     animal = Policy(animal_floor, room.places, begin, rng)
-    observer = Observer(person_floor, start, rng)
+    observer = Observer(person_floor, start, rng, habits)
     past: deque[Seen] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
     count = int(np.ceil(duration_s / STEP_S)) + 2
     rows: list[tuple] = []

@@ -1,7 +1,7 @@
 """Simulate the built-in animal's life in several homes, without pictures: what behaviour models are measured on.
 
 Writes one table of motion per session, each with its home as a feature volume, in the form that `read_trajectories`
-takes; the last home is unseen in training. Apart from them: scripted approaches in that home, with what the animal did.
+takes; the last homes are unseen in training. Apart from them: scripted approaches in the very last, with what the animal did.
 """
 
 from dataclasses import dataclass
@@ -19,12 +19,14 @@ class Config:
 
     seed: int = 0
     """Decides everything: homes, behaviour, the person's walks."""
-    homes: int = 22
-    """Homes, differently furnished; the last one is for the test."""
+    homes: int = 24
+    """Homes to learn from, differently furnished."""
     sessions_per_home: int = 1
-    """Sessions in each home but the last, with its loose things elsewhere each time."""
-    test_sessions: int = 12
-    """Sessions in the last home: more of them narrow the intervals of all that is judged there."""
+    """Sessions in each of them, with its loose things elsewhere each time."""
+    test_homes: int = 2
+    """Homes that training never sees."""
+    test_sessions: int = 8
+    """Sessions in each of those: more of them narrow the intervals of all that is judged there."""
     session_s: float = 150.0
     """Length of a session, seconds."""
     approaches: int = 400
@@ -34,12 +36,14 @@ class Config:
 def run(task: cli.Task) -> None:
     """Furnish the homes, let the animal live in them, and script the approaches."""
     c: Config = task.config
-    homes = [dwellings.furnish_otherwise(np.random.default_rng([c.seed, 10, number])) for number in range(c.homes)]
+    homes = [dwellings.furnish_otherwise(np.random.default_rng([c.seed, 10, number])) for number in range(c.homes + c.test_homes)]
+    sessions = [home for home in homes[: c.homes] for _ in range(c.sessions_per_home)]
+    sessions += [home for home in homes[c.homes :] for _ in range(c.test_sessions)]
     lived = {}
-    for number in range((c.homes - 1) * c.sessions_per_home + c.test_sessions):
-        rng, home = np.random.default_rng([c.seed, 11, number]), homes[min(number // c.sessions_per_home, c.homes - 1)]
+    for number, home in enumerate(sessions):
+        rng = np.random.default_rng([c.seed, 11, number])
         lived[f"session-{number + 1:02d}"] = lives.lived(home.rearranged(rng), rng, c.session_s)
-    progress.log(f"{len(lived)} sessions of {c.session_s:g} s in {c.homes} homes")
+    progress.log(f"{len(lived)} sessions of {c.session_s:g} s in {len(homes)} homes")
     met = approaches.scripted(homes[-1], np.random.default_rng([c.seed, 12]), c.approaches) if c.approaches else None
     with task.create() as folder:
         (folder / "recordings").mkdir()

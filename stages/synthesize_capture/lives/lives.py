@@ -11,6 +11,7 @@ from pipeline.models.perception import FeatureVolume
 from stages.synthesize_capture import camera_motion, gait, session
 from stages.synthesize_capture.animal import BONES, HEADS
 from stages.synthesize_capture.dwellings import Dwelling
+from stages.synthesize_capture.observer import AT_HOME
 from stages.synthesize_capture.voxels import volume_of
 
 RATE_HZ = 10.0
@@ -30,8 +31,8 @@ class Life:
 
 
 def lived(home: Dwelling, rng: np.random.Generator, duration_s: float) -> Life:
-    """Let animal and person live together for a while."""
-    told = session.simulate_session(home.room, rng, duration_s)
+    """Let animal and a person who lives there be together for a while."""
+    told = session.simulate_session(home.room, rng, duration_s, AT_HOME)
     timestamp_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     sample = np.round(timestamp_s / session.STEP_S).astype(int)
     motion = gait.poses(told.animal, timestamp_s)

@@ -4,6 +4,7 @@ import numpy as np
 
 from stages.synthesize_capture import review, room
 from stages.synthesize_capture.navigation import floor_for
+from stages.synthesize_capture.observer import AT_HOME, FILMING
 from stages.synthesize_capture.policy import REASONS, Policy, Seen
 from stages.synthesize_capture.session import STEP_S, simulate_session
 
@@ -14,6 +15,16 @@ def test_same_seed_same_session():
     first, second = (simulate_session(HOME, np.random.default_rng(5), 8.0) for _ in range(2))
     np.testing.assert_array_equal(first.animal.position, second.animal.position)
     np.testing.assert_array_equal(first.observer_looks_at, second.observer_looks_at)
+
+
+def test_who_lives_there_comes_up_from_farther_than_who_films():
+    nearest = []
+    for habits in (FILMING, AT_HOME):
+        told = simulate_session(HOME, np.random.default_rng(5), 40.0, habits)
+        away = np.linalg.norm(told.animal.position[:, [0, 2]] - told.observer_position, axis=-1)
+        walks = np.linalg.norm(np.diff(told.observer_position, axis=0, append=told.observer_position[-1:]), axis=-1) > 0.02
+        nearest.append(np.median(away[walks & (np.gradient(away) < 0)]))
+    assert nearest[1] > nearest[0]
 
 
 def test_manner_over_minutes():
