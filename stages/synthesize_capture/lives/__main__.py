@@ -29,6 +29,8 @@ class Config:
     """Sessions in each of those: more of them narrow the intervals of all that is judged there."""
     session_s: float = 150.0
     """Length of a session, seconds."""
+    takes: int = 5
+    """Takes of a session, each begun anew from anywhere in the home: else the animal is mostly met in the corners that it fled to."""
     approaches: int = 400
     """Scripted approaches of a person in the last home, each with a twin in which the person stands still; 0 = none."""
 
@@ -42,7 +44,7 @@ def run(task: cli.Task) -> None:
     lived = {}
     for number, home in enumerate(sessions):
         rng = np.random.default_rng([c.seed, 11, number])
-        lived[f"session-{number + 1:02d}"] = lives.lived(home.rearranged(rng), rng, c.session_s)
+        lived[f"session-{number + 1:02d}"] = lives.lived(home.rearranged(rng), rng, c.session_s, c.takes)
     progress.log(f"{len(lived)} sessions of {c.session_s:g} s in {len(homes)} homes")
     met = approaches.scripted(homes[-1], np.random.default_rng([c.seed, 12]), c.approaches) if c.approaches else None
     with task.create() as folder:

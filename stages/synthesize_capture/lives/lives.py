@@ -15,6 +15,8 @@ from stages.synthesize_capture.observer import AT_HOME
 from stages.synthesize_capture.voxels import volume_of
 
 RATE_HZ = 10.0
+APART_S = 5.0
+"""Between two takes of a session, so that no window spans them."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +32,21 @@ class Life:
     """Index into `policy.REASONS`, per frame."""
 
 
-def lived(home: Dwelling, rng: np.random.Generator, duration_s: float) -> Life:
-    """Let animal and a person who lives there be together for a while."""
+def lived(home: Dwelling, rng: np.random.Generator, duration_s: float, takes: int = 1) -> Life:
+    """Let animal and a person who lives there be together for a while, in several takes, each begun anew from anywhere."""
+    played = [_take(home, rng, duration_s / takes) for _ in range(takes)]
+    begun_s = np.arange(takes) * (duration_s / takes + APART_S)
+    time, agent, bones, camera, reason = (np.concatenate(column) for column in zip(*played, strict=True))
+    return Life(time + np.repeat(begun_s, [len(part[0]) for part in played]), agent, bones, camera, volume_of(home), reason)
+
+
+def _take(home: Dwelling, rng: np.random.Generator, duration_s: float) -> tuple[np.ndarray, ...]:
     told = session.simulate_session(home.room, rng, duration_s, AT_HOME)
     timestamp_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     sample = np.round(timestamp_s / session.STEP_S).astype(int)
     motion = gait.poses(told.animal, timestamp_s)
     camera = camera_motion.filming(told, rng)[sample]
-    return Life(timestamp_s, motion.world_from_agent, motion.agent_from_bone, camera, volume_of(home), told.reason[sample])
+    return timestamp_s, motion.world_from_agent, motion.agent_from_bone, camera, told.reason[sample]
 
 
 def rest() -> Float[np.ndarray, "bone 4 4"]:

@@ -30,8 +30,9 @@ def homes(lived: dict[str, Life]) -> UInt8[np.ndarray, "height width 3"]:
         low, high = volume.origin[[0, 2]], volume.origin[[0, 2]] + np.array(volume.occupancy.shape)[[0, 2]] * volume.voxel_m
         solid = (volume.occupancy[:, ROOT_CELLS] == 1).any(1)
         axis.imshow(solid.T, cmap="Greys", extent=(low[0], high[0], high[1], low[1]), vmax=2)
-        axis.plot(*life.world_from_camera[:, [0, 2], 3].T, color="#55a868", linewidth=0.5)
-        axis.plot(*life.world_from_agent[:, [0, 2], 3].T, color="#3b6ea5", linewidth=0.8)
+        again = np.flatnonzero(np.diff(life.timestamp_s) > 1.5 / RATE_HZ) + 1
+        for way, color, width in ((life.world_from_camera, "#55a868", 0.5), (life.world_from_agent, "#3b6ea5", 0.8)):
+            axis.plot(*np.insert(way[:, [0, 2], 3], again, np.nan, axis=0).T, color=color, linewidth=width)
         axis.set(title=name, xticks=[], yticks=[])
     return figures.pixels(figure)
 

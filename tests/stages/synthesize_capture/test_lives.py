@@ -25,7 +25,8 @@ def test_homes_differ(home):
 
 def test_the_animal_never_walks_through_what_the_volume_calls_solid(home):
     rng = np.random.default_rng(0)
-    life = lives.lived(home.rearranged(rng), rng, 30.0)
+    life = lives.lived(home.rearranged(rng), rng, 30.0, takes=2)
+    assert np.flatnonzero(np.diff(life.timestamp_s) > 1).tolist() == [149], "two takes, and no window over both"
     voxel, inside = life.volume.voxel(life.world_from_agent[:, :3, 3])
     assert inside.all()
     assert (life.volume.occupancy[tuple(voxel.T)] == 1).mean() < 0.01
