@@ -265,6 +265,11 @@ def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> 
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, "pixels"
         page.touchscreen.tap(*page.evaluate("ats.screen([0.2, 0, -0.3])"))
         assert np.allclose(page.evaluate("ats.state().aim"), [0.2, -0.3], atol=0.05), "metres"
+        assert not page.is_visible("#help")
+        page.click("#how")
+        assert page.is_visible("#help") and "Click the floor" in page.inner_text("#help")
+        page.click("#how")
+        page.wait_for_function("document.getElementById('help').classList.contains('gone')")
         assert wrong == []
 
 

@@ -38,6 +38,7 @@ export class Controls {
       this.on.play();
       event.preventDefault();
     } else if (pressed && key === 'r') this.on.reset();
+    else if (pressed && key === 'h') this.on.how();
     else if (pressed && key === 'c') this.on.aim([...this.observer.place]);
     else if (pressed && (key === 'p' || key === 'g')) this.on.hold(key === 'p' ? 'pen' : 'pins');
     else if (pressed && key === 'escape' && this.tool) this.on.hold(null);

@@ -91,6 +91,7 @@ class Simulator {
       reset: () => this.reset(),
       aim: (point, further) => this.visit(further ? [...this.stops.left, point] : [point]),
       hold: (tool) => this.hold(tool),
+      how: panel.howTo,
       stroke: (points) => this.overlays.ask(points),
       drawn: (points) => this.follow(points),
       carry: (point) => { this.observer.target = point; this.taken = true; },
@@ -285,7 +286,7 @@ class Simulator {
     try {
       plan = await this.planner.plan(this.question({ seed: this.state.seed * 1009 + this.turnNumber++ }));
     } catch (error) {
-      return panel.status(`cannot plan: ${error.message}`);
+      return panel.status(`cannot plan (${error.message}): start again, or reload the page`);
     }
     if (epoch !== this.epoch) return;
     this.waiting = false;

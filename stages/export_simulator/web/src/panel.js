@@ -1,6 +1,7 @@
 // The controls: they read and write the state and call back; they know nothing of the room.
 
 const at = (id) => document.getElementById(id);
+const HOW = at('help').innerHTML;
 const TOOLS = {
   pen: 'Draw on the floor with one stroke; it walks there.',
   pins: 'Click one place after the other; it visits them in this order.',
@@ -66,6 +67,7 @@ export function buildPanel(state, clips, on) {
   at('play').addEventListener('click', on.play);
   at('reset').addEventListener('click', on.reset);
   at('free').addEventListener('click', on.free);
+  at('how').addEventListener('click', howTo);
   at('slow').addEventListener('click', () => change('speed', state.speed === 1 ? 0.3 : 1));
   sync.push(() => at('slow').setAttribute('aria-pressed', state.speed !== 1));
 
@@ -108,6 +110,16 @@ export function help(text, seconds = 0) {
   if (text) at('help').textContent = text;
   clearTimeout(help.timer);
   if (seconds) help.timer = setTimeout(() => at('help').classList.add('gone'), 1000 * seconds);
+}
+
+// How to use the page: shown at first for a while, then when it is asked for.
+export function howTo() {
+  const box = at('help');
+  const shown = box.innerHTML === HOW && !box.classList.contains('gone') && getComputedStyle(box).display !== 'none';
+  clearTimeout(help.timer);
+  box.innerHTML = HOW;
+  box.classList.add('asked');
+  box.classList.toggle('gone', shown);
 }
 
 export function status(text) {
