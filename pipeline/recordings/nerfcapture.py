@@ -73,6 +73,9 @@ def open_recording(path: Path) -> Recording:
 
 def _table(container: Container) -> dict[str, Any]:
     if "transforms.json" not in container.names:
+        if isinstance(container, ZipContainer):
+            what = "a zip that holds no NeRFCapture recording"
+            raise InputError("CAP-003", what, container.where, "unpack it, and give the folder that the app wrote")
         raise InputError("CAP-003", "not a NeRFCapture recording: it has no transforms.json", container.where, "give the streamed folder")
     try:
         table = json.loads(container.read("transforms.json", MAX_TEXT_BYTES))

@@ -1,9 +1,8 @@
 """Build the scene template from the walk-through.
 
-COLMAP (CPU, one thread) finds the keyframes' poses; depth gives the scale, checks the poses and, with
-the odometry, replaces them where it refutes them; gravity turns +y up. Depth and colour are fused to a
-mesh, every frame is aligned to it, pymeshlab cleans it. Writes mesh.ply, vertex_features.npz,
-cameras.npz, world.json and colmap/.
+COLMAP (CPU, one thread) finds the keyframes' poses; depth gives the scale, checks the poses and, with the odometry,
+replaces them where it refutes them; gravity turns +y up. Depth and colour are fused to a mesh, every frame is aligned to
+it, pymeshlab cleans it. Writes mesh.ply, vertex_features.npz, cameras.npz, world.json and colmap/.
 """
 
 import json
@@ -16,6 +15,7 @@ import numpy as np
 from pipeline import cli, qa
 from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip
+from pipeline.progress import log
 from stages.build_scene_template import given, pictures, template
 from stages.build_scene_template.anchor import AnchorOptions
 from stages.build_scene_template.fuse import FuseOptions
@@ -44,7 +44,9 @@ class Config:
 
 def run(task: cli.Task) -> None:
     """Build and write the template."""
-    (video, frames), *_ = task.per_video("frames", roles=("walkthrough",)).items()
+    (video, frames), *others = task.per_video("frames", roles=("walkthrough",)).items()
+    if others:
+        log(f"several walk-throughs: {video} is used")
     clip = Clip.open(frames)
     features = arrays.open_lazily(task.per_video("features", roles=("walkthrough",))[video] / "features.npz", "features")
     config = task.config
@@ -69,8 +71,8 @@ def run(task: cli.Task) -> None:
         template.write_model(sparse, made.world_from_camera, folder / "colmap")
         qa.write(
             folder, good="walls are straight, furniture is whole, frames and renderings agree",
-            bad="walls are doubled or bent, the path jumps, large parts are missing",
-            checks=pictures.checks(made), pictures=pictures.pictures(made, clip),
+            bad="walls are doubled or bent, the path jumps, large parts are missing", checks=pictures.checks(made),
+            pictures=pictures.pictures(made, clip),
         )  # fmt: skip
 
 

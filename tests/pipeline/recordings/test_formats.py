@@ -14,7 +14,7 @@ from pipeline.recordings.formats import format_of, open_recording
 from pipeline.recordings.movies import Movie
 from pipeline.space import rigid
 from tests.pipeline.recordings import made_formats
-from tests.stages.extract_frames.made_recordings import Made, walk
+from tests.stages.extract_frames.made_recordings import Made, walk, write_zip
 
 LANDSCAPE = 3
 """quarter turns from upright to the sensor landscape in which iPhones store pictures"""
@@ -222,9 +222,15 @@ def _unmatched(path, made):
     return path
 
 
+def _zipped(path, made):
+    write_zip(path.with_suffix(".zip"), {"a/rgb.mp4": b"", "a/odometry.csv": b""})
+    return path.with_suffix(".zip")
+
+
 FAULTS = {
     "CAP-001": _cut_video,
     "CAP-003": lambda path, made: path,
+    "CAP-003 ": _zipped,
     "CAP-004": _new_odometry,
     "CAP-004 ": _new_polycam,
     "CAP-006": _no_depth,
