@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.errors import InputError
 from pipeline.files.clips import Clip
 from pipeline.models import localizer as model
 from pipeline.models.sight import Sight, Target
@@ -17,6 +18,9 @@ from pipeline.space.meshes import Mesh, RayCaster
 from stages.train_localizer import describing, networks, views
 from stages.train_localizer.networks import NetOptions
 from stages.train_localizer.views import Photograph, ViewOptions
+
+MOST_DRAWS = 200
+"""Random views of the scene of which one at least must be such as people take."""
 
 
 @dataclass(frozen=True)
@@ -89,18 +93,22 @@ def show_scene(
     options: Options,
     rng: np.random.Generator,
 ) -> Shown:
-    """Render random views of the scene and add frames of the walk-through with their template cameras."""
+    """Render random views of the scene and add frames of the walk-through with their template cameras.
+
+    Raises InputError MAP-006 where the map fills hardly any view.
+    """
     caster = RayCaster(mesh)
     scale = options.focal_px / float(np.median(clip.intrinsics[:, 0, 0]))
     size = (round(clip.color_size[0] * scale), round(clip.color_size[1] * scale))
     intrinsics = cameras.scale_intrinsics(np.median(clip.intrinsics, axis=0), clip.color_size, size)
 
     def draw() -> Photograph:
-        for _ in range(200):
+        for _ in range(MOST_DRAWS):
             view = views.photograph(caster, views.scene_camera(walk, floor_m, options.view, rng), intrinsics, size, options.view, rng)
             if views.plausible(view, caster):
                 return view
-        raise AssertionError("no plausible view of the scene in 200 draws")
+        what = f"none of {MOST_DRAWS} views from within the map shows it in most of its pixels"
+        raise InputError("MAP-006", what, str(clip.folder), "film the walk-through nearer to floor, walls and furniture, within 4 m")
 
     def draw_query() -> Photograph:
         view = views.with_depth_noise(draw(), rng)

@@ -1,11 +1,13 @@
-"""The agent's localizer answers from all around, at any distance, through the crop that depth scales."""
+"""The agent's localizer answers from all around, at any distance, through the crop that depth scales; the scene's wants a map."""
 
 import numpy as np
+import pytest
 import trimesh
 
-from pipeline.space.meshes import Mesh
+from pipeline.errors import InputError
+from pipeline.space.meshes import Mesh, RayCaster
 from stages.train_localizer import training
-from tests.stages.textured_room import noise_color
+from tests.stages.textured_room import MemoryClip, noise_color, textured_room, walk
 
 
 def test_agent_is_found_from_all_around():
@@ -19,3 +21,12 @@ def test_agent_is_found_from_all_around():
     assert held.good.mean() > 0.6, "share within 15 degrees and 8 cm"
     assert np.nanmedian(held.rotation_deg) < 8, "degrees"
     assert localizer.calibration.slope > 0
+
+
+def test_a_map_that_fills_no_view_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "MOST_DRAWS", 5)
+    truth = walk(4)
+    clip = MemoryClip(RayCaster(textured_room(edge_m=0.5)), truth, truth, folder=tmp_path)
+    crumb = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.full((3, 3), 9, np.uint8))
+    with pytest.raises(InputError, match="MAP-006"):
+        training.train_scene(crumb, truth, 0.0, clip, training.Options(), np.random.default_rng(0))
