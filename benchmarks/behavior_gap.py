@@ -96,10 +96,8 @@ def main() -> None:
             found[name].append(judged(data, scenes, replace(settings, seed=seed), effort))
             print(f"seed {seed}, {name}: goal minDE {found[name][-1]['end_to_end/goal_minde_m']:.3f} m", flush=True)
     for score in found["true"][0]:
-        mean = {name: np.mean([each[score] for each in rows]) for name, rows in found.items()}
-        print(
-            f"{score:40s} reconstructed {mean['reconstructed']:.3f}  true {mean['true']:.3f}  ratio {mean['reconstructed'] / mean['true']:.2f}"
-        )
+        ours, true = (float(np.mean([each[score] for each in found[name]])) for name in pairs)
+        print(f"{score:40s} reconstructed {ours:.3f}  true {true:.3f}" + (f"  ratio {ours / true:.2f}" if true else ""))
 
 
 if __name__ == "__main__":
