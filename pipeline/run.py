@@ -159,7 +159,9 @@ def _spawn(job: dict[str, Any], command: list[str]) -> tuple[int, float]:
 
     def stop(number: int, frame: FrameType | None) -> None:
         child.terminate()
-        threading.Timer(GRACE_S, child.kill).start()
+        killer = threading.Timer(GRACE_S, child.kill)
+        killer.daemon = True  # a stage that ends in time is not waited for any longer
+        killer.start()
 
     old = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
     old[signal.SIGINT] = signal.signal(signal.SIGINT, signal.SIG_IGN)  # the child has its own; what it saves is waited for

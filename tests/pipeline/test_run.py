@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from pipeline import artifact
+from pipeline import artifact, run
 from tests.pipeline import checkout
 
 
@@ -177,6 +177,18 @@ def test_kills_leave_nothing_wrong(house, victim):
     assert house.make("-j2", "toy").returncode == 0
     assert contents(house) == reference
     assert not leftovers(house)
+
+
+def test_a_job_that_is_told_to_stop_ends_with_its_stage(house):
+    house.write("agents/toy.toml", "[synthesize_capture]\npause_s = 60.0\n")
+    assert house.python("pipeline.plan", "plan", "toy").returncode == 0
+    command = [sys.executable, "-SE", "-m", "pipeline.run", "toy", "synthetic_capture"]
+    running = subprocess.Popen(command, cwd=house.folder, stderr=subprocess.PIPE, text=True)
+    while not leftovers(house) and running.poll() is None:
+        time.sleep(0.02)
+    running.send_signal(signal.SIGTERM)
+    told = running.communicate(timeout=run.GRACE_S - 5)[1]
+    assert (running.returncode, told.count("run the same again to go on")) == (128 + signal.SIGTERM, 1)
 
 
 def test_snakemake_finds_makes_results_up_to_date(house):
