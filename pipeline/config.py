@@ -59,11 +59,12 @@ def refuse_unknown(table: Mapping[str, Any], known: typing.Collection[str], *, w
 
 
 def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
-    """Raise REC-002 where the default is a number and `value` not finite, negative where that is above 0, or a rate of 0."""
+    """Raise REC-002 where the default is a number and `value` not finite, negative where that is above 0 or a count, or a rate of 0."""
     if not isinstance(value, int | float) or not isinstance(default, int | float):
         return
     stands_still = where.endswith("_hz") and value == 0
-    if not math.isfinite(value) or (default > 0 and (value < 0 or stands_still)):
+    counts = default > 0 or (default == 0 and isinstance(default, int))
+    if not math.isfinite(value) or (counts and value < 0) or (default > 0 and stands_still):
         raise InputError("REC-002", f"{value!r} cannot be", where, f"give a number as the default is, {default!r}")
 
 

@@ -16,6 +16,7 @@ class Inner:
 
 @dataclass(frozen=True)
 class Outer:
+    seed: int = 0
     steps: int = 3
     kind: Literal["a", "b"] = "a"
     sizes: tuple[int, ...] = (1, 2)
@@ -25,7 +26,7 @@ class Outer:
 
 def test_a_table_becomes_a_dataclass():
     made = config.from_table(Outer, {"steps": 5, "sizes": [3], "inner": {"width_m": 2}, "name": "x"}, where="recipe")
-    assert made == Outer(5, "a", (3,), "x", Inner(2.0))
+    assert made == Outer(0, 5, "a", (3,), "x", Inner(2.0))
     assert isinstance(made.inner.width_m, float)
 
 
@@ -37,6 +38,8 @@ def test_a_table_becomes_a_dataclass():
         ({"steps": "5"}, "REC-002"),
         ({"steps": 5.0}, "REC-002"),
         ({"steps": True}, "REC-002"),
+        ({"steps": -1}, "REC-002"),
+        ({"seed": -1}, "REC-002"),
         ({"kind": "c"}, "REC-002"),
         ({"sizes": 3}, "REC-002"),
         ({"name": 3}, "REC-002"),
