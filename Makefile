@@ -74,11 +74,13 @@ export: .venv/.ok
 	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); what is lost stands in its export.json'
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
+JOURNEY = $(if $(SUBGOALS)$(PLACES),longterm) $(if $(SUBGOALS)$(filter-out behavior,$(PLACES)),,behavior)
 simulate: .venv/.ok
 	@test -z '$(SUBGOALS)' || test -f '$(SUBGOALS)' || { { echo "error: SIM-004 $(SUBGOALS): there is no such file"; echo "  -> write it as docs/long_motion.md tells"; } >&2; exit 2; }
-	@$(MAKE) $(NESTING) $(ANIMAL).$(if $(SUBGOALS),longterm,behavior)
-	@$(call INPUTS,$(if $(SUBGOALS),longterm reconstruction,behavior) behavior_data) && \
-	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals '$(SUBGOALS)') --out $(HOME_OF)/take
+	@$(if $(PLACES),$(PYTHON) -m stages.simulate --places '$(PLACES)' --help >/dev/null)
+	@$(MAKE) $(NESTING) $(JOURNEY:%=$(ANIMAL).%)
+	@$(call INPUTS,$(JOURNEY) $(if $(filter longterm,$(JOURNEY)),reconstruction) behavior_data) && \
+	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals '$(SUBGOALS)') $(if $(PLACES),--places '$(PLACES)') --out $(HOME_OF)/take
 
 serve: .venv/.ok
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator

@@ -2,12 +2,11 @@
 
 With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`. In Python: `Simulator.reset(seed)` and
 `Simulator.step(observer)` of `pipeline.models.simulator`. With `--serve`: live in a browser, computed here; kept too.
-With `--longterm` and `--subgoals FILE` (see `stages.simulate.subgoal_file`), or sub-goals or a recording that the recipe
-asks for: writes `take.npz` at 30 fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
+With `--longterm` and `--subgoals FILE` (see `stages.simulate.subgoal_file`) or `--places`, or a recording that `--config`
+names: writes `take.npz` at 30 fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from pipeline import cli, config, progress
 from pipeline.models import behavior
@@ -31,18 +30,18 @@ class Config:
     """How plans follow each other."""
     sampling: behavior.Sampling = field(default_factory=behavior.Sampling)
     """How plans are drawn; `guidance` is the interactivity."""
-    subgoals: Literal["file", "behavior", "visited", "none"] = "none"
-    """Where sub-goals come from: `--subgoals` (whatever this says), the behaviour model's goals one after the other, or
-    places drawn from where the animal has been; none: a take of the behaviour model."""
-    subgoal_count: int = 20
-    """How many, where they are not written in a file."""
+    places: takes.Places = "none"
+    """Sub-goals that no file gives: drawn from where the animal has been, or the behaviour model's goals one after the other;
+    none: a take of the behaviour model."""
+    place_count: int = 20
+    """How many of them."""
     optimise: bool = True
     """Make the motion physical; a take of the behaviour model only where `--longterm` and `--reconstruction` are given."""
     optimisation: Settings = field(default_factory=Settings)
     """Weights and length of that."""
     recording: str | None = None
     """Take the reconstructed motion of this session, its longest stretch, instead."""
-    frames_hz: float = 10.0
+    pictures_per_s: float = 10.0
     """Pictures per second of long-term motion; 0 = none."""
     seed: int = 0
     """Seed of the beginning and of all noise."""
@@ -65,7 +64,7 @@ def run(task: cli.Task) -> None:
         take = takes.live(given, c, task.device)
     elif c.recording is not None:
         take = takes.of_recording(given, c)
-    elif written is None and c.subgoals == "none":
+    elif written is None and c.places == "none":
         take = takes.of_behavior(given, c, task.device)
     else:
         take = takes.through_subgoals(given, written, c, task.device)
@@ -76,4 +75,6 @@ def run(task: cli.Task) -> None:
 
 if __name__ == "__main__":
     optional = ("behavior", "simulator", "longterm", "reconstruction", "subgoals")
-    cli.enter(__doc__, run, config=Config, reads=("behavior_data",), optional=optional, options=("serve", "port", "seed", "seconds"))
+    cli.enter(
+        __doc__, run, config=Config, reads=("behavior_data",), optional=optional, options=("serve", "port", "seed", "seconds", "places")
+    )

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError
@@ -29,6 +29,7 @@ from stages.simulate.observers import Observer, scripted
 from stages.simulate.rollout import rollout, write_take
 
 T = TypeVar("T")
+Places = Literal["none", "visited", "behavior"]
 MOVED_M = 0.25
 """A sub-goal that is met further off than this counts as moved."""
 
@@ -97,25 +98,23 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
     world, rng = _world(given, data), np.random.default_rng(c.seed)
     if written is not None:
         subgoals = written
-    elif c.subgoals == "file":
-        raise InputError("SIM-004", "which sub-goals?", "stages.simulate", "give --subgoals file.toml")
-    elif c.subgoals == "behavior":
+    elif c.places == "behavior":
         simulator = _simulator(given, data, c, replace(c.chaining, replan_frames=FUTURE, fade_frames=0), device)
-        drawn = chained_goals(simulator, _observer(data, c), c.subgoal_count, c.seed)
+        drawn = chained_goals(simulator, _observer(data, c), c.place_count, c.seed)
         subgoals = brought_in(drawn, world.scene, world.model.habits)
     else:
         learned = [data.trajectories[data.videos[video]] for video in np.unique(data.video[data.split == TRAIN])]
         been = np.concatenate([trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in learned])
-        subgoals = preferred(been, c.subgoal_count + 1, rng)
+        subgoals = preferred(been, c.place_count + 1, rng)
     made = journeys.travel(world, subgoals, c.optimisation if c.optimise else None, rng)
     asked = np.stack([goal.position_world for goal in subgoals])
     moved = int((np.nan_to_num(np.abs(asked - made.subgoals_world)).max(1) > MOVED_M).sum())
 
     def write(folder: Path) -> None:
         journey_files.write_journey(folder, made, world.body)
-        if c.frames_hz > 0:
+        if c.pictures_per_s > 0:
             scene = meshes.read_ply(given["reconstruction"] / "scene.ply")
-            journey_files.write_frames(folder, made.moving, world.body, scene, rate_hz=c.frames_hz)
+            journey_files.write_frames(folder, made.moving, world.body, scene, rate_hz=c.pictures_per_s)
 
     worth = made.after
     said = f"{made.timestamp_s[-1]:.0f} s through {len(subgoals)} sub-goals; {worth.non_collision:.2%} free of collision, "
