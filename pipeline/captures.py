@@ -60,11 +60,19 @@ def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith("."))
 
 
+def named(path: Path, flow: Flow = "recordings") -> str:
+    """Return a stranger's name for a message: with what is amiss with it, where that can be told."""
+    if not path.exists():
+        return f"{path.name!r} (a link that leads nowhere)"
+    inner = find(path, flow)
+    return f"{path.name!r} (move {inner[0]!r} out of it: that is one)" if inner else repr(path.name)
+
+
 def refuse_strangers(folder: Path, flow: Flow = "recordings") -> None:
     """Raise CAP-003 where something was put into `folder`, but nothing that a flow can begin with."""
     strangers = [name for name in not_understood(folder, flow) if not name.endswith(SIDECAR)] if folder.is_dir() else []
     if strangers:
-        what = f"holds no recording of a known format, only {', '.join(map(repr, strangers))}"
+        what = f"holds no recording of a known format, only {', '.join(named(folder / name, flow) for name in strangers)}"
         tables = "tables of motion, CSV or NPZ"
         known = f"{UNDERSTOOD}; {tables}, where the recipe's [flow] begins at trajectories" if flow == "recordings" else tables
         raise InputError("CAP-003", what, str(folder), f"known: {known}; or empty the folder for the built-in capture")

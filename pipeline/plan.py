@@ -193,7 +193,7 @@ def _plan(home: Home) -> None:
         print(f"[{home}] nothing in {folder}/: building from the built-in synthetic capture")
     else:
         for name in captures.not_understood(folder, planned[0].flow):
-            print(f"[{home}] not a recording, left alone: {name!r}")
+            print(f"[{home}] not a recording, left alone: {captures.named(folder / name, planned[0].flow)}")
         for video in planned[0].videos:
             if video.role == "heldout" and video.synchronized_with is None:
                 print(f"[{home}] {video.file!r} measures nothing until the recipe's [videos] says what it is synchronized_with")

@@ -96,6 +96,14 @@ def test_file_names_are_never_executed(house):
     assert {video["file"] for video in videos} >= set(HOSTILE)
 
 
+def test_what_is_amiss_with_a_stranger_is_told(house):
+    house.write("captures/toy/scan/inner/rgb.mp4", "")
+    house.write("captures/toy/scan/inner/odometry.csv", "")
+    (house.folder / "captures/toy/monday.r3d").symlink_to("/nowhere")
+    told = house.python("pipeline.plan", "plan", "toy").stderr
+    assert "'monday.r3d' (a link that leads nowhere), 'scan' (move 'inner' out of it: that is one)" in told
+
+
 @pytest.mark.parametrize(
     ("arguments", "files", "code"),
     [
