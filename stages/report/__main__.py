@@ -30,8 +30,8 @@ def run(task: Task) -> None:
     """Collect, judge, render."""
     evaluation = task.input("evaluation")
     metrics, reasons = (json.loads((evaluation / file).read_bytes()) for file in ("metrics.json", "reasons.json"))
-    roles = {video.id: collect.role(video) for video in task.videos}
-    chapters = [told(task, chapter, roles) for chapter in CHAPTERS]
+    abouts = {video.id: collect.about(video, task.config.share_safe) for video in task.videos}
+    chapters = [told(task, chapter, abouts) for chapter in CHAPTERS]
     judged, figures = bars.judge(metrics, reasons), bars.grouped(metrics)
     texts = pages.render(name=task.config.name, chapters=chapters, judged=judged, figures=figures, reasons=reasons)
     with task.create() as folder:
@@ -42,11 +42,11 @@ def run(task: Task) -> None:
         qa.write(folder, good="every page opens and can be sent", bad="pages too big to send", checks=[size])
 
 
-def told(task: Task, chapter: Chapter, roles: dict[str, str]) -> collect.Told:
+def told(task: Task, chapter: Chapter, abouts: dict[str, str]) -> collect.Told:
     """Open the chapter's artifacts, by recording where there is one for each, and read their notes."""
     folders: dict[str | None, Path] = {**task.per_video(chapter.artifact)} if chapter.per_video else {None: task.input(chapter.artifact)}
     manifest = artifact.read_manifest(next(iter(folders.values()), task.out))
-    return collect.told(chapter, folders, roles, manifest.config if manifest else {}, task.config.share_safe)
+    return collect.told(chapter, folders, abouts, manifest.config if manifest else {}, task.config.share_safe)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ class Note:
 
     video: str | None
     about: str
-    """the recording's role"""
+    """the recording's file and role"""
     light: str
     good: str
     bad: str
@@ -75,13 +75,14 @@ class Told:
         return next((picture for note in self.notes for picture in note.pictures), None)
 
 
-def role(video: Video) -> str:
-    """Say what a recording is for."""
-    return f"{video.role}, {video.split}" if video.role == "session" else video.role
+def about(video: Video, safe: bool) -> str:
+    """Say which recording it is and what it is for; names of files may tell of people, so not where the report is to be ``safe``."""
+    role = f"{video.role}, {video.split}" if video.role == "session" else video.role
+    return role if safe else f"{video.file}, {role}"
 
 
 def told(
-    chapter: Chapter, folders: Mapping[str | None, Path], roles: Mapping[str, str], settings: Mapping[str, Any], safe: bool = False
+    chapter: Chapter, folders: Mapping[str | None, Path], abouts: Mapping[str, str], settings: Mapping[str, Any], safe: bool = False
 ) -> Told:
     """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all).
 
@@ -96,7 +97,7 @@ def told(
     def blurred(file: str) -> bool:
         return safe and not any(fnmatch(Path(file).stem, name) for name in chapter.nobody_in)
 
-    notes = [_note(video, roles.get(video or "", ""), folders[video], qa, shrink, blurred) for video, qa in raw.items()]
+    notes = [_note(video, abouts.get(video or "", ""), folders[video], qa, shrink, blurred) for video, qa in raw.items()]
     return Told(chapter, notes, dict(settings))
 
 

@@ -36,7 +36,9 @@ def write_notes(build: Path, metrics: dict[str, float | None], reasons: dict[str
     for chapter in CHAPTERS:
         videos = [video.id for video in VIDEOS if video.role in dag.NODES[chapter.artifact].roles] if chapter.per_video else [""]
         for video in videos:
-            with artifact.create(build / chapter.artifact / video, stage=chapter.artifact, config={"steps": 7}, inputs={}) as folder:
+            with artifact.create(
+                build / chapter.artifact / video, stage=dag.NODES[chapter.artifact].stage, config={"steps": 7}, inputs={}
+            ) as folder:
                 picture = qa.Picture("view", rng.integers(0, 255, (24, 80, 3), dtype=np.uint8), f"a view of {chapter.artifact}")
                 checks = [qa.Check("leak <script>", 2.0, "px", warn=1.0, fail=3.0), qa.Check("unmeasured", None)]
                 qa.write(folder, good="sharp", bad="blurred", checks=checks, pictures=[picture])
@@ -65,6 +67,8 @@ def test_every_note_is_shown_and_nothing_is_asked_for(tmp_path: Path) -> None:
         assert f'href="{chapter.artifact}.html"' in texts["index.html"]
     assert all(f'id="{video.id}"' in texts["frames.html"] for video in VIDEOS)
     assert "no weights" in texts["index.html"]
+    assert "(a.r3d, " in texts["index.html"] and "unmeasured not measured" in texts["index.html"]
+    assert "a.r3d" not in collect.about(VIDEOS[0], safe=True)
 
 
 def test_same_notes_same_bytes(tmp_path: Path) -> None:
