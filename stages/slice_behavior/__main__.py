@@ -57,7 +57,7 @@ def run(task: cli.Task) -> None:
             good="hundreds of windows, an animal that covers the room, and an observer at many distances",
             bad="long invalid stretches, or an animal that never moves",
             checks=pictures.checks(data),
-            pictures=pictures.pictures(data, source.volumes[0]),
+            pictures=pictures.pictures(data, source.volumes[0], test),
         )
 
 

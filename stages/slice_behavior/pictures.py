@@ -1,5 +1,7 @@
 """What the quality page of the behaviour data shows: visits, speeds and distances, windows per recording."""
 
+from collections.abc import Collection
+
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
@@ -12,12 +14,12 @@ from pipeline.qa import Check, Picture
 MOVED_M = 0.15
 
 
-def pictures(data: BehaviorData, volume: FeatureVolume) -> list[Picture]:
+def pictures(data: BehaviorData, volume: FeatureVolume, test: Collection[str]) -> list[Picture]:
     """Draw the training recordings for people; the test recordings only count."""
     return [
         Picture(
             "visitation",
-            visitation(data, volume),
+            visitation(data, volume, test),
             "Where animal (left) and observer (right) have been in the training recordings, over the room from above.",
         ),
         Picture(
@@ -25,7 +27,7 @@ def pictures(data: BehaviorData, volume: FeatureVolume) -> list[Picture]:
             histograms(data),
             "The animal's speed, its distance to the observer, and how far it gets in 5.6 s (training).",
         ),
-        Picture("windows", validity(data), "Valid times of every recording, and how many windows start there."),
+        Picture("windows", validity(data, test), "Valid times of every recording, and how many windows start there."),
     ]
 
 
@@ -52,7 +54,7 @@ def checks(data: BehaviorData) -> list[Check]:
     ]
 
 
-def visitation(data: BehaviorData, volume: FeatureVolume) -> UInt8[np.ndarray, "height width 3"]:
+def visitation(data: BehaviorData, volume: FeatureVolume, test: Collection[str]) -> UInt8[np.ndarray, "height width 3"]:
     """Draw heat maps of visits over the columns that hold surfaces."""
     figure = Figure(figsize=(9, 4.2), dpi=80, layout="constrained")
     axes = figure.subplots(1, 2)
@@ -62,7 +64,7 @@ def visitation(data: BehaviorData, volume: FeatureVolume) -> UInt8[np.ndarray, "
     bins = [np.arange(low[axis], high[axis] + 0.1, 0.1) for axis in (0, 1)]
     tracks = {"animal": "world_from_agent", "observer": "world_from_camera"}
     for axis, (name, key) in zip(axes, tracks.items(), strict=True):
-        places = [getattr(data.trajectories[v], key)[data.trajectories[v].valid, :3, 3] for v in _training(data)]
+        places = [getattr(data.trajectories[v], key)[data.trajectories[v].valid, :3, 3] for v in data.videos if v not in test]
         count, *_ = np.histogram2d(*np.concatenate(places)[:, [0, 2]].T, bins=bins) if places else (np.zeros((1, 1)),)
         axis.imshow(solid.T, cmap="Greys", extent=(low[0], high[0], high[1], low[1]), vmax=1.5)
         axis.imshow(
@@ -90,7 +92,7 @@ def histograms(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
     return figures.pixels(figure)
 
 
-def validity(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
+def validity(data: BehaviorData, test: Collection[str]) -> UInt8[np.ndarray, "height width 3"]:
     """Draw valid times and window starts per recording."""
     figure = Figure(figsize=(9, 0.5 + 0.4 * max(len(data.videos), 2)), dpi=80, layout="constrained")
     axis = figure.subplots()
@@ -99,15 +101,7 @@ def validity(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
         axis.scatter(trajectory.timestamp_s[trajectory.valid], np.full(trajectory.valid.sum(), row), s=3, color="#3b6ea5")
         mine = data.video == row
         axis.scatter(trajectory.timestamp_s[data.start[mine]], np.full(mine.sum(), row + 0.25), s=3, color="#c44e52")
-    names = [
-        f"{video} {'test' if video not in _training(data) else 'train'}: {(data.video == row).sum()}"
-        for row, video in enumerate(data.videos)
-    ]
+    names = [f"{video} {'test' if video in test else 'train'}: {(data.video == row).sum()}" for row, video in enumerate(data.videos)]
     axis.set_yticks(range(len(names)), names)
     axis.set_xlabel(f"time [s]: valid (blue), starts of windows of {PAST + FUTURE} frames (red)")
     return figures.pixels(figure)
-
-
-def _training(data: BehaviorData) -> tuple[str, ...]:
-    tested = {data.videos[v] for v in data.video[data.split == TEST]}
-    return tuple(video for video in data.videos if video not in tested)
