@@ -59,8 +59,8 @@ def run(task: cli.Task) -> None:
     twice = [video.synchronized_with for video in task.videos if video.role == "heldout"] if config.sessions == "filmed_twice" else None
     videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed, twice)
     fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion, scratch) if config.ground == "fused" else None
-    template = reading.read_template(folders.agent_template)
-    problem = assemble.build(videos, template, config.shapes, config.seed, task.device, fused, scratch)
+    template, floor_m = reading.read_template(folders.agent_template), reading.read_floor(folders.scene_template)
+    problem = assemble.build(videos, template, config.shapes, config.seed, task.device, fused, scratch, floor_m)
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(problem.store.scene)} scene rays, {len(problem.store.agent)} agent rays")
     plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, scratch)
     records = optimise.optimise(problem, plan)

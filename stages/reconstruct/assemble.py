@@ -1,5 +1,6 @@
 """Set the problem up: join the videos' rays, place the boxes of the fields, start the motion at the registered poses."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from pipeline.models.fields import Body, Field, FieldShape
 from pipeline.models.fused import Fused
@@ -16,7 +18,10 @@ from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.reconstruct.limbs import Limbs
 from stages.reconstruct.problem import Joints, Problem, RaysByFrame, Surface, frame_table
-from stages.reconstruct.rays import Source, Store, join
+from stages.reconstruct.rays import Source, Store, Views, join
+
+USUAL = 0.8
+"""quantile of the areas of masks that stands for the whole animal"""
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ class Video:
 
 @dataclass(frozen=True)
 class Doubt:
-    """Which registered roots are given up: doubtful ones far from where their neighbours in time have the agent."""
+    """Which registered roots are given up, doubtful ones far from where their neighbours in time have the agent, and what masks count."""
 
     least_confidence: float = 0.4
     """roots that are less certain may be given up"""
@@ -54,6 +59,10 @@ class Doubt:
     """and those are no farther apart in time"""
     trust: float = 0.05
     """how much the masks of such frames still count: mostly they show something else"""
+    whole_share: float = 0.6
+    """a mask counts fully from this share of the area on that most of the animal's masks have, as if seen from one metre ..."""
+    least_share: float = 0.03
+    """... less below, but at least so much: where the animal hides, its neighbours in time know better"""
 
 
 @dataclass(frozen=True)
@@ -102,8 +111,11 @@ def build(
     device: str,
     fused: Fused | None = None,
     scratch: Path | None = None,
+    floor_m: float = -math.inf,
 ) -> Problem:
     """Make the problem; videos with a scene come first, so that codes count them. The scene learns on what is fused.
+
+    Nothing is below ``floor_m``, a height in the world.
 
     Measurements are kept in unnamed files in ``scratch`` (None: where temporary files stand).
     """
@@ -116,7 +128,7 @@ def build(
     roots, kept = zip(*(steadied(video, shapes.doubt) for video in videos), strict=True)
     agent = np.concatenate([filled(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)])
     rooted = torch.from_numpy(np.concatenate([np.isfinite(root).all((1, 2)) for root in roots]))
-    trust = np.where(np.concatenate(kept), 1.0, shapes.doubt.trust)
+    trust = torch.from_numpy(np.where(np.concatenate(kept), 1.0, shapes.doubt.trust)).float() * shown(store.views, shapes.doubt)
     vertices = template.mesh.vertices
     low, high = (
         tuple(float(x) for x in corner) for corner in (vertices.min(0) - shapes.agent_margin_m, vertices.max(0) + shapes.agent_margin_m)
@@ -146,7 +158,8 @@ def build(
         limbs=limbs,
         agent_frames=usable_frames,
         agent_rays=by_frame,
-        trust=torch.from_numpy(trust).float(),
+        trust=trust,
+        floor_m=floor_m,
     )
     return problem if device == "cpu" else _moved(problem, device)
 
@@ -205,6 +218,20 @@ def steadied(video: Video, doubt: Doubt) -> tuple[Float[np.ndarray, "frame 4 4"]
     return root, kept
 
 
+def shown(views: Views, doubt: Doubt) -> Float[Tensor, "frame"]:
+    """Tell how much of the animal each frame shows, as a weight of its mask: by the mask's area at the animal's distance."""
+    area = torch.zeros(len(views.depth))
+    for frame in torch.nonzero(views.agent_seen)[:, 0].tolist():
+        inside = views.outside_px[frame] < 0
+        depth = views.depth[frame][inside].float()
+        if (depth > 0).any():
+            area[frame] = inside.sum() * (depth[depth > 0].median() / views.intrinsics[frame, 0, 0]) ** 2
+    if not (area > 0).any():
+        return torch.ones_like(area)
+    share = area / area[area > 0].quantile(USUAL)
+    return torch.where(area > 0, (share / doubt.whole_share).clamp(doubt.least_share, 1), 1.0)
+
+
 def filled(timestamp_s: Float[np.ndarray, "frame"], a_from_b: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 4 4"]:
     """Interpolate unknown poses between known ones; all unknown gives identities."""
     known = np.isfinite(a_from_b).all((1, 2))
@@ -238,4 +265,4 @@ def _moved(problem: Problem, device: str) -> Problem:
     moved = {
         name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "joints", "limbs", "agent_frames", "trust")
     }
-    return Problem(store=store, **problem.modules(), agent_rays=by_frame, **moved)
+    return Problem(store=store, **problem.modules(), agent_rays=by_frame, floor_m=problem.floor_m, **moved)

@@ -113,11 +113,15 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
 
 
 def buried_m(problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"]) -> Float[Tensor, "frame point"]:
-    """Measure how deep points lie below the scene's surface as each frame's video saw it: feet stand on the ground."""
+    """Measure how deep points lie below the scene's surface as each frame's video saw it: feet stand on the ground.
+
+    What is fused tells it near surfaces alone and holds all that was never seen for free: below the floor, the floor tells it.
+    """
     world = rigid_torch.apply(pose.world_from_agent, points_agent)
     video = problem.video[pose.frame][:, None].expand(world.shape[:2])
     video = torch.where(problem.has_scene[pose.frame, None], video, -1)
-    return functional.relu(-problem.scene.distance_at(world.reshape(-1, 3), video.reshape(-1))).view(world.shape[:2])
+    outside = problem.scene.distance_at(world.reshape(-1, 3), video.reshape(-1)).view(world.shape[:2])
+    return functional.relu(-torch.minimum(outside, world[..., 1] - problem.floor_m))
 
 
 def bare_m(points_camera: Float[Tensor, "frame point 3"], masked: Rays) -> Float[Tensor, "frame ray"]:
@@ -142,7 +146,7 @@ def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6
     torn = (carried(joints.first) - carried(joints.second)) / DECIMETRE
     root = rigid_torch.inverse(problem.motion.initial_agent[pose.frame]) @ pose.world_from_agent
     terms = {
-        "root": (weights.root, (root[:, :3, 3] / ROOT_M).square().sum(-1) + _turned(root) / ROOT_RAD**2),
+        "root": (weights.root, problem.trust[pose.frame] * ((root[:, :3, 3] / ROOT_M).square().sum(-1) + _turned(root) / ROOT_RAD**2)),
         "rigidity": (weights.rigidity, torn.square().sum(-1)),
         "rest": (weights.rest, twist.square().sum(-1) + 20 * twist.mean(1, keepdim=True).square().sum(-1)),
     }

@@ -16,6 +16,9 @@ from pipeline.space.meshes import Mesh
 from stages.reconstruct.limbs import Limbs, shared_skin
 from stages.reconstruct.rays import Store
 
+TRUSTED = 0.1
+"""frames whose masks count less are not looked at together with their neighbours"""
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -37,7 +40,9 @@ class Problem:
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
     trust: Float[Tensor, "frame"]
-    """how much a frame's mask counts for the agent, 0..1: less where its root was given up"""
+    """how much a frame's mask counts for the agent, 0..1: less where its root was given up or little of it is seen"""
+    floor_m: float
+    """nothing is below this height of the world"""
 
     @property
     def device(self) -> torch.device:
@@ -76,7 +81,7 @@ class Problem:
     def runs(self, length: int) -> Int[Tensor, "run"]:
         """Return first frames of stretches of usable frames of one video that are trusted, as far as any is."""
         first = self.agent_frames.cpu()
-        trusted = self.trust.cpu()[first] == 1
+        trusted = self.trust.cpu()[first] > TRUSTED
         first = first[trusted] if trusted.any() else first
         usable = torch.zeros(len(self.video) + length, dtype=torch.bool)
         usable[first] = True

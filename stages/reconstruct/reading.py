@@ -1,5 +1,6 @@
 """Open what the stage reads: the recordings with their poses, and the agent template."""
 
+import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,3 +123,8 @@ def read_template(folder: Path) -> Template:
     """Read the agent template."""
     skin, feature = arrays.load(folder / "skin.npz"), arrays.load(folder / "vertex_features.npz")["features"]
     return Template(meshes.read_ply(folder / "agent.ply"), feature, skin["agent_from_bone_rest"], skin["bone_scale_m"])
+
+
+def read_floor(folder: Path) -> float:
+    """Read the floor's height in the world, metres."""
+    return float(json.loads((folder / "world.json").read_text())["floor"])

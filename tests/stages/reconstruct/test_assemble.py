@@ -53,3 +53,18 @@ def test_given_up_frames_hardly_count_and_the_joint_phase_leaves_them_out():
     assert built.trust[5] == SHAPES.doubt.trust and built.trust.sum() == len(built.trust) - 1 + SHAPES.doubt.trust
     runs = built.runs(3)
     assert torch.isin(torch.tensor([0, 2, 6]), runs).all() and not torch.isin(torch.tensor([3, 4, 5]), runs).any()
+
+
+def test_masks_count_by_how_much_of_the_animal_they_show():
+    """Three quarters of the ball's mask are hidden in one frame, nearly all of it in another."""
+    built, _ = problem()
+    views = built.store.views
+    hidden = views.outside_px.clone()
+    for frame, keep in ((2, 4), (3, 50)):
+        inside = torch.nonzero((hidden[frame] < 0).flatten())[:, 0]
+        hidden[frame].view(-1)[inside[len(inside) // keep :]] = 8.0
+    doubt = Doubt(whole_share=1.0)
+    before, after = assemble.shown(views, doubt), assemble.shown(dataclasses.replace(views, outside_px=hidden), doubt)
+    assert 0.15 < after[2] / before[2] < 0.35 and after[3] == doubt.least_share
+    rest = torch.arange(len(before)) > 3
+    torch.testing.assert_close(after[rest], before[rest])

@@ -168,6 +168,23 @@ def test_what_is_buried_in_the_ground_is_lifted():
     assert -shift.grad[1] > 10 * shift.grad[[0, 2]].abs().max()
 
 
+def test_below_the_floor_nothing_is_free_however_deep():
+    """What is fused ends a little below a surface; a ball half a metre below the floor is drawn up all the same."""
+    found, _ = problem()
+    block = torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
+    fused = Fused(torch.full((3,), -0.4), 0.1, 0.2, torch.ones(2, 1, 1, 1, dtype=torch.int32), block.expand(2, -1, -1, -1, -1).half())
+    shape = FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2)
+    found = replace(found, scene=Field(shape, free_m=0.1, fused=fused))
+    pose, shift = Pose.of(found, found.agent_frames[:2]), torch.zeros(3, requires_grad=True)
+    pose = replace(pose, world_from_agent=rigid_torch.make(torch.eye(3), shift - 0.5 * torch.eye(3)[1]).expand(2, 4, 4))
+    points = found.surface.points[:200].expand(2, -1, -1)
+    assert not body.buried_m(found, pose, points).any()
+    buried = body.buried_m(replace(found, floor_m=0.0), pose, points)
+    torch.testing.assert_close(buried, 0.5 - points[..., 1])
+    buried.mean().backward()
+    torch.testing.assert_close(shift.grad, -torch.eye(3)[1])
+
+
 def test_bones_are_tied_along_limbs_and_not_across_them():
     """Two legs nearer to each other than their own bones: each hangs on its own hip."""
     heights = torch.tensor([0.0, -0.1, -0.2])
