@@ -2,6 +2,7 @@
 
 import json
 import re
+import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -78,6 +79,7 @@ class Desk:
 
 def server(desk: Desk, port: int) -> ThreadingHTTPServer:
     """Return a server that is bound but not yet running; port 0 takes any free one."""
+    keeping = threading.Lock()  # requests have a thread each, and write one file
 
     class Handler(BaseHTTPRequestHandler):
         """One request; only the page itself, asked for by its own address, is served."""
@@ -110,7 +112,8 @@ def server(desk: Desk, port: int) -> ThreadingHTTPServer:
                 return self._send(413, b"", "text/plain")
             try:
                 pairs = clicks.parse(json.loads(self.rfile.read(length)))
-                desk.keep(pairs)
+                with keeping:
+                    desk.keep(pairs)
             except (ValueError, RecursionError, InputError) as error:
                 return self._send(400, str(error).encode(), "text/plain")
             return self._json({"fits": desk.fits(pairs)})
