@@ -42,7 +42,7 @@ def main(arguments: list[str]) -> int:
         unusable += not verdict.usable
         print(f"{verdict.text}\n", flush=True)
     for name in captures.not_understood(given.folder):
-        print(f"{name}  left alone: not a recording of a known format (CAP-003)\n")
+        print(f"{captures.named(given.folder / name)}  left alone: not a recording of a known format (CAP-003)\n")
     missing = captures.missing_roles([role for _, role in files])
     for role, what in missing:
         print(f"CAP-040 there is no {role} among the recordings\n    -> add {what}")
