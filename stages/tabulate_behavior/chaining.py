@@ -24,7 +24,7 @@ def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds
     lived = rollouts(ats, data, scenes, chosen, seconds, rng)
     solid = scenes.inside_solid(lived, data.video[chosen]).mean(1)
     recorded = [data.trajectories[data.videos[video]] for video in np.unique(data.video[test])]
-    true = [_speeds(t.world_from_agent[t.valid, :3, 3]) for t in recorded]
+    true = [_speeds(t.world_from_agent[:, :3, 3])[t.valid[1:] & t.valid[:-1]] for t in recorded]
     speeds, whole = [_speeds(life) for life in lived], np.concatenate(true)
     return {
         "behavior/ats/chain_rollouts": float(count),
