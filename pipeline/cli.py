@@ -5,10 +5,14 @@ and turns `InputError` into one message and exit code 2. `Task` is all that a fr
 """
 
 import argparse
+import ast
 import dataclasses
+import inspect
+import itertools
 import os
 import signal
 import sys
+import textwrap
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -122,7 +126,9 @@ def enter(
     `doc` is the front's docstring and becomes `--help`; `reads` and `optional` name its inputs,
     `options` those fields of its configuration that the command line may set as well.
     """
-    parser = _parser(doc, reads, optional)
+    asked = not {"-h", "--help"}.isdisjoint(sys.argv)
+    told = "\n".join(["settings of the stage's table, with their defaults:", *_settings(config())]) if asked else None
+    parser = _parser(doc, told, reads, optional)
     for name in options:
         _add_option(parser, name, typing.get_type_hints(config)[name])
     given = parser.parse_args()
@@ -137,8 +143,23 @@ def enter(
         sys.exit(128 + signal.SIGINT)
 
 
-def _parser(doc: str, reads: tuple[str, ...], optional: tuple[str, ...]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+def _settings(defaults: Any, table: str = "") -> Iterator[str]:
+    """Yield a line per setting, name, default and what the source says beneath it; those of inner tables after their names."""
+    said: dict[str, str] = {}
+    for cls in (cls for cls in reversed(type(defaults).__mro__) if dataclasses.is_dataclass(cls)):
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+        for line, beneath in itertools.pairwise(body):
+            if isinstance(line, ast.AnnAssign) and isinstance(beneath, ast.Expr) and isinstance(beneath.value, ast.Constant):
+                said[line.target.id] = " ".join(str(beneath.value.value).split())
+    for name, default in vars(defaults).items():
+        if dataclasses.is_dataclass(default):
+            yield from _settings(default, f"{table}{name}.")
+        else:
+            yield f"  {table}{name} = {default!r}  {said.get(name, '')}".rstrip()
+
+
+def _parser(doc: str, told: str | None, reads: tuple[str, ...], optional: tuple[str, ...]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=doc, epilog=told, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in reads + optional:
         option = f"--{name.replace('_', '-')}"
         parser.add_argument(option, dest=name, type=Path, required=name in reads, metavar="PATH", help=_what(name))

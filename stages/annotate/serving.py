@@ -95,13 +95,10 @@ def server(desk: Desk, port: int) -> ThreadingHTTPServer:
             if self.path == "/state":
                 return self._json(desk.state())
             try:
-                return (
-                    self._send(200, desk.picture(int(match[1]), int(match[2])), "image/jpeg")
-                    if match
-                    else self._send(404, b"", "text/plain")
-                )
+                found = desk.picture(int(match[1]), int(match[2])) if match else b""
             except LookupError:
-                return self._send(404, b"", "text/plain")
+                found = b""
+            return self._send(200, found, "image/jpeg") if found else self._send(404, b"", "text/plain")
 
         def do_POST(self) -> None:
             """Keep the clicks and answer with their fits."""

@@ -84,6 +84,7 @@ def test_help_is_the_docstring(stage):
     told = stage("--help").stdout
     assert "Tell what this stage does." in told
     assert "--scene-template PATH" in told
+    assert "\n  seed = 0  Seed.\n  end = 'well'  How to end.\n" in told
 
 
 def test_an_input_must_be_finished(stage, tmp_path):
