@@ -125,13 +125,17 @@ class BehaviorData:
         return np.flatnonzero(self.split == split)
 
     def with_horizon(self, future: int) -> "BehaviorData":
-        """Return the same recordings cut into windows of another horizon, in frames, all that are valid throughout."""
+        """Return the same recordings cut into windows of another horizon, in frames, all that are valid throughout.
+
+        Recordings without any window, of which nobody knows whether they are for the test, stay without.
+        """
         if future == self.future:
             return self
-        tested = {int(video) for video in self.video[self.split == TEST]}
-        starts = [window_starts(self.trajectories[video].valid, PAST + future) for video in self.videos]
+        split_of = dict(zip(self.video.tolist(), self.split.tolist(), strict=True))
+        valid = [self.trajectories[name].valid & (number in split_of) for number, name in enumerate(self.videos)]
+        starts = [window_starts(frames, PAST + future) for frames in valid]
         video = np.repeat(np.arange(len(starts)), [len(mine) for mine in starts]).astype(np.int32)
-        split = np.where(np.isin(video, list(tested)), TEST, TRAIN).astype(np.uint8)
+        split = np.array([split_of[number] for number in video.tolist()], np.uint8)
         return replace(self, video=video, start=np.concatenate(starts).astype(np.int32), split=split, future=future)
 
     def windows(self, index: Int[np.ndarray, "window"], *, bones: bool = True) -> tuple[Context, Future]:
