@@ -46,6 +46,8 @@ class Augmentation:
     approached: float = 0.1
     """share of samples drawn from windows that begin with a person coming up, from near and from far alike, which are few and
     matter; what follows is as likely in them as ever"""
+    approached_paths: float = 0.1
+    """the same while path and body learn apart from goals"""
 
     @property
     def largest_turn_rad(self) -> float:

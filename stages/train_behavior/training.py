@@ -2,7 +2,7 @@
 
 import copy
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -87,14 +87,16 @@ def train(
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(scenes, architecture.scene_stride, device)
-    pace = settings.optimization
+    pace, drawn = settings.optimization, settings.augmentation
+    of_paths = replace(drawn, approached=drawn.approached_paths)
     goal_steps = 0 if architecture.family == "one_stage" else pace.goal_steps
     optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay, fused=True)
 
     def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
         part: Part = "all" if goal_steps == 0 else "goals" if step < goal_steps else "sequences"
         size = pace.goal_batch if part == "goals" else pace.batch
-        batch = draw_batch(windows, scene, statistics, settings.augmentation, size, generator, bodies=part != "goals")
+        how = of_paths if part == "sequences" else drawn
+        batch = draw_batch(windows, scene, statistics, how, size, generator, bodies=part != "goals")
         return minimised(nets, batch, schedule, settings.objective, generator, part=part)
 
     def after_step(step: int) -> None:

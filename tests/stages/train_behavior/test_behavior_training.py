@@ -13,6 +13,7 @@ from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN
+from stages.train_behavior import training
 from stages.train_behavior.batches import (
     AS_OFTEN,
     Augmentation,
@@ -153,6 +154,19 @@ def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatc
     resumed = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
     for name, value in whole.nets.state_dict().items():
         torch.testing.assert_close(resumed.nets.state_dict()[name], value, atol=0, rtol=0)
+
+
+def test_goals_and_paths_ask_for_approaches_each_in_its_own_share(data, monkeypatch):
+    asked = []
+
+    def watched(windows, scene, statistics, augmentation, *rest, **how):
+        asked.append(augmentation.approached)
+        return draw_batch(windows, scene, statistics, augmentation, *rest, **how)
+
+    monkeypatch.setattr(training, "draw_batch", watched)
+    settings = Settings(Optimization(steps=3, goal_steps=2, batch=4, goal_batch=4), Augmentation(approached=0.2, approached_paths=0.5))
+    train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=0)
+    assert asked == [0.2, 0.2, 0.5]
 
 
 def test_contract_is_whole_and_loads_back(windows, tmp_path):
