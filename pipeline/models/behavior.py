@@ -16,7 +16,7 @@ from torch import nn
 
 from pipeline.models.body_denoiser import TOLD, BodyDenoiser
 from pipeline.models.concatenation import ConcatenationUNet
-from pipeline.models.denoisers import ControlUNet, FreeUNet, GoalMLP
+from pipeline.models.denoisers import EMBEDDING, ControlUNet, FreeUNet, GoalMLP
 from pipeline.models.diffusion import STANDARD, Schedule
 from pipeline.models.perception import (
     GRID_CELL_M,
@@ -172,7 +172,7 @@ class BehaviorNets(nn.Module):
             case _:
                 assert_never(a.control)
         if a.family == "one_stage":  # one network for path and body, which nothing steers
-            along = FreeUNet(STRIDE + a.body_channels, a.condition, a.unet_width, a.unet_multipliers, schedule)
+            along = FreeUNet(STRIDE + a.body_channels, nn.Linear(a.condition, EMBEDDING), a.unet_width, a.unet_multipliers, schedule)
         self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
 
 

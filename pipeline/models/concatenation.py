@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.models.denoisers import EMBEDDING, Embedding, NoiseFromVelocity, UNet
+from pipeline.models.denoisers import EMBEDDING, FreeUNet
 from pipeline.models.diffusion import STANDARD, Schedule
 
 
-class ConcatenationUNet(nn.Module):
+class ConcatenationUNet(FreeUNet):
     """Denoise a sequence under a control that is one more part of the code; called as `ControlUNet` is."""
 
     def __init__(
@@ -21,12 +21,8 @@ class ConcatenationUNet(nn.Module):
         schedule: Schedule = STANDARD,
     ):
         """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of what is told of a path."""
-        super().__init__()
-        self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
         read = nn.Sequential(nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
-        self.embedding = Embedding(read)
-        self.main = UNet(channels, widths, EMBEDDING)
-        self.out = nn.Conv1d(widths[0], channels, 1)
+        super().__init__(channels, read, width, multipliers, schedule)
 
     def forward(
         self,
@@ -37,4 +33,4 @@ class ConcatenationUNet(nn.Module):
         keep: Float[Tensor, "batch 1"],
     ) -> Float[Tensor, "batch channel frame"]:
         code = torch.cat([condition, control.flatten(1) * keep, keep], dim=-1)
-        return self.noise(x, self.out(self.main(x, self.embedding(t, code))[-1]), t)
+        return super().forward(x, t, code, control, keep)

@@ -194,11 +194,12 @@ class FreeUNet(nn.Module):
     """Denoise a sequence that nothing steers; called as `ControlUNet` is, and as good as one whose control is never kept."""
 
     def __init__(
-        self, channels: int, condition: int, width: int = 32, multipliers: tuple[int, ...] = (1, 2, 4), schedule: Schedule = STANDARD
+        self, channels: int, read: nn.Module, width: int = 32, multipliers: tuple[int, ...] = (1, 2, 4), schedule: Schedule = STANDARD
     ):
+        """``read`` makes `EMBEDDING` numbers of a condition."""
         super().__init__()
         self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
-        self.embedding = Embedding(nn.Linear(condition, EMBEDDING))
+        self.embedding = Embedding(read)
         self.main = UNet(channels, widths, EMBEDDING)
         self.out = nn.Conv1d(widths[0], channels, 1)
 

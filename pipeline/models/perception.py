@@ -83,10 +83,8 @@ class FeatureVolume:
     def around(self, ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch channel 64 8 64"]:
         """Sample the nearest voxels on the ego grid (Eq. 11): centred at the root, axes x y z, zero outside."""
         index, inside = self.voxel(rigid.apply(ego, grid_points_ego().reshape(-1, 3)))
-        features, cell = (
-            self.features.reshape(len(self.features), -1),
-            np.ravel_multi_index(np.moveaxis(index, -1, 0), self.occupancy.shape),
-        )
+        features = self.features.reshape(len(self.features), -1)
+        cell = np.ravel_multi_index(np.moveaxis(index, -1, 0), self.occupancy.shape)
         grid = np.empty((len(ego), len(features), *GRID_SHAPE), np.float32)
         for each, mine, known in zip(grid, cell, inside, strict=True):
             np.multiply(features.take(mine, axis=1), known, out=each.reshape(len(features), -1), dtype=np.float32)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.models.denoisers import ControlUNet, FreeUNet, GoalMLP
+from pipeline.models.denoisers import EMBEDDING, ControlUNet, FreeUNet, GoalMLP
 from pipeline.models.diffusion import Schedule, guided, noised, sample
 
 SCHEDULE = Schedule()
@@ -68,7 +68,7 @@ def test_control_enters_every_block_and_can_be_dropped():
 def test_nothing_steers_a_free_network_which_is_a_controlled_one_without_control():
     torch.manual_seed(0)
     steered = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
-    free = FreeUNet(4, condition=8, width=8, multipliers=(1, 2)).eval()
+    free = FreeUNet(4, torch.nn.Linear(8, EMBEDDING), width=8, multipliers=(1, 2)).eval()
     free.load_state_dict({name: value for name, value in steered.state_dict().items() if name in free.state_dict()})
     x, t, code, control = torch.randn(2, 4, 56), torch.tensor([3.0, 40.0]), torch.randn(2, 8), torch.randn(2, 3)
     dropped = torch.zeros(2, 1)
