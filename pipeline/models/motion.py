@@ -16,10 +16,15 @@ from torch import Tensor, nn
 from pipeline.files import arrays
 from pipeline.space import rigid, rigid_torch
 
+DOUBTFUL = 0.1
+"""frames of less confidence than this are no evidence of anything"""
+INFERRED = 0.05
+"""confidence, at most, of frames in which nobody saw the agent: where it probably was"""
+
 
 @dataclass(frozen=True)
 class Motion:
-    """One video: poses of camera, agent and bones; NaN where the agent's pose is not known."""
+    """One video: poses of camera, agent and bones; NaN where the agent's pose is not known, of little confidence where it is inferred."""
 
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -27,6 +32,11 @@ class Motion:
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
     confidence: Float[np.ndarray, "frame"]
     agent_visible: Bool[np.ndarray, "frame"]
+
+    @property
+    def agent_known(self) -> Bool[np.ndarray, "frame"]:
+        """Where the agent's pose is known, not inferred."""
+        return np.isfinite(self.world_from_agent).all((1, 2)) & (self.confidence >= DOUBTFUL)
 
     def at(self, query_s: float) -> tuple[Float[np.ndarray, "4 4"] | None, Float[np.ndarray, "bone 4 4"] | None]:
         """Return the agent's root and bones at one time, interpolated; None where they are not known."""

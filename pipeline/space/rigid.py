@@ -6,6 +6,7 @@ Quaternions are wxyz with w >= 0; this file owns that order. Angles are radians,
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 
@@ -105,6 +106,16 @@ def interpolate(
     rotation = Slerp(timestamp_s, Rotation.from_matrix(a_from_b[:, :3, :3]))(query_s).as_matrix()
     translation = np.stack([np.interp(query_s, timestamp_s, a_from_b[:, axis, 3]) for axis in range(3)], axis=-1)
     return make(rotation, translation)
+
+
+def smoothed(a_from_b: Float[np.ndarray, "frame 4 4"], sigma_frames: float, places: bool = True) -> Float[np.ndarray, "frame 4 4"]:
+    """Smooth transforms in time: positions (where ``places``) by a Gaussian, rotations by the Gaussian mean of their matrices."""
+    if sigma_frames <= 0:
+        return a_from_b
+    mean = gaussian_filter1d(a_from_b[:, :3], sigma_frames, axis=0, mode="nearest")
+    left, _, right = np.linalg.svd(mean[:, :, :3])
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    return make(left @ right, mean[:, :, 3] if places else a_from_b[:, :3, 3])
 
 
 def mean_rotation(

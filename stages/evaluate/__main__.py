@@ -30,9 +30,9 @@ class Config:
     """Single frames per session for the localizer and its rivals."""
     map_frames: int = 60
     """Walk-through frames that the rivals may use."""
-    heldout_frames: int = 24
+    heldout_frames: int = 60
     """Frames of the held-out phone that are drawn."""
-    surface_frames: int = 12
+    surface_frames: int = 40
     """Frames per session on which the agent's surface is compared."""
     physical_windows: int = 16
     """Test windows in which penetration and foot slide are measured, of recorded and of generated motion."""

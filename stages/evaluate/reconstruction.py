@@ -17,6 +17,7 @@ from stages.evaluate import heldout, reading, surfaces
 from stages.evaluate.alignment import PoseErrors, pose_errors
 from stages.evaluate.figures import Figures
 from stages.evaluate.heldout import Shot, View
+from stages.evaluate.inferred import inferred_figures
 from stages.evaluate.reading import Folders, Frames, Reconstructed, Recorded
 from stages.evaluate.registration import root_figures
 from stages.evaluate.surfaces import Skin
@@ -48,6 +49,7 @@ def reconstruction_figures(
     motions = {each.video.id: reading.read_motion(folders.reconstruction, each.video.id) for each in sessions}
     roots = [root_errors(motions[each.video.id], each, frames) for each in sessions]
     figures.add(root_figures("reconstruction", roots))
+    figures.add(inferred_figures(sessions, motions, frames))
     turnaround = next(each for each in known if each.video.role == "turnaround")
     figures.add(surfaces.track_figures(track_distances(folders, sessions, motions, turnaround, frames)))
     figures.add(_agent_chamfer(folders, sessions, motions, frames, effort))
@@ -175,7 +177,7 @@ def _agent_chamfer(folders: Folders, sessions: Sequence[Recorded], motions: dict
         chosen = visible[np.unique(np.linspace(0, len(visible) - 1, effort.surface_frames).astype(int))] if len(visible) else []
         for frame in chosen:
             ours = _posed(skin, motions[each.video.id], frame)
-            if ours is not None:
+            if ours is not None and motions[each.video.id].agent_known[frame]:
                 true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))
                 distances.append(surfaces.chamfer(ours, true))
     value = float(np.mean(distances)) if distances else np.nan

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pipeline import cli, dag, progress, together
 from pipeline.models.fields import Reconstruction
-from stages.reconstruct import assemble, fuse, optimise, pictures, reading, results, writing
+from stages.reconstruct import assemble, fuse, hidden, optimise, pictures, reading, results, writing
 from stages.reconstruct.assemble import Shapes
 from stages.reconstruct.fuse import Fusion
 from stages.reconstruct.rays import Sampling
@@ -45,7 +45,7 @@ class Config:
     agent_step_m: float = 0.01
     """resolution of the extracted agent, metres"""
     longest_gap_s: float = 2.0
-    """the agent's pose is interpolated over gaps up to this long, seconds"""
+    """the agent's pose is trusted over gaps up to this long, seconds; over longer ones it is inferred, of low confidence"""
 
 
 def run(task: cli.Task) -> None:
@@ -67,7 +67,7 @@ def run(task: cli.Task) -> None:
     if not together.leave():
         return
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
-    motions = results.motions(problem, videos, config.longest_gap_s)
+    motions = hidden.inferred(problem, videos, results.motions(problem, videos, config.longest_gap_s))
     sessions = [video.id for video in videos if video.camera_free]
     scene, agent = results.scene_surface(problem), results.agent_surface(problem, config.agent_step_m)
     with task.create() as folder:

@@ -134,9 +134,9 @@ class FrameLoss:
 
     def _shows_agent(self, sequence: Sequence4D, frame: int, camera_from_world: Tensor, target: Target) -> bool:
         """Tell whether the agent's pose is known, and whether it may be in the picture: a ball as large as it at rest is."""
-        root = torch.from_numpy(sequence.motion.world_from_agent[frame]).float().to(self.device)
-        if not root.isfinite().all():
+        if not sequence.motion.agent_known[frame]:
             return False
+        root = torch.from_numpy(sequence.motion.world_from_agent[frame]).float().to(self.device)
         radius = self.splats.agent.means.detach().norm(dim=-1).amax() / REACH
         centre = root[None, :3, 3]
         return len(in_view(centre, radius.log().expand(1, 3), camera_from_world, target.intrinsics, *target.depth.shape)) > 0
@@ -158,7 +158,7 @@ class FrameLoss:
             return None
         means = cloud.means
         if cloud.agent.any():
-            if not np.isfinite(motion.world_from_agent[later]).all():
+            if not motion.agent_known[later]:
                 return None
             moved = self.splats.place_agent(*self._pose(sequence, later), sequence.video).means
             means = torch.cat([cloud.means[: len(cloud.means) - len(moved)], moved])

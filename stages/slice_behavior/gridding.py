@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d
 
 from pipeline.models.trajectories import RATE_HZ, Trajectory
 from pipeline.space import rigid
@@ -38,7 +37,7 @@ def trajectory_from_motion(motion: Motion, *, min_confidence: float, max_gap_s: 
         rest = np.broadcast_to(np.eye(4, dtype=np.float32), (len(grid), bones, 4, 4))
         return Trajectory(grid, still.copy(), rest.copy(), still.copy(), np.zeros(len(grid), bool))
     good = time[trusted]
-    agent = smoothed(rigid.interpolate(good, motion.world_from_agent[trusted], grid), smooth_s * RATE_HZ)
+    agent = rigid.smoothed(rigid.interpolate(good, motion.world_from_agent[trusted], grid), smooth_s * RATE_HZ)
     bone = [rigid.interpolate(good, motion.agent_from_bone[trusted, b], grid) for b in range(bones)]
     camera = rigid.interpolate(good, motion.world_from_camera[trusted], grid)
     return Trajectory(grid, agent, np.stack(bone, 1).astype(np.float32), camera, enclosed(good, grid, max_gap_s))
@@ -52,13 +51,3 @@ def enclosed(good: Float[np.ndarray, "frame"], grid: Float[np.ndarray, "sample"]
     on_frame = np.minimum(np.abs(good[after] - grid), np.abs(good[before] - grid)) <= near
     between = (good[before] <= grid) & (grid <= good[after]) & (good[after] - good[before] <= max_gap_s)
     return on_frame | between
-
-
-def smoothed(a_from_b: Float[np.ndarray, "frame 4 4"], sigma_frames: float) -> Float[np.ndarray, "frame 4 4"]:
-    """Smooth transforms in time: positions by a Gaussian, rotations by the Gaussian mean of their matrices."""
-    if sigma_frames <= 0:
-        return a_from_b
-    mean = gaussian_filter1d(a_from_b[:, :3], sigma_frames, axis=0, mode="nearest")
-    left, _, right = np.linalg.svd(mean[:, :, :3])
-    left[..., 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-    return rigid.make(left @ right, mean[:, :, 3])

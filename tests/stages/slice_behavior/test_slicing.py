@@ -2,7 +2,7 @@ import numpy as np
 
 from pipeline.models.trajectories import TEST, TRAIN, window_starts
 from pipeline.space import rigid
-from stages.slice_behavior.gridding import Motion, smoothed, trajectory_from_motion
+from stages.slice_behavior.gridding import Motion, trajectory_from_motion
 from stages.slice_behavior.windows import allowed_voxels, slice_windows
 from tests.pipeline.models.wandering import REST, room, wander
 
@@ -60,7 +60,7 @@ def test_smoothing_takes_jitter_and_keeps_rotations():
     rng = np.random.default_rng(0)
     clean = wander(rng).world_from_agent
     noisy = clean @ rigid.exp(rng.standard_normal((len(clean), 6)) * 0.02)
-    smooth = smoothed(noisy, 1.0)
+    smooth = rigid.smoothed(noisy, 1.0)
     np.testing.assert_allclose(np.linalg.det(smooth[:, :3, :3]), 1, atol=1e-9)
     error = [np.linalg.norm(track[5:-5, :3, 3] - clean[5:-5, :3, 3], axis=-1).mean() for track in (smooth, noisy)]
     assert error[0] < 0.7 * error[1]
