@@ -56,6 +56,7 @@ def fit(
     clip_norm: float | None = None,
     after_step: Callable[[int], None] | None = None,
     shared: bool = False,
+    asked_to_stop: Callable[[], bool] | None = None,
 ) -> FitRecord:
     """Minimise ``loss(step, generator)`` for ``steps`` steps, from the newest checkpoint in ``resume`` if there is one.
 
@@ -63,13 +64,14 @@ def fit(
     scalar or named, weighted, scalar terms. ``schedule`` maps progress 0..1 to a factor on each group's rate.
     Steps whose loss or gradient is not finite are skipped; three in a row fall back to the last checkpoint at
     half the rate, and the second such fall ends the run (exit 76, ``diagnosis.json`` in ``resume``).
+    ``asked_to_stop`` tells instead of signals whether to save and exit: several fits in threads share one `termination`.
     With ``shared``, all processes of `pipeline.together` minimise the mean of their losses; the first keeps checkpoints.
     """
     shared = shared and together.size() > 1
     loop = _Loop(dict(modules), optimizer, resume, shared)
     loop.restore()
     loss = together.shared(modules, loss) if shared else loss
-    with _termination() as asked_to_stop:
+    with contextlib.nullcontext(asked_to_stop) if asked_to_stop else termination() as asked_to_stop:
         for _ in progress.track(loop.until(steps), label, total=steps - loop.step):
             if not loop.advance(loss, steps, seed, schedule, clip_norm):
                 continue
@@ -237,7 +239,7 @@ def _deep_clone(value):
 
 
 @contextlib.contextmanager
-def _termination() -> Iterator[Callable[[], bool]]:
+def termination() -> Iterator[Callable[[], bool]]:
     """Yield a function that tells whether SIGTERM or SIGINT has come; the handlers live as long as the block."""
     came = []
     previous = {number: signal.signal(number, lambda number, _: came.append(number)) for number in (signal.SIGTERM, signal.SIGINT)}

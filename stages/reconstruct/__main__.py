@@ -50,19 +50,19 @@ class Config:
 
 def run(task: cli.Task) -> None:
     """Reconstruct one agent's recordings."""
-    config, scratch = task.config, task.resume
     together.join(task.device)
+    config, scratch, workers = task.config, task.resume, max(1, task.threads // together.size())
     per_video = {name: task.per_video(name, dag.VIEWED if name == "frames" else None) for name in ("frames", "masks", "flow", "features")}
     single = {name: task.input(name) for name in ("registration", "scene_template", "agent_template")}
     folders = reading.Folders(**per_video, **single, scratch=scratch)
     by_role = {video.role: video.id for video in task.videos}
     twice = [video.synchronized_with for video in task.videos if video.role == "heldout"] if config.sessions == "filmed_twice" else None
-    videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed, twice)
-    fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion, scratch) if config.ground == "fused" else None
+    videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed, twice, workers)
+    fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion, scratch, workers) if config.ground == "fused" else None
     template, floor_m = reading.read_template(folders.agent_template), reading.read_floor(folders.scene_template)
     problem = assemble.build(videos, template, config.shapes, config.seed, task.device, fused, scratch, floor_m)
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(problem.store.scene)} scene rays, {len(problem.store.agent)} agent rays")
-    plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, scratch)
+    plan = optimise.Plan(config.steps, config.weights, config.batches, config.rates, config.seed, scratch, workers)
     records = optimise.optimise(problem, plan)
     if not together.leave():
         return

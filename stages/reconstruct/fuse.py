@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float16
 
-from pipeline import progress
+from pipeline import progress, threads
 from pipeline.files import arrays
 from pipeline.models.fused import CELLS, CHANNELS, NODES, NOWHERE, Fused
 from pipeline.space.tsdf import Volume
@@ -43,19 +43,24 @@ class Fusion:
     """a block counts as changed from so many such voxels on"""
 
 
-def ground(videos: Sequence[Video], margin_m: float, fusion: Fusion, scratch: Path | None = None, least_confidence: float = 0.1) -> Fused:
-    """Fuse the videos that have a scene, in the order of their codes, in the box of the scene's field.
+def ground(videos: Sequence[Video], margin_m: float, fusion: Fusion, scratch: Path | None = None, workers: int = 1) -> Fused:
+    """Fuse the videos that have a scene, in the order of their codes, in the box of the scene's field; so many ``workers`` at once.
 
     Their volumes wait in unnamed files in ``scratch`` (None: where temporary files stand).
     """
-    ground = Ground(measured_box(videos, margin_m), fusion, scratch)
-    for video in progress.track([video for video in scene_first(videos) if video.has_scene], "fusing depth"):
-        volume = ground.empty()
-        good = np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= least_confidence)
-        for frame in np.flatnonzero(good)[:: fusion.every].tolist():
-            _integrate(volume, video, frame, fusion.ring_px)
+    ground, shown = Ground(measured_box(videos, margin_m), fusion, scratch), [video for video in scene_first(videos) if video.has_scene]
+    volumes = threads.ordered(lambda video: _fused(ground.empty(), video, fusion), shown, workers)
+    for volume in progress.track(volumes, "fusing depth", total=len(shown)):
         ground.add(volume)
     return ground.finish()
+
+
+def _fused(volume: Volume, video: Video, fusion: Fusion, least_confidence: float = 0.1) -> Volume:
+    """Add what one video saw."""
+    good = np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= least_confidence)
+    for frame in np.flatnonzero(good)[:: fusion.every].tolist():
+        _integrate(volume, video, frame, fusion.ring_px)
+    return volume
 
 
 def _integrate(volume: Volume, video: Video, frame: int, ring_px: int) -> None:

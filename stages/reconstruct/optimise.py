@@ -4,7 +4,7 @@ Each phase is one call of `pipeline.fit.fit` with its own checkpoints, so that a
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from pipeline import together
-from pipeline.fit import FitRecord, fit
+from pipeline import progress, threads, together
+from pipeline.fit import FitRecord, fit, termination
 from stages.reconstruct.joint import JointLoss, TemplateLoss
 from stages.reconstruct.posing import Chunk, ChunkLoss
 from stages.reconstruct.problem import Problem
@@ -32,6 +32,8 @@ class Plan:
     seed: int
     resume: Path | None
     """folder for checkpoints"""
+    workers: int = 1
+    """stretches that are posed at once, each by one thread"""
 
 
 def cosine(progress: float) -> float:
@@ -39,6 +41,7 @@ def cosine(progress: float) -> float:
     return 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))
 
 
+@threads.alone()
 def optimise(problem: Problem, plan: Plan) -> dict[str, FitRecord]:
     """Run all phases; the modules of the problem change in place. Returns the losses of each phase.
 
@@ -53,9 +56,7 @@ def optimise(problem: Problem, plan: Plan) -> dict[str, FitRecord]:
     scene = [*field_groups(problem.scene, rates), _motion_group([problem.motion.camera], rates.camera, momentum=0.9)]
     records["scene"] = _run(problem, plan, "scene", SceneLoss(problem, plan.weights, plan.batches, steps.scene), steps.scene, scene)
     if len(everything.agent_frames):
-        for index, frame in enumerate(chunks(everything, steps.body_chunk_frames)):
-            if torch.isin(frame, problem.agent_frames).any():
-                _pose_chunk(problem, plan, frame, f"body_{index:04d}")
+        _pose(problem, plan, list(chunks(everything, steps.body_chunk_frames)))
         for corrections in (problem.motion.root, problem.motion.bone):
             corrections.data.copy_(together.total(corrections))
         records["joint"] = _run(
@@ -89,11 +90,22 @@ def _run(problem: Problem, plan: Plan, name: str, loss, steps: int, groups: list
     )
 
 
-def _pose_chunk(problem: Problem, plan: Plan, frame: torch.Tensor, name: str) -> None:
-    """Pose the template in one stretch of frames and write root and bones into the motion table."""
+def _pose(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> None:
+    """Pose the template in all stretches with usable frames and write roots and bones into the motion table."""
     held = [problem.agent, problem.body, problem.scene]
+    own = [(f"body_{index:04d}", frame) for index, frame in enumerate(stretches) if torch.isin(frame, problem.agent_frames).any()]
     for module in held:
         module.requires_grad_(False)
+    with termination() as asked_to_stop:
+        posed = threads.ordered(lambda named: _pose_chunk(problem, plan, *named, asked_to_stop), own, plan.workers)
+        for chunk in progress.track(posed, "posing", total=len(own)):
+            chunk.write(problem)
+    for module in held:
+        module.requires_grad_(True)
+
+
+def _pose_chunk(problem: Problem, plan: Plan, name: str, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> Chunk:
+    """Pose the template in one stretch of frames; nothing else changes."""
     chunk, steps = Chunk(problem, frame), plan.steps.body
     loss = ChunkLoss(problem, chunk, plan.weights, plan.batches)
     fit(
@@ -106,10 +118,9 @@ def _pose_chunk(problem: Problem, plan: Plan, frame: torch.Tensor, name: str) ->
         save_every=steps,
         schedule=cosine,
         label=name,
+        asked_to_stop=asked_to_stop,
     )
-    chunk.write(problem)
-    for module in held:
-        module.requires_grad_(True)
+    return chunk
 
 
 def field_groups(field: nn.Module, rates: Rates) -> list[dict]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import progress
+from pipeline import progress, threads
 from pipeline.errors import InputError
 from pipeline.files import arrays, meshes
 from pipeline.files.clips import Clip, Masks
@@ -39,10 +39,12 @@ def read_videos(
     sampling: Sampling,
     seed: int,
     only: Collection[str | None] | None = None,
+    workers: int = 1,
 ) -> list[Video]:
     """Read the walk-through, the turnaround and every registered session once into rays with their poses.
 
     With ``only``, the first registered one of these sessions stands alone, with the turnaround that made its template.
+    So many ``workers`` read sessions at once.
     Raises `InputError` RCN-001 when no session was registered.
     """
     sessions = [id for id in sorted(folders.frames) if (folders.registration / id / "poses.npz").exists() and (only is None or id in only)]
@@ -51,7 +53,8 @@ def read_videos(
     if only is not None:
         return [_turnaround(turnaround, folders, sampling, seed), _session(sessions[0], folders, sampling, seed)]
     videos = [_walkthrough(walkthrough, folders, sampling, seed), _turnaround(turnaround, folders, sampling, seed)]
-    return videos + [_session(id, folders, sampling, seed) for id in progress.track(sessions, "reading sessions")]
+    read = threads.ordered(lambda id: _session(id, folders, sampling, seed), sessions, workers)
+    return videos + list(progress.track(read, "reading sessions", total=len(sessions)))
 
 
 def _walkthrough(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:

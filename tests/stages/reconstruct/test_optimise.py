@@ -132,6 +132,16 @@ def test_posed_surface_comes_nearer_to_the_truth(solved):
     assert np.linalg.norm(centre - truth, axis=-1).mean() < 0.6 * before
 
 
+def test_posing_is_the_same_however_many_are_posed_at_once():
+    def posed(workers: int) -> torch.Tensor:
+        found, _ = problem()
+        optimise._pose(found, replace(plan(body=3), workers=workers), list(optimise.chunks(found, 5)))
+        return torch.cat([found.motion.root.flatten(), found.motion.bone.flatten()]).detach()
+
+    one = posed(1)
+    assert one.abs().max() > 0.01 and torch.equal(one, posed(2))
+
+
 def test_bare_masked_pixels_draw_the_surface_to_them():
     found, _ = problem()
     frame, rays, generator = found.agent_frames[:4], found.store.agent, torch.Generator().manual_seed(0)
