@@ -28,6 +28,8 @@ MOST_LOOKS = 1200
 """... or less, so many in a stretch"""
 SMOOTH_S = 0.15
 """standard deviation of the smoothing of ways and postures"""
+NEAR = 0.05
+"""share of the frames in which the agent is seen nearer to the phone than is believed unseen"""
 TURN_S = 0.5
 """before it leaves a place the agent turns, for this long"""
 
@@ -43,6 +45,8 @@ class Known:
     """bones over the longest walk that was seen"""
     walk_m: Float[np.ndarray, "frame"]
     """how far it had come"""
+    near_m: float
+    """hardly ever is it seen nearer to the phone, along the ground"""
 
 
 def inferred(problem: Problem, videos: Sequence[Video], motions: Mapping[str, Motion]) -> dict[str, Motion]:
@@ -64,7 +68,11 @@ def _known(problem: Problem, motions: Sequence[Motion]) -> Known:
     roots = np.concatenate([place[these] for place, these in zip(root, good, strict=True)])
     walk, walk_m = _longest_walk(motions)
     places = places_of(problem.scene, problem.floor_m, roots)
-    return Known(places, Habits.of(when, root, good), Stand.of(problem.surface.points.cpu()), walk, walk_m)
+    apart = np.concatenate(
+        [np.linalg.norm((each.world_from_camera - each.world_from_agent)[seen(each)][:, [0, 2], 3], axis=1) for each in motions]
+    )
+    near_m = float(np.nanquantile(apart, NEAR))
+    return Known(places, Habits.of(when, root, good), Stand.of(problem.surface.points.cpu()), walk, walk_m, near_m)
 
 
 def _longest_walk(motions: Sequence[Motion]) -> tuple[Float[np.ndarray, "frame bone 4 4"], Float[np.ndarray, "frame"]]:
@@ -120,7 +128,15 @@ def _way(
     spacing = max(LOOK_S, span / MOST_LOOKS)
     frames = np.unique([*(begin + np.searchsorted(when[begin:end], np.arange(when[begin], when[end], spacing))), end])
     cameras = torch.from_numpy(rigid.inverse(motion.world_from_camera[frames])).float()
-    says = sightings.evidence(problem.store.views, first + frames, cameras, np.gradient(when[frames]), known.stand, places.position)
+    says = sightings.evidence(
+        problem.store.views,
+        first + frames,
+        cameras,
+        np.gradient(when[frames]),
+        known.stand,
+        places.position,
+        known.near_m,
+    )
     speed, sure = speeds_of(when, root, good)
     ending = [
         None if place is None else End(places.nearest(place), bool(_mode(speed, sure, i)))

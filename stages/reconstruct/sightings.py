@@ -1,4 +1,4 @@
-"""What frames say against the agent's having been somewhere: the phone looked through that place."""
+"""What frames say against the agent's having been somewhere: the phone looked through that place, or its holder stood there."""
 
 from dataclasses import dataclass
 
@@ -59,12 +59,18 @@ def evidence(
     duration_s: Float[np.ndarray, "frame"],
     body: Stand,
     place: Float[np.ndarray, "cell 3"],
+    near_m: float = 0.0,
 ) -> Float[np.ndarray, "frame cell"]:
-    """Return the logarithm of each frame's likelihood of the agent in each cell, which the masks of these frames do not show."""
+    """Return the logarithm of each frame's likelihood of the agent in each cell, which the masks of these frames do not show.
+
+    Cells nearer to the phone than ``near_m``, along the ground, count as looked through: nobody lets the animal so near.
+    """
     points, found = torch.from_numpy(place).float(), np.zeros((len(frames), len(place)))
     for row, (frame, camera) in enumerate(zip(frames.tolist(), camera_from_world.cpu(), strict=True)):
         if camera.isfinite().all():
             share = looked_through(views, frame, camera, body, points)
+            eye = rigid_torch.inverse(camera)[:3, 3]
+            share[(points - eye)[:, [0, 2]].norm(dim=-1) < near_m] = 1
             against = -SURE * (share - DOUBT).clamp_min(0)
             found[row] = (against.logsumexp(-1) - np.log(HEADINGS)).numpy() * min(1.0, duration_s[row] / SECOND_LOOK_S)
     return found

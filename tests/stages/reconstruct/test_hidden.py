@@ -87,6 +87,9 @@ def test_only_what_was_looked_through_speaks_against():
     found = evidence(views, np.array([0]), cameras, np.array([1.0]), stand, place)[0]
     assert found[0] < -6 and found[2] < -6, "looked through"
     assert (found[[1, 3, 4]] == 0).all(), "hidden, behind, beside"
+    below = np.array([[0.1, -1.0, 0.1]])
+    alone, avoided = (evidence(views, np.array([0]), cameras, np.array([1.0]), stand, below, near_m)[0, 0] for near_m in (0.0, 0.3))
+    assert alone == 0 and avoided < -6, "where the phone's holder stands"
     assert (evidence(views, np.array([0]), torch.full((1, 4, 4), torch.nan), np.array([1.0]), stand, place) == 0).all()
 
 
