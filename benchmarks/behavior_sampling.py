@@ -43,8 +43,8 @@ class OnnxNetworks:
     def perceive(self, *arguments: Array) -> Array:
         return self._run("perception", *arguments)
 
-    def goal(self, *arguments: Array) -> Array:
-        return self._run("goal", *arguments)
+    def goal(self, x: Array, t: Array, condition: Array) -> Array:
+        return self._run("goal", x, t, np.repeat(condition, len(x) // len(condition), axis=0))
 
     def path(self, *arguments: Array) -> Array:
         return self._run("path", *arguments)

@@ -16,11 +16,13 @@ from torch import nn
 
 from pipeline.models.body_denoiser import TOLD, BodyDenoiser
 from pipeline.models.concatenation import ConcatenationUNet
-from pipeline.models.denoisers import EMBEDDING, ControlUNet, FreeUNet, GoalMLP
+from pipeline.models.denoisers import EMBEDDING, ControlUNet, FreeUNet, Tail
 from pipeline.models.diffusion import STANDARD, Schedule
+from pipeline.models.goal_denoiser import GoalMLP
 from pipeline.models.perception import (
     GRID_CELL_M,
     GRID_SHAPE,
+    MAP_KEY,
     PACE_CHANNELS,
     Blind,
     Ego,
@@ -69,9 +71,19 @@ class Architecture:
         return self.scene_block if self.scene == "pillars" else 1
 
     @property
-    def condition(self) -> int:
+    def map_cells(self) -> int:
+        """Cells along each side of the map in which goals look things up; 0 without one."""
+        return GRID_SHAPE[0] // self.scene_block if self.scene == "pillars" else 0
+
+    @property
+    def told(self) -> int:
         """Length of the perception code of all minds, of the pace and of the posture that is held now."""
         return 3 * self.code * self.minds + PACE_CHANNELS + self.body_channels
+
+    @property
+    def condition(self) -> int:
+        """Length of all that is perceived: the maps of all minds, and what path and body are told."""
+        return 2 * MAP_KEY * self.map_cells**2 * self.minds + self.told
 
     @property
     def perception(self) -> PerceptionSize:
@@ -161,18 +173,18 @@ class BehaviorNets(nn.Module):
         super().__init__()
         a = architecture
         self.perception = Minds(a.perception, a.minds)
-        self.goal = GoalMLP(3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds)
+        self.goal = GoalMLP(3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds, map_cells=a.map_cells)
         match a.control:
             case "unet":
-                self.path = ControlUNet(STRIDE, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
-                along = ControlUNet(a.body_channels, TOLD, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                self.path = ControlUNet(STRIDE, 3, a.told, a.unet_width, a.unet_multipliers, schedule)
+                along = ControlUNet(a.body_channels, TOLD, a.told, a.unet_width, a.unet_multipliers, schedule)
             case "concatenation":
-                self.path = ConcatenationUNet(STRIDE, 3, a.condition, a.unet_width, a.unet_multipliers, schedule)
-                along = ConcatenationUNet(a.body_channels, TOLD * a.future, a.condition, a.unet_width, a.unet_multipliers, schedule)
+                self.path = ConcatenationUNet(STRIDE, 3, a.told, a.unet_width, a.unet_multipliers, schedule)
+                along = ConcatenationUNet(a.body_channels, TOLD * a.future, a.told, a.unet_width, a.unet_multipliers, schedule)
             case _:
                 assert_never(a.control)
         if a.family == "one_stage":  # one network for path and body, which nothing steers
-            along = FreeUNet(STRIDE + a.body_channels, nn.Linear(a.condition, EMBEDDING), a.unet_width, a.unet_multipliers, schedule)
+            along = FreeUNet(STRIDE + a.body_channels, Tail(a.told, EMBEDDING), a.unet_width, a.unet_multipliers, schedule)
         self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
 
 

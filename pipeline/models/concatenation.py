@@ -23,6 +23,7 @@ class ConcatenationUNet(FreeUNet):
         """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of what is told of a path."""
         read = nn.Sequential(nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING))
         super().__init__(channels, read, width, multipliers, schedule)
+        self.condition = condition
 
     def forward(
         self,
@@ -32,5 +33,5 @@ class ConcatenationUNet(FreeUNet):
         control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
         keep: Float[Tensor, "batch 1"],
     ) -> Float[Tensor, "batch channel frame"]:
-        code = torch.cat([condition, control.flatten(1) * keep, keep], dim=-1)
+        code = torch.cat([condition[:, -self.condition :], control.flatten(1) * keep, keep], dim=-1)
         return super().forward(x, t, code, control, keep)

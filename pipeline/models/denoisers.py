@@ -1,4 +1,4 @@
-"""The denoising networks: goal MLP (Eq. 7), and 1-D ControlUNets for path and body (Eq. 9, 10).
+"""The denoising networks of sequences: 1-D ControlUNets for path and body (Eq. 9, 10), and what all denoisers share.
 
 All predict the noise in x at step t, given the perception code. Inside they estimate the velocity v = sqrt(alpha_bar)
 noise - sqrt(1 - alpha_bar) clean (Salimans & Ho 2022), which is of unit scale at every step; `NoiseFromVelocity` turns
@@ -7,7 +7,6 @@ denoises, the second reads the control (goal or path) and adds its features to e
 """
 
 import math
-from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from pipeline.models.diffusion import STANDARD, Schedule
 
-TIME_CHANNELS, HORIZON_CHANNELS, EMBEDDING = 64, 8, 128
+TIME_CHANNELS, EMBEDDING = 64, 128
 
 
 def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
@@ -41,48 +40,11 @@ class NoiseFromVelocity(nn.Module):
         return self.of_sample[step].reshape(shape) * x + self.of_velocity[step].reshape(shape) * velocity
 
 
-class GoalMLP(nn.Module):
-    """Six layers of 128 (appendix A.2), one stack per mind, whose answers are averaged.
+class Tail(nn.Linear):
+    """A linear layer that reads the last numbers of a longer row: codes and posture come after the maps, which only goals read."""
 
-    Of each mind's perception code a stack reads the first ``condition`` numbers. Training may ask where the animal is
-    at another part of the 5.6 s (``horizon`` below 1), which teaches it more from as many minutes.
-    """
-
-    def __init__(
-        self, condition: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *, minds: int = 1, code: int | None = None
-    ):
-        super().__init__()
-        self.noise, self.condition, self.code = NoiseFromVelocity(schedule), condition, code or condition
-        self.stacks = nn.ModuleList(goal_stack(condition, hidden, layers) for _ in range(minds))
-
-    def forward(
-        self,
-        x: Float[Tensor, "batch 3"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        horizon: Float[Tensor, "batch"] | None = None,
-    ) -> Float[Tensor, "batch 3"]:
-        return self.apart(x, t, condition, torch.ones_like(t) if horizon is None else horizon).mean(0)
-
-    def apart(
-        self,
-        x: Float[Tensor, "batch 3"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        horizon: Float[Tensor, "batch"],
-    ) -> Float[Tensor, "mind batch 3"]:
-        """Return what each stack makes of it: they are trained apart and only averaged to sample."""
-        angle = horizon[:, None] * torch.tensor([1.0, 2.0, 4.0, 8.0], device=x.device)
-        begin = torch.cat([x, time_embedding(t), angle.sin(), angle.cos()], dim=-1)
-        codes = [condition[:, i * self.code : i * self.code + self.condition] for i in range(len(self.stacks))]
-        return torch.stack([self.noise(x, stack(torch.cat([begin, c], dim=-1)), t) for stack, c in zip(self.stacks, codes, strict=True)])
-
-
-def goal_stack(condition: int, hidden: int, layers: int) -> nn.Sequential:
-    """Return one stack of linear layers: from sample, step, horizon and code to the velocity."""
-    sizes = [3 + TIME_CHANNELS + HORIZON_CHANNELS + condition] + [hidden] * (layers - 1)
-    inner = [layer for i, o in pairwise(sizes) for layer in (nn.Linear(i, o), nn.SiLU())]
-    return nn.Sequential(*inner, nn.Linear(hidden, 3))
+    def forward(self, row: Float[Tensor, "batch number"]) -> Float[Tensor, "batch out"]:
+        return super().forward(row[:, -self.in_features :])
 
 
 class Embedding(nn.Module):
@@ -166,7 +128,7 @@ class ControlUNet(nn.Module):
         super().__init__()
         self.noise = NoiseFromVelocity(schedule)
         widths = tuple(width * m for m in multipliers)
-        self.embedding = Embedding(nn.Linear(condition, EMBEDDING))
+        self.embedding = Embedding(Tail(condition, EMBEDDING))
         self.main = UNet(channels, widths, EMBEDDING)
         self.side = UNet(control, widths, EMBEDDING)
         self.inject = nn.ModuleList(nn.Conv1d(w, w, 1) for w in self.main.block_widths)

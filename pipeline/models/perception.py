@@ -25,6 +25,8 @@ Blind = Literal["nothing", "scene", "observer", "past"]
 CONDITIONS: tuple[Blind, ...] = ("scene", "observer", "past")
 GRID_SHAPE = (64, 8, 64)
 GRID_CELL_M = 0.1
+MAP_KEY = 8
+"""numbers of a map's cell that tell what is there, and as many that are read where one looks"""
 POSITION = 3
 """leading channels of a past frame, which tell the root's position; root rotation and bones follow"""
 PACE_CHANNELS = 3
@@ -105,27 +107,35 @@ def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
     return nn.Sequential(*layers[:-2])
 
 
+Reading = tuple[Float[Tensor, "batch channel*cell"], Float[Tensor, "batch code"]]
+"""A map's channels, cell after cell (z, then x; none where there is no map), and a code"""
+
+
 class PillarScene(nn.Module):
     """A 2.5-D encoder: blocks of cells averaged, height folded into channels, 2-D convolutions down to 4 x 4.
 
-    Measured on minutes of data, blocks of 0.4 m predict as well as blocks of 0.2 m at a quarter of the time.
+    Beside the code it makes a map for goals to look things up in, where cells are blocks. Measured on minutes of data,
+    blocks of 0.4 m predict as well as blocks of 0.2 m at a quarter of the time.
     """
 
     def __init__(self, channels: int, width: int, code: int, block: int):
         super().__init__()
         self.pool = nn.AvgPool3d(block)
-        layers = [nn.Conv2d(channels * GRID_SHAPE[1] // block, width, 1), nn.SiLU()]
+        self.enter = nn.Sequential(nn.Conv2d(channels * GRID_SHAPE[1] // block, width, 1), nn.SiLU())
+        layers: list[nn.Module] = []
         for _ in range(int(np.log2(GRID_SHAPE[0] // block // 4))):
             layers += [nn.Conv2d(width, width, 3, 2, 1), nn.SiLU()]
         self.convolutions = nn.Sequential(*layers)
         self.out = nn.Linear(width * 16, code)
+        self.map = nn.Sequential(nn.Conv2d(width, width, 3, padding=1), nn.SiLU(), nn.Conv2d(width, 2 * MAP_KEY, 3, padding=1))
 
-    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Float[Tensor, "batch code"]:
+    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Reading:
         return self.encode(self.pool(grid))
 
-    def encode(self, pooled: Float[Tensor, "batch channel x y z"]) -> Float[Tensor, "batch code"]:
+    def encode(self, pooled: Float[Tensor, "batch channel x y z"]) -> Reading:
         """Encode a grid that is already averaged over blocks of cells."""
-        return self.out(self.convolutions(pooled.transpose(2, 3).flatten(1, 2).transpose(2, 3)).flatten(1))
+        blocks = self.enter(pooled.transpose(2, 3).flatten(1, 2).transpose(2, 3))
+        return self.map(blocks).flatten(1), self.out(self.convolutions(blocks).flatten(1))
 
 
 class VolumeScene(nn.Module):
@@ -139,10 +149,10 @@ class VolumeScene(nn.Module):
         self.shortcuts = nn.ModuleList(nn.Conv3d(i, width, 1, s) for i, s in zip(inputs, strides, strict=True))
         self.out = nn.Linear(width, code)
 
-    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Float[Tensor, "batch code"]:
+    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Reading:
         for convolution, shortcut in zip(self.convolutions, self.shortcuts, strict=True):
             grid = nn.functional.silu(convolution(grid)) + shortcut(grid)
-        return self.out(grid.mean((2, 3, 4)))
+        return grid.new_zeros(len(grid), 0), self.out(grid.mean((2, 3, 4)))
 
     encode = forward
 
@@ -246,7 +256,7 @@ class Perception(nn.Module):
         observer_past: Float[Tensor, "batch frame*3"],
         past: Float[Tensor, "batch frame*channel"],
         keep: Float[Tensor, "batch 3"],
-    ) -> Float[Tensor, "batch condition"]:
+    ) -> Reading:
         """``keep`` holds 1 or 0 for scene, observer and past."""
         return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
 
@@ -257,27 +267,28 @@ class Perception(nn.Module):
         past: Float[Tensor, "batch frame*channel"],
         keep: Float[Tensor, "batch 3"],
         bones_keep: Float[Tensor, "batch"],
-    ) -> Float[Tensor, "batch condition"]:
-        """Return the code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides remembered bones."""
+    ) -> Reading:
+        """Return map and code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides remembered bones."""
         return self.join(self.scene.encode(pooled), observer_past, self.past(past, bones_keep), keep)
 
     def join(
         self,
-        scene: Float[Tensor, "batch code"],
+        reading: Reading,
         observer_past: Float[Tensor, "batch frame*3"],
         past: Float[Tensor, "batch code"],
         keep: Float[Tensor, "batch 3"],
-    ) -> Float[Tensor, "batch condition"]:
-        """Put the codes side by side, nulls where ``keep`` is 0 and for what the model is blind to."""
+    ) -> Reading:
+        """Put the codes side by side, nulls where ``keep`` is 0 and for what the model is blind to; a map's null is zero."""
+        chart, scene = reading
         keep = keep * self.sees
         observer = self.observer(observer_past, keep[:, 1])
         scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
         past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
-        return torch.cat([scene, observer, past], dim=-1)
+        return chart * keep[:, :1], torch.cat([scene, observer, past], dim=-1)
 
 
 class Minds(nn.Module):
-    """Several perceptions side by side; the code of the whole is the codes of all, one after another, pace and posture."""
+    """Several perceptions side by side; the code of the whole is the maps of all, their codes, pace and posture."""
 
     HELD_FRAMES = 3
     """last frames that tell the pace, and whose mean is the posture"""
@@ -298,8 +309,12 @@ class Minds(nn.Module):
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
         frames = past.unflatten(1, (self.minds[0].past.frames, -1))[:, -self.HELD_FRAMES :]
-        codes = [mind(scene_grid, observer_past, past, keep) for mind in self.minds]
-        return torch.cat([*codes, self.now(frames, keep[:, 2])], dim=-1)
+        return self.condition([mind(scene_grid, observer_past, past, keep) for mind in self.minds], self.now(frames, keep[:, 2]))
+
+    def condition(self, readings: list[Reading], now: Float[Tensor, "batch pace+channel"]) -> Float[Tensor, "batch condition"]:
+        """Put what the minds read and what is now side by side."""
+        maps, codes = zip(*readings, strict=True)
+        return torch.cat([*maps, *codes, now], dim=-1)
 
     def now(self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]) -> Float[Tensor, "batch pace+channel"]:
         """Return pace, a stride as paths are told in, and posture, in scaled numbers; zeros where the past is not remembered."""

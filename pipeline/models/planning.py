@@ -38,7 +38,7 @@ class Networks(Protocol):
         """Return the perception code."""
 
     def goal(self, x: Array, t: Array, condition: Array) -> Array:
-        """Return the noise in x."""
+        """Return the noise in x; a row of the condition is for as many rows of x, one after another, as it takes."""
 
     def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
         """Return the noise in x."""
@@ -125,6 +125,8 @@ class Codes:
     """where the animal is now, in the ego frame"""
     ground: Ground | None
     """where goals and paths are kept to"""
+    count: int = 1
+    """plans of what is perceived once, whose rows are alike and stand together"""
 
     def cleared(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan frame 3"]:
         """Keep paths in metres where the agent may be."""
@@ -177,7 +179,7 @@ class Sampler:
             keep[:, 1] = 0
             blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
         start = np.repeat(observation.past.reshape(len(observation), PAST, -1)[:, -1, :3], count, axis=0)
-        return Codes(full, blind, start, observation.ground if sampling.clear and sampling.scene else None)
+        return Codes(full, blind, start, observation.ground if sampling.clear and sampling.scene else None, count)
 
     def goals(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
@@ -185,7 +187,7 @@ class Sampler:
         def denoise(code: Array) -> Callable[[Array, float], Array]:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
-        pair = denoise(codes.full), denoise(codes.blind)
+        pair = denoise(codes.full[:: codes.count]), denoise(codes.blind[:: codes.count])
         x = self._drawn(*pair, (len(codes.full), 3), sampling, sampling.goal_steps, rng, lambda x: self.goals_cleared(codes, x))
         return self.scaling.goal(x)
 

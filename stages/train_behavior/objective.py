@@ -93,9 +93,9 @@ def perceive(nets: BehaviorNets, batch: Batch, objective: Objective, generator: 
     """Encode a batch, dropping scene, observer and past independently, for every mind alike."""
     keep = kept(len(batch.goal), 3, objective.drop, generator).to(batch.goal.device)
     keep[:, 1] = torch.maximum(keep[:, 1], batch.chosen.float())
-    codes = [mind.training_code(batch.scene, batch.observer_past, batch.past, keep, batch.bones_keep) for mind in nets.perception]
-    code = nn.functional.dropout(torch.cat(codes, dim=-1), objective.code_dropout)
-    return torch.cat([code, nets.perception.now(batch.held, keep[:, 2])], dim=-1)
+    readings = [mind.training_code(batch.scene, batch.observer_past, batch.past, keep, batch.bones_keep) for mind in nets.perception]
+    readings = [(chart, nn.functional.dropout(code, objective.code_dropout)) for chart, code in readings]
+    return nets.perception.condition(readings, nets.perception.now(batch.held, keep[:, 2]))
 
 
 def goal_error(
@@ -115,7 +115,7 @@ def goal_error(
     row = torch.arange(count, device=code.device) // draws
     horizon = (frame + 1) / frames
     return squared_error(
-        lambda x, t: nets.goal.apart(x, t, code[row], horizon), batch.track[row, :, frame], schedule, objective.weighting, generator
+        lambda x, t: nets.goal.apart(x, t, code, horizon), batch.track[row, :, frame], schedule, objective.weighting, generator
     ).mean(0)
 
 

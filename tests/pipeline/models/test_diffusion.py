@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.models.denoisers import EMBEDDING, ControlUNet, FreeUNet, GoalMLP
+from pipeline.models.denoisers import EMBEDDING, ControlUNet, FreeUNet
 from pipeline.models.diffusion import Schedule, guided, noised, sample
 
 SCHEDULE = Schedule()
@@ -73,37 +73,3 @@ def test_nothing_steers_a_free_network_which_is_a_controlled_one_without_control
     x, t, code, control = torch.randn(2, 4, 56), torch.tensor([3.0, 40.0]), torch.randn(2, 8), torch.randn(2, 3)
     dropped = torch.zeros(2, 1)
     torch.testing.assert_close(free(x, t, code, control, dropped + 1), steered(x, t, code, control, dropped))
-
-
-def test_goal_network_learns_where_goals_are():
-    torch.manual_seed(0)
-    net, alpha_bar = GoalMLP(condition=2, hidden=32), torch.from_numpy(SCHEDULE.alpha_bar).float()
-    optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
-    for _ in range(400):
-        code = torch.sign(torch.randn(128, 2))
-        clean = torch.cat([code, code[:, :1]], dim=1) + 0.1 * torch.randn(128, 3)
-        t = torch.randint(50, (128,))
-        noise = torch.randn_like(clean)
-        loss = (net(noised(clean, noise, alpha_bar[t][:, None]), t.float(), code) - noise).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    code = torch.tensor([[1.0, -1.0]]).expand(200, 2)
-    with torch.inference_mode():
-        x = sample(lambda x, t: net(x, torch.full((200,), t), code), torch.randn(200, 3), SCHEDULE, method="ddim", count=10)
-    assert (x.mean(0) - torch.tensor([1.0, -1.0, 1.0])).abs().max() < 0.25
-
-
-def test_minds_are_averaged_and_read_their_own_codes():
-    torch.manual_seed(0)
-    net = GoalMLP(condition=4, hidden=16, minds=2, code=6)
-    x, t, code = torch.randn(5, 3), torch.full((5,), 7.0), torch.randn(5, 12)
-    first, second = net.apart(x, t, code, torch.ones(5))
-    torch.testing.assert_close(net(x, t, code), (first + second) / 2)
-    other = code.clone()
-    other[:, 6:10] += 1.0
-    unmoved, moved = net.apart(x, t, other, torch.ones(5))
-    torch.testing.assert_close(unmoved, first)
-    assert (moved - second).abs().max() > 1e-4
-    earlier = net(x, t, code, torch.full((5,), 0.3))
-    assert (earlier - net(x, t, code)).abs().max() > 1e-4

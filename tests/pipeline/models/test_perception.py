@@ -64,9 +64,11 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
 def alike(code: torch.Tensor) -> list[bool]:
     """Tell of scene, observer and past whether two agents' codes are alike; pace and posture must be so where the past is."""
     now = PACE_CHANNELS + ARCHITECTURE.body_channels
-    minds, posture = code.split([code.shape[1] - now, now], dim=1)
+    maps = ARCHITECTURE.condition - ARCHITECTURE.told
+    charts, minds, posture = code.split([maps, ARCHITECTURE.told - now, now], dim=1)
     parts = minds.unflatten(1, (ARCHITECTURE.minds, 3, -1))
     same = ((parts[0] - parts[1]).abs().amax((0, 2)) < 1e-7).tolist()
+    assert bool((charts[0] == charts[1]).all()) == same[0]
     assert bool((posture[0] == posture[1]).all()) == same[2]
     return same
 

@@ -224,6 +224,7 @@ class Timid:
 
     def goal(self, x, t, condition):
         share = Schedule().alpha_bar[int(t[0])]
+        condition = np.repeat(condition, len(x) // len(condition), axis=0)
         mean = np.stack([condition[:, 0], 0 * condition[:, 0], condition[:, 1]], axis=1)
         clean = mean + np.sqrt(share) * 0.01 / (share * 0.01 + 1 - share) * (x - np.sqrt(share) * mean)
         return (x - np.sqrt(share) * clean) / np.sqrt(1 - share)
@@ -266,7 +267,8 @@ class Asked:
 
     def apart(self, x, t, code, horizon):
         self.horizons = horizon
-        clean = self.track[code[:, 0].long(), :, (horizon * self.track.shape[-1]).round().long() - 1]
+        row = code[:, 0].long().repeat_interleave(len(x) // len(code))
+        clean = self.track[row, :, (horizon * self.track.shape[-1]).round().long() - 1]
         share = torch.from_numpy(Schedule().alpha_bar).float()[t.long()][:, None]
         return ((x - share.sqrt() * clean) / (1 - share).sqrt())[None]
 

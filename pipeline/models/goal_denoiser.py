@@ -1,0 +1,159 @@
+"""The denoiser of goals (Eq. 7): a multilayer perceptron that also reads the map where a goal may yet come to lie.
+
+A code of the whole scene hardly tells where things stand. `MapAttention` looks up the map around the noisy goal, as far
+off as the noise lets it be, and elsewhere wherever the perception code asks it to look; `Staying` tells how well the noisy
+goal agrees with none, for animals mostly stay. Both on two kept homes of the behaviour benchmark, see `docs/behavior.md`.
+"""
+
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.models.denoisers import TIME_CHANNELS, NoiseFromVelocity, time_embedding
+from pipeline.models.diffusion import STANDARD, Schedule
+from pipeline.models.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY
+from pipeline.models.strides import GOAL_POWER, powered
+
+HORIZON_CHANNELS = 8
+
+
+class GoalMLP(nn.Module):
+    """Six layers of 128 (appendix A.2), one stack per mind, whose answers are averaged.
+
+    The condition holds the maps of all minds (of ``map_cells`` squared each, or none), their codes, and more that goals do
+    not read. Training may ask where the animal is at another part of the 5.6 s (``horizon`` below 1), which teaches it more
+    from as many minutes.
+    """
+
+    def __init__(self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *, minds: int = 1, map_cells: int = 0):
+        super().__init__()
+        self.noise, self.code, self.map_numbers = NoiseFromVelocity(schedule), code, 2 * MAP_KEY * map_cells**2
+        told = TIME_CHANNELS + HORIZON_CHANNELS + code
+        self.staying = Staying(schedule)
+        self.maps = nn.ModuleList(MapAttention(map_cells, told, schedule) for _ in range(minds) if map_cells)
+        sizes = [3 + told + Staying.NUMBERS + (MapAttention.NUMBERS if map_cells else 0)] + [hidden] * (layers - 1)
+        self.stacks = nn.ModuleList(goal_stack(sizes) for _ in range(minds))
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch 3"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        horizon: Float[Tensor, "batch"] | None = None,
+    ) -> Float[Tensor, "batch 3"]:
+        return self.apart(x, t, condition, torch.ones_like(t) if horizon is None else horizon).mean(0)
+
+    def apart(
+        self,
+        x: Float[Tensor, "batch*draw 3"],
+        t: Float[Tensor, "batch*draw"],
+        condition: Float[Tensor, "batch condition"],
+        horizon: Float[Tensor, "batch*draw"],
+    ) -> Float[Tensor, "mind batch*draw 3"]:
+        """Return what each stack makes of it: they are trained apart and only averaged to sample. A batch has its draws together."""
+        angle = horizon[:, None] * torch.tensor([1.0, 2.0, 4.0, 8.0], device=x.device)
+        asked = torch.cat([time_embedding(t), angle.sin(), angle.cos()], dim=-1)
+        first, rows = self.map_numbers * len(self.stacks), condition.shape[0]
+        draws = 1 if x.shape[0] == rows else x.shape[0] // rows
+        answers = []
+        for mind, stack in enumerate(self.stacks):
+            code = condition[:, None, first + mind * self.code :][..., : self.code].expand(-1, draws, -1).flatten(0, 1)
+            told = torch.cat([asked, code], dim=-1)
+            seen = [told, self.staying(x, t)]
+            if self.maps:
+                seen.append(self.maps[mind](x, t, told, condition[:, mind * self.map_numbers :][:, : self.map_numbers]))
+            answers.append(self.noise(x, stack(torch.cat([x, *seen], dim=-1)), t))
+        return torch.stack(answers)
+
+
+def goal_stack(sizes: list[int]) -> nn.Sequential:
+    """Return one stack of linear layers, the last of which tells the velocity."""
+    inner = [layer for i, o in pairwise(sizes) for layer in (nn.Linear(i, o), nn.SiLU())]
+    return nn.Sequential(*inner, nn.Linear(sizes[-1], 3))
+
+
+class Clean(nn.Module):
+    """Where the clean goal lies if nothing is known but the noisy one: mean and variance, in scaled units."""
+
+    def __init__(self, schedule: Schedule):
+        super().__init__()
+        share = torch.from_numpy(schedule.alpha_bar).float()
+        self.register_buffer("root", share.sqrt(), persistent=False)
+        self.register_buffer("variance", (1 - share) / share, persistent=False)
+
+    def forward(self, x: Float[Tensor, "batch 3"], t: Float[Tensor, "batch"]) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 1"]]:
+        step = t.long()[:, None]
+        return x / self.root[step], self.variance[step]
+
+
+class Staying(nn.Module):
+    """How well a noisy goal agrees with where the animal is, for several spreads about it."""
+
+    SPREADS = (0.0, 0.05, 0.2, 0.6)
+    """standard deviations of goals that count as staying, in scaled units"""
+    NUMBERS = 5 * len(SPREADS)
+    LEAST, MOST = -4.0, 5.0
+    """bounds of what is told"""
+
+    def __init__(self, schedule: Schedule):
+        super().__init__()
+        self.clean = Clean(schedule)
+        self.register_buffer("spread", torch.tensor(self.SPREADS).square(), persistent=False)
+
+    def forward(self, x: Float[Tensor, "batch 3"], t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 20"]:
+        """Return likelihoods (not normalised), their logarithms, and where the goal would be expected."""
+        mean, variance = self.clean(x, t)
+        odds = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.spread))
+        shrunk = mean[:, None] * (odds.exp() * self.spread / (variance + self.spread))[..., None]
+        return torch.cat([odds.exp(), (odds / 5).clamp_min(self.LEAST), shrunk.flatten(1).clamp(-self.MOST, self.MOST)], dim=-1)
+
+
+class MapAttention(nn.Module):
+    """Attention over the cells of a map, whose keys and values are its channels, in place of a code of the whole.
+
+    Two heads keep to where the clean goal may lie, given the noisy one, as a Bayesian would; two look anywhere.
+    """
+
+    LOCAL, HEADS = 2, 4
+    PLACE = 5
+    """numbers of a cell that tell where it is: twice x and z, in parts of the map and as goals are diffused, and the latter's square"""
+    NUMBERS = HEADS * (MAP_KEY + 2) + LOCAL * 2
+    FAR = 8.0
+    """bound of the noisy goal, in scaled units"""
+
+    def __init__(self, cells: int, told: int, schedule: Schedule):
+        super().__init__()
+        self.clean, half_m = Clean(schedule), GRID_SHAPE[0] * GRID_CELL_M / 2
+        axis = (torch.arange(cells) + 0.5) * (2 * half_m / cells) - half_m
+        z, x = torch.meshgrid(axis, axis, indexing="ij")
+        place = torch.stack([x, torch.zeros_like(x), z], dim=-1).flatten(0, 1)
+        self.register_buffer("place", place[:, ::2] / half_m, persistent=False)
+        self.register_buffer("power", powered(place, GOAL_POWER)[:, ::2], persistent=False)
+        self.register_buffer("goal_std", torch.ones(3))
+        self.query = nn.Linear(told, self.HEADS * (MAP_KEY + self.PLACE))
+        self.log_variance = nn.Parameter(torch.tensor([[0.0, -3.0]] * self.LOCAL))
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch*draw 3"],
+        t: Float[Tensor, "batch*draw"],
+        told: Float[Tensor, "batch*draw told"],
+        grid: Float[Tensor, "batch channel*cell"],
+    ) -> Float[Tensor, "batch*draw 44"]:
+        """Return what each head reads, where it looks on average, and how far that is from the noisy goal."""
+        key, value = grid.unflatten(1, (2, MAP_KEY, -1)).unbind(1)
+        scaled = self.power / self.goal_std[::2]
+        cells = torch.cat([self.place, scaled, scaled.square().sum(-1, keepdim=True)], dim=-1)
+        mean, variance = self.clean(x, t)
+        mean = mean[:, None, ::2].clamp(-self.FAR, self.FAR)
+        share = self.log_variance.exp()
+        narrow = 1 / (variance * share[:, 0] + share[:, 1])[..., None]
+        query = self.query(told).unflatten(-1, (self.HEADS, -1))
+        near = torch.cat([torch.zeros_like(mean * narrow), mean * narrow, -narrow / 2], dim=-1)
+        where = query[..., MAP_KEY:] + nn.functional.pad(near, (0, 0, 0, self.HEADS - self.LOCAL))
+        asked = query[..., :MAP_KEY].reshape(grid.shape[0], -1, MAP_KEY) * MAP_KEY**-0.5
+        weight = (asked @ key + where.reshape(grid.shape[0], -1, self.PLACE) @ cells.mT).softmax(-1)
+        read, looked = ((weight @ rows).reshape(x.shape[0], self.HEADS, -1) for rows in (value.mT, scaled))
+        return torch.cat([read.flatten(1), looked.flatten(1), (looked[:, : self.LOCAL] - mean).flatten(1)], dim=-1)
