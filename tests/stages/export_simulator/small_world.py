@@ -99,7 +99,8 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
-        condition = torch.cat([elsewhere[0], mind.observer(observer.flatten(1), torch.ones(128)), elsewhere[1]], dim=-1)
+        chart = torch.randn(128, architecture.condition - architecture.told)
+        condition = torch.cat([chart, elsewhere[0], mind.observer(observer.flatten(1), torch.ones(128)), elsewhere[1]], dim=-1)
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
         loss = (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise).square().mean()
