@@ -20,8 +20,6 @@ from stages.reconstruct.problem import Problem
 from stages.reconstruct.route import MOVING_M_S, End, Habits, likeliest, speeds_of
 from stages.reconstruct.sightings import Stand
 
-SHORT_S = 1.0
-"""shorter stretches are crossed straight on"""
 LOOK_S = 0.1
 """the phone's looks are read this often ..."""
 MOST_LOOKS = 1200
@@ -100,12 +98,11 @@ def _filled(problem: Problem, known: Known, motion: Motion, first: int) -> Motio
     unknown = ~np.isfinite(root).all((1, 2))
     for stretch in _runs(~good):
         begin, end = max(stretch[0] - 1, 0), min(stretch[-1] + 1, len(when) - 1)
-        if when[end] - when[begin] >= SHORT_S or unknown[stretch].any():
+        if unknown[stretch].any():
             place, moves = _way(problem, known, motion, good, first, begin, end)
-            around = slice(begin, end + 1)
-            posed = _roots(when[around], place, moves, *(motion.world_from_agent[i] if good[i] else None for i in (begin, end)))
+            ends = [motion.world_from_agent[i] if good[i] else None for i in (begin, end)]
             inside = stretch - begin
-            root[stretch] = posed[inside]
+            root[stretch] = _roots(when[begin : end + 1], place, moves, *ends)[inside]
             bones[stretch] = _bones(known, motion, good, begin, place, moves)[inside]
     confidence = np.where(unknown, np.minimum(motion.confidence, INFERRED), motion.confidence)
     return replace(motion, world_from_agent=root, agent_from_bone=bones, confidence=confidence)
