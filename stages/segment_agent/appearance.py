@@ -5,9 +5,11 @@ differ from frame to frame while the animal's looks stay, so the network, too sm
 the looks. `learn` trains one on examples; `Appearance.log_odds` judges a picture of any size.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -46,6 +48,10 @@ class Learning:
     """share of the other crops that show the animal"""
     mined: float = 0.2
     """share of crops around what was taken for the animal by mistake, once a third of the steps is done"""
+    scaled: float = 0.5
+    """share of crops that show the animal smaller or larger than it was seen"""
+    scales: tuple[float, float] = (0.5, 1.5)
+    """how much smaller and larger"""
     least_px: int = 60
     """animal pixels that an example needs"""
 
@@ -121,7 +127,9 @@ def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generat
         if step in (options.steps // 3, 2 * options.steps // 3):
             mistakes = [_mistake(network, example, options) for example in showing[::2]]
         network.train()
-        crops = [_crop(*_chosen(showing, mistakes, options, rng), options.crop_px, rng) for _ in range(options.batch)]
+        crops = [
+            _crop(*_scaled(*_chosen(showing, mistakes, options, rng), options, rng), options.crop_px, rng) for _ in range(options.batch)
+        ]
         color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
         found = network(color)
         loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
@@ -164,6 +172,21 @@ def _chosen(
     row, column = divmod(int(inside[rng.integers(len(inside))]), width)
     reach = options.crop_px * 3 // 8
     return example, (row + int(rng.integers(-reach, reach)), column + int(rng.integers(-reach, reach)))
+
+
+def _scaled(example: Example, middle: tuple[int, int], options: Learning, rng: np.random.Generator) -> tuple[Example, tuple[int, int]]:
+    """Show an example and the middle of a crop as from nearer or from farther away, now and then: animals walk up and off."""
+    if rng.random() >= options.scaled:
+        return example, middle
+    scale = float(np.exp(rng.uniform(*np.log(options.scales))))
+    reach = math.ceil(options.crop_px / scale)
+    top, left = (max(at - reach // 2 - 1, 0) for at in middle)
+    part = np.s_[top : top + reach + 2, left : left + reach + 2]
+    color, labels = example.color[part], example.labels[part]
+    size = tuple(max(1, round(scale * side)) for side in labels.shape[::-1])
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    scaled = Example(cv2.resize(color, size, interpolation=how), cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST))
+    return scaled, (round(scale * (middle[0] - top)), round(scale * (middle[1] - left)))
 
 
 def _crop(example: Example, middle: tuple[int, int], side: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

@@ -23,6 +23,8 @@ class Evidence:
     log_odds: Float[np.ndarray, "height width"]
     certainty: Float[np.ndarray, "height width"]
     animal: Bool[np.ndarray, "height width"]
+    clear: Bool[np.ndarray, "height width"]
+    """animal by clear motion alone, at steps of depth too"""
     room: Bool[np.ndarray, "height width"]
 
 
@@ -42,6 +44,12 @@ class Weighing:
     """each time the noise by which such a surface's colour differs"""
     distrusted: float = 0.5
     """certainty of depth of low confidence or at a step; 1 is that of all other depth"""
+    distrusted_behind: float = 0.25
+    """the same where it lies where no animal is: the sensor may have looked past a tail"""
+    distrusted_moving: float = 0.6
+    """the same in space that is free at other times"""
+    few: float = 5.0
+    """references that must have seen a surface to make it half certain: one or two may have seen the animal itself there"""
 
 
 ASKEW_PX = 2
@@ -65,9 +73,13 @@ def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing
         settled = known & ~animal & (votes.occupied > 0)
         step = np.clip((votes.gap_m - weighing.step_m) / weighing.step_spread_m, -weighing.room, 1)
         log_odds = np.where(animal, weighing.moving, np.where(settled, step + weighing.recolored * recolored(window, votes, settled), 0.0))
-        log_odds[known & ~near] = -weighing.room
-        certainty = np.where(animal | settled | (known & ~near), np.where(window.trusted, 1.0, weighing.distrusted), 0.05)
-        return Evidence(log_odds, certainty, animal & window.trusted, log_odds <= -0.66 * weighing.room)
+        elsewhere, seen = known & ~near, votes.occupied / (votes.occupied + weighing.few)
+        doubted = np.where(animal, weighing.distrusted_moving, np.where(settled, weighing.distrusted, weighing.distrusted_behind))
+        certainty = np.where(settled, seen, 1.0) * np.where(window.trusted, 1.0, doubted)
+        log_odds[elsewhere] = -weighing.room
+        certainty[~(animal | settled | elsewhere)] = 0.05
+        clear = animal & movers.clearly_moving(votes, mover)
+        return Evidence(log_odds, certainty, animal & window.trusted, clear, log_odds <= -0.66 * weighing.room)
 
     return judge
 

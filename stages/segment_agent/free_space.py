@@ -92,15 +92,16 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], op
     """Let all references but the frame itself judge points (world, metres; NaN gets no vote)."""
     known = np.isfinite(points_world[..., 0])
     points = np.ascontiguousarray(points_world[known], np.float32)
-    other = (references.frame != frame) & _looking_at(references, points)
+    other = np.flatnonzero((references.frame != frame) & _looking_at(references, points))
     pinhole = references.intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
     judged = _vote(
         points,
-        references.camera_from_world[other].astype(np.float32),
-        pinhole[other],
-        references.depth[other],
-        references.nearest[other],
-        references.color[other],
+        other,
+        references.camera_from_world.astype(np.float32),
+        pinhole,
+        references.depth,
+        references.nearest,
+        references.color,
         np.float32(options.margin_m),
         np.float32(options.margin_share),
     )
@@ -129,11 +130,11 @@ def _nearest(depth: Float[np.ndarray, "height width"], focal_px: float, options:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _vote(points, camera_from_world, pinhole, depth, nearest, color, margin_m, margin_share):
+def _vote(points, voters, camera_from_world, pinhole, depth, nearest, color, margin_m, margin_share):
     count, (height, width) = len(points), depth.shape[1:]
     free, occupied, gap = np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros(count, np.float32)
     mean = np.zeros((count, 3), np.float32)
-    for r in range(len(depth)):
+    for r in voters:
         m, k = camera_from_world[r], pinhole[r]
         for i in range(count):
             x, y, z = points[i, 0], points[i, 1], points[i, 2]

@@ -1,5 +1,6 @@
 """Where the animal of a session is: a ball per frame, from what moves and, once that is learnt, from what looks like it."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,10 +11,10 @@ from pipeline.space import cameras, rigid
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.free_space import FreeSpace, References
 from stages.segment_agent.movers import Candidate, Hint, Mover
-from stages.segment_agent.windows import Sphere
+from stages.segment_agent.windows import Sphere, supported_depth
 
-STRIDE = 3
-"""depth pixels between the points that candidates are made of"""
+COARSE_PX, FINE_PX = 74, 222
+"""side of the square that has as many pixels as candidates are made of: without and with known looks"""
 
 Looks = Callable[[int], Float[np.ndarray, "height width"]]
 """log-odds of showing the animal by its looks, of one frame at any resolution"""
@@ -62,21 +63,34 @@ def _candidates(
     mover: Mover,
     looks: Looks | None,
 ) -> list[Candidate]:
-    """Group the points of one frame that move or, where its looks are known, look more like the animal than like the room."""
-    chosen = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-    depth = free_space.usable_depth(clip, frame)[chosen]
+    """Group the points of one frame that move or, where its looks are known, look more like the animal than like the room.
+
+    Known looks leave few points to judge, so all of them are: an animal may show no more than a paw or an ear.
+    """
+    stride = max(1, round(math.sqrt(math.prod(clip.depth_size)) / (COARSE_PX if looks is None else FINE_PX)))
+    chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    if looks is None:
+        depth = free_space.usable_depth(clip, frame)[chosen]
+    else:
+        like = _sampled(looks(frame), clip.depth_size, chosen)
+        depth = np.where(like > -mover.clear_motion, supported_depth(clip, frame)[chosen], 0)
     rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)[chosen]
     points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
     points[depth == 0] = np.nan
     votes = free_space.vote(references, points, free, frame)
-    area = (depth * STRIDE) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
-    moving = movers.moving(votes, mover)
+    area = (depth * stride) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
     if looks is None:
-        return movers.candidates(moving, np.ones(depth.shape), points, area, mover)
-    like = looks(frame)
-    row, column = ((np.arange(0, size)[chosen[0]] + 0.5) / size for size in clip.depth_size)
-    like = like[np.ix_((row * like.shape[0]).astype(int), (column * like.shape[1]).astype(int))]
-    settled = (votes.occupied > 0) & ~moving
-    both = np.clip(like, -mover.looks_limit, mover.looks_limit) + mover.motion * moving - mover.settled * settled
+        return movers.candidates(movers.moving(votes, mover), np.ones(depth.shape), points, area, mover)
+    motion = movers.motion(votes, mover)
+    settled = (votes.occupied > 0) & (motion == 0)
+    both = np.clip(like, -mover.looks_limit, mover.looks_limit) + motion - mover.settled * settled
     both[depth == 0] = -mover.looks_limit
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, mover)
+
+
+def _sampled(
+    picture: Float[np.ndarray, "height width"], size: tuple[int, int], chosen: tuple[slice, slice]
+) -> Float[np.ndarray, "row column"]:
+    """Read a picture where the chosen pixels of a picture of another (height, width) lie."""
+    at = ((np.arange(side)[part] + 0.5) * (own / side) for side, own, part in zip(size, picture.shape, chosen, strict=True))
+    return picture[np.ix_(*(index.astype(int) for index in at))]

@@ -27,6 +27,9 @@ from stages.segment_agent.trajectory import Trajectory, steady
 from stages.segment_agent.turnaround import Turnaround, find_standing, meeting_point
 from stages.segment_agent.windows import Sphere, rectangle, working_picture
 
+GUESSED = 2.0
+"""times its size that the animal is looked for where its place is a guess, once its looks are known"""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -83,7 +86,10 @@ def segment(
             looks = Palette() if network is None else network
             if network is not None:
                 room = free_space.without(references, lambda frame: _hidden(painter, frame, network), options.free_space)
+                radius_m = next(ball.radius_m for ball in balls if ball is not None)
                 balls, judge = _locate(clip, poses, room, options, mark, network)
+                # rims of furniture may touch what looks like the animal: how large it is, motion alone tells better
+                balls = [ball and replace(ball, radius_m=radius_m * (GUESSED if ball.presumed else 1)) for ball in balls]
         case _:
             assert_never(role)
     painter = Painter(clip, poses, balls, judge, options.refinement, looks)

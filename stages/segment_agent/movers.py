@@ -38,6 +38,8 @@ class Mover:
     """how long the animal is looked for around where it was last or will next be seen"""
     motion: float = 2.0
     """log-odds by which motion speaks for a point once the looks are known"""
+    clear_motion: float = 3.0
+    """the same where clearly more references saw through the point than saw a surface there"""
     settled: float = 1.0
     """log-odds by which a surface that other frames saw speaks against it then"""
     looks_limit: float = 3.0
@@ -69,6 +71,16 @@ class Hint:
 def moving(votes: Votes, options: Mover) -> Bool[np.ndarray, "*shape"]:
     """Tell which points lie in space that is free at other times."""
     return votes.free >= options.least_votes + options.least_share * votes.occupied
+
+
+def clearly_moving(votes: Votes, options: Mover) -> Bool[np.ndarray, "*shape"]:
+    """Tell which points clearly more references saw through than saw a surface there."""
+    return votes.free - votes.occupied > options.least_votes
+
+
+def motion(votes: Votes, options: Mover) -> Float[np.ndarray, "*shape"]:
+    """Return the log-odds by which points that move speak for an animal whose looks are known; 0 for the others."""
+    return np.where(moving(votes, options), np.where(clearly_moving(votes, options), options.clear_motion, options.motion), 0.0)
 
 
 def candidates(

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.files.clips import Clip
 from stages.segment_agent import refine
 from stages.segment_agent.appearance import Appearance
-from stages.segment_agent.evidence import Judge
+from stages.segment_agent.evidence import Evidence, Judge
 from stages.segment_agent.refine import Palette, Refinement
 from stages.segment_agent.windows import Sphere, Window, cut, working_picture, working_size
 
@@ -55,23 +55,39 @@ class Painter:
         if window is None:
             return Mask(empty, False, 1.0)
         evidence = self.judge(frame, window, ball)
-        sure = evidence.animal
         match self.looks:
             case Palette() as palette:
                 log_odds = evidence.log_odds + self.options.color_weight * palette.ratio(window.color, evidence.room)
                 log_odds = refine.sharpen(log_odds, evidence.certainty, window.color, self.options)
+                sure = evidence.animal
+                labels = refine.label(log_odds, sure, self.options)
             case Appearance() as network:
-                like = network.log_odds_within(color, window.rows, window.columns)
-                known = refine.sharpen(evidence.log_odds, evidence.certainty, window.color, self.options)
-                most = np.where(evidence.certainty < 0.3, self.options.looks_alone, self.options.looks_for)
-                log_odds = known + np.clip(self.options.looks_weight * like, -self.options.looks_against, most)
-                sure = (log_odds > self.options.sure) & (evidence.animal | (like > 0))
-        labels = refine.label(log_odds, sure, self.options)
+                labels, sure = self._by_looks(window, evidence, network.log_odds_within(color, window.rows, window.columns))
         least = self.options.least_presumed_px if ball.presumed else 1
         if sure[labels == 255].sum() < least:
             return Mask(empty, False, 0.5)
         empty[window.rows, window.columns] = labels
         return Mask(empty, True, float(sure[labels == 255].mean()))
+
+    def _by_looks(
+        self, window: Window, evidence: Evidence, like: Float[np.ndarray, "height width"]
+    ) -> tuple[UInt8[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
+        """Return labels and what is sure, by evidence and learnt looks.
+
+        A small mask must be well backed, since chance makes small ones; and as a small view lies at steps of depth all over,
+        what moves clearly there is sure too if no mask is found without it.
+        """
+        options = self.options
+        known = refine.sharpen(evidence.log_odds, evidence.certainty, window.color, options)
+        most = np.where(evidence.certainty < 0.3, options.looks_alone, options.looks_for)
+        log_odds = known + np.clip(options.looks_weight * like, -options.looks_against, most) - options.doubt
+        strict = (log_odds > options.sure) & (evidence.animal | (like > 0))
+        for sure, enough_px in ((strict, options.small_px), (strict | ((log_odds > options.sure) & evidence.clear), np.inf)):
+            labels = refine.without_strays(refine.label(log_odds, sure, options), like)
+            inside = labels == 255
+            if inside.sum() >= enough_px or (inside.any() and ((like > 0) | evidence.clear)[inside].mean() >= options.backed):
+                return labels, sure
+        return np.zeros_like(labels), sure
 
 
 def learn_palette(painter: Painter, pictures: int = 30) -> Palette:

@@ -17,7 +17,7 @@ class Refinement:
 
     color_weight: float = 0.7
     """log-odds per unit of the colours' log-ratio"""
-    looks_weight: float = 0.5
+    looks_weight: float = 0.3
     """weight of the learnt looks' log-odds"""
     looks_for: float = 0.0
     """largest log-odds by which the learnt looks speak for the animal where geometry is sure: its edges are sharper"""
@@ -25,14 +25,20 @@ class Refinement:
     """the same where geometry knows nothing"""
     looks_against: float = 4.0
     """largest log-odds by which they speak against it"""
+    doubt: float = 0.2
+    """log-odds by which a pixel is rather room, beside the learnt looks"""
     sure: float = 1.0
     """log-odds from which on a pixel is surely animal, beside the learnt looks"""
-    radius_px: int = 2
+    radius_px: int = 1
     """reach of the edge-preserving filter at working resolution"""
     edge: float = 0.1
     """colour variance (0..1 squared) below which the filter smooths"""
-    unsure: float = 0.4
+    unsure: float = 0.5
     """log-odds below which a pixel at the boundary is unknown"""
+    small_px: int = 250
+    """pixels below which a mask must be well backed: chance makes small ones"""
+    backed: float = 0.7
+    """share of such a mask's pixels that must look like the animal or have moved clearly"""
     least_presumed_px: int = 25
     """sure pixels that a frame needs in which the track was lost"""
     height_px: int = 320
@@ -93,6 +99,17 @@ def label(
     mask = np.where(inside > 0, 255, 0).astype(np.uint8)
     mask[rim & (np.abs(log_odds) < options.unsure)] = 128
     return mask
+
+
+def without_strays(labels: UInt8[np.ndarray, "height width"], like: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    """Take away parts, but for the largest, that look rather like the room: rims of furniture that drift makes seem to move."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats((labels > 0).astype(np.uint8), connectivity=8)
+    if count < 3:
+        return labels
+    looks = np.bincount(parts.ravel(), like.ravel(), count) / stats[:, cv2.CC_STAT_AREA]
+    stray = looks < 0
+    stray[[0, 1 + stats[1:, cv2.CC_STAT_AREA].argmax()]] = False
+    return np.where(stray[parts], 0, labels).astype(np.uint8)
 
 
 def _fill_holes(inside: UInt8[np.ndarray, "height width"], limit: float) -> UInt8[np.ndarray, "height width"]:

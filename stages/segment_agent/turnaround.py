@@ -137,6 +137,7 @@ def _judge(cluster: Cluster, ground: Ground, options: Turnaround) -> Judge:
         log_odds = np.where(held, np.clip((height - options.foot_m) / 0.004, -3, 3), -3.0)
         log_odds[~known] = 0.0
         certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), 0.05)
-        return Evidence(log_odds, certainty, window.trusted & (log_odds > 2), log_odds <= -2)
+        sure = window.trusted & (log_odds > 2)
+        return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)
 
     return judge

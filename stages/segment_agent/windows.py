@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
+from pipeline.space.thin_depth import supported
 from stages.segment_agent.free_space import usable_depth
 
 STEP_M = 0.05
@@ -81,6 +82,12 @@ def cut(
     points = rigid.apply(world_from_camera, (cameras.unproject(grid, intrinsics) * z[..., None]).reshape(-1, 3)).reshape(*z.shape, 3)
     points[z == 0] = np.nan
     return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points, trusted)
+
+
+def supported_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
+    """Read depth without blur at steps, thin things kept that the sensor doubts but neighbours agree on (0 = unknown)."""
+    depth = unblurred(clip.depth(frame))
+    return np.where(supported(depth), depth, 0)
 
 
 def unblurred(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
