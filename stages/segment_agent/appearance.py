@@ -176,7 +176,7 @@ def _chosen(
 
 def _scaled(example: Example, middle: tuple[int, int], options: Learning, rng: np.random.Generator) -> tuple[Example, tuple[int, int]]:
     """Show an example and the middle of a crop as from nearer or from farther away, now and then: animals walk up and off."""
-    if rng.random() >= options.scaled:
+    if options.scaled == 0 or rng.random() >= options.scaled:
         return example, middle
     scale = float(np.exp(rng.uniform(*np.log(options.scales))))
     reach = math.ceil(options.crop_px / scale)

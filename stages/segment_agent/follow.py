@@ -78,12 +78,12 @@ def follow(footage: Footage, hint: Prompt, options: Following, learning: Learnin
     count = len(footage.clip)
     hinted = cut_out(footage, hint, rng)
     shown = Example(footage.color(hint.frame), hinted.astype(np.uint8) * 255)
-    network = learn([shown], replace(learning, steps=options.first_steps, least_px=1), rng)
+    network = learn([shown], replace(learning, steps=options.first_steps, least_px=1, scaled=0.0), rng)
     rough = _followed(footage, hint.frame, hinted, network, options.reach_px, options.carried)
     chosen = np.unique(np.linspace(0, count - 1, learning.examples).round().astype(int)).tolist()
     examples = [_example(footage, frame, _unpacked(rough[frame]), options) for frame in chosen if frame != hint.frame]
     repeated = [shown] * max(1, round(options.hinted_share * len(examples)))
-    network = learn(repeated + examples, replace(learning, steps=options.steps), rng)
+    network = learn(repeated + examples, replace(learning, steps=options.steps, scaled=0.0), rng)
     allowed = _allowed(rough, options)
     found = _followed(footage, hint.frame, hinted, network, options.reach_px + 3, options.carried / 2, allowed)
     for mask in map(_unpacked, found):
