@@ -76,6 +76,8 @@ def segment(
     match role:
         case "turnaround":
             balls, judge = find_standing(clip, poses, options.turnaround, meeting_point(poses) if place is None else place)
+            edges = replace(options.refinement, radius_px=options.turnaround.radius_px, unsure=options.turnaround.unsure)
+            options = replace(options, refinement=edges)
             looks = learn_palette(Painter(clip, poses, balls, judge, options.refinement, Palette()))
         case "session":
             mark = None if place is None else Hint(hint.frame, place)

@@ -37,6 +37,10 @@ class Turnaround:
     """height above the ground from which a point under the body is rather a paw than ground"""
     least_hits: int = 3
     """pictures that must have seen a point in a cell"""
+    radius_px: int = 2
+    """reach of the edge-preserving filter: cells are coarser than what motion tells"""
+    unsure: float = 0.4
+    """log-odds below which a pixel at the boundary is unknown"""
 
 
 @dataclass(frozen=True)
