@@ -10,9 +10,11 @@ from pipeline import processes
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
+import signal
 import time
 from pipeline import processes
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal: what a script leaves in the background ignores it
 try:
     for _ in processes.unordered(time.sleep, [(0,), (60,), (60,)], 2):
         print("begun", flush=True)
