@@ -31,8 +31,8 @@ class GoalMLP(nn.Module):
         super().__init__()
         self.noise, self.code, self.map_numbers = NoiseFromVelocity(schedule), code, 2 * MAP_KEY * map_cells**2
         told = TIME_CHANNELS + HORIZON_CHANNELS + code
-        self.staying = Staying(schedule)
-        self.maps = nn.ModuleList(MapAttention(map_cells, told, schedule) for _ in range(minds) if map_cells)
+        self.clean, self.staying = Clean(schedule), Staying()
+        self.maps = nn.ModuleList(MapAttention(map_cells, told) for _ in range(minds) if map_cells)
         sizes = [3 + told + Staying.NUMBERS + (MapAttention.NUMBERS if map_cells else 0)] + [hidden] * (layers - 1)
         self.stacks = nn.ModuleList(goal_stack(sizes) for _ in range(minds))
 
@@ -57,13 +57,13 @@ class GoalMLP(nn.Module):
         asked = torch.cat([time_embedding(t), angle.sin(), angle.cos()], dim=-1)
         first, rows = self.map_numbers * len(self.stacks), condition.shape[0]
         draws = 1 if x.shape[0] == rows else x.shape[0] // rows
-        answers = []
+        clean, answers = self.clean(x, t), []
         for mind, stack in enumerate(self.stacks):
             code = condition[:, None, first + mind * self.code :][..., : self.code].expand(-1, draws, -1).flatten(0, 1)
             told = torch.cat([asked, code], dim=-1)
-            seen = [told, self.staying(x, t)]
+            seen = [told, self.staying(*clean)]
             if self.maps:
-                seen.append(self.maps[mind](x, t, told, condition[:, mind * self.map_numbers :][:, : self.map_numbers]))
+                seen.append(self.maps[mind](*clean, told, condition[:, mind * self.map_numbers :][:, : self.map_numbers]))
             answers.append(self.noise(x, stack(torch.cat([x, *seen], dim=-1)), t))
         return torch.stack(answers)
 
@@ -97,14 +97,12 @@ class Staying(nn.Module):
     LEAST, MOST = -4.0, 5.0
     """bounds of what is told"""
 
-    def __init__(self, schedule: Schedule):
+    def __init__(self):
         super().__init__()
-        self.clean = Clean(schedule)
         self.register_buffer("spread", torch.tensor(self.SPREADS).square(), persistent=False)
 
-    def forward(self, x: Float[Tensor, "batch 3"], t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 20"]:
+    def forward(self, mean: Float[Tensor, "batch 3"], variance: Float[Tensor, "batch 1"]) -> Float[Tensor, "batch 20"]:
         """Return likelihoods (not normalised), their logarithms, and where the goal would be expected."""
-        mean, variance = self.clean(x, t)
         odds = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.spread))
         shrunk = mean[:, None] * (odds.exp() * self.spread / (variance + self.spread))[..., None]
         return torch.cat([odds.exp(), (odds / 5).clamp_min(self.LEAST), shrunk.flatten(1).clamp(-self.MOST, self.MOST)], dim=-1)
@@ -123,9 +121,9 @@ class MapAttention(nn.Module):
     FAR = 8.0
     """bound of the noisy goal, in scaled units"""
 
-    def __init__(self, cells: int, told: int, schedule: Schedule):
+    def __init__(self, cells: int, told: int):
         super().__init__()
-        self.clean, half_m = Clean(schedule), GRID_SHAPE[0] * GRID_CELL_M / 2
+        half_m = GRID_SHAPE[0] * GRID_CELL_M / 2
         axis = (torch.arange(cells) + 0.5) * (2 * half_m / cells) - half_m
         z, x = torch.meshgrid(axis, axis, indexing="ij")
         place = torch.stack([x, torch.zeros_like(x), z], dim=-1).flatten(0, 1)
@@ -137,8 +135,8 @@ class MapAttention(nn.Module):
 
     def forward(
         self,
-        x: Float[Tensor, "batch*draw 3"],
-        t: Float[Tensor, "batch*draw"],
+        mean: Float[Tensor, "batch*draw 3"],
+        variance: Float[Tensor, "batch*draw 1"],
         told: Float[Tensor, "batch*draw told"],
         grid: Float[Tensor, "batch channel*cell"],
     ) -> Float[Tensor, "batch*draw 44"]:
@@ -146,7 +144,6 @@ class MapAttention(nn.Module):
         key, value = grid.unflatten(1, (2, MAP_KEY, -1)).unbind(1)
         scaled = self.power / self.goal_std[::2]
         cells = torch.cat([self.place, scaled, scaled.square().sum(-1, keepdim=True)], dim=-1)
-        mean, variance = self.clean(x, t)
         mean = mean[:, None, ::2].clamp(-self.FAR, self.FAR)
         share = self.log_variance.exp()
         narrow = 1 / (variance * share[:, 0] + share[:, 1])[..., None]
@@ -155,5 +152,5 @@ class MapAttention(nn.Module):
         where = query[..., MAP_KEY:] + nn.functional.pad(near, (0, 0, 0, self.HEADS - self.LOCAL))
         asked = query[..., :MAP_KEY].reshape(grid.shape[0], -1, MAP_KEY) * MAP_KEY**-0.5
         weight = (asked @ key + where.reshape(grid.shape[0], -1, self.PLACE) @ cells.mT).softmax(-1)
-        read, looked = ((weight @ rows).reshape(x.shape[0], self.HEADS, -1) for rows in (value.mT, scaled))
+        read, looked = ((weight @ rows).reshape(mean.shape[0], self.HEADS, -1) for rows in (value.mT, scaled))
         return torch.cat([read.flatten(1), looked.flatten(1), (looked[:, : self.LOCAL] - mean).flatten(1)], dim=-1)

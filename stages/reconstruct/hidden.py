@@ -17,7 +17,7 @@ from stages.reconstruct import sightings
 from stages.reconstruct.assemble import Video, scene_first
 from stages.reconstruct.places import Places, places_of
 from stages.reconstruct.problem import Problem
-from stages.reconstruct.route import MOVING_M_S, End, Habits, likeliest, speeds_of
+from stages.reconstruct.route import MOVING_M_S, End, Habits, likeliest, runs, speeds_of
 from stages.reconstruct.sightings import Stand
 
 LOOK_S = 0.1
@@ -79,16 +79,11 @@ def _longest_walk(motions: Sequence[Motion]) -> tuple[Float[np.ndarray, "frame b
     for motion in motions:
         place = motion.world_from_agent[:, :3, 3]
         speed, told = speeds_of(motion.timestamp_s, place, seen(motion))
-        for frames in _runs(told & (speed > MOVING_M_S)):
+        for frames in runs(told & (speed > MOVING_M_S)):
             way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place[frames], axis=0), axis=1))])
             if way[-1] > best[1][-1]:
                 best = motion.agent_from_bone[frames], way
     return best
-
-
-def _runs(chosen: Bool[np.ndarray, "frame"]) -> list[Int[np.ndarray, "run"]]:
-    frames = np.flatnonzero(chosen)
-    return np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1) if len(frames) else []
 
 
 def _filled(problem: Problem, known: Known, motion: Motion, first: int) -> Motion:
@@ -96,7 +91,7 @@ def _filled(problem: Problem, known: Known, motion: Motion, first: int) -> Motio
     good, when = seen(motion), motion.timestamp_s
     root, bones = motion.world_from_agent.copy(), motion.agent_from_bone.copy()
     unknown = ~np.isfinite(root).all((1, 2))
-    for stretch in _runs(~good):
+    for stretch in runs(~good):
         begin, end = max(stretch[0] - 1, 0), min(stretch[-1] + 1, len(when) - 1)
         if unknown[stretch].any():
             place, moves = _way(problem, known, motion, good, first, begin, end)
@@ -175,7 +170,7 @@ def _roots(
     step = np.gradient(place, when, axis=0)
     walking = moves & (np.hypot(step[:, 0], step[:, 2]) > MOVING_M_S)
     knots = {i: np.arctan2(step[i, 0], step[i, 2]) for i in np.flatnonzero(walking)} | {i: _yaw(pose) for i, pose in ends}
-    for run in _runs(~walking)[: len(when)]:  # where it rests it looks as it came, and turns before it goes on
+    for run in runs(~walking)[: len(when)]:  # where it rests it looks as it came, and turns before it goes on
         turn = int(np.searchsorted(when, when[run[-1]] - TURN_S))
         if run[0] - 1 in knots and run[0] < turn < run[-1] and walking.any():
             knots[turn] = knots[run[0] - 1]

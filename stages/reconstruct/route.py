@@ -26,8 +26,6 @@ ELSEWHERE = 0.01
 class Habits:
     """How the agent goes about, learned where it is seen."""
 
-    cruise_m_s: float
-    """half of its moving is faster"""
     fast_m_s: float
     """hardly ever faster"""
     stops_per_s: float
@@ -50,8 +48,8 @@ class Habits:
             modes.append([(step * (told & moving)).sum(), (step * (told & ~moving)).sum()])
             haunts.append(_rests(place, told & ~moving))
         speed, (moving_s, still_s) = np.concatenate(speeds), np.sum(modes, axis=0)
-        cruise, fast = np.quantile(speed, (0.5, 0.95)) if len(speed) > 10 else (0.6, 1.5)
-        return cls(float(cruise), float(fast), (stops + 1) / (moving_s + 2), (starts + 1) / (still_s + 5), np.concatenate(haunts))
+        fast = np.quantile(speed, 0.95) if len(speed) > 10 else 1.5
+        return cls(float(fast), (stops + 1) / (moving_s + 2), (starts + 1) / (still_s + 5), np.concatenate(haunts))
 
     def attraction(self, place: Float[np.ndarray, "cell 3"], most: int = 2000) -> Float[np.ndarray, "cell"]:
         """Return the logarithm of how much likelier rest is in each cell than if all of 10 square metres were alike."""
@@ -65,9 +63,13 @@ class Habits:
 
 def _rests(root: Float[np.ndarray, "frame 3"], still: Bool[np.ndarray, "frame"]) -> Float[np.ndarray, "rest 3"]:
     """Return the middle of each while of rest."""
-    frames = np.flatnonzero(still)
-    whiles = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1) if len(frames) else []
-    return np.array([np.median(root[each], axis=0) for each in whiles if len(each) > 4]).reshape(-1, 3)
+    return np.array([np.median(root[each], axis=0) for each in runs(still) if len(each) > 4]).reshape(-1, 3)
+
+
+def runs(chosen: Bool[np.ndarray, "frame"]) -> list[Int[np.ndarray, "run"]]:
+    """Return the frames of each unbroken run of chosen ones."""
+    frames = np.flatnonzero(chosen)
+    return np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1) if len(frames) else []
 
 
 def speeds_of(

@@ -39,7 +39,7 @@ def places():
 
 
 def habits(*haunts) -> Habits:
-    return Habits(0.5, 1.0, 0.5, 0.2, np.asarray(haunts, float).reshape(-1, 3))
+    return Habits(1.0, 0.5, 0.2, np.asarray(haunts, float).reshape(-1, 3))
 
 
 def test_places_are_on_the_floor_and_on_the_shelf_and_not_in_the_wall(places):
