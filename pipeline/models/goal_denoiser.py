@@ -20,21 +20,22 @@ HORIZON_CHANNELS = 8
 
 
 class GoalMLP(nn.Module):
-    """Six layers of 128 (appendix A.2), one stack per mind, whose answers are averaged.
+    """Six layers of 128 (appendix A.2) per mind, whose answers are averaged.
 
     The condition holds the maps of all minds (of ``map_cells`` squared each, or none), their codes, and more that goals do
     not read. Training may ask where the animal is at another part of the 5.6 s (``horizon`` below 1), which teaches it more
-    from as many minutes.
+    from as many minutes. All minds are asked in one product per layer: a plan for one animal is made of small products.
     """
 
     def __init__(self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *, minds: int = 1, map_cells: int = 0):
         super().__init__()
-        self.noise, self.code, self.map_numbers = NoiseFromVelocity(schedule), code, 2 * MAP_KEY * map_cells**2
+        self.noise, self.code, self.minds, self.map_numbers = NoiseFromVelocity(schedule), code, minds, 2 * MAP_KEY * map_cells**2
         told = TIME_CHANNELS + HORIZON_CHANNELS + code
         self.clean, self.staying = Clean(schedule), Staying()
-        self.maps = nn.ModuleList(MapAttention(map_cells, told) for _ in range(minds) if map_cells)
+        self.map = MapAttention(map_cells, told, minds) if map_cells else None
         sizes = [3 + told + Staying.NUMBERS + (MapAttention.NUMBERS if map_cells else 0)] + [hidden] * (layers - 1)
-        self.stacks = nn.ModuleList(goal_stack(sizes) for _ in range(minds))
+        inner = [layer for i, o in pairwise(sizes) for layer in (Linears(minds, i, o), nn.SiLU())]
+        self.layers = nn.Sequential(*inner, Linears(minds, sizes[-1], 3))
 
     def forward(
         self,
@@ -52,26 +53,32 @@ class GoalMLP(nn.Module):
         condition: Float[Tensor, "batch condition"],
         horizon: Float[Tensor, "batch*draw"],
     ) -> Float[Tensor, "mind batch*draw 3"]:
-        """Return what each stack makes of it: they are trained apart and only averaged to sample. A batch has its draws together."""
+        """Return what each mind makes of it: they are trained apart and only averaged to sample. A batch has its draws together."""
         angle = horizon[:, None] * torch.tensor([1.0, 2.0, 4.0, 8.0], device=x.device)
         asked = torch.cat([time_embedding(t), angle.sin(), angle.cos()], dim=-1)
-        first, rows = self.map_numbers * len(self.stacks), condition.shape[0]
-        draws = 1 if x.shape[0] == rows else x.shape[0] // rows
-        clean, answers = self.clean(x, t), []
-        for mind, stack in enumerate(self.stacks):
-            code = condition[:, None, first + mind * self.code :][..., : self.code].expand(-1, draws, -1).flatten(0, 1)
-            told = torch.cat([asked, code], dim=-1)
-            seen = [told, self.staying(*clean)]
-            if self.maps:
-                seen.append(self.maps[mind](*clean, told, condition[:, mind * self.map_numbers :][:, : self.map_numbers]))
-            answers.append(self.noise(x, stack(torch.cat([x, *seen], dim=-1)), t))
-        return torch.stack(answers)
+        each = [self.minds * self.map_numbers, self.minds * self.code]
+        maps, codes = (part.unflatten(1, (self.minds, -1)) for part in condition[:, : sum(each)].split(each, dim=1))
+        draws = 1 if x.shape[0] == condition.shape[0] else x.shape[0] // condition.shape[0]
+        code = codes.transpose(0, 1)[:, :, None].expand(-1, -1, draws, -1).flatten(1, 2)
+        told = torch.cat([asked.expand(self.minds, -1, -1), code], dim=-1)
+        clean = self.clean(x, t)
+        seen = [torch.cat([x, self.staying(*clean)], dim=-1).expand(self.minds, -1, -1), told]
+        if self.map is not None:
+            seen.append(self.map(*clean, told, maps))
+        return self.noise(x, self.layers(torch.cat(seen, dim=-1)), t)
 
 
-def goal_stack(sizes: list[int]) -> nn.Sequential:
-    """Return one stack of linear layers, the last of which tells the velocity."""
-    inner = [layer for i, o in pairwise(sizes) for layer in (nn.Linear(i, o), nn.SiLU())]
-    return nn.Sequential(*inner, nn.Linear(sizes[-1], 3))
+class Linears(nn.Module):
+    """A linear layer per mind."""
+
+    def __init__(self, minds: int, inner: int, outer: int):
+        super().__init__()
+        each = [nn.Linear(inner, outer) for _ in range(minds)]
+        self.weight = nn.Parameter(torch.stack([layer.weight.detach() for layer in each]))
+        self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in each])[:, None])
+
+    def forward(self, rows: Float[Tensor, "mind row inner"]) -> Float[Tensor, "mind row outer"]:
+        return torch.baddbmm(self.bias, rows, self.weight.mT)
 
 
 class Clean(nn.Module):
@@ -121,7 +128,7 @@ class MapAttention(nn.Module):
     FAR = 8.0
     """bound of the noisy goal, in scaled units"""
 
-    def __init__(self, cells: int, told: int):
+    def __init__(self, cells: int, told: int, minds: int):
         super().__init__()
         half_m = GRID_SHAPE[0] * GRID_CELL_M / 2
         axis = (torch.arange(cells) + 0.5) * (2 * half_m / cells) - half_m
@@ -130,27 +137,27 @@ class MapAttention(nn.Module):
         self.register_buffer("place", place[:, ::2] / half_m, persistent=False)
         self.register_buffer("power", powered(place, GOAL_POWER)[:, ::2], persistent=False)
         self.register_buffer("goal_std", torch.ones(3))
-        self.query = nn.Linear(told, self.HEADS * (MAP_KEY + self.PLACE))
-        self.log_variance = nn.Parameter(torch.tensor([[0.0, -3.0]] * self.LOCAL))
+        self.query = Linears(minds, told, self.HEADS * (MAP_KEY + self.PLACE))
+        self.log_variance = nn.Parameter(torch.tensor([0.0, -3.0]).expand(minds, 1, self.LOCAL, 2).clone())
 
     def forward(
         self,
         mean: Float[Tensor, "batch*draw 3"],
         variance: Float[Tensor, "batch*draw 1"],
-        told: Float[Tensor, "batch*draw told"],
-        grid: Float[Tensor, "batch channel*cell"],
-    ) -> Float[Tensor, "batch*draw 44"]:
+        told: Float[Tensor, "mind batch*draw told"],
+        maps: Float[Tensor, "batch mind channel*cell"],
+    ) -> Float[Tensor, "mind batch*draw 44"]:
         """Return what each head reads, where it looks on average, and how far that is from the noisy goal."""
-        key, value = grid.unflatten(1, (2, MAP_KEY, -1)).unbind(1)
+        key, value = maps.transpose(0, 1).unflatten(-1, (2, MAP_KEY, -1)).unbind(2)
         scaled = self.power / self.goal_std[::2]
         cells = torch.cat([self.place, scaled, scaled.square().sum(-1, keepdim=True)], dim=-1)
         mean = mean[:, None, ::2].clamp(-self.FAR, self.FAR)
         share = self.log_variance.exp()
-        narrow = 1 / (variance * share[:, 0] + share[:, 1])[..., None]
+        narrow = 1 / (variance * share[..., 0] + share[..., 1])[..., None]
         query = self.query(told).unflatten(-1, (self.HEADS, -1))
         near = torch.cat([torch.zeros_like(mean * narrow), mean * narrow, -narrow / 2], dim=-1)
         where = query[..., MAP_KEY:] + nn.functional.pad(near, (0, 0, 0, self.HEADS - self.LOCAL))
-        asked = query[..., :MAP_KEY].reshape(grid.shape[0], -1, MAP_KEY) * MAP_KEY**-0.5
-        weight = (asked @ key + where.reshape(grid.shape[0], -1, self.PLACE) @ cells.mT).softmax(-1)
-        read, looked = ((weight @ rows).reshape(mean.shape[0], self.HEADS, -1) for rows in (value.mT, scaled))
-        return torch.cat([read.flatten(1), looked.flatten(1), (looked[:, : self.LOCAL] - mean).flatten(1)], dim=-1)
+        asked, where = (part.unflatten(1, (maps.shape[0], -1)).flatten(2, 3) for part in (query[..., :MAP_KEY] * MAP_KEY**-0.5, where))
+        weight = (asked @ key + where @ cells.mT).softmax(-1)
+        read, looked = ((weight @ rows).flatten(1, 2).unflatten(1, (-1, self.HEADS)) for rows in (value.mT, scaled))
+        return torch.cat([read.flatten(2), looked.flatten(2), (looked[:, :, : self.LOCAL] - mean).flatten(2)], dim=-1)

@@ -145,8 +145,8 @@ def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Sta
     told = (scaling.path_std, scaling.body_mean[:ROOT_CHANNELS], scaling.body_std[:ROOT_CHANNELS])
     for buffer, numbers in zip((body.path_std, body.root_mean, body.root_std), told, strict=True):
         buffer[:] = torch.from_numpy(numbers)
-    for attention in nets.goal.maps:
-        attention.goal_std[:] = torch.from_numpy(scaling.goal_std)
+    if nets.goal.map is not None:
+        nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
     return nets
 
 

@@ -49,7 +49,7 @@ def test_goal_network_learns_where_goals_are():
 def test_goals_are_found_on_the_map():
     torch.manual_seed(0)
     net = GoalMLP(code=1, hidden=32, map_cells=CELLS)
-    places = net.maps[0].power
+    places = net.map.power
 
     def draw(size):
         cell = torch.randint(CELLS**2, (size,))
@@ -64,11 +64,11 @@ def test_goals_are_found_on_the_map():
 
 
 def test_local_heads_look_where_the_goal_may_be():
-    attention = MapAttention(CELLS, 2)
+    attention = MapAttention(CELLS, 2, 1)
     torch.nn.init.zeros_(attention.query.weight)
     torch.nn.init.zeros_(attention.query.bias)
     x = attention.power[[2, 9]] @ torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    read = attention(x, torch.zeros(2, 1), torch.zeros(2, 2), torch.zeros(2, 2 * MAP_KEY * CELLS**2))
+    read = attention(x, torch.zeros(2, 1), torch.zeros(1, 2, 2), torch.zeros(2, 1, 2 * MAP_KEY * CELLS**2))[0]
     looked = read[:, MapAttention.HEADS * MAP_KEY :][:, : 2 * MapAttention.HEADS].unflatten(1, (-1, 2))
     torch.testing.assert_close(looked[:, 0], x[:, ::2], atol=1e-3, rtol=0)
     torch.testing.assert_close(looked[:, -1], torch.zeros(2, 2), atol=1e-5, rtol=0)
