@@ -19,7 +19,6 @@ from jaxtyping import Float
 from pipeline import config
 from pipeline.files import arrays
 from pipeline.models.behavior import Sampling
-from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import TorchNetworks
 from pipeline.models.predictors import Ats
 from pipeline.models.rivals import sampler_of
@@ -65,8 +64,8 @@ def true_data(build: Path, ours: BehaviorData, videos: list[dict]) -> BehaviorDa
 def judged(data: BehaviorData, scenes: Scenes, settings: Config, effort: Effort) -> dict[str, float]:
     """Train on the data and return the mean scores on its test windows."""
     architecture = architecture_for(vars(settings), data, scenes)
-    fitted = train(data, scenes, architecture, Schedule(), settings.training, seed=settings.seed)
-    sampler = sampler_of(architecture, TorchNetworks(fitted.nets), Schedule(), fitted.scaling)
+    fitted = train(data, scenes, architecture, settings.schedule, settings.training, seed=settings.seed)
+    sampler = sampler_of(architecture, TorchNetworks(fitted.nets), settings.schedule, fitted.scaling)
     ats = Ats(sampler, scenes, data.agent_from_bone_rest, architecture.ego, Sampling())
     found = scores(ats, data, architecture.family, effort)
     return {name: float(value.mean()) for name, value in found.items() if "/" in name}

@@ -18,7 +18,6 @@ import torch
 
 from pipeline import config
 from pipeline.models.behavior import Sampling
-from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.predictors import Ats
 from pipeline.models.scenes import Scenes
@@ -55,14 +54,14 @@ class Ground:
         pace = replace(settings.training.optimization, steps=steps, goal_steps=goal_steps)
         architecture, begin = architecture_for(vars(settings), self.data, self.scenes), self.clock()
         training = replace(settings.training, optimization=pace)
-        fitted = train(self.data, self.scenes, architecture, Schedule(), training, seed=settings.seed, device=self.device)
+        fitted = train(self.data, self.scenes, architecture, settings.schedule, training, seed=settings.seed, device=self.device)
         return self.clock() - begin, fitted
 
 
 def goal_minde_m(ground: Ground, settings: Config, fitted: Fitted) -> float:
     """Return the mean distance of the best of 16 goals from the true one on every second test window."""
     architecture = architecture_for(vars(settings), ground.data, ground.scenes)
-    sampler = Sampler(TorchNetworks(fitted.nets.cpu()), Schedule(), fitted.scaling)
+    sampler = Sampler(TorchNetworks(fitted.nets.cpu()), settings.schedule, fitted.scaling)
     ats = Ats(sampler, ground.scenes, ground.data.agent_from_bone_rest, architecture.ego, Sampling())
     context, future = ground.data.windows(ground.data.indices(TEST)[::2])
     return float(SCORES["goal_minde_m"](ats.goals(context, SAMPLES, np.random.default_rng(0)), future).mean())

@@ -18,7 +18,7 @@ from pipeline.models.body_denoiser import TOLD, BodyDenoiser
 from pipeline.models.concatenation import ConcatenationUNet
 from pipeline.models.denoisers import EMBEDDING, ControlUNet, FreeUNet, Tail
 from pipeline.models.diffusion import STANDARD, Schedule
-from pipeline.models.goal_denoiser import GoalMLP
+from pipeline.models.goal_denoiser import GoalMLP, Reading
 from pipeline.models.perception import (
     GRID_CELL_M,
     GRID_SHAPE,
@@ -29,6 +29,7 @@ from pipeline.models.perception import (
     Minds,
     PerceptionSize,
 )
+from pipeline.models.pointwise import WaypointUNet
 from pipeline.models.strides import BREATH, FAINT, GOAL_POWER, ROOT, STRIDE, bent, path_from_strides, powered
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ
 from pipeline.space import rigid
@@ -59,6 +60,7 @@ class Architecture:
     control: Literal["unet", "concatenation"] = "unet"
     future: int = FUTURE
     minds: int = 3
+    reading: Reading = "attention"
 
     @property
     def body_channels(self) -> int:
@@ -108,8 +110,8 @@ class Scaling:
     """What turns ego-frame metres and radians into the unit-variance numbers that are diffused, and back."""
 
     goal_std: Float[np.ndarray, "3"]
-    stride_std: Float[np.ndarray, "4"]
-    """of strides, see `pipeline.models.strides`"""
+    stride_std: Float[np.ndarray, "#frame 4"]
+    """of strides, see `pipeline.models.strides`: of all frames alike, or of each on its own"""
     path_std: Float[np.ndarray, "3 56"]
     """of places, as the body is told them, metres"""
     body_mean: Float[np.ndarray, "channel"]
@@ -173,10 +175,13 @@ class BehaviorNets(nn.Module):
         super().__init__()
         a = architecture
         self.perception = Minds(a.perception, a.minds)
-        self.goal = GoalMLP(3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds, map_cells=a.map_cells)
+        self.goal = GoalMLP(3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds, map_cells=a.map_cells, reading=a.reading)
         match a.control:
             case "unet":
-                self.path = ControlUNet(STRIDE, 3, a.told, a.unet_width, a.unet_multipliers, schedule)
+                if a.map_cells and a.reading == "pointwise":
+                    self.path = WaypointUNet(a.minds, a.map_cells, a.future, 3, a.told, a.unet_width, a.unet_multipliers, schedule)
+                else:
+                    self.path = ControlUNet(STRIDE, 3, a.told, a.unet_width, a.unet_multipliers, schedule)
                 along = ControlUNet(a.body_channels, TOLD, a.told, a.unet_width, a.unet_multipliers, schedule)
             case "concatenation":
                 self.path = ConcatenationUNet(STRIDE, 3, a.told, a.unet_width, a.unet_multipliers, schedule)

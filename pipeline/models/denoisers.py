@@ -149,7 +149,14 @@ class ControlUNet(nn.Module):
         control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
         side = self.side(control, embedding)
         added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
-        return self.noise(x, self.out(self.main(x, embedding, added)[-1]), t)
+        return self.noise(x, self.out(self.main(self.seen(x, t, condition), embedding, added)[-1]), t)
+
+    def seen(
+        self, x: Float[Tensor, "batch channel frame"], t: Float[Tensor, "batch"], condition: Float[Tensor, "batch condition"]
+    ) -> Float[Tensor, "batch channel frame"]:
+        """Return what the first UNet reads: the noisy sequence."""
+        del t, condition
+        return x
 
 
 class FreeUNet(nn.Module):

@@ -1,4 +1,4 @@
-"""Diffusion in 50 steps: linear schedule, noising, DDPM and DDIM sampling, classifier-free guidance.
+"""Diffusion in 50 steps: schedules, noising, DDPM and DDIM sampling, classifier-free guidance.
 
 Arithmetic only, on NumPy arrays and torch tensors alike: `sample` takes any function that predicts the noise, be it a
 torch module, an ONNX session, or a guided pair of calls.
@@ -6,7 +6,7 @@ torch module, an ONNX session, or a guided pair of calls.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, assert_never
 
 import numpy as np
 from jaxtyping import Float
@@ -16,13 +16,19 @@ Array = TypeVar("Array")
 
 @dataclass(frozen=True)
 class Schedule:
-    """A linear variance schedule (Ho et al. 2020)."""
+    """How much noise each step holds."""
 
     steps: int = 50
+    """noise levels"""
     beta_first: float = 1e-4
+    """variance added at the first step, where it is linear"""
     beta_last: float = 0.2
+    """variance added at the last step, where it is linear"""
     clip: float = 5.0
     """bound of the clean estimate, in standard deviations"""
+    course: Literal["linear", "rectified"] = "linear"
+    """variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023): straight ways (1 - s) clean + s noise,
+    scaled to unit variance, which DDIM follows in Euler's steps; learn it with `weighting` "flow\""""
 
     @property
     def beta(self) -> Float[np.ndarray, "step"]:
@@ -32,7 +38,14 @@ class Schedule:
     @property
     def alpha_bar(self) -> Float[np.ndarray, "step"]:
         """Share of the clean signal's variance left after each step."""
-        return np.cumprod(1.0 - self.beta)
+        match self.course:
+            case "linear":
+                return np.cumprod(1.0 - self.beta)
+            case "rectified":
+                noise = np.arange(1, self.steps + 1) / (self.steps + 1)
+                return (1 - noise) ** 2 / ((1 - noise) ** 2 + noise**2)
+            case _:
+                assert_never(self.course)
 
     def visited(self, count: int) -> list[int]:
         """Return the steps that a sampler of ``count`` steps visits, noisiest first."""

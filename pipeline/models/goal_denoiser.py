@@ -6,6 +6,7 @@ goal agrees with none, for animals mostly stay. Both on two kept homes of the be
 """
 
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -14,9 +15,12 @@ from torch import Tensor, nn
 from pipeline.models.denoisers import TIME_CHANNELS, NoiseFromVelocity, time_embedding
 from pipeline.models.diffusion import STANDARD, Schedule
 from pipeline.models.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY
+from pipeline.models.pointwise import MapAtGoal
 from pipeline.models.strides import GOAL_POWER, powered
 
 HORIZON_CHANNELS = 8
+Reading = Literal["attention", "pointwise"]
+"""How a map is looked up: `MapAttention`, or `pipeline.models.pointwise`"""
 
 
 class GoalMLP(nn.Module):
@@ -27,13 +31,17 @@ class GoalMLP(nn.Module):
     from as many minutes. All minds are asked in one product per layer: a plan for one animal is made of small products.
     """
 
-    def __init__(self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *, minds: int = 1, map_cells: int = 0):
+    def __init__(
+        self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *, minds: int = 1,
+        map_cells: int = 0, reading: Reading = "attention",
+    ):  # fmt: skip
         super().__init__()
         self.noise, self.code, self.minds, self.map_numbers = NoiseFromVelocity(schedule), code, minds, 2 * MAP_KEY * map_cells**2
         told = TIME_CHANNELS + HORIZON_CHANNELS + code
         self.clean, self.staying = Clean(schedule), Staying()
-        self.map = MapAttention(map_cells, told, minds) if map_cells else None
-        sizes = [3 + told + Staying.NUMBERS + (MapAttention.NUMBERS if map_cells else 0)] + [hidden] * (layers - 1)
+        pointwise = reading == "pointwise"
+        self.map = None if not map_cells else MapAtGoal() if pointwise else MapAttention(map_cells, told, minds)
+        sizes = [3 + told + Staying.NUMBERS + (self.map.NUMBERS if self.map else 0)] + [hidden] * (layers - 1)
         inner = [layer for i, o in pairwise(sizes) for layer in (Linears(minds, i, o), nn.SiLU())]
         self.layers = nn.Sequential(*inner, Linears(minds, sizes[-1], 3))
 

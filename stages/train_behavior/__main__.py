@@ -46,6 +46,11 @@ class Config:
     """Channels of the UNets' finest level."""
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
     """Widths of the UNets' levels, in units of the finest."""
+    reading: Literal["attention", "pointwise"] = "attention"
+    """How goals look up the map of the 2.5-D encoder: attention, or, as in the released code, at the noisy point itself; then
+    paths do so too, at each noisy waypoint."""
+    schedule: Schedule = field(default_factory=Schedule)
+    """Noise levels."""
     training: Settings = field(default_factory=Settings)
     """Length of training, augmentation, dropping of conditions."""
     seed: int = 0
@@ -59,11 +64,11 @@ def run(task: cli.Task) -> None:
     scenes = Scenes.load(task.input("behavior_data"), data.videos)
     architecture = architecture_for(vars(c), data, scenes)
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
-    fitted = train(data, scenes, architecture, Schedule(), c.training, seed=c.seed, resume=task.resume, device=task.device)
+    fitted = train(data, scenes, architecture, c.schedule, c.training, seed=c.seed, resume=task.resume, device=task.device)
     with task.create() as folder:
-        outcome.write_trained(folder, fitted, architecture, data.agent_from_bone_rest)
+        outcome.write_trained(folder, fitted, architecture, c.schedule, data.agent_from_bone_rest)
         if c.export:
-            outcome.write_exported(folder, fitted, architecture, data, scenes, seed=c.seed)
+            outcome.write_exported(folder, fitted, architecture, c.schedule, data, scenes, seed=c.seed)
 
 
 if __name__ == "__main__":

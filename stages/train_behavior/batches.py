@@ -199,10 +199,10 @@ def approached(agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray,
     return np.concatenate([met[:0], *(np.resize(part, min(most, AS_OFTEN * len(part))) for part in parts)])
 
 
-def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
+def statistics_from_windows(windows: Windows, turn_rad: float, *, per_frame: bool = False) -> Statistics:
     """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past to at most 8,192 windows.
 
-    The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is remembered of
+    Strides are scaled in all frames alike or, with ``per_frame``, in each on its own, as the released code scales. The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is remembered of
     a body is scaled as the body is.
     """
     some = torch.arange(0, len(windows), -(-len(windows) // ENOUGH))
@@ -213,7 +213,8 @@ def statistics_from_windows(windows: Windows, turn_rad: float) -> Statistics:
     path_std = np.stack([level, height, level])
     whole = body_statistics(tracks.rotation[:, PAST:], windows.bones[rows[:, PAST:].unique()], turn_rad)
     strides = strides_from_path(tracks.root[:, PAST:], tracks.root[:, PAST - 1])[..., :3].double().numpy()
-    stride_std = np.array([*_spread(strides.reshape(-1, 3)), 1.0])
+    each = np.swapaxes(strides, 0, 1) if per_frame else strides.reshape(1, -1, 3)
+    stride_std = np.array([[*_spread(frame), 1.0] for frame in each])
     scaling = Scaling(_spread(powered(future[:, -1], GOAL_POWER)), stride_std, path_std, *whole)
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
     position = tracks.root[:, :PAST].std().clip(0.05).expand(3)

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, assert_never
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,6 +15,7 @@ from stages.train_behavior.batches import Batch
 
 Denoise = Callable[[Tensor, Tensor], Tensor]
 """From noisy samples and their steps to the noise"""
+Weighting = Literal["noise", "velocity", "flow"]
 Part = Literal["goals", "sequences", "all"]
 """What learns: perception and goals; path and body, of a perception that rests; or all at once"""
 
@@ -27,9 +28,9 @@ class Objective:
     """probability that a condition is replaced by its null, for each condition on its own"""
     code_dropout: float = 0.1
     """dropout on the perception code"""
-    weighting: Literal["noise", "velocity"] = "velocity"
-    """which error counts evenly at all steps: that of the noise, as in the paper, or that of the velocity, which gives
-    the noisy steps, where the outline is decided, their share"""
+    weighting: Weighting = "velocity"
+    """which error counts evenly at all steps: that of the noise, as in the paper, that of the velocity, which gives the
+    noisy steps, where the outline is decided, their share, or that of the straight way of rectified flow"""
     path_share: float = 0.5
     """share of a batch's windows from which paths, whose network costs much, learn in a step"""
     body_share: float = 0.5
@@ -128,12 +129,23 @@ def squared_error(
     denoise: Denoise,
     clean: Float[Tensor, "batch ..."],
     schedule: Schedule,
-    weighting: Literal["noise", "velocity"],
+    weighting: Weighting,
     generator: torch.Generator,
 ) -> Float[Tensor, "batch ..."]:
-    """Noise ``clean`` to a random step and compare the noise, or the velocity, with its prediction."""
+    """Noise ``clean`` to a random step and compare the noise, the velocity or noise less clean sample with its prediction.
+
+    All three are the error of the noise, for the noisy sample is given, by a factor that the step tells.
+    """
     t = torch.randint(schedule.steps, (len(clean),), generator=generator)
     share = torch.from_numpy(schedule.alpha_bar).float()[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
     noise = torch.randn(clean.shape, generator=generator).to(clean.device)
     error = (denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise) ** 2
-    return error / share if weighting == "velocity" else error
+    match weighting:
+        case "noise":
+            return error
+        case "velocity":
+            return error / share
+        case "flow":
+            return error * (1 + ((1 - share) / share).sqrt()) ** 2
+        case _:
+            assert_never(weighting)

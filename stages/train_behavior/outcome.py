@@ -27,15 +27,19 @@ def architecture_for(settings: Mapping[str, Any], data: BehaviorData, scenes: Sc
     return Architecture(**said | decided)
 
 
-def write_trained(folder: Path, fitted: Fitted, architecture: Architecture, rest: Float[np.ndarray, "bone 4 4"]) -> None:
+def write_trained(
+    folder: Path, fitted: Fitted, architecture: Architecture, schedule: Schedule, rest: Float[np.ndarray, "bone 4 4"]
+) -> None:
     """Write weights, contract and the losses of every step."""
-    export.write_contract(folder, fitted.nets.cpu(), architecture, fitted.scaling, Schedule(), rest)
+    export.write_contract(folder, fitted.nets.cpu(), architecture, fitted.scaling, schedule, rest)
     arrays.save(folder / "losses.npz", **{f"loss/{name}": values for name, values in fitted.record.terms.items()})
 
 
-def write_exported(folder: Path, fitted: Fitted, architecture: Architecture, data: BehaviorData, scenes: Scenes, *, seed: int) -> None:
+def write_exported(
+    folder: Path, fitted: Fitted, architecture: Architecture, schedule: Schedule, data: BehaviorData, scenes: Scenes, *, seed: int
+) -> None:
     """Write the networks for other samplers, and how the model looks."""
-    sampler = sampler_of(architecture, TorchNetworks(fitted.nets), Schedule(), fitted.scaling)
+    sampler = sampler_of(architecture, TorchNetworks(fitted.nets), schedule, fitted.scaling)
     difference = export.write_networks(folder, fitted.nets, architecture)
     moments = reactions.moments(data, scenes, architecture)
     reaction = reactions.measure(sampler, moments.observation, radius_m=architecture.observer_radius_m, seed=seed)

@@ -4,12 +4,14 @@ import copy
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 
 from pipeline.fit import FitRecord, fit
 from pipeline.models.behavior import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
 from pipeline.models.diffusion import Schedule
+from pipeline.models.pointwise import WaypointUNet
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN, BehaviorData
 from stages.train_behavior.batches import (
@@ -45,6 +47,10 @@ class Optimization:
     """decay per step of the averaged weights"""
     save_every: int = 200
     """steps between checkpoints"""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """of the convolutions of path and body, which cost the most: half as many bits are faster on most GPUs"""
+    compile: bool = False
+    """compile path and body, which takes a minute and a C++ compiler; on a GPU they run as one CUDA graph each"""
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,8 @@ class Settings:
     """how far samples stray from the recorded ones"""
     objective: Objective = field(default_factory=Objective)
     """dropping of conditions and the number of noise levels"""
+    per_frame: bool = False
+    """scale strides in each frame of the horizon on its own, as the released code does, not in all alike"""
 
 
 @dataclass(frozen=True)
@@ -83,16 +91,19 @@ def train(
     """Fit the networks to the training windows of the data."""
     minimised = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}[architecture.family]
     windows = windows_from_data(data, data.indices(TRAIN), architecture, scenes)
-    statistics = statistics_from_windows(windows, settings.augmentation.largest_turn_rad)
+    statistics = statistics_from_windows(windows, settings.augmentation.largest_turn_rad, per_frame=settings.per_frame)
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(scenes, architecture.scene_stride, device)
     pace, drawn = settings.optimization, settings.augmentation
     of_paths = replace(drawn, approached=drawn.approached_paths)
     goal_steps = 0 if architecture.family == "one_stage" else pace.goal_steps
+    quicken(nets, pace, device)
     optimizer = torch.optim.AdamW(nets.parameters(), lr=pace.rate, weight_decay=pace.weight_decay, fused=True)
 
     def loss(step: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        if pace.compile:
+            torch.compiler.cudagraph_mark_step_begin()
         part: Part = "all" if goal_steps == 0 else "goals" if step < goal_steps else "sequences"
         size = pace.goal_batch if part == "goals" else pace.batch
         how = of_paths if part == "sequences" else drawn
@@ -125,6 +136,16 @@ def train(
     return Fitted(rounded(average.eval()), statistics.scaling, record)
 
 
+def quicken(nets: BehaviorNets, pace: Optimization, device: str) -> None:
+    """Let path and body compute in the precision that is asked for, compiled if that is; weights stay in float32."""
+    kind = torch.device(device).type
+    for net in (nets.path, nets.body):
+        if pace.precision == "bfloat16":
+            net.forward = torch.autocast(kind, torch.bfloat16)(net.forward)
+        if pace.compile:
+            net.compile(mode="reduce-overhead" if kind == "cuda" else "default")
+
+
 def rounded(nets: BehaviorNets) -> BehaviorNets:
     """Round weights to 12 significant bits: nearly half of what a page sends of them, and far finer than training can tell."""
     with torch.no_grad():
@@ -147,6 +168,8 @@ def initial_nets(architecture: Architecture, schedule: Schedule, statistics: Sta
         buffer[:] = torch.from_numpy(numbers)
     if nets.goal.map is not None:
         nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
+    if isinstance(nets.path, WaypointUNet):
+        nets.path.stride_std[:] = torch.from_numpy(scaling.stride_std)
     return nets
 
 

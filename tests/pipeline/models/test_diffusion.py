@@ -42,6 +42,26 @@ def test_schedule_ends_in_noise_and_every_sampler_visits_both_ends():
         assert (steps[0], steps[-1], len(set(steps))) == (49, 0, count)
 
 
+def test_ddim_follows_rectified_flow_in_eulers_steps():
+    schedule = Schedule(course="rectified")
+    moment = np.arange(1, schedule.steps + 1) / (schedule.steps + 1)  # share of noise on the straight way
+    unit = np.sqrt((1 - moment) ** 2 + moment**2)
+
+    def noise_in(way, t):
+        return np.sin(3 * way) + 0.1 * t  # any prediction
+
+    first = np.random.default_rng(0).standard_normal(100)
+    sampled = sample(lambda x, t: noise_in(x * unit[int(t)], t), first, schedule, method="ddim", count=10)
+    steps = schedule.visited(10)
+    way = first * unit[steps[0]]
+    for now, later in zip(steps, [*steps[1:], None], strict=True):
+        noise = noise_in(way, now)
+        clean = ((way - moment[now] * noise) / (1 - moment[now])).clip(-schedule.clip, schedule.clip)
+        noise = (way - (1 - moment[now]) * clean) / moment[now]
+        way = way + ((0.0 if later is None else moment[later]) - moment[now]) * (noise - clean)
+    np.testing.assert_allclose(sampled, way, atol=1e-6)
+
+
 def test_guidance_is_linear_in_its_scale():
     blend = guided(lambda x, t: x + 3, lambda x, t: x + 1, 0.5)
     assert blend(0.0, 0) == 2.0

@@ -12,8 +12,9 @@ from pipeline.models.diffusion import Schedule
 from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import TRAIN
-from stages.train_behavior import training
+from pipeline.models.strides import strides_from_path
+from pipeline.models.trajectories import PAST, TRAIN
+from stages.train_behavior import outcome, training
 from stages.train_behavior.batches import (
     AS_OFTEN,
     Augmentation,
@@ -30,8 +31,9 @@ from stages.train_behavior.export import (
     golden_plan,
     signature,
     write_contract,
+    write_networks,
 )
-from stages.train_behavior.objective import Objective, goal_error, losses, perceive
+from stages.train_behavior.objective import Objective, goal_error, losses, perceive, squared_error
 from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.training import Optimization, Settings, initial_nets, train, two_cosines
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
@@ -132,6 +134,52 @@ def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
     assert fast.shape == exact.shape == (4, 16, *(n // 4 for n in GRID_SHAPE))
     together = torch.stack([exact.flatten(), fast.flatten()])
     assert torch.corrcoef(together)[0, 1] > 0.95  # one reads smoothed voxels, the other averages the nearest ones
+
+
+def test_the_error_of_rectified_flow_is_that_of_noise_less_clean_sample():
+    schedule, clean = Schedule(course="rectified"), torch.randn(64, 4, generator=torch.Generator().manual_seed(1))
+    told = {}
+
+    def denoise(x, t):
+        told.update(x=x, t=t)
+        return x.sin()
+
+    error = squared_error(denoise, clean, schedule, "flow", torch.Generator().manual_seed(0))
+    moment = ((told["t"] + 1) / (schedule.steps + 1))[:, None]
+    way = told["x"] * ((1 - moment) ** 2 + moment**2).sqrt()
+    true = (way - (1 - moment) * clean) / moment - clean
+    predicted = told["x"].sin() - (way - moment * told["x"].sin()) / (1 - moment)
+    torch.testing.assert_close(error, (predicted - true) ** 2, atol=1e-4, rtol=1e-3)
+
+
+def test_strides_are_scaled_frame_by_frame_where_asked(windows):
+    alike, each = (statistics_from_windows(windows, 0.0, per_frame=per_frame).scaling.stride_std for per_frame in (False, True))
+    assert alike.shape == (1, 4) and each.shape == (56, 4)
+    root = windows.tracks(torch.arange(len(windows))).root
+    level = strides_from_path(root[:, PAST:], root[:, PAST - 1])[:, :, [0, 2]]
+    np.testing.assert_allclose(each[:, 0], level.square().mean((0, 2)).sqrt().clamp_min(0.05), rtol=1e-3)
+
+
+def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
+    settings = Settings(Optimization(steps=3, goal_steps=1, batch=8))
+    half = replace(settings, optimization=replace(settings.optimization, precision="bfloat16"))
+    exact, rough = (train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), each, seed=3) for each in (settings, half))
+    for name in ("path", "body"):
+        ours, theirs = rough.record.terms[name][1:], exact.record.terms[name][1:]
+        np.testing.assert_allclose(ours, theirs, rtol=0.02)
+        assert (ours != theirs).any(), "nothing was rounded"
+    assert {value.dtype for value in rough.nets.state_dict().values() if value.is_floating_point()} == {torch.float32}
+
+
+def test_a_model_that_reads_pointwise_is_written_and_read(data, tmp_path):
+    shape = replace(ARCHITECTURE, reading="pointwise")
+    settings = Settings(Optimization(steps=2, goal_steps=1, batch=8), per_frame=True)
+    fitted = train(data, Scenes.of(room()), shape, Schedule(course="rectified"), settings, seed=0)
+    outcome.write_trained(tmp_path, fitted, shape, Schedule(course="rectified"), REST)
+    architecture, nets, scaling, schedule, _ = behavior.load(tmp_path)
+    assert (architecture, schedule) == (shape, Schedule(course="rectified"))
+    np.testing.assert_allclose(scaling.stride_std, fitted.scaling.stride_std)
+    assert write_networks(tmp_path, nets.eval(), shape) < 1e-4
 
 
 def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):

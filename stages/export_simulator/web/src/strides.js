@@ -17,8 +17,9 @@ export const goalFrom = (scaled, deviation, told) => (
 export function pathFrom(scaled, frames, deviation, start, rate, told) {
   let place = start;
   return Array.from({ length: frames }, (_, i) => {
+    const spread = deviation[i] ?? deviation[0]; // of each frame on its own, or of all alike
     const stays = scaled[3 * frames + i] > 0 ? 1 : told.breath;
-    const root = [0, 1, 2].map((axis) => scaled[axis * frames + i] * deviation[axis] * stays);
+    const root = [0, 1, 2].map((axis) => scaled[axis * frames + i] * spread[axis] * stays);
     place = powered(root, 1 / told.root_power, told.faint_m2).map((value, axis) => place[axis] + value / rate);
     return place;
   });

@@ -1,0 +1,88 @@
+"""Reading the map at noisy points, as the released code does: a goal at where it may lie, a path at each of its waypoints.
+
+A variant beside `goal_denoiser.MapAttention`, which looks where it wants to. Points are read where they are expected, given
+the noisy sample and nothing else: at the noisiest steps all are near the animal.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.models.denoisers import ControlUNet
+from pipeline.models.diffusion import STANDARD, Schedule
+from pipeline.models.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY
+from pipeline.models.strides import BREATH, GOAL_POWER, ROOT, STRIDE, powered
+from pipeline.models.trajectories import RATE_HZ
+
+HALF_M = GRID_SHAPE[0] * GRID_CELL_M / 2
+"""from the middle of a map to its edge"""
+READ = 2 * MAP_KEY
+"""channels of a map"""
+
+
+def read_at(
+    maps: Float[Tensor, "batch mind channel*cell"], points: Float[Tensor, "batch point 3"]
+) -> Float[Tensor, "batch mind channel point"]:
+    """Return what maps say at points in metres of the ego frame, between cells by their distance; zeros beyond the edge."""
+    cells = round((maps.shape[-1] / READ) ** 0.5)
+    chart = maps.flatten(0, 1).unflatten(1, (READ, cells, cells))
+    where = (points[:, None, :, None, ::2] / HALF_M).expand(-1, maps.shape[1], -1, -1, -1).flatten(0, 1)
+    return nn.functional.grid_sample(chart, where, align_corners=False)[..., 0].unflatten(0, maps.shape[:2])
+
+
+class MapAtGoal(nn.Module):
+    """The map where a noisy goal is expected; called as `MapAttention` is."""
+
+    NUMBERS = READ
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("goal_std", torch.ones(3))
+
+    def forward(
+        self,
+        mean: Float[Tensor, "batch*draw 3"],
+        variance: Float[Tensor, "batch*draw 1"],
+        told: Float[Tensor, "mind batch*draw told"],
+        maps: Float[Tensor, "batch mind channel*cell"],
+    ) -> Float[Tensor, "mind batch*draw 16"]:
+        """Return the map's channels there."""
+        del told
+        goal = powered(mean / (1 + variance) * self.goal_std, 1 / GOAL_POWER)
+        read = read_at(maps, goal.unflatten(0, (maps.shape[0], -1)))
+        return read.permute(1, 0, 3, 2).flatten(1, 2)
+
+
+class WaypointUNet(ControlUNet):
+    """A `ControlUNet` of strides that is told what the maps of all minds say at each noisy waypoint."""
+
+    def __init__(
+        self,
+        minds: int,
+        map_cells: int,
+        frames: int,
+        control: int,
+        condition: int,
+        width: int = 32,
+        multipliers: tuple[int, ...] = (1, 2, 4),
+        schedule: Schedule = STANDARD,
+    ):
+        super().__init__(STRIDE, control, condition, width, multipliers, schedule)
+        self.minds, self.map_numbers = minds, READ * map_cells**2
+        self.main.enter = nn.Conv1d(STRIDE + minds * READ, self.main.block_widths[0], 1)
+        self.register_buffer("share", torch.from_numpy(schedule.alpha_bar).float().sqrt(), persistent=False)
+        self.register_buffer("stride_std", torch.ones(frames, STRIDE))
+
+    def seen(
+        self, x: Float[Tensor, "batch 4 frame"], t: Float[Tensor, "batch"], condition: Float[Tensor, "batch condition"]
+    ) -> Float[Tensor, "batch channel frame"]:
+        """Return the noisy strides and, beside each, what the maps say where it is expected to lead."""
+        maps = condition[:, : self.minds * self.map_numbers].unflatten(1, (self.minds, -1))
+        read = read_at(maps, self.waypoints(x, t))
+        return torch.cat([x, read.flatten(1, 2)], dim=1)
+
+    def waypoints(self, x: Float[Tensor, "batch 4 frame"], t: Float[Tensor, "batch"]) -> Float[Tensor, "batch frame 3"]:
+        """Return where noisy strides are expected to lead, metres from the animal."""
+        strides = (self.share[t.long()][:, None, None] * x).mT * self.stride_std
+        root = strides[..., :3] * torch.where(strides[..., 3:] > 0, 1.0, BREATH)
+        return (powered(root, 1 / ROOT) / RATE_HZ).cumsum(1)
