@@ -30,7 +30,7 @@ from pipeline.models.perception import (
     PerceptionSize,
 )
 from pipeline.models.pointwise import WaypointUNet
-from pipeline.models.strides import BREATH, FAINT, GOAL_POWER, ROOT, STRIDE, bent, path_from_strides, powered
+from pipeline.models.strides import BREATH, FAINT, GOAL_POWER, ROOT, STAYS_M_S, STRIDE, bent, path_from_strides, powered
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ
 from pipeline.space import rigid
 
@@ -244,7 +244,14 @@ def contract(architecture: Architecture, scaling: Scaling, schedule: Schedule, r
             "keep": ["scene", "observer", "past"],
         },
         "grid": {"shape": list(GRID_SHAPE), "cell_m": GRID_CELL_M, "sampling": "nearest", "order": "channel, x, y, z"},
-        "strides": {"numbers": STRIDE, "root_power": ROOT, "goal_power": GOAL_POWER, "breath": BREATH, "faint_m2": FAINT},
+        "strides": {
+            "numbers": STRIDE,
+            "root_power": ROOT,
+            "goal_power": GOAL_POWER,
+            "breath": BREATH,
+            "faint_m2": FAINT,
+            "stays_m_s": STAYS_M_S,
+        },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
         "sampling": asdict(Sampling()),

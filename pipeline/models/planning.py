@@ -128,9 +128,9 @@ class Codes:
     count: int = 1
     """plans of what is perceived once, whose rows are alike and stand together"""
 
-    def cleared(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan frame 3"]:
-        """Keep paths in metres where the agent may be."""
-        return path if self.ground is None else self.ground.cleared(path)
+    def kept(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan frame 3"]:
+        """Keep paths in metres where the agent may be, and on what carries it."""
+        return path if self.ground is None else self.ground.trodden(self.ground.cleared(path), self.start)
 
 
 @dataclass(frozen=True)
@@ -220,10 +220,11 @@ class Sampler:
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def goals_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
-        """Move scaled goals to where the agent may be."""
+        """Move scaled goals to where the agent may rest."""
         if codes.ground is None:
             return scaled
-        return self.scaling.scaled_goal(codes.ground.cleared(self.scaling.goal(scaled)[:, None])[:, 0])
+        cleared = codes.ground.cleared(self.scaling.goal(scaled)[:, None])[:, 0]
+        return self.scaling.scaled_goal(codes.ground.rested(cleared))
 
     def paths_cleared(self, codes: Codes, scaled: Float[np.ndarray, "plan 4 frame"]) -> Float[np.ndarray, "plan 4 frame"]:
         """Move scaled paths to where the agent may be."""
@@ -236,7 +237,7 @@ class Sampler:
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Return scaled paths in metres, led to their goals as far as these are told, and kept where the agent may be."""
         path = led(self.scaling.path(scaled, codes.start), codes.start, goal, float(sampling.goal) * min(sampling.guidance, 1.0))
-        return codes.cleared(path)
+        return codes.kept(path)
 
     def _drawn(
         self,

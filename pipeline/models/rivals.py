@@ -106,7 +106,7 @@ class OneStageSampler(Sampler):
         return self._path(codes, self._whole(codes, sampling, rng))[:, -1]
 
     def _path(self, codes: Codes, whole: Array) -> Float[np.ndarray, "plan frame 3"]:
-        return codes.cleared(self.scaling.path(whole[:, :STRIDE], codes.start))
+        return codes.kept(self.scaling.path(whole[:, :STRIDE], codes.start))
 
     def _whole(self, codes: Codes, sampling: Sampling, rng: np.random.Generator) -> Array:
         frames = self.scaling.path_std.shape[1]

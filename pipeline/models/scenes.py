@@ -14,6 +14,9 @@ from scipy.ndimage import distance_transform_edt
 
 from pipeline.files import arrays
 from pipeline.models.perception import GRID_SHAPE, FeatureVolume
+from pipeline.models.strides import STAYS_M_S
+from pipeline.models.support import Support, stepped
+from pipeline.models.trajectories import RATE_HZ
 from pipeline.space import rigid
 
 WITHIN = 0.01
@@ -29,15 +32,19 @@ class Scenes:
     """Per volume, where the agent's root may be."""
     of_video: Int[np.ndarray, "video"]
     """Index into ``volumes`` of every recording."""
+    supports: tuple[Support | None, ...] = ()
+    """Per volume, what carries an agent, where that is known."""
 
     @classmethod
     def load(cls, folder: Path, videos: tuple[str, ...]) -> "Scenes":
         """Read `volume.npz`, or else `volumes/<id>.npz` of every recording. Raises InputError ART-010 when damaged."""
         one = folder / "volume.npz"
         files = [one] if one.is_file() else [folder / "volumes" / f"{video}.npz" for video in videos]
-        allowed = [arrays.load(file, ("allowed",))["allowed"].astype(bool) for file in files]
+        tables = [arrays.load(file, ("allowed", "stands_m")) for file in files]
+        volumes = tuple(FeatureVolume.load(file) for file in files)
         of_video = np.zeros(len(videos), int) if one.is_file() else np.arange(len(videos))
-        return cls(tuple(FeatureVolume.load(file) for file in files), tuple(allowed), of_video)
+        supports = tuple(Support.of(volume, table["allowed"], table["stands_m"]) for volume, table in zip(volumes, tables, strict=True))
+        return cls(volumes, tuple(table["allowed"] > 0 for table in tables), of_video, supports)
 
     @classmethod
     def of(cls, volume: FeatureVolume) -> "Scenes":
@@ -108,6 +115,19 @@ class Scenes:
             moved[mine] = np.where(free[..., None], moved[mine], pushed)
         return moved
 
+    def carried(
+        self,
+        points_world: Float[np.ndarray, "window *some 3"],
+        moves: Bool[np.ndarray, "window *some"],
+        video: Int[np.ndarray, "window"] | None,
+    ) -> Float[np.ndarray, "window *some"]:
+        """Return the heights at which what carries the agent bears its root, nearest to those of the points."""
+        number, height = self.number(video, len(points_world)), np.array(points_world[..., 1])
+        for scene, support in enumerate(self.supports):
+            if support is not None:
+                height[number == scene] = support.heights(points_world[number == scene], moves[number == scene])
+        return height
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -123,7 +143,28 @@ class Ground:
 
     def cleared(self, points_ego: Float[np.ndarray, "plan point 3"]) -> Float[np.ndarray, "plan point 3"]:
         """Move points out of what is solid; as many plans per agent as there are, those of an agent together."""
-        count = len(points_ego) // len(self.world_from_ego)
-        frame = np.repeat(self.world_from_ego, count, axis=0)
-        video = None if self.video is None else np.repeat(self.video, count)
+        frame, video = self._of_plans(len(points_ego))
         return rigid.apply(rigid.inverse(frame), self.scenes.cleared(rigid.apply(frame, points_ego), video))
+
+    def rested(self, goals_ego: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
+        """Put goals on what carries an agent that rests there."""
+        frame, video = self._of_plans(len(goals_ego))
+        goals = rigid.apply(frame, goals_ego[:, None])
+        goals[..., 1] = self.scenes.carried(goals, np.zeros(goals.shape[:-1], bool), video)
+        return rigid.apply(rigid.inverse(frame), goals)[:, 0]
+
+    def trodden(
+        self, path_ego: Float[np.ndarray, "plan frame 3"], start_ego: Float[np.ndarray, "plan 3"]
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Put paths, which begin a frame after ``start_ego``, on what carries the agent; steps become jumps."""
+        frame, video = self._of_plans(len(path_ego))
+        start, path = rigid.apply(frame, start_ego[:, None]), rigid.apply(frame, path_ego)
+        step = np.diff(path[..., [0, 2]], axis=1, prepend=start[..., [0, 2]])
+        moves = np.linalg.norm(step, axis=-1) * RATE_HZ > STAYS_M_S
+        path[..., 1] = stepped(self.scenes.carried(path, moves, video), start[:, 0, 1])
+        return rigid.apply(rigid.inverse(frame), path)
+
+    def _of_plans(self, plans: int) -> tuple[Float[np.ndarray, "plan 4 4"], Int[np.ndarray, "plan"] | None]:
+        """Return ego frame and recording of every plan."""
+        count = plans // len(self.world_from_ego)
+        return np.repeat(self.world_from_ego, count, axis=0), None if self.video is None else np.repeat(self.video, count)

@@ -9,10 +9,10 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels, channels_from_bones
-from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
+from pipeline.models.perception import Ego, world_from_ego
 from pipeline.models.planning import Observation, Sampler, observe
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context
@@ -122,15 +122,13 @@ class Simulator:
         self,
         sampler: Sampler,
         data: BehaviorData,
-        volume: FeatureVolume,
-        allowed: Bool[np.ndarray, "x y z"],
+        scenes: Scenes,
         ego: Ego,
         *,
         sampling: Sampling,
         chaining: Chaining,
     ):
         self.data, self.rest = data, data.agent_from_bone_rest
-        scenes = Scenes((volume,), (allowed,), np.zeros(1, int))
         self.flock = Flock(sampler, scenes, self.rest, ego, sampling=sampling, chaining=chaining)
 
     def reset(self, seed: int, observer: Float[np.ndarray, "3"] | None = None) -> State:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from pipeline.errors import InputError
 from pipeline.files import arrays, gaussian_rows, meshes
+from pipeline.models.support import CARRIES, FLIGHT
 from pipeline.models.trajectories import BehaviorData
 from pipeline.space.meshes import Mesh
 from stages.export_simulator.actions import Motion, cut, longest_run
@@ -90,6 +91,13 @@ def motions(behavior_data: Path) -> list[Motion]:
     return found
 
 
+def support(range_m: Float[np.ndarray, "2 2"]) -> dict[str, Any] | None:
+    """Return what puts paths on what carries the animal, where that is known; see `pipeline.models.support`."""
+    if not np.isfinite(range_m).all():
+        return None
+    return {"mark": CARRIES, "range_m": np.asarray(range_m, float).tolist(), "flight": FLIGHT.tolist()}
+
+
 def gaussians(splats: Path) -> Gaussians:
     """Read room and animal as Gaussians, and the animal's skin."""
     weights = arrays.load(splats / "splats.npz", names=("agent_weights",))["agent_weights"]
@@ -98,7 +106,7 @@ def gaussians(splats: Path) -> Gaussians:
 
 def minds(behavior: Path, behavior_data: Path) -> Minds:
     """Read the sampler's contract, the four networks, and the scene's features that they perceive."""
-    table = arrays.load(behavior_data / "volume.npz", names=("features", "allowed", "origin", "voxel_m"))
+    table = arrays.load(behavior_data / "volume.npz", names=("features", "allowed", "origin", "voxel_m", "stands_m"))
     return Minds(
         behavior=json.loads((behavior / "behavior.json").read_bytes()),
         networks={name: (behavior / f"{name}.onnx").read_bytes() for name in NETWORKS},
@@ -106,6 +114,7 @@ def minds(behavior: Path, behavior_data: Path) -> Minds:
             "shape": list(table["features"].shape),
             "origin": table["origin"].tolist(),
             "voxel_m": float(table["voxel_m"]),
+            "support": support(table["stands_m"]),
         },
         allowed=table["allowed"].astype(np.uint8).tobytes(),
         features=table["features"].astype("<f2").tobytes(),

@@ -10,13 +10,13 @@ from safetensors import SafetensorError
 
 from pipeline import progress
 from pipeline.errors import InputError
-from pipeline.files import arrays, glb, meshes
+from pipeline.files import glb, meshes
 from pipeline.models import behavior, journeys
 from pipeline.models.bodies import load_body
 from pipeline.models.journeys import World
 from pipeline.models.motion_synthesis import LongTerm
-from pipeline.models.perception import FeatureVolume
 from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.scenes import Scenes
 from pipeline.models.short_motions import RATE_HZ, Moving, stretches
 from pipeline.models.simulator import Simulator
 from pipeline.models.subgoals import Subgoal, brought_in, preferred
@@ -133,9 +133,8 @@ def _world(given: Mapping[str, Path], data: BehaviorData) -> World:
 def _simulator(given: Mapping[str, Path], data: BehaviorData, c: Any, chaining: Any, device: str) -> Simulator:
     architecture, nets, scaling, schedule, _ = _loaded(behavior.load, _needed(given, "behavior"))
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
-    volume = FeatureVolume.load(given["behavior_data"] / "volume.npz")
-    allowed = arrays.load(given["behavior_data"] / "volume.npz", ("allowed",))["allowed"]
-    return Simulator(sampler, data, volume, allowed, architecture.ego, sampling=c.sampling, chaining=chaining)
+    scenes = Scenes.load(given["behavior_data"], data.videos)
+    return Simulator(sampler, data, scenes, architecture.ego, sampling=c.sampling, chaining=chaining)
 
 
 def _loaded(load: Callable[[Path], T], folder: Path) -> T:

@@ -1,11 +1,15 @@
 """The exact list of training and test windows, and where in the room an animal may be."""
 
+from collections.abc import Iterable
+
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_dilation
 
 from pipeline.models.perception import FeatureVolume
-from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData, Trajectory, window_starts
+from pipeline.models.strides import STAYS_M_S
+from pipeline.models.support import marked, ranges
+from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory, window_starts
 
 
 def slice_windows(
@@ -22,11 +26,23 @@ def slice_windows(
 
 
 def allowed_voxels(volume: FeatureVolume, trajectories: dict[str, Trajectory], *, reach_voxels: int) -> UInt8[np.ndarray, "x y z"]:
-    """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of where it has been."""
+    """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of where it has been; there 2
+    right above something solid.
+    """
     visited = np.zeros(volume.occupancy.shape, bool)
     for trajectory in trajectories.values():
         voxel, inside = volume.voxel(trajectory.world_from_agent[trajectory.valid, :3, 3])
         visited[tuple(voxel[inside].T)] = True
     if reach_voxels > 0 and visited.any():
         visited = binary_dilation(visited, iterations=reach_voxels)
-    return ((volume.occupancy == 0) | visited).astype(np.uint8)
+    return marked((volume.occupancy == 0) | visited, volume.occupancy)
+
+
+def standing_heights(pairs: Iterable[tuple[FeatureVolume, Trajectory]]) -> Float[np.ndarray, "2 2"]:
+    """Return how high above what carries it the root is, see `Support.range_m`, of recordings in their scenes."""
+    seen = []
+    for volume, trajectory in pairs:
+        root = trajectory.world_from_agent[:, :3, 3]
+        speed = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0, prepend=root[:1, [0, 2]]), axis=-1) * RATE_HZ
+        seen.append((volume, root[trajectory.valid], (speed > STAYS_M_S)[trajectory.valid]))
+    return ranges(seen)

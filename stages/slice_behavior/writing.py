@@ -6,7 +6,7 @@ from pathlib import Path
 from pipeline.files import arrays
 from pipeline.models.perception import FeatureVolume
 from pipeline.models.trajectories import Trajectory
-from stages.slice_behavior.windows import allowed_voxels
+from stages.slice_behavior.windows import allowed_voxels, standing_heights
 
 
 def write_volumes(
@@ -16,12 +16,14 @@ def write_volumes(
 
     ``seen`` are the training recordings: only where they went counts as visited.
     """
+    scene = dict(zip(videos, volumes if len(volumes) > 1 else volumes * len(videos), strict=True))
+    stands_m = standing_heights((scene[id], trajectory) for id, trajectory in seen.items())
     if len(volumes) == 1:
         allowed = allowed_voxels(volumes[0], dict(seen), reach_voxels=reach_voxels)
-        arrays.save(folder / "volume.npz", compress=True, **vars(volumes[0]), allowed=allowed)
+        arrays.save(folder / "volume.npz", compress=True, **vars(volumes[0]), allowed=allowed, stands_m=stands_m)
         return
     (folder / "volumes").mkdir()
     for id, volume in zip(videos, volumes, strict=True):
         visited = {id: seen[id]} if id in seen else {}
         allowed = allowed_voxels(volume, visited, reach_voxels=reach_voxels)
-        arrays.save(folder / "volumes" / f"{id}.npz", compress=True, **vars(volume), allowed=allowed)
+        arrays.save(folder / "volumes" / f"{id}.npz", compress=True, **vars(volume), allowed=allowed, stands_m=stands_m)

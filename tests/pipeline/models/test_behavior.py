@@ -26,7 +26,7 @@ def data():
 @pytest.fixture(scope="module")
 def ats():
     channels = ARCHITECTURE.body_channels
-    scaling = Scaling(np.array([1.0, 0.1, 1.0]), np.ones(4) * 0.5, np.ones((3, 56)) * 0.5, np.zeros(channels), np.ones(channels) * 0.1)
+    scaling = Scaling(np.array([1.0, 0.1, 1.0]), np.full((1, 4), 0.5), np.ones((3, 56)) * 0.5, np.zeros(channels), np.ones(channels) * 0.1)
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)
     return Ats(sampler, room(), REST, "yaw", Sampling(goal_steps=4, sequence_steps=2))
 

@@ -113,7 +113,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
     channels = architecture.body_channels
     mean = np.zeros(channels)
     mean[[0, 4]] = 1.0
-    return nets, Scaling(np.ones(3), np.ones(4), path_std, mean, np.full(channels, 0.05))
+    return nets, Scaling(np.ones(3), np.ones((1, 4)), path_std, mean, np.full(channels, 0.05))
 
 
 def _teach_paths(nets: BehaviorNets, architecture: Architecture, schedule: Schedule, steps: int = 100) -> None:
@@ -155,6 +155,7 @@ def write(build: Path) -> None:
         features=rng.normal(0, 0.1, (16, *shape)).astype(np.float16),
         occupancy=np.zeros(shape, np.uint8),
         allowed=np.ones(shape, np.uint8),
+        stands_m=np.full((2, 2), np.nan),
         origin=np.array([-2.2, -0.2, -2.2]),
         voxel_m=np.array(0.1),
     )

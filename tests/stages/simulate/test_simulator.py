@@ -10,6 +10,7 @@ from pipeline.files import glb
 from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Sampler, TorchNetworks
+from pipeline.models.scenes import Scenes
 from pipeline.models.simulator import Chaining, Frames, Simulator, faded
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
@@ -25,7 +26,7 @@ def simulator():
     mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
     scaling = Scaling(
         np.array([0.3, 0.01, 0.3]),
-        np.array([0.5, 0.1, 0.5, 1.0]),
+        np.array([[0.5, 0.1, 0.5, 1.0]]),
         np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
         mean,
         np.full(channels, 0.05),
@@ -33,7 +34,14 @@ def simulator():
     volume = room()
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)
     sampling = Sampling(goal_steps=4, sequence_steps=2)
-    return Simulator(sampler, wandering(), volume, volume.occupancy == 0, "yaw", sampling=sampling, chaining=Chaining(candidates=3))
+    return Simulator(
+        sampler,
+        wandering(),
+        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
+        "yaw",
+        sampling=sampling,
+        chaining=Chaining(candidates=3),
+    )
 
 
 def test_same_seed_same_life_and_it_goes_on(simulator):

@@ -100,16 +100,16 @@ export class Sampler {
   async sampleGoals(question) {
     const observation = this.senses.observe(question.past, question.observer);
     const codes = await this.codes(observation, question.keep, question.interactivity);
-    const { scaled } = await this.think(codes, question);
+    const { scaled } = await this.think(observation.frame, codes, question);
     return { goals: this.goalsInWorld(observation.frame, scaled) };
   }
 
-  async think(codes, { seed, samples, steps, interactivity }) {
+  async think(frame, codes, { seed, samples, steps, interactivity }) {
     const draw = normals(seed);
     const options = { method: this.contract.sampling.method, draw, interactivity };
     const goalSteps = Math.max(steps, this.contract.sampling.goal_steps);
     const scaled = await this.goals(codes, samples, { ...options, noise: draw(3 * samples), steps: goalSteps });
-    return { scaled, options: { ...options, steps } };
+    return { scaled: this.rested(frame, scaled), options: { ...options, steps } };
   }
 
   goalsInWorld(frame, scaled) {
@@ -121,7 +121,7 @@ export class Sampler {
     const observation = this.senses.observe(question.past, question.observer);
     const { frame } = observation;
     const codes = await this.codes(observation, question.keep, question.interactivity);
-    const { scaled: dreamt, options } = await this.think(codes, question);
+    const { scaled: dreamt, options } = await this.think(frame, codes, question);
     if (question.path) return this.followed(frame, codes, question.path, options);
     const scaled = question.aim ? this.leg(frame, question.aim) : dreamt;
     const commanded = Boolean(question.aim);
@@ -132,7 +132,7 @@ export class Sampler {
     const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(this.stride * this.frames * tried.length) });
     if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
-    const path = paths.slice(3 * this.frames * best, 3 * this.frames * (best + 1));
+    const path = this.trodden(frame, codes.start, this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))));
     return { goals, chosen: tried[best], ...(await this.embodied(frame, codes, path, options)) };
   }
 
@@ -160,8 +160,23 @@ export class Sampler {
   // A plan along places that the visitor has drawn, points of the world, one a frame.
   async followed(frame, codes, places, options) {
     const egoFromWorld = inverse(frame);
-    const path = Float32Array.from(this.scaledPath(places.map((place) => apply(egoFromWorld, place))));
+    const path = this.trodden(frame, codes.start, places.map((place) => apply(egoFromWorld, place)));
     return { goals: [places.at(-1)], chosen: 0, ...(await this.embodied(frame, codes, path, options)) };
+  }
+
+  // Places of the ego frame as a scaled path on what carries the animal.
+  trodden(frame, start, places) {
+    const egoFromWorld = inverse(frame);
+    const world = this.senses.trodden(places.map((place) => apply(frame, place)), apply(frame, start), this.contract.strides.stays_m_s / this.contract.rate_hz);
+    return Float32Array.from(this.scaledPath(world.map((place) => apply(egoFromWorld, place))));
+  }
+
+  // Scaled goals, put on what carries an animal that rests.
+  rested(frame, scaled) {
+    const egoFromWorld = inverse(frame);
+    return Float32Array.from(this.goalsInWorld(frame, scaled).flatMap(([x, y, z]) => (
+      Array.from(this.scaled(apply(egoFromWorld, [x, this.senses.carried([x, y, z], false), z])))
+    )));
   }
 
   // The body along a scaled path, and both in the world.

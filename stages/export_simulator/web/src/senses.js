@@ -66,6 +66,37 @@ export class Senses {
     return a >= 0 && b >= 0 && c >= 0 && a < vx && b < vy && c < vz && this.allowed[(a * vy + b) * vz + c] > 0;
   }
 
+  // The height, nearest to a point's, at which what carries the animal bears its root; the point's own where nothing is
+  // known to. Counterpart of pipeline/models/support.py.
+  carried(point, moves) {
+    const { shape: [, vx, vy, vz], origin, voxel_m: voxel, support } = this.volume;
+    const [a, c] = [0, 2].map((axis) => Math.floor((point[axis] - origin[axis]) / voxel));
+    if (!support || a < 0 || c < 0 || a >= vx || c >= vz) return point[1];
+    const [low, high] = support.range_m[moves ? 1 : 0];
+    let nearest = Infinity;
+    for (let b = 0; b < vy; b++) {
+      if (this.allowed[(a * vy + b) * vz + c] !== support.mark) continue;
+      const top = origin[1] + b * voxel;
+      const height = Math.min(top + high, Math.max(top + low, point[1]));
+      if (Math.abs(height - point[1]) < Math.abs(nearest - point[1])) nearest = height;
+    }
+    return Number.isFinite(nearest) ? nearest : point[1];
+  }
+
+  // A path of the world, which begins a frame after `start`, on what carries the animal; steps become jumps.
+  trodden(path, start, fastest) {
+    const { support } = this.volume;
+    if (!support) return path;
+    const heights = path.map((place, i) => {
+      const before = i ? path[i - 1] : start;
+      return this.carried(place, Math.hypot(place[0] - before[0], place[2] - before[2]) > fastest);
+    });
+    const reach = (support.flight.length - 1) / 2;
+    const padded = [...Array(reach).fill(start[1]), ...heights, ...Array(reach).fill(heights.at(-1))];
+    const flown = heights.map((_, i) => support.flight.reduce((sum, share, k) => sum + share * padded[i + k], 0));
+    return path.map(([x, , z], i) => [x, Math.max(heights[i], flown[i]), z]);
+  }
+
   pastChannels(egoFromWorld, rows) {
     const root = compose(egoFromWorld, Array.from(rows.slice(0, ROW)));
     const channels = [...place(root), ...sixFromTurn(turn(root))];
