@@ -162,7 +162,8 @@ class Sampling:
     goal: bool = True
     """let the goal steer the path"""
     clear: bool = True
-    """move goals and paths out of what is solid while they are denoised, where a map is given and the scene perceived"""
+    """move goals and paths out of what is solid while they are denoised, and put them on what carries, where a map is given and
+    the scene perceived"""
     body_spread: float = 0.3
     """standard deviation of the noise that a body is drawn from: at 1 it trembles three times as much as the animal does,
     at 0.3 its bones turn from frame to frame as far as recorded ones do (measured on a session kept from training)"""

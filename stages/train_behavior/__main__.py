@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pipeline import cli, progress
+from pipeline.errors import InputError
 from pipeline.models.diffusion import Schedule
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TRAIN, BehaviorData, frames_from_seconds
@@ -63,6 +64,8 @@ def run(task: cli.Task) -> None:
     data = BehaviorData.load(task.input("behavior_data")).with_horizon(frames_from_seconds(c.horizon_s))
     scenes = Scenes.load(task.input("behavior_data"), data.videos)
     architecture = architecture_for(vars(c), data, scenes)
+    if c.reading == "pointwise" and not architecture.map_cells:
+        raise InputError("REC-002", "the 3-D encoder makes no map", "[train_behavior]: reading", 'scene = "pillars" makes one')
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
     fitted = train(data, scenes, architecture, c.schedule, c.training, seed=c.seed, resume=task.resume, device=task.device)
     with task.create() as folder:
