@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 
 from pipeline.models.scenes import Ground, Scenes
+from pipeline.models.support import Support, marked
 from pipeline.space import rigid
 from tests.pipeline.models.wandering import room
 
@@ -25,3 +28,20 @@ def test_ground_clears_in_every_agents_own_frame():
     world = rigid.apply(np.repeat(world_from_ego, 3, axis=0), cleared)
     assert not ground.scenes.inside_solid(world, None).any()
     np.testing.assert_allclose(cleared[:, :5], away[:, :5], atol=1e-9)
+
+
+def test_goals_rest_and_paths_tread_on_what_carries_in_every_agents_own_frame():
+    scene, range_m = room(), np.array([[0.15, 0.2], [0.18, 0.2]])
+    marks = marked(scene.occupancy != 1, scene.occupancy)
+    scenes = replace(Scenes.of(scene), supports=(Support.of(scene, marks, range_m),))
+    world_from_ego = rigid.make(rigid.rotation_from_vector(np.array([[0, 0.5, 0], [0, -2.0, 0]])), np.array([[1, 0.3, 0], [-1, 0.3, 1]]))
+    ground, rng = Ground(scenes, world_from_ego, None), np.random.default_rng(0)
+    plans = np.repeat(world_from_ego, 3, axis=0)
+    goals = rng.normal(0, 0.2, (6, 3))
+    world = rigid.apply(plans, ground.rested(goals)[:, None])[:, 0]
+    free = rigid.apply(plans, goals[:, None])[:, 0]
+    np.testing.assert_allclose(world[:, [0, 2]], free[:, [0, 2]], atol=1e-9)
+    np.testing.assert_allclose(world[:, 1], free[:, 1].clip(0.15, 0.2), atol=1e-9)
+    start, path = np.zeros((6, 3)), np.cumsum(rng.normal(0, 0.02, (6, 30, 3)), axis=1)
+    trodden = rigid.apply(plans, ground.trodden(path, start))
+    assert (trodden[:, :, 1] >= 0.15 - 1e-9).all() and (trodden[:, 5:, 1] <= 0.2 + 1e-9).all()  # it begins in the air
