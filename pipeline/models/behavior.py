@@ -34,8 +34,6 @@ from pipeline.models.strides import BREATH, FAINT, GOAL_POWER, ROOT, STAYS_M_S, 
 from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ
 from pipeline.space import rigid
 
-MEAN, SPREAD = 0.0, 1.0
-"""steps at which a Gaussian's networks, shown no sample, tell its mean and the logarithm of its standard deviation"""
 ROOT_CHANNELS = 6
 """the body's leading channels: the root's rotation in the ego frame, its first two columns"""
 
@@ -86,8 +84,8 @@ class Architecture:
 
     @property
     def condition(self) -> int:
-        """Length of all that is perceived: the maps of all minds and of the mirror image, its codes, what path and body are told."""
-        return (4 * MAP_KEY * self.map_cells**2 + 3 * self.code) * self.minds + self.told
+        """Length of all that is perceived: the maps of all minds, and what path and body are told."""
+        return 2 * MAP_KEY * self.map_cells**2 * self.minds + self.told
 
     @property
     def perception(self) -> PerceptionSize:
@@ -178,10 +176,7 @@ class BehaviorNets(nn.Module):
         super().__init__()
         a = architecture
         self.perception = Minds(a.perception, a.minds)
-        self.goal = GoalMLP(
-            3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds, map_cells=a.map_cells, reading=a.reading,
-            sideless=(int(SPREAD),) if a.family == "gaussian" else (),
-        )  # fmt: skip
+        self.goal = GoalMLP(3 * a.code, a.goal_hidden, a.goal_layers, schedule, minds=a.minds, map_cells=a.map_cells, reading=a.reading)
         match a.control:
             case "unet":
                 if a.map_cells and a.reading == "pointwise":

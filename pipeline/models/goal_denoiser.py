@@ -24,19 +24,17 @@ Reading = Literal["attention", "pointwise"]
 
 
 class GoalMLP(nn.Module):
-    """Six layers of 128 (appendix A.2) per mind. To sample, all minds are asked twice, about what is and about its mirror
-    image, and their answers are averaged: an animal that never went left has gone right.
+    """Six layers of 128 (appendix A.2) per mind, whose answers are averaged.
 
-    The condition holds the maps of all minds (of ``map_cells`` squared each, or none), then those of the mirror image, its
-    codes, the codes, and more that goals do not read; in training nothing of the mirror image. Training may ask where the animal is at another part of the 5.6 s (``horizon`` below 1), which teaches it more
+    The condition holds the maps of all minds (of ``map_cells`` squared each, or none), their codes, and more that goals do
+    not read. Training may ask where the animal is at another part of the 5.6 s (``horizon`` below 1), which teaches it more
     from as many minutes. All minds are asked in one product per layer: a plan for one animal is made of small products.
     """
 
     def __init__(
         self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *, minds: int = 1,
-        map_cells: int = 0, reading: Reading = "attention", sideless: tuple[int, ...] = (),
+        map_cells: int = 0, reading: Reading = "attention",
     ):  # fmt: skip
-        """At ``sideless`` steps the answer is no vector, but one number per axis that has no sign."""
         super().__init__()
         self.noise, self.code, self.minds, self.map_numbers = NoiseFromVelocity(schedule), code, minds, 2 * MAP_KEY * map_cells**2
         told = TIME_CHANNELS + HORIZON_CHANNELS + code
@@ -46,24 +44,15 @@ class GoalMLP(nn.Module):
         sizes = [3 + told + Staying.NUMBERS + (self.map.NUMBERS if self.map else 0)] + [hidden] * (layers - 1)
         inner = [layer for i, o in pairwise(sizes) for layer in (Linears(minds, i, o), nn.SiLU())]
         self.layers = nn.Sequential(*inner, Linears(minds, sizes[-1], 3))
-        self.register_buffer("mirror", torch.tensor([-1.0, 1.0, 1.0]), persistent=False)
-        sides = self.mirror.repeat(schedule.steps, 1)
-        sides[list(sideless)] = 1.0
-        self.register_buffer("sides", sides, persistent=False)
 
     def forward(
         self,
         x: Float[Tensor, "batch 3"],
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
+        horizon: Float[Tensor, "batch"] | None = None,
     ) -> Float[Tensor, "batch 3"]:
-        size = [self.minds * self.map_numbers] * 2 + [self.minds * self.code] * 2
-        maps, mirrored_maps, mirrored_codes, codes = condition[:, : sum(size)].split(size, dim=1)
-        both = torch.cat([torch.cat([maps, codes], dim=1), torch.cat([mirrored_maps, mirrored_codes], dim=1)])
-        twice = torch.cat([t, t])
-        answers = self.apart(torch.cat([x, x * self.mirror]), twice, both, torch.ones_like(twice)).mean(0)
-        here, there = answers.unflatten(0, (2, -1)).unbind(0)
-        return (here + there * self.sides[t.long()]) / 2
+        return self.apart(x, t, condition, torch.ones_like(t) if horizon is None else horizon).mean(0)
 
     def apart(
         self,

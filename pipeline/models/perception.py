@@ -250,16 +250,15 @@ class Perception(nn.Module):
         self.scene_null = nn.Parameter(torch.zeros(size.code))
         self.past_null = nn.Parameter(torch.zeros(size.code))
 
-    def look(
+    def forward(
         self,
         scene_grid: Float[Tensor, "batch channel 64 8 64"],
         observer_past: Float[Tensor, "batch frame*3"],
         past: Float[Tensor, "batch frame*channel"],
         keep: Float[Tensor, "batch 3"],
-        bones_keep: Float[Tensor, "batch"],
     ) -> Reading:
-        """Return map and code; ``keep`` holds 1 or 0 for scene, observer and past, ``bones_keep`` 0 hides remembered bones."""
-        return self.join(self.scene(scene_grid), observer_past, self.past(past, bones_keep), keep)
+        """``keep`` holds 1 or 0 for scene, observer and past."""
+        return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
 
     def training_code(
         self,
@@ -269,7 +268,7 @@ class Perception(nn.Module):
         keep: Float[Tensor, "batch 3"],
         bones_keep: Float[Tensor, "batch"],
     ) -> Reading:
-        """Return the same of a scene that is already averaged over blocks."""
+        """Return map and code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides remembered bones."""
         return self.join(self.scene.encode(pooled), observer_past, self.past(past, bones_keep), keep)
 
     def join(
@@ -289,9 +288,7 @@ class Perception(nn.Module):
 
 
 class Minds(nn.Module):
-    """Several perceptions side by side, each of which looks at what is and at its mirror image, where nobody knows which bone
-    is which. The code of the whole is the maps of all, those of the mirror image, its codes, the codes, pace and posture.
-    """
+    """Several perceptions side by side; the code of the whole is the maps of all, their codes, pace and posture."""
 
     HELD_FRAMES = 3
     """last frames that tell the pace, and whose mean is the posture"""
@@ -299,9 +296,6 @@ class Minds(nn.Module):
     def __init__(self, size: PerceptionSize, count: int):
         super().__init__()
         self.minds = nn.ModuleList(Perception(size) for _ in range(count))
-        side = torch.tensor([-1.0, 1.0, 1.0])
-        self.register_buffer("side", side, persistent=False)
-        self.register_buffer("sides", torch.cat([side, -side, side]), persistent=False)  # place, and the rotation's x and y axis
 
     def __iter__(self) -> Iterator[Perception]:
         return iter(self.minds)
@@ -314,31 +308,11 @@ class Minds(nn.Module):
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
-        frames = past.unflatten(1, (self.minds[0].past.frames, -1))
-        seen = scene_grid, observer_past, frames
-        both = [torch.cat(pair) for pair in zip(seen, self.mirrored(*seen), strict=True)]
-        known = torch.cat([torch.ones_like(keep[:, 0]), torch.zeros_like(keep[:, 0])])
-        readings = [mind.look(both[0], both[1], both[2].flatten(1), torch.cat([keep, keep]), known) for mind in self.minds]
-        parts = (torch.cat(part, dim=-1).unflatten(0, (2, -1)).unbind(0) for part in zip(*readings, strict=True))
-        (maps, mirrored_maps), (codes, mirrored_codes) = parts
-        return torch.cat([maps, mirrored_maps, mirrored_codes, codes, self.now(frames[:, -self.HELD_FRAMES :], keep[:, 2])], dim=-1)
-
-    def mirrored(
-        self,
-        scene_grid: Float[Tensor, "batch channel 64 8 64"],
-        observer_past: Float[Tensor, "batch frame*3"],
-        frames: Float[Tensor, "batch frame channel"],
-    ) -> tuple[Float[Tensor, "batch channel 64 8 64"], Float[Tensor, "batch frame*3"], Float[Tensor, "batch frame channel"]]:
-        """Exchange left and right."""
-        observer = (observer_past.unflatten(1, (-1, 3)) * self.side).flatten(1)
-        return (
-            scene_grid.flip(2),
-            observer,
-            torch.cat([frames[..., : len(self.sides)] * self.sides, frames[..., len(self.sides) :]], dim=-1),
-        )
+        frames = past.unflatten(1, (self.minds[0].past.frames, -1))[:, -self.HELD_FRAMES :]
+        return self.condition([mind(scene_grid, observer_past, past, keep) for mind in self.minds], self.now(frames, keep[:, 2]))
 
     def condition(self, readings: list[Reading], now: Float[Tensor, "batch pace+channel"]) -> Float[Tensor, "batch condition"]:
-        """Put what the minds read and what is now side by side, as training does, without a mirror image."""
+        """Put what the minds read and what is now side by side."""
         maps, codes = zip(*readings, strict=True)
         return torch.cat([*maps, *codes, now], dim=-1)
 

@@ -11,11 +11,13 @@ from typing import assert_never
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.models.behavior import MEAN, SPREAD, Architecture, Sampling, Scaling
+from pipeline.models.behavior import Architecture, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Array, Codes, Networks, Plan, Sampler
 from pipeline.models.strides import STRIDE
 
+MEAN, SPREAD = 0.0, 1.0
+"""Steps at which a Gaussian's networks, shown no sample, tell its mean and the logarithm of its standard deviation."""
 LOG_STD = (-5.0, 2.0)
 """Bounds of that logarithm."""
 

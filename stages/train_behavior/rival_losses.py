@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.models.behavior import MEAN, SPREAD, BehaviorNets
+from pipeline.models.behavior import BehaviorNets
 from pipeline.models.diffusion import Schedule
-from pipeline.models.rivals import LOG_STD
+from pipeline.models.rivals import LOG_STD, MEAN, SPREAD
 from pipeline.models.strides import STRIDE
 from stages.train_behavior.batches import Batch
 from stages.train_behavior.objective import Denoise, Objective, Part, kept, mean_of_known, perceive, sequence_rows, squared_error
@@ -22,7 +22,7 @@ def gaussian_losses(
     del schedule
     with torch.no_grad() if part == "sequences" else contextlib.nullcontext():
         code = perceive(nets, batch, objective, generator)
-        goal = negative_log_likelihood(lambda x, t: nets.goal.apart(x, t, code, torch.ones_like(t)).mean(0), batch.goal).mean()
+        goal = negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal).mean()
     told = {} if part == "sequences" else {"goal": goal}
     if part == "goals":
         return told

@@ -7,7 +7,7 @@ from pipeline.models.behavior import BehaviorNets
 from pipeline.models.perception import PACE_CHANNELS, FeatureVolume, world_from_ego
 from pipeline.models.planning import observe
 from pipeline.models.trajectories import Context
-from pipeline.space import rigid, rigid_torch
+from pipeline.space import rigid
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
 
 
@@ -64,34 +64,13 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
 def alike(code: torch.Tensor) -> list[bool]:
     """Tell of scene, observer and past whether two agents' codes are alike; pace and posture must be so where the past is."""
     now = PACE_CHANNELS + ARCHITECTURE.body_channels
-    codes = ARCHITECTURE.told - now
-    charts, minds, posture = code.split([ARCHITECTURE.condition - codes - ARCHITECTURE.told, 2 * codes, now], dim=1)
-    parts = minds.unflatten(1, (2 * ARCHITECTURE.minds, 3, -1))
+    maps = ARCHITECTURE.condition - ARCHITECTURE.told
+    charts, minds, posture = code.split([maps, ARCHITECTURE.told - now, now], dim=1)
+    parts = minds.unflatten(1, (ARCHITECTURE.minds, 3, -1))
     same = ((parts[0] - parts[1]).abs().amax((0, 2)) < 1e-7).tolist()
     assert bool((charts[0] == charts[1]).all()) == same[0]
     assert bool((posture[0] == posture[1]).all()) == same[2]
     return same
-
-
-def test_the_mirror_image_of_what_is_seen_is_what_is_seen_of_the_mirror_image():
-    nets = BehaviorNets(ARCHITECTURE).eval()
-    grid, observer, past = torch.randn(2, 16, 64, 8, 64), torch.rand(2, 24), torch.randn(2, 8, 9 + 18)
-    past[..., 9:] = nets.perception.minds[0].past.mean[9:]  # bones are hidden in a mirror
-    here = nets.perception(grid, observer, past.flatten(1), torch.ones(2, 3))
-    image = nets.perception.mirrored(grid, observer, past)
-    there = nets.perception(image[0], image[1], image[2].flatten(1), torch.ones(2, 3))
-    codes = ARCHITECTURE.told - PACE_CHANNELS - ARCHITECTURE.body_channels
-    maps = (ARCHITECTURE.condition - codes - ARCHITECTURE.told) // 2
-    sizes = [maps, maps, codes, codes, PACE_CHANNELS + ARCHITECTURE.body_channels]
-    (a, b, c, d, _), (e, f, g, h, _) = here.split(sizes, dim=1), there.split(sizes, dim=1)
-    for ours, theirs in ((a, f), (b, e), (c, h), (d, g)):
-        torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
-    assert (c - d).abs().max() > 1e-3, "left and right are told apart"
-    turn = rigid_torch.so3_exp(torch.randn(5, 3))
-    mirror = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
-    row = torch.cat([torch.zeros(5, 3), rigid_torch.rotation_to_6d(turn)], dim=1)
-    told = nets.perception.mirrored(grid, observer, row[None])[2][0, :, 3:]
-    torch.testing.assert_close(told, rigid_torch.rotation_to_6d(mirror @ turn @ mirror))
 
 
 def test_a_blind_model_never_sees_its_condition():
