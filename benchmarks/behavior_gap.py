@@ -61,13 +61,17 @@ def true_data(build: Path, ours: BehaviorData, videos: list[dict]) -> BehaviorDa
     return slice_windows(trajectories, test, rest, stride=1)
 
 
-def judged(data: BehaviorData, scenes: Scenes, settings: Config, effort: Effort) -> dict[str, float]:
-    """Train on the data and return the mean scores on its test windows."""
+def trained(data: BehaviorData, scenes: Scenes, settings: Config) -> Ats:
+    """Train a model on the data."""
     architecture = architecture_for(vars(settings), data, scenes)
     fitted = train(data, scenes, architecture, settings.schedule, settings.training, seed=settings.seed)
     sampler = sampler_of(architecture, TorchNetworks(fitted.nets), settings.schedule, fitted.scaling)
-    ats = Ats(sampler, scenes, data.agent_from_bone_rest, architecture.ego, Sampling())
-    found = scores(ats, data, architecture.family, effort)
+    return Ats(sampler, scenes, data.agent_from_bone_rest, architecture.ego, Sampling())
+
+
+def judged(data: BehaviorData, scenes: Scenes, settings: Config, effort: Effort) -> dict[str, float]:
+    """Train on the data and return the mean scores on its test windows."""
+    found = scores(trained(data, scenes, settings), data, settings.family, effort)
     return {name: float(value.mean()) for name, value in found.items() if "/" in name}
 
 

@@ -16,18 +16,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 
+from benchmarks.behavior_gap import trained
 from pipeline import config, figures
 from pipeline.files import images
-from pipeline.models.behavior import Sampling
-from pipeline.models.planning import TorchNetworks
 from pipeline.models.predictors import Ats
-from pipeline.models.rivals import sampler_of
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, TEST, TRAIN, BehaviorData, Trajectory
+from pipeline.models.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory
 from stages.slice_behavior.windows import slice_windows
 from stages.train_behavior.__main__ import Config
-from stages.train_behavior.outcome import architecture_for
-from stages.train_behavior.training import train
 
 HIGH_M = 0.25
 """a root this much higher than usual is on top of something"""
@@ -112,14 +108,6 @@ def moments(data: BehaviorData, usual_m: float, stride: int) -> Moments:
     return Moments(off[::stride], stays[::stride], len(jumps))
 
 
-def trained(data: BehaviorData, scenes: Scenes, settings: Config) -> Ats:
-    """Train a model on the data."""
-    architecture = architecture_for(vars(settings), data, scenes)
-    fitted = train(data, scenes, architecture, settings.schedule, settings.training, seed=settings.seed)
-    sampler = sampler_of(architecture, TorchNetworks(fitted.nets), settings.schedule, fitted.scaling)
-    return Ats(sampler, scenes, data.agent_from_bone_rest, architecture.ego, Sampling())
-
-
 def paths(ats: Ats, data: BehaviorData, index: Int[np.ndarray, "window"]) -> Float[np.ndarray, "window sample frame 3"]:
     """Sample paths of some windows, in the world."""
     return ats.sample(data.windows(index)[0], SAMPLES, np.random.default_rng(0)).path
@@ -150,7 +138,7 @@ def picture(models: dict[str, Ats], data: BehaviorData, met: Moments, usual_m: f
     grid = figure.subplots(len(models), SHOWN, squeeze=False, sharex=True, sharey=True)
     for row, (name, ats) in zip(grid, models.items(), strict=True):
         for axis, sampled, true in zip(row, paths(ats, data, index), future.path_world, strict=True):
-            seconds = np.arange(1, len(true) + 1) / 10
+            seconds = np.arange(1, len(true) + 1) / RATE_HZ
             axis.plot(seconds, sampled[:, :, 1].T - usual_m, color="#c44e52", linewidth=0.8, alpha=0.6)
             axis.plot(seconds, true[:, 1] - usual_m, color="black", linewidth=1.5)
         row[0].set_ylabel(f"{name}\nheight [m]")

@@ -202,8 +202,9 @@ def approached(agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray,
 def statistics_from_windows(windows: Windows, turn_rad: float, *, per_frame: bool = False) -> Statistics:
     """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past to at most 8,192 windows.
 
-    Strides are scaled in all frames alike or, with ``per_frame``, in each on its own, as the released code scales. The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is remembered of
-    a body is scaled as the body is.
+    Strides are scaled in all frames alike or, with ``per_frame``, in each on its own, as the released code scales. The root's
+    rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is remembered of a body is scaled
+    as the body is.
     """
     some = torch.arange(0, len(windows), -(-len(windows) // ENOUGH))
     tracks, rows = windows.tracks(some), windows.frame[some]

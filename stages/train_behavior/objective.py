@@ -16,6 +16,7 @@ from stages.train_behavior.batches import Batch
 Denoise = Callable[[Tensor, Tensor], Tensor]
 """From noisy samples and their steps to the noise"""
 Weighting = Literal["noise", "velocity", "flow"]
+"""Which error counts evenly at all steps, see `squared_error`"""
 Part = Literal["goals", "sequences", "all"]
 """What learns: perception and goals; path and body, of a perception that rests; or all at once"""
 
