@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import nn
 
 from pipeline.models.behavior import (
@@ -24,7 +24,7 @@ from pipeline.models.behavior import (
 from pipeline.models.diffusion import Schedule, guided, sample
 from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
 from pipeline.models.scenes import Ground, Scenes
-from pipeline.models.strides import STRIDE, led
+from pipeline.models.strides import STRIDE, led, missed
 from pipeline.models.trajectories import PAST, Context
 from pipeline.space import rigid
 
@@ -128,6 +128,11 @@ class Codes:
     count: int = 1
     """plans of what is perceived once, whose rows are alike and stand together"""
 
+    def __getitem__(self, some: Int[np.ndarray, "some"]) -> "Codes":
+        """Return some of the rows, each on its own."""
+        ground = None if self.ground is None else self.ground[some // self.count]
+        return Codes(self.full[some], self.blind[some], self.start[some], ground)
+
     def kept(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan frame 3"]:
         """Keep paths in metres where the agent may be, and on what carries it."""
         return path if self.ground is None else self.ground.trodden(self.ground.cleared(path), self.start)
@@ -194,7 +199,22 @@ class Sampler:
     def paths(
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 56 3"]:
-        """Draw paths to goals; the reference of the guidance sees neither observer nor goal."""
+        """Draw paths to goals, and others for those that do not get there although the goal is all that guidance tells."""
+        path = self.walked(codes, goal, sampling, rng)
+        for _ in range(sampling.path_draws - 1 if sampling.goal and sampling.guidance >= 1 else 0):
+            off = missed(path, codes.start, goal)
+            again = np.flatnonzero(off > 1)
+            if not len(again):
+                break
+            other = self.walked(codes[again], goal[again], sampling, rng)
+            closer = missed(other, codes.start[again], goal[again]) < off[again]
+            path[again[closer]] = other[closer]
+        return path
+
+    def walked(
+        self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
+    ) -> Float[np.ndarray, "plan 56 3"]:
+        """Draw a path towards each goal; the reference of the guidance sees neither observer nor goal."""
         control = self.scaling.scaled_goal(goal)
 
         def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
@@ -202,7 +222,8 @@ class Sampler:
 
         pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
         shape = len(goal), STRIDE, self.scaling.path_std.shape[1]
-        path = self._drawn(*pair, shape, sampling, sampling.sequence_steps, rng, lambda x: self.paths_cleared(codes, x))
+        drawn = replace(sampling, method="ddim")
+        path = self._drawn(*pair, shape, drawn, sampling.sequence_steps, rng, lambda x: self.paths_cleared(codes, x))
         return self.paths_finished(codes, path, goal, sampling)
 
     def bodies(

@@ -55,10 +55,10 @@ class GaussianSampler(Sampler):
         """Draw goals in the ego frame, metres."""
         return self.scaling.goal(self.goals_cleared(codes, self._drawn_from(self._goal(codes), rng)))
 
-    def paths(
+    def walked(
         self, codes: Codes, goal: Float[np.ndarray, "plan 3"], sampling: Sampling, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw paths to goals."""
+        """Draw a path towards each goal."""
         return self.paths_finished(codes, self._drawn_from(self._path(codes, goal, sampling), rng), goal, sampling)
 
     def bodies(

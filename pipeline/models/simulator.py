@@ -1,21 +1,22 @@
 """The behaviour model as an environment: `reset(seed)`, then `step(observer)` ten times a second.
 
-Each step plays one frame of the current plan. Every ``replan_frames`` a new plan is sampled from the last 8 frames and
-faded in over ``fade_frames``. Where a plan leaves the allowed voxels, others are drawn and the best is taken, so that
-chaining does not drift through walls. `Flock` lets many animals live at once, `Simulator` one.
+Each step plays one frame of the current plan. A plan is followed until it ends or the observer has moved noticeably; the
+next one is sampled from the last 8 frames and faded in. An animal that was asked anew all the time would change its mind
+in the middle of every walk and put off the next one. Where a plan leaves the allowed voxels, others are drawn and the best
+is taken, so that chaining does not drift through walls. `Flock` lets many animals live at once, `Simulator` one.
 """
 
 from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels, channels_from_bones
 from pipeline.models.perception import Ego, world_from_ego
 from pipeline.models.planning import Observation, Sampler, observe
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context
+from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, TRAIN, BehaviorData, Context
 from pipeline.space import rigid
 
 
@@ -36,8 +37,11 @@ class State:
 class Chaining:
     """How plans follow each other."""
 
-    replan_frames: int = 8
-    """frames of a plan that are played before the next one"""
+    reaction_frames: int = 8
+    """frames of a plan that are played before another one may follow it"""
+    noticeable: float = 0.25
+    """how far the observer must have moved since then for a plan to be dropped, as a share of how far off it is; none
+    is dropped where this is infinite"""
     fade_frames: int = 4
     """frames over which the next plan is faded in"""
     candidates: int = 8
@@ -71,31 +75,52 @@ class Flock:
         past = Frames(context.world_from_agent, bones)
         self.past = deque((past[frame : frame + 1] for frame in range(PAST)), PAST)
         self.observer = deque(np.swapaxes(context.observer_world, 0, 1), PAST)
-        self.played = 0
-        self.plan, self.goal, self.blocked = self._planned()
+        everyone = np.arange(len(past.root))
+        self.plan, self.goal, self.blocked = self._planned(everyone)
+        self.played, self.noticed = np.zeros(len(everyone), int), self.observer[-1].astype(float)
 
     def step(self, observer: Float[np.ndarray, "animal 3"]) -> Frames:
         """Let 0.1 s pass with the observers at these positions (metres, world), and return the frame that comes of it."""
         self.observer.append(np.asarray(observer, float))
-        if self.played >= self.chaining.replan_frames:
-            rest_of_plan = self.plan[self.played :]
-            self.plan, self.goal, self.blocked = self._planned()
-            self.plan = faded(rest_of_plan, self.plan, self.chaining.fade_frames)
-            self.played = 0
-        self.past.append(self.plan[self.played : self.played + 1])
+        due = np.flatnonzero(self._due())
+        if len(due):
+            self._follow(due)
+        now = np.arange(len(self.played))
+        self.past.append(Frames(self.plan.root[now, self.played][:, None], self.plan.bones[now, self.played][:, None]))
         self.played += 1
         return self.past[-1]
 
-    def _planned(self) -> tuple[Frames, Float[np.ndarray, "animal 3"], Float[np.ndarray, "animal"]]:
-        """Draw a plan for each animal, and more where it is blocked, of which the first that is blocked least is taken."""
-        root = np.concatenate([frame.root for frame in self.past], axis=1)
-        bones = bones_from_channels(np.concatenate([frame.bones for frame in self.past], axis=1), self.rest)
-        observation = observe(Context(root, bones, np.stack(self.observer, axis=1), self.video), self.scenes, self.rest, self.ego)
+    def reconsider(self) -> None:
+        """Let every plan be dropped as soon as another one may follow it."""
+        self.noticed = np.full_like(self.noticed, np.inf)
+
+    def _due(self) -> Bool[np.ndarray, "animal"]:
+        """Return whose plan ends, or was made before the observer moved noticeably, where it is perceived."""
+        moved = np.linalg.norm(self.observer[-1] - self.noticed, axis=-1)
+        away = np.linalg.norm(self.observer[-1] - self.past[-1].root[:, 0, :3, 3], axis=-1)
+        dropped = self.sampling.observer & (self.played >= self.chaining.reaction_frames) & (moved > self.chaining.noticeable * away)
+        return dropped | (self.played >= FUTURE - self.chaining.fade_frames)
+
+    def _follow(self, some: Int[np.ndarray, "some"]) -> None:
+        """Let some of the animals go over to a new plan."""
+        plan, self.goal[some], self.blocked[some] = self._planned(some)
+        for mine, animal in enumerate(some):
+            left = Frames(self.plan.root[animal, self.played[animal] :], self.plan.bones[animal, self.played[animal] :])
+            new = faded(left, Frames(plan.root[mine], plan.bones[mine]), self.chaining.fade_frames)
+            self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
+        self.played[some], self.noticed[some] = 0, self.observer[-1][some]
+
+    def _planned(self, some: Int[np.ndarray, "some"]) -> tuple[Frames, Float[np.ndarray, "some 3"], Float[np.ndarray, "some"]]:
+        """Draw a plan for some of the animals, and more where it is blocked, of which the first that is blocked least is taken."""
+        root = np.concatenate([frame.root for frame in self.past], axis=1)[some]
+        bones = bones_from_channels(np.concatenate([frame.bones for frame in self.past], axis=1)[some], self.rest)
+        video = None if self.video is None else self.video[some]
+        observation = observe(Context(root, bones, np.stack(self.observer, axis=1)[some], video), self.scenes, self.rest, self.ego)
         frame = world_from_ego(root[:, -1], self.ego)
-        goal, path, blocked = self._courses(observation, frame, np.arange(len(root)), 1)
+        goal, path, blocked = self._courses(observation, frame, video, 1)
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
-            others = self._courses(observation, frame, again, self.chaining.candidates - 1)
+            others = self._courses(observation[again], frame[again], None if video is None else video[again], self.chaining.candidates - 1)
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]
@@ -103,15 +128,15 @@ class Flock:
         return Frames(plan.world_from_agent(frame), plan.body[..., ROOT_CHANNELS:]), rigid.apply(frame, plan.goal[:, None])[:, 0], blocked
 
     def _courses(
-        self, observation: Observation, frame: Float[np.ndarray, "animal 4 4"], some: Int[np.ndarray, "some"], count: int
+        self, observation: Observation, frame: Float[np.ndarray, "some 4 4"], video: Int[np.ndarray, "some"] | None, count: int
     ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some 56 3"], Float[np.ndarray, "some"]]:
-        """Return the least blocked of ``count`` goals and paths for some of the animals, and how much of it is not allowed."""
-        codes = self.sampler.codes(observation[some], self.sampling, count)
+        """Return the least blocked of ``count`` goals and paths for each observation, and how much of it is not allowed."""
+        codes = self.sampler.codes(observation, self.sampling, count)
         goals = self.sampler.goals(codes, self.sampling, self.rng)
         paths = self.sampler.paths(codes, goals, self.sampling, self.rng)
-        world = rigid.apply(np.repeat(frame[some], count, axis=0), paths).reshape(len(some), count, -1, 3)
-        blocked = self.scenes.inside_solid(world, None if self.video is None else self.video[some]).mean(-1)
-        best = np.arange(len(some)) * count + blocked.argmin(1)
+        world = rigid.apply(np.repeat(frame, count, axis=0), paths).reshape(len(frame), count, -1, 3)
+        blocked = self.scenes.inside_solid(world, video).mean(-1)
+        best = np.arange(len(frame)) * count + blocked.argmin(1)
         return goals[best], paths[best], blocked.min(1)
 
 

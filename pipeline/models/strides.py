@@ -19,11 +19,13 @@ STRIDE = 4
 """numbers of a stride: the root of the velocity (of m/s) along x, y, z, and 1 where the animal moves, -1 where it stays"""
 STAYS_M_S = 0.05
 """speed below which an animal stays: it breathes, and reconstructions err"""
-BREATH = 0.3
-"""share of a sampled stride that is left of it where the animal stays; the rest is noise (measured on a home kept from
+BREATH = 0.6
+"""share of a sampled stride that is left of it where the animal stays; the rest is noise (measured on homes kept from
 training, where what is left moves as much as resting animals do)"""
 ROOT, GOAL_POWER = 0.5, 0.7
 """powers of lengths: of velocities, and of the ways to goals (0.7 measured ahead of 0.5 and 1 on a home kept from training)"""
+REACH_M, REACH = 0.1, 0.25
+"""how far from its goal, at most, a path ends that gets there: in metres, or as a share of the way where that is more"""
 FAINT = 1e-12
 """square of a length, in square metres, that has no direction"""
 
@@ -55,6 +57,14 @@ def bent(
     velocity = np.diff(path, axis=-2, prepend=start[..., None, :]) * RATE_HZ
     root = powered(velocity, ROOT) / np.where(strides[..., 3:] > 0, 1.0, BREATH)
     return np.concatenate([root, strides[..., 3:]], axis=-1)
+
+
+def missed(
+    path: Float[np.ndarray, "*batch frame 3"], start: Float[np.ndarray, "*batch 3"], goal: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch"]:
+    """Return how far from their goals paths end, in parts of what still counts as there: more than 1 does not."""
+    reach = np.maximum(REACH_M, REACH * np.linalg.norm(goal - start, axis=-1))
+    return np.linalg.norm(path[..., -1, :] - goal, axis=-1) / reach
 
 
 def led(

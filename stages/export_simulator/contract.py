@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.files.glb import Skin
+from pipeline.models.simulator import Chaining
 from pipeline.space import rigid
 from stages.export_simulator.actions import Motion
 
@@ -63,6 +64,7 @@ def contract(
             for motion, start in zip(motions, starts[:-1], strict=True)
         ],
         "volume": volume,
+        "chaining": vars(Chaining()),
         "behavior": behavior,
     }
 

@@ -10,7 +10,8 @@ from stages.simulate.observers import Observer
 
 def chained_goals(simulator: Simulator, observer: Observer, count: int, seed: int) -> list[Subgoal]:
     """Return the start and ``count`` goals, 5.6 s apart; the simulator must play each plan to its end."""
-    assert simulator.flock.chaining.replan_frames == FUTURE, simulator.flock.chaining
+    chaining = simulator.flock.chaining
+    assert np.isinf(chaining.noticeable) and not chaining.fade_frames, chaining
     state = simulator.reset(seed)
     found = [Subgoal(state.world_from_agent[:3, 3], _heading(state.world_from_agent), 0.0)]
     for number in range(1, count + 1):

@@ -88,7 +88,10 @@ class Live:
 
     def step(self) -> None:
         """Let 0.1 s pass with the person where the visitor has put it."""
-        self.simulator.flock.sampling = replace(self.simulator.flock.sampling, guidance=float(self.interactivity.value))
+        flock, guidance = self.simulator.flock, float(self.interactivity.value)
+        if guidance != flock.sampling.guidance:
+            flock.sampling = replace(flock.sampling, guidance=guidance)
+            flock.reconsider()
         position = np.array(self.person.position, float)
         self.states.append(self.simulator.step(position))
         self.seen.append(position)

@@ -21,7 +21,7 @@ from pipeline.models.short_motions import RATE_HZ, Moving, stretches
 from pipeline.models.simulator import Simulator
 from pipeline.models.subgoals import Subgoal, brought_in, preferred
 from pipeline.models.surroundings import Surroundings
-from pipeline.models.trajectories import FUTURE, TRAIN, BehaviorData
+from pipeline.models.trajectories import TRAIN, BehaviorData
 from stages.simulate import journey_files
 from stages.simulate.chained_goals import chained_goals
 from stages.simulate.live import Live, Look
@@ -99,7 +99,7 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
     if written is not None:
         subgoals = written
     elif c.places == "behavior":
-        simulator = _simulator(given, data, c, replace(c.chaining, replan_frames=FUTURE, fade_frames=0), device)
+        simulator = _simulator(given, data, c, replace(c.chaining, noticeable=np.inf, fade_frames=0), device)
         drawn = chained_goals(simulator, _observer(data, c), c.place_count, c.seed)
         subgoals = brought_in(drawn, world.scene, world.model.habits)
     else:

@@ -11,20 +11,24 @@ from pipeline.models.trajectories import PAST, RATE_HZ, TEST, BehaviorData
 
 REST_M_S = 0.05
 """speed below which an animal rests: it breathes, and reconstructions err by more"""
+RARELY = 0.999
+"""share of recorded time in which an animal is nearer to upright than what counts as tilted"""
 
 
 def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds: float, seed: int) -> dict[str, float]:
     """Return the share of time inside something solid or outside, and Kolmogorov-Smirnov distances of speeds.
 
     Truth against truth compares each test recording (each half, if there is one) with the others. ``moving`` counts all
-    speeds of an animal that rests as one.
+    speeds of an animal that rests as one. ``tilted`` is the share of time further from upright than recorded animals mostly are.
     """
     rng, test = np.random.default_rng(seed), data.indices(TEST)
     chosen = test[(np.arange(count) * len(test)) // count + rng.integers(max(len(test) // count, 1), size=count)]
-    lived = rollouts(ats, data, scenes, chosen, seconds, rng)
+    poses = rollouts(ats, data, scenes, chosen, seconds, rng)
+    lived, tilt = poses[..., :3, 3], _tilts(poses)
     solid = scenes.inside_solid(lived, data.video[chosen]).mean(1)
     recorded = [data.trajectories[data.videos[video]] for video in np.unique(data.video[test])]
     true = [_speeds(t.world_from_agent[:, :3, 3])[t.valid[1:] & t.valid[:-1]] for t in recorded]
+    tilted = np.quantile(np.concatenate([_tilts(t.world_from_agent[t.valid]) for t in recorded]), RARELY)
     speeds, whole = [_speeds(life) for life in lived], np.concatenate(true)
     return {
         "behavior/ats/chain_rollouts": float(count),
@@ -35,6 +39,7 @@ def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds
         "behavior/ats/chain_speed_ks_pooled": _apart(np.concatenate(speeds), whole),
         "behavior/ats/chain_moving_speed_ks": float(np.mean([_apart(each, whole, REST_M_S) for each in speeds])),
         "behavior/ats/chain_moving_speed_ks_pooled": _apart(np.concatenate(speeds), whole, REST_M_S),
+        "behavior/ats/chain_tilted_share": float(np.mean(tilt > tilted)),
         "behavior/ats/chain_rest_share": float(np.mean(np.concatenate(speeds) < REST_M_S)),
         "behavior/true/chain_speed_ks": _among(true),
         "behavior/true/chain_moving_speed_ks": _among(true, REST_M_S),
@@ -44,17 +49,22 @@ def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds
 
 def rollouts(
     ats: Ats, data: BehaviorData, scenes: Scenes, window: Int[np.ndarray, "life"], seconds: float, rng: np.random.Generator
-) -> Float[np.ndarray, "life frame 3"]:
+) -> Float[np.ndarray, "life frame 4 4"]:
     """Let the model go on from some windows, in their homes, with their observers walking as recorded, over and over."""
     flock = Flock(ats.sampler, scenes, data.agent_from_bone_rest, ats.ego, sampling=ats.sampling, chaining=Chaining())
     context, _ = data.windows(window)
     walks = [data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]]
     flock.begin(context, rng)
-    path = [context.world_from_agent[:, -1, :3, 3]]
+    root = [context.world_from_agent[:, -1]]
     for step in range(round(seconds * RATE_HZ)):
         seen = [walk[(start + PAST + step) % len(walk)] for walk, start in zip(walks, data.start[window], strict=True)]
-        path.append(flock.step(np.array(seen)).root[:, 0, :3, 3])
-    return np.stack(path, axis=1)
+        root.append(flock.step(np.array(seen)).root[:, 0])
+    return np.stack(root, axis=1)
+
+
+def _tilts(world_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:
+    """Return how far from upright roots are, radians."""
+    return np.arccos(np.clip(world_from_agent[..., 1, 1], -1, 1))
 
 
 def _speeds(path: Float[np.ndarray, "frame 3"]) -> Float[np.ndarray, "step"]:

@@ -41,6 +41,12 @@ class Augmentation:
     """standard deviation of a shift of the observer's whole past"""
     past: float = 0.3
     """standard deviation of noise on the remembered motion, in its own standard deviations"""
+    lapse: float = 0.5
+    """probability that the posture that is remembered is off, as sampled ones are: else what is off stays and adds up"""
+    lapse_rad: float = 0.15
+    """standard deviation of the tilt of the root's posture then"""
+    lapse_bones: float = 0.3
+    """standard deviation of that of its bones, in their own standard deviations"""
     hide_bones: float = 0.5
     """probability that a sample's remembered bones are hidden"""
     approached: float = 0.1
@@ -280,7 +286,16 @@ def draw_batch(
     shift = torch.randn(size, 1, 3, generator=generator) * augmentation.observer_m
     observer = (tracks.observer + shift) @ new_from_old.mT
     frames = windows.frame[index]
-    remembered = body_channels(rotation[:, :PAST], windows.bones[frames[:, :PAST]])
+    lapsed = (uniform(size, 1) < augmentation.lapse).float()
+    tilt = torch.randn(size, 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0]) * augmentation.lapse_rad * lapsed
+    bones = windows.bones[frames[:, :PAST]]
+    off = (
+        torch.randn(size, bones.shape[-1], generator=generator)
+        * statistics.past_std[-bones.shape[-1] :]
+        * augmentation.lapse_bones
+        * lapsed
+    )
+    remembered = body_channels(rigid_torch.so3_exp(tilt)[:, None] @ rotation[:, :PAST], bones + off[:, None])
     past = torch.cat([root[:, :PAST], remembered], dim=-1)
     held = past[:, -Minds.HELD_FRAMES :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past

@@ -3,6 +3,7 @@
 import json
 import logging
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,11 +113,11 @@ def golden_observation(a: Architecture) -> Observation:
 def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
     """Sample one plan by DDIM and note its input, its noise and its result."""
     observation = golden_observation(architecture)
-    sampling = Sampling(method="ddim", goal_steps=10, sequence_steps=10)
+    sampling = Sampling(method="ddim", goal_steps=10, sequence_steps=10, path_draws=1)
     noise = np.random.default_rng(0)
     shapes = {"goal": (1, 3), "path": (1, STRIDE, architecture.future), "body": (1, architecture.body_channels, architecture.future)}
     drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}
-    plans = {f"guidance_{s:g}": sampler.plan(observation, Sampling("ddim", 10, 10, s), np.random.default_rng(0)) for s in (1.0, 0.5)}
+    plans = {f"guidance_{s:g}": sampler.plan(observation, replace(sampling, guidance=s), np.random.default_rng(0)) for s in (1.0, 0.5)}
     return {
         "input": {
             "scene_grid": "scene_grid.flat[i] = 0.25 sin(0.01 i)",

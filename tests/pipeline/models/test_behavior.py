@@ -13,6 +13,7 @@ from pipeline.models.behavior import (
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Plan, Sampler, TorchNetworks, observe
 from pipeline.models.predictors import Ats, ConstantVelocity, LocationPrior, StandStill
+from pipeline.models.strides import missed
 from pipeline.models.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.space import rigid
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
@@ -69,6 +70,22 @@ def test_given_goal_and_path_replace_their_levels(ats, data):
     plan = ats.sampler.plan(observation, ats.sampling, np.random.default_rng(0), goal=goal, path=path)
     np.testing.assert_allclose(plan.goal, goal, atol=1e-6)
     np.testing.assert_allclose(plan.path, path, atol=1e-6)
+
+
+def test_paths_that_miss_their_goals_are_drawn_again(ats, data):
+    context, _ = data.windows(data.indices(TEST)[::20])
+    codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), replace(ats.sampling, clear=False), 8)
+    goal = codes.start + np.random.default_rng(0).normal(0, 0.4, codes.start.shape)
+
+    def misses(**changes):
+        path = ats.sampler.paths(codes, goal, replace(ats.sampling, **changes), np.random.default_rng(1))
+        return missed(path, codes.start, goal)
+
+    once, often = misses(path_draws=1), misses(path_draws=4)
+    assert (once > 1).sum() > (often > 1).sum(), "networks that have learned nothing get there by luck"
+    assert (often <= once).all() and (often == once)[once <= 1].all()
+    np.testing.assert_array_equal(misses(path_draws=4, guidance=0.5), misses(path_draws=1, guidance=0.5), "half a goal binds nobody")
+    np.testing.assert_array_equal(misses(path_draws=4, goal=False), misses(path_draws=1, goal=False))
 
 
 def test_bodies_spread_as_far_as_they_are_told(ats, data):

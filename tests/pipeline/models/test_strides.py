@@ -28,7 +28,7 @@ def test_paths_survive_their_strides_and_rest_is_told():
 
 def test_what_sampling_leaves_of_noise_does_not_move_an_animal_that_stays():
     path, start = stroll()
-    noisy = strides_of(path, start) + 0.1 * np.random.default_rng(1).standard_normal((20, 56, 4))
+    noisy = strides_of(path, start) + 0.05 * np.random.default_rng(1).standard_normal((20, 56, 4))
     speed = np.linalg.norm(np.diff(path_from_strides(noisy, start), axis=1), axis=-1) * 10
     assert np.median(speed[:, 42:]) < 0.005 and speed[:, 42:].max() < 0.05
     places = path + 0.1 * np.random.default_rng(1).standard_normal(path.shape)

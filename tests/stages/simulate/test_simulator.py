@@ -11,7 +11,7 @@ from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.scenes import Scenes
-from pipeline.models.simulator import Chaining, Frames, Simulator, faded
+from pipeline.models.simulator import Chaining, Flock, Frames, Simulator, faded
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.simulate.live import Live, Look
@@ -66,6 +66,36 @@ def test_animals_of_a_flock_go_on_from_their_own_windows(simulator):
     start = context.world_from_agent[:, -1, :3, 3]
     assert (np.linalg.norm(lives[:, 0, :3, 3] - start, axis=-1) < 0.3).all()
     assert np.linalg.norm(start[:, None] - start, axis=-1)[~np.eye(3, dtype=bool)].min() > 0.1
+
+
+def test_plans_are_followed_until_they_end_or_the_observer_moves(simulator):
+    context, _ = simulator.data.windows(np.array([0, 40]))
+    flock, person = simulator.flock, np.array([[0.5, 1.3, 0.5], [0.5, 1.3, 0.5]])
+
+    def begin():
+        flock.begin(replace(context, video=None, observer_world=np.repeat(person[:, None], 8, 1)), np.random.default_rng(0))
+        return flock.goal.copy()
+
+    first, changed = begin(), []
+    for _ in range(60):
+        flock.step(person)
+        changed.append((flock.goal != first).any(1))
+    assert [int(np.argmax(of_one)) for of_one in np.array(changed).T] == [52, 52], "56 frames, of which 4 fade"
+    first, near = begin(), person + np.array([[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    for frame in range(12):
+        flock.step(near)
+        assert (flock.goal != first).any(1).tolist() == [frame >= 8, False], frame
+    begin()
+    flock.reconsider()
+    for _ in range(9):
+        flock.step(person)
+    assert (flock.goal != first).any(1).all()
+    blind = Flock(flock.sampler, flock.scenes, flock.rest, "yaw", sampling=replace(flock.sampling, observer=False), chaining=Chaining())
+    blind.begin(replace(context, video=None), np.random.default_rng(0))
+    first = blind.goal.copy()
+    for frame in range(40):
+        blind.step(person * frame)
+    np.testing.assert_array_equal(blind.goal, first)
 
 
 def test_fading_leaves_the_old_plan_and_reaches_the_new_one():

@@ -36,6 +36,7 @@ def test_breathing_is_rest_and_rest_is_one_speed():
     tested = data.trajectories[data.videos[-1]]
     speed = np.linalg.norm(np.diff(tested.world_from_agent[:, :3, 3], axis=0), axis=-1) * RATE_HZ
     assert found["behavior/ats/chain_rest_share"] == 1 and found["behavior/ats/chain_solid_share"] == 0
+    assert found["behavior/ats/chain_tilted_share"] == 0, "upright all the time"
     assert found["behavior/true/chain_rest_share"] == pytest.approx((speed < chaining.REST_M_S).mean())
     assert found["behavior/ats/chain_moving_speed_ks"] == pytest.approx((speed > chaining.REST_M_S).mean())
     assert found["behavior/ats/chain_moving_speed_ks"] <= found["behavior/ats/chain_speed_ks"]

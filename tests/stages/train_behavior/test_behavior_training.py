@@ -38,7 +38,7 @@ from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.training import Optimization, Settings, initial_nets, train, two_cosines
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
 
-PLAIN = Augmentation(turn=0, yaw_rad=0, mirror=0, observer_m=0, past=0, hide_bones=0)
+PLAIN = Augmentation(turn=0, yaw_rad=0, mirror=0, observer_m=0, past=0, lapse=0, hide_bones=0)
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +115,21 @@ def test_approaches_from_rare_distances_are_asked_as_often():
     observer = walk + distance[:, None, None] * [0.0, 0.0, 1.0]
     asked = distance[approached(np.zeros((25, 3)), observer)]
     assert [(asked == near).sum() for near in (0.5, 1.5, 2.1)] == [20, 20, AS_OFTEN]
+
+
+def test_a_lapse_tilts_and_bends_what_is_remembered_and_nothing_else(windows):
+    (plain, _), (lapsed, _) = (drawn(windows, replace(PLAIN, lapse=share)) for share in (0.0, 1.0))
+    for name in ("scene", "observer_past", "goal", "path", "body"):
+        torch.testing.assert_close(getattr(lapsed, name), getattr(plain, name))
+    before, after = (batch.past.unflatten(1, (PAST, -1)) for batch in (plain, lapsed))
+    torch.testing.assert_close(after[:, -3:], lapsed.held)
+    torch.testing.assert_close(after[..., :3], before[..., :3])
+    bent = after[..., 9:] - before[..., 9:]
+    torch.testing.assert_close(bent, bent[:, :1].expand_as(bent), atol=1e-5, rtol=0)
+    assert (bent.abs().amax((1, 2)) > 0).all()
+    upright = after[..., 7]
+    assert 0.05 < torch.arccos(upright[:, 0].clamp(max=1)).square().mean().sqrt() < 0.5, "radians"
+    torch.testing.assert_close(after[..., 3:6].norm(dim=-1), torch.ones(16, PAST))
 
 
 def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):

@@ -17,12 +17,12 @@ import { Room } from './room.js';
 import { Route } from './route.js';
 import { readPlaces, readPoint, readState, writeState } from './state.js';
 import { Stops, metres, placesText } from './stops.js';
+import { distance } from './strides.js';
 import { Tags } from './tags.js';
 import { Take, save } from './take.js';
 import { Timeline, rootOf } from './timeline.js';
 
 const TICK_S = 0.1;
-const REPLAN_TICKS = 7;
 const MOST_STOPS = 9;
 
 class Simulator {
@@ -133,7 +133,6 @@ class Simulator {
     this.turnNumber = 0;
     this.waiting = false;
     this.urgent = true;
-    this.planStart = -REPLAN_TICKS;
     this.overlays.plan = null;
     this.overlays.refresh();
     this.observer.animal = moment.frames.at(-1).slice(0, 3);
@@ -275,13 +274,27 @@ class Simulator {
     this.moved = false;
   }
 
+  // Whether to ask for a plan: the one that is followed ends, or was made before the observer moved noticeably. Asked anew
+  // all the time, the animal would change its mind in the middle of every walk; only a visitor's wishes it is told so.
+  get due() {
+    const { reaction_frames: soonest, noticeable, fade_frames: fade } = this.contract.chaining;
+    if (this.urgent) return true;
+    const thinking = ((this.milliseconds ?? 0) / 1000 / TICK_S) * this.state.speed;
+    if (this.timeline.ticksLeft(this.now) <= fade + thinking) return true;
+    if (this.now - this.planStart < soonest) return false;
+    if (this.stops.next || this.route) return true;
+    const here = this.observer.pose();
+    return Boolean(this.state.observer) && distance(here, this.noticed) > noticeable * distance(here, this.observer.animal);
+  }
+
   async plan() {
-    if (this.waiting || !(this.urgent || this.now - this.planStart >= REPLAN_TICKS)) return;
+    if (this.waiting || !this.due) return;
     this.waiting = true;
     this.urgent = false;
     const epoch = this.epoch;
     const start = Math.floor(this.now);
     this.planStart = this.now;
+    this.noticed = this.observer.pose();
     let plan;
     try {
       plan = await this.planner.plan(this.question({ seed: this.state.seed * 1009 + this.turnNumber++ }));

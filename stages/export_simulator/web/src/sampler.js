@@ -3,7 +3,7 @@
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
-import { goalFrom, led, pathFrom, scaledGoal } from './strides.js';
+import { distance, goalFrom, led, pathFrom, scaledGoal } from './strides.js';
 
 const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
 const SOONEST = 6; // frames that a visitor's goal leaves at least
@@ -38,15 +38,45 @@ export class Sampler {
     return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity });
   }
 
-  // Scaled paths [3, frames] towards scaled goals. The reference of the guidance sees neither observer nor goal,
-  // but a goal that the visitor has set is not taken away.
-  async paths(codes, goals, { noise, steps, interactivity, method, draw, keepGoal = 1, commanded = false }) {
+  // Scaled paths [3, frames] towards scaled goals, and others for those that do not get there although the goal is all
+  // that guidance tells.
+  async paths(codes, goals, { draw, draws, ...options }) {
+    const { keepGoal = 1, commanded = false, interactivity } = options;
+    const paths = await this.walks(codes, goals, options);
+    const length = 3 * this.frames;
+    for (let i = 1; i < draws && (commanded || (keepGoal && interactivity >= 1)); i++) {
+      const off = this.missed(paths, goals, codes.start);
+      const again = [...off.keys()].filter((index) => off[index] > 1);
+      if (!again.length) break;
+      const targets = Float32Array.from(again.flatMap((index) => Array.from(goals.subarray(3 * index, 3 * index + 3))));
+      const others = await this.walks(codes, targets, { ...options, noise: draw(this.stride * this.frames * again.length) });
+      const closer = this.missed(others, targets, codes.start);
+      again.forEach((index, other) => {
+        if (closer[other] < off[index]) paths.set(others.subarray(other * length, (other + 1) * length), index * length);
+      });
+    }
+    return paths;
+  }
+
+  // How far from their goals paths end, in parts of what still counts as there: more than 1 does not.
+  missed(paths, goals, start) {
+    const { reach_m: least, reach } = this.contract.strides;
+    const length = 3 * this.frames;
+    return Array.from({ length: goals.length / 3 }, (_, i) => {
+      const [goal, end] = [this.goal(goals, i), this.positions(paths.subarray(i * length, (i + 1) * length)).at(-1)];
+      return distance(end, goal) / Math.max(least, reach * distance(goal, start));
+    });
+  }
+
+  // A scaled path towards each scaled goal. The reference of the guidance sees neither observer nor goal, but a goal that
+  // the visitor has set is not taken away.
+  async walks(codes, goals, { noise, steps, interactivity, keepGoal = 1, commanded = false }) {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) => this.networks.path({
       x: [x, [count, this.stride, this.frames]], ...this.step(count, t, code),
       control: [goals, [count, 3]], keep: [new Float32Array(count).fill(keep), [count, 1]],
     });
-    const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method, count: steps, draw, interactivity });
+    const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method: 'ddim', count: steps, interactivity });
     const pull = commanded ? 1 : keepGoal * Math.min(interactivity, 1);
     return this.walked(drawn, goals, codes.start, pull);
   }
@@ -129,7 +159,9 @@ export class Sampler {
     const goals = this.goalsInWorld(frame, scaled);
     const tried = commanded ? Array(Math.min(CANDIDATES, question.samples)).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
     const targets = Float32Array.from(tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))));
-    const paths = await this.paths(codes, targets, { ...options, keepGoal, commanded, noise: options.draw(this.stride * this.frames * tried.length) });
+    const paths = await this.paths(codes, targets, {
+      ...options, keepGoal, commanded, draws: this.contract.sampling.path_draws, noise: options.draw(this.stride * this.frames * tried.length),
+    });
     if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
     const path = this.trodden(frame, codes.start, this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))));

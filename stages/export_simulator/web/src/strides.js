@@ -34,4 +34,4 @@ export function led(path, start, goal, pull) {
   return path.map((place, i) => place.map((value, axis) => value + (missing[axis] * pull * gone[i]) / longest));
 }
 
-const distance = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
+export const distance = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
