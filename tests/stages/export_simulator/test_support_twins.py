@@ -1,4 +1,4 @@
-"""The page puts paths on what carries the animal exactly as Python does."""
+"""The page puts paths on what carries the animal, and where it may be, exactly as Python does."""
 
 import json
 import shutil
@@ -17,15 +17,26 @@ from stages.export_simulator.reading import support
 
 SOURCES = Path(__file__).parents[3] / "stages/export_simulator/web/src"
 ASK = """
-import { Senses } from '%s/senses.js';
+import { nearestAllowed } from '%(sources)s/clearing.js';
+import { Senses } from '%(sources)s/senses.js';
 const { volume, marks, paths, fastest } = JSON.parse(await new Response(process.stdin).text());
 const senses = Object.create(Senses.prototype);
-Object.assign(senses, { volume, allowed: Uint8Array.from(marks) });
-console.log(JSON.stringify(paths.map((path) => senses.trodden(path.slice(1), path[0], fastest))));
+const allowed = Uint8Array.from(marks);
+Object.assign(senses, { volume, allowed, nearest: nearestAllowed(allowed, volume.shape.slice(1)) });
+const told = paths.map((path) => %(answer)s);
+console.log(JSON.stringify(told));
 """
+needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
+def asked_of_the_page(answer: str, **asked: object) -> np.ndarray:
+    """Return what the page's senses make of paths."""
+    node = ["node", "--no-warnings", "--input-type=module", "-e", ASK % {"sources": SOURCES, "answer": answer}]
+    told = subprocess.run(node, input=json.dumps(asked), capture_output=True, text=True, check=True)
+    return np.array(json.loads(told.stdout))
+
+
+@needs_node
 def test_page_and_python_tread_the_same_way():
     rng = np.random.default_rng(0)
     occupancy = (rng.random((12, 8, 12)) < 0.2).astype(np.uint8)
@@ -36,13 +47,37 @@ def test_page_and_python_tread_the_same_way():
     paths[..., 1] += 0.3
     scenes = Scenes((scene,), (marks > 0,), np.zeros(1, int), (Support.of(scene, marks, range_m),))
     ours = Ground(scenes, np.tile(np.eye(4), (20, 1, 1)), None).trodden(paths[:, 1:], paths[:, 0])
-    asked = {
-        "volume": {"shape": [1, *occupancy.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1, "support": support(range_m)},
-        "marks": marks.ravel().tolist(),
-        "paths": paths.tolist(),
-        "fastest": STAYS_M_S / RATE_HZ,
-    }
-    node = ["node", "--no-warnings", "--input-type=module", "-e", ASK % SOURCES]
-    told = subprocess.run(node, input=json.dumps(asked), capture_output=True, text=True, check=True)
-    np.testing.assert_allclose(json.loads(told.stdout), ours, atol=1e-9)
+    volume = {"shape": [1, *occupancy.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1, "support": support(range_m)}
+    theirs = asked_of_the_page(
+        "senses.trodden(path.slice(1), path[0], fastest)",
+        volume=volume,
+        marks=marks.ravel().tolist(),
+        paths=paths.tolist(),
+        fastest=STAYS_M_S / RATE_HZ,
+    )
+    np.testing.assert_allclose(theirs, ours, atol=1e-9)
     assert np.abs(ours - paths[:, 1:])[..., 1].max() > 0.02
+
+
+@needs_node
+@pytest.mark.parametrize("free", [0.02, 0.5, 0.0])
+def test_page_and_python_clear_the_same_points(free):
+    rng = np.random.default_rng(1)
+    allowed = rng.random((12, 7, 9)) < free
+    scene = FeatureVolume(np.zeros((1, *allowed.shape), np.float32), (~allowed).astype(np.uint8), np.array([-0.6, -0.1, 0.3]), 0.1)
+    points = scene.origin + rng.uniform(-0.2, 1.4, (30, 5, 3))
+    ours = Scenes((scene,), (allowed,), np.zeros(1, int)).cleared(points, None)
+    volume = {"shape": [1, *allowed.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1}
+    theirs = asked_of_the_page(
+        "path.map((point) => senses.cleared(point))", volume=volume, marks=allowed.ravel().astype(int).tolist(), paths=points.tolist()
+    )
+    if not free:
+        np.testing.assert_array_equal(theirs, points)
+        return
+    own, mine, other = (scene.voxel(part)[0] for part in (points, ours, theirs))
+    assert allowed[tuple(np.moveaxis(other, -1, 0))].all()
+    far = [((part - own) ** 2).sum(-1) for part in (mine, other)]
+    np.testing.assert_array_equal(*far, "as near, where several voxels are")
+    same = (mine == other).all(-1)
+    np.testing.assert_allclose(theirs[same], ours[same], atol=1e-12)
+    assert same.mean() > 0.7

@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from playwright.sync_api import Page
 
 from pipeline.models.behavior import Sampling
-from pipeline.models.perception import FeatureVolume
 from pipeline.models.predictors import Ats
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import PAST, RATE_HZ, BehaviorData, Context, window_starts
 from pipeline.space import rigid
 from tests.stages.export_simulator.reaction import FAR_M
@@ -125,12 +125,12 @@ def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) 
     contract = json.loads((simulator / "simulator.json").read_bytes())
     eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
     told = contract["behavior"]["sampling"]
-    volume = FeatureVolume.load(build / "behavior_data" / "volume.npz")
+    scenes = Scenes.load(build / "behavior_data", ("any",))
 
     def goals(observer: np.ndarray, guidance: float = 1.0) -> np.ndarray:
         count = len(observer)
-        sampling = Sampling(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance, clear=False)
-        ats = Ats.load(build / "behavior", volume, sampling)
+        sampling = Sampling(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance)
+        ats = Ats.load(build / "behavior", scenes, sampling)
         eyes = np.stack([observer[..., 0], np.full(observer.shape[:2], eyes_m), observer[..., 1]], -1)
         parts = []
         for some in np.array_split(np.arange(count), -(-count // 32)):  # a plan a window: noise follows the plan

@@ -3,7 +3,7 @@
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
-import { distance, goalFrom, led, pathFrom, scaledGoal } from './strides.js';
+import { bent, distance, goalFrom, led, pathFrom, scaledGoal } from './strides.js';
 
 const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
 const SOONEST = 6; // frames that a visitor's goal leaves at least
@@ -33,9 +33,9 @@ export class Sampler {
   }
 
   // Scaled goals, `count` of them, three numbers each.
-  goals(codes, count, { noise, steps, interactivity, method, draw }) {
+  goals(codes, count, { noise, steps, interactivity, method, draw, frame }) {
     const denoise = (code) => (x, t) => this.networks.goal({ x: [x, [count, 3]], ...this.step(count, t, code) });
-    return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity });
+    return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity, correct: frame && ((clean) => this.goalsCleared(frame, clean)) });
   }
 
   // Scaled paths [3, frames] towards scaled goals, and others for those that do not get there although the goal is all
@@ -70,15 +70,39 @@ export class Sampler {
 
   // A scaled path towards each scaled goal. The reference of the guidance sees neither observer nor goal, but a goal that
   // the visitor has set is not taken away.
-  async walks(codes, goals, { noise, steps, interactivity, keepGoal = 1, commanded = false }) {
+  async walks(codes, goals, { noise, steps, interactivity, frame, keepGoal = 1, commanded = false }) {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) => this.networks.path({
       x: [x, [count, this.stride, this.frames]], ...this.step(count, t, code),
       control: [goals, [count, 3]], keep: [new Float32Array(count).fill(keep), [count, 1]],
     });
-    const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method: 'ddim', count: steps, interactivity });
+    const correct = frame && ((clean) => this.pathsCleared(frame, codes.start, clean));
+    const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method: 'ddim', count: steps, interactivity, correct });
     const pull = commanded ? 1 : keepGoal * Math.min(interactivity, 1);
     return this.walked(drawn, goals, codes.start, pull);
+  }
+
+  // Scaled goals, moved to where the animal may rest, on what carries it.
+  goalsCleared(frame, scaled) {
+    const egoFromWorld = inverse(frame);
+    return Float32Array.from(this.goalsInWorld(frame, scaled).flatMap((goal) => {
+      const [x, y, z] = this.senses.cleared(goal);
+      return Array.from(this.scaled(apply(egoFromWorld, [x, this.senses.carried([x, y, z], false), z])));
+    }));
+  }
+
+  // Scaled strides, bent to where the animal may be.
+  pathsCleared(frame, start, scaled) {
+    const { contract: { scaling, strides: told, rate_hz: rate }, frames } = this;
+    const [egoFromWorld, length] = [inverse(frame), this.stride * frames];
+    const out = new Float32Array(scaled.length);
+    for (let at = 0; at < scaled.length; at += length) {
+      const mine = scaled.subarray(at, at + length);
+      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, told);
+      const moved = path.map((place) => apply(egoFromWorld, this.senses.cleared(apply(frame, place))));
+      out.set(bent(mine, frames, scaling.stride_std, start, moved, rate, told), at);
+    }
+    return out;
   }
 
   // Scaled places [3, frames] that scaled strides lead to, bent towards scaled goals.
@@ -134,12 +158,13 @@ export class Sampler {
     return { goals: this.goalsInWorld(observation.frame, scaled) };
   }
 
-  async think(frame, codes, { seed, samples, steps, interactivity }) {
+  // Scaled goals, and how the rest of a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived.
+  async think(frame, codes, { seed, samples, steps, interactivity, keep }) {
     const draw = normals(seed);
-    const options = { method: this.contract.sampling.method, draw, interactivity };
+    const options = { method: this.contract.sampling.method, draw, interactivity, frame: keep.scene ? frame : null };
     const goalSteps = Math.max(steps, this.contract.sampling.goal_steps);
     const scaled = await this.goals(codes, samples, { ...options, noise: draw(3 * samples), steps: goalSteps });
-    return { scaled: this.rested(frame, scaled), options: { ...options, steps } };
+    return { scaled, options: { ...options, steps } };
   }
 
   goalsInWorld(frame, scaled) {
@@ -164,7 +189,7 @@ export class Sampler {
     });
     if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
-    const path = this.trodden(frame, codes.start, this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))));
+    const path = this.kept(frame, codes.start, this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))), options);
     return { goals, chosen: tried[best], ...(await this.embodied(frame, codes, path, options)) };
   }
 
@@ -192,23 +217,18 @@ export class Sampler {
   // A plan along places that the visitor has drawn, points of the world, one a frame.
   async followed(frame, codes, places, options) {
     const egoFromWorld = inverse(frame);
-    const path = this.trodden(frame, codes.start, places.map((place) => apply(egoFromWorld, place)));
+    const path = this.kept(frame, codes.start, places.map((place) => apply(egoFromWorld, place)), options);
     return { goals: [places.at(-1)], chosen: 0, ...(await this.embodied(frame, codes, path, options)) };
   }
 
-  // Places of the ego frame as a scaled path on what carries the animal.
-  trodden(frame, start, places) {
+  // Places of the ego frame as a scaled path where the animal may be, on what carries it; as they are where it does not
+  // perceive the scene.
+  kept(frame, start, places, { frame: cleared }) {
+    if (!cleared) return Float32Array.from(this.scaledPath(places));
     const egoFromWorld = inverse(frame);
-    const world = this.senses.trodden(places.map((place) => apply(frame, place)), apply(frame, start), this.contract.strides.stays_m_s / this.contract.rate_hz);
+    const moved = places.map((place) => this.senses.cleared(apply(frame, place)));
+    const world = this.senses.trodden(moved, apply(frame, start), this.contract.strides.stays_m_s / this.contract.rate_hz);
     return Float32Array.from(this.scaledPath(world.map((place) => apply(egoFromWorld, place))));
-  }
-
-  // Scaled goals, put on what carries an animal that rests.
-  rested(frame, scaled) {
-    const egoFromWorld = inverse(frame);
-    return Float32Array.from(this.goalsInWorld(frame, scaled).flatMap(([x, y, z]) => (
-      Array.from(this.scaled(apply(egoFromWorld, [x, this.senses.carried([x, y, z], false), z])))
-    )));
   }
 
   // The body along a scaled path, and both in the world.

@@ -1,9 +1,11 @@
 // What the animal perceives, in its ego frame: the scene on a grid, the observer's and its own last frames.
 // The counterpart of pipeline/models/perception.py and behavior.py; both are held together by a golden plan.
 
+import { nearestAllowed } from './clearing.js';
 import { ROW, apply, compose, conjugate, inverse, matrixFromTurn, multiply, place, rotate, turn, turnFromMatrix, turnFromVector } from './rigid.js';
 
 const UPRIGHT = 0.2;
+const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
 export class Senses {
   // contract: simulator.json; volume: half-precision features, channel first; allowed: bytes per voxel.
@@ -13,6 +15,7 @@ export class Senses {
     this.grid = behavior.grid;
     this.volume = { ...contract.volume, values: halfTable(volume) };
     this.allowed = allowed;
+    this.nearest = nearestAllowed(allowed, contract.volume.shape.slice(1));
     this.rest = behavior.agent_from_bone_rest.map(rowFromMatrix);
   }
 
@@ -64,6 +67,18 @@ export class Senses {
     const { shape: [, vx, vy, vz], origin, voxel_m: voxel } = this.volume;
     const [a, b, c] = [0, 1, 2].map((axis) => Math.floor((point[axis] - origin[axis]) / voxel));
     return a >= 0 && b >= 0 && c >= 0 && a < vx && b < vy && c < vz && this.allowed[(a * vy + b) * vz + c] > 0;
+  }
+
+  // A point of the world, moved to the nearest voxel where the root may be; the point itself where it may be there, or nowhere.
+  cleared(point) {
+    const { shape: [, vx, vy, vz], origin, voxel_m: voxel } = this.volume;
+    const clamped = [vx, vy, vz].map((count, axis) => Math.min(count - 1, Math.max(0, Math.floor((point[axis] - origin[axis]) / voxel))));
+    const target = this.nearest[(clamped[0] * vy + clamped[1]) * vz + clamped[2]];
+    if (target < 0 || this.allows(point)) return point;
+    return [Math.floor(target / (vy * vz)), Math.floor(target / vz) % vy, target % vz].map((index, axis) => {
+      const low = origin[axis] + (index + WITHIN) * voxel;
+      return Math.min(low + (1 - 2 * WITHIN) * voxel, Math.max(low, point[axis]));
+    });
   }
 
   // The height, nearest to a point's, at which what carries the animal bears its root; the point's own where nothing is

@@ -25,6 +25,18 @@ export function pathFrom(scaled, frames, deviation, start, rate, told) {
   });
 }
 
+// Scaled strides [numbers, frames] that lead along another path, as far as they move.
+export function bent(scaled, frames, deviation, start, path, rate, told) {
+  const out = Float32Array.from(scaled);
+  path.forEach((place, i) => {
+    const [spread, before] = [deviation[i] ?? deviation[0], i ? path[i - 1] : start];
+    const root = powered(place.map((value, axis) => (value - before[axis]) * rate), told.root_power, told.faint_m2);
+    const stays = scaled[3 * frames + i] > 0 ? 1 : told.breath;
+    for (const axis of [0, 1, 2]) out[axis * frames + i] = root[axis] / stays / spread[axis];
+  });
+  return out;
+}
+
 // Bend a path so that it ends at its goal (pull 1), where it likes (0), or between; no stride by more than its length.
 export function led(path, start, goal, pull) {
   let way = 0;
