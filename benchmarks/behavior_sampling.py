@@ -15,9 +15,10 @@ import numpy as np
 import onnxruntime
 
 from pipeline.models.behavior import Sampling
-from pipeline.models.perception import FeatureVolume, world_from_ego
+from pipeline.models.perception import world_from_ego
 from pipeline.models.planning import Array, Networks, Observation, Sampler, observe
 from pipeline.models.predictors import Ats
+from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.space import rigid
 
@@ -75,7 +76,7 @@ def plan_seconds(networks: Networks, ats: Ats, observation: Observation, samplin
 
 def observation_of(ats: Ats, data: BehaviorData, index: np.ndarray) -> Observation:
     """Return what the animal perceives in some windows."""
-    return observe(data.windows(index)[0], ats.volume, ats.agent_from_bone_rest, ats.ego)
+    return observe(data.windows(index)[0], ats.scenes, ats.agent_from_bone_rest, ats.ego)
 
 
 def accuracy(ats: Ats, data: BehaviorData, index: np.ndarray, sampling: Sampling) -> tuple[float, float]:
@@ -99,8 +100,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="of the timing")
     given = parser.parse_args()
     data = BehaviorData.load(given.build / "behavior_data")
-    volume = FeatureVolume.load(given.build / "behavior_data" / "volume.npz")
-    ats, networks = Ats.load(given.build / "behavior", volume, Sampling()), OnnxNetworks(given.build / "behavior")
+    scenes = Scenes.load(given.build / "behavior_data", data.videos)
+    ats, networks = Ats.load(given.build / "behavior", scenes, Sampling()), OnnxNetworks(given.build / "behavior")
     split = data.indices(TEST) if len(data.indices(TEST)) else data.indices(TRAIN)
     index = split[np.linspace(0, len(split) - 1, given.windows).astype(int)]
     observation = observation_of(ats, data, index[:1])

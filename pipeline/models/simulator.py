@@ -16,7 +16,7 @@ from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channel
 from pipeline.models.perception import Ego, world_from_ego
 from pipeline.models.planning import Observation, Sampler, observe
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, TRAIN, BehaviorData, Context
+from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context
 from pipeline.space import rigid
 
 
@@ -90,6 +90,11 @@ class Flock:
         self.played += 1
         return self.past[-1]
 
+    @property
+    def plan_frames(self) -> int:
+        """Return how many frames a plan has."""
+        return self.plan.root.shape[1]
+
     def reconsider(self) -> None:
         """Let every plan be dropped as soon as another one may follow it."""
         self.noticed = np.full_like(self.noticed, np.inf)
@@ -99,7 +104,7 @@ class Flock:
         moved = np.linalg.norm(self.observer[-1] - self.noticed, axis=-1)
         away = np.linalg.norm(self.observer[-1] - self.past[-1].root[:, 0, :3, 3], axis=-1)
         dropped = self.sampling.observer & (self.played >= self.chaining.reaction_frames) & (moved > self.chaining.noticeable * away)
-        return dropped | (self.played >= FUTURE - self.chaining.fade_frames)
+        return dropped | (self.played >= self.plan_frames - self.chaining.fade_frames)
 
     def _follow(self, some: Int[np.ndarray, "some"]) -> None:
         """Let some of the animals go over to a new plan."""

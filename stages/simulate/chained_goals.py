@@ -4,19 +4,20 @@ import numpy as np
 
 from pipeline.models.simulator import Simulator
 from pipeline.models.subgoals import Subgoal
-from pipeline.models.trajectories import FUTURE, RATE_HZ
+from pipeline.models.trajectories import RATE_HZ
 from stages.simulate.observers import Observer
 
 
 def chained_goals(simulator: Simulator, observer: Observer, count: int, seed: int) -> list[Subgoal]:
-    """Return the start and ``count`` goals, 5.6 s apart; the simulator must play each plan to its end."""
+    """Return the start and ``count`` goals, a plan's length apart; the simulator must play each plan to its end."""
     chaining = simulator.flock.chaining
     assert np.isinf(chaining.noticeable) and not chaining.fade_frames, chaining
     state = simulator.reset(seed)
+    frames = simulator.flock.plan_frames
     found = [Subgoal(state.world_from_agent[:3, 3], _heading(state.world_from_agent), 0.0)]
     for number in range(1, count + 1):
-        found.append(Subgoal(np.asarray(state.goal_world), None, number * FUTURE / RATE_HZ))
-        for _ in range(FUTURE + (number == 1)):  # the step after the last one of a plan asks for the next
+        found.append(Subgoal(np.asarray(state.goal_world), None, number * frames / RATE_HZ))
+        for _ in range(frames + (number == 1)):  # the step after the last one of a plan asks for the next
             state = simulator.step(observer(state.time_s, state.world_from_agent[:3, 3]))
     return found
 
