@@ -22,7 +22,7 @@ from pipeline.models.behavior import (
     past_channels,
 )
 from pipeline.models.diffusion import Schedule, guided, sample
-from pipeline.models.perception import Ego, FeatureVolume, world_from_ego
+from pipeline.models.perception import POSITION, Ego, FeatureVolume, world_from_ego
 from pipeline.models.scenes import Ground, Scenes
 from pipeline.models.strides import STRIDE, led, missed
 from pipeline.models.trajectories import PAST, Context
@@ -87,6 +87,12 @@ class Observation:
 
     def __len__(self) -> int:
         return len(self.past)
+
+    def boneless(self, mean: Float[np.ndarray, "body"]) -> "Observation":
+        """Return the same with the bones of a mean body, of which goals and paths make no more than of hidden ones."""
+        past = self.past.reshape(len(self), PAST, -1).copy()
+        past[..., POSITION + ROOT_CHANNELS :] = mean[ROOT_CHANNELS:]
+        return replace(self, past=past.reshape(len(self), -1))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 Each step plays one frame of the current plan. A plan is followed until it ends or the observer has moved noticeably; the
 next one is sampled from the last 8 frames and faded in. An animal that was asked anew all the time would change its mind
-in the middle of every walk and put off the next one. Where a plan leaves the allowed voxels, others are drawn and the best
+in the middle of every walk and put off the next one. Goals and paths are not told its bones: sampled bones walk less
+distinctly than recorded ones do, and it would stop. Where a plan leaves the allowed voxels, others are drawn and the best
 is taken, so that chaining does not drift through walls. `Flock` lets many animals live at once, `Simulator` one.
 """
 
@@ -122,10 +123,11 @@ class Flock:
         video = None if self.video is None else self.video[some]
         observation = observe(Context(root, bones, np.stack(self.observer, axis=1)[some], video), self.scenes, self.rest, self.ego)
         frame = world_from_ego(root[:, -1], self.ego)
-        goal, path, blocked = self._courses(observation, frame, video, 1)
+        bare = observation.boneless(self.sampler.scaling.body_mean)
+        goal, path, blocked = self._courses(bare, frame, video, 1)
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
-            others = self._courses(observation[again], frame[again], None if video is None else video[again], self.chaining.candidates - 1)
+            others = self._courses(bare[again], frame[again], None if video is None else video[again], self.chaining.candidates - 1)
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]

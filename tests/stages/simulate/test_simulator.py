@@ -98,6 +98,17 @@ def test_plans_are_followed_until_they_end_or_the_observer_moves(simulator):
     np.testing.assert_array_equal(blind.goal, first)
 
 
+def test_goals_and_paths_are_not_told_sampled_bones(simulator):
+    context, _ = simulator.data.windows(np.array([0, 40]))
+    lives = []
+    for bend in (0.0, 0.3):
+        bones = context.agent_from_bone @ rigid.make(rigid.rotation_from_vector(np.array([bend, 0, 0])), np.zeros(3))
+        simulator.flock.begin(replace(context, video=None, agent_from_bone=bones), np.random.default_rng(0))
+        lives.append(simulator.flock.plan)
+    np.testing.assert_array_equal(lives[0].root[..., :3, 3], lives[1].root[..., :3, 3])
+    assert np.abs(lives[0].bones - lives[1].bones).max() > 0.01, "the body goes on from the bones that it has"
+
+
 def test_fading_leaves_the_old_plan_and_reaches_the_new_one():
     old = Frames(np.tile(np.eye(4), (10, 1, 1)), np.zeros((10, 6)))
     turned = rigid.make(rigid.rotation_from_vector(np.array([0, 1.0, 0])), np.array([1.0, 0, 0]))

@@ -175,9 +175,12 @@ export class Sampler {
   async plan(question) {
     const observation = this.senses.observe(question.past, question.observer);
     const { frame } = observation;
-    const codes = await this.codes(observation, question.keep, question.interactivity);
+    const whole = await this.codes(observation, question.keep, question.interactivity);
+    // sampled bones walk less distinctly than recorded ones do: told of them, the animal would stop
+    const bare = this.senses.boneless(observation, this.contract.scaling.body_mean);
+    const codes = await this.codes(bare, question.keep, question.interactivity);
     const { scaled: dreamt, options } = await this.think(frame, codes, question);
-    if (question.path) return this.followed(frame, codes, question.path, options);
+    if (question.path) return this.followed(frame, whole, question.path, options);
     const scaled = question.aim ? this.leg(frame, question.aim) : dreamt;
     const commanded = Boolean(question.aim);
     const keepGoal = commanded ? 1 : question.keep.goal;
@@ -190,7 +193,7 @@ export class Sampler {
     if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
     const path = this.kept(frame, codes.start, this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))), options);
-    return { goals, chosen: tried[best], ...(await this.embodied(frame, codes, path, options)) };
+    return { goals, chosen: tried[best], ...(await this.embodied(frame, whole, path, options)) };
   }
 
   // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.

@@ -5,6 +5,7 @@ import { nearestAllowed } from './clearing.js';
 import { ROW, apply, compose, conjugate, inverse, matrixFromTurn, multiply, place, rotate, turn, turnFromMatrix, turnFromVector } from './rigid.js';
 
 const UPRIGHT = 0.2;
+const ROOT_CHANNELS = 6;
 const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
 export class Senses {
@@ -29,6 +30,14 @@ export class Senses {
       observerPast: Float32Array.from(observer.flatMap((row) => apply(egoFromWorld, place(row)))),
       past: Float32Array.from(past.flatMap((rows) => this.pastChannels(egoFromWorld, rows))),
     };
+  }
+
+  // The same with the bones of a mean body, of which goals and paths make no more than of hidden ones.
+  boneless(observation, mean) {
+    const past = Float32Array.from(observation.past);
+    const length = 3 + mean.length;
+    for (let at = 0; at < past.length; at += length) past.set(mean.slice(ROOT_CHANNELS), at + 3 + ROOT_CHANNELS);
+    return { ...observation, past };
   }
 
   // world_from_ego at a root pose.
