@@ -144,9 +144,10 @@ class Scaling:
 class Sampling:
     """How plans are drawn."""
 
-    method: Literal["ddpm", "ddim"] = "ddpm"
-    """of goals: DDPM adds fresh noise at every step, which mends earlier errors (minDE of goals 0.41 -> 0.39 and 0.43 -> 0.42 m
-    of two models, on a home kept from training); DDIM is a function of the first noise alone, as paths and bodies are"""
+    method: Literal["ddpm", "ddim"] | None = None
+    """of goals (none: as the schedule asks for): DDPM adds fresh noise at every step, which mends earlier errors (minDE of goals
+    0.41 -> 0.39 and 0.43 -> 0.42 m of two models, on a home kept from training); DDIM is a function of the first noise alone, as
+    paths and bodies are"""
     goal_steps: int = 50
     """denoising steps of the goal"""
     sequence_steps: int = 10
@@ -260,7 +261,7 @@ def contract(architecture: Architecture, scaling: Scaling, schedule: Schedule, r
         },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
-        "sampling": asdict(Sampling()),
+        "sampling": asdict(Sampling(method=schedule.method)),
     }
 
 

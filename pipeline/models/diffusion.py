@@ -31,6 +31,11 @@ class Schedule:
     scaled to unit variance, which DDIM follows in Euler's steps; learn it with `weighting` "flow\""""
 
     @property
+    def method(self) -> Literal["ddpm", "ddim"]:
+        """Return how goals are best drawn (measured on homes kept from training): straight ways ask for no fresh noise."""
+        return "ddim" if self.course == "rectified" else "ddpm"
+
+    @property
     def beta(self) -> Float[np.ndarray, "step"]:
         """Variance added at each step."""
         return np.linspace(self.beta_first, self.beta_last, self.steps)

@@ -281,7 +281,7 @@ class Sampler:
             return (spread * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
 
         denoise = guided(full, blind, sampling.guidance)
-        x = sample(denoise, draw(), self.schedule, method=sampling.method, count=count, draw=draw, correct=correct)
+        x = sample(denoise, draw(), self.schedule, method=sampling.method or self.schedule.method, count=count, draw=draw, correct=correct)
         return x.astype(np.float32)
 
 

@@ -93,3 +93,7 @@ def test_nothing_steers_a_free_network_which_is_a_controlled_one_without_control
     x, t, code, control = torch.randn(2, 4, 56), torch.tensor([3.0, 40.0]), torch.randn(2, 8), torch.randn(2, 3)
     dropped = torch.zeros(2, 1)
     torch.testing.assert_close(free(x, t, code, control, dropped + 1), steered(x, t, code, control, dropped))
+
+
+def test_straight_ways_are_followed_without_fresh_noise():
+    assert Schedule().method == "ddpm" and Schedule(course="rectified").method == "ddim"

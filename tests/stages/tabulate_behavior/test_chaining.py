@@ -1,5 +1,7 @@
 """Chained lives: an animal that only breathes counts as resting, however its millimetres differ from the recorded ones."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,8 @@ from tests.pipeline.models.wandering import REST, room, wandering
 
 class Breathing:
     """A sampler whose animal stays where it is and breathes."""
+
+    scaling = SimpleNamespace(body_mean=np.zeros(6 + 6 * len(REST)))
 
     def codes(self, observation, sampling, count=1):
         return count * len(observation)
