@@ -251,6 +251,21 @@ def body_channels(rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*
     return torch.cat([rigid_torch.rotation_to_6d(rotation), bones], dim=-1)
 
 
+def lapsed(
+    rotation: Float[Tensor, "batch 8 3 3"],
+    bones: Float[Tensor, "batch 8 channel"],
+    statistics: Statistics,
+    augmentation: Augmentation,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "batch 8 3 3"], Float[Tensor, "batch 8 channel"]]:
+    """Tilt the roots and bend the bones of some samples, in all frames alike."""
+    size, channels = len(bones), bones.shape[-1]
+    some = (torch.rand(size, 1, generator=generator) < augmentation.lapse).float()
+    tilt = torch.randn(size, 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0]) * augmentation.lapse_rad * some
+    bend = torch.randn(size, channels, generator=generator) * statistics.past_std[-channels:] * augmentation.lapse_bones * some
+    return rigid_torch.so3_exp(tilt)[:, None] @ rotation, bones + bend[:, None]
+
+
 def draw_batch(
     windows: Windows,
     scene: SceneSampler,
@@ -286,16 +301,7 @@ def draw_batch(
     shift = torch.randn(size, 1, 3, generator=generator) * augmentation.observer_m
     observer = (tracks.observer + shift) @ new_from_old.mT
     frames = windows.frame[index]
-    lapsed = (uniform(size, 1) < augmentation.lapse).float()
-    tilt = torch.randn(size, 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0]) * augmentation.lapse_rad * lapsed
-    bones = windows.bones[frames[:, :PAST]]
-    off = (
-        torch.randn(size, bones.shape[-1], generator=generator)
-        * statistics.past_std[-bones.shape[-1] :]
-        * augmentation.lapse_bones
-        * lapsed
-    )
-    remembered = body_channels(rigid_torch.so3_exp(tilt)[:, None] @ rotation[:, :PAST], bones + off[:, None])
+    remembered = body_channels(*lapsed(rotation[:, :PAST], windows.bones[frames[:, :PAST]], statistics, augmentation, generator))
     past = torch.cat([root[:, :PAST], remembered], dim=-1)
     held = past[:, -Minds.HELD_FRAMES :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
