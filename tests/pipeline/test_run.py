@@ -156,14 +156,15 @@ def test_two_builds_at_once_are_both_right(house):
 
 @pytest.mark.parametrize("victim", ["group", "anyone"])
 def test_kills_leave_nothing_wrong(house, victim):
-    """SIGKILL at random times; whatever counts as complete is, and the next build ends as if nothing had been."""
+    """SIGKILL at random points; whatever counts as complete is, and the next build ends as if nothing had been."""
     reference = contents(house)
     choice = random.Random(victim)
     shutil.rmtree(house.folder / "build")
-    for _ in range(2):
+    for complete in sorted(choice.sample(range(len(reference) - 5), 2)):
         command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
         build = subprocess.Popen(command, cwd=house.folder, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(choice.uniform(0.3, 1.5))
+        while build.poll() is None and sum(artifact.MANIFEST in files for *_, files in os.walk(house.folder / "build")) < complete:
+            time.sleep(choice.uniform(0.0, 0.1))
         match victim:
             case "group":
                 os.killpg(build.pid, signal.SIGKILL)

@@ -82,7 +82,7 @@ def test_paths_that_miss_their_goals_are_drawn_again(ats, data):
         return missed(path, codes.start, goal)
 
     once, often = misses(path_draws=1), misses(path_draws=4)
-    assert (once > 1).sum() > (often > 1).sum(), "networks that have learned nothing get there by luck"
+    assert (once > 1).any() and (often < once)[once > 1].any(), "networks that have learned nothing come nearer by luck"
     assert (often <= once).all() and (often == once)[once <= 1].all()
     np.testing.assert_array_equal(misses(path_draws=4, guidance=0.5), misses(path_draws=1, guidance=0.5), "half a goal binds nobody")
     np.testing.assert_array_equal(misses(path_draws=4, goal=False), misses(path_draws=1, goal=False))
