@@ -31,6 +31,15 @@ DROP = """text => {
   data.items.add(new File([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], 'dropped.npz'));
   dispatchEvent(new DragEvent('drop', { dataTransfer: data, cancelable: true }));
 }"""
+SPOILS_THE_FIRST_PLAN = """
+  const post = Worker.prototype.postMessage;
+  let spoiled = false;
+  Worker.prototype.postMessage = function (message, ...rest) {
+    const spoil = message.kind === 'plan' && !spoiled;
+    spoiled ||= spoil;
+    return post.call(this, spoil ? { ...message, content: { ...message.content, past: null } } : message, ...rest);
+  };
+"""
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
 
 
@@ -283,6 +292,12 @@ def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> 
 def test_a_page_that_cannot_live_says_so(simulator: Path, chromium: Browser, script: str, word: str) -> None:
     with browser.shown(chromium, (simulator / "index.html").as_uri(), script=script) as (page, wrong):
         assert word in page.inner_text("#splash")
+        assert wrong == []
+
+
+def test_a_plan_that_fails_is_asked_for_again(simulator: Path, chromium: Browser) -> None:
+    with browser.shown(chromium, (simulator / "index.html").as_uri(), script=SPOILS_THE_FIRST_PLAN) as (page, wrong):
+        assert page.evaluate("ats.state().plans") >= 2
         assert wrong == []
 
 

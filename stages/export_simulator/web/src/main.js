@@ -23,6 +23,7 @@ import { Take, save } from './take.js';
 import { Timeline, rootOf } from './timeline.js';
 
 const TICK_S = 0.1;
+const AGAIN_MS = 1000; // after a plan that failed, the next is asked for
 const MOST_STOPS = 9;
 
 class Simulator {
@@ -299,7 +300,8 @@ class Simulator {
     try {
       plan = await this.planner.plan(this.question({ seed: this.state.seed * 1009 + this.turnNumber++ }));
     } catch (error) {
-      return panel.status(`cannot plan (${error.message}): start again, or reload the page`);
+      panel.status(`cannot plan (${error.message}): trying again; if that does not help, reload the page`);
+      return setTimeout(() => { if (epoch === this.epoch) Object.assign(this, { waiting: false, urgent: true }); }, AGAIN_MS);
     }
     if (epoch !== this.epoch) return;
     this.waiting = false;

@@ -1,4 +1,4 @@
-// From what is perceived to a plan: goal, then path, then body. Counterpart of Sampler in pipeline/models/behavior.py.
+// From what is perceived to a plan: goal, then path, then body. Counterpart of Sampler in pipeline/models/planning.py.
 
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
@@ -42,14 +42,14 @@ export class Sampler {
   // that guidance tells.
   async paths(codes, goals, { draw, draws, ...options }) {
     const { keepGoal = 1, commanded = false, interactivity } = options;
-    const paths = await this.walks(codes, goals, options);
+    const paths = await this.pathsOnce(codes, goals, options);
     const length = 3 * this.frames;
     for (let i = 1; i < draws && (commanded || (keepGoal && interactivity >= 1)); i++) {
       const off = this.missed(paths, goals, codes.start);
       const again = [...off.keys()].filter((index) => off[index] > 1);
       if (!again.length) break;
       const targets = Float32Array.from(again.flatMap((index) => Array.from(goals.subarray(3 * index, 3 * index + 3))));
-      const others = await this.walks(codes, targets, { ...options, noise: draw(this.stride * this.frames * again.length) });
+      const others = await this.pathsOnce(codes, targets, { ...options, noise: draw(this.stride * this.frames * again.length) });
       const closer = this.missed(others, targets, codes.start);
       again.forEach((index, other) => {
         if (closer[other] < off[index]) paths.set(others.subarray(other * length, (other + 1) * length), index * length);
@@ -70,7 +70,7 @@ export class Sampler {
 
   // A scaled path towards each scaled goal. The reference of the guidance sees neither observer nor goal, but a goal that
   // the visitor has set is not taken away.
-  async walks(codes, goals, { noise, steps, interactivity, frame, keepGoal = 1, commanded = false }) {
+  async pathsOnce(codes, goals, { noise, steps, interactivity, frame, keepGoal = 1, commanded = false }) {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) => this.networks.path({
       x: [x, [count, this.stride, this.frames]], ...this.step(count, t, code),
@@ -79,7 +79,7 @@ export class Sampler {
     const correct = frame && ((clean) => this.pathsCleared(frame, codes.start, clean));
     const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method: 'ddim', count: steps, interactivity, correct });
     const pull = commanded ? 1 : keepGoal * Math.min(interactivity, 1);
-    return this.walked(drawn, goals, codes.start, pull);
+    return this.ledPaths(drawn, goals, codes.start, pull);
   }
 
   // Scaled goals, moved to where the animal may rest, on what carries it.
@@ -106,7 +106,7 @@ export class Sampler {
   }
 
   // Scaled places [3, frames] that scaled strides lead to, bent towards scaled goals.
-  walked(drawn, goals, start, pull) {
+  ledPaths(drawn, goals, start, pull) {
     const { contract: { scaling, strides: told, rate_hz: rate }, frames } = this;
     const each = Array.from({ length: goals.length / 3 }, (_, i) => {
       const mine = drawn.subarray(i * this.stride * frames, (i + 1) * this.stride * frames);
@@ -152,19 +152,20 @@ export class Sampler {
 
   // Goals alone, in the world.
   async sampleGoals(question) {
-    const observation = this.senses.observe(question.past, question.observer);
+    const { frame, ...observation } = this.senses.observe(question.past, question.observer);
     const codes = await this.codes(observation, question.keep, question.interactivity);
-    const { scaled } = await this.think(observation.frame, codes, question);
-    return { goals: this.goalsInWorld(observation.frame, scaled) };
+    return { goals: this.goalsInWorld(frame, await this.dreamt(codes, question.samples, this.drawing(frame, question))) };
   }
 
-  // Scaled goals, and how the rest of a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived.
-  async think(frame, codes, { seed, samples, steps, interactivity, keep }) {
-    const draw = normals(seed);
-    const options = { method: this.contract.sampling.method, draw, interactivity, frame: keep.scene ? frame : null };
-    const goalSteps = Math.max(steps, this.contract.sampling.goal_steps);
-    const scaled = await this.goals(codes, samples, { ...options, noise: draw(3 * samples), steps: goalSteps });
-    return { scaled, options: { ...options, steps } };
+  // How a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived.
+  drawing(frame, { seed, steps, interactivity, keep }) {
+    return { method: this.contract.sampling.method, draw: normals(seed), steps, interactivity, frame: keep.scene ? frame : null };
+  }
+
+  // Scaled goals that it thinks of by itself.
+  dreamt(codes, samples, options) {
+    const steps = Math.max(options.steps, this.contract.sampling.goal_steps);
+    return this.goals(codes, samples, { ...options, noise: options.draw(3 * samples), steps });
   }
 
   goalsInWorld(frame, scaled) {
@@ -175,14 +176,14 @@ export class Sampler {
   async plan(question) {
     const observation = this.senses.observe(question.past, question.observer);
     const { frame } = observation;
+    const options = this.drawing(frame, question);
     const whole = await this.codes(observation, question.keep, question.interactivity);
+    if (question.path) return this.followed(frame, whole, question.path, options);
     // sampled bones walk less distinctly than recorded ones do: told of them, the animal would stop
     const bare = this.senses.boneless(observation, this.contract.scaling.body_mean);
     const codes = await this.codes(bare, question.keep, question.interactivity);
-    const { scaled: dreamt, options } = await this.think(frame, codes, question);
-    if (question.path) return this.followed(frame, whole, question.path, options);
-    const scaled = question.aim ? this.leg(frame, question.aim) : dreamt;
     const commanded = Boolean(question.aim);
+    const scaled = commanded ? this.leg(frame, question.aim) : await this.dreamt(codes, question.samples, options);
     const keepGoal = commanded ? 1 : question.keep.goal;
     const goals = this.goalsInWorld(frame, scaled);
     const tried = commanded ? Array(Math.min(CANDIDATES, question.samples)).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
