@@ -50,7 +50,9 @@ def true_data(build: Path, ours: BehaviorData, videos: list[dict]) -> BehaviorDa
     for video in (video for video in videos if video["id"] in ours.videos):
         table = arrays.load(build / "synthetic_capture/truth" / f"{Path(video['file']).stem}.npz")
         agent, camera = (world_from_true @ table[name] for name in ("world_from_agent", "world_from_camera"))
-        motion = Motion(table["timestamp_s"], camera, agent, table["agent_from_bone"].astype(float), np.ones(len(agent)))
+        motion = Motion(
+            table["timestamp_s"], camera, agent, table["agent_from_bone"].astype(float), np.ones(len(agent)), np.ones(len(agent), bool)
+        )
         known = trajectory_from_motion(motion, min_confidence=0.0, max_gap_s=0.6, smooth_s=0.0)
         mine = ours.trajectories[video["id"]]
         shared = np.isclose(known.timestamp_s[:, None], mine.timestamp_s[mine.valid], atol=0.02).any(1)

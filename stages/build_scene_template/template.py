@@ -106,7 +106,7 @@ def _no_surface(clip: Clip) -> InputError:
 
 
 def floor_height(mesh: Mesh) -> float:
-    """Return the height below which only a percent of the upward-facing surface lies."""
+    """Return the height below which only a twentieth of the upward-facing surface lies."""
     up = mesh.vertex_normals()[:, 1] > 0.9
     return float(np.quantile(mesh.vertices[up, 1], 0.05)) if up.any() else float(mesh.vertices[:, 1].min())
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.models.motion import INFERRED, Motion
+from pipeline.models.motion import DOUBTFUL, INFERRED, Motion
 from pipeline.space import rigid
 from stages.reconstruct import sightings
 from stages.reconstruct.assemble import Video, scene_first
@@ -119,7 +119,8 @@ def _way(
         )
     spacing = max(LOOK_S, span / MOST_LOOKS)
     frames = np.unique([*(begin + np.searchsorted(when[begin:end], np.arange(when[begin], when[end], spacing))), end])
-    cameras = torch.from_numpy(rigid.inverse(motion.world_from_camera[frames])).float()
+    trusted = np.where((motion.confidence[frames] >= DOUBTFUL)[:, None, None], motion.world_from_camera[frames], np.nan)
+    cameras = torch.from_numpy(rigid.inverse(trusted)).float()
     says = sightings.evidence(
         problem.store.views,
         first + frames,
@@ -201,7 +202,8 @@ def _bones(
     resting = np.flatnonzero(told & (speed <= MOVING_M_S))
     resting = resting if len(resting) else np.flatnonzero(good)
     frames = begin + np.arange(len(place))
-    rests = resting[np.abs(motion.timestamp_s[resting] - motion.timestamp_s[frames][:, None]).argmin(1)]
+    between = (motion.timestamp_s[resting[1:]] + motion.timestamp_s[resting[:-1]]) / 2
+    rests = resting[np.searchsorted(between, motion.timestamp_s[frames])]
     bones = motion.agent_from_bone[rests].copy()
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     there = known.walk_m[-1] - np.abs(way % (2 * max(known.walk_m[-1], 1e-6)) - known.walk_m[-1])  # to its end and back

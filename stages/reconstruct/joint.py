@@ -44,7 +44,7 @@ class JointLoss:
 def rendered_terms(problem: Problem, pose: Pose, number: int, probability: float, weights: Weights, generator: Generator) -> Terms:
     """Render ``number`` rays per frame on and around the agent through both fields and compare all that is known."""
     rays = problem.store.agent.at(problem.agent_rays.pick(pose.frame, number, generator).flatten())
-    depth = render_depths(rays, generator)
+    depth = render_depths(rays, problem.store.farthest_m, generator)
     frames, samples = len(pose.frame), depth.shape[1]
     points_camera = rays.direction[:, None] * depth[..., None]
     world = rigid_torch.apply(pose.world_from_camera, points_camera.view(frames, -1, 3)).view(len(rays), samples, 3)

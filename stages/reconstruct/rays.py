@@ -5,6 +5,7 @@ agent. `Views` also keeps a thumbnail per frame (depth, distance from the agent'
 against. `join` strings the videos together on one frame axis.
 """
 
+import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -27,8 +28,8 @@ THUMBNAIL = 4
 """colour pixels along the edge of a thumbnail's pixel"""
 FAR_PX = 255.0
 """distances from the mask saturate here"""
-SEEN_M = (0.15, 5.0)
-"""depth outside this range is not trusted"""
+NEAREST_M = 0.15
+"""nearer depth is not trusted"""
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,11 @@ class Store:
     agent: Rays
     """on the agent's mask and in a ring around it"""
     views: Views
+
+    @functools.cached_property
+    def farthest_m(self) -> float:
+        """How far from the phone anything was measured, metres."""
+        return float(self.views.depth.max())
 
 
 @dataclass(frozen=True)
@@ -203,7 +209,7 @@ def _concatenate(parts: Sequence[Rays]) -> Rays:
 def trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
     """Return depth (0 where the sensor doubts it) and each pixel's slope from the depth's own normals."""
     depth = clip.depth(frame).astype(np.float32)
-    depth[(clip.confidence(frame) == 0) | (depth < SEEN_M[0]) | (depth > SEEN_M[1])] = 0
+    depth[(clip.confidence(frame) == 0) | (depth < NEAREST_M)] = 0
     directions = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape).astype(np.float32)
     smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(cv2.blur((depth > 0).astype(np.float32), (3, 3)), 1e-6)
     points = directions * smooth[..., None]
@@ -219,7 +225,7 @@ def trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height wid
 def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     """Return depth (0 = unknown) that neighbours support, however much the sensor doubts it: thin limbs are all edge."""
     depth = clip.depth(frame).astype(np.float32)
-    return np.where(supported(depth) & (depth >= SEEN_M[0]) & (depth <= SEEN_M[1]), depth, 0)
+    return np.where(supported(depth) & (depth >= NEAREST_M), depth, 0)
 
 
 def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np.ndarray, "height width"]:

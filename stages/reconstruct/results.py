@@ -86,7 +86,7 @@ def agent_surface(problem: Problem, step_m: float) -> Mesh:
 
 
 @torch.no_grad()
-def measured_points(problem: Problem, most: int = 300_000) -> Float[np.ndarray, "point 3"]:
+def measured_points(problem: Problem, most: int = 3_000_000) -> Float[np.ndarray, "point 3"]:
     """Return measured points of the scene in the world, thinned."""
     rays = problem.store.scene
     index = torch.nonzero(rays.depth > 0)[:, 0]
@@ -116,8 +116,8 @@ def feature_volume(problem: Problem, most_frames: int = 300) -> FeatureVolume:
 
 @torch.no_grad()
 def looked_through(problem: Problem, points_world: torch.Tensor, most_frames: int) -> torch.Tensor:
-    """Tell which points some camera saw through: they project onto a pixel whose depth lies clearly behind them."""
-    views, frames = problem.store.views, torch.nonzero(problem.has_scene)[:, 0]
+    """Tell which points some camera that is not in doubt saw through: they project onto a pixel whose depth lies clearly behind them."""
+    views, frames = problem.store.views, torch.unique(problem.store.scene.frame).long()
     frames = frames[:: max(1, len(frames) // most_frames)]
     camera_from_world = torch.linalg.inv(problem.motion.world_from_camera(frames).double()).float()
     through = torch.zeros(len(points_world), dtype=torch.bool, device=points_world.device)

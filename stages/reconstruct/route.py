@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.distance import cdist
 
 from stages.reconstruct.places import CELL_M, Places
 
@@ -56,7 +57,7 @@ class Habits:
         some = self.haunts[:: max(1, len(self.haunts) // most)]
         if not len(some):
             return np.zeros(len(place))
-        squared = ((place[:, None] - some) ** 2).sum(-1) / HAUNT_M**2
+        squared = cdist(place, some, "sqeuclidean") / HAUNT_M**2
         kernel = np.exp(-0.5 * squared).mean(1) * 10 / (2 * np.pi * HAUNT_M**2)
         return np.log(ELSEWHERE + (1 - ELSEWHERE) * kernel)
 

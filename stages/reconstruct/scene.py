@@ -14,7 +14,6 @@ from stages.reconstruct.settings import Batches, Weights
 
 Terms = dict[str, tuple[float, Tensor]]
 FREE_FROM_M = 0.1
-FARTHEST_M = 5.0
 BEHIND_M = 0.06
 """samples behind a measured surface; deeper ones would fill thin things and what lies behind edges"""
 EIKONAL_STEP_M = 0.04
@@ -104,11 +103,11 @@ def scene_layer(problem: Problem, points: Float[Tensor, "ray sample 3"], video: 
 
 
 def render_depths(
-    rays: Rays, generator: Generator, around: int = 12, along: int = 12, reach_m: float = 0.15
+    rays: Rays, farthest_m: float, generator: Generator, around: int = 12, along: int = 12, reach_m: float = 0.15
 ) -> Float[Tensor, "ray sample"]:
-    """Place samples for rendering: half around the measured depth, half up to it (up to 5 m where it is unknown)."""
+    """Place samples for rendering: half around the measured depth, half up to it (up to ``farthest_m`` where it is unknown)."""
     device = rays.depth.device
-    end = torch.where(rays.depth > 0, rays.depth, torch.full_like(rays.depth, FARTHEST_M))[:, None]
+    end = torch.where(rays.depth > 0, rays.depth, torch.full_like(rays.depth, farthest_m))[:, None]
 
     def strata(count: int) -> Tensor:
         return (torch.arange(count, device=device) + torch.rand(len(rays), count, generator=generator).to(device)) / count
@@ -118,10 +117,10 @@ def render_depths(
     return torch.cat([far, near], dim=1).sort(dim=1).values
 
 
-def even_depths(rays: Rays, samples: int, generator: Generator) -> Float[Tensor, "ray sample"]:
-    """Place samples evenly up to 5 m, wherever the surface is."""
+def even_depths(rays: Rays, farthest_m: float, samples: int, generator: Generator) -> Float[Tensor, "ray sample"]:
+    """Place samples evenly up to ``farthest_m``, wherever the surface is."""
     step = torch.arange(samples) + torch.rand(len(rays), samples, generator=generator)
-    return (FREE_FROM_M + (FARTHEST_M - FREE_FROM_M) * step / samples).to(rays.depth.device)
+    return (FREE_FROM_M + (farthest_m - FREE_FROM_M) * step / samples).to(rays.depth.device)
 
 
 def drift_term(motion: MotionTable, weights: Weights) -> Terms:
@@ -149,14 +148,14 @@ class SceneLoss:
 
     def terms(self, number: int, probability: float, generator: Generator) -> Terms:
         """Return the scene's terms over random rays."""
-        problem, store, batches = self.problem, self.problem.store.scene, self.batches
+        problem, store, batches = self.problem, self.problem.store, self.batches
         if batches.places == "even":
-            rays = store.at(pick(len(store), number // 6, generator, problem.device))
+            rays = store.scene.at(pick(len(store.scene), number // 6, generator, problem.device))
             code_of = swap(problem.video[rays.frame], problem.scene.shape.videos, probability, generator)
-            return rendered_terms(problem, rays, code_of, self.weights, even_depths(rays, batches.even, generator))
-        rays = store.at(self.measured[pick(len(self.measured), number, generator, problem.device)])
-        others = store.at(pick(len(store), batches.rendered_rays // 2, generator, problem.device))
+            return rendered_terms(problem, rays, code_of, self.weights, even_depths(rays, store.farthest_m, batches.even, generator))
+        rays = store.scene.at(self.measured[pick(len(self.measured), number, generator, problem.device)])
+        others = store.scene.at(pick(len(store.scene), batches.rendered_rays // 2, generator, problem.device))
         videos = problem.scene.shape.videos
         code_of, other_code = (swap(problem.video[some.frame], videos, probability, generator) for some in (rays, others))
         found = measured_terms(problem, rays, code_of, self.weights, batches, generator)
-        return found | rendered_terms(problem, others, other_code, self.weights, render_depths(others, generator))
+        return found | rendered_terms(problem, others, other_code, self.weights, render_depths(others, store.farthest_m, generator))

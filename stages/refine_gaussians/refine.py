@@ -107,7 +107,8 @@ class FrameLoss:
         cloud = self.cloud(sequence, frame, camera, target)
         later = self._later_pixels(sequence, frame, target, cloud)
         view = see(cloud, camera, target.intrinsics, *size, self.backend, extra=later)
-        everywhere = torch.ones_like(target.agent) if sequence.video is not None else target.agent
+        room = torch.ones_like(target.agent) if cloud.agent.any() else ~target.agent
+        everywhere = room if sequence.video is not None else target.agent
         measured = (target.depth > 0) & everywhere
         weights, terms = self.weights, {}
         behind = torch.rand(3, generator=generator).to(self.device)

@@ -55,7 +55,7 @@ def read(recording: Recording, frame: int, size: tuple[int, int], device: str) -
     clip, small = recording.clip, size[::-1]
     color = cv2.resize(clip.color(frame), small, interpolation=cv2.INTER_AREA)
     depth = clip.depth(frame)
-    depth = np.where((clip.confidence(frame) > 0) & (depth < 5), depth, 0)
+    depth = np.where(clip.confidence(frame) > 0, depth, 0)
     depth = cv2.resize(depth, small, interpolation=cv2.INTER_NEAREST_EXACT)
     mask = np.zeros(size, np.uint8)
     if recording.masks is not None:

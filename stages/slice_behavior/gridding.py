@@ -18,16 +18,20 @@ class Motion:
     world_from_agent: Float[np.ndarray, "frame 4 4"]
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
     confidence: Float[np.ndarray, "frame"]
+    agent_visible: Bool[np.ndarray, "frame"]
 
 
 def trajectory_from_motion(motion: Motion, *, min_confidence: float, max_gap_s: float, smooth_s: float) -> Trajectory:
     """Resample to 10 Hz. A grid time is valid where trusted frames no more than ``max_gap_s`` apart enclose it.
 
+    Trusted are those that show the agent from a camera whose pose is known.
+
     Invalid times hold the nearest trusted motion, so that every number is finite. ``smooth_s`` is the standard
     deviation of a Gaussian in time that takes the jitter out of the agent's root.
     """
     finite = np.isfinite(motion.world_from_agent).all((1, 2)) & np.isfinite(motion.agent_from_bone).all((1, 2, 3))
-    trusted = finite & np.isfinite(motion.world_from_camera).all((1, 2)) & (motion.confidence >= min_confidence)
+    camera_known = np.isfinite(motion.world_from_camera).all((1, 2)) & (motion.confidence >= min_confidence)
+    trusted = finite & camera_known & motion.agent_visible
     time = motion.timestamp_s
     grid = np.arange(np.floor(time[-1] * RATE_HZ + 1e-6) + 1) / RATE_HZ
     grid = grid[grid >= time[0] - 0.5 / RATE_HZ]

@@ -46,9 +46,9 @@ def read_tables(folders: Mapping[str, Path]) -> Source:
 
 def read_motion(folder: Path) -> Motion:
     """Read the motion of one recording. Raises InputError ART-010 when damaged."""
-    names = ("timestamp_s", "world_from_camera", "world_from_agent", "agent_from_bone", "confidence")
-    loaded = arrays.load(folder / "motion.npz", names)
-    return Motion(*(np.asarray(loaded[name], np.float64) for name in names))
+    numbers = ("timestamp_s", "world_from_camera", "world_from_agent", "agent_from_bone", "confidence")
+    loaded = arrays.load(folder / "motion.npz", (*numbers, "agent_visible"))
+    return Motion(*(np.asarray(loaded[name], np.float64) for name in numbers), loaded["agent_visible"].astype(bool))
 
 
 def _rest(folder: Path) -> Float[np.ndarray, "bone 4 4"]:

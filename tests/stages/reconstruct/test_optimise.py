@@ -243,6 +243,17 @@ def test_volume_tells_free_surface_and_unseen(solved):
     assert surface.any() and not volume.features[:, ~surface].any()
 
 
+def test_frames_whose_camera_is_in_doubt_look_through_nothing(solved):
+    found = solved[0]
+    points = torch.rand(500, 3) * 2 - 1
+
+    def seen_through(frames: int) -> int:
+        rays = found.store.scene.at(torch.nonzero(found.store.scene.frame < frames)[:, 0])
+        return int(results.looked_through(replace(found, store=replace(found.store, scene=rays)), points, 300).sum())
+
+    assert 0 == seen_through(0) < seen_through(2) < seen_through(len(found.video))
+
+
 def test_a_killed_run_ends_with_the_same_bits(tmp_path):
     settings = dict(template=6, scene=8, body=2, joint=6, save_every=3)
     whole, _ = problem()

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 
 from pipeline.models.trajectories import TEST, TRAIN, window_starts
@@ -17,7 +19,7 @@ def jittered(rng: np.random.Generator, seconds: float = 20.0) -> Motion:
     agent = rigid.make(turn, np.stack([0.1 * time, 0 * time + 0.2, 0 * time], axis=-1))
     bones = np.broadcast_to(REST, (len(time), *REST.shape)).copy()
     camera = rigid.make(np.broadcast_to(np.eye(3), turn.shape), np.stack([0.05 * time, 0 * time + 1, 0 * time], axis=-1))
-    return Motion(time, camera, agent, bones, np.ones(len(time)))
+    return Motion(time, camera, agent, bones, np.ones(len(time)), np.ones(len(time), bool))
 
 
 def test_uneven_times_become_even_without_error():
@@ -30,28 +32,24 @@ def test_uneven_times_become_even_without_error():
 
 def test_only_short_gaps_are_bridged_and_doubtful_frames_are_gaps():
     motion = jittered(np.random.default_rng(0))
-    agent, confidence = motion.world_from_agent.copy(), motion.confidence.copy()
+    agent, confidence, visible = motion.world_from_agent.copy(), motion.confidence.copy(), motion.agent_visible.copy()
     agent[50:53] = np.nan
     confidence[100:120] = 0.1
-    holed = Motion(motion.timestamp_s, motion.world_from_camera, agent, motion.agent_from_bone, confidence)
+    visible[150:153] = visible[160:175] = False
+    holed = replace(motion, world_from_agent=agent, confidence=confidence, agent_visible=visible)
     trajectory = trajectory_from_motion(holed, **OPTIONS)
     assert trajectory.valid[45:60].all()
     np.testing.assert_allclose(trajectory.world_from_agent[45:60, 0, 3], 0.1 * trajectory.timestamp_s[45:60], atol=1e-9)
     assert not trajectory.valid[101:119].any()
-    assert trajectory.valid[122:].all()
+    assert trajectory.valid[122:159].all()
+    assert not trajectory.valid[161:174].any(), "what nobody saw for so long is no motion, whatever stands there"
+    assert trajectory.valid[177:].all()
     assert np.isfinite(trajectory.world_from_agent).all()
 
 
 def test_an_agent_never_seen_gives_no_valid_time():
     motion = jittered(np.random.default_rng(0))
-    unseen = Motion(
-        motion.timestamp_s,
-        motion.world_from_camera,
-        motion.world_from_agent * np.nan,
-        motion.agent_from_bone,
-        motion.confidence,
-    )
-    trajectory = trajectory_from_motion(unseen, **OPTIONS)
+    trajectory = trajectory_from_motion(replace(motion, world_from_agent=motion.world_from_agent * np.nan), **OPTIONS)
     assert not trajectory.valid.any()
     assert np.isfinite(trajectory.world_from_agent).all()
 
