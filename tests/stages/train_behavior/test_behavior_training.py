@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from pipeline import fit
+from pipeline.errors import InputError
 from pipeline.models import behavior
 from pipeline.models.behavior import Sampling
 from pipeline.models.diffusion import Schedule
@@ -13,8 +14,9 @@ from pipeline.models.perception import GRID_SHAPE
 from pipeline.models.planning import Sampler, TorchNetworks
 from pipeline.models.scenes import Scenes
 from pipeline.models.strides import strides_from_path
-from pipeline.models.trajectories import PAST, TRAIN
+from pipeline.models.trajectories import PAST, TRAIN, frames_from_seconds
 from stages.train_behavior import outcome, training
+from stages.train_behavior.__main__ import Config, refuse
 from stages.train_behavior.batches import (
     AS_OFTEN,
     Augmentation,
@@ -346,3 +348,18 @@ def test_goals_are_asked_for_earlier_times_as_often_as_told(windows, share, lowe
     assert error.shape == (4 * len(batch.goal), 3)
     assert error.abs().max() < 1e-3  # the right answer for the time asked for
     assert lowest - 1e-6 <= nets.horizons.min() <= highest
+
+
+@pytest.mark.parametrize(
+    ("settings", "code"),
+    [
+        (Config(training=Settings(Optimization(steps=100, goal_steps=200))), "REC-002"),
+        (Config(family="one_stage"), "REC-002"),
+        (Config(reading="pointwise"), "REC-002"),
+        (Config(horizon_s=60.0), "BEH-001"),
+    ],
+)
+def test_what_cannot_be_learned_or_made_is_refused_at_once(data, settings, code):
+    with pytest.raises(InputError, match=code):
+        refuse(settings, data.with_horizon(frames_from_seconds(settings.horizon_s)), settings.reading != "pointwise", "behavior_data")
+    refuse(Config(), data, True, "behavior_data")
