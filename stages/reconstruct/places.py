@@ -14,7 +14,7 @@ CELL_M = 0.1
 PROBE_M = 0.03
 """steps of the search for ground, down each column"""
 CLEAR_M = 0.03
-"""the root stays this far from surfaces"""
+"""the root stays this far from surfaces, or, where it is usually lower, half as high as it usually is"""
 STEP_M = 0.15
 """higher steps are jumps"""
 LEAP_M = 1.0
@@ -71,7 +71,7 @@ def places_of(scene: Field, floor_m: float, roots: Float[np.ndarray, "root 3"]) 
     place, level = np.nonzero(ground)
     ground_m = np.where(level == 0, floor_m, levels[level] - PROBE_M / 2)
     position = np.stack([column[place, 0], ground_m + usual, column[place, 1]], axis=-1)
-    position = position[(position[:, 1] <= top) & (distances(scene, position) > CLEAR_M)]
+    position = position[(position[:, 1] <= top) & (distances(scene, position) > min(CLEAR_M, usual / 2))]
     return _connected(scene, position)
 
 
