@@ -26,12 +26,14 @@ from pipeline.recordings.recording import (
 )  # fmt: skip
 
 COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
+LEAST_REACH_M = 4.0
+"""depth beyond what 16 bits reach comes back as near: what reaches less is refused, metres"""
 ASSUMED_HZ = 10.0
 """of streams whose frames carry no times"""
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a streamed NeRFCapture folder. Raises CAP-010 for the phone's own zip, whose depth is not metric."""
+    """Open a streamed NeRFCapture folder. Raises CAP-010 for the phone's own zip and for streams whose far depth is lost."""
     container: Container = FolderContainer(path) if path.is_dir() else ZipContainer(path)
     table = _table(container)
     if not path.is_dir() or "depth_integer_scale" in table:
@@ -43,6 +45,10 @@ def open_recording(path: Path) -> Recording:
     scale = table.get("integer_depth_scale")
     if not isinstance(scale, int | float) or not 0 < scale < 1:
         raise broken_metadata(container.where, "'integer_depth_scale' (metres per unit of depth) is missing")
+    if 65535 * scale < LEAST_REACH_M:
+        what = f"depth beyond {65535 * scale:.3g} m was written as if it were near: the stream's depth_scale is too small"
+        remedy = "stream again with a depth_scale of 10; where nerfcapture_dataset.py fails with that option, change its default"
+        raise InputError("CAP-010", what, container.where, remedy)
     frames = [frame for frame in _frames(table, container) if {frame["file_path"], frame["depth_path"]} <= container.names]
     if not frames:
         raise no_frames(container.where, "no frame has colour and depth")
@@ -93,13 +99,18 @@ def _frames(table: dict[str, Any], container: Container) -> list[dict[str, Any]]
         for frame in table["frames"]:
             matrix = np.array(frame["transform_matrix"], float).reshape(4, 4)
             coefficients = [float(frame.get(key, table.get(key))) for key in COEFFICIENTS]
-            names = [str(frame[key]).removeprefix("./") for key in ("file_path", "depth_path")]
+            names = [_member(str(frame[key]).removeprefix("./"), container) for key in ("file_path", "depth_path")]
             told = frame.get("timestamp")
             entry = dict(file_path=names[0], depth_path=names[1], matrix=matrix, coefficients=coefficients)
             found.append(entry | dict(time=None if told is None else float(told), order=_order(names[0])))
     except (KeyError, TypeError, ValueError) as error:
         raise broken_metadata(container.where, f"a frame of transforms.json cannot be read ({error!r})") from error
     return sorted(found, key=lambda entry: entry["order"])
+
+
+def _member(name: str, container: Container) -> str:
+    """Return the member that a frame names: the app author's script leaves out the ending of colour pictures."""
+    return next((each for each in (name, f"{name}.png", f"{name}.jpg") if each in container.names), name)
 
 
 def _order(name: str) -> tuple[int, str]:

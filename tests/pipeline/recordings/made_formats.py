@@ -104,9 +104,9 @@ def polycam_mesh(folder: Path, mesh: trimesh.Trimesh, aligned_from_world: np.nda
     (folder / "mesh_info.json").write_text(json.dumps({"alignmentTransform": aligned_from_world.T.ravel().tolist()}))
 
 
-def nerfcapture(folder: Path, made: Made) -> Path:
-    """The streamed folder: depth enlarged to the picture's size, 8 m over the 16 bits."""
-    members, frames, scale = {}, [], 8 / 65535
+def nerfcapture(folder: Path, made: Made, reach_m: float = 8.0) -> Path:
+    """The streamed folder: depth enlarged to the picture's size, so many metres over the 16 bits."""
+    members, frames, scale = {}, [], reach_m / 65535
     fl_x, fl_y, cx, cy = coefficients(made)
     for i, camera in enumerate(cameras.opencv_from_opengl(stored_cameras(made))):
         size = made.color(i).shape[1::-1]

@@ -129,6 +129,20 @@ def test_corrected_polycam_pictures_win_and_their_borders_are_no_depth(tmp_path)
     assert (depth[:, 9:] > 0).all()
 
 
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_streams_may_name_pictures_without_their_ending(tmp_path, ending):
+    path = made_formats.nerfcapture(tmp_path / "a", walk(6))
+    table = json.loads((path / "transforms.json").read_text())
+    for frame in table["frames"]:
+        stored = path / frame["file_path"]
+        stored.rename(stored.with_suffix(ending))
+        frame["file_path"] = frame["file_path"].removesuffix(".png")
+    (path / "transforms.json").write_text(json.dumps(table))
+    recording = open_recording(path)
+    assert len(recording.index) == 6
+    assert recording.read_color(5) == (path / f"rgb/5{ending}").read_bytes()
+
+
 def test_associated_by_time():
     times = np.array([0.0, 0.1, 0.2, 5.0])
     assert tum.nearest(times, np.array([0.015, 0.19]), 0.02).tolist() == [0, -1, 1, -1]
@@ -240,6 +254,7 @@ FAULTS = {
     "CAP-008 ": _millimetres_as_metres,
     "CAP-009": _constant_rows,
     "CAP-010": lambda path, made: made_formats.nerfcapture_zip(path.with_suffix(".zip"), made),
+    "CAP-010 ": lambda path, made: made_formats.nerfcapture(path, made, reach_m=1.0),
     "CAP-011": _no_intrinsics,
 }
 
