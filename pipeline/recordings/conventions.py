@@ -4,7 +4,7 @@ For a few pairs of frames, the depth of one is moved by the poses into the other
 there. The documented convention stays unless it is clearly refuted and another one clearly fits.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal
@@ -86,12 +86,13 @@ def check_poses(
     depth_view: Callable[[int], DepthView],
     pairs: int = 6,
     documented: Convention = OPENGL,
+    among: Sequence[Convention] = CONVENTIONS,
 ) -> SelfCheck:
-    """Decide which convention the poses follow; ``depth_view(i)`` gives the depth of frame i on demand."""
+    """Decide which convention the poses follow, the documented one ``among`` them; ``depth_view(i)`` gives frame i's depth on demand."""
     broken = _fault_of(pose)
     if broken:
         return SelfCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
-    tried = {convention: odometry_from_pose(pose, convention) for convention in CONVENTIONS}
+    tried = {convention: odometry_from_pose(pose, convention) for convention in among}
     chosen = _moving_pairs(tried[documented], timestamp_s, pairs)
     if len(chosen) == 0:
         return SelfCheck("untested", documented, 0, np.nan, np.nan, TOLERANCE_M, "the phone moved too little to test its poses")

@@ -144,7 +144,8 @@ def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
     typical_m = float(np.median(depth)) if len(depth) else max_depth_m
     if not NEAREST_TYPICAL_M < typical_m < FARTHEST_TYPICAL * max_depth_m:
         what = f"depth is typically {typical_m:.3g} m, where up to {max_depth_m:g} m are used"
-        raise InputError("CAP-008", what, recording.where, "16-bit PNG holds millimetres, EXR metres; record things within 5 m")
+        remedy = "16-bit PNG holds millimetres, or the units per metre of a TUM folder's depth_scale.txt, EXR metres; record within 5 m"
+        raise InputError("CAP-008", what, recording.where, remedy)
 
 
 def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.ndarray, "used 7"] | None, str]:

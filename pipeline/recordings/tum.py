@@ -1,8 +1,10 @@
 """TUM RGB-D folders: `rgb.txt`, `depth.txt` and, where there is one, `groundtruth.txt`, associated by time.
 
-Depth is registered to the colour picture, 5000 units per metre. Intrinsics from `intrinsics.txt` or the set's default.
+Depth is registered to the colour picture; `depth_scale.txt` tells its units per metre, else poses tell the set's 5000 from
+millimetres. Intrinsics from `intrinsics.txt` or the set's default.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from jaxtyping import Float
 from pipeline.files import images
 from pipeline.recordings import text_files
 from pipeline.recordings.containers import FolderContainer
-from pipeline.recordings.conventions import OPENCV
+from pipeline.recordings.conventions import OPENCV, DepthView, check_poses
 from pipeline.recordings.recording import (
     MAX_PICTURE_BYTES,
     MAX_TEXT_BYTES,
@@ -22,8 +24,12 @@ from pipeline.recordings.recording import (
     no_depth,
     no_frames,
 )  # fmt: skip
+from pipeline.space import cameras
 
-PER_METER = 5000.0
+PER_METER, MILLIMETERS = 5000.0, 1000.0
+"""units per metre of the set, and of most other cameras"""
+CLEARLY = 0.5
+"""share of the disagreement between depth and poses that is left where another unit is the right one"""
 NEAREST_S = 0.02
 """largest difference in time between a colour picture, its depth and its pose, seconds"""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
@@ -49,21 +55,30 @@ def open_recording(path: Path) -> Recording:
     color_size = images.decode_color(container.read(pairs[0][0], MAX_PICTURE_BYTES), container.where).shape[:2]
     depth_size = meters_from_png(container.read(pairs[0][1], MAX_PICTURE_BYTES), None, container.where).shape
     coefficients, remarks = text_files.coefficients(container, default=DEFAULT if color_size == (480, 640) else None)
+    intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(pairs), 1)), container.where)
+    pose = _poses(container, times[kept])
+
+    def depth(number: int, per_meter: float) -> np.ndarray:
+        name = pairs[number][1]
+        return meters_from_png(container.read(name, MAX_PICTURE_BYTES), depth_size, f"{container.where}/{name}", per_meter)
+
+    def view(number: int, per_meter: float) -> DepthView:
+        return DepthView(depth(number, per_meter), cameras.scale_intrinsics(intrinsics[number], color_size, depth_size))
+
+    per_meter, told = _units_per_meter(container, pose, times[kept], view)
     return Recording(
         where=container.where,
         kind="TUM RGB-D",
         index=np.arange(len(pairs)),
         timestamp_s=times[kept] - times[kept[0]],
-        intrinsics=intrinsics_from_coefficients(np.tile(coefficients, (len(pairs), 1)), container.where),
-        pose=_poses(container, times[kept]),
+        intrinsics=intrinsics,
+        pose=pose,
         color_size=color_size,
         depth_size=depth_size,
         read_color=lambda i: container.read(pairs[i][0], MAX_PICTURE_BYTES),
-        read_depth=lambda i: meters_from_png(
-            container.read(pairs[i][1], MAX_PICTURE_BYTES), depth_size, f"{container.where}/{pairs[i][1]}", PER_METER
-        ),
+        read_depth=lambda i: depth(i, per_meter),
         convention=OPENCV,
-        remarks=remarks,
+        remarks=remarks + told,
     )
 
 
@@ -102,3 +117,28 @@ def _poses(container: FolderContainer, times: Float[np.ndarray, "frame"]) -> Flo
     pose = table[partner][:, [4, 5, 6, 7, 1, 2, 3]]
     pose[partner < 0] = np.nan
     return pose
+
+
+def _units_per_meter(
+    container: FolderContainer,
+    pose: Float[np.ndarray, "frame 7"] | None,
+    timestamp_s: Float[np.ndarray, "frame"],
+    view: Callable[[int, float], DepthView],
+) -> tuple[float, tuple[str, ...]]:
+    """Return what `depth_scale.txt` tells; else millimetres where poses fit them and not the set's unit, which stands otherwise."""
+    name = "depth_scale.txt"
+    if name in container.names:
+        where = f"{container.where}/{name}"
+        told = float(text_files.table(container.read(name, MAX_TEXT_BYTES).decode(errors="replace"), 1, where, rows=1)[0, 0])
+        if not 0 < told < np.inf:
+            raise broken_metadata(where, "the units per metre must be positive")
+        return told, ()
+    known = np.flatnonzero(np.isfinite(pose).all(1)) if pose is not None else np.arange(0)
+
+    def off(per_meter: float) -> float:
+        check = check_poses(pose[known], timestamp_s[known], lambda i: view(known[i], per_meter), documented=OPENCV, among=(OPENCV,))
+        return check.residual_m / check.tolerance_m
+
+    if len(known) and off(MILLIMETERS) < min(1.0, CLEARLY * off(PER_METER)):
+        return MILLIMETERS, (f"no {name}: {MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not",)
+    return PER_METER, (f"no {name}: {PER_METER:g} units per metre are assumed",)

@@ -126,13 +126,13 @@ def nerfcapture_zip(path: Path, made: Made) -> Path:
     return path
 
 
-def tum(folder: Path, made: Made, poses: bool = True) -> Path:
+def tum(folder: Path, made: Made, poses: bool = True, per_meter: float = 5000) -> Path:
     """Depth and poses come some milliseconds after the colour, as from a sensor of its own."""
     times = START_S + made.timestamp_s
     members: dict[str, bytes | str] = {"intrinsics.txt": " ".join(map(str, coefficients(made)))}
     for i, time in enumerate(times):
         members[f"rgb/{time:.6f}.png"] = png(made.color(i)[..., ::-1])
-        members[f"depth/{time + 0.004:.6f}.png"] = png(millimeters(made.depth(i), 5000))
+        members[f"depth/{time + 0.004:.6f}.png"] = png(millimeters(made.depth(i), per_meter))
     members["rgb.txt"] = "# colour\n" + "\n".join(f"{time:.6f} rgb/{time:.6f}.png" for time in times)
     members["depth.txt"] = "# depth\n" + "\n".join(f"{time + 0.004:.6f} depth/{time + 0.004:.6f}.png" for time in times)
     lines = [" ".join(map(str, [t + 0.002, *p[4:], *p[:4]])) for t, p in zip(times, quaternion_poses(made), strict=True)]

@@ -143,6 +143,27 @@ def test_streams_may_name_pictures_without_their_ending(tmp_path, ending):
     assert recording.read_color(5) == (path / f"rgb/5{ending}").read_bytes()
 
 
+@pytest.mark.parametrize("per_meter", [1000, 5000])
+def test_poses_tell_millimetres_from_the_units_of_the_set(tmp_path, per_meter):
+    made = walk(18, rate_hz=RATE_HZ)
+    recording = open_recording(made_formats.tum(tmp_path / "a", made, per_meter=per_meter))
+    np.testing.assert_allclose(recording.read_depth(3), made.depth(3), atol=1e-3)
+    assert any(f"{per_meter} units per metre" in remark for remark in recording.remarks)
+
+
+def test_a_file_tells_the_units_of_depth(tmp_path):
+    made = walk(6)
+    path = made_formats.tum(tmp_path / "a", made, poses=False, per_meter=256)
+    (path / "depth_scale.txt").write_text("# units per metre\n256\n")
+    recording = open_recording(path)
+    np.testing.assert_allclose(recording.read_depth(3), made.depth(3), atol=3e-3)
+    assert not recording.remarks
+    for impossible in ("0", "inf", "1000 1000", "millimetres"):
+        (path / "depth_scale.txt").write_text(impossible)
+        with pytest.raises(InputError, match="CAP-004"):
+            open_recording(path)
+
+
 def test_associated_by_time():
     times = np.array([0.0, 0.1, 0.2, 5.0])
     assert tum.nearest(times, np.array([0.015, 0.19]), 0.02).tolist() == [0, -1, 1, -1]
