@@ -12,7 +12,7 @@ from typing import Any
 
 import lzfse
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.errors import InputError
 from pipeline.files import images
@@ -35,8 +35,10 @@ from pipeline.recordings.recording import (
 DEPTH_SIZES = {49_152: (256, 192), 307_200: (640, 480), 691_200: (960, 720)}
 """floats per picture -> (height, width) of a portrait recording, where the metadata do not say"""
 FACE_ID_FLOATS = (307_200, 691_200)
-LIDAR = 1
-"""the app's number of the camera at the back"""
+FACE_ID, LIDAR = 0, 1
+"""the app's numbers of the cameras at the front and at the back"""
+LEAST_TIMED = 0.5
+"""share of frames whose times increase below which the times tell nothing"""
 
 
 @dataclass(frozen=True)
@@ -73,34 +75,39 @@ def _open(container: Container, layout: _Layout) -> Recording:
     if not stored:
         raise no_depth(container.where, "Record3D's archive holds none")
     index = np.array(sorted(stored & _numbers(container.names, layout.color)), int)
-    count = max(stored) + 1
-    timestamp_s, intrinsics, pose = metadata.timestamp_s(count), metadata.intrinsics(count), metadata.pose()
-    index = index[index < min(len(timestamp_s), len(intrinsics), len(timestamp_s) if pose is None else len(pose))]
     if len(index) == 0:
-        raise no_frames(container.where, "none has colour, depth and metadata")
+        raise no_frames(container.where, "none has colour and depth")
+    timestamp_s = metadata.timestamp_s(index)
+    index, timestamp_s = index[np.isfinite(timestamp_s)], timestamp_s[np.isfinite(timestamp_s)]
+    intrinsics, pose = metadata.intrinsics(index), metadata.pose(index)
     depth_size = _depth_size(container, layout, metadata, int(index[0]))
     _refuse_face_id(depth_size, metadata.camera_type(), container.where)
     return Recording(
         where=container.where,
         kind="Record3D .r3d" if layout is _ARCHIVE else "Record3D EXR + JPG",
         index=index,
-        timestamp_s=timestamp_s[index],
-        intrinsics=intrinsics[index],
-        pose=None if pose is None else pose[index],
+        timestamp_s=timestamp_s,
+        intrinsics=intrinsics,
+        pose=pose,
         color_size=metadata.color_size,
         depth_size=depth_size,
         read_color=lambda i: container.read(layout.color % i, MAX_PICTURE_BYTES),
         read_depth=lambda i: _read_depth(container, layout.depth % i, depth_size),
         read_confidence=_confidence_reader(container, layout, index, depth_size),
         convention=OPENGL,
-        up=None if pose is None or np.allclose(pose[0], (0, 0, 0, 1, 0, 0, 0), atol=1e-6) else Y_UP,
+        up=metadata.up(),
+        remarks=tuple(metadata.remarks),
     )
 
 
 class _Metadata:
-    """The recording's JSON, checked as it is asked for. Every complaint is CAP-004 and names the key."""
+    """The recording's JSON, checked as it is asked for. Every complaint is CAP-004 and names the key.
+
+    Rows are asked for by frame numbers; what single rows lack is mended, or left out, and counted in ``remarks``.
+    """
 
     def __init__(self, container: Container, name: str) -> None:
+        self.remarks: list[str] = []
         self._where = f"{container.where}:{name}"
         try:
             self._table = json.loads(container.read(name, MAX_TEXT_BYTES))
@@ -114,33 +121,61 @@ class _Metadata:
         """Return (height, width) of the depth pictures where the app wrote it."""
         return (self._pixels("dh"), self._pixels("dw")) if "dh" in self._table and "dw" in self._table else None
 
-    def timestamp_s(self, frames: int) -> Float[np.ndarray, "frame"]:
-        """Return seconds since the first frame; from the frame rate in recordings of old apps."""
-        if "frameTimestamps" not in self._table:
-            return np.arange(frames) / self._numbers("fps", (), positive=True)
-        timestamp_s = self._numbers("frameTimestamps", (None,))
-        if np.any(np.diff(timestamp_s) <= 0):
+    def timestamp_s(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
+        """Return seconds since the first frame, NaN where they do not increase; from the frame rate in recordings of old apps."""
+        if not self._table.get("frameTimestamps"):
+            return (index - index[0]) / self._numbers("fps", (), positive=True)
+        timestamp_s = self._rows("frameTimestamps", (), index)
+        good = timestamp_s > np.fmax.accumulate(np.r_[-np.inf, timestamp_s[:-1]])
+        if good.mean() < LEAST_TIMED:
             raise self._broken("'frameTimestamps' must increase")
-        return timestamp_s - timestamp_s[0] if len(timestamp_s) else timestamp_s
+        self._remark(~good, "are left out: their times are missing or do not increase")
+        return np.where(good, timestamp_s - timestamp_s[good][0], np.nan)
 
-    def intrinsics(self, frames: int) -> Float[np.ndarray, "frame 3 3"]:
+    def intrinsics(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 3 3"]:
         """Return K in colour pixels: per frame where the app wrote it, else the first frame's (stored by columns)."""
-        if "perFrameIntrinsicCoeffs" in self._table:
-            coefficients = self._numbers("perFrameIntrinsicCoeffs", (None, 4))
-        else:
+        coefficients = self._rows("perFrameIntrinsicCoeffs", (4,), index)
+        missing = ~(np.isfinite(coefficients).all(1) & (coefficients[:, :2] > 0).all(1))
+        if missing.any():
             first = self._numbers("K", (9,)).reshape(3, 3).T
-            coefficients = np.tile(first[[0, 1, 0, 1], [0, 1, 2, 2]], (frames, 1))
+            coefficients[missing] = first[[0, 1, 0, 1], [0, 1, 2, 2]]
+            if self._table.get("perFrameIntrinsicCoeffs"):
+                self._remark(missing, "have no intrinsics of their own: the first frame's are used")
         return intrinsics_from_coefficients(coefficients, self._where)
 
     def camera_type(self) -> int | None:
-        """Return the app's number of the camera (1: LiDAR), where it wrote one."""
-        return int(self._numbers("cameraType", ())) if "cameraType" in self._table else None
+        """Return the app's number of the camera, where it wrote one."""
+        if "cameraType" not in self._table:
+            return None
+        camera_type = int(self._numbers("cameraType", ()))
+        if camera_type not in (FACE_ID, LIDAR):
+            self.remarks.append(f"camera type {camera_type} is not known: it is read like the LiDAR camera")
+        return camera_type
 
-    def pose(self) -> Float[np.ndarray, "frame 7"] | None:
-        """Return the device poses as stored; values that are no numbers come back as NaN."""
+    def pose(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 7"] | None:
+        """Return the device poses as stored, NaN where they are missing or no numbers; None without any."""
         if not self._table.get("poses"):
             return None
-        return self._numbers("poses", (None, 7), finite=False)
+        pose = self._rows("poses", (7,), index)
+        self._remark(~np.isfinite(pose).all(1), "have no device pose")
+        return pose
+
+    def up(self) -> tuple[float, float, float] | None:
+        """Return what points up in the poses' world; nothing does in recordings of old apps, whose world is the first camera."""
+        first = self._rows("poses", (7,), np.zeros(1, int))
+        return None if np.isnan(first).all() or np.allclose(first, (0, 0, 0, 1, 0, 0, 0), atol=1e-6) else Y_UP
+
+    def _rows(self, key: str, shape: tuple[int, ...], index: Int[np.ndarray, "frame"]) -> np.ndarray:
+        """Read a table's rows of the given shape by frame numbers; NaN where it has none or they hold what is no number."""
+        rows = np.full((len(index), *shape), np.nan)
+        if self._table.get(key):
+            stored = self._numbers(key, (None, *shape), finite=False)
+            rows[index < len(stored)] = stored[index[index < len(stored)]]
+        return np.where(np.isfinite(rows), rows, np.nan)
+
+    def _remark(self, frames: Bool[np.ndarray, "frame"], what: str) -> None:
+        if frames.any():
+            self.remarks.append(f"{frames.sum()} of {len(frames)} frames {what}")
 
     def _pixels(self, key: str) -> int:
         value = float(self._numbers(key, (), positive=True))
@@ -197,7 +232,7 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
 
 def _refuse_face_id(depth_size: tuple[int, int], camera_type: int | None, where: str) -> None:
     """Refuse the front camera: depth of another size, another camera type, and no device poses at all."""
-    if camera_type not in (None, LIDAR) or math.prod(depth_size) in FACE_ID_FLOATS:
+    if camera_type == FACE_ID or math.prod(depth_size) in FACE_ID_FLOATS:
         remedy = "record with the LiDAR camera at the back of the phone"
         raise InputError("CAP-005", "recorded with the Face-ID camera: it has no device poses", where, remedy)
 

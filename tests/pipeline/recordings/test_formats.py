@@ -68,6 +68,37 @@ def test_poses_may_be_missing(tmp_path, write):
     assert len(plan.chosen) >= 5
 
 
+TIMES, POSES = (np.arange(12) / RATE_HZ).tolist(), walk(12, rate_hz=RATE_HZ).poses().tolist()
+MENDED = {
+    "no intrinsics of frames": ({"perFrameIntrinsicCoeffs": []}, 12, None),
+    "few intrinsics of frames": ({"perFrameIntrinsicCoeffs": [[51, 53, 25, 31]] * 9}, 12, "3 of 12 frames have no intrinsics"),
+    "no times": ({"frameTimestamps": []}, 12, None),
+    "few times": ({"frameTimestamps": TIMES[:10]}, 10, "2 of 12 frames are left out"),
+    "a time twice": ({"frameTimestamps": [*TIMES[:10], TIMES[9], TIMES[11]]}, 11, "1 of 12 frames are left out"),
+    "a time that is none": ({"frameTimestamps": [*TIMES[:10], None, TIMES[11]]}, 11, "1 of 12 frames are left out"),
+    "few poses": ({"poses": POSES[:10]}, 12, "2 of 12 frames have no device pose"),
+    "another camera": ({"cameraType": 2}, 12, "camera type 2 is not known"),
+}
+
+
+@pytest.mark.parametrize("name", MENDED)
+def test_rows_that_record3d_left_out_cost_no_more_than_themselves(tmp_path, name):
+    change, frames, remark = MENDED[name]
+    made = walk(12, rate_hz=RATE_HZ)
+    made.metadata |= change
+    recording = open_recording(made.write(tmp_path / "a.r3d"))
+    assert len(recording.index) == len(recording.pose) == len(recording.intrinsics) == frames
+    assert (np.diff(recording.timestamp_s) > 0).all()
+    assert [each.startswith(remark) for each in recording.remarks] == [True] if remark else not recording.remarks
+
+
+def test_the_first_frames_intrinsics_stand_in_for_missing_ones(tmp_path):
+    made = walk(6)
+    made.metadata["perFrameIntrinsicCoeffs"] = [[51, 53, 25, 31], [0, 0, 0, 0], [51, None, 25, 31], [51, 53, 25, 31]]
+    recording = open_recording(made.write(tmp_path / "a.r3d"))
+    assert recording.intrinsics[:, 0, 0].tolist() == [51, 50, 50, 51, 50, 50]
+
+
 @pytest.mark.parametrize("columns", [7, 9, 15])
 def test_every_age_of_stray_scanner_is_read(tmp_path, columns):
     made = walk(8, quarter_turns=LANDSCAPE)
