@@ -32,6 +32,8 @@ UNIT_VIEWS = 5
 """frames whose depth tells whether it can be metres"""
 NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
 """typical depth is not below the one, metres, nor above the other, in units of the farthest that is used"""
+MOST_STRETCHED = 0.03
+"""difference in shape of pictures and depth, as a share, beyond which they cannot show the same"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
 """mean brightness (0..1) below which a picture loses quality"""
@@ -84,6 +86,7 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
     if recording.depth_size is None or recording.intrinsics is None:
         raise no_depth(recording.where, f"{recording.kind}; an animal moves, so that pictures alone do not tell how far away it is")
     _refuse_other_pictures(recording)
+    _refuse_other_shape(recording.color_size, recording.depth_size, recording.where)
     _refuse_other_unit(recording, max_depth_m)
     depth_size = reduced_size(recording.depth_size, MAX_DEPTH_SIDE_PX)
     depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, depth_size)
@@ -134,6 +137,16 @@ def _refuse_other_pictures(recording: Recording) -> None:
     if not ((center > 0) & (center < (width, height))).all():
         why = f"the intrinsics' centre, {center[0]:.0f} {center[1]:.0f}, lies outside of pictures of {width} x {height}"
         raise broken_metadata(recording.where, why)
+
+
+def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int], where: str) -> None:
+    """Raise CAP-008 for depth of another shape than the pictures, all as stored: the one shows more than the other."""
+    (height, width), (depth_height, depth_width) = color_size, depth_size
+    stretched_px = abs(depth_height - depth_width * height / width)
+    rounding_px = 0.5 * (1 + height / width)
+    if stretched_px > max(MOST_STRETCHED * depth_height, rounding_px):
+        what = f"depth of {depth_width} x {depth_height} cannot show the same as pictures of {width} x {height}"
+        raise InputError("CAP-008", what, where, "crop the one to what the other shows, turned as the pictures are stored")
 
 
 def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:

@@ -244,6 +244,12 @@ def _millimetres_as_metres(path, made):
     return path
 
 
+def _video_of_another_shape(path, made):
+    made_formats.video_and_depth(path, made)
+    made_formats.write_movie(path / "clip.mov", [made.color(i)[:48] for i in range(6)])
+    return path
+
+
 def _intrinsics_of_another_size(path, made):
     made_formats.video_and_depth(path, made)
     (path / "intrinsics.txt").write_text("3000 3000 1920 1080")
@@ -304,6 +310,7 @@ FAULTS = {
     "CAP-008": _other_depth_size,
     "CAP-004  ": _intrinsics_of_another_size,
     "CAP-008 ": _millimetres_as_metres,
+    "CAP-008  ": _video_of_another_shape,
     "CAP-009": _constant_rows,
     "CAP-010": lambda path, made: made_formats.nerfcapture_zip(path.with_suffix(".zip"), made),
     "CAP-010 ": lambda path, made: made_formats.nerfcapture(path, made, reach_m=1.0),
@@ -318,6 +325,13 @@ def test_what_cannot_be_used_is_refused_with_a_remedy(tmp_path, code):
         _understand(path)
     assert refused.value.code == code.strip()
     assert refused.value.remedy
+
+
+@pytest.mark.parametrize(("color", "depth"), [((1920, 1440), (256, 192)), ((1080, 1920), (144, 256)), ((768, 1366), (27, 48))])
+def test_pictures_and_depth_of_one_shape_may_be_rounded(color, depth):
+    extraction._refuse_other_shape(color, depth, "a")
+    with pytest.raises(InputError, match=f"CAP-008.*depth of {depth[0]} x {depth[1]}"):
+        extraction._refuse_other_shape(color, depth[::-1], "a")
 
 
 def test_up_may_be_any_axis():

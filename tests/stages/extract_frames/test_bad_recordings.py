@@ -47,7 +47,7 @@ CASES = {
         {"metadata": {"w": 1e9}},
         {"metadata": {"w": float("nan")}},
         {"metadata": {"frameTimestamps": [0.0] * 12}},
-        {"metadata": {"h": 60}},
+        {"metadata": {"h": 62}},
     ],
     "CAP-005": [
         {"metadata": {"cameraType": 0}},
