@@ -17,6 +17,7 @@ from pipeline.space import cameras, rigid
 TOLERANCE_M = 0.015
 TOLERANCE_SHARE = 0.01
 UNUSABLE_FACTOR = 4.0
+"""of the tolerance, which grows with depth, beyond which poses are no mere drift"""
 MIN_OVERLAP = 0.25
 MIN_TURN_RAD = np.radians(3.0)
 MIN_SHIFT_M = 0.05
@@ -185,7 +186,7 @@ def _judge(scores: dict[Convention, _Score], documented: Convention, pairs: int)
         return _checked("documented", documented, told, pairs, "the documented convention explains the depth")
     if scores[best].accepted and scores[best].cost < 0.5 * told.cost:
         return _checked("other", best, scores[best], pairs, f"the documented convention is refuted by the depth; {best} explains it")
-    if told.residual_m < UNUSABLE_FACTOR * TOLERANCE_M and told.overlap > MIN_OVERLAP:
+    if told.residual_m < UNUSABLE_FACTOR * told.tolerance_m and told.overlap > MIN_OVERLAP:
         return _checked("documented", documented, told, pairs, "device poses explain the depth only roughly: they drift")
     return _checked("unusable", documented, told, pairs, "device poses do not explain the depth under any convention")
 

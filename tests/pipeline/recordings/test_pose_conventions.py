@@ -10,12 +10,13 @@ from tests.stages import textured_room
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 
-def _check(made, pose):
+def _check(made, pose, size=1.0):
+    """Judge poses of a walk through the room made so many times larger, with noise of LiDAR."""
     intrinsics = cameras.scale_intrinsics(made.intrinsics, COLOR_SIZE, DEPTH_SIZE)
     rng = np.random.default_rng(0)
 
     def view(frame):
-        noisy = made.depth(frame) + rng.normal(0, 0.003, DEPTH_SIZE)
+        noisy = size * made.depth(frame) + rng.normal(0, 0.003, DEPTH_SIZE)
         return conventions.DepthView(noisy, intrinsics)
 
     return conventions.check_poses(pose, made.timestamp_s, view)
@@ -74,6 +75,17 @@ def test_meaningless_poses_are_unusable():
         shuffled,
     ):
         assert _check(made, bad).verdict == "unusable"
+
+
+@pytest.mark.parametrize("size", [1.0, 3.0])
+def test_poses_that_drift_are_used_whatever_the_size_of_the_room(size):
+    made = walk(40)
+    pose = made.poses()
+    pose[:, 4:] += 0.08 * made.timestamp_s[:, None]
+    pose[:, 4:] *= size
+    check = _check(made, pose, size)
+    assert check.verdict == "documented"
+    assert check.tolerance_m < check.residual_m < 4 * check.tolerance_m
 
 
 def test_a_still_phone_proves_nothing():
