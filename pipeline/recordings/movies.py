@@ -93,6 +93,7 @@ class Movie:
 
 
 def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:
+    """Yield the times of all frames but those that an edit list hides: they are decoded for others and never shown."""
     packets = container.demux(stream)
     while True:
         try:
@@ -101,7 +102,7 @@ def _packet_times(container: av.container.InputContainer, stream: av.VideoStream
             return
         if packet is None:
             return
-        if packet.pts is not None and packet.size:
+        if packet.pts is not None and packet.size and not packet.is_discard:
             yield packet.pts
 
 

@@ -365,6 +365,20 @@ def _turn_track(path, turns):
     path.write_bytes(data)
 
 
+def test_frames_that_an_edit_list_hides_are_none(tmp_path):
+    """A phone that trims a video keeps its pictures from the last key frame on and writes where to begin."""
+    made = walk(20)
+    path = tmp_path / "a.mp4"
+    made_formats.write_movie(path, [made.color(i) for i in range(20)], rate=15)
+    data = bytearray(path.read_bytes())
+    units_per_s = struct.unpack_from(">I", data, data.find(b"mdhd") + 16)[0]
+    struct.pack_into(">i", data, data.find(b"elst") + 16, 5 * units_per_s // 15)
+    path.write_bytes(data)
+    movie = Movie(path)
+    assert len(movie) == 15
+    assert all(np.abs(movie.read(i).astype(int) - made.color(i + 5)).mean() < 4 for i in range(15))
+
+
 def test_polycams_own_mesh_stands_where_its_cameras_do(tmp_path):
     box = trimesh.creation.box((4.0, 2.5, 5.0), rigid.make(np.eye(3), np.array([2.0, 1.25, 2.5])))
     folder = made_formats.polycam(tmp_path / "a", walk(12))
