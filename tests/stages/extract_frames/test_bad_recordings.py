@@ -98,6 +98,13 @@ def test_flipped_bytes_are_refused(tmp_path, monkeypatch, capsys):
     assert "CAP-001" in _refused(path, tmp_path, monkeypatch, capsys)
 
 
+@pytest.mark.parametrize("frames", [1, 5])
+def test_a_recording_of_a_moment_is_refused(tmp_path, monkeypatch, capsys, frames):
+    told = _refused(walk(frames).write(tmp_path / "a.r3d"), tmp_path, monkeypatch, capsys)
+    assert "CAP-007" in told
+    assert "record some seconds" in told
+
+
 def test_a_video_that_is_mostly_damaged_is_refused(tmp_path):
     with pytest.raises(InputError, match="CAP-001.*3 of 4 pictures"):
         writing.write_frames(tmp_path, [None] * 3, total=4, min_depth_valid=0.2, where="a.mp4")
