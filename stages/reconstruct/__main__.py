@@ -36,8 +36,8 @@ class Config:
     rates: Rates = Rates()
     """of learning"""
     sessions: Literal["all", "filmed_twice"] = "all"
-    """what is reconstructed together: all registered sessions and the walk-through, or alone the first session that a
-    held-out phone filmed too, or the first of all where there is no such phone (single-video baselines)"""
+    """what is reconstructed together: all registered sessions and the walk-through, or one session alone (single-video
+    baselines): the first that a held-out phone filmed too, else the first"""
     ground: Literal["fused", "none"] = "fused"
     """what the scene's field learns on: fused depth, or nothing (baselines)"""
     fusion: Fusion = Fusion()
@@ -56,9 +56,8 @@ def run(task: cli.Task) -> None:
     single = {name: task.input(name) for name in ("registration", "scene_template", "agent_template")}
     folders = reading.Folders(**per_video, **single, scratch=scratch)
     by_role = {video.role: video.id for video in task.videos}
-    twice = [video.synchronized_with for video in task.videos if video.role == "heldout"] or list(per_video["frames"])
-    only = twice if config.sessions == "filmed_twice" else None
-    videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed, only, workers)
+    twice = [video.synchronized_with for video in task.videos if video.role == "heldout"] if config.sessions == "filmed_twice" else None
+    videos = reading.read_videos(folders, by_role["walkthrough"], by_role["turnaround"], config.sampling, config.seed, twice, workers)
     fused = fuse.ground(videos, config.shapes.scene_margin_m, config.fusion, scratch, workers) if config.ground == "fused" else None
     template, floor_m = reading.read_template(folders.agent_template), reading.read_floor(folders.scene_template)
     problem = assemble.build(videos, template, config.shapes, config.seed, task.device, fused, scratch, floor_m)

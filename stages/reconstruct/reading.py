@@ -43,11 +43,12 @@ def read_videos(
 ) -> list[Video]:
     """Read the walk-through, the turnaround and every registered session once into rays with their poses.
 
-    With ``only``, the first registered one of these sessions stands alone, with the turnaround that made its template.
+    With ``only``, the first registered one of these sessions, of all where it is empty, stands alone, with the turnaround that
+    made its template.
     So many ``workers`` read sessions at once.
     Raises `InputError` RCN-001 when no session was registered.
     """
-    sessions = [id for id in sorted(folders.frames) if (folders.registration / id / "poses.npz").exists() and (only is None or id in only)]
+    sessions = [id for id in sorted(folders.frames) if (folders.registration / id / "poses.npz").exists() and (not only or id in only)]
     if not sessions:
         raise InputError("RCN-001", "no session was registered", str(folders.registration), "see registration/summary.json for the reasons")
     if only is not None:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pipeline import cli, progress
-from pipeline.errors import InputError
 from pipeline.models.diffusion import Schedule
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, frames_from_seconds
+from pipeline.models.trajectories import TRAIN, BehaviorData, frames_from_seconds
 from stages.train_behavior import outcome
 from stages.train_behavior.outcome import architecture_for
+from stages.train_behavior.refusals import refuse
 from stages.train_behavior.training import Settings, train
 
 
@@ -64,29 +64,13 @@ def run(task: cli.Task) -> None:
     data = BehaviorData.load(task.input("behavior_data")).with_horizon(frames_from_seconds(c.horizon_s))
     scenes = Scenes.load(task.input("behavior_data"), data.videos)
     architecture = architecture_for(vars(c), data, scenes)
-    refuse(c, data, bool(architecture.map_cells), str(task.input("behavior_data")))
+    refuse(vars(c), data, architecture, str(task.input("behavior_data")))
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
     fitted = train(data, scenes, architecture, c.schedule, c.training, seed=c.seed, resume=task.resume, device=task.device)
     with task.create() as folder:
         outcome.write_trained(folder, fitted, architecture, c.schedule, data.agent_from_bone_rest)
         if c.export:
             outcome.write_exported(folder, fitted, architecture, c.schedule, data, scenes, seed=c.seed)
-
-
-def refuse(c: Config, data: BehaviorData, mapped: bool, where: str) -> None:
-    """Raise REC-002 for settings of which nothing can be learned or made, BEH-001 where no window is as long as they want."""
-    pace = c.training.optimization
-    if c.reading == "pointwise" and not mapped:
-        raise InputError("REC-002", "the 3-D encoder makes no map", "[train_behavior]: reading", 'scene = "pillars" makes one')
-    if c.family == "one_stage" and c.export:
-        what = "a model without goals cannot be exported: page and samplers ask for them"
-        raise InputError("REC-002", what, "[train_behavior]: export", "set it to false; `make behavior-tables` judges such models")
-    if c.family != "one_stage" and pace.steps <= pace.goal_steps:
-        what = f"{pace.goal_steps} steps of goals leave none of {pace.steps} to paths and bodies"
-        raise InputError("REC-002", what, "[train_behavior.training.optimization]: steps", "take more steps, or fewer `goal_steps`")
-    if not len(data.indices(TRAIN)):
-        what = f"no {(PAST + data.future) / RATE_HZ:.1f} s of uninterrupted motion to learn from"
-        raise InputError("BEH-001", what, where, "film longer sessions in which the animal stays in view, or foretell less (`horizon_s`)")
 
 
 if __name__ == "__main__":

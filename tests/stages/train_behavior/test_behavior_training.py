@@ -16,7 +16,7 @@ from pipeline.models.scenes import Scenes
 from pipeline.models.strides import strides_from_path
 from pipeline.models.trajectories import PAST, TRAIN, frames_from_seconds
 from stages.train_behavior import outcome, training
-from stages.train_behavior.__main__ import Config, refuse
+from stages.train_behavior.__main__ import Config
 from stages.train_behavior.batches import (
     AS_OFTEN,
     Augmentation,
@@ -37,6 +37,7 @@ from stages.train_behavior.export import (
 )
 from stages.train_behavior.objective import Objective, goal_error, losses, perceive, squared_error
 from stages.train_behavior.reactions import Reactions, measure, moments
+from stages.train_behavior.refusals import refuse
 from stages.train_behavior.training import Optimization, Settings, initial_nets, train, two_cosines
 from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
 
@@ -355,11 +356,15 @@ def test_goals_are_asked_for_earlier_times_as_often_as_told(windows, share, lowe
     [
         (Config(training=Settings(Optimization(steps=100, goal_steps=200))), "REC-002"),
         (Config(family="one_stage"), "REC-002"),
-        (Config(reading="pointwise"), "REC-002"),
+        (Config(reading="pointwise", scene="volume"), "REC-002"),
         (Config(horizon_s=60.0), "BEH-001"),
     ],
 )
 def test_what_cannot_be_learned_or_made_is_refused_at_once(data, settings, code):
+    def asked(config):
+        longer = data.with_horizon(frames_from_seconds(config.horizon_s))
+        refuse(vars(config), longer, outcome.architecture_for(vars(config), longer, Scenes.of(room())), "behavior_data")
+
     with pytest.raises(InputError, match=code):
-        refuse(settings, data.with_horizon(frames_from_seconds(settings.horizon_s)), settings.reading != "pointwise", "behavior_data")
-    refuse(Config(), data, True, "behavior_data")
+        asked(settings)
+    asked(Config())
