@@ -5,16 +5,16 @@ the whole distribution. Truth is the reconstructed future of the test video, as 
 through `predictors.Predictor`; goals are judged on all windows, paths and bodies on a share of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.models.intervals import Interval, bootstrapped, episodes
-from pipeline.models.predictors import Ats, ConstantVelocity, LocationPrior, Predictor, Samples, StandStill
+from pipeline.models.predictors import WINDOWS_AT_ONCE, Ats, ConstantVelocity, LocationPrior, Predictor, Samples, StandStill
 from pipeline.models.scores import GOAL_SCORES, PLAN_SCORES, SCORES, goal_distances, path_distances
-from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData, Context
+from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData
 from stages.evaluate import best_of
 from stages.evaluate.figures import Figures
 
@@ -43,7 +43,7 @@ class Protocol:
 
 def rivals(data: BehaviorData) -> dict[str, Predictor]:
     """Fit the simple predictors to the training windows."""
-    context, future = data.windows(data.indices(TRAIN))
+    context, future = data.windows(data.indices(TRAIN), bones=False)
     methods = (LocationPrior, StandStill, ConstantVelocity)
     return {name: method.fit(context, future) for name, method in zip(RIVALS, methods, strict=True)}
 
@@ -87,24 +87,65 @@ class _Judged:
 def _judged(method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], protocol: Protocol) -> _Judged:
     """Judge one method; plans are judged on every ``plan_stride``-th window."""
     rng = np.random.default_rng(protocol.seed)
-    context, future = data.windows(test)
-    goals = _goals(method, context, protocol.samples * protocol.trials, rng)
-    trials = [Samples(part) for part in np.split(goals, protocol.trials, axis=1)]
-    found = {name: [SCORES[name](trial, future) for trial in trials] for name in GOAL_SCORES}
-    distances = {"goal": goal_distances(Samples(goals), future)}
-    context, future = data.windows(test[:: protocol.plan_stride])
+    goals = _goals_judged(method, data, test, protocol, rng)
+    plans = _plans_judged(method, data, test[:: protocol.plan_stride], protocol, rng)
+    return _Judged(goals.scores | plans.scores, goals.distances | plans.distances)
+
+
+def _goals_judged(
+    method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], protocol: Protocol, rng: np.random.Generator
+) -> _Judged:
+    goals, parts = _goals(method, data, test, protocol.samples * protocol.trials, rng), []
+    for window, drawn in zip(_chunks(test), _chunks(goals), strict=True):
+        future = data.windows(window, bones=False)[1]
+        trials = [Samples(trial) for trial in np.split(drawn, protocol.trials, axis=1)]
+        found = {name: np.mean([SCORES[name](trial, future) for trial in trials], axis=0) for name in GOAL_SCORES}
+        parts.append(_Judged(found, {"goal": goal_distances(Samples(drawn), future)}))
+    return _joined(parts)
+
+
+def _goals(
+    method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "window sample 3"]:
+    """Draw goals only where a method can, which spares the networks of path and body; others a chunk at a time, for their paths are large.
+
+    What is drawn must not hang on the chunks: the location prior, which draws all cells before the places in them, gets one.
+    """
+    at_once = isinstance(method, LocationPrior)
+    draw = method.goals if isinstance(method, Ats) else method.sample
+    parts = [test] if at_once else _chunks(test)
+    # Goals may be the ends of paths: without a copy these would stay.
+    return np.concatenate([draw(data.windows(part, bones=not at_once)[0], count, rng).goal.copy() for part in parts])
+
+
+def _plans_judged(
+    method: Predictor, data: BehaviorData, chosen: Int[np.ndarray, "window"], protocol: Protocol, rng: np.random.Generator
+) -> _Judged:
+    """Judge whole plans, where a method makes them; distances are those of the last trial."""
+    trials = []
     for _ in range(protocol.plan_trials):
-        samples = method.sample(context, protocol.samples, rng)
-        for name in PLAN_SCORES if samples.path is not None else ():
-            found.setdefault(name, []).append(SCORES[name](samples, future))
-        if samples.path is not None:
-            distances["path"] = path_distances(samples, future)
-    return _Judged({name: np.mean(values, axis=0) for name, values in found.items()}, distances)
+        parts = []
+        for window in _chunks(chosen):
+            context, future = data.windows(window)
+            samples = method.sample(context, protocol.samples, rng)
+            if samples.path is None:
+                return _Judged({}, {})
+            parts.append(_Judged({name: SCORES[name](samples, future) for name in PLAN_SCORES}, {"path": path_distances(samples, future)}))
+        trials.append(_joined(parts))
+    return _Judged({name: np.mean([trial.scores[name] for trial in trials], axis=0) for name in PLAN_SCORES}, trials[-1].distances)
 
 
-def _goals(method: Predictor, context: Context, count: int, rng: np.random.Generator) -> Float[np.ndarray, "window sample 3"]:
-    """Draw goals only where a method can, which spares the networks of path and body."""
-    return (method.goals if isinstance(method, Ats) else method.sample)(context, count, rng).goal
+def _chunks(array: np.ndarray) -> list[np.ndarray]:
+    return [array[begin : begin + WINDOWS_AT_ONCE] for begin in range(0, len(array), WINDOWS_AT_ONCE)]
+
+
+def _joined(parts: Sequence[_Judged]) -> _Judged:
+    """Put the windows of several chunks one after the other."""
+    scores, distances = (
+        {name: np.concatenate([getattr(part, field)[name] for part in parts]) for name in getattr(parts[0], field)}
+        for field in ("scores", "distances")
+    )
+    return _Judged(scores, distances)
 
 
 def _report(

@@ -1,5 +1,8 @@
 """Scores: exact on constructed cases, blind to what they must be blind to, and honest about failures."""
 
+import tracemalloc
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -167,11 +170,12 @@ class Oracle:
     """Knows the future up to a little noise."""
 
     def __init__(self, data):
-        self.future = data.windows(data.indices(TEST))[1]
+        context, self.future = data.windows(data.indices(TEST))
+        self.now = context.world_from_agent[:, -1, :3, 3]
 
     def sample(self, context, count, rng):
-        keep = slice(None) if len(context) == len(self.future.world_from_agent) else slice(None, None, 16)
-        root, bones = self.future.world_from_agent[keep], self.future.agent_from_bone[keep]
+        apart = np.linalg.norm(context.world_from_agent[:, -1, None, :3, 3] - self.now, axis=-1)
+        root, bones = (part[apart.argmin(1)] for part in (self.future.world_from_agent, self.future.agent_from_bone))
         path = root[:, None, :, :3, 3] + rng.normal(0, 0.01, (len(root), count, 1, 3))
         shape = (len(root), count, *root.shape[1:2])
         rotation = np.broadcast_to(root[:, None, :, :3, :3], (*shape, 3, 3))
@@ -195,6 +199,18 @@ def test_who_knows_the_future_beats_blind_rivals_and_the_interval_says_so(data):
 def test_constant_velocity_is_right_about_straight_walks(data):
     values = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
     assert values["behavior/constant_velocity/goal_minde_m"] < 0.01 < values["behavior/stand_still/goal_minde_m"]
+
+
+def test_chunks_bound_the_memory_and_change_nothing(data, monkeypatch):
+    few = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
+    monkeypatch.setattr(behavior, "WINDOWS_AT_ONCE", 1000)
+    assert behavior.behavior_figures(data, Oracle(data), PROTOCOL).values == few
+    monkeypatch.undo()
+    tracemalloc.start()
+    behavior.behavior_figures(data, Oracle(data), replace(PROTOCOL, samples=32, trials=16))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6, "bytes; 512 paths in each of 97 windows take 67 MB, and their noise as much"
 
 
 def test_without_a_test_video_behaviour_is_skipped_and_says_so(data):
