@@ -42,8 +42,8 @@ class Config:
     """Trials of goals."""
     plan_trials: int = 1
     """Trials of paths and bodies, which cost a hundred times more."""
-    plan_stride: int = 16
-    """Paths and bodies are judged on every so many windows; goals on all."""
+    plan_windows: int = 120
+    """Test windows, evenly spread, on which paths and bodies are judged; goals on all."""
     bootstrap_draws: int = 2000
     """Resamples of the intervals."""
     time_plans: bool = True
@@ -59,7 +59,7 @@ def run(task: cli.Task) -> None:
         **{name: task.input(name) if task.has(name) else None for name in ("truth", "clicks")},
     )
     effort = evaluation.Effort(c.localizer_frames, c.map_frames, c.heldout_frames, c.surface_frames, c.physical_windows, c.time_plans)
-    protocol = Protocol(c.samples, c.trials, c.plan_trials, c.plan_stride, c.bootstrap_draws, c.seed)
+    protocol = Protocol(c.samples, c.trials, c.plan_trials, c.plan_windows, c.bootstrap_draws, c.seed)
     rng = np.random.default_rng(c.seed)
     figures = evaluation.evaluate(folders, task.videos, effort, protocol, rng, task.device)
     with task.create() as folder:

@@ -2,7 +2,7 @@
 
 Each method draws 16 samples a window in several trials; the best of 16 counts (minADE), and the energy score rewards
 the whole distribution. Truth is the reconstructed future of the test video, as in the paper. Every method is met
-through `predictors.Predictor`; goals are judged on all windows, paths and bodies on a share of them.
+through `predictors.Predictor`; goals are judged on all windows, paths and bodies on some, spread evenly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,8 +34,8 @@ class Protocol:
     """of goals"""
     plan_trials: int
     """of paths and bodies"""
-    plan_stride: int
-    """every how many windows paths and bodies are judged"""
+    plan_windows: int
+    """on which paths and bodies are judged, at most"""
     draws: int
     """of the bootstrap"""
     seed: int
@@ -58,9 +58,13 @@ def behavior_figures(data: BehaviorData, ours: Predictor, protocol: Protocol) ->
     if len(test) == 0 or len(data.indices(TRAIN)) == 0:
         figures.skip(_names(), reason)
         return figures
+    plans = np.unique(np.linspace(0, len(test) - 1, protocol.plan_windows).astype(int))
+    figures.put("behavior/plan_windows", len(plans))
+    figures.put("behavior/plan_trials", protocol.plan_trials)
     episode = episodes(data.start[test], data.video[test], PAST + FUTURE)
-    judged = {name: _judged(method, data, test, protocol) for name, method in ({OURS: ours} | rivals(data)).items()}
-    _report(figures, {name: each.scores for name, each in judged.items()}, episode, protocol)
+    judged = {name: _judged(method, data, test, test[plans], protocol) for name, method in ({OURS: ours} | rivals(data)).items()}
+    episode_of = dict.fromkeys(GOAL_SCORES, episode) | dict.fromkeys(PLAN_SCORES, episode[plans])
+    _report(figures, {name: each.scores for name, each in judged.items()}, episode_of, protocol)
     figures.charts[CURVES] = best_of.drawn({name: each.distances for name, each in judged.items()})
     return figures
 
@@ -84,11 +88,13 @@ class _Judged:
     """of every sampled goal and path, metres"""
 
 
-def _judged(method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], protocol: Protocol) -> _Judged:
-    """Judge one method; plans are judged on every ``plan_stride``-th window."""
+def _judged(
+    method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], chosen: Int[np.ndarray, "window"], protocol: Protocol
+) -> _Judged:
+    """Judge one method: its goals on all test windows, its plans on the chosen ones."""
     rng = np.random.default_rng(protocol.seed)
     goals = _goals_judged(method, data, test, protocol, rng)
-    plans = _plans_judged(method, data, test[:: protocol.plan_stride], protocol, rng)
+    plans = _plans_judged(method, data, chosen, protocol, rng)
     return _Judged(goals.scores | plans.scores, goals.distances | plans.distances)
 
 
@@ -151,25 +157,26 @@ def _joined(parts: Sequence[_Judged]) -> _Judged:
 def _report(
     figures: Figures,
     scores: Mapping[str, Mapping[str, Float[np.ndarray, "window"]]],
-    episode: Int[np.ndarray, "window"],
+    episode: Mapping[str, Int[np.ndarray, "window"]],
     protocol: Protocol,
 ) -> None:
-    def interval(values: Float[np.ndarray, "window"]) -> Interval:
-        chosen = episode if len(values) == len(episode) else episode[:: protocol.plan_stride]
-        return bootstrapped(values, np.unique(chosen, return_inverse=True)[1], protocol.draws, np.random.default_rng(protocol.seed))
+    def interval(name: str, values: Float[np.ndarray, "window"]) -> Interval:
+        drawn = np.unique(episode[name], return_inverse=True)[1]
+        return bootstrapped(values, drawn, protocol.draws, np.random.default_rng(protocol.seed))
 
     for method, of_method in scores.items():
         for name in SCORES:
             if name in of_method:
-                figures.put_mean(f"behavior/{method}/{name}", interval(of_method[name]))
+                figures.put_mean(f"behavior/{method}/{name}", interval(name, of_method[name]))
             else:
                 figures.skip([f"behavior/{method}/{name}"], "this method predicts goals only")
     for rival in RIVALS:
         for name in SCORES:
             if name in scores[rival]:
-                difference = interval(scores[OURS][name] - scores[rival][name])
+                difference = interval(name, scores[OURS][name] - scores[rival][name])
                 figures.put_mean(f"behavior/{OURS}_minus_{rival}/{name}", difference)
 
 
 def _names() -> list[str]:
-    return [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in SCORES]
+    scores = [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in SCORES]
+    return ["behavior/plan_windows", "behavior/plan_trials", *scores]

@@ -27,7 +27,7 @@ from stages.evaluate.figures import Figures
 KINDS = {"recorded": "recorded", "ats": "generated"}
 STYLES = {"recorded": ("#2f6f9f", "--"), "ats": ("#c8722b", "-")}
 MEASURES = ("penetration_m", "foot_slide_m_s", "non_collision_share", "contact_share")
-NAMES = tuple(f"behavior/{kind}/{measure}" for kind in KINDS for measure in MEASURES)
+NAMES = ("behavior/physical_windows", *(f"behavior/{kind}/{measure}" for kind in KINDS for measure in MEASURES))
 PICTURE = "How physical motion is in the test windows, recorded (dashed) and generated: share of windows that are better than a value."
 
 
@@ -39,7 +39,9 @@ def physical_figures(data: BehaviorData, ours: Predictor, reconstruction: Path, 
         figures.skip(NAMES, "no test window, or no session that shows the animal for two seconds")
         return figures
     judge = _judge(data, learned, reconstruction)
-    context, future = data.windows(test[np.unique(np.linspace(0, len(test) - 1, windows).astype(int))])
+    chosen = test[np.unique(np.linspace(0, len(test) - 1, windows).astype(int))]
+    figures.put("behavior/physical_windows", len(chosen))
+    context, future = data.windows(chosen)
     made = ours.sample(context, 1, np.random.default_rng(seed))
     found = {
         "recorded": _judged(judge, _recorded(future)),

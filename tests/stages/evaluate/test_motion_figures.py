@@ -42,7 +42,7 @@ def test_a_body_in_the_floor_penetrates(tmp_path: Path) -> None:
     data = BehaviorData(tracks, small_world.rest(), videos, starts, np.array([TRAIN, TRAIN, TEST, TEST], np.uint8), tuple(tracks))
     sunk = Sunk(data.windows(data.indices(TEST))[1], 0.1)
     values = physical.physical_figures(data, sunk, tmp_path, windows=2, seed=0).values
-    assert set(values) == set(physical.NAMES)
+    assert set(values) == set(physical.NAMES) and values["behavior/physical_windows"] == 2
     assert values["behavior/recorded/penetration_m"] < 0.003 < 0.01 < values["behavior/ats/penetration_m"] < 0.1, "metres"
     assert values["behavior/ats/non_collision_share"] < 0.7 < 0.95 < values["behavior/recorded/non_collision_share"]
     nobody = BehaviorData(tracks, small_world.rest(), videos, starts, np.full(4, TRAIN, np.uint8), tuple(tracks))

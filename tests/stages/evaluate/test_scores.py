@@ -182,7 +182,7 @@ class Oracle:
         return Samples(path[:, :, -1], path, rotation, np.broadcast_to(bones[:, None], (*shape, *bones.shape[2:])))
 
 
-PROTOCOL = behavior.Protocol(samples=8, trials=2, plan_trials=1, plan_stride=16, draws=200, seed=0)
+PROTOCOL = behavior.Protocol(samples=8, trials=2, plan_trials=1, plan_windows=7, draws=200, seed=0)
 
 
 def test_who_knows_the_future_beats_blind_rivals_and_the_interval_says_so(data):
@@ -199,6 +199,13 @@ def test_who_knows_the_future_beats_blind_rivals_and_the_interval_says_so(data):
 def test_constant_velocity_is_right_about_straight_walks(data):
     values = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
     assert values["behavior/constant_velocity/goal_minde_m"] < 0.01 < values["behavior/stand_still/goal_minde_m"]
+
+
+def test_plans_are_judged_on_windows_of_the_whole_test_and_their_number_is_told(data):
+    for asked, told in ((7, 7), (120, 97)):
+        values = behavior.behavior_figures(data, Oracle(data), replace(PROTOCOL, plan_windows=asked)).values
+        assert values["behavior/plan_windows"] == told and values["behavior/plan_trials"] == 1 and values["behavior/test_windows"] == 97
+        assert values["behavior/ats_minus_stand_still/path_minade_m_ci95_high"] < 0
 
 
 def test_chunks_bound_the_memory_and_change_nothing(data, monkeypatch):
