@@ -67,11 +67,12 @@ def evaluate(folders: Folders, videos: Sequence, effort: Effort, protocol: Proto
     else:
         figures.add(_against_truth(folders, videos, effort, rng, device))
     progress.log("evaluate: behaviour")
-    data, ours = _predictor(folders, device)
+    data = BehaviorData.load(folders.behavior_data)
+    ours = _predictor(folders, data, device)
     figures.add(behavior.behavior_figures(data, ours, protocol))
     progress.log("evaluate: penetration and foot slide")
     figures.add(physical.physical_figures(data, ours, folders.reconstruction, windows=effort.physical_windows, seed=protocol.seed))
-    figures.add(speed.plan_figures(data, ours, protocol.seed, measure=effort.time_plans))
+    figures.add(speed.plan_figures(data, _predictor(folders, data, "cpu"), protocol.seed, measure=effort.time_plans))
     return figures
 
 
@@ -180,7 +181,6 @@ def _perception(folders: Folders, sessions: Sequence[Recorded], turnaround: Reco
     return figures
 
 
-def _predictor(folders: Folders, device: str) -> tuple[BehaviorData, Ats]:
+def _predictor(folders: Folders, data: BehaviorData, device: str) -> Ats:
     """Open the behaviour model as a predictor on its own windows."""
-    data = BehaviorData.load(folders.behavior_data)
-    return data, Ats.load(folders.behavior, Scenes.load(folders.behavior_data, data.videos), Sampling(), device=device)
+    return Ats.load(folders.behavior, Scenes.load(folders.behavior_data, data.videos), Sampling(), device=device)
