@@ -43,11 +43,11 @@ class View:
 
 
 def view_figures(views: Sequence[View]) -> Figures:
-    """Average over all pixels (depth) and over pictures (PSNR, SSIM)."""
+    """Average over all pixels (depth) and over pictures (PSNR, SSIM); phones may differ in the shape of their pictures."""
     figures = Figures()
-    known = np.stack([(view.true.depth > 0) & (view.true.depth <= RANGE_M) for view in views])
-    right = np.stack([depth_is_right(view) for view in views])
-    agent = np.stack([view.true.agent for view in views])
+    known = np.concatenate([((view.true.depth > 0) & (view.true.depth <= RANGE_M)).ravel() for view in views])
+    right = np.concatenate([depth_is_right(view).ravel() for view in views])
+    agent = np.concatenate([view.true.agent.ravel() for view in views])
     for part, chosen in (("all", known), ("agent", known & agent), ("scene", known & ~agent)):
         value = float(right[chosen].mean()) if chosen.any() else np.nan
         figures.put(f"reconstruction/depth_acc_{part}", value, "not in view of the held-out phone")
@@ -67,15 +67,12 @@ def picture_figures(name: str, views: Sequence[View]) -> Figures:
 
 
 def side_by_side(views: Sequence[View], count: int = 6) -> UInt8[np.ndarray, "height width 3"]:
-    """Put some views beside each other: truth, ours, true depth, our depth."""
+    """Put some views beside each other: truth, ours, true depth, our depth; below smaller ones it stays black."""
     chosen = [views[index] for index in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
-    rows = [
-        [view.true.color for view in chosen],
-        [view.color for view in chosen],
-        [_gray(view.true.depth) for view in chosen],
-        [_gray(view.depth) for view in chosen],
-    ]
-    return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
+    columns = [(view.true.color, view.color, _gray(view.true.depth), _gray(view.depth)) for view in chosen]
+    height = max(len(column[0]) for column in columns)
+    padded = [[np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in column] for column in columns]
+    return np.concatenate([np.concatenate(column) for column in padded], axis=1)
 
 
 def _gray(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:

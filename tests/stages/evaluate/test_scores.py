@@ -96,6 +96,17 @@ def test_held_out_views_count_holes_as_wrong_and_forgive_exposure():
     assert values["reconstruction/lpips_all"] is None
 
 
+def test_phones_may_be_held_upright_and_across():
+    views = []
+    for shape, off_m in (((32, 24), 0.0), ((24, 32), 1.0)):
+        color, depth = np.full((*shape, 3), 128, np.uint8), np.full(shape, 2.0)
+        views.append(view(color, depth + off_m, color, depth, np.zeros(shape, bool)))
+    assert heldout.view_figures(views).values["reconstruction/depth_acc_scene"] == 0.5
+    drawn = heldout.side_by_side(views)
+    assert drawn.shape == (4 * 32, 24 + 32, 3)
+    assert (drawn[24:32, 24:] == 0).all() and (drawn[:32, :24] == 128).all()
+
+
 def test_worse_pictures_score_worse():
     rng = np.random.default_rng(0)
     true_color = rng.integers(0, 255, (40, 40, 3), dtype=np.uint8)
