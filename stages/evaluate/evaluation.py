@@ -89,12 +89,12 @@ def _against_clicks(folders: Folders, videos: tuple[Video, ...], effort: Effort,
     for video in (video for video in videos if video.role == "heldout" and video.synchronized_with):
         placed = real_phone.cameras_of(folders, video, cameras.get(video.id))
         told.append(placed[1] if placed else real_phone.UNPLACED)
-        if placed:
-            seen.append((video.synchronized_with, real_phone.shots(folders, video, placed[0], effort.heldout_frames)))
+        seen.append((video.synchronized_with, real_phone.shots(folders, video, placed[0], effort.heldout_frames) if placed else []))
     if told:
         progress.log("evaluate: held-out phone")
-        figures.add(reconstruction.held_out_figures(folders, seen, device) if seen else Figures())
-        figures.skip(heldout.NAMES if not seen else real_phone.PARTS_WITHOUT_MASKS, "; ".join(told) if not seen else real_phone.NO_MASKS)
+        figures.add(reconstruction.held_out_figures(folders, seen, device))
+        nowhere = all(where == real_phone.UNPLACED for where in told)
+        figures.skip(*((heldout.NAMES, real_phone.UNPLACED) if nowhere else (real_phone.PARTS_WITHOUT_MASKS, real_phone.NO_MASKS)))
         figures.skip(["reconstruction/heldout_cameras"], f"from {'; '.join(told)}")
     return figures
 

@@ -9,6 +9,7 @@ from skimage.metrics import structural_similarity
 
 from stages.evaluate.figures import Figures
 
+UNSEEN = "no held-out phone, or none that films while its session does"
 TOLERANCE_M = 0.1
 RANGE_M = 5.0
 PARTS = ("all", "agent", "scene")
@@ -40,6 +41,11 @@ class View:
     depth: Float[np.ndarray, "height width"]
     """metres, 0 = nothing"""
     true: Shot
+
+    @classmethod
+    def empty(cls, true: Shot) -> "View":
+        """Draw nothing: what a session that was refused has to show."""
+        return cls(np.zeros_like(true.color), np.zeros_like(true.depth), true)
 
 
 def view_figures(views: Sequence[View]) -> Figures:

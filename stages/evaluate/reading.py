@@ -95,6 +95,20 @@ def frames_of_truth(folders: Reconstructed, walkthrough: Recorded, turnaround: R
     return Frames(constant_between(ours, walkthrough.truth.world_from_camera), constant_between(around, true_agent_from_camera))
 
 
+def filmed_together(folders: Reconstructed, phone: Video) -> Int[np.ndarray, "frame"]:
+    """Return the frames of a held-out phone that lie within the session that it is synchronized with."""
+    when, session_s = (
+        arrays.load(folders.frames[id] / "frames.npz", ("timestamp_s",))["timestamp_s"] for id in (phone.id, phone.synchronized_with)
+    )
+    when = when + phone.offset_s
+    return np.flatnonzero((when >= session_s[0]) & (when <= session_s[-1]))
+
+
+def spread(frames: Int[np.ndarray, "frame"], count: int) -> Int[np.ndarray, "frame"]:
+    """Return up to ``count`` of the frames, evenly spread."""
+    return frames[np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))]
+
+
 def _template_cameras(folder: Path, name: str) -> Float[np.ndarray, "frame 4 4"]:
     table = arrays.load(folder / "cameras.npz")
     return np.where(table["registered"][:, None, None], table[name], np.nan)

@@ -13,6 +13,7 @@ from pipeline.files.clips import Clip
 from pipeline.models import localizer as localizers
 from pipeline.space import rigid
 from pipeline.videos import Video
+from stages.evaluate import reading
 from stages.evaluate.clicked import Clicked, all_cameras
 from stages.evaluate.heldout import NAMES, RANGE_M, Shot
 from stages.evaluate.reading import Folders
@@ -61,10 +62,11 @@ def agreement(votes: Float[np.ndarray, "vote 4 4"]) -> tuple[Float[np.ndarray, "
 
 
 def shots(folders: Folders, video: Video, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> Sequence[Shot]:
-    """Return what the phone saw and measured in up to ``count`` frames whose camera is known."""
+    """Return what the phone saw and measured while its session was filmed, in up to ``count`` frames whose camera is known."""
     clip, found = Clip.open(folders.frames[video.id]), []
-    known = np.flatnonzero(np.isfinite(world_from_camera).all((1, 2)))
-    for frame in known[np.unique(np.linspace(0, len(known) - 1, count).astype(int))].tolist():
+    together = reading.filmed_together(folders, video)
+    known = together[np.isfinite(world_from_camera[together]).all((1, 2))]
+    for frame in reading.spread(known, count).tolist():
         depth = np.where((clip.confidence(frame) > 0) & (clip.depth(frame) <= RANGE_M), clip.depth(frame), 0).astype(np.float32)
         color = cv2.resize(clip.color(frame), depth.shape[::-1], interpolation=cv2.INTER_AREA)
         time_s = float(clip.timestamp_s[frame] + video.offset_s)

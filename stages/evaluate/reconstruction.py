@@ -61,19 +61,25 @@ def reconstruction_figures(
 
 def _held_out(folders: Folders, phones: Sequence[Recorded], frames: Frames, effort: Effort, device: str) -> Figures:
     """Compare with what the held-out phones truly saw."""
+    phones = [phone for phone in phones if phone.video.synchronized_with]
     seen = [(phone.video.synchronized_with, shots_of(folders, phone, frames, effort.heldout_frames)) for phone in phones]
     return held_out_figures(folders, seen, device)
 
 
-def held_out_figures(folders: Folders, seen: Sequence[tuple[str | None, Sequence[Shot]]], device: str) -> Figures:
-    """Draw the shots of phones, each with the session it is synchronized with, by the fields and by the 3D Gaussians."""
-    figures, by_fields, by_splats = Figures(), [], []
+def held_out_figures(folders: Folders, seen: Sequence[tuple[str, Sequence[Shot]]], device: str) -> Figures:
+    """Draw the shots of phones, each with the session it is synchronized with, by the fields and by the 3D Gaussians.
+
+    Where that session was refused nothing is drawn, which is wrong everywhere.
+    """
+    figures, by_fields, by_splats, drawn = Figures(), [], [], 0
     for session, shots in seen:
-        motion = None if session is None else reading.read_motion(folders.reconstruction, session)
-        if motion is None:
-            continue
+        motion = reading.read_motion(folders.reconstruction, session)
         by_fields += drawn_by_fields(folders, session, motion, shots, device)
         by_splats += _drawn_by_splats(folders, session, reading.read_motion(folders.splats, session) or motion, shots)
+        drawn += motion is not None and len(shots) > 0
+    figures.put("reconstruction/heldout_phones_drawn", drawn)
+    figures.put("reconstruction/heldout_phones_total", len(seen))
+    figures.put("reconstruction/heldout_frames", len(by_fields))
     if by_fields:
         figures.add(heldout.view_figures(by_fields))
         figures.add(heldout.picture_figures("splats", by_splats))
@@ -81,8 +87,7 @@ def held_out_figures(folders: Folders, seen: Sequence[tuple[str | None, Sequence
             caption = f"held-out phone: truth, ours ({name}), true depth, our depth"
             figures.pictures[caption] = heldout.side_by_side(views)
     else:
-        reason = "no held-out phone, or the session that it is synchronized with was not registered"
-        figures.skip(heldout.NAMES, reason)
+        figures.skip(heldout.NAMES, heldout.UNSEEN)
     return figures
 
 
@@ -93,9 +98,9 @@ def root_errors(motion: Motion | None, each: Recorded, frames: Frames) -> PoseEr
 
 
 def shots_of(folders: Reconstructed, phone: Recorded, frames: Frames, count: int) -> list[Shot]:
-    """Return what the held-out phone saw, at its depth's resolution."""
+    """Return what the held-out phone saw while its session was filmed, in up to ``count`` frames, at its depth's resolution."""
     true, cameras, shots = read_depth(folders.truth, phone.name, phone.source_index), frames.cameras(phone.truth), []
-    for frame in np.unique(np.linspace(0, len(phone.clip) - 1, count).astype(int)).tolist():
+    for frame in reading.spread(reading.filmed_together(folders, phone.video), count).tolist():
         size = true.depth[frame].shape[::-1]
         color = cv2.resize(phone.clip.color(frame), size, interpolation=cv2.INTER_AREA)
         agent = cv2.resize(phone.truth.masks[frame].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
@@ -104,8 +109,10 @@ def shots_of(folders: Reconstructed, phone: Recorded, frames: Frames, count: int
     return shots
 
 
-def drawn_by_fields(folders: Reconstructed, session: str, motion: Motion, shots: Sequence[Shot], device: str) -> list[View]:
-    """Draw the reconstruction as the synchronized session saw it."""
+def drawn_by_fields(folders: Reconstructed, session: str, motion: Motion | None, shots: Sequence[Shot], device: str) -> list[View]:
+    """Draw the reconstruction as the synchronized session saw it; nothing where that was refused."""
+    if motion is None:
+        return [View.empty(shot) for shot in shots]
     renderer, views = Renderer(fields.load(folders.reconstruction, device), session), []
     for shot in shots:
         picture = renderer.draw(shot.world_from_camera, shot.intrinsics, *shot.depth.shape, *motion.at(shot.time_s))
@@ -113,8 +120,10 @@ def drawn_by_fields(folders: Reconstructed, session: str, motion: Motion, shots:
     return views
 
 
-def _drawn_by_splats(folders: Folders, session: str, motion: Motion, shots: Sequence[Shot]) -> list[View]:
+def _drawn_by_splats(folders: Folders, session: str, motion: Motion | None, shots: Sequence[Shot]) -> list[View]:
     """Draw the 3D Gaussians as they stood in a session; where the animal's pose is not known, the room alone."""
+    if motion is None:
+        return [View.empty(shot) for shot in shots]
     scene, agent = gaussians.load_scene(folders.splats, session), gaussians.load_ply(folders.splats / "agent.ply")
     weights = torch.from_numpy(arrays.load(folders.splats / "splats.npz", ("agent_weights",))["agent_weights"])
     rest = torch.from_numpy(arrays.load(folders.reconstruction / "skin.npz")["agent_from_bone_rest"])
