@@ -3,11 +3,17 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
-from pipeline.models.motion import Motion
+from pipeline.models.motion import INFERRED, Motion
 from stages.evaluate.alignment import joined, pose_errors
 from stages.evaluate.figures import Figures, median
 from stages.evaluate.reading import Frames, Recorded
+
+
+def is_inferred(motion: Motion) -> Bool[np.ndarray, "frame"]:
+    """Tell where the pose was inferred because nobody saw the agent; where it was seen, the camera alone may be in doubt."""
+    return np.isfinite(motion.world_from_agent).all((1, 2)) & ~motion.agent_visible & (motion.confidence <= INFERRED)
 
 
 def inferred_figures(sessions: Sequence[Recorded], motions: Mapping[str, Motion | None], frames: Frames) -> Figures:
@@ -16,7 +22,7 @@ def inferred_figures(sessions: Sequence[Recorded], motions: Mapping[str, Motion 
     for each in sessions:
         motion = motions[each.video.id]
         if motion is not None:
-            guessed = np.isfinite(motion.world_from_agent).all((1, 2)) & ~motion.agent_known
+            guessed = is_inferred(motion)
             errors.append(pose_errors(motion.world_from_agent, frames.roots(each.truth))[guessed])
             total += len(guessed)
     found = joined(errors)

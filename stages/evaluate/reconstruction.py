@@ -1,6 +1,6 @@
 """The 4D reconstruction against truth: held-out views, agent roots, followed points, surfaces."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +14,7 @@ from pipeline.models.render import Renderer
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh, RayCaster
 from stages.evaluate import heldout, reading, surfaces
-from stages.evaluate.alignment import PoseErrors, pose_errors
+from stages.evaluate.alignment import pose_errors
 from stages.evaluate.figures import Figures
 from stages.evaluate.heldout import Shot, View
 from stages.evaluate.inferred import inferred_figures
@@ -27,6 +27,7 @@ CAMERAS_FOR_SEEN = 40
 SURFACE_NAMES = (
     "reconstruction/agent_root_m_median", "reconstruction/agent_root_deg_median", "reconstruction/agent_track_m_median",
     "reconstruction/agent_track_m_p90", "reconstruction/scene_chamfer_m", "reconstruction/agent_chamfer_m",
+    "reconstruction/agent_chamfer_share",
 )  # fmt: skip
 NAMES = heldout.NAMES + SURFACE_NAMES
 
@@ -47,8 +48,7 @@ def reconstruction_figures(
     figures = Figures()
     sessions = [each for each in known if each.video.role == "session"]
     motions = {each.video.id: reading.read_motion(folders.reconstruction, each.video.id) for each in sessions}
-    roots = [root_errors(motions[each.video.id], each, frames) for each in sessions]
-    figures.add(root_figures("reconstruction", roots))
+    figures.add(agent_roots(sessions, motions, frames))
     figures.add(inferred_figures(sessions, motions, frames))
     turnaround = next(each for each in known if each.video.role == "turnaround")
     figures.add(surfaces.track_figures(track_distances(folders, sessions, motions, turnaround, frames)))
@@ -91,10 +91,15 @@ def held_out_figures(folders: Folders, seen: Sequence[tuple[str, Sequence[Shot]]
     return figures
 
 
-def root_errors(motion: Motion | None, each: Recorded, frames: Frames) -> PoseErrors:
-    """Compare the agent's root with truth in the frames that truly show the agent."""
-    ours = np.full((len(each.clip), 4, 4), np.nan) if motion is None else motion.world_from_agent
-    return pose_errors(ours, frames.roots(each.truth))[each.truth.agent_visible]
+def agent_roots(sessions: Sequence[Recorded], motions: Mapping[str, Motion | None], frames: Frames) -> Figures:
+    """Compare the agent's root with truth in the frames that truly show the agent; what is inferred there is not placed."""
+    errors, placed = [], []
+    for each in sessions:
+        motion, visible = motions[each.video.id], each.truth.agent_visible
+        ours = np.full((len(visible), 4, 4), np.nan) if motion is None else motion.world_from_agent
+        errors.append(pose_errors(ours, frames.roots(each.truth))[visible])
+        placed.append((np.zeros(len(visible), bool) if motion is None else motion.agent_known)[visible])
+    return root_figures("reconstruction", errors, placed)
 
 
 def shots_of(folders: Reconstructed, phone: Recorded, frames: Frames, count: int) -> list[Shot]:
@@ -180,17 +185,19 @@ def _posed(skin: Skin, motion: Motion | None, frame: int) -> np.ndarray | None:
 
 
 def _agent_chamfer(folders: Folders, sessions: Sequence[Recorded], motions: dict, frames: Frames, effort: Effort) -> Figures:
-    figures, skin, distances = Figures(), _skin(folders)[1], []
+    """Compare the agent's surface where its pose is known, and tell in what share of the frames that is."""
+    figures, skin, distances, total = Figures(), _skin(folders)[1], [], 0
     for each in sessions:
-        visible = np.flatnonzero(each.truth.agent_visible)
-        chosen = visible[np.unique(np.linspace(0, len(visible) - 1, effort.surface_frames).astype(int))] if len(visible) else []
-        for frame in chosen:
-            ours = _posed(skin, motions[each.video.id], frame)
-            if ours is not None and motions[each.video.id].agent_known[frame]:
+        motion = motions[each.video.id]
+        chosen = reading.spread(np.flatnonzero(each.truth.agent_visible), effort.surface_frames)
+        total += len(chosen)
+        for frame in chosen if motion is not None else ():
+            if motion.agent_known[frame]:
                 true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))
-                distances.append(surfaces.chamfer(ours, true))
-    value = float(np.mean(distances)) if distances else np.nan
+                distances.append(surfaces.chamfer(_posed(skin, motion, frame), true))
+    value, share = (float(np.mean(distances)), len(distances) / total) if distances else (np.nan, 0.0 if total else np.nan)
     figures.put("reconstruction/agent_chamfer_m", value, "the agent's pose is known in no visible frame")
+    figures.put("reconstruction/agent_chamfer_share", share, "the animal is never visible")
     return figures
 
 

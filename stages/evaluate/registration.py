@@ -41,15 +41,16 @@ def is_right(errors: PoseErrors) -> Bool[np.ndarray, "frame"]:
     return (errors.degrees <= GOOD[0]) & (errors.meters <= GOOD[1])
 
 
-def root_figures(name: str, errors: Sequence[PoseErrors]) -> Figures:
-    """Summarise the agent's root over the frames in which it is truly visible."""
+def root_figures(name: str, errors: Sequence[PoseErrors], placed: Sequence[Bool[np.ndarray, "frame"]] | None = None) -> Figures:
+    """Summarise the agent's root over the frames in which it is truly visible; ``placed`` tells where it is known, None: where it is given."""
     figures, all_errors = Figures(), joined(list(errors))
     figures.put(f"{name}/agent_root_m_median", median(all_errors.meters), REFUSED)
     figures.put(f"{name}/agent_root_deg_median", median(all_errors.degrees), REFUSED)
     figures.put(f"{name}/agent_root_m_p90", percentile(all_errors.meters, 90), "a tenth of the frames has no pose")
-    placed = np.isfinite(all_errors.degrees)
-    figures.put(f"{name}/agent_flips_share", float((all_errors.degrees[placed] > FLIPPED_DEG).mean()) if placed.any() else np.nan)
-    figures.put(f"{name}/agent_placed_share", float(placed.mean()) if len(placed) else np.nan)
+    given = np.isfinite(all_errors.degrees)
+    known = np.concatenate(placed) if placed else given
+    figures.put(f"{name}/agent_flips_share", float((all_errors.degrees[given] > FLIPPED_DEG).mean()) if given.any() else np.nan)
+    figures.put(f"{name}/agent_placed_share", float(known.mean()) if len(known) else np.nan)
     return figures
 
 

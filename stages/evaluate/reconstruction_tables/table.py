@@ -14,7 +14,6 @@ from stages.evaluate import heldout, reading, reconstruction, surfaces
 from stages.evaluate.figures import Figures, told
 from stages.evaluate.heldout import PARTS, View
 from stages.evaluate.reading import Reconstructed
-from stages.evaluate.registration import root_figures
 
 PAPER = {"ours": (0.708, 0.695, 0.703), "totalrecon": (0.099, 0.647, 0.053), "totalrecon_single": (0.533, 0.685, 0.518)}
 """DepthAcc of all, agent and scene on the paper's own cat (Table 3)"""
@@ -70,7 +69,7 @@ def figures(
         ]
         one = Figures()
         one.add(heldout.view_figures(views) if views else _nothing())
-        one.add(root_figures("reconstruction", [reconstruction.root_errors(motions[each.video.id], each, frames) for each in sessions]))
+        one.add(reconstruction.agent_roots(sessions, motions, frames))
         followed = reconstruction.track_distances(here, sessions, motions, of_role["turnaround"][0], frames)
         one.add(surfaces.track_figures(followed))
         found.add_as(variant, one, "reconstruction")
