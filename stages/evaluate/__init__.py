@@ -2,5 +2,5 @@
 
 The only room that reads truth. `reading` opens artifacts and brings truth into our frames (one SE(3) from the
 walk-through's cameras, one constant agent SE(3) from the turnaround); `registration`, `localizing`, `perception`,
-`heldout`, `surfaces` and `behavior` each return `Figures`; `evaluation` asks them one after the other.
+`heldout`, `surfaces` (by `triangles`) and `behavior` each return `Figures`; `evaluation` asks them one after the other.
 """

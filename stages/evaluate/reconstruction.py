@@ -13,7 +13,7 @@ from pipeline.models.motion import Motion
 from pipeline.models.render import Renderer
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh, RayCaster
-from stages.evaluate import heldout, reading, surfaces
+from stages.evaluate import heldout, reading, surfaces, triangles
 from stages.evaluate.alignment import pose_errors
 from stages.evaluate.figures import Figures
 from stages.evaluate.heldout import Shot, View
@@ -21,9 +21,14 @@ from stages.evaluate.inferred import inferred_figures
 from stages.evaluate.reading import Folders, Frames, Reconstructed, Recorded
 from stages.evaluate.registration import root_figures
 from stages.evaluate.surfaces import Skin
+from stages.evaluate.triangles import Surface
 from stages.evaluate.truth import read_depth
 
 CAMERAS_FOR_SEEN = 40
+SEEN_M = 0.1
+"""longest edge of the pieces of the true room, each of which is seen or not"""
+SCENE_POINTS, AGENT_POINTS = 20_000, 1_000
+"""on each surface, whose distance from the other is measured; of the agent's in every frame"""
 SURFACE_NAMES = (
     "reconstruction/agent_root_m_median", "reconstruction/agent_root_deg_median", "reconstruction/agent_track_m_median",
     "reconstruction/agent_track_m_p90", "reconstruction/scene_chamfer_m", "reconstruction/agent_chamfer_m",
@@ -52,7 +57,7 @@ def reconstruction_figures(
     figures.add(inferred_figures(sessions, motions, frames))
     turnaround = next(each for each in known if each.video.role == "turnaround")
     figures.add(surfaces.track_figures(track_distances(folders, sessions, motions, turnaround, frames)))
-    figures.add(_agent_chamfer(folders, sessions, motions, frames, effort))
+    figures.add(_agent_chamfer(folders, sessions, motions, frames, effort, rng))
     walkthrough = next(each for each in known if each.video.role == "walkthrough")
     figures.add(_scene_chamfer(folders, walkthrough, frames, rng))
     figures.add(_held_out(folders, [each for each in known if each.video.role == "heldout"], frames, effort, device))
@@ -184,17 +189,21 @@ def _posed(skin: Skin, motion: Motion | None, frame: int) -> np.ndarray | None:
     return skin.posed(motion.world_from_agent[frame], motion.agent_from_bone[frame])
 
 
-def _agent_chamfer(folders: Folders, sessions: Sequence[Recorded], motions: dict, frames: Frames, effort: Effort) -> Figures:
+def _agent_chamfer(
+    folders: Folders, sessions: Sequence[Recorded], motions: dict, frames: Frames, effort: Effort, rng: np.random.Generator
+) -> Figures:
     """Compare the agent's surface where its pose is known, and tell in what share of the frames that is."""
-    figures, skin, distances, total = Figures(), _skin(folders)[1], [], 0
+    figures, (mesh, skin), distances, total = Figures(), _skin(folders), [], 0
+    faces = meshes.read_ply(folders.truth / "agent.ply").faces
     for each in sessions:
         motion = motions[each.video.id]
         chosen = reading.spread(np.flatnonzero(each.truth.agent_visible), effort.surface_frames)
         total += len(chosen)
         for frame in chosen if motion is not None else ():
             if motion.agent_known[frame]:
-                true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))
-                distances.append(surfaces.chamfer(_posed(skin, motion, frame), true))
+                ours = Surface(_posed(skin, motion, frame)[mesh.faces])
+                true = Surface(rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))[faces])
+                distances.append(surfaces.chamfer(ours, true, AGENT_POINTS, rng))
     value, share = (float(np.mean(distances)), len(distances) / total) if distances else (np.nan, 0.0 if total else np.nan)
     figures.put("reconstruction/agent_chamfer_m", value, "the agent's pose is known in no visible frame")
     figures.put("reconstruction/agent_chamfer_share", share, "the animal is never visible")
@@ -206,10 +215,9 @@ def _scene_chamfer(folders: Folders, walkthrough: Recorded, frames: Frames, rng:
     figures = Figures()
     ours, true = meshes.read_ply(folders.reconstruction / "scene.ply"), meshes.read_ply(folders.truth / "scene.ply")
     true = Mesh(rigid.apply(frames.world_from_true_world, true.vertices.astype(float)).astype(np.float32), true.faces)
-    cameras, caster = frames.cameras(walkthrough.truth), RayCaster(true)
+    cameras, pieces = frames.cameras(walkthrough.truth), triangles.cut(triangles.corners(true), SEEN_M)
     chosen = np.unique(np.linspace(0, len(cameras) - 1, CAMERAS_FOR_SEEN).astype(int))
     camera = (cameras[chosen], walkthrough.truth.intrinsics[chosen], walkthrough.clip.color_size)
-    points = surfaces.sample_surface(true, surfaces.SAMPLES, rng)
-    seen = points[surfaces.seen_by(caster, points, *camera)]
-    figures.put("reconstruction/scene_chamfer_m", surfaces.chamfer(surfaces.sample_surface(ours, surfaces.SAMPLES, rng), seen))
+    seen = Surface(pieces[surfaces.seen_by(RayCaster(true), pieces.mean(1), *camera)])
+    figures.put("reconstruction/scene_chamfer_m", surfaces.chamfer(Surface.of(ours), seen, SCENE_POINTS, rng))
     return figures

@@ -10,14 +10,11 @@ from scipy.spatial import KDTree
 
 from pipeline.models import skinning
 from pipeline.space import rigid
-from pipeline.space.meshes import Mesh, RayCaster
+from pipeline.space.meshes import RayCaster
 from stages.evaluate.figures import Figures, median, percentile
+from stages.evaluate.triangles import Surface
 
 RANGE_M = 5.0
-SAMPLES = 300_000
-"""points on a room's surface: about a centimetre apart, so that distances between clouds are those between surfaces"""
-QUERIES = 20_000
-"""of these whose nearest neighbour is looked up"""
 
 
 @dataclass(frozen=True)
@@ -62,17 +59,9 @@ def track_figures(distances: Sequence[Float[np.ndarray, "point"]]) -> Figures:
     return figures
 
 
-def chamfer(ours: Float[np.ndarray, "point 3"], true: Float[np.ndarray, "vertex 3"]) -> float:
-    """Return the mean of both directions' mean distances, metres; of long arrays in random order, their beginnings ask."""
-    return float((KDTree(true).query(ours[:QUERIES])[0].mean() + KDTree(ours).query(true[:QUERIES])[0].mean()) / 2)
-
-
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:
-    """Draw points evenly over a surface."""
-    corner = mesh.vertices[mesh.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    return (rng.dirichlet((1, 1, 1), count)[..., None] * corner[face]).sum(1)
+def chamfer(ours: Surface, true: Surface, count: int, rng: np.random.Generator) -> float:
+    """Return the mean of both directions' mean distances between ``count`` points of one surface and the other, metres."""
+    return float((true.distance(ours.sample(count, rng)).mean() + ours.distance(true.sample(count, rng)).mean()) / 2)
 
 
 def seen_by(

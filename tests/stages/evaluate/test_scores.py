@@ -16,6 +16,7 @@ from stages.evaluate import behavior, heldout, registration, surfaces
 from stages.evaluate.alignment import constant_between, pose_errors
 from stages.evaluate.figures import Figures, median, percentile
 from stages.evaluate.heldout import Shot, View
+from stages.evaluate.triangles import Surface
 
 
 def poses(count, seed=0, size_m=2.0):
@@ -120,25 +121,11 @@ def test_worse_pictures_score_worse():
     assert np.all(np.diff(ssim) < 0)
 
 
-def test_chamfer_measures_the_distance_of_surfaces():
-    plane = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
-    assert surfaces.chamfer(plane, plane + np.array([0, 0, 0.3])) == pytest.approx(0.3)
-
-
-def test_two_clouds_of_one_room_are_nearer_than_any_error_worth_telling():
-    """A room has about 120 square metres of surface; what remains is the clouds' own spacing."""
-    corners = np.array([[0, 0, 0], [12, 0, 0], [12, 0, 10], [0, 0, 10]], np.float32)
-    floor = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
-    first, second = (surfaces.sample_surface(floor, surfaces.SAMPLES, np.random.default_rng(seed)) for seed in (0, 1))
-    assert surfaces.chamfer(first, second) < 0.012, "metres; the bar for a scene is 0.025"
-    assert surfaces.chamfer(first, second + np.array([0, 0.03, 0])) == pytest.approx(0.03, abs=0.004)
-
-
 def test_only_what_cameras_see_is_seen():
     corner = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     mesh = Mesh(corner.astype(np.float32), faces)
-    points = surfaces.sample_surface(mesh, 2000, np.random.default_rng(0))
+    points = Surface.of(mesh).sample(2000, np.random.default_rng(0))
     lens = np.array([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]])
     seen = surfaces.seen_by(RayCaster(mesh), points, np.eye(4)[None], lens, (100, 100))
     assert seen[points[:, 2] < 2.5].all()

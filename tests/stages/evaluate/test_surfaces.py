@@ -1,4 +1,4 @@
-"""The animal's surface is compared where its pose is known, and in what share of the frames that is is told."""
+"""Distances are those of surfaces, exact; the animal is compared where its pose is known, and in what share of the frames is told."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,9 +11,53 @@ from pipeline.files import arrays, meshes
 from pipeline.models.motion import INFERRED, Motion
 from pipeline.space.meshes import Mesh
 from stages.evaluate import reconstruction
+from stages.evaluate.surfaces import chamfer
+from stages.evaluate.triangles import Surface, cut
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
 FRAMES = 6
+RNG = np.random.default_rng(0)
+
+
+def plane(height_m: float) -> Surface:
+    """Return a floor of 120 square metres as two triangles."""
+    corner = np.array([[0, height_m, 0], [12, height_m, 0], [12, height_m, 10], [0, height_m, 10.0]])
+    return Surface(corner[[[0, 1, 2], [0, 2, 3]]])
+
+
+def soup(count: int) -> np.ndarray:
+    """Return triangles of a centimetre to a metre, some of them flat as a line or a point."""
+    corner = RNG.normal(0, 1, (count, 1, 3)) + RNG.normal(0, 1, (count, 3, 3)) * 10 ** RNG.uniform(-2, 0, (count, 1, 1))
+    corner[: count // 10, 2] = corner[: count // 10, :2].mean(1)
+    corner[0] = corner[0, 0]
+    return corner
+
+
+def test_distances_are_exact():
+    corner, points = soup(60), RNG.normal(0, 2, (300, 3))
+    true = [np.linalg.norm(trimesh.triangles.closest_point(corner[6:], np.tile(point, (54, 1))) - point, axis=1).min() for point in points]
+    np.testing.assert_allclose(Surface(corner[6:]).distance(points), true, atol=1e-12)
+    assert (Surface(corner).distance(points) <= np.array(true) + 1e-12).all(), "triangles without an inside count as lines"
+
+
+def test_cutting_keeps_the_surface():
+    corner = soup(60)
+    pieces = cut(corner, 0.1)
+    assert np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=-1).max() <= 0.1
+    assert len(cut(pieces, 0.1)) == len(pieces)
+    area = [np.linalg.norm(np.cross(part[:, 1] - part[:, 0], part[:, 2] - part[:, 0]), axis=1).sum() for part in (corner, pieces)]
+    assert area[0] == pytest.approx(area[1])
+
+
+@pytest.mark.parametrize("apart_m", [0.0, 0.01, 2.0])
+def test_planes_are_as_far_apart_as_they_are(apart_m: float):
+    assert chamfer(plane(0.0), plane(apart_m), 2000, RNG) == pytest.approx(apart_m, abs=1e-9)
+
+
+def test_a_surface_is_no_way_from_itself():
+    ball = Surface(BALL.triangles)
+    assert chamfer(ball, ball, 2000, RNG) < 1e-12, "metres"
+    assert chamfer(ball, Surface(1.05 * BALL.triangles), 2000, RNG) == pytest.approx(0.01, abs=3e-4)
 
 
 def motion_of(confidence: np.ndarray) -> Motion:
@@ -33,8 +77,8 @@ def test_the_share_of_frames_in_which_the_animal_is_compared_is_told(tmp_path: P
     motions = {"v002": motion_of(np.array([0.9, 0.9, 0.9, INFERRED, INFERRED, INFERRED])), "v003": None}
     folders = SimpleNamespace(reconstruction=tmp_path, truth=tmp_path / "truth")
     effort, frames = SimpleNamespace(surface_frames=FRAMES), SimpleNamespace(world_from_true_world=np.eye(4))
-    values = reconstruction._agent_chamfer(folders, sessions, motions, frames, effort).values
+    values = reconstruction._agent_chamfer(folders, sessions, motions, frames, effort, RNG).values
     assert values["reconstruction/agent_chamfer_share"] == pytest.approx(3 / 12)
-    assert values["reconstruction/agent_chamfer_m"] < 1e-4, "metres"
-    nobody = reconstruction._agent_chamfer(folders, sessions, dict.fromkeys(motions), frames, effort).values
+    assert values["reconstruction/agent_chamfer_m"] < 1e-6, "metres"
+    nobody = reconstruction._agent_chamfer(folders, sessions, dict.fromkeys(motions), frames, effort, RNG).values
     assert nobody == {"reconstruction/agent_chamfer_m": None, "reconstruction/agent_chamfer_share": 0}
