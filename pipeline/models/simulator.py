@@ -17,7 +17,7 @@ from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channel
 from pipeline.models.perception import Ego, world_from_ego
 from pipeline.models.planning import Observation, Sampler, observe
 from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context
+from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context, Trajectory
 from pipeline.space import rigid
 
 
@@ -168,9 +168,14 @@ class Simulator:
         rng = np.random.default_rng(seed)
         context, _ = self.data.windows(rng.choice(self.data.indices(TRAIN), 1))
         seen = context.observer_world if observer is None else np.tile(np.asarray(observer, float), (1, PAST, 1))
-        self.flock.begin(replace(context, observer_world=seen, video=None), rng)
+        self.flock.begin(replace(context, observer_world=seen), rng)
         self.frame = 0
         return self._state(self.flock.past[-1])
+
+    @property
+    def recording(self) -> Trajectory:
+        """Return the recording that this life began in."""
+        return self.data.trajectories[self.data.videos[self.flock.video[0]]]
 
     def step(self, observer: Float[np.ndarray, "3"]) -> State:
         """Let 0.1 s pass with the observer at this position (metres, world)."""

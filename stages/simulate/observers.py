@@ -11,6 +11,8 @@ from pipeline.models.trajectories import RATE_HZ
 Script = Literal["away", "still", "approach", "circle"]
 Observer = Callable[[float, Float[np.ndarray, "3"]], Float[np.ndarray, "3"]]
 """From time in seconds and the animal's position to the observer's position, world metres"""
+AWAY_M = 100.0
+"""From here on nobody perceives an observer: one who was recorded further off is one of whom nothing is known."""
 
 
 def scripted(script: Script, *, center: Float[np.ndarray, "3"], speed_m_s: float = 1.0) -> Observer:
@@ -20,7 +22,7 @@ def scripted(script: Script, *, center: Float[np.ndarray, "3"], speed_m_s: float
     """
     match script:
         case "away":
-            return lambda time_s, animal: center + np.array([100.0, 0.0, 0.0])
+            return lambda time_s, animal: center + np.array([AWAY_M, 0.0, 0.0])
         case "still":
             return lambda time_s, animal: center
         case "circle":

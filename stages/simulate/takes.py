@@ -25,13 +25,15 @@ from pipeline.models.trajectories import TRAIN, BehaviorData
 from stages.simulate import journey_files
 from stages.simulate.chained_goals import chained_goals
 from stages.simulate.live import Live, Look
-from stages.simulate.observers import Observer, scripted
+from stages.simulate.observers import AWAY_M, Observer, scripted
 from stages.simulate.rollout import rollout, write_take
 
 T = TypeVar("T")
 Places = Literal["none", "visited", "behavior"]
 MOVED_M = 0.25
 """A sub-goal that is met further off than this counts as moved."""
+BESIDE_M = np.array([1.0, 1.4, 0.0])
+"""Where a phone is held of whose observer nothing is known, from the animal's first position."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,8 @@ class Made:
 def of_behavior(given: Mapping[str, Path], c: Any, device: str) -> Made:
     """Let the animal live beside a scripted observer; make the take physical where that is asked for and possible."""
     data = BehaviorData.load(_needed(given, "behavior_data"))
-    simulator, observer = _simulator(given, data, c, c.chaining, device), _observer(data, c)
-    take = rollout(simulator, observer, seconds=c.seconds, seed=c.seed)
+    simulator = _simulator(given, data, c, c.chaining, device)
+    take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
     said = f"{c.seconds:g} s, {float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space"
     if not (c.optimise and "longterm" in given and "reconstruction" in given):
         return Made(said, lambda folder: write_take(folder, take))
@@ -100,7 +102,7 @@ def through_subgoals(given: Mapping[str, Path], written: list[Subgoal] | None, c
         subgoals = written
     elif c.places == "behavior":
         simulator = _simulator(given, data, c, replace(c.chaining, noticeable=np.inf, fade_frames=0), device)
-        drawn = chained_goals(simulator, _observer(data, c), c.place_count, c.seed)
+        drawn = chained_goals(simulator, _observer(simulator, c), c.place_count, c.seed)
         subgoals = brought_in(drawn, world.scene, world.model.habits)
     else:
         learned = [data.trajectories[data.videos[video]] for video in np.unique(data.video[data.split == TRAIN])]
@@ -146,9 +148,14 @@ def _loaded(load: Callable[[Path], T], folder: Path) -> T:
         raise InputError("ART-007", what, str(folder), "build it again with this version: make <agent>.<artifact>.redo") from error
 
 
-def _observer(data: BehaviorData, c: Any) -> Observer:
-    seen = np.concatenate([t.world_from_camera[t.valid, :3, 3] for t in data.trajectories.values()])
-    return scripted(c.observer, center=np.median(seen, axis=0), speed_m_s=c.observer_speed_m_s)
+def _observer(simulator: Simulator, c: Any) -> Observer:
+    """Return a person about where one stood in the recording that the life begins in; beside the animal where nobody is known of."""
+    begin = simulator.reset(c.seed).world_from_agent[:3, 3]
+    track = simulator.recording
+    seen, been = (poses[track.valid, :3, 3] for poses in (track.world_from_camera, track.world_from_agent))
+    known = seen[np.linalg.norm(seen - been, axis=-1) < AWAY_M]
+    center = np.median(known, axis=0) if len(known) else begin + BESIDE_M
+    return scripted(c.observer, center=center, speed_m_s=c.observer_speed_m_s)
 
 
 def _needed(given: Mapping[str, Path], name: str) -> Path:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import InputError
-from pipeline.files import glb
+from pipeline.files import arrays, glb
 from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
 from pipeline.models.diffusion import Schedule
 from pipeline.models.planning import Sampler, TorchNetworks
@@ -14,25 +14,31 @@ from pipeline.models.scenes import Scenes
 from pipeline.models.simulator import Chaining, Flock, Frames, Simulator, faded
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
+from stages.simulate import takes
+from stages.simulate.__main__ import Config
 from stages.simulate.live import Live, Look
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
-from tests.pipeline.models.wandering import ARCHITECTURE, room, wandering
+from stages.train_behavior.export import write_contract
+from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
 
 
-@pytest.fixture(scope="module")
-def simulator():
+def scaling():
     channels = ARCHITECTURE.body_channels
     mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
-    scaling = Scaling(
+    return Scaling(
         np.array([0.3, 0.01, 0.3]),
         np.array([[0.5, 0.1, 0.5, 1.0]]),
         np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
         mean,
         np.full(channels, 0.05),
     )
+
+
+@pytest.fixture(scope="module")
+def simulator():
     volume = room()
-    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)
+    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
     sampling = Sampling(goal_steps=4, sequence_steps=2)
     return Simulator(
         sampler,
@@ -139,6 +145,38 @@ def test_take_is_written_completely(simulator, tmp_path):
     assert len(lines) == 1 + 11
     assert lines[0].startswith("time_s,x,y,z,qw")
     assert (tmp_path / "take.npz").stat().st_size > 1000
+
+
+def homes(folder, seen=None, architecture=ARCHITECTURE):
+    """Write a model and recordings in a home each, 20 m apart, beside observers who are not there, or at `seen`."""
+    data = wandering()
+    for number, (name, track) in enumerate(data.trajectories.items()):
+        there = np.array([20.0 * number, 0, 0])
+        person = np.tile(rigid.make(np.eye(3), np.array([1000.0, 0, 0]) if seen is None else there + seen), (len(track.valid), 1, 1))
+        shifted = rigid.make(np.eye(3), there) @ track.world_from_agent
+        data.trajectories[name] = replace(track, world_from_agent=shifted, world_from_camera=person)
+    for artifact in ("behavior_data/volumes", "behavior"):
+        (folder / artifact).mkdir(parents=True)
+    data.save(folder / "behavior_data")
+    for number, name in enumerate(data.videos):
+        bare = room()
+        volume = replace(bare, origin=bare.origin + np.array([20.0 * number, 0, 0]))
+        known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
+        arrays.save(folder / f"behavior_data/volumes/{name}.npz", **vars(volume), **known)
+    write_contract(folder / "behavior", BehaviorNets(architecture), architecture, scaling(), Schedule(), REST)
+    return {name: folder / name for name in ("behavior", "behavior_data")}
+
+
+@pytest.mark.parametrize("seen", [None, [0.5, 1.6, -0.5]])
+def test_a_take_in_one_of_several_homes_has_its_observer_there(tmp_path, seen):
+    few = Sampling(goal_steps=4, sequence_steps=2)
+    settings = Config(seconds=1.0, observer="still", seed=3, sampling=few, chaining=Chaining(candidates=2))
+    takes.of_behavior(homes(tmp_path, seen), settings, "cpu").write(tmp_path)
+    take = arrays.load(tmp_path / "take.npz")
+    begin, person = take["world_from_agent"][0, :3, 3], take["observer_world"]
+    assert abs(begin[0] - 20) < 2, "metres: the second home"
+    np.testing.assert_allclose(person, np.tile(begin + takes.BESIDE_M if seen is None else np.add(seen, [20, 0, 0]), (11, 1)))
+    assert take["blocked"].mean() < 0.9, "it lives in its own home: elsewhere all is blocked"
 
 
 def look():
