@@ -105,10 +105,18 @@ def gaussians(splats: Path) -> Gaussians:
 
 
 def minds(behavior: Path, behavior_data: Path) -> Minds:
-    """Read the sampler's contract, the four networks, and the scene's features that they perceive."""
+    """Read the sampler's contract, the four networks, and the scene's features that they perceive.
+
+    Raises InputError EXP-002 for a variant that the page's sampler does not know.
+    """
+    contract = json.loads((behavior / "behavior.json").read_bytes())
+    family, ego = (contract["architecture"][key] for key in ("family", "ego"))
+    if family != "diffusion" or ego == "world":
+        what = f"the page cannot sample a model of the family {family} with the ego frame {ego}"
+        raise InputError("EXP-002", what, str(behavior), "take another variant: family diffusion, ego yaw or full")
     table = arrays.load(behavior_data / "volume.npz", names=("features", "allowed", "origin", "voxel_m", "stands_m"))
     return Minds(
-        behavior=json.loads((behavior / "behavior.json").read_bytes()),
+        behavior=contract,
         networks={name: (behavior / f"{name}.onnx").read_bytes() for name in NETWORKS},
         volume={
             "shape": list(table["features"].shape),

@@ -134,6 +134,9 @@ def _world(given: Mapping[str, Path], data: BehaviorData) -> World:
 
 def _simulator(given: Mapping[str, Path], data: BehaviorData, c: Any, chaining: Any, device: str) -> Simulator:
     architecture, nets, scaling, schedule, _ = _loaded(behavior.load, _needed(given, "behavior"))
+    if architecture.family != "diffusion":
+        what = f"plans of the family {architecture.family} cannot be chained"
+        raise InputError("SIM-006", what, str(given["behavior"]), "give a model of the family diffusion")
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
     scenes = Scenes.load(given["behavior_data"], data.videos)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=c.sampling, chaining=chaining)

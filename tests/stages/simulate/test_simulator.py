@@ -179,6 +179,11 @@ def test_a_take_in_one_of_several_homes_has_its_observer_there(tmp_path, seen):
     assert take["blocked"].mean() < 0.9, "it lives in its own home: elsewhere all is blocked"
 
 
+def test_models_whose_plans_cannot_be_chained_are_refused(tmp_path):
+    with pytest.raises(InputError, match="SIM-006.*gaussian"):
+        takes.of_behavior(homes(tmp_path, architecture=replace(ARCHITECTURE, family="gaussian")), Config(), "cpu")
+
+
 def look():
     """A triangle on three bones in a room of one triangle."""
     mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), None)

@@ -1,0 +1,18 @@
+"""What the page cannot sample is refused before it is built."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.models.behavior import Architecture
+from stages.export_simulator import reading
+
+
+@pytest.mark.parametrize("variant", [{"family": "gaussian"}, {"family": "one_stage"}, {"ego": "world"}])
+def test_variants_that_the_page_does_not_know_are_refused(tmp_path: Path, variant: dict[str, str]) -> None:
+    (tmp_path / "behavior.json").write_text(json.dumps({"architecture": asdict(Architecture(bones=3, **variant))}))
+    with pytest.raises(InputError, match=f"EXP-002.*{next(iter(variant.values()))}"):
+        reading.minds(tmp_path, tmp_path)
