@@ -14,6 +14,8 @@ from pipeline.dag import Flow
 from pipeline.errors import InputError
 
 VIDEOS_TABLE, FLOW_TABLE, TABLES_STAGE, TRIED_TABLE = "videos", "flow", "tabulate_behavior", "train_behavior"
+OURS = "ats"
+"""The method that all others of the tables are compared with."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,9 @@ def trials(table: Mapping[str, Any], cache: sources.Cache) -> Iterator[Trial]:
     count, methods = _count(settings, "seeds", TABLES_STAGE), settings.get("methods", ())
     if not isinstance(methods, list | tuple) or not all(isinstance(method, str) for method in methods):
         raise InputError("REC-002", f"{methods!r} is no list of methods", f"[{TABLES_STAGE}]: methods", 'write ["ats", ...]')
+    if OURS not in methods or not count:
+        what = f"{count} trainings of {', '.join(methods) or 'no method'} make no tables"
+        raise InputError("REC-002", what, f"[{TABLES_STAGE}]: methods, seeds", f"one seed at least, and {OURS!r} among the methods")
     for method in methods:
         path = Path("agents", "variants", f"{method}.toml")
         overlay, _ = read(path, cache)

@@ -13,9 +13,8 @@ from pipeline.models.behavior import Sampling
 from pipeline.models.predictors import Ats
 from pipeline.models.scenes import Scenes
 from pipeline.models.trajectories import BehaviorData
+from pipeline.recipes import OURS
 from stages.tabulate_behavior import chaining, pictures, printing, reading, tables, untrained
-
-OURS = "ats"
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,12 @@ def test_trials_of_the_wrong_type_are_refused(table):
         list(recipes.trials(table, sources.Cache()))
 
 
+@pytest.mark.parametrize("table", [{"seeds": 0}, {"methods": ["world"]}, {"methods": []}])
+def test_tables_of_nothing_or_without_ours_are_refused(table):
+    with pytest.raises(InputError, match="REC-002.*tabulate_behavior(.|\n)*'ats' among the methods"):
+        list(recipes.trials(table, sources.Cache()))
+
+
 def test_a_count_of_recordings_of_the_wrong_type_is_refused():
     with pytest.raises(InputError, match="REC-002.*session_count"):
         recipes.builtin_remarks("recordings", {"synthesize_capture": {"session_count": "two"}}, sources.Cache(), "agents/toy.toml")
