@@ -45,7 +45,7 @@ def run(task: cli.Task) -> None:
     test = frozenset(id for id in trajectories if sessions[id].split == "test")
     data = slice_windows(trajectories, test, source.agent_from_bone_rest, stride=settings.stride)
     if not len(data.indices(TRAIN)):
-        remedy = "record longer sessions in which the animal stays in view, or lower min_confidence"
+        remedy = "record longer sessions in which the animal stays in view, lower min_confidence, or raise max_gap_s where rows are further apart"
         raise InputError("BEH-001", "no 6.4 s of uninterrupted motion to learn from", source.where, remedy)
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start) - len(data.indices(TRAIN))} test windows")
     seen = {id: trajectory for id, trajectory in trajectories.items() if id not in test}

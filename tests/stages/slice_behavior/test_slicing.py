@@ -1,9 +1,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from pipeline import artifact
+from pipeline.cli import Task
+from pipeline.errors import InputError
+from pipeline.files import arrays
 from pipeline.models.trajectories import TEST, TRAIN, window_starts
 from pipeline.space import rigid
+from pipeline.videos import Video
+from stages.slice_behavior.__main__ import Config, run
 from stages.slice_behavior.gridding import Motion, trajectory_from_motion
 from stages.slice_behavior.windows import allowed_voxels, slice_windows
 from tests.pipeline.models.wandering import REST, room, wander
@@ -80,6 +87,20 @@ def test_windows_hold_only_valid_frames_of_one_recording():
 
 def test_too_short_a_recording_gives_no_window():
     assert len(window_starts(np.ones(63, bool), 64)) == 0
+
+
+def test_rows_too_far_apart_are_told_how_to_be_bridged(tmp_path):
+    still = np.tile(np.eye(4), (60, 1, 1))
+    with artifact.create(tmp_path / "trajectories/v000", stage="read_trajectories", config={}, inputs={}) as folder:
+        motion = {"world_from_agent": still, "world_from_camera": still, "agent_from_bone": still[:, None], "confidence": np.ones(60)}
+        arrays.save(folder / "motion.npz", timestamp_s=np.arange(60.0), agent_visible=np.ones(60, bool), **motion)
+        arrays.save(folder / "skin.npz", agent_from_bone_rest=still[:1])
+        arrays.save(folder / "feature_volume.npz", **vars(room()))
+    videos, paths = (Video("v000", "a.csv", "session", "train", None),), {"trajectories": tmp_path / "trajectories"}
+    task = Task("slice_behavior", Config(), tmp_path / "behavior_data", None, videos, None, 1, None, paths, "cpu")
+    with pytest.raises(InputError, match="BEH-001(.|\n)*max_gap_s"):
+        run(task)
+    run(replace(task, config=Config(max_gap_s=1.5)))
 
 
 def test_animal_may_be_where_it_is_free_or_where_it_has_been():
