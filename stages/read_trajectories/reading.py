@@ -15,6 +15,8 @@ from stages.read_trajectories.life import Life, nobody, one_after_another
 
 LIFE = ("timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "agent_from_bone_rest")
 FLOOR_QUANTILE = 0.002
+FURTHEST_M = 10_000.0
+"""Further from the origin single precision tells no more than millimetres, of which walks are made."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,15 @@ class Reading:
 
 def read(path: Path, reading: Reading) -> Life:
     """Read a recording of any kind. Raises TRJ-001, TRJ-002."""
+    life = _read(path, reading)
+    away = np.abs(life.world_from_agent[:, [0, 2], 3])
+    if np.nanmax(away) > FURTHEST_M:
+        what = f"the animal is up to {np.nanmax(away) / 1000:.0f} km away from the origin"
+        raise InputError("TRJ-001", what, str(path), "write metres; subtract one origin near the animal from all x and z")
+    return life
+
+
+def _read(path: Path, reading: Reading) -> Life:
     if path.is_dir():
         return _from_csv(path / "trajectory.csv", path / "obstacles.csv", reading)
     if path.suffix.lower() == ".csv":

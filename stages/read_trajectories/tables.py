@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from pipeline.errors import InputError
 from pipeline.space import rigid
-from stages.read_trajectories.life import NOBODY_M, nobody, one_after_another
+from stages.read_trajectories.life import APART_S, NOBODY_M, nobody, one_after_another
 
 NEEDED = ("time", "x", "y", "z", "heading")
 OBSERVER = ("observer_x", "observer_y", "observer_z")
@@ -55,7 +55,8 @@ def numbers(path: Path, table: dict[str, list[str]], name: str) -> Float[np.ndar
 def motion_from_csv(
     path: Path,
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame 4 4"]]:
-    """Return times, ``world_from_agent`` and ``world_from_camera``; ids follow each other on one clock.
+    """Return times, ``world_from_agent`` and ``world_from_camera``; ids follow each other on one clock, as do stretches of one id
+    that lie further apart than clips are put.
 
     Rows without a position are frames in which the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
     """
@@ -70,6 +71,7 @@ def motion_from_csv(
     rows = [np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)]
     rows = [mine[np.argsort(value["time"][mine], kind="stable")] for mine in rows]
     _refuse_impossible_times(path, [value["time"][mine] for mine in rows])
+    rows = [clip for mine in rows for clip in np.split(mine, 1 + np.flatnonzero(np.diff(value["time"][mine]) > APART_S))]
     order = np.concatenate(rows)
     turn = np.zeros((len(order), 3))
     turn[:, 1] = value["heading"][order]

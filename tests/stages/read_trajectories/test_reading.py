@@ -28,6 +28,15 @@ def test_a_table_becomes_poses_id_by_id(tmp_path):
     assert (life.world_from_camera[:, 0, 3] == NOBODY_M).all()
 
 
+def test_stretches_days_apart_become_clips_of_one_recording(tmp_path):
+    rows = [f"{1.7e9 + 86400 * day + 0.1 * i:.1f},{i * 0.01},0.2,0,0" for day in (0, 1, 7) for i in range(20)]
+    time = read(table(tmp_path / "t.csv", rows, "time,x,y,z,heading"), READING).timestamp_s
+    step = np.diff(time)
+    assert len(time) == 60 and time[0] == 0
+    np.testing.assert_allclose(step[[19, 39]], APART_S)
+    np.testing.assert_allclose(np.delete(step, [19, 39]), 0.1, atol=1e-6)
+
+
 def test_unseen_rows_and_observers_are_kept_apart(tmp_path):
     rows = ["a,0.0,1,0,2,0,3,1,4", "a,0.1,,,,,3,1,4", "a,0.2,1,0,2,0,,,"]
     life = read(table(tmp_path / "t.csv", rows, "id,time,x,y,z,heading,observer_x,observer_y,observer_z"), READING)
@@ -97,6 +106,7 @@ def test_clips_of_joints_stand_on_the_floor(tmp_path):
         ("Time,X,Y,Z,Heading\n0,inf,0,0,0\n", "TRJ-002.*no position"),
         ("id,time,x,y,z,heading\na,1,0,0,0,0\na,1,1,0,0,0\n", "TRJ-001.*same time"),
         ("time,x,y,z,heading\n0,0,0,0,0\n100,0,0,0,0\n", "TRJ-001.*100 s apart"),
+        ("time,x,y,z,heading\n0,431250.5,0,5402000,0\n1,431251,0,5402000,0\n", "TRJ-001.*5402 km away(.|\n)*subtract one origin"),
         ("time;x;y;z;heading\n0,1;0,0;0,0;0,0;0,0\n", "TRJ-001.*line 2 has more cells"),
         ("time,x,y,z,heading,observer_x\n0,0,0,0,0,0\n", "TRJ-001.*no column observer_y, observer_z"),
     ],
