@@ -10,6 +10,7 @@ from pipeline.files import arrays
 from pipeline.models.trajectories import TEST, TRAIN, window_starts
 from pipeline.space import rigid
 from pipeline.videos import Video
+from stages.slice_behavior import pictures
 from stages.slice_behavior.__main__ import Config, run
 from stages.slice_behavior.gridding import Motion, trajectory_from_motion
 from stages.slice_behavior.windows import allowed_voxels, slice_windows
@@ -101,6 +102,14 @@ def test_rows_too_far_apart_are_told_how_to_be_bridged(tmp_path):
     with pytest.raises(InputError, match="BEH-001(.|\n)*max_gap_s"):
         run(task)
     run(replace(task, config=Config(max_gap_s=1.5)))
+
+
+def test_a_day_of_windows_is_judged_by_some_of_them():
+    few, many = np.arange(3, 60, 2), np.arange(7, 100_007)
+    np.testing.assert_array_equal(pictures.some(few), few)
+    chosen = pictures.some(many)
+    assert len(chosen) == pictures.MOST_WINDOWS and (chosen[0], chosen[-1]) == (7, 100_006)
+    assert set(np.diff(chosen)) == {12, 13}
 
 
 def test_animal_may_be_where_it_is_free_or_where_it_has_been():
