@@ -17,6 +17,7 @@ from stages.train_behavior.export import write_model
 
 BONES = 5
 HALF_ROOM_M = 2.0
+CUPBOARD_M = 1.3
 
 
 def rest() -> np.ndarray:
@@ -154,7 +155,7 @@ def write(build: Path) -> None:
         build / "behavior_data/volume.npz",
         features=rng.normal(0, 0.1, (16, *shape)).astype(np.float16),
         occupancy=np.zeros(shape, np.uint8),
-        allowed=np.ones(shape, np.uint8),
+        allowed=allowed(shape),
         stands_m=np.full((2, 2), np.nan),
         origin=np.array([-2.2, -0.2, -2.2]),
         voxel_m=np.array(0.1),
@@ -165,6 +166,14 @@ def write(build: Path) -> None:
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
+
+
+def allowed(shape: tuple[int, int, int]) -> np.ndarray:
+    """The animal may be everywhere but in a cupboard, where x > `CUPBOARD_M` and z < -`CUPBOARD_M`."""
+    space = np.ones(shape, np.uint8)
+    edge = round((CUPBOARD_M + 2.2) / 0.1)
+    space[edge:, :, : shape[2] - edge] = 0
+    return space
 
 
 def write_surfaces(reconstruction: Path) -> None:

@@ -86,6 +86,7 @@ def test_goals_and_paths_are_obeyed_and_takes_are_kept(simulator: Path, chromium
     with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(900, 760), accept_downloads=True) as (page, wrong):
         _check_a_clicked_goal(page)
         _check_goals_in_turn(page, tmp_path)
+        _check_a_goal_in_a_cupboard(page)
         _check_a_drawn_path(page)
         _check_downloads(page, tmp_path)
         _check_a_clip_beside(page)
@@ -183,6 +184,15 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
         page.wait_for_function(f"ats.state().stops.length === {left}", timeout=30_000)
         place = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
         assert np.linalg.norm(place - goals[2 - left]) < 0.6, "metres: it is at the stop that is next in turn"
+
+
+def _check_a_goal_in_a_cupboard(page: Page) -> None:
+    """Where the animal cannot be it gets as near as it can, and goes on to the next goal."""
+    page.evaluate("ats.visit([[1.8, -1.8], [0.3, -0.2]])")
+    page.wait_for_function("ats.state().stops.length === 1", timeout=30_000)
+    place = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
+    assert np.linalg.norm(place - [1.8, -1.8]) < 1.0, "metres: beside the cupboard, which is 0.7 m wide"
+    page.wait_for_function("ats.state().aim === null", timeout=30_000)
 
 
 def _check_a_drawn_path(page: Page) -> None:

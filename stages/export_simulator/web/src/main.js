@@ -296,6 +296,7 @@ class Simulator {
     const start = Math.floor(this.now);
     this.planStart = this.now;
     this.noticed = this.observer.pose();
+    const stop = this.stops.next;
     let plan;
     try {
       plan = await this.planner.plan(this.question({ seed: this.state.seed * 1009 + this.turnNumber++ }));
@@ -306,6 +307,7 @@ class Simulator {
     if (epoch !== this.epoch) return;
     this.waiting = false;
     this.timeline.follow(start, plan.frames, this.now);
+    if (plan.cleared) this.stops.clear(stop, plan.cleared);
     this.overlays.show(plan);
     this.ghost.pose(plan.frames.at(-1), this.contract.scene.floor_m);
     if (!this.milliseconds) performance.mark('plan');

@@ -172,7 +172,8 @@ export class Sampler {
     return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, this.goal(scaled, i)));
   }
 
-  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, path}.
+  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, path}. `cleared` is where a plan
+  // ends that goes all the way to the aim: as near to it as the animal may be.
   async plan(question) {
     const observation = this.senses.observe(question.past, question.observer);
     const { frame } = observation;
@@ -183,7 +184,8 @@ export class Sampler {
     const bare = this.senses.boneless(observation, this.contract.scaling.body_mean);
     const codes = await this.codes(bare, question.keep, question.interactivity);
     const commanded = Boolean(question.aim);
-    const scaled = commanded ? this.leg(frame, question.aim) : await this.dreamt(codes, question.samples, options);
+    const leg = commanded && this.leg(frame, question.aim);
+    const scaled = commanded ? leg.scaled : await this.dreamt(codes, question.samples, options);
     const keepGoal = commanded ? 1 : question.keep.goal;
     const goals = this.goalsInWorld(frame, scaled);
     const tried = commanded ? Array(Math.min(CANDIDATES, question.samples)).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
@@ -194,7 +196,8 @@ export class Sampler {
     if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
     const best = this.firstInside(frame, paths);
     const path = this.kept(frame, codes.start, this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))), options);
-    return { goals, chosen: tried[best], ...(await this.embodied(frame, whole, path, options)) };
+    const lived = await this.embodied(frame, whole, path, options);
+    return { goals, chosen: tried[best], ...lived, cleared: leg.last ? lived.path.at(-1) : null };
   }
 
   // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.
@@ -262,12 +265,12 @@ export class Sampler {
     return rows;
   }
 
-  // The visitor's goal in scaled units, not further than the animal goes in one plan.
+  // The visitor's goal in scaled units, not further than the animal goes in one plan; and whether it is there then.
   leg(frame, aim) {
     const [x, , z] = apply(inverse(frame), aim);
     const whole = this.scaled([x, 0, z]);
     const share = Math.min(1, FURTHEST / Math.max(1e-6, Math.hypot(...whole)));
-    return Float32Array.from(whole, (value) => value * share);
+    return { scaled: Float32Array.from(whole, (value) => value * share), last: share === 1 };
   }
 
   // Metres and channels, frame by frame.

@@ -8,7 +8,7 @@ const ARRIVED_M = 0.25;
 export class Stops {
   // points: [[x, z], ...] on the floor, metres; from: the root's row where the journey begins.
   constructor(points = [], from = null) {
-    Object.assign(this, { points, from, reached: 0 });
+    Object.assign(this, { points, from, reached: 0, nearest: new Map() });
   }
 
   get left() {
@@ -25,9 +25,15 @@ export class Stops {
     this.points = [...this.points.slice(0, this.reached), ...points];
   }
 
+  // Note where the animal arrives that goes to a stop: in furniture it may not be.
+  clear(stop, [x, , z]) {
+    this.nearest.set(stop, [x, z]);
+  }
+
   // Note where the animal is; true when a stop has just been reached.
   visit([x, , z]) {
-    const near = this.next && Math.hypot(this.next[0] - x, this.next[1] - z) < ARRIVED_M;
+    const goal = this.nearest.get(this.next) ?? this.next;
+    const near = goal && Math.hypot(goal[0] - x, goal[1] - z) < ARRIVED_M;
     if (near) this.reached += 1;
     return Boolean(near);
   }
