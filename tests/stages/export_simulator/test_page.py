@@ -40,6 +40,17 @@ SPOILS_THE_FIRST_PLAN = """
     return post.call(this, spoil ? { ...message, content: { ...message.content, past: null } } : message, ...rest);
   };
 """
+WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED = """
+  const post = Worker.prototype.postMessage;
+  window.told = [];
+  Worker.prototype.postMessage = function (message, ...rest) {
+    if (message.kind !== 'plan') return post.call(this, message, ...rest);
+    told.push(message.content.observer);
+    if (told.length > 1) return post.call(this, message, ...rest);
+    dispatchEvent(new KeyboardEvent('keydown', { key: 'w', code: 'KeyW' }));
+    setTimeout(() => post.call(this, message, ...rest), 2000);
+  };
+"""
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
 
 
@@ -271,6 +282,61 @@ def _check_it_plays(page: Page, name: str, place: np.ndarray) -> None:
     page.wait_for_function(f"ats.state().replay?.name === '{name}' && ats.state().tick > 2", timeout=20_000)
     replay = page.evaluate("ats.state().replay")
     np.testing.assert_allclose(replay["place"], place[3 * (replay["tick"] % 61)], atol=1e-5)  # metres
+
+
+def test_keys_stay_alive_while_the_panel_is_used(simulator: Path, chromium: Browser) -> None:
+    with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(900, 760)) as (page, wrong):
+        page.locator("#interactivity").press("ArrowLeft")
+        assert page.input_value("#interactivity") == "0.95", "arrows are the slider's"
+        _check_a_key_walks(page, "w")
+        page.locator("[data-sense=past]").focus()
+        page.keyboard.press("Space")
+        assert page.evaluate("ats.state().settings.past") == 0 and page.inner_text("#play") == "pause", "space is the box's"
+        _check_a_key_walks(page, "ArrowUp")
+        page.locator("#seed").focus()
+        page.keyboard.down("w")
+        _check_nobody_walks(page)
+        page.keyboard.up("w")
+        page.locator("#view").focus()
+        page.keyboard.down("s")
+        page.keyboard.down("Alt")
+        page.keyboard.up("s")
+        page.keyboard.up("Alt")
+        _check_nobody_walks(page)
+        assert wrong == []
+
+
+def _check_a_key_walks(page: Page, key: str) -> None:
+    before = page.evaluate("ats.state().observer")
+    page.keyboard.down(key)
+    page.wait_for_function(
+        "([x, z]) => Math.hypot(ats.state().observer[0] - x, ats.state().observer[1] - z) > 0.1", arg=before, timeout=10_000
+    )
+    page.keyboard.up(key)
+
+
+def _check_nobody_walks(page: Page) -> None:
+    before = page.evaluate("ats.state()")
+    page.wait_for_function(f"ats.state().tick > {before['tick'] + 2}", timeout=10_000)
+    assert page.evaluate("ats.state().observer") == before["observer"]
+
+
+def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    """Not before the first plan, nor in slow motion: nobody takes steps of more than 0.11 m in 0.1 s of the animal's time."""
+    address = (simulator / "index.html").as_uri() + "#speed=0.3&at=1.2,1.2"
+    with browser.shown(chromium, address, script=WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED) as (page, wrong):
+        assert np.linalg.norm(np.subtract(page.evaluate("ats.state().observer"), 1.2)) > 0.3, "metres, while the first plan is awaited"
+        page.wait_for_function("ats.state().take_s > 0.5 && told.length > 1", timeout=30_000)
+        page.keyboard.up("w")
+        with page.expect_download() as download:
+            page.evaluate("document.querySelector('#csv').click()")
+        download.value.save_as(tmp_path / "take.csv")
+        table = np.genfromtxt(tmp_path / "take.csv", delimiter=",", names=True)
+        told = np.array(page.evaluate("told.at(-1)"))
+        for places in (np.stack([table["observer_x"], table["observer_z"]], -1), told[:, [0, 2]]):
+            steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+            assert 0.05 < steps.max() < 0.115, "metres"
+        assert wrong == []
 
 
 def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> None:

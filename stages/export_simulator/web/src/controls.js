@@ -1,5 +1,6 @@
 // Hands on the scene: keys walk the observer and turn the view, a drag on the figure carries it, a click on the floor
 // is a goal, one more with the pins (or with shift), a stroke with the pen (or with shift) is a path.
+// Keys that mean something to the part of the panel that has the focus stay its own.
 
 const KEYS = { w: [0, 1], arrowup: [0, 1], s: [0, -1], arrowdown: [0, -1], a: [-1, 0], arrowleft: [-1, 0], d: [1, 0], arrowright: [1, 0] };
 const TURNS = { q: [-1, 0], e: [1, 0], '+': [0, -1], '=': [0, -1], '-': [0, 1] };
@@ -8,9 +9,9 @@ const STROKE_M = 0.03;
 
 export class Controls {
   constructor(room, observer, on) {
-    Object.assign(this, { room, observer, on, down: new Set(), press: null, dragging: false, tool: null, stroke: null });
-    addEventListener('keydown', (event) => this.key(event, true));
-    addEventListener('keyup', (event) => this.key(event, false));
+    Object.assign(this, { room, observer, on, down: new Map(), press: null, dragging: false, tool: null, stroke: null });
+    addEventListener('keydown', (event) => this.key(event));
+    addEventListener('keyup', (event) => this.down.delete(event.code));
     addEventListener('blur', () => this.down.clear());
     const canvas = room.canvas;
     canvas.addEventListener('pointerdown', (event) => this.start(event), { capture: true });
@@ -20,28 +21,34 @@ export class Controls {
   }
 
   direction() {
-    return [...this.down].reduce(([x, y], key) => [x + (KEYS[key]?.[0] ?? 0), y + (KEYS[key]?.[1] ?? 0)], [0, 0]);
+    return this.held(KEYS);
   }
 
   // How the view is to turn (about the animal) and to close in, -1..1 each.
   turning() {
-    return [...this.down].reduce(([x, y], key) => [x + (TURNS[key]?.[0] ?? 0), y + (TURNS[key]?.[1] ?? 0)], [0, 0]);
+    return this.held(TURNS);
   }
 
-  key(event, pressed) {
-    if (event.target.matches?.('input, select') || event.ctrlKey || event.metaKey || event.altKey) return;
+  // The sum of what the keys that are down mean.
+  held(meanings) {
+    return [...this.down.values()].reduce(([x, y], key) => [x + (meanings[key]?.[0] ?? 0), y + (meanings[key]?.[1] ?? 0)], [0, 0]);
+  }
+
+  key(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return this.down.clear(); // some systems never tell when a chord's keys go up
     const key = event.key.toLowerCase();
+    if (belongs(key, event.target)) return;
     if (key in KEYS || key in TURNS) {
-      this.down[pressed ? 'add' : 'delete'](key);
+      this.down.set(event.code, key);
       event.preventDefault();
-    } else if (pressed && key === ' ' && !event.target.matches?.('button')) {
+    } else if (key === ' ') {
       this.on.play();
       event.preventDefault();
-    } else if (pressed && key === 'r') this.on.reset();
-    else if (pressed && key === 'h') this.on.how();
-    else if (pressed && key === 'c') this.on.aim([...this.observer.place]);
-    else if (pressed && (key === 'p' || key === 'g')) this.on.hold(key === 'p' ? 'pen' : 'pins');
-    else if (pressed && key === 'escape' && this.tool) this.on.hold(null);
+    } else if (key === 'r') this.on.reset();
+    else if (key === 'h') this.on.how();
+    else if (key === 'c') this.on.aim([...this.observer.place]);
+    else if (key === 'p' || key === 'g') this.on.hold(key === 'p' ? 'pen' : 'pins');
+    else if (key === 'escape' && this.tool) this.on.hold(null);
   }
 
   overObserver(event) {
@@ -99,4 +106,11 @@ export class Controls {
       if (point) this.on.aim(point, event.shiftKey || this.tool === 'pins');
     }
   }
+}
+
+// Whether a key means something to the element that has the focus.
+function belongs(key, element) {
+  if (element.matches?.('[type=range]')) return key.startsWith('arrow') || '+=-'.includes(key);
+  if (element.matches?.('button, [type=checkbox]')) return key === ' ';
+  return Boolean(element.matches?.('input, select'));
 }

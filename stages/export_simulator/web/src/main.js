@@ -83,7 +83,7 @@ class Simulator {
       glb: () => save(this.take.glb(this.model), `${this.fileName}.glb`),
       film: () => this.shoot(),
       toml: () => save(this.stops.toml, `${this.fileName}_subgoals.toml`),
-      link: () => this.copyLink(),
+      link: panel.copyLink,
       open: (file) => this.openTake(file),
     });
     panel.showFilm(false, Film.possible);
@@ -201,15 +201,6 @@ class Simulator {
     save(await this.film.stop(), `${this.fileName}.webm`);
   }
 
-  async copyLink() {
-    try {
-      await navigator.clipboard.writeText(location.href);
-      panel.help('The address of this behaviour is copied.', 4);
-    } catch {
-      panel.help('The address of this behaviour stands in the browser\'s address line.', 6);
-    }
-  }
-
   // A take of `stages.simulate` plays beside, as a recorded clip does.
   async openTake(file) {
     try {
@@ -229,7 +220,9 @@ class Simulator {
     if (time - this.last < 1000) this.room.steadiness.note(time - this.last);
     this.last = time;
     if (this.playing) {
-      this.advance(seconds * this.state.speed, seconds);
+      if (this.timeline.plans.length) this.advance(seconds * this.state.speed);
+      else if (this.walk(seconds)) this.observer.settle(); // no time has passed: who has come since then has always stood here
+      this.plan();
       this.room.attend(this.observer.animal, seconds, this.eyes());
     }
     const [turn, closer] = this.controls.turning();
@@ -237,29 +230,36 @@ class Simulator {
     this.draw();
   }
 
-  advance(seconds, wallSeconds) {
-    const before = Math.floor(this.now);
-    // Never run past what is planned: wait for the mind rather than freeze in mid-step.
-    this.now = this.timeline.plans.length ? Math.min(this.now + seconds / TICK_S, this.now + Math.max(0, this.timeline.ticksLeft(this.now))) : this.now;
-    const walked = this.observer.step(wallSeconds, this.controls.direction(), this.room.heading());
-    if (walked) this.moved = this.taken = true;
-    for (let tick = before; tick < Math.floor(this.now); tick++) {
-      this.observer.tick();
-      this.map.visit('animal', this.observer.animal[0], this.observer.animal[2]);
-      this.map.visit('observer', ...this.observer.place);
-      this.replayTick += 1;
-      this.take.add(this.timeline.at(tick + 1), this.observer.pose(), this.overlays.plan?.goals[this.overlays.plan.chosen]);
-      if (this.stops.visit(this.observer.animal)) this.arrive();
-      if (this.replaying && !this.taken) this.followPerson();
-      if (this.moved && tick % 10 === 0) this.rememberPlace();
+  // Let seconds pass, for animal and observer; never past what is planned: wait for the mind rather than freeze in mid-step.
+  advance(seconds) {
+    const end = this.now + Math.min(seconds / TICK_S, Math.max(0, this.timeline.ticksLeft(this.now)));
+    while (this.now < end) {
+      const next = Math.min(end, Math.floor(this.now) + 1);
+      this.walk((next - this.now) * TICK_S);
+      this.now = next;
+      if (Number.isInteger(next)) this.tick();
     }
     this.timeline.record(this.now);
-    this.plan();
   }
 
-  arrive() {
-    this.showWishes();
-    this.urgent = true;
+  tick() {
+    this.observer.tick();
+    this.map.visit('animal', this.observer.animal[0], this.observer.animal[2]);
+    this.map.visit('observer', ...this.observer.place);
+    this.replayTick += 1;
+    this.take.add(this.timeline.at(this.now), this.observer.pose(), this.overlays.plan?.goals[this.overlays.plan.chosen]);
+    if (this.stops.visit(this.observer.animal)) {
+      this.showWishes();
+      this.urgent = true;
+    }
+    if (this.replaying && !this.taken) this.followPerson();
+    if (this.moved && this.now % 10 === 0) this.rememberPlace();
+  }
+
+  walk(seconds) {
+    const walked = this.observer.step(seconds, this.controls.direction(), this.room.heading());
+    if (walked) this.moved = this.taken = true;
+    return walked;
   }
 
   // Beside a clip the observer walks as the person did.

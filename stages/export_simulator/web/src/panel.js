@@ -122,6 +122,15 @@ export function howTo() {
   box.classList.toggle('gone', shown);
 }
 
+export async function copyLink() {
+  try {
+    await navigator.clipboard.writeText(location.href);
+    help('The address of this behaviour is copied.', 4);
+  } catch {
+    help('The address of this behaviour stands in the browser\'s address line.', 6);
+  }
+}
+
 export function status(text) {
   at('status').textContent = text;
 }
