@@ -355,7 +355,18 @@ def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> 
         assert page.is_visible("#help") and "Click the floor" in page.inner_text("#help")
         page.click("#how")
         page.wait_for_function("document.getElementById('help').classList.contains('gone')")
+        _check_a_followed_link(page)
         assert wrong == []
+
+
+def _check_a_followed_link(page: Page) -> None:
+    """A link that is followed in an open page does what it does in a new one."""
+    page.evaluate("location.hash = '#replay=v002&view=animal&speed=0&samples=1'")
+    page.wait_for_function("ats.state().replay?.name === 'v002'", timeout=10_000)
+    state = page.evaluate("ats.state()")
+    kept = {"replay": "v002", "view": "animal", "speed": 1, "samples": 1, "interactivity": 1}
+    assert {key: state["settings"][key] for key in kept} == kept and state["aim"] is None
+    page.wait_for_function("ats.state().tick > 2", timeout=20_000)
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,7 @@ class Simulator {
     addEventListener('hashchange', () => {
       Object.assign(this.state, readState());
       this.panel.refresh();
+      this.changed('view');
       this.reset();
     });
     this.changed('');

@@ -1,5 +1,7 @@
 // The controls: they read and write the state and call back; they know nothing of the room.
 
+import { SPEEDS } from './state.js';
+
 const at = (id) => document.getElementById(id);
 const HOW = at('help').innerHTML;
 const TOOLS = {
@@ -68,7 +70,7 @@ export function buildPanel(state, clips, on) {
   at('reset').addEventListener('click', on.reset);
   at('free').addEventListener('click', on.free);
   at('how').addEventListener('click', howTo);
-  at('slow').addEventListener('click', () => change('speed', state.speed === 1 ? 0.3 : 1));
+  at('slow').addEventListener('click', () => change('speed', SPEEDS.find((speed) => speed !== state.speed)));
   sync.push(() => at('slow').setAttribute('aria-pressed', state.speed !== 1));
 
   const fold = () => at('panel-toggle').setAttribute('aria-expanded', !at('panel').classList.toggle('closed'));

@@ -6,6 +6,7 @@ const DEFAULTS = {
   aim: '', route: '', at: '', view: 'room', goals: 1, path: 1,
 };
 
+export const SPEEDS = [1, 0.3]; // seconds of the animal's life a second
 export const VIEWS = ['room', 'animal', 'you'];
 
 export function readState() {
@@ -18,6 +19,7 @@ export function readState() {
   state.interactivity = Math.min(1, Math.max(0, state.interactivity));
   state.samples = [1, 4, 16].includes(state.samples) ? state.samples : DEFAULTS.samples;
   state.steps = [10, 50].includes(state.steps) ? state.steps : DEFAULTS.steps;
+  state.speed = SPEEDS.includes(state.speed) ? state.speed : DEFAULTS.speed;
   state.view = VIEWS.includes(state.view) ? state.view : DEFAULTS.view;
   state.seed = Math.min(999999, Math.max(0, Math.round(state.seed)));
   return state;
