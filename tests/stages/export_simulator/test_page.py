@@ -2,11 +2,13 @@
 
 import base64
 import functools
+import gzip
 import http.server
 import json
 import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,6 +53,7 @@ WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED = """
     setTimeout(() => post.call(this, message, ...rest), 2000);
   };
 """
+SEES_ALL = "points => points.map(ats.screen).every(([x, y]) => x > 0 && x < innerWidth && y > 0 && y < innerHeight)"
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
 
 
@@ -392,12 +395,42 @@ def test_folder_variant_lives_on_a_static_host(simulator: Path, chromium: Browse
     folder = simulator.parent / "light"
     assert (folder / "index.html").stat().st_size < 5e6 < (simulator / "index.html").stat().st_size
 
+    with served(folder) as address, browser.shown(chromium, address) as (page, wrong):
+        assert page.evaluate("ats.state().plans") >= 1
+        assert [line for line in wrong if "favicon" not in line] == []
+
+
+def test_splats_that_cannot_be_read_leave_the_mesh(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    folder = shutil.copytree(simulator.parent / "light", tmp_path / "light")
+    (folder / "assets/splats.gz").write_bytes(b"no splats")
+    with served(folder) as address, browser.shown(chromium, f"{address}?splats") as (page, wrong):
+        page.wait_for_function("document.querySelector('#status').textContent.includes('drawn as a mesh')", timeout=30_000)
+        assert page.evaluate("document.querySelector('#splash').classList.contains('gone')")
+        assert [line for line in wrong if "favicon" not in line] == []
+
+
+def test_a_hall_is_framed_as_a_room_is_and_seen_whole_from_afar(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    folder = shutil.copytree(simulator.parent / "light", tmp_path / "light")
+    told = json.loads(gzip.decompress((folder / "assets/simulator.gz").read_bytes()))
+    told["scene"]["bounds_m"] = (np.array(told["scene"]["bounds_m"]) * [4, 1, 4]).tolist()
+    (folder / "assets/simulator.gz").write_bytes(gzip.compress(json.dumps(told).encode()))
+    size, half = (390, 780), 4 * small_world.HALF_ROOM_M
+    with served(folder) as address, browser.shown(chromium, address, size=size) as (page, _):
+        near, far = (np.array(page.evaluate("p => ats.screen(p)", [0, 0, side * half])) for side in (1, -1))
+        assert 330 < np.linalg.norm(near - far) < 360, "pixels, as in a room of a quarter of the size"
+        page.keyboard.down("-")
+        corners = [[x, 0, z] for x in (-half, half) for z in (-half, half)]
+        page.wait_for_function(SEES_ALL, arg=corners, timeout=20_000)
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Yield the address of a folder's page on a static host."""
+
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None: ...
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        with browser.shown(chromium, f"http://127.0.0.1:{server.server_port}/index.html") as (page, wrong):
-            assert page.evaluate("ats.state().plans") >= 1
-            assert [line for line in wrong if "favicon" not in line] == []
+        yield f"http://127.0.0.1:{server.server_port}/index.html"
         server.shutdown()

@@ -58,10 +58,10 @@ class Simulator {
     panel.ready();
     this.last = performance.now();
     this.room.renderer.setAnimationLoop(() => this.frame());
-    await this.addSplats();
+    await this.addSplats().catch((error) => { this.remark = `; drawn as a mesh, without splats: ${error.message}`; });
   }
 
-  // Splats need a real graphics card; in software the mesh is kinder.
+  // Splats need a real graphics card; in software the mesh is kinder, and where they fail.
   async addSplats() {
     const wanted = new URLSearchParams(location.search);
     if (wanted.has('mesh') || (this.room.software && !wanted.has('splats'))) return;
@@ -313,7 +313,7 @@ class Simulator {
     this.ghost.pose(plan.frames.at(-1), this.contract.scene.floor_m);
     if (!this.milliseconds) performance.mark('plan');
     this.milliseconds = plan.milliseconds;
-    panel.status(`planned ${(plan.frames.length * TICK_S).toFixed(1)} s ahead in ${(plan.milliseconds / 1000).toFixed(2)} s`);
+    panel.status(`planned ${(plan.frames.length * TICK_S).toFixed(1)} s ahead in ${(plan.milliseconds / 1000).toFixed(2)} s${this.remark ?? ''}`);
     if (this.route?.finished) this.visit([]);
   }
 

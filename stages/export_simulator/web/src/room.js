@@ -12,6 +12,8 @@ const PIXELS = { software: [0.75, 0.3, 75], graphics: [2, 0.6, 28] }; // drawn p
 const WALL_M = 0.35; // a wall's thickness, with what leans on it
 
 const FOG_M = 0.5; // Gaussians nearer to the eye are hidden
+const FURTHEST_M = 14; // how far away the view may go
+const FURTHEST = 4; // and in widths of the room: from there an upright phone shows it from wall to wall
 const CLOSE_M = 1.7; // how far away the view stays that follows the animal
 
 export const parseModel = (bytes) => new Promise((done, fail) => {
@@ -36,18 +38,25 @@ export class Room {
     const sun = new THREE.DirectionalLight(0xfff4e2, 1.3);
     sun.position.set(1, 3, 2);
     this.scene.add(sun);
-    this.camera = new THREE.PerspectiveCamera(40, 1, 0.05, 60);
+    const furthest = Math.max(FURTHEST_M, FURTHEST * this.span);
+    this.camera = new THREE.PerspectiveCamera(40, 1, 0.05, 5 * furthest);
     this.orbit = new OrbitControls(this.camera, canvas);
-    Object.assign(this.orbit, { enableDamping: true, dampingFactor: 0.08, maxPolarAngle: 1.5, minDistance: 0.6, maxDistance: 14 });
+    Object.assign(this.orbit, { enableDamping: true, dampingFactor: 0.08, maxPolarAngle: 1.5, minDistance: 0.6, maxDistance: furthest });
     this.ray = new THREE.Raycaster();
     this.frameRoom();
     addEventListener('resize', () => this.resize());
     this.resize();
   }
 
-  frameRoom() {
+  // The longer side of the room, metres.
+  get span() {
     const [low, high] = this.contract.scene.bounds_m;
-    const span = Math.max(high[0] - low[0], high[2] - low[2]);
+    return Math.max(high[0] - low[0], high[2] - low[2]);
+  }
+
+  frameRoom() {
+    const { span } = this;
+    const [low, high] = this.contract.scene.bounds_m;
     const middle = [(low[0] + high[0]) / 2, this.contract.scene.floor_m + 0.25, (low[2] + high[2]) / 2];
     const narrow = innerWidth < 720 ? 1.75 : 1;
     this.orbit.target.set(...middle);
@@ -68,7 +77,6 @@ export class Room {
   }
 
   async addSplats(bytes) {
-    this.scene.add(new SparkRenderer({ renderer: this.renderer }));
     const splats = new SplatMesh({ fileBytes: bytes, fileType: SplatFileType.SPLAT, editable: true });
     this.shell = new SplatEditSdf({ type: SplatEditSdfType.BOX, opacity: 0, invert: true });
     const edit = new SplatEdit({ rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY, sdfs: [this.shell] });
@@ -76,8 +84,8 @@ export class Room {
     this.near = new SplatEditSdf({ type: SplatEditSdfType.SPHERE, opacity: 0, radius: FOG_M });
     const clear = new SplatEdit({ rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY, softEdge: 0.1, sdfs: [this.near] });
     splats.add(edit, this.shell, clear, this.near);
-    this.scene.add(splats);
     await splats.initialized;
+    this.scene.add(new SparkRenderer({ renderer: this.renderer }), splats);
     this.splats = splats;
     if (this.mesh) this.mesh.visible = false;
   }
