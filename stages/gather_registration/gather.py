@@ -43,7 +43,8 @@ def checks(outcomes: list[Outcome]) -> list[Check]:
     """Judge the whole."""
     share = sum(outcome.poses is not None for outcome in outcomes) / max(len(outcomes), 1)
     figures = [outcome.status["figures"] for outcome in outcomes if outcome.poses is not None]
-    gap = float(np.median([figure["depth_gap_m"] for figure in figures]) * 100) if figures else None
+    gaps = [figure["depth_gap_m"] for figure in figures if figure["depth_gap_m"] is not None]
+    gap = float(np.median(gaps) * 100) if gaps else None
     confidence = float(np.mean([figure["confidence"] for figure in figures])) if figures else None
     return [
         Check("recordings registered", share, "share", 0.99, 0.5, "higher"),

@@ -18,6 +18,9 @@ from pipeline.space.meshes import Mesh, RayCaster
 from stages.register_videos.comparing import compare
 from stages.register_videos.votes import Votes
 
+LEAST_POINTS = 20
+"""Points of static depth without which a frame tells nothing of its fit."""
+
 
 @dataclass(frozen=True)
 class AlignOptions:
@@ -66,7 +69,19 @@ class Aligned:
     gap_m: Float[np.ndarray, "frame"]
     """Median distance of the static depth from the surface; NaN where nothing was in reach."""
     fit: Float[np.ndarray, "frame"]
-    """Share of the static depth within 5 cm of the surface, of what lies within half a metre of it."""
+    """Share of the static depth within 5 cm of the surface, of what lies within half a metre of it; NaN where there is no
+    static depth to measure.
+    """
+
+    @property
+    def usual_gap_m(self) -> float:
+        """Return the median frame's gap; NaN where no frame was measured."""
+        return _median(self.gap_m)
+
+    @property
+    def usual_fit(self) -> float:
+        """Return the median frame's fit; NaN where no frame was measured."""
+        return _median(self.fit)
 
 
 def align(
@@ -122,16 +137,21 @@ def measure_fit(
     place: surface.Surface, scans: list[surface.Scan], world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
     """Return each frame's median gap (metres) and the share of its depth within 5 cm of the surface, of that within
-    50 cm.
+    50 cm; NaN for frames that measured too few points, and no share at all where they lie nowhere near.
     """
-    gap, fit = np.full(len(scans), np.nan), np.zeros(len(scans))
+    gap, fit = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
     for frame, scan in enumerate(scans):
-        if len(scan.points_camera):
+        if len(scan.points_camera) >= LEAST_POINTS:
             distance = np.abs(place.distance(rigid.apply(world_from_camera[frame], scan.points_camera)))
-            near = distance[distance < 0.5]
-            if len(near) >= 20:
+            near, fit[frame] = distance[distance < 0.5], 0.0
+            if len(near) >= LEAST_POINTS:
                 gap[frame], fit[frame] = np.median(near), (near < 0.05).mean()
     return gap, fit
+
+
+def _median(values):
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
 
 
 def _static_scan(clip, masks, frame, options, most):

@@ -31,14 +31,19 @@ def status(found: Registered | Refused, walk_time_s: Float[np.ndarray, "walk"], 
         return {"registered": False, "reason": found.reason, "nearest_view": nearest, "figures": figures}
     figures |= {
         "votes_agreeing": int(found.supports.sum()),
-        "depth_gap_m": float(np.nanmedian(found.aligned.gap_m)),
-        "depth_fit": float(np.median(found.aligned.fit)),
+        "depth_gap_m": _told(found.aligned.usual_gap_m),
+        "depth_fit": _told(found.aligned.usual_fit),
         "likeness": found.likeness,
         "confidence": float(found.confidence.mean()),
         "agent_frames": int(found.roots.visible.sum()),
         "agent_confidence": float(found.agent_confidence[found.roots.visible].mean()) if found.roots.visible.any() else 0.0,
     }
     return {"registered": True, "reason": None, "nearest_view": nearest, "figures": figures}
+
+
+def _told(figure):
+    """Return a figure as JSON knows it: null where nothing was measured."""
+    return figure if np.isfinite(figure) else None
 
 
 def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[np.ndarray, "4 4"]) -> int:
@@ -54,8 +59,8 @@ def checks(found: Registered | Refused) -> list[Check]:
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
         Check("frame votes that agree", float(found.supports.mean()) if len(found.supports) else None, "share", 0.5, 0.25, "higher"),
-        Check("depth against the template", float(np.nanmedian(found.aligned.gap_m) * 100), "cm, median", 2.5, 6.0),
-        Check("static depth within 5 cm", float(np.median(found.aligned.fit)), "share", 0.6, 0.35, "higher"),
+        Check("depth against the template", found.aligned.usual_gap_m * 100, "cm, median", 2.5, 6.0),
+        Check("static depth within 5 cm", found.aligned.usual_fit, "share", 0.6, 0.35, "higher"),
         Check("likeness of frames and renderings", found.likeness, "share", 0.5, None, "higher"),
         Check("camera confidence", float(found.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(found.roots.visible.mean()), "share of frames", 0.4, None, "higher"),

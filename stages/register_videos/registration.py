@@ -25,8 +25,10 @@ from stages.register_videos.votes import VoteOptions, Votes
 class GateOptions:
     """When an aligned recording is believed."""
 
+    least_measured: float = 0.2
+    """Share of the frames that must have static depth to measure ..."""
     least_fit: float = 0.35
-    """Median share of a frame's static depth that must lie within 5 cm of the template."""
+    """... and median share of it, in these frames, that must lie within 5 cm of the template."""
     least_certainty: float = 0.5
     """Where not even `least_votes` of the agreeing votes have this probability, ..."""
     least_recognised: float = 0.2
@@ -124,12 +126,12 @@ def register(clip: Clip, masks: Masks, maps: Maps, options: Options, rng: np.ran
             assert_never(options.begin)
     log(f"{int(start.supports.sum())} of {votes.asked} localised frames agree")
     aligned = alignment.align(clip, masks, maps.scene, start.world_from_camera, motion.relatives, votes, start.supports, options.align)
-    fit = float(np.median(aligned.fit))
-    log(f"static depth: {np.nanmedian(aligned.gap_m) * 100:.1f} cm from the template, {fit:.0%} within 5 cm")
+    measured = f"{int(np.isfinite(aligned.fit).sum())} of {len(clip)} frames"
+    log(f"static depth of {measured}: {aligned.usual_gap_m * 100:.1f} cm from the template, {aligned.usual_fit:.0%} within 5 cm")
     caster = RayCaster(maps.scene)
     alike = compare(clip, masks, caster, aligned.world_from_camera, options.confidence, rng)
     looks = looks_right(clip.timestamp_s, alike, options.confidence)
-    reason = strange(fit, float(looks.mean()), votes, start.supports, options) if options.begin == "votes" else None
+    reason = strange(aligned.fit, float(looks.mean()), votes, start.supports, options) if options.begin == "votes" else None
     if reason is not None:
         return Refused(reason, votes)
     confidence = camera_confidence(aligned.spread, looks, start.anchored, options.confidence, rng)
@@ -175,10 +177,17 @@ def _begin(clip, votes, motion, vote_options) -> _Start | None:
     return _Start(poses, supports, following.anchored(votes, supports, motion))
 
 
-def strange(fit: float, right: float, votes: Votes, supports: Bool[np.ndarray, "vote"], options: Options) -> str | None:
+def strange(
+    fit: Float[np.ndarray, "frame"], right: float, votes: Votes, supports: Bool[np.ndarray, "vote"], options: Options
+) -> str | None:
     """Say why an aligned recording is not believed, None when it is."""
-    if fit < options.gate.least_fit:
-        return f"only {fit:.0%} of the static depth lies within 5 cm of the room: it has changed too much, or the place was mistaken"
+    known = fit[np.isfinite(fit)]
+    if not len(known) or len(known) < options.gate.least_measured * len(fit):
+        count = f"only {len(known)} of {len(fit)} frames measured the room's depth"
+        return f"{count}: it is too dark or too far away, or the animal fills the view"
+    if np.median(known) < options.gate.least_fit:
+        share = f"only {np.median(known):.0%} of the static depth lies within 5 cm of the room"
+        return f"{share}: it has changed too much, or the place was mistaken"
     if (votes.probability[supports] >= options.gate.least_certainty).sum() >= options.vote.least_votes:
         return None
     if supports.sum() < options.gate.least_recognised * votes.asked:

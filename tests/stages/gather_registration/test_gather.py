@@ -19,6 +19,12 @@ def test_summary_and_checks():
     assert gather.paths(outcomes).shape == (560, 560, 3)
 
 
+def test_a_gap_that_was_not_measured_does_not_count():
+    measured = gather.Outcome("v002", STATUS, {})
+    unmeasured = gather.Outcome("v003", {**STATUS, "figures": {"depth_gap_m": None, "confidence": 0.9}}, {})
+    assert [gather.checks(outcomes)[1].value for outcomes in ([measured, unmeasured], [unmeasured])] == [1.0, None]
+
+
 def test_nothing_registered_is_told_without_a_fault():
     outcomes = [gather.Outcome("v002", REFUSED, None)]
     assert gather.checks(outcomes)[0].status == "fail"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.models import localizer as model
-from pipeline.space import rigid
+from pipeline.space import rigid, surface
 from pipeline.space.meshes import Mesh, RayCaster
 from stages.register_videos import alignment, pictures, registration
 from stages.register_videos import votes as voting
@@ -96,12 +96,43 @@ def test_a_repainted_room_of_the_same_shape_is_refused(maps):
     assert right["dim"] > 2 * options.gate.least_right
     votes = voting.collect(clip, NoAgent(40), maps.scene_localizer, voting.VoteOptions(every_frames=8))
     doubtful, sure = (replace(votes, answers=[replace(answer, probability=p) for answer in votes.answers]) for p in (0.3, 0.9))
-    supports = np.ones(len(votes.frame), bool)
-    assert "looks different" in registration.strange(0.9, right["other"], doubtful, supports, options)
-    assert registration.strange(0.9, right["dim"], doubtful, supports, options) is None
-    assert registration.strange(0.9, right["other"], sure, supports, options) is None, "recognised with certainty"
+    supports, fit = np.ones(len(votes.frame), bool), np.full(40, 0.9)
+    assert "looks different" in registration.strange(fit, right["other"], doubtful, supports, options)
+    assert registration.strange(fit, right["dim"], doubtful, supports, options) is None
+    assert registration.strange(fit, right["other"], sure, supports, options) is None, "recognised with certainty"
     rare = replace(doubtful, asked=10 * len(votes.frame))
-    assert "were recognised and agree" in registration.strange(0.9, right["dim"], rare, supports, options), "chance, of so many"
+    assert "were recognised and agree" in registration.strange(fit, right["dim"], rare, supports, options), "chance, of so many"
+
+
+def test_frames_without_static_depth_do_not_speak_against_a_recording(maps):
+    truth, options = walk(12), registration.Options()
+    clip, place = MemoryClip(RayCaster(maps.scene), truth, None), surface.Surface(maps.scene)
+    seen = [surface.scan(clip.depth(frame), clip.depth_intrinsics[frame], stride=9) for frame in range(12)]
+    blind = surface.scan(np.zeros(clip.depth_size), clip.depth_intrinsics[0], stride=9)
+    votes = voting.collect(clip, NoAgent(12), maps.scene_localizer, voting.VoteOptions(every_frames=2))
+    votes, supports = replace(votes, answers=[replace(one, probability=0.9) for one in votes.answers]), np.ones(len(votes.frame), bool)
+    gap, fit = alignment.measure_fit(place, [blind] * 8 + seen[8:], truth)
+    assert (np.isnan(fit) == np.isnan(gap)).all()
+    assert np.isnan(fit).sum() == 8
+    assert registration.strange(fit, 0.9, votes, supports, options) is None, "the four others fit"
+    _, fit = alignment.measure_fit(place, [blind] * 11 + seen[11:], truth)
+    assert "only 1 of 12 frames measured" in registration.strange(fit, 0.9, votes, supports, options)
+    away = rigid.make(np.eye(3), np.array([0.0, 3.0, 0.0])) @ truth
+    gap, fit = alignment.measure_fit(place, seen, away)
+    assert (fit[np.isnan(gap)] == 0).all(), "depth that meets nothing is no fit"
+    assert "5 cm of the room" in registration.strange(fit, 0.9, votes, supports, options)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_was_not_measured_is_told_as_nothing(maps):
+    truth, nothing = walk(3), np.full(3, np.nan)
+    aligned = alignment.Aligned(truth, np.zeros((3, 6, 6)), [], nothing, nothing)
+    found = registration.Registered(
+        aligned, np.ones(3), registration.Roots.unseen(3), np.zeros(3), voting.none_cast(), np.zeros(0, bool), 1.0
+    )
+    figures = pictures.status(found, np.arange(3.0), truth)["figures"]
+    assert (figures["depth_gap_m"], figures["depth_fit"]) == (None, None)
+    assert [check.status for check in pictures.checks(found) if "depth" in check.name] == ["warn", "warn"]
 
 
 def test_a_refusal_names_the_nearest_moment_of_the_walk():
