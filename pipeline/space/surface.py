@@ -23,6 +23,12 @@ class Scan:
     pixel_index: Int[np.ndarray, "point"]
     """Row-major index into the depth image."""
 
+    def thinned(self, most: int) -> "Scan":
+        """Keep at most so many points, spread evenly over the picture."""
+        count = len(self.sigma_m)
+        kept = np.unique(np.linspace(0, max(count - 1, 0), min(most, count)).astype(int))
+        return Scan(self.points_camera[kept], self.sigma_m[kept], self.pixel_index[kept])
+
 
 def depth_noise(depth_m: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
     """Return the standard deviation to expect of phone LiDAR at a depth: 8 mm and 0.4 % of it."""

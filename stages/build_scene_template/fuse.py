@@ -40,6 +40,10 @@ class FuseOptions:
     """Gauss-Newton steps that align every frame to the surface."""
     align_stride_px: int = 9
     """One depth pixel in so many, each way, takes part in the alignment."""
+    align_points: int = 400_000
+    """Depth points that take part; scans of larger or more pictures are thinned evenly, so that memory stays bounded ..."""
+    align_least_points: int = 40
+    """... but a scan keeps so many."""
     feature_frames: int = 80
     """Frames that lend their features to the vertices, spread evenly."""
 
@@ -79,6 +83,7 @@ def align_frames(
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
     """Relax every frame against the surface and the odometry; also return each frame's median gap in metres."""
     place, frames = surface.Surface(mesh), np.arange(len(clip))
+    most = max(options.align_points // len(clip), options.align_least_points)
     scans = [
         surface.scan(
             clip.depth(f),
@@ -86,7 +91,7 @@ def align_frames(
             stride=options.align_stride_px,
             confidence=clip.confidence(f),
             furthest_m=options.furthest_m,
-        )
+        ).thinned(most)
         for f in frames
     ]
 

@@ -164,8 +164,7 @@ def _static_scan(clip, masks, frame, options, most):
         confidence=clip.confidence(frame),
         ignore=ignore,
     )
-    kept = np.unique(np.linspace(0, max(len(found.sigma_m) - 1, 0), min(most, len(found.sigma_m))).astype(int))
-    return surface.Scan(found.points_camera[kept], found.sigma_m[kept], found.pixel_index[kept])
+    return found.thinned(most)
 
 
 def _vote_contacts(votes, supports, options):

@@ -34,6 +34,14 @@ def test_scan_leaves_out_jumps_far_and_doubtful_depth():
     assert np.allclose(found.points_camera[:, 2], 2.0)
 
 
+def test_a_thinned_scan_keeps_what_it_may_evenly():
+    scan = surface.scan(np.full((48, 64), 2.0), K, stride=2)
+    few = scan.thinned(100)
+    assert len(few.points_camera) == len(few.sigma_m) == 100
+    assert np.abs(np.diff(np.searchsorted(scan.pixel_index, few.pixel_index)) - len(scan.sigma_m) / 100).max() < 1
+    assert np.array_equal(scan.thinned(10**6).points_camera, scan.points_camera), "below the limit nothing changes"
+
+
 def test_contacts_pull_a_camera_onto_the_wall():
     place = surface.Surface(wall(2.0))
     scan = surface.scan(np.full((48, 64), 2.0), K, stride=4)
