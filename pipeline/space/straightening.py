@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.space import rigid
+from pipeline.space import rigid, tears
 from pipeline.space.align import rotation_between
 from pipeline.space.depth_alignment import Alignment, DepthView, align_views
 from pipeline.space.pose_graph import Edge, optimise
@@ -32,6 +32,8 @@ class Straightening:
     """drift of odometry from one frame to the next"""
     odometry_translation_m: float = 0.004
     """drift of odometry from one frame to the next"""
+    torn: float = 60.0
+    """times the drift by which a step may err where odometry is torn"""
     least_overlap: float = 0.4
     """share of the points that must meet"""
     alignment_iterations: int = 8
@@ -50,14 +52,18 @@ class Straightened:
 
 
 def straighten(
-    view: Callable[[int], DepthView], odometry_from_camera: Float[np.ndarray, "frame 4 4"], options: Straightening
+    view: Callable[[int], DepthView],
+    timestamp_s: Float[np.ndarray, "frame"],
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    options: Straightening,
 ) -> Straightened:
-    """Refine odometry; the first camera keeps its pose, so that up stays up."""
+    """Refine odometry, mended where it is torn; the first camera keeps its pose, so that up stays up."""
     view = functools.lru_cache(maxsize=256)(view)
-    count = len(odometry_from_camera)
+    count, torn = len(odometry_from_camera), tears.torn(timestamp_s, odometry_from_camera)
+    odometry_from_camera, loose = tears.mended(timestamp_s, odometry_from_camera, torn), np.where(torn, options.torn, 1.0)[1:]
     sigma = np.r_[np.full(3, options.odometry_rotation_rad), np.full(3, options.odometry_translation_m)]
     relative = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
-    edges = [Edge(i, i + 1, relative[i], np.diag(sigma**-2), robust=False) for i in range(count - 1)]
+    edges = [Edge(i, i + 1, relative[i], np.diag((loose[i] * sigma) ** -2), robust=False) for i in range(count - 1)]
     residuals = []
     for first, second in _pairs(odometry_from_camera, options):
         guess = rigid.inverse(odometry_from_camera[first]) @ odometry_from_camera[second]

@@ -50,7 +50,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Followed:
-    """A recording's own odometry, made from its pictures."""
+    """A recording's own odometry, made from its pictures or told by the phone."""
 
     odometry_from_camera: Float[np.ndarray, "frame 4 4"]
     torn: Bool[np.ndarray, "frame"]

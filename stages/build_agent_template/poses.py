@@ -38,7 +38,7 @@ def walk_around(clip: Clip, masks: Masks, options: Straightening) -> Circle:
     odometry = clip.odometry_from_camera
     if odometry is None:
         odometry = chain(view, lambda _, last: last, len(clip), options)
-    straightened = straighten(view, odometry, options)
+    straightened = straighten(view, clip.timestamp_s, odometry, options)
     poses = straightened.world_from_camera
     if clip.odometry_from_camera is None or not clip.gravity_known:
         poses = level(view, poses)

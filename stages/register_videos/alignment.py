@@ -127,10 +127,11 @@ def align(
     return Aligned(poses, spread, scans, *measure_fit(place, scans, poses))
 
 
-def odometry_edges(clip: Clip, options: AlignOptions) -> relax.Relatives:
+def odometry_edges(
+    timestamp_s: Float[np.ndarray, "frame"], odometry_from_camera: Float[np.ndarray, "frame 4 4"], options: AlignOptions
+) -> relax.Relatives:
     """Return the phone's own motions between neighbouring frames."""
-    drift_rad_s = np.deg2rad(options.drift_deg_s)
-    return relax.chain(clip.timestamp_s, clip.odometry_from_camera, drift_rad_s=drift_rad_s, drift_m_s=options.drift_m_s)
+    return relax.chain(timestamp_s, odometry_from_camera, drift_rad_s=np.deg2rad(options.drift_deg_s), drift_m_s=options.drift_m_s)
 
 
 def measure_fit(

@@ -1,15 +1,20 @@
 """Where the phone tells no odometry: pictures with depth are followed from one to the next, and votes are carried along.
 
-A motion that pictures do not tell (darkness, a cut) tears the recording into pieces; votes agree only within a piece.
+A motion that pictures do not tell (darkness, a cut) tears the recording into pieces, as a jump of the phone's own odometry
+does; votes agree only within a piece.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.files.clips import Clip, Masks
 from pipeline.progress import track
-from pipeline.space import rigid, visual_odometry
+from pipeline.space import rigid, tears, visual_odometry
 from pipeline.space.visual_odometry import Followed, FollowOptions
+from stages.register_videos import alignment
+from stages.register_videos.alignment import AlignOptions
 from stages.register_videos.votes import VoteOptions, Votes, close
 
 
@@ -23,6 +28,14 @@ def follow(clip: Clip, masks: Masks, options: FollowOptions, rng: np.random.Gene
         )
 
     return visual_odometry.follow((view(frame) for frame in track(range(len(clip)), "following pictures")), options, rng)
+
+
+def keep(clip: Clip, align: AlignOptions, options: FollowOptions) -> Followed:
+    """Keep the phone's own odometry, mended and held loosely where it is torn."""
+    torn = tears.torn(clip.timestamp_s, clip.odometry_from_camera)
+    odometry = tears.mended(clip.timestamp_s, clip.odometry_from_camera, torn)
+    edges, loose = alignment.odometry_edges(clip.timestamp_s, odometry, align), np.where(torn, options.torn, 1.0)[1:]
+    return Followed(odometry, torn, replace(edges, sigma_rad=loose * edges.sigma_rad, sigma_m=loose * edges.sigma_m))
 
 
 def agree_nearby(

@@ -156,7 +156,10 @@ class _Start:
 def _motion(clip, masks, options, rng) -> Followed:
     """Return the motions between neighbours: the phone's, or those that the pictures tell."""
     if options.odometry == "phone" and clip.odometry_from_camera is not None:
-        return Followed(clip.odometry_from_camera, np.zeros(len(clip), bool), alignment.odometry_edges(clip, options.align))
+        kept = following.keep(clip, options.align, options.follow)
+        if kept.torn.any():
+            log(f"the phone's odometry jumps before {int(kept.torn.sum())} of {len(clip)} frames: what lies between is placed on its own")
+        return kept
     followed = following.follow(clip, masks, options.follow, rng)
     log(f"no odometry: {int(followed.torn.sum())} of {len(clip)} motions could not be followed from picture to picture")
     return followed

@@ -38,7 +38,7 @@ def steady(clip: Clip, flow: Path, options: Straightening, rng: np.random.Genera
     if poses is None:
         forward = arrays.open_lazily(flow / "flow_1_fw.npz", "flow")
         poses = chain(view, lambda frame, _: motion_from_flow(clip, frame, forward[frame], rng), len(clip), options)
-    found = straighten(view, poses, options)
+    found = straighten(view, clip.timestamp_s, poses, options)
     level_known = clip.odometry_from_camera is not None and clip.gravity_known
     poses = found.world_from_camera if level_known else level(view, found.world_from_camera)
     return Trajectory(poses, found.edges, found.residual_m)

@@ -90,12 +90,20 @@ def test_one_false_edge_does_little_harm():
 def test_straightening_takes_the_drift_out(circle):
     poses, views = circle
     odometry = drifted(poses, np.random.default_rng(2))
-    found = straighten(views.__getitem__, odometry, Straightening())
+    found = straighten(views.__getitem__, 0.1 * np.arange(len(poses)), odometry, Straightening())
     before = np.linalg.norm(odometry[:, :3, 3] - poses[:, :3, 3], axis=1)
     after = np.linalg.norm(found.world_from_camera[:, :3, 3] - poses[:, :3, 3], axis=1)
     assert np.median(after) < 0.6 * np.median(before)
     assert np.median(after) < 0.015, "metres; the depth noise is 4 mm, the odometry drifts by several cm"
     assert found.edges >= 12
+
+
+def test_straightening_closes_a_tear(circle):
+    poses, views = circle
+    odometry = drifted(poses, np.random.default_rng(2))
+    odometry[35:] = rigid.exp(np.array([0, 0.1, 0, 0.5, 0, 0.3])) @ odometry[35:]
+    found = straighten(views.__getitem__, 0.1 * np.arange(len(poses)), odometry, Straightening())
+    assert np.linalg.norm(found.world_from_camera[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.05, "metres; the tear is 0.6 m"
 
 
 def test_chain_needs_no_odometry(circle):

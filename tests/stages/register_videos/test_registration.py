@@ -40,6 +40,18 @@ def test_recording_is_registered(maps, with_odometry):
     assert np.isnan(found.roots.world_from_agent).all()
 
 
+def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
+    truth = walk(40, seed=7)
+    odometry = drifting(truth, 2, deg=0.03, m=0.001)
+    odometry[20:, :3, 3] += np.array([0.5, 0.0, 0.35])
+    clip = MemoryClip(RayCaster(maps.scene), truth, odometry)
+    options = registration.Options(align=alignment.AlignOptions(stride_px=9, picture_every_frames=8))
+    found = registration.register(clip, NoAgent(40), maps, options, np.random.default_rng(0))
+    rotation, distance = model.errors(found.aligned.world_from_camera, truth)
+    assert rotation.max() < 1.0, "degrees"
+    assert distance.max() < 0.05, "metres; the jump is 0.6 m"
+
+
 def test_foreign_room_is_refused(maps):
     truth = walk(40, seed=7)
     other = textured_room(seed=99)

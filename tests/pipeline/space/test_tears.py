@@ -1,0 +1,43 @@
+"""Odometry that jumps: the jump is told from fast walking, missing frames and tipping, and taken out."""
+
+import numpy as np
+
+from pipeline.space import rigid, tears
+from tests.stages.textured_room import aligned_errors, drifting, walk
+
+TIME_S = 0.1 * np.arange(60)
+
+
+def jumping(odometry, frame, metres=0.6):
+    """Let tracking jump before a frame: all that follows is displaced and turned."""
+    displaced = odometry.copy()
+    displaced[frame:] = rigid.exp(np.array([0, 0.2, 0, metres, 0, 0])) @ odometry[frame:]
+    return displaced
+
+
+def test_a_jump_tears_and_is_mended():
+    truth = walk(60)
+    odometry = jumping(jumping(drifting(truth, 4, deg=0.03, m=0.001), 20), 41, 0.9)
+    torn = tears.torn(TIME_S, odometry)
+    assert np.flatnonzero(torn).tolist() == [20, 41]
+    assert aligned_errors(odometry, truth)[1].max() > 0.3, "metres"
+    assert aligned_errors(tears.mended(TIME_S, odometry, torn), truth)[1].max() < 0.03, "metres, drift included"
+
+
+def test_one_frame_elsewhere_tears_twice():
+    odometry = walk(60)
+    odometry[30, :3, 3] += 1.0
+    assert np.flatnonzero(tears.torn(TIME_S, odometry)).tolist() == [30, 31]
+
+
+def test_what_hands_do_is_no_tear():
+    ends = np.array([0.0, 2.0, 2.5, 6.0])
+    lunge = rigid.make(np.eye(3), np.interp(TIME_S, ends, [0.0, 1.0, 3.5, 5.0])[:, None] * np.array([1.0, 0, 0]))
+    tipped = walk(60)
+    tipped[30:, :3, :3] = tipped[30:, :3, :3] @ rigid.rotation_from_vector(np.array([0, 0, 3.0]))
+    pause_s = TIME_S + 1.0 * (np.arange(60) >= 30)
+    paused = rigid.make(np.eye(3), np.cumsum(np.diff(pause_s, prepend=0.0))[:, None] * np.array([1.0, 0, 0]))
+    for time_s, odometry in ((TIME_S, lunge), (TIME_S, tipped), (pause_s, paused), (TIME_S[:1], tipped[:1]), (TIME_S[:2], lunge[:2])):
+        torn = tears.torn(time_s, odometry)
+        assert not torn.any()
+        assert tears.mended(time_s, odometry, torn) is odometry
