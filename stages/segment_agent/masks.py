@@ -75,7 +75,8 @@ def segment(
     place = None if hint is None else prompts.position(hint, clip, poses)
     match role:
         case "turnaround":
-            balls, judge = find_standing(clip, poses, options.turnaround, meeting_point(poses) if place is None else place)
+            focus = meeting_point(poses, options.turnaround) if place is None else place
+            balls, judge = find_standing(clip, poses, options.turnaround, focus)
             edges = replace(options.refinement, radius_px=options.turnaround.radius_px, unsure=options.turnaround.unsure)
             options = replace(options, refinement=edges)
             looks = learn_palette(Painter(clip, poses, balls, judge, options.refinement, Palette()))

@@ -20,6 +20,9 @@ from pipeline.space.thin_depth import supported
 from stages.segment_agent.evidence import Evidence, Judge
 from stages.segment_agent.windows import Sphere, Window
 
+LEAST_SPREAD = 1e-3
+"""mean squared sine of the angles between optical axes and the line that they all run along; below, they meet nowhere"""
+
 
 @dataclass(frozen=True)
 class Turnaround:
@@ -41,6 +44,10 @@ class Turnaround:
     """reach of the edge-preserving filter: cells are coarser than what motion tells"""
     unsure: float = 0.4
     """log-odds below which a pixel at the boundary is unknown"""
+    least_level: int = 200
+    """points of level surface lower than the focus without which there is no ground"""
+    nearest_m: float = 0.25
+    """the optical axes meet at least so far before most cameras"""
 
 
 @dataclass(frozen=True)
@@ -60,39 +67,49 @@ class Cluster:
 
 
 def find_standing(
-    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"]
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"] | None
 ) -> tuple[list[Sphere | None], Judge]:
     """Locate what stands at the focus; return a ball per frame and the judge of its points. World: +y up.
 
-    Raises InputError MSK-003 when nothing stands there.
+    Raises InputError MSK-003 when nothing stands there, when there is no ground that it stands on, or no focus.
     """
+
+    def refused(what: str) -> InputError:
+        remedy = "circle the resting animal with the phone pointed at it and the ground in view, or give a hint"
+        return InputError("MSK-003", what, str(clip.folder), remedy)
+
+    if focus is None:
+        raise refused("the cameras do not look at one place from around it")
     chosen = np.unique(np.linspace(0, len(clip) - 1, options.pictures).astype(int))
     points, level = _points_near(clip, world_from_camera, focus, options, chosen)
+    if (points[level, 1] < focus[1] + 0.05).sum() < options.least_level:
+        raise refused("no level ground is seen where the cameras look")
     ground = fit_ground(points[level], focus)
     cluster = find_cluster(points[ground.above(points) > options.clearance_m], focus, options)
     if not cluster.cells.any():
-        raise InputError(
-            "MSK-003",
-            "nothing stands where the cameras look",
-            str(clip.folder),
-            "circle the resting animal with the phone pointed at it, or give a hint",
-        )
+        raise refused("nothing stands where the cameras look")
     centres = cluster.origin + (np.argwhere(cluster.cells) + 0.5) * cluster.voxel_m
     middle = (centres.min(0) + centres.max(0)) / 2
     ball = Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + 0.05))
     return [ball] * len(clip), _judge(cluster, ground, options)
 
 
-def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"]:
-    """Return the point nearest to all optical axes (robust least squares), metres."""
+def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround) -> Float[np.ndarray, "3"] | None:
+    """Return the point nearest to all optical axes (robust least squares), metres; None where they meet at no place that most
+    cameras look at: they run alongside, or the phone turns on the spot.
+    """
     centre, forward = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     weight = np.ones(len(centre))
     for _ in range(10):
-        point = np.linalg.solve((weight[:, None, None] * across).sum(0), np.einsum("f,fij,fj->i", weight, across, centre))
+        total = (weight[:, None, None] * across).sum(0)
+        if np.linalg.eigvalsh(total)[0] < LEAST_SPREAD * weight.sum():
+            return None
+        point = np.linalg.solve(total, np.einsum("f,fij,fj->i", weight, across, centre))
         distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - centre), axis=1)
         weight = 1 / (1 + (distance / 0.15) ** 2)
-    return point
+    before_m = np.einsum("fi,fi->f", point - centre, forward)
+    return point if np.median(before_m) > options.nearest_m else None
 
 
 def find_cluster(points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], options: Turnaround) -> Cluster:

@@ -67,6 +67,32 @@ def test_a_standing_animal_is_found_from_around(tmp_path):
     assert np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.85
 
 
+def around(middle, radius_m, outward=False, count=12):
+    """Return level cameras on a circle that look at its middle, or away from it."""
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    away = np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
+    eyes = np.array(middle) + radius_m * away
+    return np.stack(
+        [scenery.rigid.look_at(eye, eye + (side if outward else -side), scenery.UP) for eye, side in zip(eyes, away, strict=True)]
+    )
+
+
+@pytest.mark.parametrize(
+    ("poses", "what"),
+    [
+        (scenery.rigid.make(np.eye(3), np.linspace([-0.3, 1.0, 0.0], [0.3, 1.0, 0.0], 12)), "one place"),
+        (around((0.0, 1.0, 0.0), 0.0, outward=True), "one place"),
+        (around((0.0, 1.0, 0.0), 0.3, outward=True), "one place"),
+        (around((0.0, 2.0, 0.0), 0.9), "no level ground"),
+    ],
+    ids=["alongside", "on the spot", "outward", "at the ceiling"],
+)
+def test_a_turnaround_around_nothing_is_refused(tmp_path, poses, what):
+    _, agent = scenery.turnaround(len(poses))
+    with pytest.raises(InputError, match=f"MSK-003.*{what}"):
+        make(tmp_path / "frames", "turnaround", poses, agent, poses)
+
+
 def test_a_recording_without_odometry_still_works(tmp_path):
     poses, agent = scenery.turnaround(40)
     flow = tmp_path / "flow"
