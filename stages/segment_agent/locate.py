@@ -29,13 +29,22 @@ def find_mover(
     hint: Hint | None,
     looks: Looks | None = None,
 ) -> list[Sphere | None]:
-    """Track the animal of a session: a ball per frame, None where it is out of view."""
+    """Track the animal of a session: a ball per frame, None where it is out of view.
+
+    Without known looks a hint holds only what hangs together with it; the rest of the track, which may have gone over to
+    another mover, is a guess.
+    """
     found = [_candidates(clip, frame, world_from_camera[frame], references, free, mover, looks) for frame in range(len(clip))]
     choice = movers.track(found, clip.timestamp_s, mover, hint)
     chosen = [group[index] if index >= 0 else None for group, index in zip(found, choice, strict=True)]
-    radii = [candidate.radius_m for candidate in chosen if candidate]
+    surely = np.ones(len(clip), bool) if hint is None or looks is not None else movers.connected(chosen, clip.timestamp_s, mover, hint)
+    radii = [candidate.radius_m for candidate, sure in zip(chosen, surely, strict=True) if candidate and sure]
     radius = float(np.clip(1.8 * np.quantile(radii, 0.9), 0.15, mover.largest_m)) if radii else 0.0
-    return presume([Sphere(candidate.centre_world, radius) if candidate else None for candidate in chosen], clip.timestamp_s, mover)
+    balls = [
+        Sphere(candidate.centre_world, radius, presumed=not sure) if candidate else None
+        for candidate, sure in zip(chosen, surely, strict=True)
+    ]
+    return presume(balls, clip.timestamp_s, mover)
 
 
 def presume(balls: list[Sphere | None], timestamp_s: Float[np.ndarray, "frame"], mover: Mover) -> list[Sphere | None]:

@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, Int
 from stages.segment_agent.free_space import Votes
 
 HINT_REWARD = 1000.0
+FREE_M = 0.1
+"""how far a candidate's centre may jump without motion: another part of the animal is seen"""
 
 
 @dataclass(frozen=True)
@@ -29,13 +31,15 @@ class Mover:
     likely_area_m2: float = 0.03
     """visible area from which on a candidate is fully convincing"""
     largest_m: float = 1.3
-    """largest extent of an animal"""
+    """largest extent of an animal; groups that are larger, up to twice that, count half"""
     speed_m_s: float = 2.5
     """fastest motion that costs nothing much"""
     candidates: int = 6
     """groups kept per frame"""
     presumed_s: float = 3.0
     """how long the animal is looked for around where it was last or will next be seen"""
+    absent_s: float = 0.5
+    """absence after which a track is not trusted to go on with what a hint points at"""
     motion: float = 2.0
     """log-odds by which motion speaks for a point once the looks are known"""
     clear_motion: float = 3.0
@@ -118,10 +122,7 @@ def track(
     for index, group in enumerate(found):
         score = np.array([0.0] + [_score(candidate, options) for candidate in group])
         if hint is not None and hint.frame == index:
-            score[1:] += [
-                HINT_REWARD if np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + 0.2 else 0.0
-                for candidate in group
-            ]
+            score[1:] += [HINT_REWARD * _meant(candidate, hint) for candidate in group]
         if index == 0:
             best = [score - options.appear_cost * (np.arange(len(score)) > 0)]
             back.append(np.zeros(len(score), int))
@@ -135,6 +136,29 @@ def track(
     for index in range(len(found) - 1, 0, -1):
         choice[index - 1] = back[index][choice[index]]
     return choice - 1
+
+
+def connected(
+    chosen: Sequence[Candidate | None], timestamp_s: Float[np.ndarray, "frame"], options: Mover, hint: Hint
+) -> Bool[np.ndarray, "frame"]:
+    """Tell in which frames a track surely has what a hint points at: nowhere on the way there it is absent or faster than
+    an animal. Nowhere if it is elsewhere at the time of the hint.
+    """
+    seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
+    surely = np.zeros(len(chosen), bool)
+    wait_s = np.abs(timestamp_s[seen] - timestamp_s[hint.frame])
+    if not len(seen) or wait_s.min() > options.absent_s or not _meant(chosen[seen[wait_s.argmin()]], hint):
+        return surely
+    gap_s = np.diff(timestamp_s[seen])
+    apart_m = np.linalg.norm(np.diff([chosen[frame].centre_world for frame in seen], axis=0), axis=1)
+    piece = np.cumsum(np.r_[False, (gap_s > options.absent_s) | (apart_m > FREE_M + options.speed_m_s * gap_s)])
+    surely[seen[piece == piece[wait_s.argmin()]]] = True
+    return surely
+
+
+def _meant(candidate: Candidate, hint: Hint) -> bool:
+    """Tell whether a hint may point at a candidate."""
+    return bool(np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + 0.2)
 
 
 def _score(candidate: Candidate, options: Mover) -> float:
@@ -151,6 +175,6 @@ def _transition(before: Sequence[Candidate], after: Sequence[Candidate], seconds
         apart = np.linalg.norm(
             np.stack([c.centre_world for c in before])[:, None] - np.stack([c.centre_world for c in after])[None], axis=-1
         )
-        excess = np.maximum(apart - 0.1 - options.speed_m_s * seconds, 0) / 0.3
+        excess = np.maximum(apart - FREE_M - options.speed_m_s * seconds, 0) / 0.3
         step[1:, 1:] = -np.minimum(excess, 2.5 * options.appear_cost)
     return step

@@ -22,7 +22,7 @@ class Sphere:
     centre_world: Float[np.ndarray, "3"]
     radius_m: float
     presumed: bool = False
-    """guessed from earlier or later frames"""
+    """guessed from earlier or later frames, or apart from what a hint holds"""
 
 
 @dataclass(frozen=True)

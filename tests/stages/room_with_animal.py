@@ -13,7 +13,7 @@ from pipeline.space.meshes import Mesh, RayCaster
 COLOR_SIZE, DEPTH_SIZE = (120, 90), (120, 90)
 INTRINSICS = np.array([[84.0, 0, 45], [0, 84.0, 60], [0, 0, 1]])
 UP = np.array([0.0, 1.0, 0.0])
-ROOM_COLOR, ANIMAL_COLOR = np.array([120, 130, 150]), np.array([190, 120, 50])
+ROOM_COLOR, ANIMAL_COLOR, OTHER_COLOR = np.array([120, 130, 150]), np.array([190, 120, 50]), np.array([60, 160, 80])
 
 
 def box(size, at) -> trimesh.Trimesh:
@@ -49,27 +49,35 @@ class Recording:
 
 
 def record(
-    folder: Path, world_from_camera: np.ndarray, world_from_agent: np.ndarray, odometry: np.ndarray | None, seed: int = 0
+    folder: Path,
+    world_from_camera: np.ndarray,
+    world_from_agent: np.ndarray,
+    odometry: np.ndarray | None,
+    seed: int = 0,
+    world_from_other: np.ndarray | None = None,
 ) -> Recording:
-    """Render a frames artifact into ``folder``; an agent pose of NaN leaves the animal out."""
+    """Render a frames artifact into ``folder``; a pose of NaN leaves the animal out, or the other one, which is green."""
     rng = np.random.default_rng(seed)
     still, body = room(), animal()
+    others = np.full_like(world_from_agent, np.nan) if world_from_other is None else world_from_other
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir(parents=True)
     masks = []
-    for frame, (camera, agent) in enumerate(zip(world_from_camera, world_from_agent, strict=True)):
-        mesh = still if np.isnan(agent).any() else trimesh.util.concatenate([still, body.copy().apply_transform(agent)])
+    for frame, (camera, agent, other) in enumerate(zip(world_from_camera, world_from_agent, others, strict=True)):
+        movers = [(pose, kind) for pose, kind in ((agent, 1), (other, 2)) if not np.isnan(pose).any()]
+        mesh = trimesh.util.concatenate([still, *(body.copy().apply_transform(pose) for pose, _ in movers)])
+        kinds = np.repeat([0, *(kind for _, kind in movers), 0], [len(still.faces), *[len(body.faces)] * len(movers), 1])
         directions = cameras.ray_directions(INTRINSICS, *COLOR_SIZE).reshape(-1, 3) @ camera[:3, :3].T
         hits = RayCaster(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces))).cast(camera[:3, 3], directions)
-        on_animal = hits.face >= len(still.faces)
+        kind = kinds[hits.face]
         points = camera[:3, 3] + directions * hits.distance[:, None]
         check = np.where(np.floor(points / 0.17 + 0.013).astype(int).sum(1) % 2, 25, -25)[:, None]
-        color = np.where(on_animal[:, None], ANIMAL_COLOR, ROOM_COLOR + check) + rng.normal(0, 4, (len(points), 3))
+        color = np.choose(kind[:, None], [ROOM_COLOR + check, ANIMAL_COLOR, OTHER_COLOR]) + rng.normal(0, 4, (len(points), 3))
         depth = hits.distance + rng.normal(0, 0.005, len(points))
         images.write_color(folder / "color" / f"{frame:06d}.jpg", np.clip(color, 0, 255).astype(np.uint8).reshape(*COLOR_SIZE, 3))
         images.write_depth(folder / "depth" / f"{frame:06d}.exr", depth.reshape(DEPTH_SIZE))
         images.write_gray(folder / "confidence" / f"{frame:06d}.png", np.full(DEPTH_SIZE, 2, np.uint8))
-        masks.append(on_animal.reshape(COLOR_SIZE))
+        masks.append((kind == 1).reshape(COLOR_SIZE))
     count = len(world_from_camera)
     table = {"odometry_from_camera": odometry} if odometry is not None else {}
     arrays.save(

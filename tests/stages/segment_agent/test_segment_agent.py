@@ -121,6 +121,42 @@ def test_a_hint_decides_between_two_movers():
     assert set(movers.track(both, time, Mover(), Hint(4, np.array([2.0, 0.0, 0.0])))) == {1}
 
 
+def test_a_hint_holds_what_hangs_together_with_it():
+    """Seen, hidden for two frames, seen, gone for more than a second, and something else in its place or far away."""
+    at = [0.1 * i for i in range(20)] + [None] * 12 + [2.0] * 8 + [4.0] * 10
+    at[7:9] = [None, None]
+    chosen, time = [None if x is None else candidate(x) for x in at], np.arange(len(at)) * 0.1
+
+    def held(frame, x):
+        return np.flatnonzero(movers.connected(chosen, time, Mover(), Hint(frame, np.array([x, 0.0, 0.0])))).tolist()
+
+    first = [*range(7), *range(9, 20)]
+    assert held(3, 0.3) == held(8, 0.8) == first
+    assert held(33, 2.0) == list(range(32, 40))
+    assert held(45, 4.0) == list(range(40, 50))
+    assert held(3, 3.0) == held(25, 2.0) == [], "elsewhere, or nothing seen then"
+
+
+def click(mask, frame):
+    """Return a click on the middle of what a true mask shows."""
+    row, column = np.argwhere(mask)[mask.sum() // 2]
+    return prompt.Prompt(frame, (column + 0.5, row + 0.5) * 2)
+
+
+def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
+    """The animal leaves for good after 1.6 s; something of its size and of another colour walks about all the time."""
+    poses, agent = scenery.session()
+    other = np.stack([scenery.rigid.exp(np.array([0, 0, 0, 0.75, 0.22, z])) for z in np.linspace(-0.9, 0.2, 40)])
+    agent = np.stack([scenery.rigid.exp(np.array([0, np.pi / 2, 0, x, 0.22, -0.2])) for x in np.linspace(-0.6, 0.1, 40)])
+    agent[16:] = np.nan
+    truth = scenery.record(tmp_path / "frames", poses, agent, poses, world_from_other=other)
+    clip, hint = Clip.open(tmp_path / "frames"), click(truth.masks[8], 8)
+    found, _ = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0))
+    found = list(found)
+    assert np.mean([iou(mask.labels == 255, true) for mask, true in zip(found[:16], truth.masks[:16], strict=True)]) > 0.6
+    assert np.mean([mask.visible for mask in found[16:]]) < 0.2, "share of the frames without it"
+
+
 @pytest.mark.parametrize(
     "text",
     [
