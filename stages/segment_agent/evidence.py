@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -80,6 +80,17 @@ def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing
         certainty[~(animal | settled | elsewhere)] = 0.05
         clear = animal & movers.clearly_moving(votes, mover)
         return Evidence(log_odds, certainty, animal & window.trusted, clear, log_odds <= -0.66 * weighing.room)
+
+    return judge
+
+
+def either(first: Judge, second: Judge) -> Judge:
+    """Evidence by the first judge where that speaks for the animal, by the second elsewhere."""
+
+    def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
+        told, other = first(frame, window, ball), second(frame, window, ball)
+        own = told.log_odds > 0
+        return Evidence(**{part.name: np.where(own, getattr(told, part.name), getattr(other, part.name)) for part in fields(Evidence)})
 
     return judge
 

@@ -92,21 +92,27 @@ def follow(footage: Footage, hint: Prompt, options: Following, learning: Learnin
 
 
 def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
-    """Cut the animal out of the hinted frame by GrabCut (Rother et al. 2004); a click stands for a box around it."""
+    """Cut the animal out of the hinted frame; a click stands for a box around it."""
     color = footage.color(hint.frame)
     height, width = color.shape[:2]
     x0, y0, x1, y1 = np.array(hint.box_px) * height / footage.clip.color_size[0]
     if min(x1 - x0, y1 - y0) < 4:
         x0, y0, x1, y1 = x0 - 0.2 * height, y0 - 0.2 * height, x1 + 0.2 * height, y1 + 0.2 * height
     low = np.clip(np.floor([x0, y0]), 1, [width - 8, height - 8]).astype(int)
-    size = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1]) - low
-    marks = np.zeros((height, width), np.uint8)
+    high = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1])
+    marks = np.full((height, width), cv2.GC_BGD, np.uint8)
+    marks[low[1] : high[1], low[0] : high[0]] = cv2.GC_PR_FGD
+    inside = grab(color, marks, rng)
+    return inside if inside.any() else marks == cv2.GC_PR_FGD
+
+
+def grab(
+    color: UInt8[np.ndarray, "height width 3"], marks: UInt8[np.ndarray, "height width"], rng: np.random.Generator
+) -> Bool[np.ndarray, "height width"]:
+    """Cut something out of a picture by GrabCut (Rother et al. 2004); ``marks`` are OpenCV's four."""
     cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
-    cv2.grabCut(color, marks, (*low.tolist(), *size.tolist()), np.zeros((1, 65)), np.zeros((1, 65)), 8, cv2.GC_INIT_WITH_RECT)
-    inside = (marks == cv2.GC_FGD) | (marks == cv2.GC_PR_FGD)
-    if not inside.any():
-        inside[low[1] : low[1] + size[1], low[0] : low[0] + size[0]] = True
-    return inside
+    found = cv2.grabCut(color, marks.copy(), None, np.zeros((1, 65)), np.zeros((1, 65)), 8, cv2.GC_INIT_WITH_MASK)[0]
+    return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
 
 
 def residual(footage: Footage, frame: int) -> Float[np.ndarray, "height width"]:

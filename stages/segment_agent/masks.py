@@ -15,7 +15,7 @@ from pipeline.space.straightening import Straightening
 from stages.segment_agent import free_space
 from stages.segment_agent import prompt as prompts
 from stages.segment_agent.appearance import Appearance, Example, Learning, learn
-from stages.segment_agent.evidence import Judge, Weighing, judge_motion
+from stages.segment_agent.evidence import Judge, Weighing, either, judge_motion
 from stages.segment_agent.follow import Following, Footage, follow
 from stages.segment_agent.free_space import FreeSpace, References
 from stages.segment_agent.locate import find_mover
@@ -23,6 +23,7 @@ from stages.segment_agent.movers import Hint, Mover
 from stages.segment_agent.painting import Mask, Painter, learn_palette
 from stages.segment_agent.prompt import Prompt
 from stages.segment_agent.refine import Palette, Refinement
+from stages.segment_agent.resting import find_resting, rests
 from stages.segment_agent.trajectory import Trajectory, steady
 from stages.segment_agent.turnaround import Turnaround, find_standing, meeting_point
 from stages.segment_agent.windows import Sphere, rectangle, working_picture
@@ -72,18 +73,21 @@ def segment(
         return follow(footage, hint, options.following, options.learning, rng), None
     path = steady(clip, flow, options.straightening, rng)
     poses = path.world_from_camera
-    place = None if hint is None else prompts.position(hint, clip, poses)
+    mark = None if hint is None else prompts.place(hint, clip, poses)
     match role:
         case "turnaround":
-            focus = meeting_point(poses, options.turnaround) if place is None else place
+            focus = meeting_point(poses, options.turnaround) if mark is None else mark.centre_world
             balls, judge = find_standing(clip, poses, options.turnaround, focus)
             edges = replace(options.refinement, radius_px=options.turnaround.radius_px, unsure=options.turnaround.unsure)
             options = replace(options, refinement=edges)
             looks = learn_palette(Painter(clip, poses, balls, judge, options.refinement, Palette()))
         case "session":
-            mark = None if place is None else Hint(hint.frame, place)
             references = free_space.gather(clip, poses, options.free_space)
             balls, judge = _locate(clip, poses, references, options, mark, None)
+            still = None
+            if mark is not None and (not _held(balls) or rests(clip, poses, references, options.free_space, options.mover, mark)):
+                balls, still = find_resting(clip, poses, mark, options.turnaround, options.refinement.height_px, rng)
+                judge = still
             painter = Painter(clip, poses, balls, judge, options.refinement, Palette())
             network = _learn(painter, options, rng)
             looks = Palette() if network is None else network
@@ -93,10 +97,16 @@ def segment(
                 balls, judge = _locate(clip, poses, room, options, mark, network)
                 # rims of furniture may touch what looks like the animal: how large it is, motion alone tells better
                 balls = [ball and replace(ball, radius_m=radius_m * (GUESSED if ball.presumed else 1)) for ball in balls]
+                judge = judge if still is None else either(still, judge)
         case _:
             assert_never(role)
     painter = Painter(clip, poses, balls, judge, options.refinement, looks)
     return painter.masks(range(len(clip))), path
+
+
+def _held(balls: list[Sphere | None]) -> bool:
+    """Tell whether any ball is more than a guess."""
+    return any(ball is not None and not ball.presumed for ball in balls)
 
 
 def _has_depth(clip: Clip, probes: int = 12) -> bool:

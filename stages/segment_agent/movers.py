@@ -70,6 +70,8 @@ class Hint:
 
     frame: int
     centre_world: Float[np.ndarray, "3"]
+    reach_m: float = 0.5
+    """how far from there the animal reaches; a click leaves it open"""
 
 
 def moving(votes: Votes, options: Mover) -> Bool[np.ndarray, "*shape"]:

@@ -11,6 +11,10 @@ from pipeline.errors import InputError
 from pipeline.files.clips import Clip
 from pipeline.space import cameras, rigid
 from stages.segment_agent.free_space import usable_depth
+from stages.segment_agent.movers import Hint
+
+FORESHORTENED = 1.5
+"""times half its box that an animal may reach: along the line of sight it may be longer"""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,15 @@ def parse(path: Path, clip: Clip) -> Prompt:
             "give `frame = 12` or `time_s = 1.2`, and `box = [x0, y0, x1, y1]` or `click = [x, y]` in pixels or in shares of the picture",
         ) from error
     return Prompt(frame, (x0, y0, x1, y1))
+
+
+def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Hint:
+    """Take a prompt to the world; a box tells how far the animal reaches. Raises InputError MSK-002 without depth there."""
+    centre = position(prompt, clip, world_from_camera)
+    x0, y0, x1, y1 = prompt.box_px
+    distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
+    half_m = max(x1 - x0, y1 - y0) / 2 * distance / clip.intrinsics[prompt.frame, 0, 0]
+    return Hint(prompt.frame, centre, FORESHORTENED * half_m) if half_m > 0.02 else Hint(prompt.frame, centre)
 
 
 def position(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"]:

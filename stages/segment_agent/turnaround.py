@@ -65,6 +65,13 @@ class Cluster:
         at = np.clip(at, 0, np.array(self.cells.shape) - 1)
         return inside & self.cells[at[..., 0], at[..., 1], at[..., 2]]
 
+    @property
+    def ball(self) -> Sphere:
+        """Return a ball around the cells."""
+        centres = self.origin + (np.argwhere(self.cells) + 0.5) * self.voxel_m
+        middle = (centres.min(0) + centres.max(0)) / 2
+        return Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + 0.05))
+
 
 def find_standing(
     clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"] | None
@@ -80,18 +87,23 @@ def find_standing(
 
     if focus is None:
         raise refused("the cameras do not look at one place from around it")
-    chosen = np.unique(np.linspace(0, len(clip) - 1, options.pictures).astype(int))
-    points, level = _points_near(clip, world_from_camera, focus, options, chosen)
-    if (points[level, 1] < focus[1] + 0.05).sum() < options.least_level:
+    points, ground = surroundings(clip, world_from_camera, options, focus)
+    if ground is None:
         raise refused("no level ground is seen where the cameras look")
-    ground = fit_ground(points[level], focus)
     cluster = find_cluster(points[ground.above(points) > options.clearance_m], focus, options)
     if not cluster.cells.any():
         raise refused("nothing stands where the cameras look")
-    centres = cluster.origin + (np.argwhere(cluster.cells) + 0.5) * cluster.voxel_m
-    middle = (centres.min(0) + centres.max(0)) / 2
-    ball = Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + 0.05))
-    return [ball] * len(clip), _judge(cluster, ground, options)
+    return [cluster.ball] * len(clip), judge_standing(cluster, ground, options)
+
+
+def surroundings(
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "point 3"], Ground | None]:
+    """Return the points near a focus that frames spread over the recording see, and the ground beneath it, if one is seen."""
+    chosen = np.unique(np.linspace(0, len(clip) - 1, options.pictures).astype(int))
+    points, level = _points_near(clip, world_from_camera, focus, options, chosen)
+    seen = (points[level, 1] < focus[1] + 0.05).sum() >= options.least_level
+    return points, fit_ground(points[level], focus) if seen else None
 
 
 def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround) -> Float[np.ndarray, "3"] | None:
@@ -146,8 +158,11 @@ def _points_near(
     return np.concatenate(points), np.concatenate(level)
 
 
-def _judge(cluster: Cluster, ground: Ground, options: Turnaround) -> Judge:
-    """Evidence for the turnaround: cells of the cluster well above the ground are animal, the rest is room."""
+def judge_standing(cluster: Cluster, ground: Ground, options: Turnaround, whole: bool = True) -> Judge:
+    """Evidence of a cluster: its cells well above the ground are animal, the rest is room.
+
+    If they are not the ``whole`` animal, nothing is known of what stands beside them.
+    """
 
     def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
         known = np.isfinite(window.points_world[..., 0])
@@ -158,6 +173,10 @@ def _judge(cluster: Cluster, ground: Ground, options: Turnaround) -> Judge:
         log_odds = np.where(held, np.clip((height - options.foot_m) / 0.004, -3, 3), -3.0)
         log_odds[~known] = 0.0
         certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), 0.05)
+        if not whole:
+            near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
+            beside = near & ~held & (height > options.clearance_m)
+            log_odds[beside], certainty[beside] = 0.0, 0.05
         sure = window.trusted & (log_odds > 2)
         return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)
 

@@ -143,6 +143,18 @@ def click(mask, frame):
     return prompt.Prompt(frame, (column + 0.5, row + 0.5) * 2)
 
 
+def test_an_animal_that_never_moves_is_found_by_a_hint(tmp_path):
+    poses, agent = scenery.session()
+    agent = np.repeat(agent[20:21], 40, axis=0)
+    truth = scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
+    clip, scores = Clip.open(tmp_path / "frames"), {}
+    for hint in (None, click(truth.masks[20], 20)):
+        found, _ = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0))
+        scores[hint] = [iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]
+    assert np.max(scores.pop(None)) == 0, "nothing moves"
+    assert np.mean(*scores.values()) > 0.7
+
+
 def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
     """The animal leaves for good after 1.6 s; something of its size and of another colour walks about all the time."""
     poses, agent = scenery.session()
