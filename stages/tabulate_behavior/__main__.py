@@ -25,7 +25,7 @@ class Config:
         "ats", "gaussian", "one_stage", "world", "no_observer", "no_scene", "no_past", "concatenation", "horizon_4_0", "horizon_7_2",
     )  # fmt: skip
     """Trained methods: variants in `agents/variants/`, of which `ats` changes nothing."""
-    seeds: int = 3
+    seeds: int = 5
     """Trainings of each method."""
     samples: int = 16
     """Samples per window of the rivals that need no training; as many as `score_behavior` draws."""
