@@ -1,8 +1,8 @@
 """Build the canonical animal from the recording that circles it: closed surface, 25 bones, features, cameras.
 
 The phone's poses are freed of drift and the circle is closed, masked depth is fused and carved, and the body's cells
-are divided into Gaussian bones along the limbs. `flip = true` in the recipe turns the animal when head and tail were
-mistaken for each other (see the turntable in the report).
+are divided into Gaussian bones along the limbs. Where the turntable in the report does not begin with the head's side,
+`turn_deg` in the recipe turns the animal: 180 when head and tail were mistaken for each other.
 
     python -m stages.build_agent_template --frames build/cat/frames --masks build/cat/masks --features build/cat/features \\
         --videos build/cat/plan/videos.json --out build/cat/agent_template

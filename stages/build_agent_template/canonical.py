@@ -14,30 +14,34 @@ END_SHARE = 0.18
 
 @dataclass(frozen=True)
 class Heading:
-    """Which way the body points in the turnaround's world, and how clearly its head is the heavier end."""
+    """Which way the body points in the turnaround's world, and how clearly that was told."""
 
     world_from_agent: Float[np.ndarray, "4 4"]
     head_share: float
-    """share of the two ends' volume times height that lies at the head's end (0.5 = cannot be told)"""
+    """share of the two ends' volume times height that lies at the end taken for the head's (0.5 = cannot be told)"""
+    elongation: float
+    """spread along the axis that was found against the spread across it, both level (1 = cannot be told)"""
 
 
-def find_heading(inside_world: Float[np.ndarray, "cell 3"], ground: Ground, flip: bool) -> Heading:
+def find_heading(inside_world: Float[np.ndarray, "cell 3"], ground: Ground, turn_deg: float) -> Heading:
     """Lay +z along the longest level axis of the body, towards the end that holds more volume, higher up.
 
-    The head is thick and high where the tail is thin or, curled up, the rump is low; ``flip`` turns the answer round
-    when it is wrong.
+    The head is thick and high where the tail is thin or, curled up, the rump is low. Who stands upright or lies curled up
+    may be wider than long: ``turn_deg``, counterclockwise from above, turns an answer that is wrong.
     """
     centre = np.median(inside_world, axis=0)
     level = (inside_world - inside_world.mean(0))[:, [0, 2]]
-    axis = np.linalg.eigh(level.T @ level)[1][:, -1]
+    spread, axes = np.linalg.eigh(level.T @ level)
+    axis = axes[:, -1]
     axis = axis if axis[np.abs(axis).argmax()] > 0 else -axis
     along = (inside_world - centre)[:, [0, 2]] @ axis
     end = END_SHARE * np.ptp(along)
     height = np.maximum(ground.above(inside_world), 0)
     ahead, behind = height[along > along.max() - end].sum(), height[along < along.min() + end].sum()
     share = max(ahead, behind) / max(ahead + behind, 1e-9)
-    if (behind > ahead) != flip:
+    if behind > ahead:
         axis = -axis
-    forward, up = np.array([axis[0], 0, axis[1]]), np.array([0.0, 1.0, 0.0])
+    up = np.array([0.0, 1.0, 0.0])
+    forward = rigid.exp(np.r_[np.radians(turn_deg) * up, 0, 0, 0])[:3, :3] @ np.array([axis[0], 0, axis[1]])
     rotation = np.stack([np.cross(up, forward), up, forward], axis=1)
-    return Heading(rigid.make(rotation, centre), float(1 - share if flip else share))
+    return Heading(rigid.make(rotation, centre), float(share), float(np.sqrt(spread[1] / max(spread[0], 1e-12))))

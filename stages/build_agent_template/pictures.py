@@ -47,6 +47,7 @@ def report(template: Template) -> tuple[list[Check], list[Picture]]:
         Check("length", float(np.ptp(mesh.vertices[:, 2])), "m"),
         Check("height", float(np.ptp(mesh.vertices[:, 1])), "m"),
         Check("volume", 1000 * float(abs(solid.volume)), "l"),
+        Check("longer than wide (1 = cannot be told)", template.elongation, "", warn=1.3, better="higher"),
         Check("head against tail (50 = cannot be told)", 100 * template.head_share, "%", warn=55, better="higher"),
         Check(
             "bones that move less than 1 % of the surface", float((influence < 0.01 * influence.mean() * len(influence)).sum()), "", warn=8

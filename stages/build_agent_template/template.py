@@ -27,8 +27,9 @@ FEATURE_STRIDE = 8
 class Options:
     """How the template is made; each table belongs to one file of this room."""
 
-    flip: bool = False
-    """Turn the animal round when its head and tail were mistaken for each other."""
+    turn_deg: float = 0.0
+    """Turn the animal by so much, counterclockwise from above, when the turntable does not begin with its head's side: 180 where
+    head and tail were mistaken for each other, 90 or -90 where its sides were taken for them."""
     straightening: Straightening = field(default_factory=lambda: Straightening(loops=5))
     """Drift of the phone's poses and its repair."""
     fusion: Fusion = field(default_factory=Fusion)
@@ -50,6 +51,7 @@ class Template:
     agent_from_camera: Float[np.ndarray, "frame 4 4"]
     """NaN where the animal is not in view"""
     head_share: float
+    elongation: float
     residual_m: float
     around_deg: float
     """how much of the circle the cameras cover"""
@@ -68,7 +70,7 @@ def build(
         )
     circle = walk_around(clip, masks, options.straightening)
     body = fuse(clip, masks, circle, options.fusion)
-    heading = find_heading(body.inside_world, circle.ground, options.flip)
+    heading = find_heading(body.inside_world, circle.ground, options.turn_deg)
     agent_from_world = rigid.inverse(heading.world_from_agent)
     mesh = Mesh(rigid.apply(agent_from_world, body.mesh.vertices.astype(float)).astype(np.float32), body.mesh.faces)
     bones = lay_bones(rigid.apply(agent_from_world, body.inside_world), body.voxel_m, options.skeleton, rng)
@@ -92,6 +94,7 @@ def build(
         weights.numpy(),
         cameras,
         heading.head_share,
+        heading.elongation,
         circle.straightened.residual_m,
         covered_deg(cameras[seen]),
     )

@@ -72,13 +72,15 @@ def test_the_axes_point_up_and_to_the_head(template, turnaround):
     turn = true_from_ours(template, turnaround)[:3, :3]
     assert np.degrees(rigid.rotation_angle(turn, np.eye(3))) < 6
     assert template.head_share > 0.6
+    assert template.elongation > 1.3
 
 
-def test_flip_turns_the_animal_round(turnaround, template):
+@pytest.mark.parametrize(("turn_deg", "head"), [(180, [0, 0, -1]), (90, [1, 0, 0])])
+def test_the_animal_can_be_turned(turnaround, template, turn_deg, head):
     clip, masks, features, _ = turnaround
-    flipped = build(clip, masks, features, replace(Options(), flip=True), np.random.default_rng(0))
-    between = flipped.agent_from_camera[0, :3, :3] @ template.agent_from_camera[0, :3, :3].T
-    assert np.allclose(between, np.diag([-1, 1, -1]), atol=1e-6)
+    turned = build(clip, masks, features, replace(Options(), turn_deg=turn_deg), np.random.default_rng(0))
+    former_from_new = template.agent_from_camera[0, :3, :3] @ turned.agent_from_camera[0, :3, :3].T
+    assert np.allclose(former_from_new @ [0, 0, 1], head, atol=1e-6)
 
 
 def test_cameras_stand_where_they_stood(template, turnaround):
