@@ -4,6 +4,7 @@ They serve twice: `posing` poses the template to the frames before the field lea
 terms while everything learns.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -91,12 +92,13 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
     posed = problem.body.pose(problem.surface.points[chosen], pose.agent_from_bone)
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
-    outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel)
+    outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel, views.size_px[pose.frame])
     with torch.no_grad():
         measured = _nearest(views.depth[pose.frame], pixel)
+        before = _nearest(_occluders(views.depth[pose.frame].float(), views.outside_px[pose.frame]), pixel)
         inside_picture = ((pixel >= 0) & (pixel <= views.size_px[pose.frame, None])).all(-1)
         in_view = inside_picture & (depth > 0.1)
-        hidden = (measured > 0) & (measured < depth - MARGIN_M)
+        hidden = (before > 0) & (before < depth - MARGIN_M)
     outside_m = functional.relu(outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None] - EDGE_M)
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
@@ -171,9 +173,21 @@ def _size(squared: Float[Tensor, "*step"]) -> Float[Tensor, "*step"]:
     return (squared.clamp_min(0) + STILL**2).sqrt() - STILL
 
 
-def _bilinear(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:
-    """Read thumbnails between their pixels, with gradients towards the place."""
-    place = _normalized(images, pixel)
+def _occluders(
+    depth: Float[Tensor, "frame height width"], outside_px: Float[Tensor, "frame height width"]
+) -> Float[Tensor, "frame height width"]:
+    """Fill what is not known of thumbnails with the nearest that is measured beside it, but on the agent: edges have no depth."""
+    beside = torch.where((depth > 0) & (outside_px > 0), -depth, -math.inf)
+    nearest = -functional.max_pool2d(beside[:, None], 3, stride=1, padding=1)[:, 0]
+    return torch.where((depth > 0) | nearest.isinf(), depth, nearest)
+
+
+def _bilinear(
+    images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"], size_px: Float[Tensor, "frame 2"]
+) -> Float[Tensor, "frame point"]:
+    """Read thumbnails between their pixels, with gradients towards the place; at a picture's border, not what pads it there."""
+    last = (size_px // THUMBNAIL - 0.5)[:, None] * THUMBNAIL
+    place = _normalized(images, torch.minimum(pixel.clamp_min(0.5 * THUMBNAIL), last))
     return functional.grid_sample(images[:, None], place[:, :, None], padding_mode="border", align_corners=False)[:, 0, :, 0]
 
 

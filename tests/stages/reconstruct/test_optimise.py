@@ -160,6 +160,37 @@ def test_bare_masked_pixels_draw_the_surface_to_them():
     assert torch.nn.functional.cosine_similarity(-shift.grad, home, dim=0) > 0.7
 
 
+def beside(found, metres: float) -> dict:
+    """Return what `surface_terms` says of the session when the ball stands so far to the right in all pictures."""
+    pose = Pose.of(found, torch.arange(4))
+    right = (
+        pose.world_from_camera @ rigid_torch.make(torch.eye(3), torch.tensor([metres, 0, 0])) @ rigid_torch.inverse(pose.world_from_camera)
+    )
+    pose = replace(pose, world_from_agent=right @ pose.world_from_agent)
+    return {name: term for name, (_, term) in body.surface_terms(found, pose, 4000, Weights(), torch.Generator().manual_seed(0)).items()}
+
+
+def test_what_pads_pictures_says_nothing():
+    """Across the right border of an upright picture the mask is as far as its last pixel says, also beside a wide recording."""
+    alone, padded = (
+        beside(problem(videos=[film("v002", 12, True, rng, UPRIGHT), film("v001", 6, False, rng, size)])[0], 0.45)["outside"]
+        for rng, size in ((np.random.default_rng(0), UPRIGHT), (np.random.default_rng(0), WIDE))
+    )
+    assert alone.max() > 1 and torch.equal(alone, padded)
+
+
+def test_where_depth_ends_at_something_nearer_the_surface_may_be_hidden():
+    found, _ = problem()
+    free, views = beside(found, 0.15)["outside"], found.store.views
+    shown = views.outside_px[:4].float() < 0
+    edge = torch.nonzero(shown.any(0).any(0)).max() + 1
+    views.depth[:4, :, edge:] = 0.3
+    hidden = beside(found, 0.15)["outside"]
+    assert len(hidden) < 0.9 * len(free)
+    views.depth[:4, :, edge] = 0
+    assert torch.equal(beside(found, 0.15)["outside"], hidden), "sensors do not measure along edges"
+
+
 def test_what_is_buried_in_the_ground_is_lifted():
     """A floor 10 cm below the ball's middle: its underside lies as deep as it lies below that, and is drawn up."""
     found, _ = problem()
