@@ -4,6 +4,7 @@ import base64
 import functools
 import gzip
 import http.server
+import itertools
 import json
 import shutil
 import threading
@@ -340,6 +341,18 @@ def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, 
             steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
             assert 0.05 < steps.max() < 0.115, "metres"
         assert wrong == []
+
+
+def test_nothing_covers_anything(simulator: Path, chromium: Browser) -> None:
+    parts = ("#panel-body", "#player", "#help", "#map", "#title")
+    with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(1280, 720)) as (page, _):
+        for width, height in ((1280, 720), (1000, 640), (900, 760), (768, 1024)):
+            page.set_viewport_size({"width": width, "height": height})
+            box = {part: page.locator(part).bounding_box() for part in parts}
+            for first, second in itertools.combinations(parts, 2):
+                a, b = box[first], box[second]
+                beside = a["x"] + a["width"] <= b["x"] or b["x"] + b["width"] <= a["x"]
+                assert beside or a["y"] + a["height"] <= b["y"] or b["y"] + b["height"] <= a["y"], (width, height, first, second)
 
 
 def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> None:
