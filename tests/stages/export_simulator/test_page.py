@@ -21,9 +21,10 @@ from playwright.sync_api import Browser, Page
 
 from pipeline import artifact, config, dag
 from pipeline.cli import Task
-from pipeline.files import arrays
+from pipeline.files import arrays, meshes
 from pipeline.models.trajectories import BehaviorData
 from pipeline.space import rigid
+from pipeline.space.meshes import Mesh, RayCaster
 from stages.export_simulator.__main__ import Config, run
 from stages.simulate.subgoal_file import Written, subgoals, tables
 from tests.stages.export_simulator import browser, reaction, small_world, twins
@@ -58,17 +59,23 @@ SEES_ALL = "points => points.map(ats.screen).every(([x, y]) => x > 0 && x < inne
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
 
 
-@pytest.fixture(scope="module")
-def simulator(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Export a small world, as one file and as a folder beside it."""
-    raw, build = tmp_path_factory.mktemp("raw"), tmp_path_factory.mktemp("build")
-    small_world.write(raw)
+def exported(raw: Path, build: Path) -> Task:
+    """Export a world as one file; return what was done, to do it otherwise."""
     for name in READS:
         with artifact.create(build / name, stage=dag.NODES[name].stage, config={}, inputs={}) as folder:
             shutil.copytree(raw / name, folder, dirs_exist_ok=True)
     paths = {name: build / name for name in READS}
     task = Task("export_simulator", Config(name="tube"), build / "simulator", None, (), None, 1, None, paths, "cpu")
     run(task)
+    return task
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Export a small world, as one file and as a folder beside it."""
+    raw, build = tmp_path_factory.mktemp("raw"), tmp_path_factory.mktemp("build")
+    small_world.write(raw)
+    task = exported(raw, build)
     run(replace(task, config=Config(name="tube", layout="folder"), out=build / "light"))
     shutil.copy(raw / "behavior/golden.json", build / "golden.json")
     return build / "simulator"
@@ -340,6 +347,26 @@ def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, 
         for places in (np.stack([table["observer_x"], table["observer_z"]], -1), told[:, [0, 2]]):
             steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
             assert 0.05 < steps.max() < 0.115, "metres"
+        assert wrong == []
+
+
+def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    """A box stands between it and the corner that the room is looked into from otherwise."""
+    with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, _):
+        page.evaluate("ats.pause(); ats.reset()")
+        eye, animal = (np.array(page.evaluate(f"ats.state().{what}")[:3]) for what in ("eye", "animal"))
+    small_world.write(tmp_path)
+    place = animal + 0.4 * (eye - animal) / np.linalg.norm((eye - animal)[[0, 2]])
+    box = trimesh.creation.box((0.3, 0.3, 0.3), rigid.make(np.eye(3), place))
+    cast = RayCaster(Mesh(np.asarray(box.vertices, np.float32), np.asarray(box.faces))).cast
+    scene = meshes.read_ply(tmp_path / "reconstruction/scene.ply")
+    vertices, faces = np.concatenate([scene.vertices, box.vertices]), np.concatenate([scene.faces, box.faces + len(scene.vertices)])
+    color = np.concatenate([scene.color, np.full((8, 3), 99)]).astype(np.uint8)
+    meshes.write_ply(tmp_path / "reconstruction/scene.ply", Mesh(vertices.astype(np.float32), faces.astype(np.int32), color))
+    task = exported(tmp_path, tmp_path / "build")
+    with browser.shown(chromium, (task.out / "index.html").as_uri()) as (page, wrong):
+        shown_from = np.array(page.evaluate("ats.state().eye"))
+        assert cast(eye, (animal - eye)[None]).distance[0] < 1 < cast(shown_from, (animal - shown_from)[None]).distance[0]
         assert wrong == []
 
 

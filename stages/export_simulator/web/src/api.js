@@ -14,6 +14,7 @@ export function api(simulator) {
         animal: root,
         nose: rotate(root.slice(3), [0, 0, 1]),
         observer: [...observer.place],
+        eye: room.camera.position.toArray(),
         plans: simulator.turnNumber,
         milliseconds: simulator.milliseconds,
         aim: simulator.stops.next,

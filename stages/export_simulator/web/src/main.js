@@ -45,6 +45,7 @@ class Simulator {
     this.overlays = new Overlays(this.room.scene, this.contract.scene.floor_m, this.contract.agent.root_height_m[0] - this.contract.scene.floor_m);
     this.tags = new Tags(this.room.camera);
     this.film = new Film(this.room.canvas);
+    this.room.frameRoom(this.clips.moment(this.state.seed, this.contract.behavior.past_frames).frames.at(-1).slice(0, 3));
     this.map = new Minimap(document.getElementById('minimap'), this.room.picture(256), this.room.heading());
     this.clips.each((frame, camera) => {
       this.map.visit('animal', frame[0], frame[2], 0.25);

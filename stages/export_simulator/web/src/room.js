@@ -15,6 +15,7 @@ const FOG_M = 0.5; // Gaussians nearer to the eye are hidden
 const FURTHEST_M = 14; // how far away the view may go
 const FURTHEST = 4; // and in widths of the room: from there an upright phone shows it from wall to wall
 const CLOSE_M = 1.7; // how far away the view stays that follows the animal
+const CORNERS = [[1, 1], [-1, 1], [1, -1], [-1, -1]]; // towards +x and +z, from which the room is looked into
 
 export const parseModel = (bytes) => new Promise((done, fail) => {
   new GLTFLoader().parse(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength), '', done, fail);
@@ -54,14 +55,24 @@ export class Room {
     return Math.max(high[0] - low[0], high[2] - low[2]);
   }
 
-  frameRoom() {
-    const { span } = this;
+  // Look into the room from the corner that shows the animal, if one does.
+  frameRoom(animal) {
     const [low, high] = this.contract.scene.bounds_m;
-    const middle = [(low[0] + high[0]) / 2, this.contract.scene.floor_m + 0.25, (low[2] + high[2]) / 2];
-    const narrow = innerWidth < 720 ? 1.75 : 1;
-    this.orbit.target.set(...middle);
-    this.camera.position.set(middle[0] + 0.62 * span * narrow, middle[1] + 0.98 * span * narrow, middle[2] + 0.86 * span * narrow);
+    const middle = new THREE.Vector3((low[0] + high[0]) / 2, this.contract.scene.floor_m + 0.25, (low[2] + high[2]) / 2);
+    const away = this.span * (innerWidth < 720 ? 1.75 : 1);
+    const from = ([x, z]) => middle.clone().add(new THREE.Vector3(0.62 * x, 0.98, 0.86 * z).multiplyScalar(away));
+    if (animal) this.corner = CORNERS.find((corner) => this.sees(from(corner), new THREE.Vector3(...animal)));
+    this.orbit.target.copy(middle);
+    this.camera.position.copy(from(this.corner ?? CORNERS[0]));
     this.orbit.update();
+  }
+
+  // Whether nothing that is drawn of the room's mesh stands between.
+  sees(eye, point) {
+    const ray = new THREE.Raycaster(eye, point.clone().sub(eye).normalize(), 0, eye.distanceTo(point) - 0.1);
+    ray.layers.enableAll();
+    this.mesh.updateWorldMatrix(true, false);
+    return ray.intersectObject(this.mesh).every((hit) => hit.point.y > this.contract.scene.floor_m + HEADROOM_M);
   }
 
   async addMesh(bytes) {
