@@ -17,7 +17,7 @@ from pipeline.models.motion import MotionTable
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.reconstruct.limbs import Limbs
-from stages.reconstruct.problem import Joints, Problem, RaysByFrame, Surface, frame_table
+from stages.reconstruct.problem import Joints, Problem, RaysByFrame, Surface, firmness, frame_table
 from stages.reconstruct.rays import Source, Store, Views, join
 
 USUAL = 0.8
@@ -138,6 +138,8 @@ def build(
     by_frame = RaysByFrame.of(store.agent.frame, len(camera))
     usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
+    free, poses = [video.camera_free for video in videos], map(torch.from_numpy, (camera, agent))
+    motion = MotionTable(*poses, rest, lengths, free, shapes.knot_frames)
     body = Body(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape)
     surface = Surface.of(template.mesh, template.feature, np.random.default_rng(seed))
     with torch.no_grad():
@@ -148,9 +150,7 @@ def build(
         scene=scene_field(videos, shapes, fused),
         agent=Field(agent_shape, free_m=0.1),
         body=body,
-        motion=MotionTable(
-            torch.from_numpy(camera), torch.from_numpy(agent), rest, lengths, [v.camera_free for v in videos], shapes.knot_frames
-        ),
+        motion=motion,
         video=frame_table(lengths),
         has_scene=has_scene,
         surface=surface,
@@ -159,6 +159,7 @@ def build(
         agent_frames=usable_frames,
         agent_rays=by_frame,
         trust=trust,
+        firm=firmness(motion, np.concatenate([video.confidence for video in videos])),
         floor_m=floor_m,
     )
     return problem if device == "cpu" else _moved(problem, device)
@@ -263,6 +264,7 @@ def _moved(problem: Problem, device: str) -> Problem:
     store = Store(problem.store.scene.to(device), problem.store.agent.to(device), problem.store.views.to(device))
     by_frame = RaysByFrame(problem.agent_rays.start.to(device), problem.agent_rays.count.to(device))
     moved = {
-        name: getattr(problem, name).to(device) for name in ("video", "has_scene", "surface", "joints", "limbs", "agent_frames", "trust")
+        name: getattr(problem, name).to(device)
+        for name in ("video", "has_scene", "surface", "joints", "limbs", "agent_frames", "trust", "firm")
     }
     return Problem(store=store, **problem.modules(), agent_rays=by_frame, floor_m=problem.floor_m, **moved)

@@ -37,7 +37,7 @@ class JointLoss:
         terms |= body.surface_terms(problem, pose, batches.surface_points, self.weights, generator)
         terms |= body.prior_terms(problem, pose, problem.motion.bone[frame], self.run_frames, self.weights)
         terms |= rendered_terms(problem, pose, max(1, batches.rendered_rays // len(frame)), probability, self.weights, generator)
-        terms |= field_terms(problem, self.weights, generator) | drift_term(problem.motion, self.weights)
+        terms |= field_terms(problem, self.weights, generator) | drift_term(problem, self.weights)
         return losses.weighted(terms, shared=True)
 
 

@@ -123,12 +123,12 @@ def even_depths(rays: Rays, farthest_m: float, samples: int, generator: Generato
     return (FREE_FROM_M + (farthest_m - FREE_FROM_M) * step / samples).to(rays.depth.device)
 
 
-def drift_term(motion: MotionTable, weights: Weights) -> Terms:
-    """Keep the corrections of cameras small, and those of neighbouring knots alike: units of 1 cm and half a degree."""
-    unit = 0.01
+def drift_term(problem: Problem, weights: Weights) -> Terms:
+    """Keep the corrections of cameras small where registration is sure, and those of neighbouring knots alike: 1 cm and half a degree."""
+    motion, unit = problem.motion, 0.01
     return {
         "drift": (weights.drift, (torch.diff(motion.camera, dim=0) / unit).square()),
-        "anchor": (weights.anchor, (motion.camera / unit).square()),
+        "anchor": (weights.anchor, problem.firm[:, None] * (motion.camera / unit).square()),
     }
 
 
@@ -142,7 +142,7 @@ class SceneLoss:
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
         return losses.weighted(
             self.terms(self.batches.scene_rays, swap_probability(step / self.steps, self.batches), generator)
-            | drift_term(self.problem.motion, self.weights),
+            | drift_term(self.problem, self.weights),
             shared=True,
         )
 

@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import torch
 
+from pipeline.models.motion import MotionTable
 from pipeline.space import rigid
 from stages.reconstruct import assemble, rays
 from stages.reconstruct.assemble import Doubt
+from stages.reconstruct.problem import FIRMEST, firmness
 from tests.stages.reconstruct.test_optimise import SHAPES, WIDE, film, problem
 
 
@@ -68,3 +70,12 @@ def test_masks_count_by_how_much_of_the_animal_they_show():
     assert 0.15 < after[2] / before[2] < 0.35 and after[3] == doubt.least_share
     rest = torch.arange(len(before)) > 3
     torch.testing.assert_close(after[rest], before[rest])
+
+
+def test_cameras_are_held_as_firmly_as_registration_is_sure():
+    pose = torch.eye(4).repeat(40, 1, 1)
+    table = MotionTable(pose, pose, torch.eye(4)[None], [40], [True], knot_frames=10)
+    confidence = np.repeat([0.3, 1.0], 20)
+    firm = firmness(table, confidence)
+    assert firm[0] == firm[1] == 1 and firm[4] == FIRMEST
+    assert 1 < firm[2] < FIRMEST, "between doubtful and certain frames"
