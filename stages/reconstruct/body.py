@@ -92,13 +92,13 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
     posed = problem.body.pose(problem.surface.points[chosen], pose.agent_from_bone)
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
-    outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel, views.size_px[pose.frame])
+    depths, masks, size_px = views.depth[pose.frame].float(), views.outside_px[pose.frame].float(), views.size_px[pose.frame]
+    outside_px = _bilinear(masks, pixel, size_px)
     with torch.no_grad():
-        measured = _nearest(views.depth[pose.frame], pixel)
-        before = _nearest(_occluders(views.depth[pose.frame].float(), views.outside_px[pose.frame]), pixel)
-        inside_picture = ((pixel >= 0) & (pixel <= views.size_px[pose.frame, None])).all(-1)
+        measured, nearest = _nearest(depths, pixel), _nearest(_occluders(depths, masks), pixel)
+        inside_picture = ((pixel >= 0) & (pixel <= size_px[:, None])).all(-1)
         in_view = inside_picture & (depth > 0.1)
-        hidden = (before > 0) & (before < depth - MARGIN_M)
+        hidden = (nearest > 0) & (nearest < depth - MARGIN_M)
     outside_m = functional.relu(outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None] - EDGE_M)
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
@@ -194,9 +194,7 @@ def _bilinear(
 def _nearest(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:
     """Read thumbnails at the nearest pixel."""
     place = _normalized(images, pixel)
-    return functional.grid_sample(images[:, None].float(), place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False)[
-        :, 0, :, 0
-    ]
+    return functional.grid_sample(images[:, None], place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False)[:, 0, :, 0]
 
 
 def _normalized(images: Tensor, pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point 2"]:

@@ -199,7 +199,7 @@ def firmness(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Flo
     for knot in (motion.knot, motion.knot + 1):
         total.index_add_(0, knot, sure)
         count.index_add_(0, knot, torch.ones_like(sure))
-    return total / count.clamp_min(1)
+    return total / count
 
 
 def pick(count: int, number: int, generator: Generator, device: torch.device) -> Int[Tensor, "sample"]:
