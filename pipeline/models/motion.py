@@ -101,6 +101,11 @@ class MotionTable(nn.Module):
         self.root = nn.Parameter(torch.zeros(len(world_from_camera), 6))
         self.bone = nn.Parameter(torch.zeros(len(world_from_camera), len(agent_from_bone_rest), 6))
 
+    @torch.no_grad()
+    def lean(self, initial_from_leaning: Float[Tensor, "frame 4 4"]) -> None:
+        """Let the agent's initial roots lean; corrections start from there."""
+        self.initial_agent.copy_(self.initial_agent @ initial_from_leaning)
+
     def camera_correction(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 6"]:
         """Return the corrections of cameras as twists (rotation vector, translation)."""
         share = self.knot_share[frame][..., None]

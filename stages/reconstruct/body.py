@@ -44,6 +44,8 @@ class Pose:
     world_from_camera: Float[Tensor, "frame 4 4"]
     world_from_agent: Float[Tensor, "frame 4 4"]
     agent_from_bone: Float[Tensor, "frame bone 4 4"]
+    world_from_initial: Float[Tensor, "frame 4 4"]
+    """where the agent's root is expected: as posing found it, before corrections"""
 
     @property
     def agent_from_camera(self) -> Float[Tensor, "frame 4 4"]:
@@ -54,7 +56,12 @@ class Pose:
     def of(cls, problem: Problem, frame: Int[Tensor, "frame"]) -> "Pose":
         """Read the motion table."""
         motion = problem.motion
-        return cls(frame, motion.world_from_camera(frame), motion.world_from_agent(frame), motion.agent_from_bone(frame))
+        posed = motion.world_from_camera(frame), motion.world_from_agent(frame), motion.agent_from_bone(frame)
+        return cls(frame, *posed, motion.initial_agent[frame])
+
+    def at(self, chosen: Tensor | slice) -> "Pose":
+        """Choose frames."""
+        return Pose(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
 def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, generator: Generator, near: int = 2) -> Terms:
@@ -146,7 +153,7 @@ def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6
         return (motion[:, bone, :3, :3] @ joints.place[..., None])[..., 0] + motion[:, bone, :3, 3]
 
     torn = (carried(joints.first) - carried(joints.second)) / DECIMETRE
-    root = rigid_torch.inverse(problem.motion.initial_agent[pose.frame]) @ pose.world_from_agent
+    root = rigid_torch.inverse(pose.world_from_initial) @ pose.world_from_agent
     terms = {
         "root": (weights.root, problem.trust[pose.frame] * ((root[:, :3, 3] / ROOT_M).square().sum(-1) + _turned(root) / ROOT_RAD**2)),
         "rigidity": (weights.rigidity, torn.square().sum(-1)),

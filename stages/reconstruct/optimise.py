@@ -4,21 +4,25 @@ Each phase is one call of `pipeline.fit.fit` with its own checkpoints, so that a
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import nn
 
 from pipeline import progress, threads, together
-from pipeline.fit import FitRecord, fit, termination
+from pipeline.fit import FitRecord, fit, generator_for, termination
+from stages.reconstruct import stances
 from stages.reconstruct.joint import JointLoss, TemplateLoss
 from stages.reconstruct.posing import Chunk, ChunkLoss
 from stages.reconstruct.problem import Problem
 from stages.reconstruct.scene import SceneLoss
 from stages.reconstruct.settings import Batches, Rates, Steps, Weights
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,9 @@ def optimise(problem: Problem, plan: Plan) -> dict[str, FitRecord]:
     scene = [*field_groups(problem.scene, rates), _motion_group([problem.motion.camera], rates.camera, momentum=0.9)]
     records["scene"] = _run(problem, plan, "scene", SceneLoss(problem, plan.weights, plan.batches, steps.scene), steps.scene, scene)
     if len(everything.agent_frames):
-        _pose(problem, plan, list(chunks(everything, steps.body_chunk_frames)))
+        stretches = list(chunks(everything, steps.body_chunk_frames))
+        _stand(problem, plan, stretches)
+        _pose(problem, plan, stretches)
         for corrections in (problem.motion.root, problem.motion.bone):
             corrections.data.copy_(together.total(corrections))
         records["joint"] = _run(
@@ -92,21 +98,48 @@ def _run(problem: Problem, plan: Plan, name: str, loss, steps: int, groups: list
 
 def _pose(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> None:
     """Pose the template in all stretches with usable frames and write roots and bones into the motion table."""
+
+    def pose(index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> Chunk:
+        chunk = Chunk(problem, frame)
+        _fit_chunk(problem, plan, f"body_{index:04d}", chunk, plan.steps.body, asked_to_stop)
+        return chunk
+
+    for chunk in _in_each(problem, plan, stretches, pose, "posing"):
+        chunk.write(problem)
+
+
+def _stand(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> None:
+    """Find in all stretches with usable frames how the agent stands, and let its roots start so."""
+    stance, leans = torch.zeros(len(problem.video), dtype=torch.long), stances.leans().to(problem.device)
+
+    def told(index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> tuple[torch.Tensor, np.ndarray]:
+        losses = []
+        for number, lean in enumerate(leans):
+            chunk, name = Chunk(problem, frame[:: stances.EVERY], lean), f"stance_{index:04d}_{number}"
+            loss = _fit_chunk(problem, plan, name, chunk, plan.steps.stance, asked_to_stop)
+            losses.append(loss.of_parts(stances.PART, generator_for(plan.seed, index)))
+        return frame, torch.stack(losses, dim=-1).cpu().numpy()
+
+    for frame, loss in _in_each(problem, plan, stretches, told, "stances"):
+        stance[frame] = stances.by_frame(stances.likeliest(loss), len(frame))
+    problem.motion.lean(leans[together.total(stance).to(problem.device)])
+
+
+def _in_each(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor], work: Callable[..., Result], label: str) -> Iterator[Result]:
+    """Yield what is found in each stretch with usable frames, given its number and its frames; only chunks learn meanwhile."""
     held = [problem.agent, problem.body, problem.scene]
-    own = [(f"body_{index:04d}", frame) for index, frame in enumerate(stretches) if torch.isin(frame, problem.agent_frames).any()]
+    own = [(index, frame) for index, frame in enumerate(stretches) if torch.isin(frame, problem.agent_frames).any()]
     for module in held:
         module.requires_grad_(False)
     with termination() as asked_to_stop:
-        posed = threads.ordered(lambda named: _pose_chunk(problem, plan, *named, asked_to_stop), own, plan.workers)
-        for chunk in progress.track(posed, "posing", total=len(own)):
-            chunk.write(problem)
+        found = threads.ordered(lambda numbered: work(*numbered, asked_to_stop), own, plan.workers)
+        yield from progress.track(found, label, total=len(own))
     for module in held:
         module.requires_grad_(True)
 
 
-def _pose_chunk(problem: Problem, plan: Plan, name: str, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> Chunk:
-    """Pose the template in one stretch of frames; nothing else changes."""
-    chunk, steps = Chunk(problem, frame), plan.steps.body
+def _fit_chunk(problem: Problem, plan: Plan, name: str, chunk: Chunk, steps: int, asked_to_stop: Callable[[], bool]) -> ChunkLoss:
+    """Pose the template in one stretch of frames; nothing else changes. Returns what its poses lack."""
     loss = ChunkLoss(problem, chunk, plan.weights, plan.batches)
     fit(
         modules={"chunk": chunk},
@@ -120,7 +153,7 @@ def _pose_chunk(problem: Problem, plan: Plan, name: str, frame: torch.Tensor, as
         label=name,
         asked_to_stop=asked_to_stop,
     )
-    return chunk
+    return loss
 
 
 def field_groups(field: nn.Module, rates: Rates) -> list[dict]:

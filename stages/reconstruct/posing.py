@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
@@ -22,11 +22,15 @@ ROOT_SHARE = 0.25
 
 
 class Chunk(nn.Module):
-    """What moves in a stretch of frames: the root, the limbs' turns, and each bone by itself."""
+    """What moves in a stretch of frames: the root, the limbs' turns, and each bone by itself.
 
-    def __init__(self, problem: Problem, frame: Int[Tensor, "frame"]):
+    Roots start as registered, or leaning from there (``lean``, a motion of the agent's own frame).
+    """
+
+    def __init__(self, problem: Problem, frame: Int[Tensor, "frame"], lean: Float[Tensor, "4 4"] | None = None):
         super().__init__()
         self.frame, motion = frame, problem.motion
+        self.initial = motion.initial_agent[frame] if lean is None else motion.initial_agent[frame] @ lean
         self.root = nn.Parameter(motion.root.detach()[frame].clone())
         self.bone = nn.Parameter(motion.bone.detach()[frame].clone())
         self.turn = Waves(len(frame), motion.bone.shape[1], KNOT_FRAMES).to(problem.device)
@@ -44,9 +48,9 @@ class Chunk(nn.Module):
             turn, bone = turn.detach(), bone.detach()
         with torch.no_grad():
             world_from_camera = motion.world_from_camera(self.frame)
-        root = motion.initial_agent[self.frame] @ rigid_torch.se3_exp(self.root)
+        root = self.initial @ rigid_torch.se3_exp(self.root)
         bones = problem.limbs.motion(turn) @ motion.agent_from_bone_rest @ rigid_torch.se3_exp(bone)
-        return Pose(self.frame, world_from_camera, root, bones), torch.cat([bone, functional.pad(turn, (0, 3))], dim=1)
+        return Pose(self.frame, world_from_camera, root, bones, self.initial), torch.cat([bone, functional.pad(turn, (0, 3))], dim=1)
 
     @torch.no_grad()
     def write(self, problem: Problem) -> None:
@@ -72,10 +76,23 @@ class ChunkLoss:
 
     def __call__(self, progress: float, generator: Generator) -> dict[str, Tensor]:
         """Return the weighted terms over all frames of the chunk."""
-        problem, seen, (pose, twist) = self.problem, self.seen, self.chunk.pose(self.problem, progress >= ROOT_SHARE)
-        shown = Pose(pose.frame[seen], pose.world_from_camera[seen], pose.world_from_agent[seen], pose.agent_from_bone[seen])
-        rays = problem.store.agent.at(self.masked[self.masked_rays.pick(shown.frame, self.batches.posed_rays, generator).flatten()])
-        terms = measured_terms(problem, shown, rays, self.weights, generator, near=0)
-        terms |= surface_terms(problem, shown, self.batches.posed_points, self.weights, generator, rays)
-        terms |= prior_terms(problem, pose, twist, len(pose.frame), self.weights)
-        return losses.weighted(terms)
+        return self._terms(*self.chunk.pose(self.problem, progress >= ROOT_SHARE), self.seen, generator)
+
+    @torch.no_grad()
+    def of_parts(self, length: int, generator: Generator) -> Float[Tensor, "part"]:
+        """Return the losses of each ``length`` frames by themselves."""
+        pose, twist = self.chunk.pose(self.problem)
+        parts = [slice(first, first + length) for first in range(0, len(pose.frame), length)]
+        terms = [self._terms(pose.at(part), twist[part], self.seen[part], generator) for part in parts]
+        return torch.stack([sum(each.values()) for each in terms])
+
+    def _terms(
+        self, pose: Pose, twist: Float[Tensor, "frame twist 6"], seen: Bool[Tensor, "frame"], generator: Generator
+    ) -> dict[str, Tensor]:
+        problem, terms = self.problem, {}
+        if seen.any():
+            shown = pose.at(seen)
+            rays = problem.store.agent.at(self.masked[self.masked_rays.pick(shown.frame, self.batches.posed_rays, generator).flatten()])
+            terms = measured_terms(problem, shown, rays, self.weights, generator, near=0)
+            terms |= surface_terms(problem, shown, self.batches.posed_points, self.weights, generator, rays)
+        return losses.weighted(terms | prior_terms(problem, pose, twist, len(pose.frame), self.weights))

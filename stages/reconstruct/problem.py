@@ -18,7 +18,7 @@ from stages.reconstruct.rays import Store
 
 TRUSTED = 0.1
 """frames whose masks count less are not looked at together with their neighbours"""
-FIRMEST = 40.0
+FIRMEST = 100.0
 """times as firmly as at even odds is a camera held that registration is certain of: losses err by a millimetre and a twentieth of a degree"""
 
 

@@ -66,6 +66,8 @@ class Steps:
     """steps of the first phase: scene and cameras"""
     body: int = 60
     """steps per chunk that pose the template to the masked depth"""
+    stance: int = 20
+    """steps per chunk and stance, before: does the agent sit?"""
     joint: int = 1000
     """steps of the second phase: everything"""
     body_chunk_frames: int = 100
