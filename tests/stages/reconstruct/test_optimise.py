@@ -86,13 +86,19 @@ def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
 def problem(shapes: Shapes = SHAPES, videos=None):
     rng = np.random.default_rng(0)
     videos = videos or [film("v002", 12, True, rng), film("v001", 6, False, rng, UPRIGHT)]
-    ball = trimesh.creation.icosphere(2, RADIUS_M)
-    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32), np.full((len(ball.vertices), 3), [200, 40, 40], np.uint8))
+    return assemble.build(videos, template(RADIUS_M), shapes, 0, "cpu"), videos
+
+
+def template(half_m: float | np.ndarray) -> Template:
+    """Return the template of a ball, or of an ellipsoid with these half axes."""
+    ball = trimesh.creation.icosphere(2)
+    mesh = Mesh(
+        (half_m * ball.vertices).astype(np.float32), ball.faces.astype(np.int32), np.full((len(ball.vertices), 3), [200, 40, 40], np.uint8)
+    )
     feature = np.zeros((len(mesh.vertices), 16), np.float32)
     feature[:, 0] = 1
     rest = rigid.make(np.tile(np.eye(3), (6, 1, 1)), 0.1 * np.concatenate([np.eye(3), -np.eye(3)]))
-    template = Template(mesh, feature, rest, np.full((6, 3), 0.1))
-    return assemble.build(videos, template, shapes, 0, "cpu"), videos
+    return Template(mesh, feature, rest, np.full((6, 3), 0.1))
 
 
 def plan(resume=None, **steps) -> optimise.Plan:
