@@ -102,9 +102,10 @@ class MotionTable(nn.Module):
         self.bone = nn.Parameter(torch.zeros(len(world_from_camera), len(agent_from_bone_rest), 6))
 
     @torch.no_grad()
-    def lean(self, initial_from_leaning: Float[Tensor, "frame 4 4"]) -> None:
-        """Let the agent's initial roots lean; corrections start from there."""
+    def start(self, initial_from_leaning: Float[Tensor, "frame 4 4"], bone: Float[Tensor, "frame bone 6"]) -> None:
+        """Let the agent's initial roots lean, and its bones start with these corrections."""
         self.initial_agent.copy_(self.initial_agent @ initial_from_leaning)
+        self.bone.copy_(bone)
 
     def camera_correction(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 6"]:
         """Return the corrections of cameras as twists (rotation vector, translation)."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from torch import Tensor, nn
 
@@ -15,6 +15,8 @@ from pipeline.space import rigid_torch
 
 NEVER = 1e-9
 """share of skin from which on bones count as strangers"""
+LOW, GROUND = 0.45, 0.15
+"""legs are below this share of the animal's height, and reach below this"""
 
 
 def shared_skin(weights: Float[Tensor, "point bone"]) -> Float[Tensor, "bone bone"]:
@@ -65,6 +67,18 @@ class Limbs:
     def to(self, device: str) -> "Limbs":
         """Move all to a device."""
         return Limbs(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+
+def legs(limbs: Limbs, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> Bool[Tensor, "bone"]:
+    """Tell which bones are the uppermost of legs: they and all that hangs on them are low, and something of it stands on the ground."""
+    height = (points[:, 1] - points[:, 1].min()) / (points[:, 1].max() - points[:, 1].min())
+    low = weights.T @ height < LOW * weights.sum(0)
+    stands = torch.stack([(height[weights.argmax(1) == bone] < GROUND).any() for bone in range(weights.shape[1])])
+    low, stands, parent = low[limbs.order], stands[limbs.order], limbs.parent.tolist()
+    for place in range(len(parent) - 1, 0, -1):
+        low[parent[place]] &= low[place]
+        stands[parent[place]] |= stands[place]
+    return (low & stands & ~low[limbs.parent])[limbs.order.argsort()]
 
 
 class Waves(nn.Module):

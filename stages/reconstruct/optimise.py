@@ -110,19 +110,20 @@ def _pose(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> No
 
 def _stand(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> None:
     """Find in all stretches with usable frames how the agent stands, and let its roots start so."""
-    stance, leans = torch.zeros(len(problem.video), dtype=torch.long), stances.leans().to(problem.device)
+    choices, chosen = stances.known(problem), torch.zeros_like(problem.video)
 
     def told(index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> tuple[torch.Tensor, np.ndarray]:
         losses = []
-        for number, lean in enumerate(leans):
-            chunk, name = Chunk(problem, frame[:: stances.EVERY], lean), f"stance_{index:04d}_{number}"
+        for number, stance in enumerate(choices):
+            chunk, name = Chunk(problem, frame, stance), f"stance_{index:04d}_{number}"
             loss = _fit_chunk(problem, plan, name, chunk, plan.steps.stance, asked_to_stop)
             losses.append(loss.of_parts(stances.PART, generator_for(plan.seed, index)))
         return frame, torch.stack(losses, dim=-1).cpu().numpy()
 
     for frame, loss in _in_each(problem, plan, stretches, told, "stances"):
-        stance[frame] = stances.by_frame(stances.likeliest(loss), len(frame))
-    problem.motion.lean(leans[together.total(stance).to(problem.device)])
+        chosen[frame] = stances.by_frame(stances.likeliest(loss), len(frame)).to(chosen)
+    lean, bone = (torch.stack([getattr(stance, name) for stance in choices]) for name in ("lean", "bone"))
+    problem.motion.start(lean[together.total(chosen)], bone[chosen])
 
 
 def _in_each(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor], work: Callable[..., Result], label: str) -> Iterator[Result]:

@@ -14,6 +14,7 @@ from stages.reconstruct.limbs import Waves
 from stages.reconstruct.problem import Problem, RaysByFrame
 from stages.reconstruct.rays import AGENT
 from stages.reconstruct.settings import Batches, Rates, Weights
+from stages.reconstruct.stances import Stance
 
 KNOT_FRAMES = (32, 8)
 """limbs turn on these time scales, and frame by frame"""
@@ -24,15 +25,15 @@ ROOT_SHARE = 0.25
 class Chunk(nn.Module):
     """What moves in a stretch of frames: the root, the limbs' turns, and each bone by itself.
 
-    Roots start as registered, or leaning from there (``lean``, a motion of the agent's own frame).
+    They start as the motion table has them, or from a stance.
     """
 
-    def __init__(self, problem: Problem, frame: Int[Tensor, "frame"], lean: Float[Tensor, "4 4"] | None = None):
+    def __init__(self, problem: Problem, frame: Int[Tensor, "frame"], stance: Stance | None = None):
         super().__init__()
         self.frame, motion = frame, problem.motion
-        self.initial = motion.initial_agent[frame] if lean is None else motion.initial_agent[frame] @ lean
+        self.initial = motion.initial_agent[frame] @ stance.lean if stance else motion.initial_agent[frame]
         self.root = nn.Parameter(motion.root.detach()[frame].clone())
-        self.bone = nn.Parameter(motion.bone.detach()[frame].clone())
+        self.bone = nn.Parameter(stance.bone.repeat(len(frame), 1, 1) if stance else motion.bone.detach()[frame].clone())
         self.turn = Waves(len(frame), motion.bone.shape[1], KNOT_FRAMES).to(problem.device)
 
     def groups(self, rates: Rates) -> list[dict]:
