@@ -30,6 +30,8 @@ EDGE_M = 0.01
 """masks' edges are about this good"""
 STILL = 0.01
 """steps of bones and root below this, radians and decimetres, count as none"""
+TOUCH_M, STRIDE_M = 0.02, 0.06
+"""soles this near to something touch it; those that move by more than this from frame to frame are not held"""
 COVER_M = 0.015
 """a masked pixel is covered when a sample of the posed surface is seen this near to it"""
 MARGIN_M = 0.03
@@ -122,15 +124,19 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
 
 
 def buried_m(problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"]) -> Float[Tensor, "frame point"]:
-    """Measure how deep points lie below the scene's surface as each frame's video saw it: feet stand on the ground.
+    """Measure how deep points lie below the scene's surface: feet stand on the ground."""
+    return functional.relu(-height_m(problem, pose, rigid_torch.apply(pose.world_from_agent, points_agent)))
+
+
+def height_m(problem: Problem, pose: Pose, world: Float[Tensor, "frame point 3"]) -> Float[Tensor, "frame point"]:
+    """Measure how far points are outside the scene's surface as each frame's video saw it.
 
     What is fused tells it near surfaces alone and holds all that was never seen for free: below the floor, the floor tells it.
     """
-    world = rigid_torch.apply(pose.world_from_agent, points_agent)
     video = problem.video[pose.frame][:, None].expand(world.shape[:2])
     video = torch.where(problem.has_scene[pose.frame, None], video, -1)
     outside = problem.scene.distance_at(world.reshape(-1, 3), video.reshape(-1)).view(world.shape[:2])
-    return functional.relu(-torch.minimum(outside, world[..., 1] - problem.floor_m))
+    return torch.minimum(outside, world[..., 1] - problem.floor_m)
 
 
 def bare_m(points_camera: Float[Tensor, "frame point 3"], masked: Rays) -> Float[Tensor, "frame ray"]:
@@ -145,7 +151,7 @@ def bare_m(points_camera: Float[Tensor, "frame point 3"], masked: Rays) -> Float
 
 
 def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: Weights) -> Terms:
-    """Keep bones together where they meet, near rest, and moving smoothly and seldom within runs of consecutive frames."""
+    """Keep bones together where they meet, near rest, and moving smoothly and seldom within runs of consecutive frames, soles planted."""
     rest, joints = problem.body.agent_from_bone_rest, problem.joints
     motion = pose.agent_from_bone @ rigid_torch.inverse(rest)
 
@@ -167,7 +173,22 @@ def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6
         terms["root smoothness"] = (4 * weights.smoothness, path.square().sum(-1))
         terms["still"] = (weights.still, _size(torch.diff(bend, dim=1).square().sum(-1)))
         terms["root still"] = (0.5 * weights.still, _size((step[..., :3, 3] / DECIMETRE).square().sum(-1) + _turned(step)))
+        if problem.scene.fused:
+            terms["planted"] = (weights.planted, slid(problem, pose, run))
     return terms
+
+
+def slid(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run step sole"]:
+    """Tell how far soles move between frames in which they touch something: 0 = not at all, 1 = by much more than `STRIDE_M`.
+
+    Legs that are hidden would go with the body, or swing as they like; 0 for soles in the air.
+    """
+    world = rigid_torch.apply(pose.world_from_agent, problem.body.pose(problem.surface.sole, pose.agent_from_bone))
+    with torch.no_grad():
+        near = torch.exp(-(height_m(problem, pose, world).clamp_min(0) / TOUCH_M).square()) * problem.has_scene[pose.frame, None]
+    touch = near.view(-1, run, near.shape[1])
+    squared = torch.diff(world.view(-1, run, *world.shape[1:]), dim=1).square().sum(-1)
+    return torch.minimum(touch[:, 1:], touch[:, :-1]) * squared / (squared + STRIDE_M**2)
 
 
 def _turned(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:

@@ -20,6 +20,8 @@ TRUSTED = 0.1
 """frames whose masks count less are not looked at together with their neighbours"""
 FIRMEST = 100.0
 """times as firmly as at even odds is a camera held that registration is certain of: losses err by a millimetre and a twentieth of a degree"""
+SOLE = 0.07
+"""soles are below this share of the animal's height"""
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,8 @@ class Surface:
     color: Float[Tensor, "sample 3"]
     """of the nearest surface point"""
     feature: Float[Tensor, "sample 16"]
+    sole: Float[Tensor, "sole 3"]
+    """some of the lowest of ``points``"""
 
     @classmethod
     def of(
@@ -161,6 +165,7 @@ class Surface:
         margin_m: float = 0.25,
         on: int = 4000,
         off: int = 40000,
+        soles: int = 32,
     ) -> "Surface":
         """Sample a template mesh; distances are to the nearest of many surface samples, signed by their normals."""
         corner = mesh.vertices[mesh.faces].astype(np.float64)
@@ -185,7 +190,10 @@ class Surface:
         color = np.einsum("pk,pkc->pc", mix, (mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128))[vertex] / 255)
         features = np.einsum("pk,pkc->pc", mix, feature[vertex].astype(np.float64))
         features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-6)
-        return cls(*(torch.from_numpy(array).float() for array in (points[:on], normal[:on], around, distance, color, features)))
+        points, normal = points[:on], normal[:on]
+        height = points[:, 1] - points[:, 1].min()
+        sole = points[height < SOLE * height.max()][:soles]
+        return cls(*(torch.from_numpy(array).float() for array in (points, normal, around, distance, color, features, sole)))
 
     def to(self, device: str) -> "Surface":
         """Move all to a device."""

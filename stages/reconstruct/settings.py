@@ -44,6 +44,8 @@ class Weights:
     """accelerations of root and bones"""
     still: float = 0.1
     """steps of the bones, not squared: most of the time most of an animal rests; those of the root count half"""
+    planted: float = 0.3
+    """soles that touch something stay where they are, 0 at rest to 1 in motion"""
     rest: float = 0.05
     """bones stay near rest"""
     drift: float = 0.1

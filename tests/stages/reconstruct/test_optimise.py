@@ -232,6 +232,29 @@ def test_below_the_floor_nothing_is_free_however_deep():
     torch.testing.assert_close(shift.grad, -torch.eye(3)[1])
 
 
+def test_soles_that_touch_the_floor_are_drawn_to_where_they_were():
+    """A ball that rolls over the floor of an empty home at 1 cm, then at 1 m a frame, and flies 20 cm above it."""
+    found, _ = problem()
+    free = torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1).expand(2, -1, -1, -1, -1).half()
+    fused = Fused(torch.full((3,), -0.4), 0.1, 0.2, torch.ones(2, 1, 1, 1, dtype=torch.int32), free)
+    field = Field(FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2), free_m=0.1, fused=fused)
+    found = replace(found, scene=field, floor_m=float(found.surface.sole[:, 1].max()))
+    pose, shift = Pose.of(found, found.agent_frames[:3]), torch.tensor([0.0, 0.01, 1.01], requires_grad=True)
+    rolling = torch.stack([shift, torch.zeros(3), torch.zeros(3)], dim=-1)
+
+    def slid(place: torch.Tensor) -> torch.Tensor:
+        return body.slid(found, replace(pose, world_from_agent=rigid_torch.make(torch.eye(3).expand(3, 3, 3), place)), 3)
+
+    step_m = torch.tensor([0.01, 1.0])
+    expected = step_m.square() / (step_m.square() + body.STRIDE_M**2)
+    found_there = slid(rolling)
+    torch.testing.assert_close(found_there, expected.view(1, 2, 1).expand_as(found_there), atol=1e-3, rtol=0)
+    found_there.mean().backward()
+    assert shift.grad[0] < 0 < shift.grad[1], "towards each other"
+    assert shift.grad[2].abs() < 0.05 * shift.grad[1], "a stride is left alone"
+    assert not slid(rolling.detach() + 0.2 * torch.eye(3)[1]).gt(1e-6).any()
+
+
 def test_bones_are_tied_along_limbs_and_not_across_them():
     """Two legs nearer to each other than their own bones: each hangs on its own hip."""
     heights = torch.tensor([0.0, -0.1, -0.2])
