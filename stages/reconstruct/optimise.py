@@ -120,8 +120,10 @@ def _stand(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> N
             losses.append(loss.of_parts(stances.PART, generator_for(plan.seed, index)))
         return frame, torch.stack(losses, dim=-1).cpu().numpy()
 
-    for frame, loss in _in_each(problem, plan, stretches, told, "stances"):
-        chosen[frame] = stances.by_frame(stances.likeliest(loss), len(frame)).to(chosen)
+    losses = list(_in_each(problem, plan, stretches, told, "stances"))
+    usual = float(np.nanmedian(np.concatenate([loss[:, 0] for _, loss in losses])))
+    for frame, loss in losses:
+        chosen[frame] = stances.by_frame(stances.likeliest(loss, usual), len(frame)).to(chosen)
     lean, bone = (torch.stack([getattr(stance, name) for stance in choices]) for name in ("lean", "bone"))
     problem.motion.start(lean[together.total(chosen)], bone[chosen])
 

@@ -81,11 +81,12 @@ class ChunkLoss:
 
     @torch.no_grad()
     def of_parts(self, length: int, generator: Generator) -> Float[Tensor, "part"]:
-        """Return the losses of each ``length`` frames by themselves."""
+        """Return the losses of each ``length`` frames by themselves; NaN where nothing of the agent is seen."""
         pose, twist = self.chunk.pose(self.problem)
         parts = [slice(first, first + length) for first in range(0, len(pose.frame), length)]
         terms = [self._terms(pose.at(part), twist[part], self.seen[part], generator) for part in parts]
-        return torch.stack([sum(each.values()) for each in terms])
+        seen = torch.stack([self.seen[part].any() for part in parts])
+        return torch.stack([sum(each.values()) for each in terms]).where(seen, torch.nan)
 
     def _terms(
         self, pose: Pose, twist: Float[Tensor, "frame twist 6"], seen: Bool[Tensor, "frame"], generator: Generator

@@ -22,6 +22,8 @@ SURE = 0.03
 """so much lower must the losses of a stance be that is not level"""
 CHANGE = 0.03
 """and so much lower to be worth a change"""
+FITS = 1.25
+"""and at most so many times the usual: where nothing fits, as with a wrong heading, the better of two misfits tells nothing"""
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,14 @@ def known(problem: Problem) -> tuple[Stance, ...]:
     return level, Stance(lean, torch.from_numpy(bone).to(level.bone))
 
 
-def likeliest(loss: Float[np.ndarray, "part stance"]) -> Int[np.ndarray, "part"]:
-    """Return the stances of consecutive parts (Viterbi): those of low losses that seldom change, level if in doubt."""
+def likeliest(loss: Float[np.ndarray, "part stance"], usual: float) -> Int[np.ndarray, "part"]:
+    """Return the stances of consecutive parts (Viterbi): those of low losses that seldom change, level if in doubt.
+
+    Of parts without the agent nothing is known (NaN). The ``usual`` loss is that of level ones.
+    """
     stances = np.arange(loss.shape[1])
-    cost = loss + SURE * (stances > 0)
+    cost = np.nan_to_num(loss) + SURE * (stances > 0)
+    cost[:, 1:][loss[:, 1:] > FITS * usual] = np.inf
     change = CHANGE * (stances[:, None] != stances)
     total, came = cost[0], []
     for each in cost[1:]:

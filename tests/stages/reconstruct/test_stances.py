@@ -18,8 +18,16 @@ HALF_M = np.array([0.1, 0.1, 0.3])
 def test_a_stance_must_be_sure_and_lasts():
     level, raised = np.full(6, 0.2), np.full(6, 0.2)
     raised[[1, 3, 4]] -= [0.05, 0.08, 0.08]
-    assert stances.likeliest(np.stack([level, raised], -1)).tolist() == [0, 0, 0, 1, 1, 0]
-    assert stances.likeliest(np.stack([level, level - stances.SURE], -1)).tolist() == [0] * 6
+    assert stances.likeliest(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
+    assert stances.likeliest(np.stack([level, level - stances.SURE], -1), 0.2).tolist() == [0] * 6
+
+
+def test_the_better_of_two_misfits_tells_nothing():
+    loss = np.tile([0.8, 0.5], (6, 1))
+    assert stances.likeliest(loss, 0.39).tolist() == [0] * 6
+    assert stances.likeliest(loss, 0.5).tolist() == [1] * 6
+    loss[2] = np.nan
+    assert stances.likeliest(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
 
 
 def test_parts_are_told_by_frame():
