@@ -25,12 +25,13 @@ ROOM_M, RADIUS_M = 1.5, 0.2
 SHAPES = Shapes(scene_voxel_m=(0.4, 0.2), agent_voxel_m=(0.1, 0.05), width=32, knot_frames=4)
 
 
-def cast(origin, direction, ball_centre):
-    """Return z-depth and whether the ball is hit, inside a cube room."""
+def cast(origin, direction, world_from_agent, half_m):
+    """Return z-depth and whether the animal is hit, an ellipsoid with these half axes, inside a cube room."""
     with np.errstate(divide="ignore"):
         wall = np.min(np.where(direction > 0, (ROOM_M - origin) / direction, (-ROOM_M - origin) / direction), axis=-1)
-    to_ball = origin - ball_centre
-    a, b, c = (direction**2).sum(-1), (direction * to_ball).sum(-1), (to_ball**2).sum(-1) - RADIUS_M**2
+    own = world_from_agent[:3, :3] / half_m
+    toward, to_ball = direction @ own, (origin - world_from_agent[:3, 3]) @ own
+    a, b, c = (toward**2).sum(-1), (toward * to_ball).sum(-1), (to_ball**2).sum(-1) - 1
     root = b * b - a * c
     near = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
     hit = (near > 0) & (near < wall)
@@ -39,25 +40,30 @@ def cast(origin, direction, ball_centre):
 
 def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> Video:
     """Film the ball as it moves along x; the turnaround's world is the ball."""
+    root = np.tile(np.eye(4), (frames, 1, 1))
+    if has_scene:
+        root[:, 0, 3] = 0.03 * np.arange(frames)
+    registered = root @ rigid.make(np.eye(3), np.array([0.03, -0.03, 0.02])) if has_scene else root
+    return film_animal(id, root, registered, RADIUS_M, has_scene, rng, size)
+
+
+def film_animal(id: str, root, registered, half_m: float | np.ndarray, has_scene: bool, rng, size=WIDE) -> Video:
+    """Film an ellipsoid of these half axes from all around as its root moves; registration has it elsewhere."""
+    frames = len(root)
     height, width = size[0] * 4, size[1] * 4
     intrinsics = np.array([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
     directions = cameras.ray_directions(intrinsics, height, width).reshape(-1, 3)
-    rays, depths, outside, camera, root = [], [], [], [], []
+    rays, depths, outside, camera = [], [], [], []
     for frame in range(frames):
-        centre = np.array([0.03 * frame, 0, 0]) if has_scene else np.zeros(3)
         angle = 0.4 * frame
         eye = np.array([np.cos(angle), 0.3, np.sin(angle)])
-        camera.append(rigid.look_at(eye, centre, np.array([0.0, 1, 0])))
-        root.append(rigid.make(np.eye(3), centre))
-        depth, hit = cast(eye, directions @ camera[-1][:3, :3].T, centre)
+        camera.append(rigid.look_at(eye, root[frame, :3, 3], np.array([0.0, 1, 0])))
+        depth, hit = cast(eye, directions @ camera[-1][:3, :3].T, root[frame], half_m)
         chosen = np.concatenate([rng.choice(np.flatnonzero(~hit), 60), rng.choice(np.flatnonzero(hit), 40)])
         rays.append((frame, directions[chosen], depth[chosen], hit[chosen]))
         depths.append(depth.reshape(height, width)[2::4, 2::4])
         outside.append(distance_outside(np.where(hit, AGENT, NOT_AGENT).astype(np.uint8).reshape(height, width), size))
     store = pack(rays, depths, outside, intrinsics, has_scene)
-    registered = np.stack(root)
-    if has_scene:
-        registered = registered @ rigid.make(np.eye(3), np.array([0.03, -0.03, 0.02]))
     ones = np.ones(frames, bool)
     return Video(id, np.arange(frames) * 0.1, np.stack(camera), registered, ones.astype(float), ones, has_scene, has_scene, store)
 
