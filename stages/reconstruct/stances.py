@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline import viterbi
 from pipeline.space import rigid, rigid_torch
 from stages.reconstruct import limbs
 from stages.reconstruct.problem import Problem
@@ -58,15 +59,7 @@ def likeliest(loss: Float[np.ndarray, "part stance"], usual: float) -> Int[np.nd
     cost = np.nan_to_num(loss) + SURE * (stances > 0)
     cost[:, 1:][loss[:, 1:] > FITS * usual] = np.inf
     change = CHANGE * (stances[:, None] != stances)
-    total, came = cost[0], []
-    for each in cost[1:]:
-        reached = total[:, None] + change
-        came.append(reached.argmin(0))
-        total = reached.min(0) + each
-    found = [int(total.argmin())]
-    for back in reversed(came):
-        found.append(int(back[found[-1]]))
-    return np.array(found[::-1])
+    return viterbi.cheapest(cost, lambda _: change)
 
 
 def by_frame(stance: Int[np.ndarray, "part"], frames: int) -> Int[Tensor, "frame"]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipeline import viterbi
+
 
 @dataclass(frozen=True)
 class HeadingOptions:
@@ -74,17 +76,13 @@ def path(timestamp_s: Float[np.ndarray, "frame"], candidates: list[Candidates], 
     moves, weight = pace(timestamp_s, candidates, options.still_weight), weights(candidates, options)
     spoken = [_own_cost(each, grid, moves, index, options) * weight[index] for index, each in enumerate(candidates)]
     turn = (wrap(grid[:, None] - grid[None]) / np.deg2rad(options.turn_deg)) ** 2
-    totals, back = spoken[0], []
-    for index in range(1, len(candidates)):
+
+    def turned(index: int) -> Float[np.ndarray, "before after"]:
         elapsed = timestamp_s[candidates[index].frame] - timestamp_s[candidates[index - 1].frame]
         tenths = max(elapsed / 0.1, 1.0)
-        step = totals[:, None] + np.minimum(turn / tenths, options.flip_cost / np.sqrt(tenths))
-        back.append(step.argmin(0))
-        totals = step.min(0) + spoken[index]
-    chosen = [int(totals.argmin())]
-    for pointers in reversed(back):
-        chosen.append(int(pointers[chosen[-1]]))
-    return grid[chosen[::-1]]
+        return np.minimum(turn / tenths, options.flip_cost / np.sqrt(tenths))
+
+    return grid[viterbi.cheapest(spoken, turned)]
 
 
 def weights(candidates: list[Candidates], options: HeadingOptions) -> Float[np.ndarray, "glimpse"]:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline import viterbi
 from stages.segment_agent.free_space import Votes
 
 HINT_REWARD = 1000.0
@@ -120,24 +121,15 @@ def track(
 
     A hint outweighs everything else in its frame.
     """
-    best, back = [np.zeros(1)], []
-    for index, group in enumerate(found):
-        score = np.array([0.0] + [_score(candidate, options) for candidate in group])
-        if hint is not None and hint.frame == index:
-            score[1:] += [HINT_REWARD * _meant(candidate, hint) for candidate in group]
-        if index == 0:
-            best = [score - options.appear_cost * (np.arange(len(score)) > 0)]
-            back.append(np.zeros(len(score), int))
-            continue
-        step = _transition(found[index - 1], group, timestamp_s[index] - timestamp_s[index - 1], options)
-        total = best[-1][:, None] + step
-        back.append(total.argmax(0))
-        best.append(total.max(0) + score)
-    choice = np.zeros(len(found), int)
-    choice[-1] = best[-1].argmax()
-    for index in range(len(found) - 1, 0, -1):
-        choice[index - 1] = back[index][choice[index]]
-    return choice - 1
+    scores = [np.array([0.0] + [_score(candidate, options) for candidate in group]) for group in found]
+    if hint is not None and hint.frame in range(len(found)):
+        scores[hint.frame][1:] += [HINT_REWARD * _meant(candidate, hint) for candidate in found[hint.frame]]
+    scores[0][1:] -= options.appear_cost
+
+    def change(index: int) -> Float[np.ndarray, "before after"]:
+        return -_transition(found[index - 1], found[index], timestamp_s[index] - timestamp_s[index - 1], options)
+
+    return viterbi.cheapest([-score for score in scores], change) - 1
 
 
 def connected(
