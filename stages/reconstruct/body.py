@@ -47,7 +47,7 @@ class Pose:
     world_from_agent: Float[Tensor, "frame 4 4"]
     agent_from_bone: Float[Tensor, "frame bone 4 4"]
     world_from_initial: Float[Tensor, "frame 4 4"]
-    """where the agent's root is expected: as posing found it, before corrections"""
+    """where the agent's root starts, to which priors draw it: as registered, leaning if it sits"""
 
     @property
     def agent_from_camera(self) -> Float[Tensor, "frame 4 4"]:
