@@ -102,7 +102,7 @@ def _without_strays(points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndar
 
 
 def extract(volume: Volume, share_beside: Float[np.ndarray, "x y z"], below_ground: Bool[np.ndarray, "x y z"], options: Fusion) -> Body:
-    """Close the fused volume and return its largest body, smoothed and thinned.
+    """Close the fused volume and return its largest body, smoothed and with fewer vertices, but as large as it was.
 
     Where depth was fused it decides unless most frames see through; elsewhere a cell is inside that hardly any frame
     sees through.
@@ -116,7 +116,9 @@ def extract(volume: Volume, share_beside: Float[np.ndarray, "x y z"], below_grou
     own = scipy.ndimage.binary_fill_holes(own)
     distance = np.where(own, np.minimum(distance, -0.05), np.maximum(distance, 0.05))
     distance = scipy.ndimage.gaussian_filter(distance, options.smooth_voxels)
-    vertices, faces, _, _ = measure.marching_cubes(distance, 0.0)
+    cells = int((own & scipy.ndimage.binary_dilation(distance < 0)).sum())
+    as_large = np.partition(distance, cells, axis=None)[cells]  # smoothing eats what is round, and should eat scraps alone
+    vertices, faces, _, _ = measure.marching_cubes(distance, as_large)
     origin = volume.origin - options.voxel_m
     surface = max(trimesh.Trimesh(vertices, faces).split(only_watertight=False), key=lambda part: len(part.faces))
     trimesh.smoothing.filter_taubin(surface, iterations=6)
