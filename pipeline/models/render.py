@@ -81,7 +81,7 @@ class Picture:
 class Renderer:
     """Draws views of a reconstruction as one video saw it; build once per video, draw often."""
 
-    def __init__(self, reconstruction: Reconstruction, video: str | None = None, agent_step_m: float = 0.01):
+    def __init__(self, reconstruction: Reconstruction, video: str | None = None, agent_step_m: float = 0.0075):
         """``video`` chooses the scene's code (None: the shared scene); the step is the resolution of the agent's mesh."""
         self.reconstruction = reconstruction
         self.code = reconstruction.video_code(video)

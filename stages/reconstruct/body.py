@@ -205,8 +205,8 @@ def _occluders(
     depth: Float[Tensor, "frame height width"], outside_px: Float[Tensor, "frame height width"]
 ) -> Float[Tensor, "frame height width"]:
     """Fill what is not known of thumbnails with the nearest that is measured beside it, but on the agent: edges have no depth."""
-    beside = torch.where((depth > 0) & (outside_px > 0), -depth, -math.inf)
-    nearest = -functional.max_pool2d(beside[:, None], 3, stride=1, padding=1)[:, 0]
+    beside = functional.pad(torch.where((depth > 0) & (outside_px > 0), depth, math.inf), (1, 1, 1, 1), value=math.inf)
+    nearest = beside.unfold(1, 3, 1).amin(-1).unfold(2, 3, 1).amin(-1)
     return torch.where((depth > 0) | nearest.isinf(), depth, nearest)
 
 

@@ -94,11 +94,11 @@ class Batches:
     """frames of each stretch"""
     agent_rays: int = 32
     """rays on the agent per frame and step"""
-    posed_rays: int = 48
+    posed_rays: int = 96
     """the same while the template is posed"""
     surface_points: int = 96
     """points of the agent's surface per frame and step"""
-    posed_points: int = 192
+    posed_points: int = 384
     """and while the template is posed"""
     near: int = 4
     """samples of a ray near its measured depth"""
