@@ -4,7 +4,6 @@ They serve twice: `posing` poses the template to the frames before the field lea
 terms while everything learns.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -101,10 +100,10 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
     posed = problem.body.pose(problem.surface.points[chosen], pose.agent_from_bone)
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
-    depths, masks, size_px = views.depth[pose.frame].float(), views.outside_px[pose.frame].float(), views.size_px[pose.frame]
-    outside_px = _bilinear(masks, pixel, size_px)
+    size_px = views.size_px[pose.frame]
+    outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel, size_px)
     with torch.no_grad():
-        measured, nearest = _nearest(depths, pixel), _nearest(_occluders(depths, masks), pixel)
+        measured, nearest = (_nearest(each[pose.frame].float(), pixel) for each in (views.depth, views.occluder))
         inside_picture = ((pixel >= 0) & (pixel <= size_px[:, None])).all(-1)
         in_view = inside_picture & (depth > 0.1)
         hidden = (nearest > 0) & (nearest < depth - MARGIN_M)
@@ -199,15 +198,6 @@ def _turned(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
 def _size(squared: Float[Tensor, "*step"]) -> Float[Tensor, "*step"]:
     """Turn squares to lengths, smooth at 0: what rests most of the time may leap at others."""
     return (squared.clamp_min(0) + STILL**2).sqrt() - STILL
-
-
-def _occluders(
-    depth: Float[Tensor, "frame height width"], outside_px: Float[Tensor, "frame height width"]
-) -> Float[Tensor, "frame height width"]:
-    """Fill what is not known of thumbnails with the nearest that is measured beside it, but on the agent: edges have no depth."""
-    beside = functional.pad(torch.where((depth > 0) & (outside_px > 0), depth, math.inf), (1, 1, 1, 1), value=math.inf)
-    nearest = beside.unfold(1, 3, 1).amin(-1).unfold(2, 3, 1).amin(-1)
-    return torch.where((depth > 0) | nearest.isinf(), depth, nearest)
 
 
 def _bilinear(

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, Int, Int8, UInt8
 from numpy.random import Generator
+from scipy.ndimage import minimum_filter
 from torch import Tensor
 from torch.nn import functional
 
@@ -77,6 +78,8 @@ class Views:
     """metres, half precision; 0 = unknown"""
     outside_px: Float[Tensor, "frame height width"]
     """colour pixels outside the agent's mask, negative inside, half precision; `FAR_PX` = farther or no mask"""
+    occluder: Float[Tensor, "frame height width"]
+    """depth of what may hide the agent (`occluder_depth`)"""
     agent_seen: Bool[Tensor, "frame"]
     """the mask of this frame can be trusted"""
 
@@ -129,7 +132,7 @@ class Source:
 
 def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
     """Read every frame of a video once; frames count from 0."""
-    scene, agent, depths, outsides = [], [], [], []
+    scene, agent, depths, outsides, occluders = [], [], [], [], []
     for frame in range(len(source.clip)):
         depth, slope = trusted_depth(source.clip, frame)
         mask = source.masks[frame] if source.masks is not None else np.zeros(source.clip.color_size, np.uint8)
@@ -144,12 +147,14 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
         small = tuple(size // THUMBNAIL for size in mask.shape)
         depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16))
         outsides.append(distance_outside(mask, small) if seen else np.full(small, FAR_PX, np.float16))
+        occluders.append(occluder_depth(depths[-1], outsides[-1]))
     visible = source.masks.visible if source.masks is not None else np.zeros(len(source.clip), bool)
     views = Views(
         torch.from_numpy(source.clip.intrinsics).float(),
         torch.tensor(source.clip.color_size[::-1]).float().expand(len(source.clip), 2),
         torch.from_numpy(np.stack(depths)),
         torch.from_numpy(np.stack(outsides)),
+        torch.from_numpy(np.stack(occluders)),
         torch.from_numpy(visible.astype(bool)),
     )
     return Store(_concatenate(scene), _concatenate(agent), views)
@@ -180,7 +185,8 @@ def join(stores: Iterable[Store], folder: Path | None, size: tuple[int, int] | N
 def _padded(views: Views, height: int, width: int) -> Views:
     """Widen thumbnails to the right and below with unknown depth and no mask: recordings may be upright or wide."""
     edge = (0, width - views.depth.shape[2], 0, height - views.depth.shape[1])
-    return replace(views, depth=functional.pad(views.depth, edge), outside_px=functional.pad(views.outside_px, edge, value=FAR_PX))
+    depth, occluder = functional.pad(views.depth, edge), functional.pad(views.occluder, edge)
+    return replace(views, depth=depth, occluder=occluder, outside_px=functional.pad(views.outside_px, edge, value=FAR_PX))
 
 
 def _shift(rays: Rays, start: int) -> Rays:
@@ -204,6 +210,15 @@ def _concatenate(parts: Sequence[Rays]) -> Rays:
             signed,
         )
     return Rays(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Rays)))
+
+
+def occluder_depth(
+    depth: Float[np.ndarray, "height width"], outside_px: Float[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width"]:
+    """Fill what is not known of a thumbnail with the nearest that is measured beside it, but on the agent: edges have no depth."""
+    beside = np.where((depth > 0) & (outside_px > 0), depth, np.inf)
+    nearest = minimum_filter(beside.astype(np.float32), 3, mode="constant", cval=np.inf)
+    return np.where((depth > 0) | np.isinf(nearest), depth, nearest).astype(depth.dtype)
 
 
 def trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:

@@ -80,7 +80,8 @@ def test_only_what_was_looked_through_speaks_against():
     depth = torch.full((1, 30, 40), 3.0)
     depth[:, :, 20:] = 1.0
     intrinsics = torch.tensor([[[100.0, 0, 80], [0, 100.0, 60], [0, 0, 1]]])
-    views = Views(intrinsics, torch.tensor([[160.0, 120.0]]), depth.half(), torch.zeros_like(depth).half(), torch.ones(1, dtype=torch.bool))
+    thumbnails = depth.half(), torch.zeros_like(depth).half(), depth.half()
+    views = Views(intrinsics, torch.tensor([[160.0, 120.0]]), *thumbnails, torch.ones(1, dtype=torch.bool))
     stand = Stand.of(0.05 * torch.randn(32, 3, generator=torch.Generator().manual_seed(0)))
     place = np.array([[-0.5, 0, 2.0], [0.5, 0, 2.0], [0.2, 0, 0.6], [-0.5, 0, -2.0], [-5.0, 0, 2.0]])
     cameras = torch.eye(4).expand(1, 4, 4)

@@ -16,7 +16,7 @@ from stages.reconstruct import assemble, body, optimise, results
 from stages.reconstruct.assemble import Shapes, Template, Video
 from stages.reconstruct.body import Pose
 from stages.reconstruct.problem import Joints, RaysByFrame
-from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, Store, Views, distance_outside
+from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, Store, Views, distance_outside, occluder_depth
 from stages.reconstruct.settings import Batches, Rates, Steps, Weights
 
 WIDE, UPRIGHT = (24, 32), (32, 24)
@@ -84,7 +84,8 @@ def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
     views = Views(
         torch.from_numpy(intrinsics).float().repeat(frames, 1, 1), torch.tensor([width * 4.0, height * 4.0]).repeat(frames, 1),
         torch.from_numpy(np.stack(depths)).half(),
-        torch.from_numpy(np.stack(outside)), torch.ones(frames, dtype=torch.bool),
+        torch.from_numpy(np.stack(outside)), torch.from_numpy(np.stack(list(map(occluder_depth, depths, outside)))).half(),
+        torch.ones(frames, dtype=torch.bool),
     )  # fmt: skip
     return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
 
@@ -193,14 +194,18 @@ def test_what_pads_pictures_says_nothing():
 
 def test_where_depth_ends_at_something_nearer_the_surface_may_be_hidden():
     found, _ = problem()
-    free, views = beside(found, 0.15)["outside"], found.store.views
-    shown = views.outside_px[:4].float() < 0
-    edge = torch.nonzero(shown.any(0).any(0)).max() + 1
-    views.depth[:4, :, edge:] = 0.3
-    hidden = beside(found, 0.15)["outside"]
+    views = found.store.views
+    edge = torch.nonzero((views.outside_px[:4] < 0).any(0).any(0)).max() + 1
+
+    def outside(column: slice | int, depth_m: float):
+        views.depth[:4, :, column] = depth_m
+        for frame in range(4):
+            views.occluder[frame] = torch.from_numpy(occluder_depth(views.depth[frame].numpy(), views.outside_px[frame].numpy()))
+        return beside(found, 0.15)["outside"]
+
+    free, hidden = beside(found, 0.15)["outside"], outside(slice(edge, None), 0.3)
     assert len(hidden) < 0.9 * len(free)
-    views.depth[:4, :, edge] = 0
-    assert torch.equal(beside(found, 0.15)["outside"], hidden), "sensors do not measure along edges"
+    assert torch.equal(outside(edge, 0.0), hidden), "sensors do not measure along edges"
 
 
 def test_what_is_buried_in_the_ground_is_lifted():
