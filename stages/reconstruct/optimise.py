@@ -109,8 +109,10 @@ def _pose(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> No
 
 
 def _stand(problem: Problem, plan: Plan, stretches: Sequence[torch.Tensor]) -> None:
-    """Find in all stretches with usable frames how the agent stands, and let its roots start so."""
+    """Find in all stretches with usable frames how the agent stands, by half as many rays as pose it, and let its roots start so."""
     choices, chosen = stances.known(problem), torch.zeros_like(problem.video)
+    batches = plan.batches
+    plan = replace(plan, batches=replace(batches, posed_rays=batches.posed_rays // 2, posed_points=batches.posed_points // 2))
 
     def told(index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> tuple[torch.Tensor, np.ndarray]:
         losses = []
