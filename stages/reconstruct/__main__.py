@@ -44,7 +44,7 @@ class Config:
     """how depth is fused"""
     agent_step_m: float = 0.01
     """resolution of the extracted agent, metres"""
-    longest_gap_s: float = 2.0
+    longest_gap_s: float = 0.75
     """the agent's pose is trusted over gaps up to this long, seconds; over longer ones it is inferred, of low confidence"""
 
 
