@@ -44,8 +44,8 @@ class Config:
     """how depth is fused"""
     agent_step_m: float = 0.01
     """resolution of the extracted agent, metres"""
-    longest_gap_s: float = 0.75
-    """the agent's pose is trusted over gaps up to this long, seconds; over longer ones it is inferred, of low confidence"""
+    gaps: results.Gaps = results.Gaps()
+    """how moments without a view of the agent are crossed"""
 
 
 def run(task: cli.Task) -> None:
@@ -67,7 +67,7 @@ def run(task: cli.Task) -> None:
     if not together.leave():
         return
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
-    motions = hidden.inferred(problem, videos, results.motions(problem, videos, config.longest_gap_s))
+    motions = hidden.inferred(problem, videos, results.motions(problem, videos, config.gaps))
     sessions = [video.id for video in videos if video.camera_free]
     scene, agent = results.scene_surface(problem), results.agent_surface(problem, config.agent_step_m)
     with task.create() as folder:

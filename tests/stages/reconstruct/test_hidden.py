@@ -96,14 +96,14 @@ def test_only_what_was_looked_through_speaks_against():
 
 def test_every_frame_of_a_session_gets_a_pose_and_says_when_it_is_inferred():
     found, videos = problem()
-    motion = results.motions(found, videos, 1.0)["v002"]
+    motion = results.motions(found, videos, results.Gaps(longest_s=1.0))["v002"]
     seen = np.ones(12, bool)
     seen[:2] = seen[4:10] = False
     root, when = motion.world_from_agent.copy(), motion.timestamp_s * 5
     root[~seen] = np.nan
     motions = {"v002": replace(motion, timestamp_s=when, world_from_agent=root, agent_visible=seen)}
     videos = [replace(video, timestamp_s=when) if video.id == "v002" else video for video in videos]
-    motions["v001"] = results.motions(found, videos, 1.0)["v001"]
+    motions["v001"] = results.motions(found, videos, results.Gaps(longest_s=1.0))["v001"]
     filled = hidden.inferred(found, videos, motions)
     made = filled["v002"]
     assert np.isfinite(made.world_from_agent).all() and np.isfinite(made.agent_from_bone).all()

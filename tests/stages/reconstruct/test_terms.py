@@ -72,6 +72,11 @@ def test_short_gaps_are_bridged_and_long_ones_are_not():
     found, _ = results.bridged(time, garbled, garbled[:, None], good, longest_gap_s=1.0)
     np.testing.assert_allclose(found[:20], root[:20], atol=1e-9)
     assert np.isnan(found[20:36]).all() and np.isfinite(found[36:]).all()
+    gaps_s = results.gaps_s(time, good)
+    np.testing.assert_allclose(gaps_s[5:9], 0.5)
+    np.testing.assert_allclose(gaps_s[20:36], 1.7)
+    assert (gaps_s[good] == 0).all()
+    assert (results.gaps_s(time, time < 1)[10:] == np.inf).all()
 
 
 def test_surface_of_a_ball_is_closed_and_looks_outwards():
