@@ -68,6 +68,13 @@ def load(path: Path) -> Motion:
     return Motion(**arrays.load(path, tuple(Motion.__dataclass_fields__)))
 
 
+def gaps_s(timestamp_s: Float[np.ndarray, "frame"], good: Bool[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
+    """Tell how far apart in time the good frames around each frame are: 0 for good ones, without end where one side has none."""
+    when = np.concatenate([[-np.inf], timestamp_s[good], [np.inf]])
+    after = np.searchsorted(when, timestamp_s)
+    return np.where(good, 0.0, when[after] - when[after - 1])
+
+
 class MotionTable(nn.Module):
     """Poses of all frames of all videos, one after the other, with learned corrections.
 

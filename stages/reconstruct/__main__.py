@@ -67,7 +67,7 @@ def run(task: cli.Task) -> None:
     if not together.leave():
         return
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
-    motions = hidden.inferred(problem, videos, results.motions(problem, videos, config.gaps))
+    motions = hidden.inferred(problem, videos, results.motions(problem, videos, config.gaps.longest_s), config.gaps.certain_s)
     sessions = [video.id for video in videos if video.camera_free]
     scene, agent = results.scene_surface(problem), results.agent_surface(problem, config.agent_step_m)
     with task.create() as folder:

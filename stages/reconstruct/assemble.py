@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pipeline.models.fields import Body, Field, FieldShape
 from pipeline.models.fused import Fused
-from pipeline.models.motion import MotionTable
+from pipeline.models.motion import MotionTable, gaps_s
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.reconstruct.limbs import Limbs
@@ -210,9 +210,7 @@ def steadied(video: Video, doubt: Doubt) -> tuple[Float[np.ndarray, "frame 4 4"]
     if certain.sum() < 2:
         return root, kept
     certain_s = when[certain]
-    after = np.searchsorted(certain_s, when).clip(1, len(certain_s) - 1)
-    near = (when > certain_s[0]) & (when < certain_s[-1]) & (certain_s[after] - certain_s[after - 1] <= doubt.longest_gap_s)
-    doubted = np.flatnonzero(known & ~certain & near)
+    doubted = np.flatnonzero(known & ~certain & (gaps_s(when, certain) <= doubt.longest_gap_s))
     between = rigid.interpolate(certain_s, root[certain], when[doubted])
     far = np.linalg.norm(root[doubted, :3, 3] - between[:, :3, 3], axis=1) > doubt.farthest_m
     root[doubted[far]], kept[doubted[far]] = between[far], False

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.models.motion import DOUBTFUL, INFERRED, Motion
+from pipeline.models.motion import DOUBTFUL, INFERRED, Motion, gaps_s
 from pipeline.space import rigid
 from stages.reconstruct import sightings
 from stages.reconstruct.assemble import Video, scene_first
@@ -47,13 +47,16 @@ class Known:
     """hardly ever is it seen nearer to the phone, along the ground"""
 
 
-def inferred(problem: Problem, videos: Sequence[Video], motions: Mapping[str, Motion]) -> dict[str, Motion]:
-    """Fill hidden stretches of all recordings that show the agent in its home; frames without a pose get `INFERRED` confidence."""
+def inferred(problem: Problem, videos: Sequence[Video], motions: Mapping[str, Motion], certain_gap_s: float) -> dict[str, Motion]:
+    """Fill hidden stretches of all recordings that show the agent in its home.
+
+    Frames in gaps longer than ``certain_gap_s``, filled here or before, get `INFERRED` confidence.
+    """
     ordered = scene_first(videos)
     first = dict(zip((video.id for video in ordered), np.cumsum([0, *(len(video.timestamp_s) for video in ordered)]), strict=False))
     shown = [video.id for video in ordered if video.has_scene and seen(motions[video.id]).any()]
     known = _known(problem, [motions[id] for id in shown]) if shown else None
-    return {id: _filled(problem, known, motion, int(first[id])) if id in shown else motion for id, motion in motions.items()}
+    return {id: _filled(problem, known, motion, int(first[id]), certain_gap_s) if id in shown else motion for id, motion in motions.items()}
 
 
 def seen(motion: Motion) -> Bool[np.ndarray, "frame"]:
@@ -86,7 +89,7 @@ def _longest_walk(motions: Sequence[Motion]) -> tuple[Float[np.ndarray, "frame b
     return best
 
 
-def _filled(problem: Problem, known: Known, motion: Motion, first: int) -> Motion:
+def _filled(problem: Problem, known: Known, motion: Motion, first: int, certain_gap_s: float) -> Motion:
     """Fill one recording's stretches, whose frames begin at ``first``."""
     good, when = seen(motion), motion.timestamp_s
     root, bones = motion.world_from_agent.copy(), motion.agent_from_bone.copy()
@@ -99,7 +102,8 @@ def _filled(problem: Problem, known: Known, motion: Motion, first: int) -> Motio
             inside = stretch - begin
             root[stretch] = _roots(when[begin : end + 1], place, moves, *ends)[inside]
             bones[stretch] = _bones(known, motion, good, begin, place, moves)[inside]
-    confidence = np.where(unknown, np.minimum(motion.confidence, INFERRED), motion.confidence)
+    guessed = gaps_s(when, good) > certain_gap_s
+    confidence = np.where(guessed, np.minimum(motion.confidence, INFERRED), motion.confidence)
     return replace(motion, world_from_agent=root, agent_from_bone=bones, confidence=confidence)
 
 

@@ -1,8 +1,8 @@
 """Turn recordings into a compact store of rays, so that fitting never opens a picture again.
 
 `collect` reads each frame of one video once and keeps a few pixels of it: some anywhere, some on and around the
-agent. `Views` also keeps a thumbnail per frame (depth, distance from the agent's mask) to test the posed surface
-against. `join` strings the videos together on one frame axis.
+agent. `Views` also keeps thumbnails of each frame (depth, distance from the agent's mask, what may hide it) to test the
+posed surface against. `join` strings the videos together on one frame axis.
 """
 
 import functools

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial import cKDTree
 
 from pipeline.models import surfaces
-from pipeline.models.motion import INFERRED, Motion
+from pipeline.models.motion import Motion, gaps_s
 from pipeline.space import rigid
 from pipeline.space.meshes import Mesh
 from stages.reconstruct.assemble import Video, scene_first
@@ -38,12 +38,12 @@ class Gaps:
     longest_s: float = 2.0
     """its pose is interpolated over gaps up to this long; over longer ones it is inferred"""
     certain_s: float = 0.75
-    """over gaps longer than this it has little confidence, either way"""
+    """over gaps longer than this it has `INFERRED` confidence, either way"""
 
 
 @torch.no_grad()
-def motions(problem: Problem, videos: Sequence[Video], gaps: Gaps) -> dict[str, Motion]:
-    """Return each video's motion (the turnaround's world is the agent); poses of the agent are NaN in gaps too long to interpolate."""
+def motions(problem: Problem, videos: Sequence[Video], longest_gap_s: float) -> dict[str, Motion]:
+    """Return each video's motion (the turnaround's world is the agent); poses of the agent are interpolated over gaps up to ``longest_gap_s``."""
     found, table = {}, problem.motion
     known = torch.zeros(len(problem.video), dtype=torch.bool)
     known[problem.agent_frames.cpu()] = True
@@ -52,12 +52,10 @@ def motions(problem: Problem, videos: Sequence[Video], gaps: Gaps) -> dict[str, 
         root = table.world_from_agent(frame).double().cpu().numpy()
         bones = table.agent_from_bone(frame).double().cpu().numpy()
         good = known[frame.cpu()].numpy()
-        root, bones = bridged(video.timestamp_s, root, bones, good, gaps.longest_s)
+        root, bones = bridged(video.timestamp_s, root, bones, good, longest_gap_s)
         camera = table.world_from_camera(frame).double().cpu().numpy()
         camera[~np.isfinite(video.world_from_camera).all((1, 2))] = np.nan
-        guessed = np.isfinite(root).all((1, 2)) & (gaps_s(video.timestamp_s, good) > gaps.certain_s)
-        confidence = np.where(guessed, np.minimum(video.confidence, INFERRED), video.confidence)
-        found[video.id] = Motion(video.timestamp_s, camera, root, bones, confidence, video.agent_visible & good)
+        found[video.id] = Motion(video.timestamp_s, camera, root, bones, video.confidence, video.agent_visible & good)
     return found
 
 
@@ -79,13 +77,6 @@ def bridged(
         bones[~good, bone] = rigid.interpolate(when, bones[good, bone], timestamp_s[~good])
     root[gaps_s(timestamp_s, good) > longest_gap_s] = np.nan
     return root, bones
-
-
-def gaps_s(timestamp_s: Float[np.ndarray, "frame"], good: Bool[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
-    """Tell how far apart in time the good frames around each frame are: 0 for good ones, without end where one side has none."""
-    when = np.concatenate([[-np.inf], timestamp_s[good], [np.inf]])
-    after = np.searchsorted(when, timestamp_s)
-    return np.where(good, 0.0, when[after] - when[after - 1])
 
 
 def scene_surface(problem: Problem, reach_m: float = 0.045) -> Mesh:

@@ -96,20 +96,25 @@ def test_only_what_was_looked_through_speaks_against():
 
 def test_every_frame_of_a_session_gets_a_pose_and_says_when_it_is_inferred():
     found, videos = problem()
-    motion = results.motions(found, videos, results.Gaps(longest_s=1.0))["v002"]
+    motion = results.motions(found, videos, 1.0)["v002"]
     seen = np.ones(12, bool)
     seen[:2] = seen[4:10] = False
     root, when = motion.world_from_agent.copy(), motion.timestamp_s * 5
     root[~seen] = np.nan
     motions = {"v002": replace(motion, timestamp_s=when, world_from_agent=root, agent_visible=seen)}
     videos = [replace(video, timestamp_s=when) if video.id == "v002" else video for video in videos]
-    motions["v001"] = results.motions(found, videos, results.Gaps(longest_s=1.0))["v001"]
-    filled = hidden.inferred(found, videos, motions)
+    motions["v001"] = results.motions(found, videos, 1.0)["v001"]
+    filled = hidden.inferred(found, videos, motions, 0.75)
     made = filled["v002"]
     assert np.isfinite(made.world_from_agent).all() and np.isfinite(made.agent_from_bone).all()
     np.testing.assert_array_equal(made.world_from_agent[seen], root[seen])
     assert (made.confidence[~seen] <= INFERRED).all() and (made.confidence[seen] == motion.confidence[seen]).all()
     np.testing.assert_array_equal(made.agent_known, seen)
+    crossed = {**motions, "v002": replace(motions["v002"], world_from_agent=motion.world_from_agent)}
+    for certain_s, known in ((0.75, seen), (4.0, seen | (np.arange(12) > 2))):
+        bridged = hidden.inferred(found, videos, crossed, certain_s)["v002"]
+        np.testing.assert_array_equal(bridged.world_from_agent, motion.world_from_agent)
+        np.testing.assert_array_equal(bridged.agent_known, known, "crossed by a line, and as little certain where that is long")
     turned = made.world_from_agent[:, :3, :3]
     np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), np.tile(np.eye(3), (12, 1, 1)), atol=1e-5)
     np.testing.assert_array_equal(filled["v001"].confidence, motions["v001"].confidence)

@@ -136,7 +136,7 @@ def test_room_and_ball_are_found(solved):
 def test_posed_surface_comes_nearer_to_the_truth(solved):
     """Registered roots are off by 4.7 cm; bones and root together must carry the ball to where it is."""
     found, videos = solved
-    motion = results.motions(found, videos, results.Gaps(longest_s=1.0))["v002"]
+    motion = results.motions(found, videos, 1.0)["v002"]
     with torch.no_grad():
         posed = found.body.pose(found.surface.points, torch.from_numpy(motion.agent_from_bone).float()).numpy()
     centre = rigid.apply(motion.world_from_agent, posed).mean(1)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from pipeline.models.fields import density
-from pipeline.models.motion import MotionTable
+from pipeline.models.motion import MotionTable, gaps_s
 from pipeline.models.render import Layer, composite
 from pipeline.models.surfaces import zero_level
 from pipeline.space import rigid
@@ -72,11 +72,11 @@ def test_short_gaps_are_bridged_and_long_ones_are_not():
     found, _ = results.bridged(time, garbled, garbled[:, None], good, longest_gap_s=1.0)
     np.testing.assert_allclose(found[:20], root[:20], atol=1e-9)
     assert np.isnan(found[20:36]).all() and np.isfinite(found[36:]).all()
-    gaps_s = results.gaps_s(time, good)
-    np.testing.assert_allclose(gaps_s[5:9], 0.5)
-    np.testing.assert_allclose(gaps_s[20:36], 1.7)
-    assert (gaps_s[good] == 0).all()
-    assert (results.gaps_s(time, time < 1)[10:] == np.inf).all()
+    gap_s = gaps_s(time, good)
+    np.testing.assert_allclose(gap_s[5:9], 0.5)
+    np.testing.assert_allclose(gap_s[20:36], 1.7)
+    assert (gap_s[good] == 0).all()
+    assert (gaps_s(time, time < 1)[10:] == np.inf).all()
 
 
 def test_surface_of_a_ball_is_closed_and_looks_outwards():
