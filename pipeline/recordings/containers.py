@@ -1,22 +1,47 @@
 """Guarded access to the members of a recording: a ZIP that may be hostile, or a folder.
 
-Nothing is ever extracted to disk: members are checked when the container opens and read one at a time, at most
-``max_bytes`` each.
+Nothing is ever extracted to disk: members are checked when the container opens and read one at a time, at
+most ``max_bytes`` each.
 """
 
+import lzma
 import stat
+import struct
 import zipfile
 import zlib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Protocol
 
-from pipeline.errors import InputError
+from pipeline.core.errors import InputError
 from pipeline.recordings.recording import damaged
 
-MAX_MEMBERS = 200_000
-MAX_TOTAL_BYTES = 64 << 30
+MAX_MEMBERS = 1_000_000
+"""members that are listed at all: 90 minutes at 60 frames per second with three files each.
+
+About 0.6 GB of memory
+"""
+MEMBERS_PER_FRAME, MEMBERS_BESIDE = 4, 1000
+"""members that a recording of so many declared frames may hold: colour, depth, confidence and one more.
+
+And others
+"""
+MAX_TOTAL_BYTES = 256 << 30
 MAX_RATIO = 200
+"""unpacked over packed size beyond which a member is no picture but a bomb"""
 SMALL_BYTES = 1 << 16
+"""members up to this size are never called bombs"""
+MAX_DIGITS = 18
+"""of a frame number in a file name: what 64 bits hold"""
+DIRECTORY_ENTRY_BYTES = 47
+"""least size of a member's entry in a ZIP's directory"""
+_END_OF_DIRECTORY, _END_OF_DIRECTORY_64 = b"PK\x05\x06", b"PK\x06\x06"
+_TAIL_BYTES = (1 << 16) + 22 + 20 + 56
+"""longest end of a ZIP: comment, end of directory, its 64-bit locator and record"""
+_UNREADABLE = (
+    zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, struct.error, ValueError, NotImplementedError,
+    RuntimeError, OverflowError, OSError,
+)  # fmt: skip
+"""what zipfile raises for archives that are damaged, encrypted, of unknown methods, or lie"""
 
 
 class Container(Protocol):
@@ -43,11 +68,17 @@ class FolderContainer:
         """Return where a member lies."""
         return self._folder / name
 
+    def regular(self, name: str) -> Path:
+        """Return where a regular file lies. Raises CAP-001 for links, pipes and names that are not there."""
+        if name not in self.names:
+            raise damaged(f"{self.where}/{name}", "there is no such regular file")
+        return self.path(name)
+
     def read(self, name: str, max_bytes: int) -> bytes:
         """Read one file of at most ``max_bytes``."""
         where = f"{self.where}/{name}"
         try:
-            with open(self.path(name), "rb") as file:
+            with open(self.regular(name), "rb") as file:
                 return _within(file.read(max_bytes + 1), max_bytes, where)
         except OSError as error:
             raise damaged(where, error.strerror or str(error)) from error
@@ -59,8 +90,11 @@ class ZipContainer:
     def __init__(self, path: Path) -> None:
         self.where = str(path)
         try:
+            declared = _declared_members(path)
+            if declared > MAX_MEMBERS:
+                raise _unsafe(self.where, f"{declared} members, at most {MAX_MEMBERS} are read")
             self._archive = zipfile.ZipFile(path)
-        except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError) as error:
+        except _UNREADABLE as error:
             raise damaged(self.where, str(error)) from error
         _refuse_unsafe(self._archive.infolist(), self.where)
         self.names = frozenset(info.filename for info in self._archive.infolist() if not info.is_dir())
@@ -71,8 +105,35 @@ class ZipContainer:
         try:
             with self._archive.open(name) as member:
                 return _within(member.read(max_bytes + 1), max_bytes, where)
-        except (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError, OSError) as error:
+        except _UNREADABLE as error:
             raise damaged(where, str(error)) from error
+
+
+def refuse_surplus_members(container: Container, frames: int) -> None:
+    """Raise CAP-002 where a container holds more members than its metadata's count of frames accounts for."""
+    most = MEMBERS_PER_FRAME * frames + MEMBERS_BESIDE
+    if len(container.names) > most:
+        raise _unsafe(container.where, f"{len(container.names)} members for {frames} frames, at most {most}")
+
+
+def frame_number(stem: str) -> int | None:
+    """Return the number that a file name is, None for any other name."""
+    return int(stem) if stem.isascii() and stem.isdigit() and len(stem) <= MAX_DIGITS else None
+
+
+def _declared_members(path: Path) -> int:
+    """Read how many members a ZIP's end declares, before its directory is read into memory."""
+    with open(path, "rb") as file:
+        file.seek(max(path.stat().st_size - _TAIL_BYTES, 0))
+        tail = file.read()
+    end, end_64 = tail.rfind(_END_OF_DIRECTORY), tail.rfind(_END_OF_DIRECTORY_64)
+    if end < 0 or len(tail) < end + 12:
+        raise zipfile.BadZipFile("it has no directory")
+    count = struct.unpack_from("<H", tail, end + 10)[0]
+    directory = struct.unpack_from("<I", tail, end + 12)[0] if len(tail) >= end + 16 else 0
+    if end_64 >= 0 and len(tail) >= end_64 + 48:
+        count, directory = struct.unpack_from("<2Q", tail, end_64 + 32)
+    return max(count, directory // DIRECTORY_ENTRY_BYTES)
 
 
 def _within(data: bytes, max_bytes: int, where: str) -> bytes:
@@ -107,7 +168,7 @@ def _refuse_unsafe(members: list[zipfile.ZipInfo], where: str) -> None:
 def _fault_of(info: zipfile.ZipInfo) -> str | None:
     """Name what is wrong with a member, if anything."""
     name = info.orig_filename
-    parts = PurePosixPath(name).parts
+    parts = name.split("/")
     if "\\" in name or "\0" in name or ":" in name or name.startswith("/") or ".." in parts:
         return "a member's name leads outside of it"
     if stat.S_ISLNK(info.external_attr >> 16):

@@ -1,7 +1,8 @@
 """Check on the depth itself what a recording's device poses mean, and whether they mean anything.
 
-For a few pairs of frames, the depth of one is moved by the poses into the other and compared with what was measured
-there. The documented convention stays unless it is clearly refuted and another one clearly fits.
+For a few pairs of frames, the depth of one is moved by the poses into the other and compared with what
+was measured there. The documented convention stays unless it is clearly refuted and another one clearly
+fits.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.space import cameras, rigid
+from pipeline.geometry import cameras, rigid
 
 TOLERANCE_M = 0.015
 TOLERANCE_SHARE = 0.01
@@ -21,6 +22,8 @@ UNUSABLE_FACTOR = 4.0
 MIN_OVERLAP = 0.25
 MIN_TURN_RAD = np.radians(3.0)
 MIN_SHIFT_M = 0.05
+POSE_PAIRS = 6
+"""pairs of frames on which device poses are checked against depth"""
 GAP_S = (0.33, 1.5)
 STRIDE_PX, POINTS_A_SIDE = 3, 80
 """every third pixel of the first picture is enough, and so are 80 along its longer side"""
@@ -42,12 +45,15 @@ OPENGL = Convention()
 OPENCV = Convention(axes="opencv")
 """Stray Scanner, TUM, 7-Scenes"""
 CONVENTIONS = tuple(
-    Convention(*choice) for choice in product(("camera_to_world", "world_to_camera"), ("opengl", "opencv"), range(4), ("xyzw", "wxyz"))
+    Convention(*choice)
+    for choice in product(
+        ("camera_to_world", "world_to_camera"), ("opengl", "opencv"), range(4), ("xyzw", "wxyz")
+    )
 )
 
 
 @dataclass(frozen=True)
-class DepthView:
+class DepthPicture:
     """One frame's depth (metres, 0 = unknown) and its intrinsics."""
 
     depth: Float[np.ndarray, "height width"]
@@ -55,8 +61,8 @@ class DepthView:
 
 
 @dataclass(frozen=True)
-class SelfCheck:
-    """What the depth said about the poses."""
+class PoseCheck:
+    """Result of comparing device poses with the depth."""
 
     verdict: Literal["documented", "other", "untested", "unusable"]
     convention: Convention
@@ -70,7 +76,9 @@ class SelfCheck:
     reason: str
 
 
-def odometry_from_pose(pose: Float[np.ndarray, "frame 7"], convention: Convention) -> Float[np.ndarray, "frame 4 4"]:
+def odometry_from_pose(
+    pose: Float[np.ndarray, "frame 7"], convention: Convention
+) -> Float[np.ndarray, "frame 4 4"]:
     """Turn stored poses into ``odometry_from_camera`` with OpenCV axes of the stored picture."""
     quaternion = np.roll(pose[:, :4], 1, axis=1) if convention.quaternion == "xyzw" else pose[:, :4]
     odometry_from_camera = rigid.make(rigid.rotation_from_quaternion(quaternion), pose[:, 4:])
@@ -84,21 +92,35 @@ def odometry_from_pose(pose: Float[np.ndarray, "frame 7"], convention: Conventio
 def check_poses(
     pose: Float[np.ndarray, "frame 7"] | None,
     timestamp_s: Float[np.ndarray, "frame"],
-    depth_view: Callable[[int], DepthView],
-    pairs: int = 6,
+    depth_view: Callable[[int], DepthPicture],
+    pairs: int = POSE_PAIRS,
     documented: Convention = OPENGL,
     among: Sequence[Convention] = CONVENTIONS,
-) -> SelfCheck:
-    """Decide which convention the poses follow, the documented one ``among`` them; ``depth_view(i)`` gives frame i's depth on demand."""
+) -> PoseCheck:
+    """Decide which convention the poses follow, the documented one ``among`` them.
+
+    ``depth_view(i)`` gives frame i's depth on demand.
+    """
     broken = _fault_of(pose)
     if broken:
-        return SelfCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
-    tried = {convention: odometry_from_pose(pose, convention) for convention in among}
-    chosen = _moving_pairs(tried[documented], timestamp_s, pairs)
+        return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
+    chosen = _moving_pairs(odometry_from_pose(pose, documented), timestamp_s, pairs)
     if len(chosen) == 0:
-        return SelfCheck("untested", documented, 0, np.nan, np.nan, TOLERANCE_M, "the phone moved too little to test its poses")
-    views = {frame: depth_view(frame) for frame in sorted(set(chosen.ravel().tolist()))}
-    scores = {convention: _score(odometry_from_camera, chosen, views) for convention, odometry_from_camera in tried.items()}
+        return PoseCheck(
+            "untested",
+            documented,
+            0,
+            np.nan,
+            np.nan,
+            TOLERANCE_M,
+            "the phone moved too little to test its poses",
+        )
+    frames, position = np.unique(chosen, return_inverse=True)
+    pairs_of_views, views = position.reshape(chosen.shape), [depth_view(frame) for frame in frames.tolist()]
+    scores = {
+        convention: _score(odometry_from_pose(pose[frames], convention), pairs_of_views, views)
+        for convention in among
+    }
     return _judge(scores, documented, len(chosen))
 
 
@@ -127,7 +149,9 @@ def _fault_of(pose: Float[np.ndarray, "frame 7"] | None) -> str | None:
     return None
 
 
-def _moving_pairs(odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int) -> np.ndarray:
+def _moving_pairs(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int
+) -> np.ndarray:
     """Pick up to ``pairs`` (first, second) frames with time and motion between, spread over the recording."""
     second = np.searchsorted(timestamp_s, timestamp_s + GAP_S[0])
     first = np.flatnonzero(second < len(timestamp_s))
@@ -136,12 +160,22 @@ def _moving_pairs(odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestam
     moved = (rigid.rotation_angle(np.eye(3), relative[:, :3, :3]) > MIN_TURN_RAD) | (
         np.linalg.norm(relative[:, :3, 3], axis=1) > MIN_SHIFT_M
     )
-    longest_s = max(GAP_S[1], 2.5 * float(np.median(np.diff(timestamp_s)))) if len(timestamp_s) > 1 else GAP_S[1]
-    usable = np.stack([first, second], axis=1)[moved & (timestamp_s[second] - timestamp_s[first] <= longest_s)]
-    return usable[np.unique(np.linspace(0, len(usable) - 1, pairs).round().astype(int))] if len(usable) else usable
+    longest_s = (
+        max(GAP_S[1], 2.5 * float(np.median(np.diff(timestamp_s)))) if len(timestamp_s) > 1 else GAP_S[1]
+    )
+    usable = np.stack([first, second], axis=1)[
+        moved & (timestamp_s[second] - timestamp_s[first] <= longest_s)
+    ]
+    return (
+        usable[np.unique(np.linspace(0, len(usable) - 1, pairs).round().astype(int))]
+        if len(usable)
+        else usable
+    )
 
 
-def _score(odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarray, views: dict[int, DepthView]) -> _Score:
+def _score(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarray, views: Sequence[DepthPicture]
+) -> _Score:
     """Compare depth over all pairs under one convention."""
     rows = []
     for first, second in pairs:
@@ -157,7 +191,9 @@ def _score(odometry_from_camera: Float[np.ndarray, "frame 4 4"], pairs: np.ndarr
     )
 
 
-def compare(first: DepthView, second: DepthView, second_from_first: Float[np.ndarray, "4 4"]) -> tuple[float, float, float]:
+def compare(
+    first: DepthPicture, second: DepthPicture, second_from_first: Float[np.ndarray, "4 4"]
+) -> tuple[float, float, float]:
     """Return (median depth difference, share of points that can be compared, tolerance), metres."""
     stride = max(STRIDE_PX, max(first.depth.shape) // POINTS_A_SIDE)
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
@@ -178,18 +214,41 @@ def compare(first: DepthView, second: DepthView, second_from_first: Float[np.nda
     )
 
 
-def _judge(scores: dict[Convention, _Score], documented: Convention, pairs: int) -> SelfCheck:
+def _judge(scores: dict[Convention, _Score], documented: Convention, pairs: int) -> PoseCheck:
     """Keep the documented convention unless it is refuted and another one is clearly right."""
-    told = scores[documented]
+    documented_score = scores[documented]
     best = min(scores, key=lambda convention: scores[convention].cost)
-    if told.accepted:
-        return _checked("documented", documented, told, pairs, "the documented convention explains the depth")
-    if scores[best].accepted and scores[best].cost < 0.5 * told.cost:
-        return _checked("other", best, scores[best], pairs, f"the documented convention is refuted by the depth; {best} explains it")
-    if told.residual_m < UNUSABLE_FACTOR * told.tolerance_m and told.overlap > MIN_OVERLAP:
-        return _checked("documented", documented, told, pairs, "device poses explain the depth only roughly: they drift")
-    return _checked("unusable", documented, told, pairs, "device poses do not explain the depth under any convention")
+    if documented_score.accepted:
+        return _checked(
+            "documented", documented, documented_score, pairs, "the documented convention explains the depth"
+        )
+    if scores[best].accepted and scores[best].cost < 0.5 * documented_score.cost:
+        return _checked(
+            "other",
+            best,
+            scores[best],
+            pairs,
+            f"the documented convention is refuted by the depth; {best} explains it",
+        )
+    if (
+        documented_score.residual_m < UNUSABLE_FACTOR * documented_score.tolerance_m
+        and documented_score.overlap > MIN_OVERLAP
+    ):
+        return _checked(
+            "documented",
+            documented,
+            documented_score,
+            pairs,
+            "device poses explain the depth only roughly: they drift",
+        )
+    return _checked(
+        "unusable",
+        documented,
+        documented_score,
+        pairs,
+        "device poses do not explain the depth under any convention",
+    )
 
 
-def _checked(verdict, convention: Convention, score: _Score, pairs: int, reason: str) -> SelfCheck:
-    return SelfCheck(verdict, convention, pairs, score.residual_m, score.overlap, score.tolerance_m, reason)
+def _checked(verdict, convention: Convention, score: _Score, pairs: int, reason: str) -> PoseCheck:
+    return PoseCheck(verdict, convention, pairs, score.residual_m, score.overlap, score.tolerance_m, reason)

@@ -1,4 +1,6 @@
-"""From a recording to upright frames at a steady rate: first understand the whole, then read picture by picture.
+"""From a recording to upright frames at a steady rate.
+
+First understand the whole, then read picture by picture.
 
 `understand` costs a second and reads a dozen depth pictures; `frames` then yields one `Frame` at a time.
 """
@@ -11,14 +13,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.errors import InputError
-from pipeline.files import images
+from pipeline.core.errors import InputError
+from pipeline.data import images
+from pipeline.geometry import cameras, rigid
 from pipeline.recordings import conventions
-from pipeline.recordings.conventions import SelfCheck
+from pipeline.recordings.conventions import PoseCheck
+from pipeline.recordings.depth_camera import grid_size, reproject
 from pipeline.recordings.recording import Picture, Recording, broken_metadata, no_depth
-from pipeline.recordings.selection import choose_frames
-from pipeline.recordings.upright import quarter_turns_from_gravity, quarter_turns_from_room, quarter_turns_from_surfaces
-from pipeline.space import cameras, rigid
+from pipeline.recordings.upright import (
+    quarter_turns_from_gravity,
+    quarter_turns_from_room,
+    quarter_turns_from_surfaces,
+)
 
 JPEG = b"\xff\xd8"
 MAX_DEPTH_SIDE_PX = 640
@@ -27,9 +33,9 @@ LEAST_TRACKED = 0.8
 """share of frames with a device pose below which device poses are not used at all"""
 MEASURED, RELATIVE = "measured", "relative"
 UPRIGHT_VIEWS = 12
-"""frames whose depth tells what is up where no sensor did"""
+"""frames whose depth is used to find the up direction where no sensor measured it"""
 UNIT_VIEWS = 5
-"""frames whose depth tells whether it can be metres"""
+"""frames on which the unit of the depth is checked"""
 NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
 """typical depth is not below the one, metres, nor above the other, in units of the farthest that is used"""
 MOST_STRETCHED = 0.03
@@ -40,8 +46,11 @@ DARK = 0.15
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What was understood of a recording; ``chosen`` indexes the recording's frames, everything else is upright."""
+class ExtractionPlan:
+    """What was understood of a recording.
+
+    ``chosen`` indexes the recording's frames, everything else is upright.
+    """
 
     chosen: Int[np.ndarray, "frame"]
     timestamp_s: Float[np.ndarray, "frame"]
@@ -54,13 +63,14 @@ class Plan:
     gravity_known: bool
     quarter_turns: int
     """clockwise, stored to upright"""
-    self_check: SelfCheck
+    pose_check: PoseCheck
     scale: str = MEASURED
-    """`measured` by the recording's own depth, `relative`, or the id of the recording whose depth told the metres"""
+    """`measured` by the recording's own depth, `relative`, or the id of the recording that supplied the scale
+    """
 
 
 @dataclass(frozen=True)
-class Frame:
+class ExtractedFrame:
     """One upright frame."""
 
     color: UInt8[np.ndarray, "height width 3"]
@@ -78,26 +88,42 @@ class Frame:
     """share of known depth"""
 
 
-def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pairs: int, max_side_px: int) -> Plan:
+def understand(
+    recording: Recording, *, rate_hz: float, max_depth_m: float, max_side_px: int
+) -> ExtractionPlan:
     """Choose frames, check the poses on the depth, find the upright turn and the size of the pictures.
 
-    Raises InputError CAP-006 for a recording without depth, CAP-004 and CAP-008 for intrinsics and depth that cannot be.
+    Raises InputError CAP-006 for a recording without depth, CAP-004 and CAP-008 for intrinsics and depth
+    that cannot be.
     """
     if recording.depth_size is None or recording.intrinsics is None:
-        raise no_depth(recording.where, f"{recording.kind}; an animal moves, so that pictures alone do not tell how far away it is")
+        raise no_depth(
+            recording.where,
+            f"{recording.kind}; an animal moves, so its distance cannot be triangulated from pictures",
+        )
     _refuse_other_pictures(recording)
-    _refuse_other_shape(recording.color_size, recording.depth_size, recording.where)
+    if recording.depth_camera is None:
+        _refuse_other_shape(recording.color_size, recording.depth_size, recording.where)
     _refuse_other_unit(recording, max_depth_m)
-    depth_size = reduced_size(recording.depth_size, MAX_DEPTH_SIDE_PX)
+    depth_size = recording.depth_size
+    if recording.depth_camera is not None:
+        depth_size = grid_size(depth_size, recording.color_size)
+    depth_size = reduced_size(depth_size, MAX_DEPTH_SIDE_PX)
     depth_intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, depth_size)
     used, pose, lost = _tracked(recording)
 
-    def view(frame: int) -> conventions.DepthView:
-        return conventions.DepthView(stored_depth(recording, int(recording.index[used[frame]]), max_depth_m), depth_intrinsics[used[frame]])
+    def view(frame: int) -> conventions.DepthPicture:
+        return conventions.DepthPicture(
+            stored_depth(recording, int(recording.index[used[frame]]), max_depth_m),
+            depth_intrinsics[used[frame]],
+        )
 
-    check = conventions.check_poses(pose, recording.timestamp_s[used], view, pairs, recording.convention)
+    check = conventions.check_poses(pose, recording.timestamp_s[used], view, documented=recording.convention)
     if lost and check.verdict == "unusable":
-        used, check = np.arange(len(recording.index)), dataclasses.replace(check, reason=f"{check.reason}; {lost}")
+        used, check = (
+            np.arange(len(recording.index)),
+            dataclasses.replace(check, reason=f"{check.reason}; {lost}"),
+        )
     chosen = used[choose_frames(recording.timestamp_s[used], rate_hz)]
     odometry_from_camera, turns = None, recording.quarter_turns
     looked_at = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
@@ -109,7 +135,9 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
     if check.verdict == "unusable":
         turns = turns or quarter_turns_from_surfaces(room())
     else:
-        odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)[np.searchsorted(used, chosen)]
+        odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)[
+            np.searchsorted(used, chosen)
+        ]
         if recording.up is not None:
             odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
             turns = quarter_turns_from_gravity(odometry_from_camera)
@@ -118,7 +146,7 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
         odometry_from_camera = cameras.turn_camera(odometry_from_camera, turns)
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
-    return Plan(
+    return ExtractionPlan(
         chosen=chosen,
         timestamp_s=recording.timestamp_s[chosen],
         stored_size=size,
@@ -127,44 +155,64 @@ def understand(recording: Recording, *, rate_hz: float, max_depth_m: float, pair
         odometry_from_camera=odometry_from_camera,
         gravity_known=odometry_from_camera is not None and recording.up is not None,
         quarter_turns=turns,
-        self_check=check,
+        pose_check=check,
     )
 
 
 def _refuse_other_pictures(recording: Recording) -> None:
-    """Raise CAP-004 for intrinsics whose centre lies outside of the picture: those of another resolution, or of one turned."""
+    """Raise CAP-004 for intrinsics whose centre lies outside of the picture.
+
+    Those of another resolution, or of one turned.
+    """
     (height, width), center = recording.color_size, np.median(recording.intrinsics[:, :2, 2], axis=0)
     if not ((center > 0) & (center < (width, height))).all():
-        why = f"the intrinsics' centre, {center[0]:.0f} {center[1]:.0f}, lies outside of pictures of {width} x {height}"
+        why = (
+            f"the intrinsics' centre, {center[0]:.0f} {center[1]:.0f}, lies "
+            f"outside of pictures of {width} x {height}"
+        )
         raise broken_metadata(recording.where, why)
 
 
 def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int], where: str) -> None:
-    """Raise CAP-008 for depth of another shape than the pictures, all as stored: the one shows more than the other."""
+    """Raise CAP-008 for depth of another shape than the pictures, all as stored.
+
+    The one shows more than the other.
+    """
     (height, width), (depth_height, depth_width) = color_size, depth_size
     stretched_px = abs(depth_height - depth_width * height / width)
     rounding_px = 0.5 * (1 + height / width)
     if stretched_px > max(MOST_STRETCHED * depth_height, rounding_px):
-        what = f"depth of {depth_width} x {depth_height} cannot show the same as pictures of {width} x {height}"
-        raise InputError("CAP-008", what, where, "crop the one to what the other shows, turned as the pictures are stored")
+        what = (
+            f"depth of {depth_width} x {depth_height} cannot show the same as pictures of {width} x {height}"
+        )
+        raise InputError(
+            "CAP-008", what, where, "crop the one to what the other shows, turned as the pictures are stored"
+        )
 
 
 def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
-    """Raise CAP-008 for depth that is typically farther or nearer than any sensor would be used at: written in another unit."""
+    """Raise CAP-008 for depth that is typically farther or nearer than any sensor would be used at.
+
+    Written in another unit.
+    """
     shown = recording.index[np.unique(np.linspace(0, len(recording.index) - 1, UNIT_VIEWS).astype(int))]
     depth = np.concatenate([recording.read_depth(int(number)).ravel() for number in shown])
     depth = depth[np.isfinite(depth) & (depth > 0)]
     typical_m = float(np.median(depth)) if len(depth) else max_depth_m
     if not NEAREST_TYPICAL_M < typical_m < FARTHEST_TYPICAL * max_depth_m:
         what = f"depth is typically {typical_m:.3g} m, where up to {max_depth_m:g} m are used"
-        remedy = "16-bit PNG holds millimetres, or the units per metre of a TUM folder's depth_scale.txt, EXR metres; record within 5 m"
+        remedy = (
+            "16-bit PNG holds millimetres, or the units per metre of a TUM folder's "
+            "depth_scale.txt, EXR metres; record within 5 m"
+        )
         raise InputError("CAP-008", what, recording.where, remedy)
 
 
 def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.ndarray, "used 7"] | None, str]:
     """Return the frames to use, their poses, and what was lost.
 
-    Where the tracking was lost for a few frames, the others are used; where it was lost for many, all are, without poses.
+    Where the tracking was lost for a few frames, the others are used; where it was lost for many, all
+    are, without poses.
     """
     everything = np.arange(len(recording.index))
     if recording.pose is None:
@@ -185,8 +233,13 @@ def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
     return rigid.make(rigid.rotation_from_vector(axis * angle), np.zeros(3))
 
 
-def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality: int) -> Iterator[Frame | None]:
-    """Yield the plan's frames in order, upright; None where the file is damaged. Raises InputError for broken pictures."""
+def frames(
+    recording: Recording, plan: ExtractionPlan, *, max_depth_m: float, jpeg_quality: int
+) -> Iterator[ExtractedFrame | None]:
+    """Yield the plan's frames in order, upright; None where the file is damaged.
+
+    Raises InputError for broken pictures.
+    """
     for number in recording.index[plan.chosen]:
         stored = recording.read_color(int(number))
         if stored is None:
@@ -198,24 +251,47 @@ def frames(recording: Recording, plan: Plan, *, max_depth_m: float, jpeg_quality
         if color.shape[:2] != plan.stored_size:
             color = cv2.resize(color, plan.stored_size[::-1], interpolation=cv2.INTER_AREA)
         if plan.quarter_turns:
-            color, depth, confidence = (cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence))
-        untouched = isinstance(stored, bytes) and stored[:2] == JPEG and not plan.quarter_turns and plan.stored_size == recording.color_size
+            color, depth, confidence = (
+                cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence)
+            )
+        untouched = (
+            isinstance(stored, bytes)
+            and stored[:2] == JPEG
+            and not plan.quarter_turns
+            and plan.stored_size == recording.color_size
+        )
         jpeg = stored if untouched else images.encode_jpeg(color, jpeg_quality)
         sharpness, brightness = picture_statistics(color)
-        yield Frame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
+        yield ExtractedFrame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
 
 
 def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float[np.ndarray, "height width"]:
-    """Read one frame's known depth as stored (not turned), metres; enlarged depth is brought back to a sensor's size."""
+    """Read one frame's known depth as stored (not turned), metres.
+
+    Enlarged depth is brought back to a sensor's size.
+    """
     depth = known_depth(recording.read_depth(number), max_depth_m)
+    if recording.depth_camera is not None:
+        assert recording.intrinsics is not None, recording.where
+        row = int(np.searchsorted(recording.index, number))
+        color = recording.intrinsics[row], recording.color_size
+        depth = known_depth(reproject(depth, recording.depth_camera, *color), max_depth_m)
     size = reduced_size(depth.shape, MAX_DEPTH_SIDE_PX)
-    return depth if depth.shape == size else cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    return (
+        depth if depth.shape == size else cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    )
 
 
 def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.ndarray, "height width 3"]:
     color = images.decode_color(stored, where) if isinstance(stored, bytes) else stored
     if color.shape[:2] != size:
-        raise broken_metadata(where, f"the picture is {color.shape[1]} x {color.shape[0]}, they say {size[1]} x {size[0]}")
+        raise broken_metadata(
+            where,
+            (
+                f"the picture is {color.shape[1]} x {color.shape[0]}, the "
+                f"recording declares {size[1]} x {size[0]}"
+            ),
+        )
     return color
 
 
@@ -225,17 +301,23 @@ def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[n
         return np.where(depth > 0, 2, 0).astype(np.uint8)
     confidence = np.minimum(recording.read_confidence(number), 2)
     return (
-        confidence if confidence.shape == depth.shape else cv2.resize(confidence, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        confidence
+        if confidence.shape == depth.shape
+        else cv2.resize(confidence, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     )
 
 
 def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
-    """Divide a (height, width) by the smallest whole number that brings the longer side to ``max_side_px``."""
+    """Divide a (height, width) by the smallest whole number that brings the longer side to
+    ``max_side_px``.
+    """
     factor = -(-max(size) // max_side_px)
     return (round(size[0] / factor), round(size[1] / factor))
 
 
-def known_depth(depth: Float[np.ndarray, "height width"], max_depth_m: float) -> Float[np.ndarray, "height width"]:
+def known_depth(
+    depth: Float[np.ndarray, "height width"], max_depth_m: float
+) -> Float[np.ndarray, "height width"]:
     """Return depth in metres with 0 where it is not finite, not positive or beyond the sensor's range."""
     return np.where(np.isfinite(depth) & (depth > 0) & (depth < max_depth_m), depth, np.float32(0))
 
@@ -258,13 +340,29 @@ def quality_of(
     return sharp * np.minimum(brightness / DARK, 1) * depth_valid
 
 
-def sentence(recording: Recording, plan: Plan) -> str:
-    """Say in one line what was understood of a recording."""
+def summary(recording: Recording, plan: ExtractionPlan) -> str:
+    """Summarise in one line what was understood of a recording."""
     seconds = recording.timestamp_s[-1] - recording.timestamp_s[0]
     height, width = recording.color_size
     turned = f"turned {90 * plan.quarter_turns} deg clockwise" if plan.quarter_turns else "upright as stored"
-    seen = f"{seconds:.1f} s, {len(recording.index)} frames {width} x {height}, {len(plan.chosen)} kept, {turned}"
-    check = plan.self_check
+    seen = (
+        f"{seconds:.1f} s, {len(recording.index)} frames {width} x "
+        f"{height}, {len(plan.chosen)} kept, {turned}"
+    )
+    check = plan.pose_check
     measured = f" ({1000 * check.residual_m:.1f} mm)" if np.isfinite(check.residual_m) else ""
-    told = "".join(f"; {remark}" for remark in recording.remarks)
-    return f"{recording.where}: {recording.kind}, {seen}; {check.reason}{measured}{told}"
+    remarks = "".join(f"; {remark}" for remark in recording.remarks)
+    return f"{recording.where}: {recording.kind}, {seen}; {check.reason}{measured}{remarks}"
+
+
+def choose_frames(timestamp_s: Float[np.ndarray, "frame"], rate_hz: float) -> Int[np.ndarray, "chosen"]:
+    """Pick, for every tick of a clock at ``rate_hz``, the frame nearest to it within half a tick.
+
+    Ticks start at the first frame. No frame is picked twice and none is invented: a tick without a frame
+    stays empty. ``timestamp_s`` must increase.
+    """
+    tick = np.rint((timestamp_s - timestamp_s[0]) * rate_hz).astype(int)
+    distance_s = np.abs(timestamp_s - timestamp_s[0] - tick / rate_hz)
+    order = np.lexsort((distance_s, tick))
+    first_of_tick = np.unique(tick[order], return_index=True)[1]
+    return order[first_of_tick]

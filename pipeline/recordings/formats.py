@@ -1,26 +1,30 @@
 """The formats that are understood: how each is recognised and which file of this room reads it.
 
-A new format is one file with `open_recording` and one line here. Standard library only until a recording is opened:
-the planner looks at the disk with `format_of`.
+A new format is one file with `open_recording` and one line here. Standard library only until a recording
+is opened: the planner looks at the disk with `format_of`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import InputError
+from pipeline.core.errors import InputError
+from pipeline.core.videos import VIDEO_SUFFIXES, Video
 
 if TYPE_CHECKING:
     from pipeline.recordings.recording import Recording
 
-MOVIES = (".mp4", ".mov", ".m4v", ".mkv")
 UNDERSTOOD = (
-    "Record3D .r3d or EXR + JPG folder, Stray Scanner, Polycam raw data, NeRFCapture stream, TUM or 7-Scenes folder, "
+    "Record3D .r3d or EXR + JPG folder, Stray Scanner, Polycam raw data, "
+    "NeRFCapture stream, TUM or 7-Scenes folder, "
     "a folder with a video, depth/ and intrinsics.txt, a video alone for the walk-through"
 )
+
+MOST_SCALE_SOURCES = 3
+"""sessions that are read for scale; each costs half a minute"""
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,11 @@ def _is_file(*suffixes: str) -> Callable[[Path], bool]:
 
 
 def _holds_movie(path: Path) -> bool:
-    return path.is_dir() and (path / "depth").is_dir() and any(each.suffix.lower() in MOVIES for each in path.iterdir())
+    return (
+        path.is_dir()
+        and (path / "depth").is_dir()
+        and any(each.suffix.lower() in VIDEO_SUFFIXES for each in path.iterdir())
+    )
 
 
 def _holds_seven_scenes(path: Path) -> bool:
@@ -95,14 +103,20 @@ def _holds_seven_scenes(path: Path) -> bool:
 
 FORMATS: tuple[Format, ...] = (
     Format("Record3D .r3d", _is_file(".r3d"), _record3d),
-    Format("Record3D EXR + JPG", lambda path: _holds("metadata.json")(path) or _holds("EXR_RGBD/metadata.json")(path), _record3d),
+    Format(
+        "Record3D EXR + JPG",
+        lambda path: _holds("metadata.json")(path) or _holds("EXR_RGBD/metadata.json")(path),
+        _record3d,
+    ),
     Format("Stray Scanner", _holds("rgb.mp4", "odometry.csv"), _stray),
     Format("Polycam raw data", _holds("keyframes"), _polycam),
-    Format("NeRFCapture", lambda path: _is_file(".zip")(path) or _holds("transforms.json")(path), _nerfcapture),
+    Format(
+        "NeRFCapture", lambda path: _is_file(".zip")(path) or _holds("transforms.json")(path), _nerfcapture
+    ),
     Format("TUM RGB-D", _holds("rgb.txt", "depth.txt"), _tum),
     Format("7-Scenes RGB-D", _holds_seven_scenes, _seven_scenes),
     Format("video and depth", _holds_movie, _plain_video),
-    Format("video alone", _is_file(*MOVIES), _plain_video, has_depth=False),
+    Format("video alone", _is_file(*VIDEO_SUFFIXES), _plain_video, has_depth=False),
 )
 
 
@@ -119,3 +133,19 @@ def open_recording(path: Path) -> Recording:
     if found is None:
         raise InputError("CAP-003", "not a recording of a known format", str(path), f"known: {UNDERSTOOD}")
     return found.open(path)
+
+
+def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[Video]:
+    """Return the recordings in ``folder`` whose depth may supply metric scale to ``video``.
+
+    For a walk-through without depth these are some training sessions with depth; for any other none.
+    """
+    if video.role != "walkthrough" or _has_depth(folder / video.file):
+        return []
+    sessions = (other for other in videos if other.role == "session" and other.split == "train")
+    return [other for other in sessions if _has_depth(folder / other.file)][:MOST_SCALE_SOURCES]
+
+
+def _has_depth(path: Path) -> bool:
+    found = format_of(path)
+    return found is not None and found.has_depth

@@ -1,7 +1,7 @@
 """Video files by frame number: any codec that PyAV reads, damaged places left out, nothing held in memory.
 
-Frames are told apart by their presentation time, read from the packets without decoding: a frame that a damaged place
-swallows shifts no other.
+Frames are identified by their presentation time, read from the packets without decoding: a frame that a
+damaged place swallows shifts no other.
 """
 
 import contextlib
@@ -12,8 +12,17 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
+from pipeline.data.images import MAX_PIXELS
 from pipeline.recordings.recording import damaged, no_frames
 
+_GUARDS = {
+    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm",
+    "protocol_whitelist": "file",
+    "max_pixels": str(MAX_PIXELS),
+}
+"""FFmpeg's: a list of other files (ffconcat, HLS) is no video, and no picture is decoded that is larger
+than any phone's
+"""
 SKIP_FRAMES = 90
 """further ahead than this, decoding begins anew at the nearest key frame"""
 
@@ -83,17 +92,27 @@ class Movie:
     @contextlib.contextmanager
     def _opened(self) -> Iterator[av.container.InputContainer]:
         try:
-            container = av.open(str(self._path))
+            container = av.open(str(self._path), options=_GUARDS, metadata_errors="replace")
         except (av.error.FFmpegError, OSError) as error:
             raise damaged(self.where, f"not a readable video: {error.strerror or error}") from error
         with container:
             if not container.streams.video:
                 raise no_frames(self.where, "the file holds no pictures")
+            codec = container.streams.video[0].codec_context
+            if codec is None:
+                raise damaged(self.where, "the video is of an unknown codec")
+            if codec.width * codec.height > MAX_PIXELS:
+                raise damaged(
+                    self.where, f"pictures of {codec.width} x {codec.height}, larger than any phone's"
+                )
             yield container
 
 
 def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:
-    """Yield the times of all frames but those that an edit list hides: they are decoded for others and never shown."""
+    """Yield the times of all frames but those that an edit list hides.
+
+    They are decoded for others and never shown.
+    """
     packets = container.demux(stream)
     while True:
         try:

@@ -1,6 +1,9 @@
-"""NeRFCapture: the folder that its streaming scripts write (metric depth). The zip the phone saves itself is refused.
+"""NeRFCapture: the folder that its streaming scripts write (metric depth).
 
-Stream: `transforms.json` with `integer_depth_scale` (metres per unit), one colour and one 16-bit depth picture per frame.
+The zip the phone saves itself is refused.
+
+Stream: `transforms.json` with `integer_depth_scale` (metres per unit), one colour and one 16-bit depth
+picture per frame.
 """
 
 import json
@@ -9,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.files import images
-from pipeline.recordings.containers import Container, FolderContainer, ZipContainer
+from pipeline.core.errors import InputError
+from pipeline.data import images
+from pipeline.recordings.containers import Container, FolderContainer, ZipContainer, frame_number
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (
+from pipeline.recordings.recording import (  # fmt: skip
     MAX_PICTURE_BYTES,
     MAX_TEXT_BYTES,
     Y_UP,
@@ -23,7 +26,7 @@ from pipeline.recordings.recording import (
     meters_from_png,
     no_frames,
     pose_from_matrix,
-)  # fmt: skip
+)
 
 COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
 LEAST_REACH_M = 4.0
@@ -33,12 +36,17 @@ ASSUMED_HZ = 10.0
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a streamed NeRFCapture folder. Raises CAP-010 for the phone's own zip and for streams whose far depth is lost."""
+    """Open a streamed NeRFCapture folder.
+
+    Raises CAP-010 for the phone's own zip and for streams whose far depth is lost.
+    """
     container: Container = FolderContainer(path) if path.is_dir() else ZipContainer(path)
     table = _table(container)
     if not path.is_dir() or "depth_integer_scale" in table:
         what = (
-            "NeRFCapture's saved zip holds no metric depth" if "depth_integer_scale" in table else "a zip of transforms has no metric depth"
+            "NeRFCapture's saved zip holds no metric depth"
+            if "depth_integer_scale" in table
+            else "a zip of transforms has no metric depth"
         )
         remedy = "stream from the app with its nerfcapture_dataset.py and give the folder that it writes"
         raise InputError("CAP-010", what, container.where, remedy)
@@ -46,26 +54,44 @@ def open_recording(path: Path) -> Recording:
     if not isinstance(scale, int | float) or not 0 < scale < 1:
         raise broken_metadata(container.where, "'integer_depth_scale' (metres per unit of depth) is missing")
     if 65535 * scale < LEAST_REACH_M:
-        what = f"depth beyond {65535 * scale:.3g} m was written as if it were near: the stream's depth_scale is too small"
-        remedy = "stream again with a depth_scale of 10; where nerfcapture_dataset.py fails with that option, change its default"
+        what = (
+            f"depth beyond {65535 * scale:.3g} m was written as if it were "
+            "near: the stream's depth_scale is too small"
+        )
+        remedy = (
+            "stream again with a depth_scale of 10; where nerfcapture_dataset.py "
+            "fails with that option, change its default"
+        )
         raise InputError("CAP-010", what, container.where, remedy)
-    frames = [frame for frame in _frames(table, container) if {frame["file_path"], frame["depth_path"]} <= container.names]
+    frames = [
+        frame
+        for frame in _frames(table, container)
+        if {frame["file_path"], frame["depth_path"]} <= container.names
+    ]
     if not frames:
         raise no_frames(container.where, "no frame has colour and depth")
     timestamp_s, remarks = _times(frames, container.where)
-    depth_size = meters_from_png(container.read(frames[0]["depth_path"], MAX_PICTURE_BYTES), None, container.where).shape
-    color_size = images.decode_color(container.read(frames[0]["file_path"], MAX_PICTURE_BYTES), container.where).shape[:2]
+    depth_size = meters_from_png(
+        container.read(frames[0]["depth_path"], MAX_PICTURE_BYTES), None, container.where
+    ).shape
+    color_size = images.decode_color(
+        container.read(frames[0]["file_path"], MAX_PICTURE_BYTES), container.where
+    ).shape[:2]
 
     def depth(number: int) -> np.ndarray:
         name = frames[number]["depth_path"]
-        return meters_from_png(container.read(name, MAX_PICTURE_BYTES), depth_size, f"{container.where}/{name}", 1 / scale)
+        return meters_from_png(
+            container.read(name, MAX_PICTURE_BYTES), depth_size, f"{container.where}/{name}", 1 / scale
+        )
 
     return Recording(
         where=container.where,
         kind="NeRFCapture stream",
         index=np.arange(len(frames)),
         timestamp_s=timestamp_s,
-        intrinsics=intrinsics_from_coefficients(np.array([frame["coefficients"] for frame in frames]), container.where),
+        intrinsics=intrinsics_from_coefficients(
+            np.array([frame["coefficients"] for frame in frames]), container.where
+        ),
         pose=pose_from_matrix(np.stack([frame["matrix"] for frame in frames])),
         color_size=color_size,
         depth_size=depth_size,
@@ -81,8 +107,15 @@ def _table(container: Container) -> dict[str, Any]:
     if "transforms.json" not in container.names:
         if isinstance(container, ZipContainer):
             what = "a zip that holds no NeRFCapture recording"
-            raise InputError("CAP-003", what, container.where, "unpack it, and give the folder that the app wrote")
-        raise InputError("CAP-003", "not a NeRFCapture recording: it has no transforms.json", container.where, "give the streamed folder")
+            raise InputError(
+                "CAP-003", what, container.where, "unpack it, and give the folder that the app wrote"
+            )
+        raise InputError(
+            "CAP-003",
+            "not a NeRFCapture recording: it has no transforms.json",
+            container.where,
+            "give the streamed folder",
+        )
     try:
         table = json.loads(container.read("transforms.json", MAX_TEXT_BYTES))
     except (ValueError, RecursionError) as error:
@@ -99,29 +132,38 @@ def _frames(table: dict[str, Any], container: Container) -> list[dict[str, Any]]
         for frame in table["frames"]:
             matrix = np.array(frame["transform_matrix"], float).reshape(4, 4)
             coefficients = [float(frame.get(key, table.get(key))) for key in COEFFICIENTS]
-            names = [_member(str(frame[key]).removeprefix("./"), container) for key in ("file_path", "depth_path")]
-            told = frame.get("timestamp")
+            names = [
+                _member(str(frame[key]).removeprefix("./"), container) for key in ("file_path", "depth_path")
+            ]
+            time_s = frame.get("timestamp")
             entry = dict(file_path=names[0], depth_path=names[1], matrix=matrix, coefficients=coefficients)
-            found.append(entry | dict(time=None if told is None else float(told), order=_order(names[0])))
-    except (KeyError, TypeError, ValueError) as error:
-        raise broken_metadata(container.where, f"a frame of transforms.json cannot be read ({error!r})") from error
+            found.append(entry | dict(time=None if time_s is None else float(time_s), order=_order(names[0])))
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise broken_metadata(
+            container.where, f"a frame of transforms.json cannot be read ({error!r})"
+        ) from error
     return sorted(found, key=lambda entry: entry["order"])
 
 
 def _member(name: str, container: Container) -> str:
-    """Return the member that a frame names: the app author's script leaves out the ending of colour pictures."""
+    """Return the member that a frame names.
+
+    The app author's script leaves out the ending of colour pictures.
+    """
     return next((each for each in (name, f"{name}.png", f"{name}.jpg") if each in container.names), name)
 
 
 def _order(name: str) -> tuple[int, str]:
     stem = Path(name).stem
-    return (int(stem) if stem.isdigit() else 0, stem)
+    return (frame_number(stem) or 0, stem)
 
 
 def _times(frames: list[dict[str, Any]], where: str) -> tuple[np.ndarray, tuple[str, ...]]:
     if any(frame["time"] is None for frame in frames):
-        return np.arange(len(frames)) / ASSUMED_HZ, (f"the frames carry no times: {ASSUMED_HZ:g} per second are assumed",)
+        return np.arange(len(frames)) / ASSUMED_HZ, (
+            f"the frames carry no times: {ASSUMED_HZ:g} per second are assumed",
+        )
     timestamp_s = np.array([frame["time"] for frame in frames])
-    if np.any(np.diff(timestamp_s) <= 0):
+    if not (np.isfinite(timestamp_s).all() and (np.diff(timestamp_s) > 0).all()):
         raise broken_metadata(where, "the frames' times must increase with their numbers")
     return timestamp_s - timestamp_s[0], ()

@@ -1,7 +1,9 @@
-"""A plain video: alone, or in a folder with `depth/` (one picture per video frame, by its number) and `intrinsics.txt`.
+"""A plain video: alone, or in a folder with `depth/` (one picture per video frame, by its number) and
+`intrinsics.txt`.
 
-Depth: 16-bit PNG in millimetres or EXR in metres, aligned with the picture as stored. `poses.txt`, where there is one:
-frame number, tx ty tz qx qy qz qw of the camera (OpenCV axes) in its world. A video alone has no depth and no scale.
+Depth: 16-bit PNG in millimetres or EXR in metres, aligned with the picture as stored. `poses.txt`, where
+there is one: frame number, tx ty tz qx qy qz qw of the camera (OpenCV axes) in its world. A video alone
+has no depth and no scale.
 """
 
 from pathlib import Path
@@ -9,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import images
+from pipeline.core.videos import VIDEO_SUFFIXES
+from pipeline.data import images
 from pipeline.recordings import text_files
-from pipeline.recordings.containers import FolderContainer
+from pipeline.recordings.containers import FolderContainer, frame_number
 from pipeline.recordings.conventions import OPENCV
-from pipeline.recordings.formats import MOVIES
 from pipeline.recordings.movies import Movie
-from pipeline.recordings.recording import (
+from pipeline.recordings.recording import (  # fmt: skip
     MAX_PICTURE_BYTES,
     MAX_TEXT_BYTES,
     Recording,
@@ -25,7 +27,7 @@ from pipeline.recordings.recording import (
     no_depth,
     no_frames,
     wrong_depth,
-)  # fmt: skip
+)
 
 
 def open_recording(path: Path) -> Recording:
@@ -33,28 +35,41 @@ def open_recording(path: Path) -> Recording:
     if path.is_file():
         return _alone(path)
     container = FolderContainer(path)
-    movies = sorted(name for name in container.names if Path(name).suffix.lower() in MOVIES and "/" not in name)
+    movies = sorted(
+        name for name in container.names if Path(name).suffix.lower() in VIDEO_SUFFIXES and "/" not in name
+    )
     if len(movies) != 1:
         raise broken_metadata(container.where, f"{len(movies)} videos in the folder instead of one")
     movie = Movie(path / movies[0])
-    depth = {int(Path(name).stem): name for name in container.names if name.startswith("depth/") and Path(name).stem.isdigit()}
+    depth = {
+        number: name
+        for name in sorted(container.names)
+        if name.startswith("depth/") and (number := frame_number(Path(name).stem)) is not None
+    }
     depth = {number: name for number, name in depth.items() if Path(name).suffix.lower() in (".png", ".exr")}
     if not depth:
         raise no_depth(container.where, "depth/ holds no numbered PNG or EXR pictures")
     index = np.array(sorted(number for number in depth if number < len(movie)), int)
     if len(index) == 0:
-        raise no_frames(container.where, "no depth picture carries the number of a video frame, counted from 0")
+        raise no_frames(
+            container.where, "no depth picture carries the number of a video frame, counted from 0"
+        )
     if max(depth) + 1 < 0.5 * len(movie):
-        why = f"{len(movie)} video frames but depth up to number {max(depth)}: name depth pictures by the frame they belong to"
+        why = (
+            f"{len(movie)} video frames but depth up to number {max(depth)}: name "
+            "depth pictures by the frame they belong to"
+        )
         raise broken_metadata(container.where, why)
     size = _depth(container, depth[int(index[0])], None).shape
     coefficients, remarks = text_files.coefficients(container, default=None)
+    intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(index), 1)), container.where)
+    camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (movie.size, size))
     return Recording(
         where=container.where,
         kind="video and depth",
         index=index,
         timestamp_s=movie.timestamp_s[index] - movie.timestamp_s[index[0]],
-        intrinsics=intrinsics_from_coefficients(np.tile(coefficients, (len(index), 1)), container.where),
+        intrinsics=intrinsics,
         pose=_poses(container, index),
         color_size=movie.size,
         depth_size=size,
@@ -62,7 +77,8 @@ def open_recording(path: Path) -> Recording:
         read_depth=lambda i: _depth(container, depth[i], size),
         convention=OPENCV,
         quarter_turns=movie.quarter_turns,
-        remarks=remarks,
+        depth_camera=camera,
+        remarks=remarks + camera_remarks,
     )
 
 
@@ -83,12 +99,17 @@ def _alone(path: Path) -> Recording:
     )
 
 
-def _depth(container: FolderContainer, name: str, size: tuple[int, int] | None) -> Float[np.ndarray, "height width"]:
+def _depth(
+    container: FolderContainer, name: str, size: tuple[int, int] | None
+) -> Float[np.ndarray, "height width"]:
     if name.lower().endswith(".png"):
         return meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, f"{container.where}/{name}")
     depth = images.read_depth(container.path(name), channel=None)
     if size is not None and depth.shape != size:
-        raise wrong_depth(f"{container.where}/{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}")
+        raise wrong_depth(
+            f"{container.where}/{name}",
+            f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}",
+        )
     return depth
 
 
@@ -97,7 +118,7 @@ def _poses(container: FolderContainer, index: np.ndarray) -> Float[np.ndarray, "
         return None
     where = f"{container.where}/poses.txt"
     table = text_files.table(container.read("poses.txt", MAX_TEXT_BYTES).decode(errors="replace"), 8, where)
-    row = {int(number): i for i, number in enumerate(table[:, 0])}
+    row = {int(number): i for i, number in enumerate(table[:, 0]) if np.isfinite(number)}
     pose = np.full((len(index), 7), np.nan)
     for frame, number in enumerate(index):
         if int(number) in row:

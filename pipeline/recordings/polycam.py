@@ -1,7 +1,8 @@
 """Polycam raw data (LiDAR or room mode, developer mode): sparse keyframes with poses, for the walk-through.
 
-Optimised pictures and cameras (`corrected_*`) are used where both exist; their black borders carry no depth. The app's own
-mesh, `raw.glb`, stands turned to its axes; the inverse of `alignmentTransform` (column-major) brings it back to the cameras.
+Optimised pictures and cameras (`corrected_*`) are used where both exist; their black borders carry no
+depth. The app's own mesh, `raw.glb`, stands turned to its axes; the inverse of `alignmentTransform`
+(column-major) brings it back to the cameras.
 """
 
 import io
@@ -14,10 +15,12 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 
-from pipeline.files import images
-from pipeline.recordings.containers import FolderContainer
+from pipeline.data import images
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
+from pipeline.recordings.containers import FolderContainer, frame_number
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (
+from pipeline.recordings.recording import (  # fmt: skip
     MAX_PICTURE_BYTES,
     MAX_TEXT_BYTES,
     Y_UP,
@@ -30,9 +33,7 @@ from pipeline.recordings.recording import (
     no_depth,
     no_frames,
     pose_from_matrix,
-)  # fmt: skip
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
+)
 
 TRUSTED_M = 5.0
 """depth beyond this is unknown, metres"""
@@ -62,14 +63,20 @@ def open_recording(path: Path) -> Recording:
 
     def depth(number: int) -> np.ndarray:
         measured = _depth(container, number, size)
-        return np.where(_border(container, f"keyframes/{color}/{number}.jpg", size), 0, measured) if corrected else measured
+        return (
+            np.where(_border(container, f"keyframes/{color}/{number}.jpg", size), 0, measured)
+            if corrected
+            else measured
+        )
 
     return Recording(
         where=container.where,
         kind="Polycam raw data",
         index=index,
         timestamp_s=(index - index[0]) * 1e-6,
-        intrinsics=intrinsics_from_coefficients(np.array([[table[key] for key in COEFFICIENTS] for table in tables]), container.where),
+        intrinsics=intrinsics_from_coefficients(
+            np.array([[table[key] for key in COEFFICIENTS] for table in tables]), container.where
+        ),
         pose=pose_from_matrix(np.stack([_world_from_camera(table) for table in tables])),
         color_size=next(iter(sizes)),
         depth_size=size,
@@ -78,23 +85,30 @@ def open_recording(path: Path) -> Recording:
         read_confidence=(lambda i: _confidence(container, i, size)) if known else None,
         convention=OPENGL,
         up=Y_UP,
-        read_mesh=(lambda: _mesh(container)) if {"raw.glb", "mesh_info.json"} <= set(container.names) else None,
+        read_mesh=(lambda: _mesh(container))
+        if {"raw.glb", "mesh_info.json"} <= set(container.names)
+        else None,
         remarks=("Polycam keeps sparse keyframes: good for the walk-through, too few for the animal",),
     )
 
 
 def _stems(container: FolderContainer, part: str) -> set[int]:
     names = (Path(name) for name in container.names if name.startswith(f"keyframes/{part}/"))
-    return {int(name.stem) for name in names if name.stem.isdigit()}
+    return {number for name in names if (number := frame_number(name.stem)) is not None}
 
 
 def _camera(container: FolderContainer, name: str) -> dict[str, Any]:
     where = f"{container.where}/{name}"
     try:
         table = json.loads(container.read(name, MAX_TEXT_BYTES))
-        wanted = (*COEFFICIENTS, "width", "height", *(f"t_{row}{column}" for row in range(3) for column in range(4)))
+        wanted = (
+            *COEFFICIENTS,
+            "width",
+            "height",
+            *(f"t_{row}{column}" for row in range(3) for column in range(4)),
+        )
         return {key: float(table[key]) for key in wanted}
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise broken_metadata(where, f"not a camera ({error!r})") from error
 
 
@@ -103,7 +117,9 @@ def _world_from_camera(table: dict[str, float]) -> Float[np.ndarray, "4 4"]:
     return np.array([*rows, [0.0, 0.0, 0.0, 1.0]])
 
 
-def _depth(container: FolderContainer, number: int, size: tuple[int, int] | None) -> Float[np.ndarray, "height width"]:
+def _depth(
+    container: FolderContainer, number: int, size: tuple[int, int] | None
+) -> Float[np.ndarray, "height width"]:
     name = f"keyframes/depth/{number}.png"
     depth = meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, f"{container.where}/{name}")
     return np.where(depth <= TRUSTED_M, depth, np.float32(0))
@@ -116,10 +132,12 @@ def _mesh(container: FolderContainer) -> Mesh:
         table = json.loads(container.read("mesh_info.json", MAX_TEXT_BYTES))
         aligned_from_world = np.array(table["alignmentTransform"], float).reshape(4, 4).T
         world_from_aligned = np.linalg.inv(aligned_from_world)
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise broken_metadata(where, f"no alignmentTransform of 16 numbers ({error!r})") from error
     try:
-        loaded = trimesh.load(io.BytesIO(container.read("raw.glb", MAX_MESH_BYTES)), file_type="glb", force="mesh")
+        loaded = trimesh.load(
+            io.BytesIO(container.read("raw.glb", MAX_MESH_BYTES)), file_type="glb", force="mesh"
+        )
     except Exception as error:  # whatever the reader meets in a file that was cut
         raise damaged(f"{container.where}/raw.glb", repr(error)) from error
     if not len(loaded.faces):
@@ -133,7 +151,9 @@ def _border(container: FolderContainer, name: str, size: tuple[int, int]) -> np.
     return cv2.resize(color.max(-1), size[::-1], interpolation=cv2.INTER_AREA) < 3
 
 
-def _confidence(container: FolderContainer, number: int, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
+def _confidence(
+    container: FolderContainer, number: int, size: tuple[int, int]
+) -> UInt8[np.ndarray, "height width"]:
     """Read 0 as low, 255 as high and whatever lies between as medium."""
     name = f"keyframes/confidence/{number}.png"
     raw = decode_gray(container.read(name, MAX_PICTURE_BYTES), f"{container.where}/{name}", np.uint8)

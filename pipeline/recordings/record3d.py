@@ -1,10 +1,13 @@
-"""Record3D recordings, both ways the app exports them: one ``.r3d`` archive, or a folder of EXR and JPEG files.
+"""Record3D recordings, both ways the app exports them.
+
+One ``.r3d`` archive, or a folder of EXR and JPEG files.
 
 Files are paired with the metadata's rows by number, so that missing ones shift nothing.
 """
 
 import json
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +17,11 @@ import lzfse
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.errors import InputError
-from pipeline.files import images
-from pipeline.recordings import lzfse_blocks
-from pipeline.recordings.containers import Container, FolderContainer, ZipContainer
+from pipeline.core.errors import InputError
+from pipeline.data import images
+from pipeline.recordings.containers import Container, FolderContainer, ZipContainer, refuse_surplus_members
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (
+from pipeline.recordings.recording import (  # fmt: skip
     MAX_PICTURE_BYTES,
     MAX_TEXT_BYTES,
     Y_UP,
@@ -30,15 +32,21 @@ from pipeline.recordings.recording import (
     no_depth,
     no_frames,
     wrong_depth,
-)  # fmt: skip
+)
 
 DEPTH_SIZES = {49_152: (256, 192), 307_200: (640, 480), 691_200: (960, 720)}
-"""floats per picture -> (height, width) of a portrait recording, where the metadata do not say"""
+"""floats per picture -> (height, width) of a portrait recording, where the metadata lack it"""
 FACE_ID_FLOATS = (307_200, 691_200)
 FACE_ID, LIDAR = 0, 1
 """the app's numbers of the cameras at the front and at the back"""
+MAX_SIDE_PX = 16384
+"""a picture with a longer side is none that a phone takes"""
 LEAST_TIMED = 0.5
-"""share of frames whose times increase below which the times tell nothing"""
+"""share of frames whose times increase below which the times are not used"""
+
+
+LZFSE_END = b"bvx$"
+"""marks the end of an LZFSE stream"""
 
 
 @dataclass(frozen=True)
@@ -69,8 +77,11 @@ def open_recording(path: Path) -> Recording:
 def _open(container: Container, layout: _Layout) -> Recording:
     if layout.metadata not in container.names:
         remedy = "export from Record3D as 'Shareable/Internal format (.r3d)' or 'EXR + JPG sequence'"
-        raise InputError("CAP-003", f"not a Record3D recording: it has no {layout.metadata!r}", container.where, remedy)
+        raise InputError(
+            "CAP-003", f"not a Record3D recording: it has no {layout.metadata!r}", container.where, remedy
+        )
     metadata = _Metadata(container, layout.metadata)
+    refuse_surplus_members(container, metadata.declared_frames())
     stored = _numbers(container.names, layout.depth)
     if not stored:
         raise no_depth(container.where, "Record3D's archive holds none")
@@ -103,7 +114,8 @@ def _open(container: Container, layout: _Layout) -> Recording:
 class _Metadata:
     """The recording's JSON, checked as it is asked for. Every complaint is CAP-004 and names the key.
 
-    Rows are asked for by frame numbers; what single rows lack is mended, or left out, and counted in ``remarks``.
+    Rows are asked for by frame numbers; what single rows lack is mended, or left out, and counted in
+    ``remarks``.
     """
 
     def __init__(self, container: Container, name: str) -> None:
@@ -117,12 +129,22 @@ class _Metadata:
             raise self._broken("not a table")
         self.color_size = (self._pixels("h"), self._pixels("w"))
 
+    def declared_frames(self) -> int:
+        """Return how many frames the recording has by its metadata, the most where tables disagree."""
+        tables = (self._table.get(key) for key in ("poses", "frameTimestamps", "perFrameIntrinsicCoeffs"))
+        return max((len(table) for table in tables if isinstance(table, list)), default=0)
+
     def depth_size(self) -> tuple[int, int] | None:
         """Return (height, width) of the depth pictures where the app wrote it."""
-        return (self._pixels("dh"), self._pixels("dw")) if "dh" in self._table and "dw" in self._table else None
+        return (
+            (self._pixels("dh"), self._pixels("dw")) if "dh" in self._table and "dw" in self._table else None
+        )
 
     def timestamp_s(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
-        """Return seconds since the first frame, NaN where they do not increase; from the frame rate in recordings of old apps."""
+        """Return seconds since the first frame, NaN where they do not increase.
+
+        From the frame rate in recordings of old apps.
+        """
         if not self._table.get("frameTimestamps"):
             return (index - index[0]) / self._numbers("fps", (), positive=True)
         timestamp_s = self._rows("frameTimestamps", (), index)
@@ -133,7 +155,9 @@ class _Metadata:
         return np.where(good, timestamp_s - timestamp_s[good][0], np.nan)
 
     def intrinsics(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 3 3"]:
-        """Return K in colour pixels: per frame where the app wrote it, else the first frame's (stored by columns)."""
+        """Return K in colour pixels: per frame where the app wrote it, else the first frame's (stored by
+        columns).
+        """
         coefficients = self._rows("perFrameIntrinsicCoeffs", (4,), index)
         missing = ~(np.isfinite(coefficients).all(1) & (coefficients[:, :2] > 0).all(1))
         if missing.any():
@@ -161,12 +185,18 @@ class _Metadata:
         return pose
 
     def up(self) -> tuple[float, float, float] | None:
-        """Return what points up in the poses' world; nothing does in recordings of old apps, whose world is the first camera."""
+        """Return what points up in the poses' world.
+
+        Nothing does in recordings of old apps, whose world is the first camera.
+        """
         first = self._rows("poses", (7,), np.zeros(1, int))
         return None if np.isnan(first).all() or np.allclose(first, (0, 0, 0, 1, 0, 0, 0), atol=1e-6) else Y_UP
 
     def _rows(self, key: str, shape: tuple[int, ...], index: Int[np.ndarray, "frame"]) -> np.ndarray:
-        """Read a table's rows of the given shape by frame numbers; NaN where it has none or they hold what is no number."""
+        """Read a table's rows of the given shape by frame numbers.
+
+        NaN where it has none or they hold what is no number.
+        """
         rows = np.full((len(index), *shape), np.nan)
         if self._table.get(key):
             stored = self._numbers(key, (None, *shape), finite=False)
@@ -179,11 +209,13 @@ class _Metadata:
 
     def _pixels(self, key: str) -> int:
         value = float(self._numbers(key, (), positive=True))
-        if value != int(value) or value > 16384:
+        if value > MAX_SIDE_PX or value != int(value):
             raise self._broken(f"{key!r} is no picture size: {value:g}")
         return int(value)
 
-    def _numbers(self, key: str, shape: tuple[int | None, ...], *, positive: bool = False, finite: bool = True) -> np.ndarray:
+    def _numbers(
+        self, key: str, shape: tuple[int | None, ...], *, positive: bool = False, finite: bool = True
+    ) -> np.ndarray:
         """Read an array of numbers whose axes have the given lengths (None: any)."""
         if key not in self._table:
             raise self._broken(f"{key!r} is missing")
@@ -205,15 +237,23 @@ class _Metadata:
 def _array_from_json(value: Any) -> np.ndarray | None:
     try:
         return np.array(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
 
 
 def _numbers(names: frozenset[str], pattern: str) -> set[int]:
     """Return the frame numbers of the members that follow a pattern such as ``rgbd/%d.jpg``."""
     prefix, suffix = pattern.split("%d")
-    stems = (name[len(prefix) : -len(suffix)] for name in names if name.startswith(prefix) and name.endswith(suffix))
-    return {int(stem) for stem in stems if stem.isascii() and stem.isdigit() and len(stem) < 10 and str(int(stem)) == stem}
+    stems = (
+        name[len(prefix) : -len(suffix)]
+        for name in names
+        if name.startswith(prefix) and name.endswith(suffix)
+    )
+    return {
+        int(stem)
+        for stem in stems
+        if stem.isascii() and stem.isdigit() and len(stem) < 10 and str(int(stem)) == stem
+    }
 
 
 def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, first: int) -> tuple[int, int]:
@@ -225,7 +265,9 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
         return images.read_depth(container.path(layout.depth % first), channel="R").shape
     floats = len(_decompress(container, layout.depth % first, 4 * max(DEPTH_SIZES))) // 4
     if floats not in DEPTH_SIZES:
-        raise wrong_depth(f"{container.where}:{layout.depth % first}", f"{floats} values fit no known depth camera")
+        raise wrong_depth(
+            f"{container.where}:{layout.depth % first}", f"{floats} values fit no known depth camera"
+        )
     portrait = DEPTH_SIZES[floats]
     return portrait if metadata.color_size[0] >= metadata.color_size[1] else portrait[::-1]
 
@@ -243,7 +285,10 @@ def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float
     else:
         depth = np.frombuffer(_decompress_exactly(container, name, 4 * math.prod(size)), "<f4").reshape(size)
     if depth.shape != size:
-        raise wrong_depth(f"{container.where}:{name}", f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}")
+        raise wrong_depth(
+            f"{container.where}:{name}",
+            f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}",
+        )
     return depth
 
 
@@ -251,9 +296,13 @@ def _confidence_reader(
     container: Container, layout: _Layout, index: np.ndarray, size: tuple[int, int]
 ) -> Callable[[int], np.ndarray] | None:
     """Return a reader of confidence pictures where every frame has one."""
-    if isinstance(container, FolderContainer) or not set(index) <= _numbers(container.names, layout.confidence):
+    if isinstance(container, FolderContainer) or not set(index) <= _numbers(
+        container.names, layout.confidence
+    ):
         return None
-    return lambda i: np.frombuffer(_decompress_exactly(container, layout.confidence % i, math.prod(size)), np.uint8).reshape(size)
+    return lambda i: np.frombuffer(
+        _decompress_exactly(container, layout.confidence % i, math.prod(size)), np.uint8
+    ).reshape(size)
 
 
 def _decompress_exactly(container: Container, name: str, expected: int) -> bytes:
@@ -268,8 +317,45 @@ def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
     where = f"{container.where}:{name}"
     packed = container.read(name, max_bytes + max_bytes // 8 + 4096)
     try:
-        if lzfse_blocks.unpacked_bytes(packed) > max_bytes:
+        if unpacked_bytes(packed) > max_bytes:
             raise wrong_depth(where, f"more than {max_bytes} bytes")
         return lzfse.decompress(packed)
-    except (lzfse_blocks.BrokenBlockError, lzfse.error) as error:
+    except (BrokenBlockError, lzfse.error, MemoryError, ValueError) as error:
         raise damaged(where, f"LZFSE: {error}") from error
+
+
+class BrokenBlockError(ValueError):
+    """The stream is cut or is no LZFSE."""
+
+
+def unpacked_bytes(data: bytes) -> int:
+    """Add up the sizes that the blocks' headers declare. Raises BrokenBlockError."""
+    at, total = 0, 0
+    while data[at : at + 4] != LZFSE_END:
+        raw, length = _block(data, at)
+        if length < 8:
+            raise BrokenBlockError("empty block")
+        at, total = at + length, total + raw
+    return total
+
+
+def _block(data: bytes, at: int) -> tuple[int, int]:
+    """Return (unpacked bytes, stored bytes with the header) of the block at an offset."""
+    try:
+        match data[at : at + 4]:
+            case b"bvx-":
+                (raw,) = struct.unpack_from("<I", data, at + 4)
+                return raw, 8 + raw
+            case b"bvxn":
+                raw, payload = struct.unpack_from("<2I", data, at + 4)
+                return raw, 12 + payload
+            case b"bvx1":
+                raw, payload = struct.unpack_from("<2I", data, at + 4)
+                return raw, 772 + payload
+            case b"bvx2":
+                raw, first, second, third = struct.unpack_from("<I3Q", data, at + 4)
+                literals, matches = first >> 20 & 0xFFFFF, second >> 40 & 0xFFFFF
+                return raw, (third & 0xFFFFFFFF) + literals + matches
+    except struct.error as error:
+        raise BrokenBlockError("cut short") from error
+    raise BrokenBlockError("unknown block" if data[at : at + 4] else "cut short")

@@ -1,7 +1,7 @@
 """What every format becomes: a `Recording` whose frames are known and whose pictures are read on demand.
 
-Readers give poses and pictures as stored, with the convention that the format documents; checking and turning them is
-the next files' work.
+Readers give poses and pictures as stored, with the convention that the format documents; checking and
+turning them is the next files' work.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt16
 
-from pipeline.errors import InputError
+from pipeline.core.errors import InputError
+from pipeline.data import images
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
 from pipeline.recordings.conventions import OPENCV, Convention
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
+from pipeline.recordings.depth_camera import DepthCamera
 
 MAX_PICTURE_BYTES = 64 << 20
 MAX_TEXT_BYTES = 64 << 20
@@ -25,7 +27,9 @@ Picture = bytes | UInt8[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording whose frames are known and whose pictures are read on demand, all as stored (not yet upright)."""
+    """A recording whose frames are known and whose pictures are read on demand, all as stored (not yet
+    upright).
+    """
 
     where: str
     kind: str
@@ -35,9 +39,12 @@ class Recording:
     timestamp_s: Float[np.ndarray, "frame"]
     """increasing, on the recording's own clock, which starts at 0"""
     intrinsics: Float[np.ndarray, "frame 3 3"] | None
-    """colour pixels; None where nothing tells them (plain video)"""
+    """colour pixels; None where they are unknown (plain video)"""
     pose: Float[np.ndarray, "frame 7"] | None
-    """four quaternion and three translation (metres) numbers as documented, NaN where lost; None where there are none"""
+    """four quaternion and three translation (metres) numbers as documented, NaN where lost.
+
+    None where there are none
+    """
     color_size: tuple[int, int]
     """(height, width) in pixels"""
     depth_size: tuple[int, int] | None
@@ -51,29 +58,48 @@ class Recording:
     convention: Convention = OPENCV
     """what the format documents about its poses"""
     up: tuple[float, float, float] | None = None
-    """direction that points up in the poses' world; None where the format does not tell"""
+    """direction that points up in the poses' world; None where the format does not document it"""
     quarter_turns: int = 0
-    """clockwise, stored to upright, where the file itself tells (video rotation tag) and `up` does not"""
+    """clockwise, stored to upright, from the video rotation tag, used where `up` is None"""
     read_mesh: Callable[[], Mesh] | None = None
     """the app's own surface of the room, metres, in the poses' world; None where it has none"""
+    depth_camera: DepthCamera | None = None
+    """the depth camera where it is another one than the colour camera.
+
+    None where depth is aligned with colour
+    """
     remarks: tuple[str, ...] = ()
     """what had to be assumed or left out, one sentence each"""
 
 
 def damaged(where: str, why: str) -> InputError:
     """Make the error for something that cannot be read to its end."""
-    return InputError("CAP-001", f"the recording is damaged or was not copied completely ({why})", where, "export it from the phone again")
+    return InputError(
+        "CAP-001",
+        f"the recording is damaged or was not copied completely ({why})",
+        where,
+        "export it from the phone again",
+    )
 
 
 def broken_metadata(where: str, why: str) -> InputError:
-    """Make the error for numbers beside the pictures that cannot be used: also what a changed export format leads to."""
-    remedy = "export it from the phone again; if a newer app writes this, the format has changed: report the app's version"
+    """Make the error for numbers beside the pictures that cannot be used.
+
+    Also what a changed export format leads to.
+    """
+    remedy = (
+        "export it from the phone again; if a newer app writes this, the "
+        "format has changed: report the app's version"
+    )
     return InputError("CAP-004", f"the recording's metadata cannot be used: {why}", where, remedy)
 
 
 def no_depth(where: str, why: str) -> InputError:
     """Make the error for recordings without depth."""
-    remedy = "record with a LiDAR phone (Record3D, Stray Scanner), or add a depth picture per frame: see the README's table of formats"
+    remedy = (
+        "record with a LiDAR phone (Record3D, Stray Scanner), or add a depth "
+        "picture per frame: see the README's table of formats"
+    )
     return InputError("CAP-006", f"no depth: {why}", where, remedy)
 
 
@@ -88,19 +114,28 @@ def wrong_depth(where: str, why: str) -> InputError:
 
 
 def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 7"]:
-    """Turn stored matrices into stored poses (quaternion xyzw, translation); NaN where a matrix is no rigid motion."""
+    """Turn stored matrices into stored poses (quaternion xyzw, translation).
+
+    NaN where a matrix is no rigid motion.
+    """
     pose = np.full((len(world_from_camera), 7), np.nan)
     rotation = world_from_camera[:, :3, :3]
     with np.errstate(all="ignore"):
         off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
-        good = np.isfinite(world_from_camera).all((1, 2)) & (off < 0.02) & (np.linalg.det(np.nan_to_num(rotation)) > 0)
+        good = (
+            np.isfinite(world_from_camera).all((1, 2))
+            & (off < 0.02)
+            & (np.linalg.det(np.nan_to_num(rotation)) > 0)
+        )
     if good.any():
         pose[good, :4] = np.roll(rigid.quaternion_from_rotation(rotation[good]), -1, axis=1)
         pose[good, 4:] = world_from_camera[good, :3, 3]
     return pose
 
 
-def intrinsics_from_coefficients(coefficients: Float[np.ndarray, "frame 4"], where: str) -> Float[np.ndarray, "frame 3 3"]:
+def intrinsics_from_coefficients(
+    coefficients: Float[np.ndarray, "frame 4"], where: str
+) -> Float[np.ndarray, "frame 3 3"]:
     """Turn (fx, fy, cx, cy) per frame into matrices; raises CAP-004 for impossible values."""
     if not np.isfinite(coefficients).all() or np.any(coefficients[:, :2] <= 0):
         raise broken_metadata(where, "the focal length must be positive")
@@ -109,19 +144,26 @@ def intrinsics_from_coefficients(coefficients: Float[np.ndarray, "frame 4"], whe
     return intrinsics
 
 
-def decode_gray(data: bytes, where: str, dtype: type = np.uint16) -> UInt16[np.ndarray, "height width"] | UInt8[np.ndarray, "height width"]:
-    """Decode a single-channel PNG of 16 bits (depth) or 8 bits (confidence). Raises CAP-008 for anything else."""
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
+def decode_gray(
+    data: bytes, where: str, dtype: type = np.uint16
+) -> UInt16[np.ndarray, "height width"] | UInt8[np.ndarray, "height width"]:
+    """Decode a single-channel PNG of 16 bits (depth) or 8 bits (confidence).
+
+    Raises CAP-008 for anything else.
+    """
+    image = images.decoded(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != dtype:
         raise wrong_depth(where, f"not a readable {8 * np.dtype(dtype).itemsize}-bit single-channel PNG")
     return image
 
 
-def meters_from_png(data: bytes, size: tuple[int, int] | None, where: str, per_meter: float = 1000.0) -> Float[np.ndarray, "height width"]:
-    """Decode a 16-bit depth PNG to metres; 0 and 65535 are unknown. Raises CAP-008 when it has not the expected size."""
+def meters_from_png(
+    data: bytes, size: tuple[int, int] | None, where: str, per_meter: float = 1000.0
+) -> Float[np.ndarray, "height width"]:
+    """Decode a 16-bit depth PNG to metres; 0 and 65535 are unknown.
+
+    Raises CAP-008 when it has not the expected size.
+    """
     raw = decode_gray(data, where)
     if size is not None and raw.shape != size:
         raise wrong_depth(where, f"{raw.shape[1]} x {raw.shape[0]} instead of {size[1]} x {size[0]}")

@@ -1,6 +1,8 @@
-"""Stray Scanner: a folder with `rgb.mp4`, one depth and confidence PNG per frame and `odometry.csv`, as stored in sensor landscape.
+"""Stray Scanner: a folder with `rgb.mp4`, one depth and confidence PNG per frame and `odometry.csv`, as
+stored in sensor landscape.
 
-Times are the odometry's (the video's are counted, not real); focal lengths per frame where the app wrote them.
+Times are the odometry's (the video's are counted, not real); focal lengths per frame where the app wrote
+them.
 """
 
 import csv
@@ -11,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.errors import InputError
-from pipeline.recordings.containers import FolderContainer
+from pipeline.core.errors import InputError
+from pipeline.recordings.containers import FolderContainer, frame_number
 from pipeline.recordings.conventions import OPENCV
 from pipeline.recordings.movies import Movie
-from pipeline.recordings.recording import (
+from pipeline.recordings.recording import (  # fmt: skip
     MAX_PICTURE_BYTES,
     MAX_TEXT_BYTES,
     Y_UP,
@@ -26,11 +28,13 @@ from pipeline.recordings.recording import (
     meters_from_png,
     no_depth,
     no_frames,
-)  # fmt: skip
+)
 
 INTRINSICS_SIZE = (1440, 1920)
 """(height, width) to which the app's intrinsics refer, whatever the video's size"""
 POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
+MAX_FRAMES = 1 << 31
+"""frame numbers are below this"""
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
 OLDEST = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """columns of the oldest app, which wrote no header"""
@@ -51,9 +55,13 @@ class Odometry:
 def open_recording(path: Path) -> Recording:
     """Open a Stray Scanner folder. Raises InputError CAP-001..009 for what cannot be used."""
     container = FolderContainer(path)
-    movie = Movie(path / "rgb.mp4")
+    movie = Movie(container.regular("rgb.mp4"))
     rows = read_odometry(_text(container, "odometry.csv"), f"{path}/odometry.csv")
-    depth = {int(Path(name).stem): name for name in sorted(container.names) if name.startswith("depth/") and Path(name).stem.isdigit()}
+    depth = {
+        number: name
+        for name in sorted(container.names)
+        if name.startswith("depth/") and (number := frame_number(Path(name).stem)) is not None
+    }
     if not depth:
         raise no_depth(container.where, "the folder depth/ is empty")
     kept = np.array([number < len(movie) and int(number) in depth for number in rows.frame], bool)
@@ -82,8 +90,15 @@ def open_recording(path: Path) -> Recording:
 
 
 def read_odometry(text: str, where: str) -> Odometry:
-    """Read the table by its column names: 7 (oldest, no header), 9 or 15 columns, blanks where nothing was known."""
-    lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    """Read the table by its column names.
+
+    7 (oldest, no header), 9 or 15 columns, blanks where nothing was known.
+    """
+    lines = [
+        [cell.strip() for cell in row]
+        for row in csv.reader(text.splitlines())
+        if any(cell.strip() for cell in row)
+    ]
     header = tuple(lines[0]) if lines else ()
     if not set(POSE) <= set(header):
         if len(header) != len(OLDEST):
@@ -92,7 +107,9 @@ def read_odometry(text: str, where: str) -> Odometry:
     else:
         lines = lines[1:]
     try:
-        table = np.array([[float(cell) if cell else np.nan for cell in row[: len(header)]] for row in lines]).reshape(-1, len(header))
+        table = np.array(
+            [[float(cell) if cell else np.nan for cell in row[: len(header)]] for row in lines]
+        ).reshape(-1, len(header))
     except ValueError as error:
         raise broken_metadata(where, f"a row is cut or no numbers ({error})") from error
     column = {name: table[:, i] for i, name in enumerate(header)}
@@ -100,22 +117,35 @@ def read_odometry(text: str, where: str) -> Odometry:
     if timestamp_s is not None and (not np.isfinite(timestamp_s).all() or np.any(np.diff(timestamp_s) <= 0)):
         raise broken_metadata(where, "the times must increase")
     frame = column.get("frame", np.arange(len(table)))
-    if not np.isfinite(frame).all():
+    if not (np.isfinite(frame) & (frame >= 0) & (frame < MAX_FRAMES)).all():
         raise broken_metadata(where, "a frame has no number")
-    coefficients = np.stack([column[name] for name in COEFFICIENTS], axis=1) if set(COEFFICIENTS) <= set(column) else None
+    coefficients = (
+        np.stack([column[name] for name in COEFFICIENTS], axis=1)
+        if set(COEFFICIENTS) <= set(column)
+        else None
+    )
     if coefficients is not None and not np.isfinite(coefficients).all():
         coefficients = None
-    return Odometry(frame.astype(int), timestamp_s, np.stack([column[name] for name in POSE], axis=1), coefficients)
+    return Odometry(
+        frame.astype(int), timestamp_s, np.stack([column[name] for name in POSE], axis=1), coefficients
+    )
 
 
-def _intrinsics(container: FolderContainer, rows: Odometry, kept: np.ndarray, size: tuple[int, int]) -> Float[np.ndarray, "frame 3 3"]:
-    """Return per-frame intrinsics in the video's pixels; `camera_matrix.csv` (the last frame's) where the rows have none."""
+def _intrinsics(
+    container: FolderContainer, rows: Odometry, kept: np.ndarray, size: tuple[int, int]
+) -> Float[np.ndarray, "frame 3 3"]:
+    """Return per-frame intrinsics in the video's pixels.
+
+    `camera_matrix.csv` (the last frame's) where the rows have none.
+    """
     if rows.coefficients is not None:
         coefficients = rows.coefficients[kept]
     else:
         text = _text(container, "camera_matrix.csv")
         try:
-            matrix = np.array([[float(cell) for cell in line.split(",")] for line in text.splitlines() if line.strip()]).reshape(3, 3)
+            matrix = np.array(
+                [[float(cell) for cell in line.split(",")] for line in text.splitlines() if line.strip()]
+            ).reshape(3, 3)
         except ValueError as error:
             raise broken_metadata(f"{container.where}/camera_matrix.csv", "it is no 3 x 3 matrix") from error
         coefficients = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (int(kept.sum()), 1))
@@ -129,21 +159,32 @@ def _text(container: FolderContainer, name: str) -> str:
     return container.read(name, MAX_TEXT_BYTES).decode("utf-8", errors="replace")
 
 
-def _depth(container: FolderContainer, name: str, size: tuple[int, int] | None) -> Float[np.ndarray, "height width"]:
+def _depth(
+    container: FolderContainer, name: str, size: tuple[int, int] | None
+) -> Float[np.ndarray, "height width"]:
     where = f"{container.where}/{name}"
     if name.endswith(".npy"):
         return meters_from_npy(container.read(name, MAX_PICTURE_BYTES), size, where)
     return meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, where)
 
 
-def meters_from_npy(data: bytes, size: tuple[int, int] | None, where: str) -> Float[np.ndarray, "height width"]:
+def meters_from_npy(
+    data: bytes, size: tuple[int, int] | None, where: str
+) -> Float[np.ndarray, "height width"]:
     """Read the older app's `.npy` depth: uint16 millimetres. Raises CAP-008."""
     try:
         raw = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise InputError("CAP-008", f"a depth picture is wrong: {error}", where, "export it from the phone again") from error
+        raise InputError(
+            "CAP-008", f"a depth picture is wrong: {error}", where, "export it from the phone again"
+        ) from error
     if raw.ndim != 2 or raw.dtype != np.uint16 or (size is not None and raw.shape != size):
-        raise InputError("CAP-008", f"a depth picture is wrong: {raw.dtype} {raw.shape}", where, "export it from the phone again")
+        raise InputError(
+            "CAP-008",
+            f"a depth picture is wrong: {raw.dtype} {raw.shape}",
+            where,
+            "export it from the phone again",
+        )
     return raw.astype(np.float32) / np.float32(1000)
 
 
@@ -156,4 +197,9 @@ def _refuse_constant_rows(container: FolderContainer, names: list[str]) -> None:
     pictures = [_depth(container, name, None) for name in names]
     if all(np.ptp(picture, axis=1).max() == 0 and np.ptp(picture) > 0 for picture in pictures):
         what = "every row of the depth pictures holds one value: a fault of this version of Stray Scanner"
-        raise InputError("CAP-009", what, container.where, "update the app and record again; the depth of this recording is lost")
+        raise InputError(
+            "CAP-009",
+            what,
+            container.where,
+            "update the app and record again; the depth of this recording is lost",
+        )

@@ -1,7 +1,7 @@
 """TUM RGB-D folders: `rgb.txt`, `depth.txt` and, where there is one, `groundtruth.txt`, associated by time.
 
-Depth is registered to the colour picture; `depth_scale.txt` tells its units per metre, else poses tell the set's 5000 from
-millimetres. Intrinsics from `intrinsics.txt` or the set's default.
+Depth is registered to the colour picture; `depth_scale.txt` holds its units per metre, else poses distinguish
+the set's 5000 from millimetres. Intrinsics from `intrinsics.txt` or the set's default.
 """
 
 from collections.abc import Callable
@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import images
+from pipeline.data import images
+from pipeline.geometry import cameras
 from pipeline.recordings import text_files
 from pipeline.recordings.containers import FolderContainer
-from pipeline.recordings.conventions import OPENCV, DepthView, check_poses
-from pipeline.recordings.recording import (
+from pipeline.recordings.conventions import OPENCV, DepthPicture, check_poses
+from pipeline.recordings.recording import (  # fmt: skip
     MAX_PICTURE_BYTES,
     MAX_TEXT_BYTES,
     Recording,
@@ -23,8 +24,7 @@ from pipeline.recordings.recording import (
     meters_from_png,
     no_depth,
     no_frames,
-)  # fmt: skip
-from pipeline.space import cameras
+)
 
 PER_METER, MILLIMETERS = 5000.0, 1000.0
 """units per metre of the set, and of most other cameras"""
@@ -52,20 +52,29 @@ def open_recording(path: Path) -> Recording:
     kept, pairs = kept[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     if not pairs:
         raise no_frames(container.where, "no colour picture has depth within 20 ms")
-    color_size = images.decode_color(container.read(pairs[0][0], MAX_PICTURE_BYTES), container.where).shape[:2]
+    color_size = images.decode_color(container.read(pairs[0][0], MAX_PICTURE_BYTES), container.where).shape[
+        :2
+    ]
     depth_size = meters_from_png(container.read(pairs[0][1], MAX_PICTURE_BYTES), None, container.where).shape
-    coefficients, remarks = text_files.coefficients(container, default=DEFAULT if color_size == (480, 640) else None)
+    coefficients, remarks = text_files.coefficients(
+        container, default=DEFAULT if color_size == (480, 640) else None
+    )
     intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(pairs), 1)), container.where)
+    camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (color_size, depth_size))
     pose = _poses(container, times[kept])
 
     def depth(number: int, per_meter: float) -> np.ndarray:
         name = pairs[number][1]
-        return meters_from_png(container.read(name, MAX_PICTURE_BYTES), depth_size, f"{container.where}/{name}", per_meter)
+        return meters_from_png(
+            container.read(name, MAX_PICTURE_BYTES), depth_size, f"{container.where}/{name}", per_meter
+        )
 
-    def view(number: int, per_meter: float) -> DepthView:
-        return DepthView(depth(number, per_meter), cameras.scale_intrinsics(intrinsics[number], color_size, depth_size))
+    def view(number: int, per_meter: float) -> DepthPicture:
+        return DepthPicture(
+            depth(number, per_meter), cameras.scale_intrinsics(intrinsics[number], color_size, depth_size)
+        )
 
-    per_meter, told = _units_per_meter(container, pose, times[kept], view)
+    per_meter, scale_remarks = _units_per_meter(container, pose, times[kept], view)
     return Recording(
         where=container.where,
         kind="TUM RGB-D",
@@ -78,12 +87,17 @@ def open_recording(path: Path) -> Recording:
         read_color=lambda i: container.read(pairs[i][0], MAX_PICTURE_BYTES),
         read_depth=lambda i: depth(i, per_meter),
         convention=OPENCV,
-        remarks=remarks + told,
+        depth_camera=camera,
+        remarks=remarks + scale_remarks + camera_remarks,
     )
 
 
-def nearest(times: Float[np.ndarray, "frame"], others: Float[np.ndarray, "other"], within_s: float) -> np.ndarray:
-    """Return for each time the index of the nearest of `others` (increasing), -1 where none is near enough."""
+def nearest(
+    times: Float[np.ndarray, "frame"], others: Float[np.ndarray, "other"], within_s: float
+) -> np.ndarray:
+    """Return for each time the index of the nearest of `others` (increasing), -1 where none is near
+    enough.
+    """
     right = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
     left = np.clip(right - 1, 0, len(others) - 1)
     right = np.clip(right, 0, len(others) - 1)
@@ -97,19 +111,34 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
     for line in text_files.lines(container, name):
         cells = line.split()
         try:
-            found.append((float(cells[0]), cells[1]))
+            time_s = float(cells[0])
+            if not np.isfinite(time_s):
+                raise ValueError(time_s)
+            found.append((time_s, cells[1]))
         except (ValueError, IndexError) as error:
-            raise broken_metadata(f"{container.where}/{name}", f"{line[:40]!r} is no time and file name") from error
+            raise broken_metadata(
+                f"{container.where}/{name}", f"{line[:40]!r} is no time and file name"
+            ) from error
     return sorted(dict(found).items())
 
 
-def _poses(container: FolderContainer, times: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 7"] | None:
-    """Return the pose nearest in time to each frame, NaN where there is none within 20 ms; None without the file."""
+def _poses(
+    container: FolderContainer, times: Float[np.ndarray, "frame"]
+) -> Float[np.ndarray, "frame 7"] | None:
+    """Return the pose nearest in time to each frame, NaN where there is none within 20 ms.
+
+    None without the file.
+    """
     if "groundtruth.txt" not in container.names:
         return None
     table = text_files.table(
-        container.read("groundtruth.txt", MAX_TEXT_BYTES).decode(errors="replace"), 8, f"{container.where}/groundtruth.txt"
+        container.read("groundtruth.txt", MAX_TEXT_BYTES).decode(errors="replace"),
+        8,
+        f"{container.where}/groundtruth.txt",
     )
+    if len(table) == 0:
+        return None
+    table = table[np.isfinite(table[:, 0])]
     if len(table) == 0:
         return None
     table = table[np.argsort(table[:, 0], kind="stable")]
@@ -123,22 +152,37 @@ def _units_per_meter(
     container: FolderContainer,
     pose: Float[np.ndarray, "frame 7"] | None,
     timestamp_s: Float[np.ndarray, "frame"],
-    view: Callable[[int, float], DepthView],
+    view: Callable[[int, float], DepthPicture],
 ) -> tuple[float, tuple[str, ...]]:
-    """Return what `depth_scale.txt` tells; else millimetres where poses fit them and not the set's unit, which stands otherwise."""
+    """Return the units of `depth_scale.txt`.
+
+    Else millimetres where poses fit them and not the set's unit, which stands otherwise.
+    """
     name = "depth_scale.txt"
     if name in container.names:
         where = f"{container.where}/{name}"
-        told = float(text_files.table(container.read(name, MAX_TEXT_BYTES).decode(errors="replace"), 1, where, rows=1)[0, 0])
-        if not 0 < told < np.inf:
+        per_meter = float(
+            text_files.table(container.read(name, MAX_TEXT_BYTES).decode(errors="replace"), 1, where, rows=1)[
+                0, 0
+            ]
+        )
+        if not 0 < per_meter < np.inf:
             raise broken_metadata(where, "the units per metre must be positive")
-        return told, ()
+        return per_meter, ()
     known = np.flatnonzero(np.isfinite(pose).all(1)) if pose is not None else np.arange(0)
 
     def off(per_meter: float) -> float:
-        check = check_poses(pose[known], timestamp_s[known], lambda i: view(known[i], per_meter), documented=OPENCV, among=(OPENCV,))
+        check = check_poses(
+            pose[known],
+            timestamp_s[known],
+            lambda i: view(known[i], per_meter),
+            documented=OPENCV,
+            among=(OPENCV,),
+        )
         return check.residual_m / check.tolerance_m
 
     if len(known) and off(MILLIMETERS) < min(1.0, CLEARLY * off(PER_METER)):
-        return MILLIMETERS, (f"no {name}: {MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not",)
+        return MILLIMETERS, (
+            f"no {name}: {MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not",
+        )
     return PER_METER, (f"no {name}: {PER_METER:g} units per metre are assumed",)

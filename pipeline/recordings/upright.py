@@ -1,12 +1,16 @@
-"""Find how many quarter turns make a recording upright: from gravity, or without it from how it was held and the room."""
+"""Find how many quarter turns make a recording upright.
+
+From gravity, or without it from how it was held and the room.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.space import cameras, surface
-from pipeline.space.ground import floor_direction
+from pipeline.geometry import cameras
+from pipeline.geometry.ground import floor_direction
+from pipeline.mapping import depth_scans
 
 ROLL = 4.0
 """what a mean squared sine of roll counts against a share of level surface"""
@@ -24,12 +28,16 @@ def quarter_turns_from_gravity(
     up_odometry: tuple[float, float, float] | Float[np.ndarray, "3"] = (0.0, 1.0, 0.0),
     margin: float = 0.1,
 ) -> int:
-    """Return the clockwise quarter turns (0..3) after which up in the world points up in the pictures on average.
+    """Return the clockwise quarter turns (0..3) after which up in the world points up in the pictures on
+    average.
 
-    The pictures stay as they are unless another turn is better by ``margin`` (mean cosine): a phone that looks
-    straight down has no upright.
+    The pictures stay as they are unless another turn is better by ``margin`` (mean cosine): a phone that
+    looks straight down has no upright.
     """
-    up_in_picture = [-(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean() for turns in range(4)]
+    up_in_picture = [
+        -(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean()
+        for turns in range(4)
+    ]
     best = int(np.argmax(up_in_picture))
     return best if up_in_picture[best] > up_in_picture[0] + margin else 0
 
@@ -38,14 +46,18 @@ def up_from_room(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
 ) -> Float[np.ndarray, "3"] | None:
-    """Return the direction that points up where no sensor told it, or None where the room does not tell either.
+    """Return the direction that points up where no sensor measured it, or None where the room is ambiguous.
 
-    Each of the four sides of the pictures may be up. It is sharpened by the room's planes (Manhattan) and judged by
-    what people film: more level surface is seen from above (floor, seats, tables) than from below, and one side of
-    the pictures stays level while they turn. ``views`` are (depth in metres, intrinsics) of frames spread evenly.
+    Each of the four sides of the pictures may be up. It is sharpened by the room's planes (Manhattan) and
+    judged by what people film: more level surface is seen from above (floor, seats, tables) than from
+    below, and one side of the pictures stays level while they turn. ``views`` are (depth in metres,
+    intrinsics) of frames spread evenly.
     """
     seen = np.linspace(0, len(odometry_from_camera) - 1, len(views)).round().astype(int)
-    normals = [_normals(*view) @ odometry[:3, :3].T for view, odometry in zip(views, odometry_from_camera[seen], strict=True)]
+    normals = [
+        _normals(*view) @ odometry[:3, :3].T
+        for view, odometry in zip(views, odometry_from_camera[seen], strict=True)
+    ]
     towards_camera = np.concatenate(normals)
     if len(towards_camera) < LEAST_POINTS:
         return None
@@ -62,11 +74,15 @@ def up_from_room(
     return directions[best] if scores[best] > scores[second] + MARGIN else None
 
 
-def _normals(depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "point 3"]:
+def _normals(
+    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "point 3"]:
     """Return some of the directions that surfaces face, in camera axes."""
     step = max(1, max(depth.shape) // SIDE_PX)
     thinned = depth[step // 2 :: step, step // 2 :: step]
-    normal = surface.image_normals(thinned, cameras.scale_intrinsics(intrinsics, depth.shape, thinned.shape))
+    normal = depth_scans.image_normals(
+        thinned, cameras.scale_intrinsics(intrinsics, depth.shape, thinned.shape)
+    )
     return normal[np.abs(normal).sum(-1) > 0][::5]
 
 
@@ -74,16 +90,21 @@ def quarter_turns_from_room(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
 ) -> int:
-    """Return the clockwise quarter turns (0..3) that make pictures upright where no sensor told up; 0 where nothing tells."""
+    """Return the clockwise quarter turns (0..3) that make pictures upright where no sensor measured up.
+
+    0 where it is ambiguous.
+    """
     up = up_from_room(odometry_from_camera, views)
     return 0 if up is None else quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
 
 
-def quarter_turns_from_surfaces(views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]]) -> int:
+def quarter_turns_from_surfaces(
+    views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
+) -> int:
     """Return the clockwise quarter turns (0..3) that make pictures upright where not even poses are known.
 
-    Floors, seats and tables are seen from above, so surfaces face up in the pictures more than to any other side; the pictures
-    stay as they are where that is not clear.
+    Floors, seats and tables are seen from above, so surfaces face up in the pictures more than to any
+    other side; the pictures stay as they are where that is not clear.
     """
     lean = [found.mean(0) for found in (_normals(*view) for view in views) if len(found) >= LEAST_POINTS]
     return quarter_turns_from_gravity(np.eye(4)[None], up_odometry=np.mean(lean, axis=0)) if lean else 0

@@ -1,0 +1,1 @@
+"""Feature, flow and segmentation backends that are weight-free or load published checkpoints."""

@@ -1,0 +1,92 @@
+"""Checkpoints of foundation models: folders as `save_pretrained` writes them, read with the optional
+`transformers`.
+
+Nothing is downloaded: a missing library or checkpoint is an error that says where to get it. Pictures are
+prepared here, without torchvision, as the checkpoint's own `preprocessor_config.json` tells.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from pipeline.core.errors import InputError
+
+CONFIG = "config.json"
+PREPARATION = "preprocessor_config.json"
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""ImageNet's, where a checkpoint tells none"""
+
+
+def library() -> ModuleType:
+    """Return the `transformers` package. Raises MOD-002 where the extra is not installed."""
+    try:
+        import transformers
+    except ImportError as error:
+        raise InputError(
+            "MOD-002", "this backend needs the package transformers", str(error), "make extras"
+        ) from error
+    return transformers
+
+
+def folder(path: str, what: str, name: str) -> Path:
+    """Return a checkpoint's folder. Raises MOD-001 with the name of a public checkpoint where there is
+    none.
+    """
+    fetch = f"hf download {name} --local-dir weights/{name.split('/')[-1]}"
+    remedy = f"download {name} (`{fetch}`) and name its folder in the recipe"
+    if not path or not (Path(path) / CONFIG).is_file():
+        raise InputError(
+            "MOD-001", f"the weights of {what} are not there", str(Path(path or ".") / CONFIG), remedy
+        )
+    return Path(path)
+
+
+def model(kind: str, path: Path, device: str) -> Any:
+    """Load a model of the class `kind` for inference. Raises MOD-003 where the folder holds another one."""
+    try:
+        loaded = getattr(library(), kind).from_pretrained(path, local_files_only=True)
+    except (OSError, ValueError, RuntimeError, KeyError) as error:
+        raise InputError(
+            "MOD-003", f"no usable {kind} ({str(error)[:200]})", str(path), "download the checkpoint again"
+        ) from error
+    return loaded.to(device).eval()
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """How a checkpoint wants its pictures."""
+
+    mean: tuple[float, float, float] = MEAN
+    std: tuple[float, float, float] = STD
+    resample: int = Image.Resampling.BICUBIC
+    size: Any = None
+    """as the checkpoint tells it"""
+
+    @classmethod
+    def read(cls, path: Path, resample: int) -> "Preparation":
+        """Read a checkpoint's own; ``resample`` is the method of its family where it tells none."""
+        file = path / PREPARATION
+        table = json.loads(file.read_text()) if file.is_file() else {}
+        table = table.get("image_processor", table)
+        mean, std = (
+            tuple(table.get(key) or default) for key, default in (("image_mean", MEAN), ("image_std", STD))
+        )
+        return cls(mean, std, int(table.get("resample") or resample), table.get("size"))
+
+    def pixels(
+        self, color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
+    ) -> Float[np.ndarray, "1 3 height width"]:
+        """Resize to (height, width), scale to 0..1 and normalise."""
+        image = Image.fromarray(color)
+        if color.shape[:2] != size:
+            image = image.resize(size[::-1], self.resample)
+        scaled = (np.asarray(image, np.float32) / 255 - np.array(self.mean, np.float32)) / np.array(
+            self.std, np.float32
+        )
+        return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])

@@ -1,0 +1,67 @@
+"""Grounding DINO (Liu et al. 2023): boxes in a picture from words, with the optional `transformers`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from pipeline.backends import checkpoints
+
+CHECKPOINT = "IDEA-Research/grounding-dino-tiny"
+SHORTEST_PX, LONGEST_PX = 800, 1333
+
+
+@dataclass(frozen=True)
+class Found:
+    """Boxes, most certain first."""
+
+    boxes_px: Float[np.ndarray, "box 4"]
+    """x0, y0, x1, y1 in the picture's pixels"""
+    score: Float[np.ndarray, "box"]
+    """0..1"""
+
+
+class GroundingDino:
+    """A loaded detector."""
+
+    def __init__(self, weights: str, device: str) -> None:
+        """Load a checkpoint folder. Raises MOD-001 (missing), MOD-002 (no transformers), MOD-003 (another
+        model).
+        """
+        path = checkpoints.folder(weights, "Grounding DINO", CHECKPOINT)
+        self._model = checkpoints.model("GroundingDinoForObjectDetection", path, device)
+        self._tokenizer = checkpoints.library().AutoTokenizer.from_pretrained(path, local_files_only=True)
+        self._preparation = checkpoints.Preparation.read(path, Image.Resampling.BILINEAR)
+        self._device = device
+
+    @torch.inference_mode()
+    def find(self, color: UInt8[np.ndarray, "height width 3"], description: str, threshold: float) -> Found:
+        """Find what is described; every phrase ends with a full stop (``a cat.``)."""
+        height, width = color.shape[:2]
+        pixels = self._preparation.pixels(color, fitted((height, width), self._preparation.size or {}))
+        words = self._tokenizer(description.lower().strip().rstrip(".") + ".", return_tensors="pt").to(
+            self._device
+        )
+        answer = self._model(pixel_values=torch.from_numpy(pixels).to(self._device), **words)
+        score = answer.logits[0].sigmoid().amax(-1)
+        center, size = answer.pred_boxes[0].split(2, dim=-1)
+        boxes = torch.cat([center - size / 2, center + size / 2], dim=-1) * torch.tensor(
+            [width, height] * 2, device=center.device
+        )
+        order = torch.argsort(score, descending=True, stable=True)
+        order = order[score[order] > threshold]
+        return Found(boxes[order].cpu().numpy(), score[order].cpu().numpy())
+
+
+def fitted(size: tuple[int, int], wanted: dict[str, int]) -> tuple[int, int]:
+    """Return (height, width) with the shorter side as wanted unless the longer one then grew too long."""
+    shortest, longest = wanted.get("shortest_edge") or SHORTEST_PX, wanted.get("longest_edge") or LONGEST_PX
+    short, long = min(size), max(size)
+    exact = longest * short / long if long / short * shortest > longest else float(shortest)
+    side = round(exact)
+    if side == short:
+        return size
+    other = int(exact * long / short)
+    return (side, other) if size[0] <= size[1] else (other, side)

@@ -1,0 +1,1 @@
+"""The behavior model: trajectories, perception, diffusion, planning and the simulator."""

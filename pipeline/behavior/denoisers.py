@@ -1,0 +1,220 @@
+"""The denoising networks of sequences: 1-D ControlUNets for path and body (Eq. 9, 10), and what all denoisers
+share.
+
+All predict the noise in x at step t, given the perception code. Inside they estimate the velocity v =
+sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) clean (Salimans & Ho 2022), which is of unit scale at every step;
+`NoiseFromVelocity` turns it into the noise, so that an untrained network begins as the best linear predictor.
+A ControlUNet is two identical UNets: the first denoises, the second reads the control (goal or path) and adds
+its features to every block of the first.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pipeline.behavior.diffusion import STANDARD, Schedule
+
+TIME_CHANNELS, EMBEDDING = 64, 128
+
+
+def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
+    """Return sines and cosines of the step number at 32 frequencies from 1 down to 1e-4."""
+    frequency = torch.exp(
+        -math.log(1e4)
+        / (TIME_CHANNELS // 2)
+        * torch.arange(TIME_CHANNELS // 2, dtype=torch.float32, device=t.device)
+    )
+    angle = t[:, None] * frequency
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)
+
+
+class NoiseFromVelocity(nn.Module):
+    """The noise, given the noisy sample and its velocity."""
+
+    def __init__(self, schedule: Schedule):
+        super().__init__()
+        share = torch.from_numpy(schedule.alpha_bar).float()
+        self.register_buffer("of_sample", (1 - share).sqrt(), persistent=False)
+        self.register_buffer("of_velocity", share.sqrt(), persistent=False)
+
+    def forward(
+        self, x: Float[Tensor, "batch ..."], velocity: Float[Tensor, "batch ..."], t: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch ..."]:
+        step, shape = t.long(), (-1, *[1] * (x.ndim - 1))
+        return self.of_sample[step].reshape(shape) * x + self.of_velocity[step].reshape(shape) * velocity
+
+
+class TrailingLinear(nn.Linear):
+    """A linear layer that reads the last numbers of a longer row: codes and posture come after the maps,
+    which only goals read.
+    """
+
+    def forward(self, row: Float[Tensor, "batch number"]) -> Float[Tensor, "batch out"]:
+        return super().forward(row[:, -self.in_features :])
+
+
+class Embedding(nn.Module):
+    """Step and code as one vector, which conditions every block of a UNet; ``read`` makes so many numbers of
+    the code.
+    """
+
+    def __init__(self, read: nn.Module):
+        super().__init__()
+        self.time = nn.Sequential(
+            nn.Linear(TIME_CHANNELS, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING)
+        )
+        self.read = read
+
+    def forward(
+        self, t: Float[Tensor, "batch"], code: Float[Tensor, "batch code"]
+    ) -> Float[Tensor, "batch 128"]:
+        return nn.functional.silu(self.time(time_embedding(t)) + self.read(code))
+
+
+class TemporalBlock(nn.Module):
+    """Two convolutions over time with group norm; the embedding of step and condition enters between them."""
+
+    def __init__(self, inner: int, outer: int, embedding: int, kernel: int = 5):
+        super().__init__()
+        self.first = nn.Sequential(
+            nn.Conv1d(inner, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
+        )
+        self.second = nn.Sequential(
+            nn.Conv1d(outer, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
+        )
+        self.embedding = nn.Linear(embedding, outer)
+        self.shortcut = nn.Conv1d(inner, outer, 1) if inner != outer else nn.Identity()
+
+    def forward(
+        self, h: Float[Tensor, "batch channel frame"], embedding: Float[Tensor, "batch e"]
+    ) -> Float[Tensor, "batch outer frame"]:
+        return self.second(self.first(h) + self.embedding(embedding)[..., None]) + self.shortcut(h)
+
+
+class UNet1d(nn.Module):
+    """A 1-D UNet over 56 frames (14 at the bottom of three levels) that takes features to add to
+    each block.
+    """
+
+    def __init__(self, channels: int, widths: tuple[int, ...], embedding: int):
+        super().__init__()
+        inner = (widths[0], *widths[:-1])
+        self.enter = nn.Conv1d(channels, widths[0], 1)
+        self.down = nn.ModuleList(TemporalBlock(i, o, embedding) for i, o in zip(inner, widths, strict=True))
+        self.halve = nn.ModuleList(nn.Conv1d(w, w, 3, 2, 1) for w in widths[:-1])
+        self.middle = TemporalBlock(widths[-1], widths[-1], embedding)
+        self.up = nn.ModuleList(
+            TemporalBlock(2 * o, i, embedding) for i, o in zip(inner[::-1], widths[::-1], strict=True)
+        )
+        self.block_widths = (*widths, widths[-1], *inner[::-1])
+
+    def forward(
+        self,
+        h: Float[Tensor, "batch channel frame"],
+        embedding: Float[Tensor, "batch e"],
+        added: list[Tensor] | None = None,
+    ) -> list[Tensor]:
+        """Return the output of every block in order; ``added`` holds one tensor per block."""
+        outputs: list[Tensor] = []
+
+        def run(block: TemporalBlock, h: Tensor) -> Tensor:
+            h = block(h, embedding)
+            outputs.append(h + added[len(outputs)] if added else h)
+            return outputs[-1]
+
+        h = self.enter(h)
+        skips = []
+        for level, block in enumerate(self.down):
+            h = run(block, h)
+            skips.append(h)
+            h = self.halve[level](h) if level < len(self.halve) else h
+        h = run(self.middle, h)
+        for level, block in enumerate(self.up):
+            h = h if level == 0 else h[..., None].expand(*h.shape, 2).flatten(-2)
+            h = run(block, torch.cat([h, skips[-1 - level]], dim=1))
+        return outputs
+
+
+class ControlUNet(nn.Module):
+    """Denoise a sequence under a control sequence (or one vector for all frames); ``keep`` 0 stands for no
+    control.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        control: int,
+        condition: int,
+        width: int = 32,
+        multipliers: tuple[int, ...] = (1, 2, 4),
+        schedule: Schedule = STANDARD,
+    ):
+        super().__init__()
+        self.noise = NoiseFromVelocity(schedule)
+        widths = tuple(width * m for m in multipliers)
+        self.embedding = Embedding(TrailingLinear(condition, EMBEDDING))
+        self.main = UNet1d(channels, widths, EMBEDDING)
+        self.side = UNet1d(control, widths, EMBEDDING)
+        self.inject = nn.ModuleList(nn.Conv1d(w, w, 1) for w in self.main.block_widths)
+        self.out = nn.Conv1d(widths[0], channels, 1)
+        for zero in self.inject:
+            nn.init.zeros_(zero.weight)
+            nn.init.zeros_(zero.bias)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch channel frame"]:
+        embedding = self.embedding(t, condition)
+        control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
+        side = self.side(control, embedding)
+        added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
+        return self.noise(x, self.out(self.main(self.unet_input(x, t, condition), embedding, added)[-1]), t)
+
+    def unet_input(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+    ) -> Float[Tensor, "batch channel frame"]:
+        """Return what the first UNet reads: the noisy sequence."""
+        del t, condition
+        return x
+
+
+class UncontrolledUNet(nn.Module):
+    """Denoise a sequence that nothing steers; called as `ControlUNet` is, and as good as one whose control is
+    never kept.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        read: nn.Module,
+        width: int = 32,
+        multipliers: tuple[int, ...] = (1, 2, 4),
+        schedule: Schedule = STANDARD,
+    ):
+        """``read`` makes `EMBEDDING` numbers of a condition."""
+        super().__init__()
+        self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
+        self.embedding = Embedding(read)
+        self.main = UNet1d(channels, widths, EMBEDDING)
+        self.out = nn.Conv1d(widths[0], channels, 1)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch ..."],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch channel frame"]:
+        del control, keep
+        return self.noise(x, self.out(self.main(x, self.embedding(t, condition))[-1]), t)

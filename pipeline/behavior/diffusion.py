@@ -1,0 +1,123 @@
+"""Diffusion in 50 steps: schedules, noising, DDPM and DDIM sampling, classifier-free guidance.
+
+Arithmetic only, on NumPy arrays and torch tensors alike: `sample` takes any function that predicts the noise,
+be it a torch module, an ONNX session, or a guided pair of calls.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeVar, assert_never
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.behavior.config import NoiseCourse
+
+Array = TypeVar("Array")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How much noise each step holds."""
+
+    steps: int = 50
+    """noise levels"""
+    beta_first: float = 1e-4
+    """variance added at the first step, where it is linear"""
+    beta_last: float = 0.2
+    """variance added at the last step, where it is linear"""
+    clip: float = 5.0
+    """bound of the clean estimate, in standard deviations"""
+    course: NoiseCourse = "linear"
+    """variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023): straight ways (1 -
+    s) clean + s noise, scaled to unit variance, which DDIM follows in Euler's steps; learn it with
+    `weighting` "flow\""""
+
+    @property
+    def method(self) -> Literal["ddpm", "ddim"]:
+        """Return how goals are best drawn (measured on homes kept from training): straight ways ask for no
+        fresh noise.
+        """
+        return "ddim" if self.course == "rectified" else "ddpm"
+
+    @property
+    def beta(self) -> Float[np.ndarray, "step"]:
+        """Variance added at each step."""
+        return np.linspace(self.beta_first, self.beta_last, self.steps)
+
+    @property
+    def alpha_bar(self) -> Float[np.ndarray, "step"]:
+        """Share of the clean signal's variance left after each step."""
+        match self.course:
+            case "linear":
+                return np.cumprod(1.0 - self.beta)
+            case "rectified":
+                noise = np.arange(1, self.steps + 1) / (self.steps + 1)
+                return (1 - noise) ** 2 / ((1 - noise) ** 2 + noise**2)
+            case _:
+                assert_never(self.course)
+
+    def visited(self, count: int) -> list[int]:
+        """Return the steps that a sampler of ``count`` steps visits, noisiest first."""
+        return [int(np.floor(t + 0.5)) for t in np.linspace(self.steps - 1, 0, count)]
+
+
+STANDARD = Schedule()
+"""50 linear steps, as in the paper"""
+
+
+def noised(clean: Array, noise: Array, alpha_bar: Array) -> Array:
+    """Return x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise; ``alpha_bar`` broadcasts
+    against both.
+    """
+    return alpha_bar**0.5 * clean + (1 - alpha_bar) ** 0.5 * noise
+
+
+def guided(
+    with_condition: Callable[[Array, float], Array], without: Callable[[Array, float], Array], scale: float
+) -> Callable[[Array, float], Array]:
+    """Return e = e_without + scale (e_with - e_without); only one network call where the scale is 0 or 1."""
+    if scale == 1.0:
+        return with_condition
+    if scale == 0.0:
+        return without
+
+    def both(x: Array, t: float) -> Array:
+        reference = without(x, t)
+        return reference + scale * (with_condition(x, t) - reference)
+
+    return both
+
+
+def sample(
+    denoise: Callable[[Array, float], Array],
+    noise: Array,
+    schedule: Schedule,
+    *,
+    method: Literal["ddpm", "ddim"],
+    count: int,
+    draw: Callable[[], Array] | None = None,
+    correct: Callable[[Array], Array] | None = None,
+) -> Array:
+    """Turn ``noise`` into a sample in ``count`` steps.
+
+    ``denoise(x, t)`` predicts the noise. DDIM is deterministic; DDPM adds fresh noise from ``draw`` at each
+    step but the last, with the posterior variance of the steps visited (exact ancestral sampling when all
+    are). ``correct`` is applied to the clean estimates of the steps at which most of the variance is clean,
+    the last one among them.
+    """
+    x, steps, alpha_bar = noise, schedule.visited(count), schedule.alpha_bar
+    for position, t in enumerate(steps):
+        now = float(alpha_bar[t])
+        epsilon = denoise(x, float(t))
+        clean = ((x - (1 - now) ** 0.5 * epsilon) / now**0.5).clip(-schedule.clip, schedule.clip)
+        epsilon = (x - now**0.5 * clean) / (1 - now) ** 0.5
+        clean = correct(clean) if correct and now > 0.5 else clean
+        if position == len(steps) - 1:
+            return clean
+        later = float(alpha_bar[steps[position + 1]])
+        variance = (1 - later) / (1 - now) * (1 - now / later) if method == "ddpm" else 0.0
+        x = later**0.5 * clean + max(1 - later - variance, 0.0) ** 0.5 * epsilon
+        if method == "ddpm":
+            x = x + variance**0.5 * draw()
+    return x

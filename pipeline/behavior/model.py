@@ -1,0 +1,341 @@
+"""The behaviour model as a whole: what its channels mean, its networks, its files.
+
+`Architecture` fixes shapes, `BehaviorNets` holds the weights, `contract` and `load` write and read them as
+files; the functions between define the channels of body and past. Plans are drawn by
+`pipeline.behavior.planning`.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, assert_never
+
+import numpy as np
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import nn
+
+from pipeline.behavior.body_denoiser import CONTROL_CHANNELS, BodyDenoiser
+from pipeline.behavior.concatenation import ConcatenationUNet
+from pipeline.behavior.config import (
+    AblatedInput,
+    Control,
+    Ego,
+    Family,
+    MapLookup,
+    PlanSamplingConfig,
+    SceneEncoder,
+)
+from pipeline.behavior.denoisers import EMBEDDING, ControlUNet, TrailingLinear, UncontrolledUNet
+from pipeline.behavior.diffusion import STANDARD, Schedule
+from pipeline.behavior.goal_denoiser import GoalMLP
+from pipeline.behavior.path_encoding import (
+    GOAL_LENGTH_POWER,
+    GOAL_TOLERANCE_M,
+    GOAL_TOLERANCE_SHARE,
+    MIN_SQUARED_M2,
+    PATH_CHANNELS,
+    REST_DAMPING,
+    REST_SPEED_M_S,
+    VELOCITY_POWER,
+    path_from_velocity_channels,
+    warped_path,
+    with_powered_length,
+)
+from pipeline.behavior.perception import (
+    GRID_CELL_M,
+    GRID_SHAPE,
+    MAP_KEY_CHANNELS,
+    VELOCITY_CHANNELS,
+    PerceptionConfig,
+    PerceptionEnsemble,
+)
+from pipeline.behavior.pointwise import WaypointUNet
+from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ
+from pipeline.geometry import rigid
+
+ROOT_CHANNELS = 6
+"""the body's leading channels: the root's rotation in the ego frame, its first two columns"""
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Everything that fixes the shape of the networks and the meaning of their channels."""
+
+    bones: int
+    ego: Ego = "yaw"
+    scene: SceneEncoder = "pillars"
+    scene_width: int = 32
+    scene_block: int = 4
+    scene_channels: int = 16
+    hidden: int = 128
+    code: int = 64
+    observer_radius_m: float = 4.0
+    ablated_input: AblatedInput = "nothing"
+    unet_width: int = 16
+    unet_multipliers: tuple[int, ...] = (1, 2, 4)
+    goal_hidden: int = 128
+    goal_layers: int = 6
+    family: Family = "diffusion"
+    control: Control = "unet"
+    future: int = FUTURE
+    ensemble_size: int = 3
+    map_lookup: MapLookup = "attention"
+
+    @property
+    def body_channels(self) -> int:
+        """Root rotation and 6 numbers per bone."""
+        return ROOT_CHANNELS + 6 * self.bones
+
+    @property
+    def scene_stride(self) -> int:
+        """How many cells of the ego grid the scene encoder averages along each axis before it begins."""
+        return self.scene_block if self.scene == "pillars" else 1
+
+    @property
+    def map_cells(self) -> int:
+        """Cells along each side of the map in which goals look things up; 0 without one."""
+        return GRID_SHAPE[0] // self.scene_block if self.scene == "pillars" else 0
+
+    @property
+    def code_length(self) -> int:
+        """Length of the perception code of all members, of the pace and of the posture that is held now."""
+        return 3 * self.code * self.ensemble_size + VELOCITY_CHANNELS + self.body_channels
+
+    @property
+    def condition_length(self) -> int:
+        """Length of all that is perceived: the maps of all members, and what conditions path and body."""
+        return 2 * MAP_KEY_CHANNELS * self.map_cells**2 * self.ensemble_size + self.code_length
+
+    @property
+    def perception(self) -> PerceptionConfig:
+        """Return the sizes of the perception network."""
+        return PerceptionConfig(
+            self.scene,
+            self.scene_width,
+            self.scene_block,
+            self.scene_channels,
+            self.hidden,
+            self.code,
+            PAST,
+            9 + 6 * self.bones,
+            self.observer_radius_m,
+            RATE_HZ,
+            self.ablated_input,
+        )
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """What turns ego-frame metres and radians into the unit-variance numbers that are diffused, and back."""
+
+    goal_std: Float[np.ndarray, "3"]
+    stride_std: Float[np.ndarray, "#frame 4"]
+    """of strides, see `pipeline.behavior.path_encoding`: of all frames alike, or of each on its own"""
+    path_std: Float[np.ndarray, "3 56"]
+    """of places, as they condition the body, metres"""
+    body_mean: Float[np.ndarray, "channel"]
+    body_std: Float[np.ndarray, "channel"]
+
+    def scaled_goal(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
+        """Return goals in metres as they are diffused, and as they control a path."""
+        return (with_powered_length(goal, GOAL_LENGTH_POWER) / self.goal_std).astype(np.float32)
+
+    def goal(self, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
+        """Undo `scaled_goal`."""
+        return with_powered_length(scaled * self.goal_std, 1 / GOAL_LENGTH_POWER)
+
+    def path(
+        self, scaled: Float[np.ndarray, "plan 4 frame"], start: Float[np.ndarray, "plan 3"]
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Return the paths in metres, from ``start`` on, that scaled strides lead along."""
+        return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.stride_std, start)
+
+    def warped_path(
+        self,
+        scaled: Float[np.ndarray, "plan 4 frame"],
+        start: Float[np.ndarray, "plan 3"],
+        path: Float[np.ndarray, "plan frame 3"],
+    ) -> Float[np.ndarray, "plan 4 frame"]:
+        """Return scaled strides that lead along other paths."""
+        return np.swapaxes(
+            warped_path(np.swapaxes(scaled, 1, 2) * self.stride_std, start, path) / self.stride_std, 1, 2
+        )
+
+    def scaled_path(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan 3 frame"]:
+        """Return paths in metres as they control a body."""
+        return (np.swapaxes(path, 1, 2) / self.path_std).astype(np.float32)
+
+
+class BehaviorNets(nn.Module):
+    """Perception and the three denoisers."""
+
+    def __init__(self, architecture: Architecture, schedule: Schedule = STANDARD):
+        super().__init__()
+        a = architecture
+        self.perception = PerceptionEnsemble(a.perception, a.ensemble_size)
+        self.goal = GoalMLP(
+            3 * a.code,
+            a.goal_hidden,
+            a.goal_layers,
+            schedule,
+            ensemble_size=a.ensemble_size,
+            map_cells=a.map_cells,
+            map_lookup=a.map_lookup,
+        )
+        match a.control:
+            case "unet":
+                if a.map_cells and a.map_lookup == "pointwise":
+                    self.path = WaypointUNet(
+                        a.ensemble_size,
+                        a.map_cells,
+                        a.future,
+                        3,
+                        a.code_length,
+                        a.unet_width,
+                        a.unet_multipliers,
+                        schedule,
+                    )
+                else:
+                    self.path = ControlUNet(
+                        PATH_CHANNELS, 3, a.code_length, a.unet_width, a.unet_multipliers, schedule
+                    )
+                along = ControlUNet(
+                    a.body_channels,
+                    CONTROL_CHANNELS,
+                    a.code_length,
+                    a.unet_width,
+                    a.unet_multipliers,
+                    schedule,
+                )
+            case "concatenation":
+                self.path = ConcatenationUNet(
+                    PATH_CHANNELS, 3, a.code_length, a.unet_width, a.unet_multipliers, schedule
+                )
+                along = ConcatenationUNet(
+                    a.body_channels,
+                    CONTROL_CHANNELS * a.future,
+                    a.code_length,
+                    a.unet_width,
+                    a.unet_multipliers,
+                    schedule,
+                )
+            case _:
+                assert_never(a.control)
+        if a.family == "one_stage":  # one network for path and body, which nothing steers
+            along = UncontrolledUNet(
+                PATH_CHANNELS + a.body_channels,
+                TrailingLinear(a.code_length, EMBEDDING),
+                a.unet_width,
+                a.unet_multipliers,
+                schedule,
+            )
+        self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
+
+
+def channels_from_bones(
+    agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
+) -> Float[np.ndarray, "*batch channel"]:
+    """Return per bone the rotation vector of ``agent_from_bone rest^-1`` and the shift of its origin from
+    rest.
+    """
+    turn = agent_from_bone[..., :3, :3] @ np.swapaxes(rest[..., :3, :3], -1, -2)
+    shift = agent_from_bone[..., :3, 3] - rest[..., :3, 3]
+    return np.concatenate([rigid.vector_from_rotation(turn), shift], axis=-1).reshape(*turn.shape[:-3], -1)
+
+
+def bones_from_channels(
+    channels: Float[np.ndarray, "*batch channel"], rest: Float[np.ndarray, "bone 4 4"]
+) -> Float[np.ndarray, "*batch bone 4 4"]:
+    """Undo `channels_from_bones`."""
+    twist = channels.reshape(*channels.shape[:-1], len(rest), 6)
+    return rigid.make(
+        rigid.rotation_from_vector(twist[..., :3]) @ rest[..., :3, :3], rest[..., :3, 3] + twist[..., 3:]
+    )
+
+
+def past_channels(
+    ego_from_agent: Float[np.ndarray, "batch 8 4 4"], bones: Float[np.ndarray, "batch 8 channel"]
+) -> Float[np.ndarray, "batch 8*channel"]:
+    """Return per past frame: root position, root rotation (6), bones; oldest frame first."""
+    root = np.concatenate(
+        [ego_from_agent[..., :3, 3], rigid.rotation_to_6d(ego_from_agent[..., :3, :3])], axis=-1
+    )
+    return np.concatenate([root, bones], axis=-1).reshape(len(root), -1).astype(np.float32)
+
+
+EXPORTED_NAMES = {
+    "avoid_solid": "clear",
+    "body_noise_std": "body_spread",
+    "max_path_draws": "path_draws",
+    "observer_motion_ratio": "noticeable",
+    "blend_frames": "fade_frames",
+}
+"""Keys of the exported contract that differ from the names of the fields that they hold."""
+
+
+def exported(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings under the names that the exported contract gives them."""
+    return {EXPORTED_NAMES.get(name, name): value for name, value in settings.items()}
+
+
+def contract(
+    architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: Float[np.ndarray, "bone 4 4"]
+) -> dict:
+    """Return the content of `behavior.json`: all that a sampler in another language must know."""
+    bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
+    root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]
+    return {
+        "units": "metres, radians, seconds",
+        "up": [0, 1, 0],
+        "rate_hz": RATE_HZ,
+        "past_frames": PAST,
+        "future_frames": architecture.future,
+        "architecture": asdict(architecture),
+        "bones": [f"bone_{number:02d}" for number in range(architecture.bones)],
+        "agent_from_bone_rest": np.asarray(rest, float).tolist(),
+        "channels": {
+            "observer_past": {"per_frame": ["x", "y", "z"], "order": "frame, channel; oldest first"},
+            "past": {
+                "per_frame": ["root_x", "root_y", "root_z", *root],
+                "per_bone": bone,
+                "order": "frame, (root, bones); oldest first",
+            },
+            "goal": ["x", "y", "z"],
+            "path": ["root_of_velocity_x", "root_of_velocity_y", "root_of_velocity_z", "moves"],
+            "body": {"root": root, "per_bone": bone},
+            "keep": ["scene", "observer", "past"],
+        },
+        "grid": {
+            "shape": list(GRID_SHAPE),
+            "cell_m": GRID_CELL_M,
+            "sampling": "nearest",
+            "order": "channel, x, y, z",
+        },
+        "strides": {
+            "numbers": PATH_CHANNELS,
+            "root_power": VELOCITY_POWER,
+            "goal_power": GOAL_LENGTH_POWER,
+            "breath": REST_DAMPING,
+            "faint_m2": MIN_SQUARED_M2,
+            "stays_m_s": REST_SPEED_M_S,
+            "reach_m": GOAL_TOLERANCE_M,
+            "reach": GOAL_TOLERANCE_SHARE,
+        },
+        "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
+        "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
+        "sampling": exported(asdict(PlanSamplingConfig(method=schedule.method))),
+    }
+
+
+def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, Float[np.ndarray, "bone 4 4"]]:
+    """Read a trained model: its shape, networks, scaling, schedule, and the bones at rest."""
+    document = json.loads((folder / "behavior.json").read_text())
+    shape = document["architecture"]
+    architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
+    scaling = Scaling(**{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()})
+    schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
+    nets = BehaviorNets(architecture, schedule)
+    nets.load_state_dict(load_file(folder / "behavior.safetensors"))
+    return architecture, nets, scaling, schedule, np.asarray(document["agent_from_bone_rest"])

@@ -1,0 +1,97 @@
+"""Goals and paths as the numbers that are diffused: ways by a power of their length, paths by their strides.
+
+An animal rests most of the time. Told as places, rest is as uncertain as a walk, and what sampling leaves of
+noise makes a path tremble. Told as strides it is zero, the root sets it apart from the slowest walk, and a
+number of its own states whether the animal moves or stays.
+"""
+
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.behavior.trajectories import RATE_HZ
+
+Array = TypeVar("Array", np.ndarray, Tensor)
+PATH_CHANNELS = 4
+"""numbers of a stride: the root of the velocity (of m/s) along x, y, z, and 1 where the animal moves, -1
+where it stays"""
+REST_SPEED_M_S = 0.05
+"""speed below which an animal stays: it breathes, and reconstructions err"""
+REST_DAMPING = 0.6
+"""share of a sampled stride that is left of it where the animal stays; the rest is noise (measured on homes
+kept from training, where what is left moves as much as resting animals do)"""
+VELOCITY_POWER, GOAL_LENGTH_POWER = 0.5, 0.7
+"""powers of lengths: of velocities, and of the ways to goals (0.7 measured ahead of 0.5 and 1 on a home kept
+from training)"""
+GOAL_TOLERANCE_M, GOAL_TOLERANCE_SHARE = 0.1, 0.25
+"""how far from its goal, at most, a path ends that gets there: in metres, or as a share of the way where that
+is more"""
+MIN_SQUARED_M2 = 1e-12
+"""square of a length, in square metres, that has no direction"""
+
+
+def with_powered_length(way: Float[Array, "*batch 3"], power: float) -> Float[Array, "*batch 3"]:
+    """Return vectors of the same direction, whose lengths are raised to a power; the inverse
+    power undoes it.
+    """
+    return way * ((way**2).sum(-1)[..., None] + MIN_SQUARED_M2) ** ((power - 1) / 2)
+
+
+def velocity_channels_from_path(
+    path: Float[Tensor, "*batch frame 3"], start: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch frame 4"]:
+    """Return the strides along a path in metres that begins a frame after ``start``."""
+    velocity = torch.diff(path, dim=-2, prepend=start[..., None, :]) * RATE_HZ
+    moves = torch.where((velocity**2).sum(-1, keepdim=True) > REST_SPEED_M_S**2, 1.0, -1.0)
+    return torch.cat([with_powered_length(velocity, VELOCITY_POWER), moves.to(velocity)], dim=-1)
+
+
+def path_from_velocity_channels(
+    strides: Float[np.ndarray, "*batch frame 4"], start: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch frame 3"]:
+    """Return the path in metres that sampled strides lead along."""
+    root = strides[..., :3] * np.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
+    return start[..., None, :] + (with_powered_length(root, 1 / VELOCITY_POWER) / RATE_HZ).cumsum(-2)
+
+
+def warped_path(
+    strides: Float[np.ndarray, "*batch frame 4"],
+    start: Float[np.ndarray, "*batch 3"],
+    path: Float[np.ndarray, "*batch frame 3"],
+) -> Float[np.ndarray, "*batch frame 4"]:
+    """Return strides that lead along another path, as far as they move."""
+    velocity = np.diff(path, axis=-2, prepend=start[..., None, :]) * RATE_HZ
+    root = with_powered_length(velocity, VELOCITY_POWER) / np.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
+    return np.concatenate([root, strides[..., 3:]], axis=-1)
+
+
+def goal_error(
+    path: Float[np.ndarray, "*batch frame 3"],
+    start: Float[np.ndarray, "*batch 3"],
+    goal: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch"]:
+    """Return how far from their goals paths end, in parts of what still counts as there: more than 1 does
+    not.
+    """
+    reach = np.maximum(GOAL_TOLERANCE_M, GOAL_TOLERANCE_SHARE * np.linalg.norm(goal - start, axis=-1))
+    return np.linalg.norm(path[..., -1, :] - goal, axis=-1) / reach
+
+
+def snapped_to_goal(
+    path: Float[np.ndarray, "*batch frame 3"],
+    start: Float[np.ndarray, "*batch 3"],
+    goal: Float[np.ndarray, "*batch 3"],
+    pull: float,
+) -> Float[np.ndarray, "*batch frame 3"]:
+    """Bend a path so that it ends at its goal (``pull`` 1), where it likes (0), or between.
+
+    Each stride is bent in proportion to its length and by no more than that: who stays, stays, and who hardly
+    moves does not get there.
+    """
+    way = np.linalg.norm(np.diff(path, axis=-2, prepend=start[..., None, :]), axis=-1).cumsum(-1)
+    missing = goal - path[..., -1, :]
+    longest = np.maximum(np.linalg.norm(missing, axis=-1, keepdims=True), way[..., -1:])
+    return path + missing[..., None, :] * (pull * way / np.maximum(longest, MIN_SQUARED_M2))[..., None]

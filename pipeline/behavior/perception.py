@@ -1,0 +1,375 @@
+"""What the agent perceives (omega of the paper): scene, observer's and own last 0.8 s, as one code.
+
+`world_from_ego` gives the frame of all inputs, `FeatureVolume.around` samples the scene in it, and
+`Perception` turns the three raw inputs (metres, ego frame) into a code of 3 x 64 numbers. Normalisation
+happens inside the network. `PerceptionEnsemble` holds several perceptions, each with weights of its own, side
+by side.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import assert_never
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from pipeline.behavior.config import AblatedInput, Ego, SceneEncoder
+from pipeline.behavior.path_encoding import VELOCITY_POWER, with_powered_length
+from pipeline.data import npz
+from pipeline.geometry import rigid
+
+CONDITIONS: tuple[AblatedInput, ...] = ("scene", "observer", "past")
+GRID_SHAPE = (64, 8, 64)
+GRID_CELL_M = 0.1
+MAP_KEY_CHANNELS = 8
+"""channels of a map's keys, and as many of its values"""
+POSITION = 3
+"""leading channels of a past frame, the root's position; root rotation and bones follow"""
+VELOCITY_CHANNELS = 3
+"""numbers of a code for the velocity"""
+CLOSE_RANGE_M, EDGE_SHARPNESS = 1.5, 4.0
+"""distance around which an observer's is encoded, metres, and the inverse width, in radii, of the soft edge
+at the radius"""
+MIN_HORIZONTAL = 0.2
+"""shortest horizontal part of the head's direction that still defines the heading"""
+
+
+def world_from_ego(
+    world_from_agent: Float[np.ndarray, "*batch 4 4"], ego: Ego
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Return the ego frame at the agent's root: its full rotation, or only its heading about world +y
+    (``yaw``).
+
+    A head that points straight up or down has no heading: the belly's, or the back's, direction takes its
+    place. The ablation ``world`` keeps the world's axes and horizontal origin, and takes only the height from
+    the root.
+    """
+    if ego == "full":
+        return np.asarray(world_from_agent, float)
+    if ego == "world":
+        frame = np.broadcast_to(np.eye(4), np.shape(world_from_agent)).copy()
+        frame[..., 1, 3] = np.asarray(world_from_agent)[..., 1, 3]
+        return frame
+    rotation = np.asarray(world_from_agent, float)[..., :3, :3]
+    head, back = rotation[..., :, 2], rotation[..., :, 1]
+    lying = np.hypot(head[..., 0], head[..., 2]) < MIN_HORIZONTAL
+    forward = np.where(lying[..., None], -np.sign(head[..., 1:2]) * back, head) * [1.0, 0.0, 1.0]
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    up = np.broadcast_to([0.0, 1.0, 0.0], forward.shape)
+    return rigid.make(
+        np.stack([np.cross(up, forward), up, forward], axis=-1), np.asarray(world_from_agent)[..., :3, 3]
+    )
+
+
+@dataclass(frozen=True)
+class FeatureVolume:
+    """The scene's features and occupancy on voxels of the world (Psi of the paper)."""
+
+    features: Float[np.ndarray, "channel x y z"]
+    occupancy: Int[np.ndarray, "x y z"]
+    """0 free, 1 surface or inside, 2 unseen"""
+    origin: Float[np.ndarray, "3"]
+    """world position of the corner of voxel 0"""
+    voxel_m: float
+
+    @classmethod
+    def load(cls, path: Path) -> "FeatureVolume":
+        """Read `feature_volume.npz` or `volume.npz`. Raises InputError ART-010 when damaged."""
+        stored = npz.load(path, ("features", "occupancy", "origin", "voxel_m"))
+        return cls(stored["features"], stored["occupancy"], stored["origin"], float(stored["voxel_m"]))
+
+    def voxel(
+        self, points_world: Float[np.ndarray, "*batch 3"]
+    ) -> tuple[Int[np.ndarray, "*batch 3"], Bool[np.ndarray, "*batch"]]:
+        """Return the voxel that holds each point (clamped to the volume) and whether it lies inside."""
+        index = np.floor((points_world - self.origin) / self.voxel_m).astype(np.int64)
+        last = np.array(self.occupancy.shape) - 1
+        clamped = np.clip(index, 0, last)
+        return clamped, (index == clamped).all(-1)
+
+    def around(self, ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch channel 64 8 64"]:
+        """Sample the nearest voxels on the ego grid (Eq. 11): centred at the root, axes x y z,
+        zero outside.
+        """
+        index, inside = self.voxel(rigid.apply(ego, grid_points_ego().reshape(-1, 3)))
+        features = self.features.reshape(len(self.features), -1)
+        cell = np.ravel_multi_index(np.moveaxis(index, -1, 0), self.occupancy.shape)
+        grid = np.empty((len(ego), len(features), *GRID_SHAPE), np.float32)
+        for each, mine, known in zip(grid, cell, inside, strict=True):
+            np.multiply(
+                features.take(mine, axis=1), known, out=each.reshape(len(features), -1), dtype=np.float32
+            )
+        return grid
+
+
+def grid_points_ego(stride: int = 1) -> Float[np.ndarray, "width height length 3"]:
+    """Return the centres of the ego grid's cells, or of blocks of ``stride`` cells, in metres."""
+    axes = [(np.arange(n // stride) + 0.5 - n / stride / 2) * GRID_CELL_M * stride for n in GRID_SHAPE]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
+    """Return linear layers of these sizes with SiLU (and dropout) between them."""
+    layers: list[nn.Module] = []
+    for inner, outer in pairwise(sizes):
+        layers += [nn.Linear(inner, outer), nn.SiLU(), nn.Dropout(dropout)]
+    return nn.Sequential(*layers[:-2])
+
+
+SceneEncoding = tuple[Float[Tensor, "batch channel*cell"], Float[Tensor, "batch code"]]
+"""A map's channels, cell after cell (z, then x; none where there is no map), and a code"""
+
+
+class PillarScene(nn.Module):
+    """A 2.5-D encoder: blocks of cells averaged, height folded into channels, 2-D convolutions down to 4 x 4.
+
+    Beside the code it makes a map for goals to look things up in, where cells are blocks. Measured on minutes
+    of data, blocks of 0.4 m predict as well as blocks of 0.2 m at a quarter of the time.
+    """
+
+    def __init__(self, channels: int, width: int, code: int, block: int):
+        super().__init__()
+        self.pool = nn.AvgPool3d(block)
+        self.enter = nn.Sequential(nn.Conv2d(channels * GRID_SHAPE[1] // block, width, 1), nn.SiLU())
+        layers: list[nn.Module] = []
+        for _ in range(int(np.log2(GRID_SHAPE[0] // block // 4))):
+            layers += [nn.Conv2d(width, width, 3, 2, 1), nn.SiLU()]
+        self.convolutions = nn.Sequential(*layers)
+        self.out = nn.Linear(width * 16, code)
+        self.map = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(width, 2 * MAP_KEY_CHANNELS, 3, padding=1),
+        )
+
+    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> SceneEncoding:
+        return self.encode(self.pool(grid))
+
+    def encode(self, pooled: Float[Tensor, "batch channel x y z"]) -> SceneEncoding:
+        """Encode a grid that is already averaged over blocks of cells."""
+        blocks = self.enter(pooled.transpose(2, 3).flatten(1, 2).transpose(2, 3))
+        return self.map(blocks).flatten(1), self.out(self.convolutions(blocks).flatten(1))
+
+
+class VolumeScene(nn.Module):
+    """The paper's encoder: six 3-D convolutions of kernel 3 with residual connections."""
+
+    def __init__(self, channels: int, width: int, code: int):
+        super().__init__()
+        strides = [(1, 1, 1), (2, 1, 2), (2, 2, 2), (2, 2, 2), (2, 2, 2), (2, 1, 2)]
+        inputs = [channels] + [width] * 5
+        self.convolutions = nn.ModuleList(
+            nn.Conv3d(i, width, 3, s, 1) for i, s in zip(inputs, strides, strict=True)
+        )
+        self.shortcuts = nn.ModuleList(
+            nn.Conv3d(i, width, 1, s) for i, s in zip(inputs, strides, strict=True)
+        )
+        self.out = nn.Linear(width, code)
+
+    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> SceneEncoding:
+        for convolution, shortcut in zip(self.convolutions, self.shortcuts, strict=True):
+            grid = nn.functional.silu(convolution(grid)) + shortcut(grid)
+        return grid.new_zeros(len(grid), 0), self.out(grid.mean((2, 3, 4)))
+
+    encode = forward
+
+
+class ObserverEncoder(nn.Module):
+    """Encode the observer's past positions (Eq. 12) through features that vanish towards ``radius_m``.
+
+    Distance and approach speed are encoded frame by frame in metres and m/s, well inside the radius undamped:
+    whether the animal minds hangs on them, and to learn them from positions takes thousands of steps. Beyond
+    the radius all features are zero, so that a far observer and none at all are the same to the agent: the
+    code of zero features is also the learned null.
+    """
+
+    def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
+        super().__init__()
+        self.frames, self.radius_m, self.rate_hz = frames, radius_m, rate_hz
+        self.layers = mlp((frames * 5 + 2, hidden, hidden, code))
+
+    def forward(
+        self, observer_past: Float[Tensor, "batch frame*3"], keep: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch code"]:
+        position = observer_past.unflatten(1, (self.frames, 3))[:, :, ::2]
+        distance = (position.square().sum(-1) + 1e-6).sqrt()
+        nearness = (1 - distance / self.radius_m).clamp_min(0)
+        direction = position / (distance[..., None] + 0.1)
+        velocity = (position[:, -1] - position[:, 0]) * (self.rate_hz / (self.frames - 1))
+        closing = -(velocity * direction[:, -1]).sum(-1, keepdim=True)
+        seen = torch.cat([direction * nearness[..., None], nearness[..., None]], dim=-1).flatten(1)
+        moving = torch.cat([velocity, closing], dim=-1) * nearness[:, -1:]
+        inside = (nearness * EDGE_SHARPNESS).clamp_max(1)
+        close = (CLOSE_RANGE_M - distance).clamp_min(-CLOSE_RANGE_M) * (2 * inside)
+        coming = -(position.diff(dim=1) * self.rate_hz * direction[:, 1:]).sum(-1).clamp(-2, 2) * (
+            1.5 * inside[:, 1:]
+        )
+        return self.layers(torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1) * keep[:, None])
+
+
+class PastEncoder(nn.Module):
+    """Encode the agent's own past: root poses in the ego frame, their changes, and bones (Eq. 13), normalised
+    inside.
+    """
+
+    CHANGE = 3.0
+    """scale of changes from frame to frame, and their bound"""
+
+    def __init__(self, frames: int, channels: int, hidden: int, code: int):
+        super().__init__()
+        self.frames = frames
+        self.register_buffer("mean", torch.zeros(channels))
+        self.register_buffer("std", torch.ones(channels))
+        self.bones = nn.Linear(frames * (channels - 9), 32)
+        self.layers = mlp(((2 * frames - 1) * 9 + 32, hidden, hidden, code))
+
+    def forward(
+        self, past: Float[Tensor, "batch frame*channel"], bones_keep: Float[Tensor, "batch"] | None = None
+    ) -> Float[Tensor, "batch code"]:
+        """``bones_keep`` is for training: 0 hides the bones of a sample (they take their mean)."""
+        past = (past.unflatten(1, (self.frames, -1)) - self.mean) / self.std
+        bones = past[:, :, 9:].flatten(1)
+        if bones_keep is not None:
+            bones = bones * bones_keep[:, None]
+        root = past[:, :, :9]
+        change = (root.diff(dim=1) * self.CHANGE).clamp(-self.CHANGE, self.CHANGE)
+        return self.layers(torch.cat([root.flatten(1), change.flatten(1), self.bones(bones)], dim=-1))
+
+
+@dataclass(frozen=True)
+class PerceptionConfig:
+    """Sizes of the perception network."""
+
+    scene: SceneEncoder
+    scene_width: int
+    scene_block: int
+    """cells that pillars average along each axis"""
+    scene_channels: int
+    hidden: int
+    code: int
+    past_frames: int
+    past_channels: int
+    observer_radius_m: float
+    rate_hz: float
+    ablated_input: AblatedInput
+
+
+class Perception(nn.Module):
+    """The perception code: scene, observer and past, each of which ``keep`` can replace by its
+    learned null.
+    """
+
+    def __init__(self, size: PerceptionConfig):
+        super().__init__()
+        match size.scene:
+            case "pillars":
+                self.scene = PillarScene(size.scene_channels, size.scene_width, size.code, size.scene_block)
+            case "volume":
+                self.scene = VolumeScene(size.scene_channels, size.scene_width, size.code)
+            case _:
+                assert_never(size.scene)
+        self.observer = ObserverEncoder(
+            size.past_frames, size.hidden, size.code, size.observer_radius_m, size.rate_hz
+        )
+        self.past = PastEncoder(size.past_frames, size.past_channels, size.hidden, size.code)
+        condition_mask = torch.tensor([float(condition != size.ablated_input) for condition in CONDITIONS])
+        self.register_buffer("condition_mask", condition_mask, persistent=False)
+        self.scene_null = nn.Parameter(torch.zeros(size.code))
+        self.past_null = nn.Parameter(torch.zeros(size.code))
+
+    def forward(
+        self,
+        scene_grid: Float[Tensor, "batch channel 64 8 64"],
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch frame*channel"],
+        keep: Float[Tensor, "batch 3"],
+    ) -> SceneEncoding:
+        """``keep`` holds 1 or 0 for scene, observer and past."""
+        return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
+
+    def encode_training(
+        self,
+        pooled: Float[Tensor, "batch channel x y z"],
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch frame*channel"],
+        keep: Float[Tensor, "batch 3"],
+        bones_keep: Float[Tensor, "batch"],
+    ) -> SceneEncoding:
+        """Return map and code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides
+        remembered bones.
+        """
+        return self.join(self.scene.encode(pooled), observer_past, self.past(past, bones_keep), keep)
+
+    def join(
+        self,
+        map_lookup: SceneEncoding,
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch code"],
+        keep: Float[Tensor, "batch 3"],
+    ) -> SceneEncoding:
+        """Put the codes side by side, nulls where ``keep`` is 0 and for what the model is blind to; a map's
+        null is zero.
+        """
+        chart, scene = map_lookup
+        keep = keep * self.condition_mask
+        observer = self.observer(observer_past, keep[:, 1])
+        scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
+        past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
+        return chart * keep[:, :1], torch.cat([scene, observer, past], dim=-1)
+
+
+class PerceptionEnsemble(nn.Module):
+    """Several perceptions side by side; the code of the whole is the maps of all, their codes, pace and
+    posture.
+    """
+
+    POSTURE_FRAMES = 3
+    """last frames, which give the velocity and whose mean is the posture"""
+
+    def __init__(self, size: PerceptionConfig, count: int):
+        super().__init__()
+        self.members = nn.ModuleList(Perception(size) for _ in range(count))
+
+    def __iter__(self) -> Iterator[Perception]:
+        return iter(self.members)
+
+    def forward(
+        self,
+        scene_grid: Float[Tensor, "batch channel 64 8 64"],
+        observer_past: Float[Tensor, "batch frame*3"],
+        past: Float[Tensor, "batch frame*channel"],
+        keep: Float[Tensor, "batch 3"],
+    ) -> Float[Tensor, "batch condition"]:
+        """``keep`` holds 1 or 0 for scene, observer and past."""
+        frames = past.unflatten(1, (self.members[0].past.frames, -1))[:, -self.POSTURE_FRAMES :]
+        return self.condition(
+            [member(scene_grid, observer_past, past, keep) for member in self.members],
+            self.now(frames, keep[:, 2]),
+        )
+
+    def condition(
+        self, readings: list[SceneEncoding], now: Float[Tensor, "batch pace+channel"]
+    ) -> Float[Tensor, "batch condition"]:
+        """Put the encodings of all members and the current state side by side."""
+        maps, codes = zip(*readings, strict=True)
+        return torch.cat([*maps, *codes, now], dim=-1)
+
+    def now(
+        self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch pace+channel"]:
+        """Return velocity, encoded as paths are, and posture, in scaled numbers; zeros where the past is
+        not remembered.
+        """
+        member = self.members[0]
+        velocity = (frames[:, -1, :POSITION] - frames[:, 0, :POSITION]) * (
+            member.observer.rate_hz / (self.POSTURE_FRAMES - 1)
+        )
+        posture = ((frames.mean(1) - member.past.mean) / member.past.std)[:, POSITION:]
+        return (
+            torch.cat([with_powered_length(velocity, VELOCITY_POWER), posture], dim=-1)
+            * (keep * member.condition_mask[2])[:, None]
+        )

@@ -1,0 +1,400 @@
+"""PlanSamplingConfig plans: what the agent perceives goes in, goal, then path, then body come out (Fig. 3).
+
+`observe` turns a context into network inputs, `Sampler.plan` draws plans from them,
+`SampledPlan.world_from_agent` puts them into the world. Networks are met through `Networks`, which torch
+modules and ONNX sessions can satisfy.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import nn
+
+from pipeline.behavior.config import Ego, PlanSamplingConfig
+from pipeline.behavior.diffusion import Schedule, guided, sample
+from pipeline.behavior.model import ROOT_CHANNELS, BehaviorNets, Scaling, channels_from_bones, past_channels
+from pipeline.behavior.path_encoding import PATH_CHANNELS, goal_error, snapped_to_goal
+from pipeline.behavior.perception import POSITION, FeatureVolume, world_from_ego
+from pipeline.behavior.scenes import SceneConstraint, Scenes
+from pipeline.behavior.trajectories import PAST, Context
+from pipeline.geometry import rigid
+
+Array = np.ndarray
+
+
+class Networks(Protocol):
+    """The four networks on NumPy arrays of float32, batch first."""
+
+    def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
+        """Return the perception code."""
+        ...
+
+    def goal(self, x: Array, t: Array, condition: Array) -> Array:
+        """Return the noise in x; a row of the condition is for as many rows of x, one after another, as it
+        takes.
+        """
+        ...
+
+    def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
+        ...
+
+    def body(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
+        ...
+
+
+class TorchNetworks:
+    """`Networks` by torch modules on any device."""
+
+    def __init__(self, nets: BehaviorNets, device: str = "cpu"):
+        self.nets, self.device = nets.eval().to(device), device
+
+    def _run(self, module: nn.Module, *arguments: Array) -> Array:
+        with torch.inference_mode():
+            return (
+                module(
+                    *(
+                        torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device)
+                        for a in arguments
+                    )
+                )
+                .cpu()
+                .numpy()
+            )
+
+    def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
+        return self._run(self.nets.perception, scene_grid, observer_past, past, keep)
+
+    def goal(self, x: Array, t: Array, condition: Array) -> Array:
+        return self._run(self.nets.goal, x, t, condition)
+
+    def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        return self._run(self.nets.path, x, t, condition, control, keep)
+
+    def body(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        return self._run(self.nets.body, x, t, condition, control, keep)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The inputs of perception, in metres and the ego frame."""
+
+    scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
+    observer_past: Float[np.ndarray, "batch frame*3"]
+    past: Float[np.ndarray, "batch frame*channel"]
+    constraint: SceneConstraint | None = None
+    """where the agents may be, for samplers that keep to it"""
+
+    def __getitem__(self, index: slice | np.ndarray) -> "Observation":
+        """Return some of the batch."""
+        constraint = None if self.constraint is None else self.constraint[index]
+        return Observation(self.scene_grid[index], self.observer_past[index], self.past[index], constraint)
+
+    def __len__(self) -> int:
+        return len(self.past)
+
+    def boneless(self, mean: Float[np.ndarray, "body"]) -> "Observation":
+        """Return the same with the bones of a mean body, of which goals and paths make no more than of hidden
+        ones.
+        """
+        past = self.past.reshape(len(self), PAST, -1).copy()
+        past[..., POSITION + ROOT_CHANNELS :] = mean[ROOT_CHANNELS:]
+        return replace(self, past=past.reshape(len(self), -1))
+
+
+@dataclass(frozen=True)
+class SampledPlan:
+    """Sampled futures in the ego frame."""
+
+    goal: Float[np.ndarray, "batch 3"]
+    path: Float[np.ndarray, "batch 56 3"]
+    body: Float[np.ndarray, "batch 56 channel"]
+
+    def world_from_agent(
+        self, world_from_ego: Float[np.ndarray, "batch 4 4"]
+    ) -> Float[np.ndarray, "batch 56 4 4"]:
+        """Return the root's poses."""
+        ego_from_agent = rigid.make(rigid.rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
+        return world_from_ego[:, None] @ ego_from_agent
+
+
+def observe(
+    context: Context, scenes: FeatureVolume | Scenes, rest: Float[np.ndarray, "bone 4 4"], ego: Ego
+) -> Observation:
+    """Encode contexts as network inputs (Eq. 11, 12, 13)."""
+    frame = world_from_ego(context.world_from_agent[:, -1], ego)
+    ego_from_world = rigid.inverse(frame)
+    observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
+    past = past_channels(
+        ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
+    )
+    scenes = scenes if isinstance(scenes, Scenes) else Scenes.of(scenes)
+    return Observation(
+        scenes.around(frame, context.video), observer, past, SceneConstraint(scenes, frame, context.video)
+    )
+
+
+@dataclass(frozen=True)
+class PlanCondition:
+    """Perception codes, one row per plan."""
+
+    full: Float[np.ndarray, "plan condition"]
+    """of everything that is kept"""
+    blind: Float[np.ndarray, "plan condition"]
+    """of the same without the observer"""
+    start: Float[np.ndarray, "plan 3"]
+    """where the animal is now, in the ego frame"""
+    constraint: SceneConstraint | None
+    """where goals and paths are kept to"""
+    count: int = 1
+    """plans of what is perceived once, whose rows are alike and stand together"""
+
+    def __getitem__(self, some: Int[np.ndarray, "some"]) -> "PlanCondition":
+        """Return some of the rows, each on its own."""
+        constraint = None if self.constraint is None else self.constraint[some // self.count]
+        return PlanCondition(self.full[some], self.blind[some], self.start[some], constraint)
+
+    def constrained(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan frame 3"]:
+        """Keep paths in metres where the agent may be, and on what carries it."""
+        return (
+            path
+            if self.constraint is None
+            else self.constraint.on_support(self.constraint.out_of_solid(path), self.start)
+        )
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """Draws plans: networks, schedule and scaling together."""
+
+    networks: Networks
+    schedule: Schedule
+    scaling: Scaling
+
+    def plan(
+        self,
+        observation: Observation,
+        sampling: PlanSamplingConfig,
+        rng: np.random.Generator,
+        *,
+        count: int = 1,
+        goal: Float[np.ndarray, "plan 3"] | None = None,
+        path: Float[np.ndarray, "plan 56 3"] | None = None,
+    ) -> SampledPlan:
+        """Draw ``count`` plans for each row, those of a row together; a given goal or path replaces its
+        level.
+        """
+        return self.draw_plans(self.codes(observation, sampling, count), sampling, rng, goal, path)
+
+    def course(
+        self,
+        observation: Observation,
+        sampling: PlanSamplingConfig,
+        rng: np.random.Generator,
+        *,
+        count: int = 1,
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw goals and paths as `plan` does and spare the body."""
+        return self.draw_courses(self.codes(observation, sampling, count), sampling, rng)
+
+    def draw_plans(
+        self,
+        codes: PlanCondition,
+        sampling: PlanSamplingConfig,
+        rng: np.random.Generator,
+        goal: Array | None,
+        path: Array | None,
+    ) -> SampledPlan:
+        """Draw one plan per code, each level on its own where it is not given."""
+        goal = self.goals(codes, sampling, rng) if goal is None else goal
+        path = self.paths(codes, goal, sampling, rng) if path is None else path
+        return SampledPlan(goal, path, self.bodies(codes, path, sampling, rng))
+
+    def draw_courses(
+        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw one path per code, towards a goal of its own."""
+        return self.paths(codes, self.goals(codes, sampling, rng), sampling, rng)
+
+    def codes(self, observation: Observation, sampling: PlanSamplingConfig, count: int = 1) -> PlanCondition:
+        """Encode what is perceived, with all that ``sampling`` keeps and without the observer, ``count``
+        times.
+        """
+        keep = np.tile(
+            np.array([sampling.scene, sampling.observer, sampling.past], np.float32), (len(observation), 1)
+        )
+        inputs = (observation.scene_grid, observation.observer_past, observation.past)
+        full = blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
+        if sampling.guidance != 1:
+            keep[:, 1] = 0
+            blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
+        start = np.repeat(observation.past.reshape(len(observation), PAST, -1)[:, -1, :3], count, axis=0)
+        return PlanCondition(
+            full,
+            blind,
+            start,
+            observation.constraint if sampling.avoid_solid and sampling.scene else None,
+            count,
+        )
+
+    def goals(
+        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
+    ) -> Float[np.ndarray, "plan 3"]:
+        """Draw goals in the ego frame, metres."""
+
+        def denoise(code: Array) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
+
+        pair = denoise(codes.full[:: codes.count]), denoise(codes.blind[:: codes.count])
+        x = self._drawn(
+            *pair,
+            (len(codes.full), 3),
+            sampling,
+            sampling.goal_steps,
+            rng,
+            lambda x: self.goals_out_of_solid(codes, x),
+        )
+        return self.scaling.goal(x)
+
+    def paths(
+        self,
+        codes: PlanCondition,
+        goal: Float[np.ndarray, "plan 3"],
+        sampling: PlanSamplingConfig,
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "plan 56 3"]:
+        """Draw paths to goals, and others for those that do not get there although the goal is all that
+        guidance tells.
+        """
+        path = self.draw_paths(codes, goal, sampling, rng)
+        for _ in range(sampling.max_path_draws - 1 if sampling.goal and sampling.guidance >= 1 else 0):
+            off = goal_error(path, codes.start, goal)
+            again = np.flatnonzero(off > 1)
+            if not len(again):
+                break
+            other = self.draw_paths(codes[again], goal[again], sampling, rng)
+            closer = goal_error(other, codes.start[again], goal[again]) < off[again]
+            path[again[closer]] = other[closer]
+        return path
+
+    def draw_paths(
+        self,
+        codes: PlanCondition,
+        goal: Float[np.ndarray, "plan 3"],
+        sampling: PlanSamplingConfig,
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "plan 56 3"]:
+        """Draw a path towards each goal; the reference of the guidance sees neither observer nor goal."""
+        control = self.scaling.scaled_goal(goal)
+
+        def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.path(
+                x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
+            )
+
+        pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
+        shape = len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]
+        drawn = replace(sampling, method="ddim")
+        path = self._drawn(
+            *pair, shape, drawn, sampling.sequence_steps, rng, lambda x: self.paths_out_of_solid(codes, x)
+        )
+        return self.finished_paths(codes, path, goal, sampling)
+
+    def bodies(
+        self,
+        codes: PlanCondition,
+        path: Float[np.ndarray, "plan 56 3"],
+        sampling: PlanSamplingConfig,
+        rng: np.random.Generator,
+    ) -> Float[np.ndarray, "plan 56 channel"]:
+        """Draw bodies along paths, which guidance never takes away."""
+        control = self.scaling.scaled_path(path)
+
+        def denoise(code: Array) -> Callable[[Array, float], Array]:
+            return lambda x, t: self.networks.body(
+                x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0)
+            )
+
+        shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
+        pair = denoise(codes.full), denoise(codes.blind)
+        body = self._drawn(
+            *pair,
+            shape,
+            replace(sampling, method="ddim"),
+            sampling.sequence_steps,
+            rng,
+            spread=sampling.body_noise_std,
+        )
+        return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
+
+    def goals_out_of_solid(
+        self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 3"]
+    ) -> Float[np.ndarray, "plan 3"]:
+        """Move scaled goals to where the agent may rest."""
+        if codes.constraint is None:
+            return scaled
+        out_of_solid = codes.constraint.out_of_solid(self.scaling.goal(scaled)[:, None])[:, 0]
+        return self.scaling.scaled_goal(codes.constraint.goals_on_support(out_of_solid))
+
+    def paths_out_of_solid(
+        self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 4 frame"]
+    ) -> Float[np.ndarray, "plan 4 frame"]:
+        """Move scaled paths to where the agent may be."""
+        if codes.constraint is None:
+            return scaled
+        return self.scaling.warped_path(
+            scaled, codes.start, codes.constraint.out_of_solid(self.scaling.path(scaled, codes.start))
+        )
+
+    def finished_paths(
+        self,
+        codes: PlanCondition,
+        scaled: Float[np.ndarray, "plan 4 frame"],
+        goal: Float[np.ndarray, "plan 3"],
+        sampling: PlanSamplingConfig,
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Return scaled paths in metres, snapped to their goals as far as these condition, and kept where the
+        agent may be.
+        """
+        path = snapped_to_goal(
+            self.scaling.path(scaled, codes.start),
+            codes.start,
+            goal,
+            float(sampling.goal) * min(sampling.guidance, 1.0),
+        )
+        return codes.constrained(path)
+
+    def _drawn(
+        self,
+        full: Callable[[Array, float], Array],
+        blind: Callable[[Array, float], Array],
+        shape: tuple[int, ...],
+        sampling: PlanSamplingConfig,
+        count: int,
+        rng: np.random.Generator,
+        correct: Callable[[Array], Array] | None = None,
+        spread: float | Array = 1.0,
+    ) -> Array:
+        def draw() -> Array:
+            return (spread * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
+
+        denoise = guided(full, blind, sampling.guidance)
+        x = sample(
+            denoise,
+            draw(),
+            self.schedule,
+            method=sampling.method or self.schedule.method,
+            count=count,
+            draw=draw,
+            correct=correct,
+        )
+        return x.astype(np.float32)
+
+
+def _filled(shape: int | tuple[int, int], value: float) -> Array:
+    return np.full(shape, value, np.float32)

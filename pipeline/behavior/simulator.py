@@ -1,0 +1,299 @@
+"""The behaviour model as an environment: `reset(seed)`, then `step(observer)` ten times a second.
+
+Each step plays one frame of the current plan. A plan is followed until it ends or the observer has moved
+noticeably; the next one is sampled from the last 8 frames and faded in. An animal that was asked anew all the
+time would switch goals in the middle of every walk and put off the next one. Goals and paths do not see
+its bones: sampled bones walk less distinctly than recorded ones do, and it would stop. Where a plan leaves
+the allowed voxels, others are drawn and the best is taken, so that chaining does not drift through walls.
+`AnimalBatch` lets many animals live at once, `Simulator` one.
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.behavior.avoidance import around_person
+from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels, channels_from_bones
+from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.planning import Observation, Sampler, observe
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context, Trajectory
+from pipeline.geometry import rigid
+
+
+@dataclass(frozen=True)
+class SimulatorState:
+    """The world after a step."""
+
+    time_s: float
+    world_from_agent: Float[np.ndarray, "4 4"]
+    agent_from_bone: Float[np.ndarray, "bone 4 4"]
+    goal_world: Float[np.ndarray, "3"]
+    """where the current plan ends"""
+    blocked: float
+    """share of the current plan in voxels that are not allowed, 0..1"""
+
+
+@dataclass(frozen=True)
+class PoseFrames:
+    """Consecutive poses of animals: root, and bone channels as in `behavior.json`."""
+
+    root: Float[np.ndarray, "*animal frame 4 4"]
+    bones: Float[np.ndarray, "*animal frame channel"]
+
+    def __getitem__(self, part: slice) -> "PoseFrames":
+        """Return some of the frames."""
+        return PoseFrames(self.root[..., part, :, :], self.bones[..., part, :])
+
+
+GOAL_CHANGE_M = 0.3
+"""How far a commanded goal must be from the planned one for a steered animal to plan again."""
+
+
+class AnimalBatch:
+    """Animals that live at once, each in the scene of its recording; they do not perceive each other.
+
+    Plans are drawn for all animals that need one in one batch, and followed until they end, the observer
+    moves, or a commanded goal changes. ``plans_drawn`` counts them.
+    """
+
+    def __init__(
+        self,
+        sampler: Sampler,
+        scenes: Scenes,
+        rest: Float[np.ndarray, "bone 4 4"],
+        ego: Ego,
+        *,
+        sampling: PlanSamplingConfig,
+        chaining: ReplanningConfig,
+    ):
+        self.sampler, self.scenes, self.rest, self.ego = sampler, scenes, rest, ego
+        self.sampling, self.chaining = sampling, chaining
+
+    def begin(self, context: Context, rng: np.random.Generator) -> None:
+        """Continue from these windows, one animal per window."""
+        bones = channels_from_bones(context.agent_from_bone, self.rest)
+        self.video = None if context.video is None else np.array(context.video)
+        self.rng, self.plans_drawn = rng, 0
+        root, observer = np.array(context.world_from_agent, float), np.array(context.observer_world, float)
+        frames = (slice(frame, frame + 1) for frame in range(PAST))
+        self.past = deque((PoseFrames(root[:, each], bones[:, each]) for each in frames), PAST)
+        self.observer = deque((observer[:, frame] for frame in range(PAST)), PAST)
+        self.goal_command = np.full((len(root), 3), np.nan)
+        self.plan, self.goal, self.blocked = self._planned(np.arange(len(root)))
+        self.played, self.planned_observer = np.zeros(len(root), int), self.observer[-1].copy()
+
+    def restart(self, some: Int[np.ndarray, "some"], context: Context) -> None:
+        """Let some of the animals begin again, each from a window of its own."""
+        bones = channels_from_bones(context.agent_from_bone, self.rest)
+        if self.video is not None and context.video is not None:
+            self.video[some] = context.video
+        for frame in range(PAST):
+            self.past[frame].root[some] = context.world_from_agent[:, frame : frame + 1]
+            self.past[frame].bones[some] = bones[:, frame : frame + 1]
+            self.observer[frame][some] = context.observer_world[:, frame]
+        self.goal_command[some] = np.nan
+        plan, self.goal[some], self.blocked[some] = self._planned(some)
+        self.plan.root[some], self.plan.bones[some] = plan.root, plan.bones
+        self.played[some], self.planned_observer[some] = 0, self.observer[-1][some]
+
+    def command(self, goal_world: Float[np.ndarray, "animal 3"]) -> None:
+        """Steer animals to goals (metres, world); rows of NaN leave an animal to its own goals."""
+        self.goal_command = np.array(goal_world, float)
+
+    def step(self, observer: Float[np.ndarray, "animal 3"]) -> PoseFrames:
+        """Let 0.1 s pass with the observers at these positions (metres, world), and return the frame that
+        comes of it.
+        """
+        self.observer.append(np.asarray(observer, float))
+        due = np.flatnonzero(self._due())
+        if len(due):
+            self._follow(due)
+        now = np.arange(len(self.played))
+        self.past.append(
+            PoseFrames(self.plan.root[now, self.played][:, None], self.plan.bones[now, self.played][:, None])
+        )
+        self.played += 1
+        return self.past[-1]
+
+    @property
+    def plan_frames(self) -> int:
+        """Return how many frames a plan has."""
+        return self.plan.root.shape[1]
+
+    def invalidate_plans(self) -> None:
+        """Let every plan be dropped as soon as another one may follow it."""
+        self.planned_observer = np.full_like(self.planned_observer, np.inf)
+
+    def _due(self) -> Bool[np.ndarray, "animal"]:
+        """Return whose plan ends, or was made before the observer moved noticeably, where it is perceived."""
+        moved = np.linalg.norm(self.observer[-1] - self.planned_observer, axis=-1)
+        away = np.linalg.norm(self.observer[-1] - self.past[-1].root[:, 0, :3, 3], axis=-1)
+        dropped = (
+            self.sampling.observer
+            & (self.played >= self.chaining.reaction_frames)
+            & (moved > self.chaining.observer_motion_ratio * away)
+        )
+        changed = np.linalg.norm(np.nan_to_num(self.goal_command - self.goal), axis=-1) > GOAL_CHANGE_M
+        redirected = changed & (self.played >= self.chaining.reaction_frames)
+        return dropped | redirected | (self.played >= self.plan_frames - self.chaining.blend_frames)
+
+    def _follow(self, some: Int[np.ndarray, "some"]) -> None:
+        """Let some of the animals go over to a new plan."""
+        plan, self.goal[some], self.blocked[some] = self._planned(some)
+        for mine, animal in enumerate(some):
+            left = PoseFrames(
+                self.plan.root[animal, self.played[animal] :], self.plan.bones[animal, self.played[animal] :]
+            )
+            new = blended_frames(
+                left, PoseFrames(plan.root[mine], plan.bones[mine]), self.chaining.blend_frames
+            )
+            self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
+        self.played[some], self.planned_observer[some] = 0, self.observer[-1][some]
+
+    def _planned(
+        self, some: Int[np.ndarray, "some"]
+    ) -> tuple[PoseFrames, Float[np.ndarray, "some 3"], Float[np.ndarray, "some"]]:
+        """Draw a plan for some of the animals, and more where it is blocked, of which the first that is
+        blocked least is taken.
+        """
+        root = np.concatenate([frame.root for frame in self.past], axis=1)[some]
+        bones = bones_from_channels(
+            np.concatenate([frame.bones for frame in self.past], axis=1)[some], self.rest
+        )
+        video = None if self.video is None else self.video[some]
+        observation = observe(
+            Context(root, bones, np.stack(self.observer, axis=1)[some], video),
+            self.scenes,
+            self.rest,
+            self.ego,
+        )
+        frame = world_from_ego(root[:, -1], self.ego)
+        bare = observation.boneless(self.sampler.scaling.body_mean)
+        self.plans_drawn += len(some)
+        commanded = rigid.apply(rigid.inverse(frame), self.goal_command[some][:, None])[:, 0]
+        goal, path, blocked = self._courses(bare, frame, video, 1, commanded)
+        again = np.flatnonzero(blocked)
+        if len(again) and self.chaining.candidates > 1:
+            others = self._courses(
+                bare[again],
+                frame[again],
+                None if video is None else video[again],
+                self.chaining.candidates - 1,
+                commanded[again],
+            )
+            better = others[2] < blocked[again]
+            for mine, other in zip((goal, path, blocked), others, strict=True):
+                mine[again[better]] = other[better]
+        path = self._around_observer(path, frame, root[:, -1, :3, 3], some)
+        plan = self.sampler.plan(observation, self.sampling, self.rng, goal=goal, path=path)
+        return (
+            PoseFrames(plan.world_from_agent(frame), plan.body[..., ROOT_CHANNELS:]),
+            rigid.apply(frame, plan.goal[:, None])[:, 0],
+            blocked,
+        )
+
+    def _around_observer(
+        self,
+        path: Float[np.ndarray, "some 56 3"],
+        frame: Float[np.ndarray, "some 4 4"],
+        start_world: Float[np.ndarray, "some 3"],
+        some: Int[np.ndarray, "some"],
+    ) -> Float[np.ndarray, "some 56 3"]:
+        """Lead paths in ego frames around the body of the observer, whatever the guidance is."""
+        video = None if self.video is None else self.video[some]
+
+        def clear(points: Float[np.ndarray, "some 3"]) -> Float[np.ndarray, "some 3"]:
+            return self.scenes.out_of_solid(points[:, None], video)[:, 0]
+
+        led = around_person(rigid.apply(frame, path), start_world, self.observer[-1][some], clear)
+        return rigid.apply(rigid.inverse(frame), led)
+
+    def _courses(
+        self,
+        observation: Observation,
+        frame: Float[np.ndarray, "some 4 4"],
+        video: Int[np.ndarray, "some"] | None,
+        count: int,
+        commanded: Float[np.ndarray, "some 3"],
+    ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some 56 3"], Float[np.ndarray, "some"]]:
+        """Return the least blocked of ``count`` goals and paths for each observation, and how much of it is
+        blocked.
+
+        ``commanded`` goals (metres, ego frame) replace sampled ones where they are not NaN.
+        """
+        codes = self.sampler.codes(observation, self.sampling, count)
+        goals = self.sampler.goals(codes, self.sampling, self.rng)
+        given = np.repeat(commanded, count, axis=0)
+        goals = np.where(np.isfinite(given), given, goals).astype(goals.dtype)
+        paths = self.sampler.paths(codes, goals, self.sampling, self.rng)
+        world = rigid.apply(np.repeat(frame, count, axis=0), paths).reshape(len(frame), count, -1, 3)
+        blocked = self.scenes.inside_solid(world, video).mean(-1)
+        best = np.arange(len(frame)) * count + blocked.argmin(1)
+        return goals[best], paths[best], blocked.min(1)
+
+
+class Simulator:
+    """A gymnasium-style environment of one animal; the action is the observer's position in the world."""
+
+    def __init__(
+        self,
+        sampler: Sampler,
+        data: BehaviorData,
+        scenes: Scenes,
+        ego: Ego,
+        *,
+        sampling: PlanSamplingConfig,
+        chaining: ReplanningConfig,
+    ):
+        self.data, self.rest = data, data.agent_from_bone_rest
+        self.flock = AnimalBatch(sampler, scenes, self.rest, ego, sampling=sampling, chaining=chaining)
+
+    def reset(self, seed: int, observer: Float[np.ndarray, "3"] | None = None) -> SimulatorState:
+        """Begin at a random training window, with the observer of then or one that has stood at
+        ``observer``.
+        """
+        rng = np.random.default_rng(seed)
+        context, _ = self.data.windows(rng.choice(self.data.indices(TRAIN), 1))
+        seen = (
+            context.observer_world if observer is None else np.tile(np.asarray(observer, float), (1, PAST, 1))
+        )
+        self.flock.begin(replace(context, observer_world=seen), rng)
+        self.frame = 0
+        return self._state(self.flock.past[-1])
+
+    @property
+    def recording(self) -> Trajectory:
+        """Return the recording that this life began in."""
+        return self.data.trajectories[self.data.videos[self.flock.video[0]]]
+
+    def step(self, observer: Float[np.ndarray, "3"]) -> SimulatorState:
+        """Let 0.1 s pass with the observer at this position (metres, world)."""
+        now = self.flock.step(np.asarray(observer, float)[None])
+        self.frame += 1
+        return self._state(now)
+
+    def _state(self, now: PoseFrames) -> SimulatorState:
+        bones = bones_from_channels(now.bones[0, 0], self.rest)
+        return SimulatorState(
+            self.frame / RATE_HZ, now.root[0, 0], bones, self.flock.goal[0], float(self.flock.blocked[0])
+        )
+
+
+def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:
+    """Blend the beginning of a new plan with the continuation of the old one, which it leaves smoothly."""
+    count = min(frames, old.root.shape[-3], new.root.shape[-3])
+    if count <= 0:
+        return new
+    old, begin, share = old[:count], new[:count], ((np.arange(count) + 1.0) / (count + 1))[:, None]
+    turn = rigid.vector_from_rotation(np.swapaxes(old.root[..., :3, :3], -1, -2) @ begin.root[..., :3, :3])
+    position = old.root[..., :3, 3] * (1 - share) + begin.root[..., :3, 3] * share
+    root, bones = new.root.copy(), new.bones.copy()
+    root[..., :count, :, :] = rigid.make(
+        old.root[..., :3, :3] @ rigid.rotation_from_vector(turn * share), position
+    )
+    bones[..., :count, :] = old.bones * (1 - share) + begin.bones * share
+    return PoseFrames(root, bones)

@@ -1,0 +1,117 @@
+"""What carries an animal: the tops of what is solid, and how high above them its root is.
+
+A sampler that is off by a tenth of a metre lets an animal float or sink. `Support.heights` puts roots where
+recorded ones are above the top that they are nearest to; `smoothed_jumps` makes jumps of the steps between
+tops.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.behavior.perception import FeatureVolume
+
+SUPPORTED = 2
+"""mark of an allowed voxel right above a solid one, 3 of one above filled floor; other allowed ones have 1"""
+HEIGHT_TAIL_PERCENT = (1.0, 5.0)
+"""percent of frames at rest, and in motion, where jumps are among them, that may be lower, and higher, than
+the range of heights"""
+MIN_SUPPORTED_SHARE = 0.5
+"""share of frames that must be above something solid"""
+JUMP_KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
+"""weights over 0.5 s that make a jump of a step"""
+
+
+@dataclass(frozen=True)
+class Support:
+    """The tops in one scene, and the range of the root's height above them."""
+
+    tops: Float[np.ndarray, "x z level"]
+    """world heights of each column, ascending, infinite where there are fewer"""
+    corner: Float[np.ndarray, "2"]
+    """world x and z where column 0 begins"""
+    voxel_m: float
+    range_m: Float[np.ndarray, "2 2"]
+    """lowest and highest root above a top, of an animal that rests (0) and moves (1)"""
+
+    @classmethod
+    def of(
+        cls, volume: FeatureVolume, marks: Int[np.ndarray, "x y z"], range_m: Float[np.ndarray, "2 2"]
+    ) -> "Support | None":
+        """Gather the tops of a scene, or none where it is not known what carries."""
+        carries = marks >= SUPPORTED
+        if not carries.any() or not np.isfinite(range_m).all():
+            return None
+        level = np.where(carries, np.arange(marks.shape[1])[:, None], np.inf)
+        levels = np.sort(level, axis=1)[:, : int(carries.sum(1).max())]
+        tops = volume.origin[1] + np.swapaxes(levels, 1, 2) * volume.voxel_m
+        return cls(tops, np.asarray(volume.origin)[[0, 2]], volume.voxel_m, np.asarray(range_m, float))
+
+    def heights(
+        self, points_world: Float[np.ndarray, "*batch 3"], moves: Bool[np.ndarray, "*batch"]
+    ) -> Float[np.ndarray, "*batch"]:
+        """Return the heights nearest to those of the points at which roots are found; their own where nothing
+        carries.
+        """
+        column = np.floor((points_world[..., [0, 2]] - self.corner) / self.voxel_m).astype(int)
+        inside = ((column >= 0) & (column < self.tops.shape[:2])).all(-1)
+        column = np.clip(column, 0, np.array(self.tops.shape[:2]) - 1)
+        tops, own = self.tops[column[..., 0], column[..., 1]], points_world[..., 1]
+        low, high = np.moveaxis(self.range_m[moves.astype(int)], -1, 0)
+        possible = np.clip(own[..., None], tops + low[..., None], tops + high[..., None])
+        nearest = np.abs(possible - own[..., None]).argmin(-1)
+        found = np.take_along_axis(possible, nearest[..., None], axis=-1)[..., 0]
+        return np.where(inside & np.isfinite(found), found, own)
+
+
+def mark_supported(
+    allowed: Bool[np.ndarray, "x y z"], occupancy: Int[np.ndarray, "x y z"]
+) -> Int[np.ndarray, "x y z"]:
+    """Return 1 where the root may be, and 2 where that is right above something solid."""
+    beneath = np.zeros_like(allowed)
+    beneath[:, 1:] = occupancy[:, :-1] == 1
+    return allowed.astype(np.uint8) + (allowed & beneath & (occupancy != 1))
+
+
+def height_ranges(
+    scenes: list[tuple[FeatureVolume, Float[np.ndarray, "frame 3"], Bool[np.ndarray, "frame"]]],
+) -> Float[np.ndarray, "2 2"]:
+    """Return `Support.range_m` of all recordings: per scene, where the root was and whether it moved; NaN
+    where unknown.
+    """
+    above, moved = [np.zeros(0)], [np.zeros(0, bool)]
+    for volume, points, moves in scenes:
+        voxel, inside = volume.voxel(points)
+        solid = (volume.occupancy == 1)[voxel[:, 0], :, voxel[:, 2]]
+        level = np.where(
+            solid & (np.arange(solid.shape[1]) < voxel[:, 1:2]), np.arange(1, solid.shape[1] + 1), -np.inf
+        ).max(1)
+        above.append(np.where(inside, points[:, 1] - volume.origin[1] - level * volume.voxel_m, np.inf))
+        moved.append(moves)
+    height, moves = np.concatenate(above), np.concatenate(moved)
+    known = np.isfinite(height)
+    if known.sum() <= MIN_SUPPORTED_SHARE * len(known):
+        return np.full((2, 2), np.nan)
+    some = (known & kind if (known & kind).any() else known for kind in (~moves, moves))
+    return np.array(
+        [
+            np.percentile(height[part], [rare, 100 - rare])
+            for part, rare in zip(some, HEIGHT_TAIL_PERCENT, strict=True)
+        ]
+    )
+
+
+def smoothed_jumps(
+    height: Float[np.ndarray, "*batch frame"], before: Float[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch frame"]:
+    """Make jumps of steps: heights averaged over half a second where that is higher, so that nothing gets
+    into an edge.
+    """
+    reach = len(JUMP_KERNEL) // 2
+    padded = np.concatenate(
+        [np.repeat(before[..., None], reach, -1), height, np.repeat(height[..., -1:], reach, -1)], axis=-1
+    )
+    return np.maximum(
+        height, np.lib.stride_tricks.sliding_window_view(padded, len(JUMP_KERNEL), axis=-1) @ JUMP_KERNEL
+    )

@@ -1,0 +1,133 @@
+"""Strict configuration: a table of plain values becomes a frozen dataclass, or an `InputError`.
+
+A stage's front declares `Config`; the recipe's table for that stage is checked against it:
+unknown keys and ill-typed values are refused with what is known. Standard library only.
+"""
+
+import dataclasses
+import json
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pipeline.core.errors import InputError
+
+C = TypeVar("C")
+
+
+def load(config: type[C], path: Path) -> C:
+    """Read one stage's table from a JSON or TOML file into `config`.
+
+    Raises `InputError` REC-001 (unknown key), REC-002 (wrong type), REC-003 (not readable).
+    """
+    return from_table(config, read_table(path), where=str(path))
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Read a JSON (`.json`) or TOML file that holds one table."""
+    try:
+        text = path.read_text()
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError("REC-003", f"cannot be read: {error}", str(path), "repair the file") from error
+    if not isinstance(table, dict):
+        raise InputError("REC-003", "does not hold a table", str(path), "write `key = value` lines")
+    return table
+
+
+def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C | None = None) -> C:
+    """Check `table` against the fields of the dataclass `config` and build it; nested tables likewise.
+
+    What the table leaves out is as in `base`, else the field's default. Raises `InputError` REC-001
+    (unknown key), REC-002 (wrong type, impossible or missing value).
+    """
+    fields = {field.name: field for field in dataclasses.fields(config)}
+    refuse_unknown(table, fields, where=where)
+    hints = typing.get_type_hints(config)
+    values = {
+        name: default_of(field) if base is None else getattr(base, name) for name, field in fields.items()
+    }
+    for key, value in table.items():
+        refuse_impossible(value, values[key], where=f"{where}: {key}")
+        values[key] = _checked(hints[key], value, f"{where}: {key}", values[key])
+    for key, value in values.items():
+        if value is dataclasses.MISSING:
+            raise InputError("REC-002", f"{key!r} is missing", where, f"give a value of type {hints[key]}")
+    return config(**values)
+
+
+def default_of(field: dataclasses.Field) -> Any:
+    """Return a field's default, `MISSING` where it has none."""
+    made = field.default_factory
+    return field.default if made is dataclasses.MISSING else made()
+
+
+def refuse_unknown(
+    table: Mapping[str, Any], known: typing.Collection[str], *, where: str, kind: str = "key"
+) -> None:
+    """Raise REC-001 naming the known ones when `table` has a key outside `known`."""
+    for key in table:
+        if key not in known:
+            raise InputError(
+                "REC-001", f"unknown {kind} {key!r}", where, f"known: {', '.join(sorted(known)) or 'none'}"
+            )
+
+
+def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
+    """Raise REC-002 where the default is a number and `value` not finite, negative where that is above 0
+    or a count, or a rate of 0.
+    """
+    if not isinstance(value, int | float) or not isinstance(default, int | float):
+        return
+    stands_still = where.endswith("_hz") and value == 0
+    counts = default > 0 or (default == 0 and isinstance(default, int))
+    if not math.isfinite(value) or (counts and value < 0) or (default > 0 and stands_still):
+        raise InputError(
+            "REC-002", f"{value!r} cannot be", where, f"give a number as the default is, {default!r}"
+        )
+
+
+def _checked(hint: Any, value: Any, where: str, default: Any = None) -> Any:
+    """Return `value` as `hint` wants it (lists become tuples, integers floats) or raise REC-002."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        if not isinstance(value, Mapping):
+            known = ", ".join(sorted(field.name for field in dataclasses.fields(hint)))
+            raise InputError("REC-002", f"{value!r} is no table", where, f"keys in it: {known}")
+        return from_table(hint, value, where=where, base=default if isinstance(default, hint) else None)
+    if origin is typing.Literal and value in arguments:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        return _first_fitting(arguments, value, hint, where)
+    if origin is tuple and isinstance(value, (list, tuple)):
+        each = [arguments[0]] * len(value) if arguments[1:] == (...,) else list(arguments)
+        if len(each) == len(value):
+            return tuple(
+                _checked(kind, item, f"{where}[{i}]")
+                for i, (kind, item) in enumerate(zip(each, value, strict=True))
+            )
+    if origin is dict and isinstance(value, Mapping):
+        return {key: _checked(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if origin is None and isinstance(hint, type) and type(value) is hint:
+        return value
+    if hint in (None, types.NoneType) and value is None:
+        return None
+    expected = (
+        hint.__name__ if isinstance(hint, type) and origin is None else str(hint).replace("typing.", "")
+    )
+    raise InputError("REC-002", f"{value!r} is not {expected}", where, f"give a value of type {expected}")
+
+
+def _first_fitting(kinds: tuple[Any, ...], value: Any, hint: Any, where: str) -> Any:
+    for kind in kinds:
+        try:
+            return _checked(kind, value, where)
+        except InputError:
+            continue
+    raise InputError("REC-002", f"{value!r} is not {hint}", where, f"give a value of type {hint}")

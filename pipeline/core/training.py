@@ -1,0 +1,284 @@
+"""The one training loop: seeded steps, checkpoints, resume, guards.
+
+`fit` calls a loss, steps an optimiser and keeps enough on disk to go on after any kill. Randomness is a
+pure function of (seed, step), so that on a CPU an interrupted run ends with the same bits as an
+uninterrupted one. SIGTERM saves and exits with 75; a loss that stays broken exits with 76 and a diagnosis.
+"""
+
+import contextlib
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.core import distributed, progress
+
+KEEP = 3
+BROKEN_IN_A_ROW = 3
+EXIT_SAVED = 75
+EXIT_DIVERGED = 76
+
+
+@dataclass(frozen=True)
+class FitRecord:
+    """The loss terms of every step, as weighted in the sum; NaN where a broken step was skipped or the loss
+    had no such term.
+    """
+
+    terms: dict[str, Float[np.ndarray, "step"]]
+    rolled_back: int
+    """how often the loop fell back to a checkpoint with half the rate"""
+
+    def total(self) -> Float[np.ndarray, "step"]:
+        """Return the sum of all terms per step."""
+        each = np.array(list(self.terms.values()))
+        return np.where(np.isnan(each).all(0), np.nan, np.nansum(each, axis=0))
+
+
+def fit(
+    *,
+    modules: Mapping[str, torch.nn.Module],
+    optimizer: torch.optim.Optimizer,
+    loss: Callable[[int, torch.Generator], Tensor | Mapping[str, Tensor]],
+    steps: int,
+    seed: int,
+    resume: Path | None = None,
+    save_every: int = 500,
+    schedule: Callable[[float], float] | None = None,
+    label: str = "fit",
+    clip_norm: float | None = None,
+    after_step: Callable[[int], None] | None = None,
+    shared: bool = False,
+    asked_to_stop: Callable[[], bool] | None = None,
+) -> FitRecord:
+    """Minimise ``loss(step, generator)`` for ``steps`` steps, from the newest checkpoint in ``resume`` if
+    there is one.
+
+    ``modules`` is all state that must survive (an average of the weights is one of them). The loss returns a
+    scalar or named, weighted, scalar terms. ``schedule`` maps progress 0..1 to a factor on each group's rate.
+    Steps whose loss or gradient is not finite are skipped; three in a row fall back to the last checkpoint at
+    half the rate, and the second such fall ends the run (exit 76, ``diagnosis.json`` in ``resume``).
+    ``asked_to_stop`` tells instead of signals whether to save and exit: several fits in threads share one
+    `termination`. With ``shared``, all processes of `pipeline.core.distributed` minimise the mean of their
+    losses; the first keeps checkpoints.
+    """
+    shared = shared and distributed.size() > 1
+    loop = _Loop(dict(modules), optimizer, resume, shared)
+    loop.restore()
+    loss = distributed.shared(modules, loss) if shared else loss
+    with contextlib.nullcontext(asked_to_stop) if asked_to_stop else termination() as asked_to_stop:
+        for _ in progress.track(loop.until(steps), label, total=steps - loop.step):
+            if not loop.advance(loss, steps, seed, schedule, clip_norm):
+                continue
+            if after_step:
+                after_step(loop.step - 1)
+            stop = loop.anywhere(asked_to_stop())
+            if resume and (loop.step % save_every == 0 or stop):
+                loop.save()
+            if stop:
+                progress.log(f"{label}: stopped at step {loop.step}" + (", saved" if resume else ""))
+                sys.exit(EXIT_SAVED)
+    return FitRecord(
+        {name: np.asarray(values, np.float32) for name, values in loop.terms.items()}, loop.rolled_back
+    )
+
+
+def generator_for(seed: int, step: int, rank: int = 0) -> torch.Generator:
+    """Return the generator of one step, a pure function of (seed, step) and of the process, where there are
+    several.
+    """
+    seeds = np.random.SeedSequence([seed, step, rank] if rank else [seed, step])
+    return torch.Generator().manual_seed(int(seeds.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+
+
+class _Loop:
+    """The state of a run: modules, optimiser, step, losses so far; knows how to save and restore itself."""
+
+    def __init__(
+        self,
+        modules: dict[str, torch.nn.Module],
+        optimizer: torch.optim.Optimizer,
+        folder: Path | None,
+        shared: bool,
+    ):
+        self.modules, self.optimizer, self.folder, self.shared = modules, optimizer, folder, shared
+        self.rank = distributed.rank() if shared else 0
+        self.step, self.rate, self.rolled_back, self.broken = 0, 1.0, 0, 0
+        self.terms: dict[str, list[float]] = {}
+        self.base_rates = [group["lr"] for group in optimizer.param_groups]
+        self.start = self._state() if folder is None else None
+
+    def until(self, steps: int) -> Iterator[int]:
+        """Yield the step to do next until all are done; a fall back yields earlier ones again."""
+        while self.step < steps:
+            yield self.step
+
+    def advance(self, loss, steps: int, seed: int, schedule, clip_norm: float | None) -> bool:
+        """Do one step. Return False when it was broken and the loop fell back to an earlier one."""
+        factor = self.rate * (schedule(self.step / max(steps, 1)) if schedule else 1.0)
+        for group, base in zip(self.optimizer.param_groups, self.base_rates, strict=True):
+            group["lr"] = base * factor
+        generator = generator_for(seed, self.step, self.rank)
+        torch.manual_seed(generator.initial_seed())
+        terms = loss(self.step, generator)
+        terms = {"loss": terms} if isinstance(terms, Tensor) else terms
+        total = sum(terms.values())
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        parameters = [
+            p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None
+        ]
+        norm = torch.nn.utils.clip_grad_norm_(parameters, clip_norm or math.inf)
+        told = self._told(terms)
+        if torch.isfinite(norm) and math.isfinite(sum(told.values())):
+            self.optimizer.step()
+            self.broken = 0
+        else:
+            self.broken += 1
+            if self.broken >= BROKEN_IN_A_ROW:
+                self._fall_back(told, float(norm))
+                return False
+        for name in self.terms | told:
+            self.terms.setdefault(name, [math.nan] * self.step).append(
+                told.get(name, math.nan) if self.broken == 0 else math.nan
+            )
+        self.step += 1
+        return True
+
+    def _told(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
+        """Return the terms as numbers; the mean of all processes'."""
+        values = torch.stack([value.detach().float() for value in terms.values()])
+        values = distributed.total(values) / distributed.size() if self.shared else values
+        return dict(zip(terms, values.tolist(), strict=True))
+
+    def anywhere(self, here: bool) -> bool:
+        """Tell whether something is so in any of the processes."""
+        return bool(distributed.total(torch.tensor(float(here)))) if self.shared else here
+
+    def _fall_back(self, told: Mapping[str, float], norm: float) -> None:
+        diagnosis = {
+            "step": self.step,
+            "gradient_norm": repr(norm),
+            "terms": {name: repr(value) for name, value in told.items()},
+        }
+        if self.rolled_back >= 1:
+            if self.folder and self.rank == 0:
+                (self.folder / "diagnosis.json").write_text(json.dumps(diagnosis, indent=2) + "\n")
+            progress.log(
+                f"the loss is not finite and did not recover at half the rate: {json.dumps(diagnosis)}"
+            )
+            sys.exit(EXIT_DIVERGED)
+        progress.log(
+            f"the loss is not finite at step {self.step}: back to the last checkpoint with half the rate"
+        )
+        if self.folder is None:
+            self._load(self.start)
+        else:
+            self.restore()
+        self.rate, self.rolled_back, self.broken = self.rate / 2, self.rolled_back + 1, 0
+
+    def _state(self) -> dict:
+        copy = {
+            name: {key: value.clone() for key, value in module.state_dict().items()}
+            for name, module in self.modules.items()
+        }
+        optimizer = _deep_clone(self.optimizer.state_dict())
+        return {
+            "step": self.step,
+            "rate": self.rate,
+            "rolled_back": self.rolled_back,
+            "terms": {k: list(v) for k, v in self.terms.items()},
+            "modules": copy,
+            "optimizer": optimizer,
+        }
+
+    def _load(self, state: dict) -> None:
+        self.step, self.rate, self.rolled_back = state["step"], state["rate"], state["rolled_back"]
+        self.terms = {name: list(values) for name, values in state["terms"].items()}
+        for name, module in self.modules.items():
+            module.load_state_dict(state["modules"][name])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    def save(self) -> None:
+        """Write a checkpoint by temp file, fsync and rename; keep the newest three. Of several processes, the
+        first does.
+        """
+        if self.rank:
+            return
+        temp = self.folder / f".step.tmp.{os.getpid()}"
+        with open(temp, "wb") as file:
+            torch.save(self._state(), file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temp, self.folder / f"step{self.step:09d}.pt")
+        for old in self._checkpoints()[KEEP:]:
+            old.unlink()
+
+    def restore(self) -> None:
+        """Load the newest checkpoint that can be read; start over when there is none. Of several processes,
+        the first goes first.
+        """
+        if self.folder is None:
+            return
+        if self.rank == 0:
+            self._restore()
+        if self.shared:
+            distributed.wait()
+        if self.rank:
+            self._restore()
+
+    def _restore(self) -> None:
+        if self.rank == 0:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for dead in self.folder.glob(".step.tmp.*"):
+                dead.unlink()
+        for path in self._checkpoints():
+            try:
+                state = torch.load(path, weights_only=True, map_location="cpu")
+            except Exception as error:  # any damage: the file before it is as good
+                progress.log(f"{path.name} cannot be read ({type(error).__name__}); trying the one before")
+                continue
+            self._load(state)
+            progress.log(f"resumed at step {self.step}")
+            return
+        self.save()
+
+    def _checkpoints(self) -> list[Path]:
+        return sorted(self.folder.glob("step*.pt"), reverse=True)
+
+
+def _deep_clone(value):
+    """Copy nested containers, cloning tensors, so that later steps cannot change the copy."""
+    if isinstance(value, Tensor):
+        return value.clone()
+    if isinstance(value, dict):
+        return {key: _deep_clone(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_deep_clone(item) for item in value]
+    return value
+
+
+@contextlib.contextmanager
+def termination() -> Iterator[Callable[[], bool]]:
+    """Yield a function that tells whether SIGTERM or SIGINT has come; the handlers live as long as the
+    block.
+    """
+    came = []
+    previous = {
+        number: signal.signal(number, lambda number, _: came.append(number))
+        for number in (signal.SIGTERM, signal.SIGINT)
+    }
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,47 @@
+"""The recordings of one agent: who they are, what role they play, on which side of the split they stand.
+
+`plan` writes them to `build/<agent>/plan/videos.json`; stages read them with `read`. Standard library only.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from pipeline.core.errors import InputError
+
+Role = Literal["walkthrough", "turnaround", "session", "heldout"]
+Split = Literal["train", "test", "none"]
+ROLES: tuple[Role, ...] = get_args(Role)
+SPLITS: tuple[Split, ...] = get_args(Split)
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv")
+"""names of video files end like this, in lower case"""
+
+
+@dataclass(frozen=True)
+class Video:
+    """One recording."""
+
+    id: str
+    """`v000`, `v001`, ...; never given to another file."""
+    file: str
+    """Name inside the capture folder; appears nowhere else, whatever characters it holds."""
+    role: Role
+    split: Split
+    """Sessions: `train` or `test`; every other role `none`."""
+    sha256: str | None
+    """Of the recording; None for the built-in capture, whose manifest holds it."""
+    synchronized_with: str | None = None
+    """Id of the session whose clock this one shares (held-out phone)."""
+    offset_s: float = 0.0
+    """Time in the other recording = time in this one + offset."""
+
+
+def read(path: Path) -> tuple[Video, ...]:
+    """Read `videos.json`. Raises `InputError` ART-003 for anything else."""
+    try:
+        return tuple(Video(**entry) for entry in json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            "ART-003", "is no list of recordings", str(path), "give build/<agent>/plan/videos.json"
+        ) from error

@@ -1,0 +1,142 @@
+"""Recordings as the stages see them: `Clip` over ``frames/<id>/`` and `Masks` over ``masks/<id>/``.
+
+Both open in milliseconds and read pictures one at a time, so that a clip of any length fits in memory.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.data import images
+from pipeline.data.schema import FileSchema
+
+FRAMES = FileSchema.of(
+    "frames/frames.npz",
+    "timestamp_s [frame] f8",
+    "intrinsics [frame 3 3] f8",
+    "depth_intrinsics [frame 3 3] f8",
+    "odometry_from_camera [frame 4 4] f8?",
+    "gravity_known [] bool",
+    "scale [] U?",
+    "source_index [frame] i8",
+    "quarter_turns [] i8",
+    "sharpness [frame] f4",
+    "brightness [frame] f4",
+    "depth_valid [frame] f4",
+    "quality [frame] f4",
+)
+MASKS = FileSchema.of("masks/masks.npz", "visible [frame] bool", "confidence [frame] f4", "area [frame] f4")
+CLIP_KEYS = (
+    "timestamp_s", "intrinsics", "depth_intrinsics", "odometry_from_camera",
+    "gravity_known", "scale", "quality",
+)  # fmt: skip
+"""what `Clip` holds of `frames.npz`"""
+
+LEAST_CONFIDENCE = 1
+"""depth of less confidence is not used: 0 is what a phone itself calls low"""
+STEP_SHARE = 0.25
+"""range of depth over 3 x 3 pixels, as a share of the depth, from which on a pixel lies at a step"""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One recording at 10 Hz: upright colour, depth in metres, confidence, intrinsics, the phone's
+    odometry.
+    """
+
+    folder: Path
+    timestamp_s: Float[np.ndarray, "frame"]
+    intrinsics: Float[np.ndarray, "frame 3 3"]
+    depth_intrinsics: Float[np.ndarray, "frame 3 3"]
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"] | None
+    gravity_known: bool
+    quality: Float[np.ndarray, "frame"]
+    color_size: tuple[int, int]
+    """(height, width) in pixels"""
+    depth_size: tuple[int, int]
+    """(height, width) in pixels"""
+    scale: str = "measured"
+    """what makes its lengths metres: its own depth, the id of another recording whose depth does, or
+    nothing: `relative`
+    """
+
+    @classmethod
+    def open(cls, folder: Path) -> "Clip":
+        """Open a finished ``frames/<id>`` artifact."""
+        table = FRAMES.load(folder / "frames.npz", *CLIP_KEYS)
+        return cls(
+            folder=folder,
+            timestamp_s=table["timestamp_s"],
+            intrinsics=table["intrinsics"],
+            depth_intrinsics=table["depth_intrinsics"],
+            odometry_from_camera=table.get("odometry_from_camera"),
+            gravity_known=bool(table["gravity_known"]),
+            quality=table["quality"],
+            color_size=images.read_color(folder / "color" / "000000.jpg").shape[:2],
+            depth_size=images.read_depth(folder / "depth" / "000000.exr").shape,
+            scale=str(table.get("scale", "measured")),
+        )
+
+    def __len__(self) -> int:
+        return len(self.timestamp_s)
+
+    def color(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        """Read one frame's RGB."""
+        return images.read_color(self.folder / "color" / f"{frame:06d}.jpg")
+
+    def depth(self, frame: int) -> Float[np.ndarray, "height width"]:
+        """Read one frame's depth in metres, 0 = unknown, at the sensor's resolution."""
+        return images.read_depth(self.folder / "depth" / f"{frame:06d}.exr")
+
+    def confidence(self, frame: int) -> UInt8[np.ndarray, "height width"]:
+        """Read one frame's depth confidence: 0 low, 1 medium, 2 high."""
+        return images.read_gray(self.folder / "confidence" / f"{frame:06d}.png")
+
+
+@dataclass(frozen=True)
+class Masks:
+    """The agent's masks of one recording, at colour resolution: 255 agent, 0 not, 128 unknown."""
+
+    folder: Path
+    visible: np.ndarray
+    """[frame] bool: the agent was found"""
+    confidence: Float[np.ndarray, "frame"]
+
+    @classmethod
+    def open(cls, folder: Path) -> "Masks":
+        """Open a finished ``masks/<id>`` artifact."""
+        table = MASKS.load(folder / "masks.npz", "visible", "confidence")
+        return cls(folder, table["visible"], table["confidence"])
+
+    def __len__(self) -> int:
+        return len(self.visible)
+
+    def __getitem__(self, frame: int) -> UInt8[np.ndarray, "height width"]:
+        if not 0 <= frame < len(self):
+            raise IndexError(frame)
+        return images.read_gray(self.folder / f"{frame:06d}.png")
+
+
+def usable_depth(
+    clip: Clip, frame: int, *, nearest_m: float = 0.0, farthest_m: float = np.inf, keep_steps: bool = True
+) -> Float[np.ndarray, "height width"]:
+    """Read one frame's depth (metres) where it can be relied on, 0 elsewhere: the one policy of all stages.
+
+    Out are pixels of low confidence and those outside of the range; without ``keep_steps`` also those at
+    depth steps, where a sensor averages two surfaces into flying pixels.
+    """
+    depth = clip.depth(frame)
+    usable = (clip.confidence(frame) >= LEAST_CONFIDENCE) & (depth >= nearest_m) & (depth <= farthest_m)
+    if not keep_steps:
+        around = np.ones((3, 3), np.uint8)
+        low = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around)
+        usable &= cv2.dilate(depth, around) - low < STEP_SHARE * depth
+    return np.where(usable, depth, 0).astype(np.float32)
+
+
+def read_source_index(frames: Path) -> Int[np.ndarray, "frame"]:
+    """Read the number of the recorded frame behind each frame of a finished ``frames/<id>``."""
+    return FRAMES.load(frames / "frames.npz", "source_index")["source_index"]

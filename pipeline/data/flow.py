@@ -1,0 +1,54 @@
+"""Optical flow of one recording as files: `flow/<id>/flow_<gap>_{fw,bw}.npz`, mapped lazily."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.data import npz
+from pipeline.data.schema import FileSchema
+
+STRIDE_PX = 4
+"""side of a cell of flow, colour pixels"""
+GAPS = (1, 2, 4, 8)
+"""frames between the two pictures of a pair"""
+FLOW = FileSchema.of(
+    "flow/flow_<gap>_{fw,bw}.npz", "flow [frame height width 2] f2", "confidence [frame height width] u1"
+)
+
+
+def path_of(folder: Path, gap: int, *, backward: bool = False) -> Path:
+    """Return the file of one gap: frame i to i + gap, or ``backward`` from i + gap to i."""
+    return folder / f"flow_{gap}_{'bw' if backward else 'fw'}.npz"
+
+
+def open_flow(folder: Path, gap: int, *, backward: bool = False) -> Float[np.ndarray, "frame height width 2"]:
+    """Map the flow of one gap, colour pixels, per cell of `STRIDE_PX`."""
+    return npz.open_lazily(path_of(folder, gap, backward=backward), "flow")
+
+
+def open_confidence(
+    folder: Path, gap: int, *, backward: bool = False
+) -> UInt8[np.ndarray, "frame height width"]:
+    """Map the confidence of one gap, 255 = certain."""
+    return npz.open_lazily(path_of(folder, gap, backward=backward), "confidence")
+
+
+def writer(folder: Path, gap: int, frames: int, size: tuple[int, int], *, backward: bool = False) -> npz.Rows:
+    """Begin the file of one gap, to which ``frames`` rows are appended.
+
+    ``size`` is (height, width) in cells.
+    """
+    shape = (frames, *size)
+    return npz.Rows(
+        path_of(folder, gap, backward=backward), flow=((*shape, 2), np.float16), confidence=(shape, np.uint8)
+    )
+
+
+def cell_of(
+    pixel: Int[np.ndarray, "*batch"] | Float[np.ndarray, "*batch"], cells: int
+) -> Int[np.ndarray, "*batch"]:
+    """Return the cell along one axis that holds each colour pixel, of ``cells`` (the last one takes the
+    rest).
+    """
+    return np.minimum(np.asarray(pixel).astype(np.int64) // STRIDE_PX, cells - 1)

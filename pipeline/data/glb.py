@@ -1,0 +1,270 @@
+"""Make binary glTF 2.0: still surfaces and skinned, animated ones.
+
+A skinned file holds one root node that carries `world_from_agent`, every bone as a sibling joint under it
+(bone b carries `agent_from_bone`), and beside the root the mesh, which follows its joints alone. Same
+content, same bytes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pygltflib as gltf
+from jaxtyping import Float, Float32, UInt8
+
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
+
+_FLOAT, _U8, _U32 = gltf.FLOAT, gltf.UNSIGNED_BYTE, gltf.UNSIGNED_INT
+_ROOT_NODE, _MESH_NODE, _FIRST_JOINT = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Four or eight influences a vertex; `agent_from_bone_rest` are the bones in the pose of the surface."""
+
+    joints: UInt8[np.ndarray, "vertex influence"]
+    weights: Float32[np.ndarray, "vertex influence"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    bone_names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Action:
+    """One named animation: keys in seconds, root in the world, bones in the agent frame."""
+
+    name: str
+    time_s: Float[np.ndarray, " frame"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+
+
+def static(mesh: Mesh, name: str) -> bytes:
+    """Return a file of a still surface with vertex colour; metres, +y up."""
+    document = _Document()
+    document.add_mesh(mesh, name, None)
+    document.file.nodes = [gltf.Node(name=name, mesh=0)]
+    document.file.scenes = [gltf.Scene(nodes=[0])]
+    return document.packed()
+
+
+def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agent") -> bytes:
+    """Return a file of a skinned surface (agent frame, metres) with one animation per action."""
+    document = _Document()
+    document.add_mesh(mesh, name, skin)
+    joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
+    document.file.nodes = [gltf.Node(name=name, children=joints)]
+    document.file.nodes.append(gltf.Node(name=f"{name}_surface", mesh=0, skin=0))
+    translations, quaternions = _translation_quaternion(skin.agent_from_bone_rest)
+    for bone, translation, quaternion in zip(skin.bone_names, translations, quaternions, strict=True):
+        document.file.nodes.append(
+            gltf.Node(name=bone, translation=_floats(translation), rotation=_floats(quaternion))
+        )
+    inverse_bind = rigid.inverse(skin.agent_from_bone_rest).astype(np.float32)
+    columns = np.ascontiguousarray(inverse_bind.transpose(0, 2, 1)).reshape(-1, 16)  # glTF is column-major
+    matrices = document.add(columns, "MAT4", _FLOAT)
+    document.file.skins = [
+        gltf.Skin(name="skin", joints=joints, skeleton=_ROOT_NODE, inverseBindMatrices=matrices)
+    ]
+    document.file.animations = [document.animation(action) for action in actions]
+    document.file.scenes = [gltf.Scene(nodes=[_ROOT_NODE, _MESH_NODE])]
+    return document.packed()
+
+
+class _Document:
+    """A growing glTF document and its one binary buffer."""
+
+    def __init__(self) -> None:
+        self.file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="agent-to-sim"), scene=0)
+        self.blob = bytearray()
+
+    def add(
+        self,
+        values: np.ndarray,
+        kind: str,
+        component: int,
+        *,
+        target: int | None = None,
+        bounds: bool = False,
+    ) -> int:
+        """Append an array and return its accessor."""
+        values = np.ascontiguousarray(values)
+        self.blob.extend(b"\0" * (-len(self.blob) % 4))
+        self.file.bufferViews.append(
+            gltf.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=values.nbytes, target=target)
+        )
+        self.blob.extend(values.tobytes())
+        accessor = gltf.Accessor(
+            bufferView=len(self.file.bufferViews) - 1, componentType=component, count=len(values), type=kind
+        )
+        if bounds:
+            rows = values.reshape(len(values), -1)
+            accessor.min, accessor.max = rows.min(0).tolist(), rows.max(0).tolist()
+        self.file.accessors.append(accessor)
+        return len(self.file.accessors) - 1
+
+    def add_mesh(self, mesh: Mesh, name: str, skin: Skin | None) -> None:
+        vertex = {"target": gltf.ARRAY_BUFFER}
+        attributes = gltf.Attributes(
+            POSITION=self.add(mesh.vertices.astype(np.float32), "VEC3", _FLOAT, bounds=True, **vertex),
+            NORMAL=self.add(_unit_normals(mesh), "VEC3", _FLOAT, **vertex),
+        )
+        if mesh.color is not None:
+            attributes.COLOR_0 = self.add(_linear_rgba(mesh.color), "VEC4", _FLOAT, **vertex)
+        if skin is not None:
+            for number in range(skin.joints.shape[1] // 4):
+                four = slice(4 * number, 4 * number + 4)
+                setattr(attributes, f"JOINTS_{number}", self.add(skin.joints[:, four], "VEC4", _U8, **vertex))
+                setattr(
+                    attributes, f"WEIGHTS_{number}", self.add(skin.weights[:, four], "VEC4", _FLOAT, **vertex)
+                )
+        indices = self.add(
+            mesh.faces.astype(np.uint32).reshape(-1), "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER
+        )
+        matte = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)
+        self.file.materials = [gltf.Material(name="surface", doubleSided=True, pbrMetallicRoughness=matte)]
+        self.file.meshes = [
+            gltf.Mesh(
+                name=name, primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)]
+            )
+        ]
+
+    def animation(self, action: Action) -> gltf.Animation:
+        """Turn an action into channels: translation and rotation of the root and of every joint."""
+        animation = gltf.Animation(name=action.name)
+        keys = self.add(action.time_s.astype(np.float32), "SCALAR", _FLOAT, bounds=True)
+        tracks = [(_ROOT_NODE, action.world_from_agent)]
+        tracks += [
+            (_FIRST_JOINT + bone, action.agent_from_bone[:, bone])
+            for bone in range(action.agent_from_bone.shape[1])
+        ]
+        for node, parent_from_node in tracks:
+            translation, quaternion = _translation_quaternion(parent_from_node)
+            for path, values, kind in (
+                ("translation", translation, "VEC3"),
+                ("rotation", _without_flips(quaternion), "VEC4"),
+            ):
+                output = self.add(values.astype(np.float32), kind, _FLOAT)
+                animation.samplers.append(
+                    gltf.AnimationSampler(input=keys, output=output, interpolation="LINEAR")
+                )
+                target = gltf.AnimationChannelTarget(node=node, path=path)
+                animation.channels.append(
+                    gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target)
+                )
+        return animation
+
+    def packed(self) -> bytes:
+        """Return the whole file."""
+        self.file.buffers = [gltf.Buffer(byteLength=len(self.blob))]
+        self.file.set_binary_blob(bytes(self.blob))
+        return b"".join(self.file.save_to_bytes())
+
+
+def _translation_quaternion(parent_from_node: Float[np.ndarray, "n 4 4"]) -> tuple[np.ndarray, np.ndarray]:
+    """Split rigid motions into translation and quaternion in glTF's order, xyzw."""
+    wxyz = rigid.quaternion_from_rotation(np.asarray(parent_from_node[:, :3, :3], np.float64))
+    return np.asarray(parent_from_node[:, :3, 3]), np.roll(wxyz, -1, axis=-1)
+
+
+def _without_flips(quaternion: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "frame 4"]:
+    """Choose signs so that neighbouring keys lie on one side.
+
+    Viewers interpolate the shorter arc either way.
+    """
+    flips = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
+    return quaternion * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+
+
+def _unit_normals(mesh: Mesh) -> Float32[np.ndarray, "vertex 3"]:
+    """Vertex normals of unit length, +y where a vertex has no face: glTF forbids zero normals."""
+    normals = mesh.vertex_normals().astype(np.float64)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length < 1e-6, [0.0, 1.0, 0.0], normals / np.maximum(length, 1e-6)).astype(np.float32)
+
+
+def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "vertex 4"]:
+    """Undo the sRGB curve: glTF's vertex colours are linear."""
+    srgb = color.astype(np.float32) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([linear, np.ones_like(linear[:, :1])], 1).astype(np.float32)
+
+
+def _floats(values: np.ndarray) -> list[float]:
+    return [float(value) for value in values]
+
+
+def read_static(data: bytes) -> Mesh:
+    """Read back what `static` made."""
+    document = _Opened(data)
+    return document.mesh()
+
+
+def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
+    """Read back what `skinned` made: colours to a level of 255, everything else to float32."""
+    document = _Opened(data)
+    attributes = document.file.meshes[0].primitives[0].attributes
+    table = document.file.skins[0]
+    matrices = (
+        document.values(table.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
+    )
+    names = tuple(document.file.nodes[joint].name for joint in table.joints)
+    joints, weights = (
+        np.concatenate(
+            [
+                document.values(getattr(attributes, f"{kind}_{n}"))
+                for n in (0, 1)
+                if hasattr(attributes, f"{kind}_{n}")
+            ],
+            1,
+        )
+        for kind in ("JOINTS", "WEIGHTS")
+    )
+    skin = Skin(joints, weights, rigid.inverse(matrices), names)
+    return (
+        document.mesh(),
+        skin,
+        [document.action(animation, len(names)) for animation in document.file.animations],
+    )
+
+
+class _Opened:
+    """A glTF document that is read."""
+
+    def __init__(self, data: bytes) -> None:
+        self.file = gltf.GLTF2.load_from_bytes(data)
+        self.blob = self.file.binary_blob()
+
+    def values(self, index: int) -> np.ndarray:
+        accessor = self.file.accessors[index]
+        kind = {_FLOAT: "<f4", _U8: "u1", _U32: "<u4"}[accessor.componentType]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]
+        start = self.file.bufferViews[accessor.bufferView].byteOffset
+        return np.frombuffer(self.blob, kind, accessor.count * width, start).reshape(accessor.count, -1)
+
+    def mesh(self) -> Mesh:
+        primitive = self.file.meshes[0].primitives[0]
+        color = None
+        if primitive.attributes.COLOR_0 is not None:
+            linear = self.values(primitive.attributes.COLOR_0)[:, :3].astype(np.float64)
+            srgb = np.where(
+                linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
+            )
+            color = np.rint(255 * srgb).astype(np.uint8)
+        faces = self.values(primitive.indices).reshape(-1, 3).astype(np.int32)
+        return Mesh(self.values(primitive.attributes.POSITION).copy(), faces, color)
+
+    def action(self, animation: gltf.Animation, bones: int) -> Action:
+        """Channels stand in the order in which `_Document.animation` writes them."""
+        outputs = [self.values(sampler.output) for sampler in animation.samplers]
+        places, turns = np.stack(outputs[::2], 1), np.roll(np.stack(outputs[1::2], 1), 1, axis=-1)
+        poses = rigid.make(
+            rigid.rotation_from_quaternion(turns.astype(np.float64)), places.astype(np.float64)
+        )
+        assert poses.shape[1] == 1 + bones, poses.shape
+        return Action(
+            animation.name,
+            self.values(animation.samplers[0].input).ravel().astype(np.float64),
+            poses[:, 0],
+            poses[:, 1:],
+        )

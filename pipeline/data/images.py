@@ -1,0 +1,218 @@
+"""Images on disk: colour (JPEG, PNG, WebP), 8-bit labels (PNG) and depth (EXR, one HALF channel ``Z``,
+metres).
+
+The only file that decodes OpenEXR and OpenCV images. Sizes are checked before pixels are decoded:
+a few hundred bytes can ask for gigabytes.
+"""
+
+import contextlib
+import errno
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+from jaxtyping import Float, UInt8
+
+from pipeline.core.errors import InputError
+
+MAX_PIXELS = 32 << 20
+"""of a colour picture.
+
+Of a depth picture, all channels together: 8K video, larger than any phone's picture
+"""
+MAX_DEPTH_M = 1000.0
+"""depth beyond this is no measurement, metres"""
+MAX_EXR_HEADER_BYTES = 1 << 16
+_EXR_DEEP, _EXR_MULTIPART, _EXR_CHANNEL_BYTES, _EXR_ZIP_ROWS = 0x800, 0x1000, 16, 16
+"""flags of OpenEXR's version field, what follows a channel's name, rows of a ZIP block (OpenEXR file
+layout)
+"""
+
+
+def decode_color(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Decode an image file's bytes to RGB.
+
+    Raises InputError CAP-020 when the bytes are not a readable image.
+    """
+    image = decoded(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(
+            "CAP-020", what="the picture cannot be decoded", where=where, remedy="export the recording again"
+        )
+    return image
+
+
+def read_color(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an RGB picture."""
+    return decode_color(Path(path).read_bytes(), str(path))
+
+
+def encode_jpeg(color: UInt8[np.ndarray, "height width 3"], quality: int = 92) -> bytes:
+    """Encode RGB as JPEG."""
+    return cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def write_color(path: Path, color: UInt8[np.ndarray, "height width 3"], quality: int = 92) -> None:
+    """Write RGB; the ending chooses JPEG, PNG or WebP, ``quality`` counts for JPEG and WebP."""
+    flags = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, quality], ".webp": [cv2.IMWRITE_WEBP_QUALITY, quality]}.get(
+        Path(path).suffix, []
+    )
+    encoded, data = cv2.imencode(Path(path).suffix, np.ascontiguousarray(color[..., ::-1]), flags)
+    assert encoded, path
+    Path(path).write_bytes(data.tobytes())
+
+
+def read_gray(path: Path) -> UInt8[np.ndarray, "height width"]:
+    """Read an 8-bit single-channel PNG (masks, confidence) with its values as they are."""
+    image = decoded(Path(path).read_bytes(), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 2 or image.dtype != np.uint8:
+        raise InputError(
+            "CAP-021",
+            what="not a readable 8-bit single-channel picture",
+            where=str(path),
+            remedy="rebuild the stage that wrote it",
+        )
+    return image
+
+
+def write_gray(path: Path, image: UInt8[np.ndarray, "height width"]) -> None:
+    """Write an 8-bit single-channel PNG."""
+    assert image.dtype == np.uint8 and image.ndim == 2, (image.dtype, image.shape)
+    Path(path).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def read_depth(path: Path, channel: str | None = "Z") -> Float[np.ndarray, "height width"]:
+    """Read a depth EXR as float32 metres, 0 where the value is not finite, not positive or absurdly far.
+
+    Without a ``channel`` the file must have exactly one. Raises InputError CAP-022 for files that are not
+    EXR, ask for too many pixels or lack the channel.
+    """
+    _check_exr_size(Path(path))
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            (name,) = [channel] if channel else file.channels()
+            pixels = file.channels()[name].pixels.astype(np.float32)
+    except (RuntimeError, KeyError, ValueError, TypeError, MemoryError) as error:
+        raise InputError(
+            "CAP-022",
+            what=f"not a depth EXR with a channel {channel!r} ({error})",
+            where=str(path),
+            remedy="export the recording again",
+        ) from error
+    return np.where(np.isfinite(pixels) & (pixels > 0) & (pixels < MAX_DEPTH_M), pixels, np.float32(0))
+
+
+def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
+    """Write z-depth in metres (0 = unknown) as one HALF channel ``Z``, ZIP compressed."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float16)}) as file:
+        with contextlib.suppress(RuntimeError):
+            file.write(str(path))
+    if not _is_complete(Path(path)):  # OpenEXR does not notice a disk that is full when it closes the file
+        Path(path).write_bytes(bytes(max(depth.nbytes, MAX_EXR_HEADER_BYTES)))  # raises the disk's own reason
+        raise OSError(errno.EIO, "OpenEXR wrote an incomplete file", str(path))
+
+
+def _is_complete(path: Path) -> bool:
+    """Tell whether a ZIP-compressed scan-line EXR reaches to the end of its last block."""
+    with open(path, "rb") as file:
+        try:
+            attributes, table = _exr_attributes(file.read(MAX_EXR_HEADER_BYTES))
+            _, y0, _, y1 = struct.unpack("<4i", attributes["dataWindow"])
+            file.seek(table + 8 * ((y1 - y0) // _EXR_ZIP_ROWS))
+            (last,) = struct.unpack("<Q", file.read(8))
+            file.seek(last)
+            _, length = struct.unpack("<2i", file.read(8))
+        except (struct.error, ValueError, KeyError):
+            return False
+    return path.stat().st_size == last + 8 + length
+
+
+def decoded(data: bytes, flags: int) -> np.ndarray | None:
+    """Decode with OpenCV; None for what it cannot read, PNG with a wrong checksum among them.
+
+    PNG and JPEG whose header asks for too many pixels are not tried.
+    """
+    try:
+        if _declared_pixels(data) > MAX_PIXELS:
+            return None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (cv2.error, struct.error):
+        return None
+
+
+def _declared_pixels(data: bytes) -> int:
+    """Return the pixels that the header of a PNG or JPEG asks for; 0 for other kinds, too many for a broken
+    PNG.
+    """
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        at, kind = 8, b""
+        while kind != b"IEND":  # OpenCV allocates what a chunk declares before it looks for its bytes
+            length, kind = struct.unpack_from(">I4s", data, at)
+            at += 12 + length
+            if zlib.crc32(data[at - length - 8 : at - 4]) != struct.unpack_from(">I", data, at - 4)[0]:
+                return MAX_PIXELS + 1
+        width, height = struct.unpack_from(">2I", data, 16)
+        return width * height
+    at = 2
+    while data[:2] == b"\xff\xd8" and data[at : at + 1] == b"\xff":
+        marker, length = struct.unpack_from(">BH", data, at + 1)
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame, of any coding
+            height, width = struct.unpack_from(">2H", data, at + 5)
+            return height * width
+        at += 2 + length
+    return 0
+
+
+def _check_exr_size(path: Path) -> None:
+    """Read size and channels from the header and refuse what no depth picture has, before pixels are
+    decoded.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(MAX_EXR_HEADER_BYTES)
+        attributes, _ = _exr_attributes(head)
+        x0, y0, x1, y1 = struct.unpack("<4i", attributes["dataWindow"])
+        channels = _exr_channels(attributes["channels"])
+        good = x1 >= x0 and y1 >= y0 and (x1 - x0 + 1) * (y1 - y0 + 1) * channels <= MAX_PIXELS
+    except (OSError, struct.error, ValueError, KeyError):
+        good = False
+    if not good:
+        raise InputError(
+            "CAP-022",
+            what="not an EXR picture of a sensible size",
+            where=str(path),
+            remedy="export the recording again",
+        )
+
+
+def _exr_attributes(head: bytes) -> tuple[dict[str, bytes], int]:
+    """Return the attributes of a flat EXR's header by name, and where it ends.
+
+    Raises ValueError for other files.
+    """
+    version = struct.unpack_from("<I", head, 4)[0] if head[:4] == b"\x76\x2f\x31\x01" else 0
+    if version & 0xFF != 2 or version & (_EXR_DEEP | _EXR_MULTIPART):
+        raise ValueError("no single flat picture")
+    attributes: dict[str, bytes] = {}
+    at = 8
+    while head[at : at + 1] != b"\0":
+        name, kind = head.index(b"\0", at), head.index(b"\0", head.index(b"\0", at) + 1)
+        size, start = struct.unpack_from("<I", head, kind + 1)[0], kind + 5
+        if start + size > len(head):
+            raise ValueError("the header is too long")
+        attributes.setdefault(head[at:name].decode("latin-1"), head[start : start + size])
+        at = start + size
+    return attributes, at + 1
+
+
+def _exr_channels(listed: bytes) -> int:
+    """Count the channels of a channel list: names, each with 16 bytes behind it, to an empty one."""
+    count, at = 0, 0
+    while listed[at : at + 1] not in (b"\0", b""):
+        at = listed.index(b"\0", at) + 1 + _EXR_CHANNEL_BYTES
+        count += 1
+    return count

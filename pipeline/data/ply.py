@@ -1,0 +1,96 @@
+"""PLY meshes, binary little-endian: positions, optional colour and any per-vertex float properties.
+
+`write_ply` and `read_ply` are exact inverses for float32 data. Reading checks counts, indices and finiteness.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.core.errors import InputError
+from pipeline.geometry.meshes import Mesh
+
+_TYPES = {
+    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
+    "uchar": "u1", "uint8": "u1", "char": "i1", "int8": "i1",
+    "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
+}  # fmt: skip
+
+
+def write_ply(path: Path, mesh: Mesh, **properties: Float[np.ndarray, "vertex"]) -> None:
+    """Write a mesh; each extra property becomes a float column of the vertices."""
+    columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    columns += [(name, "<f4") for name in properties]
+    columns += [(name, "u1") for name in ("red", "green", "blue")] if mesh.color is not None else []
+    table = np.zeros(len(mesh.vertices), columns)
+    for axis, name in enumerate("xyz"):
+        table[name] = mesh.vertices[:, axis]
+    for name, values in properties.items():
+        table[name] = values
+    for channel, name in enumerate(("red", "green", "blue") if mesh.color is not None else ()):
+        table[name] = mesh.color[:, channel]
+    faces = np.zeros(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    names = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property {names[kind]} {name}" for name, kind in columns]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    Path(path).write_bytes("\n".join(header).encode() + table.tobytes() + faces.tobytes())
+
+
+def read_ply(path: Path) -> Mesh:
+    """Read a binary triangle mesh. Raises InputError ART-020 when it is not one or is damaged."""
+    try:
+        return _parse(Path(path).read_bytes())
+    except (ValueError, IndexError, KeyError, TypeError, OverflowError, StopIteration) as error:
+        raise InputError(
+            "ART-020",
+            what=f"not a binary PLY of triangles: {error}",
+            where=str(path),
+            remedy="export it again as binary little-endian PLY",
+        ) from error
+
+
+def _parse(data: bytes) -> Mesh:
+    end = data.index(b"end_header\n") + len(b"end_header\n")
+    lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
+    if ["format", "binary_little_endian", "1.0"] not in lines:
+        raise ValueError("only binary_little_endian 1.0 is read")
+    elements = [(line[1], int(line[2]), []) for line in lines if line[:1] == ["element"]]
+    current = iter(elements)
+    columns: list[list[str]] | None = None
+    for line in lines:
+        if line[:1] == ["element"]:
+            columns = next(current)[2]
+        elif line[:1] == ["property"] and columns is None:
+            raise ValueError("a property before any element")
+        elif line[:1] == ["property"]:
+            columns.append(line[1:])
+    if any(not 0 <= count <= len(data) for _, count, _ in elements):
+        raise ValueError("the file is shorter than its header declares")
+    if [name for name, _, _ in elements][:2] != ["vertex", "face"]:
+        raise ValueError("it needs the elements vertex and face, in this order")
+    (_, vertex_count, vertex_columns), (_, face_count, face_columns) = elements[:2]
+    row = np.dtype([(name, _TYPES[kind]) for kind, name in vertex_columns])
+    if len(face_columns) != 1 or face_columns[0][0] != "list":
+        raise ValueError("faces must be one index list")
+    face_row = np.dtype([("count", _TYPES[face_columns[0][1]]), ("index", _TYPES[face_columns[0][2]], 3)])
+    if end + vertex_count * row.itemsize + face_count * face_row.itemsize > len(data):
+        raise ValueError("the file is shorter than its header declares")
+    table = np.frombuffer(data, row, vertex_count, end)
+    faces = np.frombuffer(data, face_row, face_count, end + table.nbytes)
+    vertices = np.stack([table[axis] for axis in "xyz"], axis=-1).astype(np.float32)
+    index = faces["index"].astype(np.int32)
+    if face_count and ((faces["count"] != 3).any() or index.min() < 0 or index.max() >= vertex_count):
+        raise ValueError("faces are not triangles of existing vertices")
+    if not np.isfinite(vertices).all():
+        raise ValueError("vertices are not finite")
+    has_color = {"red", "green", "blue"} <= set(row.names)
+    color = (
+        np.stack([table[name] for name in ("red", "green", "blue")], axis=-1).astype(np.uint8)
+        if has_color
+        else None
+    )
+    return Mesh(vertices, index, color)

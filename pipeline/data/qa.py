@@ -1,0 +1,95 @@
+"""A stage's quality check of its own result: numbers with thresholds, pictures, and how good and bad look.
+
+`write` puts `qa.json` and `qa/<name>.webp` into an artifact that is being made; `report` shows them.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from pipeline.data import images
+
+Status = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One number and where it begins to worry."""
+
+    name: str
+    value: float | None
+    unit: str = ""
+    warn: float | None = None
+    """Beyond this the check warns; None never warns."""
+    fail: float | None = None
+    """Beyond this the check fails; None never fails."""
+    better: Literal["lower", "higher"] = "lower"
+
+    @property
+    def status(self) -> Status:
+        """Judge the value; one that was not measured (None, NaN) warns."""
+        if self.value is None or not math.isfinite(self.value):
+            return "warn"
+        if _beyond(self.value, self.fail, self.better):
+            return "fail"
+        return "warn" if _beyond(self.value, self.warn, self.better) else "ok"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture for the report."""
+
+    name: str
+    """File name without ending."""
+    image: UInt8[ndarray, "height width 3"]
+    caption: str
+
+
+def write(
+    folder: Path, *, good: str, bad: str, checks: Sequence[Check] = (), pictures: Sequence[Picture] = ()
+) -> None:
+    """Write `qa.json` and its pictures into `folder`, an artifact in the making.
+
+    `good` and `bad` each complete the sentence "good (bad) looks like ...".
+    """
+    for picture in pictures:
+        (folder / "qa").mkdir(exist_ok=True)
+        images.write_color(folder / "qa" / f"{picture.name}.webp", picture.image)
+    report = {
+        "status": worst([check.status for check in checks]),
+        "good": good,
+        "bad": bad,
+        "checks": [_plain(check) for check in checks],
+        "pictures": [{"file": f"qa/{picture.name}.webp", "caption": picture.caption} for picture in pictures],
+    }
+    (folder / "qa.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+
+
+def worst(statuses: Sequence[Status]) -> Status:
+    """Return the most serious of several judgements; none at all is ok."""
+    return max(statuses, key=("ok", "warn", "fail").index, default="ok")
+
+
+def _beyond(value: float, limit: float | None, better: Literal["lower", "higher"]) -> bool:
+    if limit is None:
+        return False
+    return value > limit if better == "lower" else value < limit
+
+
+def _plain(check: Check) -> dict[str, Any]:
+    value = None if check.value is None or not math.isfinite(check.value) else float(check.value)
+    return {
+        "name": check.name,
+        "value": value,
+        "unit": check.unit,
+        "warn": check.warn,
+        "fail": check.fail,
+        "better": check.better,
+        "status": check.status,
+    }

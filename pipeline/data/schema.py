@@ -1,0 +1,101 @@
+"""What an NPZ file of an artifact holds: every array's key, axes and dtype, written and checked in one place.
+
+A module per artifact kind declares its files as `FileSchema` and offers typed readers and writers over it;
+`tests/test_data_layout.py` compares every schema with `data_layout.md`.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.data import npz
+
+_SPEC = re.compile(
+    r"(?P<key>\w+) \[(?P<axes>[^\]]*)\] (?P<dtype>f2|f4|f8|u1|u2|i4|i8|bool|U)(?P<optional>\?)?"
+)
+
+
+@dataclass(frozen=True)
+class ArraySchema:
+    """One array: axis names or fixed lengths in order, and the dtype on disk."""
+
+    axes: tuple[str, ...]
+    dtype: str
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class FileSchema:
+    """The arrays of one NPZ file, by key."""
+
+    file: str
+    """`<artifact>/<file>` as in `data_layout.md`"""
+    arrays: dict[str, ArraySchema]
+
+    @classmethod
+    def of(cls, file: str, *specs: str) -> "FileSchema":
+        """Make a schema from lines such as `world_from_camera [frame 4 4] f8`.
+
+        A final `?` marks an optional one.
+        """
+        matches = [_SPEC.fullmatch(spec) for spec in specs]
+        assert all(matches), specs
+        return cls(
+            file,
+            {
+                m["key"]: ArraySchema(tuple(m["axes"].split()), m["dtype"], bool(m["optional"]))
+                for m in matches
+                if m
+            },
+        )
+
+    def save(self, path: Path, *, compress: bool = False, **arrays: np.ndarray | None) -> None:
+        """Write the arrays in the schema's order and dtypes; None leaves an optional one out."""
+        given = {key: array for key, array in arrays.items() if array is not None}
+        known = {key: np.asarray(given[key], self._dtype(key)) for key in self.arrays if key in given}
+        problem = self._problem(known) if given.keys() <= self.arrays.keys() else f"unknown {given.keys()}"
+        assert problem is None, (self.file, problem)
+        npz.save(path, compress=compress, **known)
+
+    def load(self, path: Path, *keys: str) -> dict[str, np.ndarray]:
+        """Read the named arrays (default: all) in the schema's dtypes.
+
+        Raises InputError ART-010 for damaged files, missing keys, and arrays of other axes or kinds.
+        """
+        wanted = keys or tuple(self.arrays)
+        required = tuple(key for key in wanted if not self.arrays[key].optional)
+        stored = npz.load(path, required, optional=wanted)
+        problem = self._problem(stored, wanted)
+        if problem is not None:
+            raise InputError(
+                "ART-010", f"not a {self.file}: {problem}", str(path), "rebuild the stage that wrote it"
+            )
+        return {
+            key: array.astype(self._dtype(key) or array.dtype, copy=False) for key, array in stored.items()
+        }
+
+    def _dtype(self, key: str) -> np.dtype | None:
+        """Return the dtype on disk; None for text, whose length is its own."""
+        return None if self.arrays[key].dtype == "U" else np.dtype(self.arrays[key].dtype)
+
+    def _problem(self, stored: dict[str, np.ndarray], wanted: tuple[str, ...] | None = None) -> str | None:
+        """Name what contradicts the schema: missing keys, kinds, numbers of axes, lengths that disagree."""
+        lengths: dict[str, int] = {}
+        for key in self.arrays if wanted is None else wanted:
+            schema = self.arrays[key]
+            if key not in stored:
+                if schema.optional:
+                    continue
+                return f"{key} is missing"
+            array = stored[key]
+            if array.dtype.kind != np.dtype(schema.dtype).kind:
+                return f"{key} holds {array.dtype} instead of {schema.dtype}"
+            if array.ndim != len(schema.axes):
+                return f"{key} has {array.ndim} axes instead of {' '.join(schema.axes) or 'none'}"
+            for axis, length in zip(schema.axes, array.shape, strict=True):
+                if lengths.setdefault(axis, int(axis) if axis.isdigit() else length) != length:
+                    return f"{key} has {length} along {axis} instead of {lengths[axis]}"
+        return None

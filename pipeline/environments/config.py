@@ -1,0 +1,35 @@
+"""Settings of the environments. Standard library only."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Embodiment = Literal["person", "robot"]
+"""A person steps forward, sideways and turns; a robot on wheels drives forward and turns."""
+RewardName = Literal["approach", "follow", "calm", "none"]
+"""See `pipeline.environments.rewards`."""
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """What acts, what it is rewarded for, and how the animal plans."""
+
+    embodiment: Embodiment = "person"
+    """What acts."""
+    reward: RewardName = "approach"
+    """What is rewarded."""
+    episode_s: float = 20.0
+    """Length of an episode, seconds."""
+    speed_m_s: float = 1.2
+    """Highest walking or driving speed, m/s."""
+    turn_rad_s: float = 2.0
+    """Highest turning speed, rad/s."""
+    start_m: tuple[float, float] = (1.5, 3.5)
+    """Nearest and furthest distance from the animal at which an episode begins, metres."""
+    goal_steps: int = 4
+    """Denoising steps of the animal's goals; 50 for the full sampler."""
+    sequence_steps: int = 4
+    """Denoising steps of its paths and bodies; 10 for the full sampler."""
+    guidance: float = 1.0
+    """Scale of classifier-free guidance: the interactivity."""
+    candidates: int = 2
+    """Plans drawn at most where the first one is blocked."""

@@ -1,0 +1,83 @@
+"""One person, or robot, beside one animal, for Gymnasium."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.rendering import PictureWindow, bird_view
+from pipeline.environments.rewards import ENDING, REWARDS
+from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
+from pipeline.environments.world import AnimalWorld
+
+
+class PersonEnv(gymnasium.Env):
+    """The agent is a person or a robot, the animal of a build is the world; a step is 0.1 s.
+
+    `reset(options={"split": "test"})` begins at windows of the test recording. `info` holds `distance_m`,
+    `reached`, `flees` and `plans_per_step`.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RATE_HZ}  # noqa: RUF012
+
+    def __init__(
+        self,
+        build: str | Path | AnimalWorld,
+        *,
+        render_mode: str | None = None,
+        device: str = "cpu",
+        config: EnvironmentConfig | None = None,
+        **settings: Any,
+    ):
+        """Open a build (`build/<agent>`); ``settings`` replace fields of `EnvironmentConfig`."""
+        self.world = AnimalWorld.opened(build, config, settings, device=device)
+        self.config, self.render_mode = self.world.config, render_mode
+        self.observation_space = person_observation_space()
+        self.action_space = person_action_space(self.world)
+        self.window: PictureWindow | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Begin at a recorded moment, the person a few metres off."""
+        super().reset(seed=seed)
+        self.frame = 0
+        self.world.begin(1, self.np_random, (options or {}).get("split", "train"))
+        self._show()
+        return self._observation(), {"distance_m": float(self.world.distance_m[0])}
+
+    def step(self, action: np.ndarray):
+        """Let 0.1 s pass."""
+        outcome = self.world.step(np.asarray(action)[None])
+        self.frame += 1
+        reward = float(REWARDS[self.config.reward](outcome)[0])
+        reached, fled = bool(outcome.reached[0]), bool(outcome.flees[0])
+        terminated = self.config.reward in ENDING and (reached or fled)
+        truncated = self.frame >= round(self.config.episode_s * RATE_HZ)
+        self._show()
+        info = {
+            "distance_m": float(outcome.distance_m[0]),
+            "reached": reached,
+            "flees": fled,
+            "plans_per_step": self.world.plans_per_step,
+        }
+        return self._observation(), reward, terminated, truncated, info
+
+    def render(self):
+        """Return a picture from above (`rgb_array`)."""
+        return bird_view(self.world, 0) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window."""
+        if self.window is not None:
+            self.window.close()
+            self.window = None
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        return {name: value[0] for name, value in person_observation(self.world).items()}
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.window = self.window or PictureWindow()
+            self.window.show(bird_view(self.world, 0))

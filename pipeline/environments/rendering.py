@@ -1,0 +1,75 @@
+"""A pair from above: what is blocked grey, the person green, the animal blue, its plan and goal orange."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.environments.world import AnimalWorld
+
+SIDE_PX, SIDE_M = 400, 8.0
+"""Side of a picture in pixels, and of what it shows in metres."""
+GROUND, SOLID, PERSON, ANIMAL, PLAN = (
+    (250, 250, 250),
+    (150, 150, 150),
+    (85, 168, 104),
+    (59, 110, 165),
+    (221, 132, 82),
+)
+"""Colours, RGB."""
+
+
+def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
+    """Draw one pair, the person in the middle of the picture; world +x is right, +z down."""
+    centre, scale = world.persons.position[row], SIDE_PX / SIDE_M
+    axis = (np.arange(SIDE_PX) + 0.5) / scale - SIDE_M / 2
+    x, z = np.meshgrid(axis + centre[0], axis + centre[1])
+    blocked = world.floors[world.scene[row]].blocks(np.stack([x, z], axis=-1))
+    picture = np.where(blocked[..., None], SOLID, GROUND).astype(np.uint8)
+
+    def pixel(point: Float[np.ndarray, "2"]) -> tuple[int, int]:
+        u, v = np.round((point - centre) * scale + SIDE_PX / 2).astype(int)
+        return int(u), int(v)
+
+    animals = world.animals
+    path = animals.plan.root[row, animals.played[row] :, :3, 3][:, [0, 2]]
+    root = animals.past[-1].root[row, 0]
+    cv2.polylines(
+        picture, [np.array([pixel(point) for point in path], np.int32).reshape(-1, 1, 2)], False, PLAN, 1
+    )
+    cv2.circle(picture, pixel(animals.goal[row][[0, 2]]), 4, PLAN, -1)
+    nose = root[[0, 2], 3] + 0.3 * root[[0, 2], 2]
+    cv2.line(picture, pixel(root[[0, 2], 3]), pixel(nose), ANIMAL, 3)
+    cv2.circle(picture, pixel(root[[0, 2], 3]), 6, ANIMAL, -1)
+    heading = world.persons.heading[row]
+    cv2.line(
+        picture, pixel(centre), pixel(centre + 0.5 * np.array([np.sin(heading), np.cos(heading)])), PERSON, 2
+    )
+    cv2.circle(picture, pixel(centre), 8, PERSON, -1)
+    return picture
+
+
+class PictureWindow:
+    """Pictures on a screen, where there is one; elsewhere they are drawn and not shown."""
+
+    def __init__(self) -> None:
+        import matplotlib.pyplot as plt  # late: only `render_mode="human"` needs a window
+        from matplotlib.backends.registry import BackendFilter, backend_registry
+
+        interactive = backend_registry.list_builtin(BackendFilter.INTERACTIVE)
+        self.visible = plt.get_backend().lower() in {name.lower() for name in interactive}
+        self.figure = plt.figure(figsize=(5, 5))
+        self.image = self.figure.add_axes((0, 0, 1, 1)).imshow(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
+
+    def show(self, picture: UInt8[np.ndarray, "400 400 3"]) -> None:
+        """Replace the picture."""
+        import matplotlib.pyplot as plt
+
+        self.image.set_data(picture)
+        if self.visible:
+            plt.pause(1e-3)
+
+    def close(self) -> None:
+        """Close the window."""
+        import matplotlib.pyplot as plt
+
+        plt.close(self.figure)

@@ -1,0 +1,69 @@
+"""Many persons beside many animals at once, for Gymnasium's vector interface; animals plan in batches."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector.utils import batch_space
+
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.rewards import ENDING, REWARDS
+from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
+from pipeline.environments.world import AnimalWorld
+
+
+class PersonVectorEnv(gymnasium.vector.VectorEnv):
+    """`PersonEnv` ``num_envs`` times in one process; ended episodes begin anew in the next step."""
+
+    metadata = {  # noqa: RUF012
+        "render_modes": [],
+        "render_fps": RATE_HZ,
+        "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        build: str | Path | AnimalWorld,
+        num_envs: int = 1,
+        *,
+        device: str = "cpu",
+        config: EnvironmentConfig | None = None,
+        **settings: Any,
+    ):
+        """Open a build (`build/<agent>`); ``settings`` replace fields of `EnvironmentConfig`."""
+        self.world = AnimalWorld.opened(build, config, settings, device=device)
+        self.config, self.num_envs, self.render_mode = self.world.config, num_envs, None
+        self.single_observation_space = person_observation_space()
+        self.single_action_space = person_action_space(self.world)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
+        """Begin all episodes; one seed (of a list, its first) determines all of them."""
+        super().reset(seed=seed[0] if isinstance(seed, list) else seed)
+        self.split = (options or {}).get("split", "train")
+        self.frame, self.ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
+        self.world.begin(self.num_envs, self.np_random, self.split)
+        return person_observation(self.world), {"distance_m": self.world.distance_m}
+
+    def step(self, actions: np.ndarray):
+        """Let 0.1 s pass everywhere; where an episode had ended, another begins instead."""
+        again = np.flatnonzero(self.ended)
+        outcome = self.world.step(np.where(self.ended[:, None], 0.0, actions))
+        if len(again):
+            self.world.restart(again, self.split)
+        self.frame = np.where(self.ended, 0, self.frame + 1)
+        lived = ~self.ended
+        ending = self.config.reward in ENDING
+        terminated = lived & ending & (outcome.reached | outcome.flees)
+        truncated = lived & (self.frame >= round(self.config.episode_s * RATE_HZ))
+        reward = np.where(lived, REWARDS[self.config.reward](outcome), 0.0)
+        self.ended = terminated | truncated
+        info = {
+            "distance_m": outcome.distance_m,
+            "reached": lived & outcome.reached,
+            "flees": lived & outcome.flees,
+        }
+        return person_observation(self.world), reward, terminated, truncated, info

@@ -1,0 +1,264 @@
+"""Many persons and animals at once: one pair per row, planning in batches, each pair restarting on its own.
+
+`AnimalWorld.load` opens a build; `reset` begins some pairs, `step` moves all by 0.1 s and returns what
+happened. Persons are moved by actions, animals by the behaviour model through `AnimalBatch`, which plans only
+where a plan ends or the person has moved noticeably: `plans_per_step` is that rate.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.behavior import model as behavior
+from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Context
+from pipeline.core.errors import InputError
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.floor import PersonFloor, to_local, to_world
+from pipeline.environments.rewards import StepOutcome
+from pipeline.metrics.flight import WITHIN_FRAMES, flees
+
+EYE_M = 1.4
+"""Height of a person's phone above the floor, metres."""
+CLOSE_M = 2.4
+"""Distance within which an animal that gets away counts as fleeing; what it does far off is its own affair.
+"""
+START_DRAWS = 30
+"""Places that are tried for a person's start before one in something solid is taken."""
+SPLITS = {"train": TRAIN, "test": TEST}
+
+
+@dataclass
+class Persons:
+    """Where the persons are; rows are replaced when an episode begins."""
+
+    position: Float[np.ndarray, "person 2"]
+    """World x and z, metres."""
+    heading: Float[np.ndarray, "person"]
+    """About world +y, radians; 0 looks along +z."""
+    velocity: Float[np.ndarray, "person 2"]
+    """World x and z, m/s."""
+
+
+class AnimalWorld:
+    """Pairs of a person and an animal, each pair in the scene of the animal's recording."""
+
+    def __init__(
+        self, sampler: Sampler, data: BehaviorData, scenes: Scenes, ego: Ego, config: EnvironmentConfig
+    ):
+        self.data, self.scenes, self.config = data, scenes, config
+        sampling = PlanSamplingConfig(
+            method="ddim",
+            goal_steps=config.goal_steps,
+            sequence_steps=config.sequence_steps,
+            guidance=config.guidance,
+            max_path_draws=1,
+        )
+        self.animals = AnimalBatch(
+            sampler,
+            scenes,
+            data.agent_from_bone_rest,
+            ego,
+            sampling=sampling,
+            chaining=ReplanningConfig(candidates=config.candidates),
+        )
+        tracks = [data.trajectories[name] for name in data.videos]
+        roots = [track.world_from_agent[track.valid, :3, 3] for track in tracks]
+        self.floors = []
+        for number, volume in enumerate(scenes.volumes):
+            here = [
+                root for root, scene in zip(roots, self._scene_of_videos(), strict=True) if scene == number
+            ]
+            self.floors.append(PersonFloor.of(volume, np.concatenate(here)))
+
+    @classmethod
+    def opened(
+        cls,
+        build: "str | Path | AnimalWorld",
+        config: EnvironmentConfig | None,
+        settings: Mapping[str, Any],
+        *,
+        device: str,
+    ) -> "AnimalWorld":
+        """Return the world of a build, or the one given; ``settings`` replace fields of ``config``."""
+        config = replace(config or EnvironmentConfig(), **settings)
+        return build if isinstance(build, AnimalWorld) else cls.load(Path(build), config, device=device)
+
+    @classmethod
+    def load(cls, build: Path, config: EnvironmentConfig, *, device: str = "cpu") -> "AnimalWorld":
+        """Open a finished build. Raises ART-003 where it lacks the model, SIM-006 for models
+        without goals.
+        """
+        for artifact in ("behavior", "behavior_data"):
+            if not (build / artifact).is_dir():
+                raise InputError(
+                    "ART-003", f"has no {artifact}", str(build), "make it: make <agent>.behavior"
+                )
+        try:
+            architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            what = f"is no model as this version writes it ({type(error).__name__})"
+            raise InputError(
+                "ART-007", what, str(build / "behavior"), "build it again: make <agent>.behavior.redo"
+            ) from error
+        if architecture.family != "diffusion":
+            what = f"plans of the family {architecture.family} cannot be chained"
+            raise InputError("SIM-006", what, str(build), "give a build of the family diffusion")
+        data = BehaviorData.load(build / "behavior_data")
+        scenes = Scenes.load(build / "behavior_data", data.videos)
+        sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
+        return cls(sampler, data, scenes, architecture.ego, config)
+
+    def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
+        """Begin ``count`` pairs; ``rng`` draws windows, starts and all plans from here on."""
+        self.rng, self.steps = rng, 0
+        zeros = np.zeros((count, 2))
+        self.persons = Persons(zeros.copy(), np.zeros(count), zeros.copy())
+        self.video = np.zeros(count, int)
+        context = self._drawn(np.arange(count), split)
+        self.animals.begin(context, rng)
+
+    def restart(self, some: Int[np.ndarray, "some"], split: str = "train") -> None:
+        """Begin some pairs anew."""
+        self.animals.restart(some, self._drawn(some, split))
+
+    def step(self, action: Float[np.ndarray, "person command"]) -> StepOutcome:
+        """Move the persons by their actions (-1..1 of the highest speeds) and let the animals
+        live for 0.1 s.
+        """
+        before = self.distance_m
+        self._walk(np.clip(np.asarray(action, float), -1, 1))
+        last = self.animal_position.copy()
+        self.animals.step(self.eyes)
+        self.steps += len(before)
+        moved = np.linalg.norm((self.animal_position - last)[:, [0, 2]], axis=-1)
+        return StepOutcome(before, self.distance_m, moved * RATE_HZ, self.fleeing)
+
+    @property
+    def action_size(self) -> int:
+        """Numbers of an action: ahead, left and turn of a person; ahead and turn of a robot."""
+        return 3 if self.config.embodiment == "person" else 2
+
+    @property
+    def plans_per_step(self) -> float:
+        """Plans drawn per animal and step since `begin`."""
+        return self.animals.plans_drawn / max(self.steps, 1)
+
+    @property
+    def animal_position(self) -> Float[np.ndarray, "animal 3"]:
+        """World positions of the roots, metres."""
+        return self.animals.past[-1].root[:, 0, :3, 3]
+
+    @property
+    def distance_m(self) -> Float[np.ndarray, "person"]:
+        """Horizontal distance of person and animal, metres."""
+        return np.linalg.norm(self.animal_position[:, [0, 2]] - self.persons.position, axis=-1)
+
+    @property
+    def eyes(self) -> Float[np.ndarray, "person 3"]:
+        """World positions that the animals perceive, metres."""
+        x, z = self.persons.position.T
+        height = np.array([self.floors[scene].floor_m for scene in self.scene]) + EYE_M
+        return np.stack([x, height, z], axis=-1)
+
+    @property
+    def scene(self) -> Int[np.ndarray, "person"]:
+        """Number of each pair's scene."""
+        return self.scenes.number(self.video, len(self.video))
+
+    @property
+    def fleeing(self) -> Bool[np.ndarray, "animal"]:
+        """Whether a person is close and the rest of the animal's plan gets away by what counts as flight."""
+        plan, played = self.animals.plan.root[..., :3, 3], self.animals.played
+        frames = np.minimum(played[:, None] + np.arange(WITHIN_FRAMES), plan.shape[1] - 1)
+        path = np.take_along_axis(plan, frames[..., None], axis=1)
+        return (self.distance_m < CLOSE_M) & flees(path, self.animal_position, self.eyes)
+
+    def _walk(self, action: Float[np.ndarray, "person command"]) -> None:
+        """Move persons, along walls where they would walk into them."""
+        persons, c = self.persons, self.config
+        persons.heading = persons.heading + action[:, -1] * c.turn_rad_s / RATE_HZ
+        left = action[:, 1] if self.action_size == 3 else np.zeros(len(action))
+        wish = np.stack([left, action[:, 0]], axis=-1)
+        wish = wish / np.maximum(np.linalg.norm(wish, axis=-1, keepdims=True), 1.0)
+        step = to_world(wish, persons.heading) * c.speed_m_s / RATE_HZ
+        begin = persons.position.copy()
+        for axes in ([1.0, 1.0], [1.0, 0.0], [0.0, 1.0]):
+            stuck = (persons.position == begin).all(-1)
+            target = begin + step * axes
+            free = stuck & ~self._blocked(target)
+            persons.position[free] = target[free]
+        persons.velocity = (persons.position - begin) * RATE_HZ
+
+    def _blocked(self, points: Float[np.ndarray, "person 2"]) -> Bool[np.ndarray, "person"]:
+        blocked = np.zeros(len(points), bool)
+        for number in np.unique(self.scene):
+            mine = self.scene == number
+            blocked[mine] = self.floors[number].blocks(points[mine])
+        return blocked
+
+    def _drawn(self, some: Int[np.ndarray, "some"], split: str) -> Context:
+        """Draw windows and starts for some pairs; the person has stood there, facing the animal."""
+        windows = self.data.indices(SPLITS[split])
+        assert len(windows), f"there is no window of the split {split}"
+        context, _ = self.data.windows(self.rng.choice(windows, len(some)))
+        assert context.video is not None, "windows of data always name their recording"
+        self.video[some] = context.video
+        for row, video, root in zip(some, context.video, context.world_from_agent[:, -1, :3, 3], strict=True):
+            animal = root[[0, 2]]
+            self.persons.position[row] = self._start(animal, self.floors[self._scene_of_videos()[video]])
+            ahead = animal - self.persons.position[row]
+            self.persons.heading[row] = np.arctan2(ahead[0], ahead[1])
+            self.persons.velocity[row] = 0.0
+        observer = np.repeat(self.eyes[some][:, None], PAST, axis=1)
+        return replace(context, observer_world=observer)
+
+    def _start(self, animal: Float[np.ndarray, "2"], floor: PersonFloor) -> Float[np.ndarray, "2"]:
+        """Draw a free place around the animal, the last one drawn where none is free."""
+        near, far = self.config.start_m
+        place = animal
+        for _ in range(START_DRAWS):
+            angle, distance = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(near, far)
+            place = animal + distance * np.array([np.sin(angle), np.cos(angle)])
+            if not floor.blocks(place[None])[0]:
+                break
+        return place
+
+    def _scene_of_videos(self) -> Sequence[int]:
+        count = len(self.data.videos)
+        return self.scenes.number(np.arange(count), count).tolist()
+
+
+ANIMAL_NUMBERS = 7
+"""Numbers of `animal_seen`."""
+
+
+def animal_seen(world: AnimalWorld) -> Float[np.ndarray, "person 7"]:
+    """Return the animal in the person's frame: left, ahead (m), height above the floor, heading sine and
+    cosine, velocity.
+    """
+    root, persons = world.animals.past[-1].root[:, 0], world.persons
+    before = world.animals.past[-2].root[:, 0, :3, 3]
+    place = to_local(root[:, [0, 2], 3] - persons.position, persons.heading)
+    height = root[:, 1, 3] - np.array([world.floors[scene].floor_m for scene in world.scene])
+    ahead = to_local(root[:, [0, 2], 2], persons.heading)
+    velocity = to_local((root[:, :3, 3] - before)[:, [0, 2]] * RATE_HZ, persons.heading)
+    return np.concatenate([place, height[:, None], ahead, velocity], axis=-1).astype(np.float32)
+
+
+def occupancy_seen(world: AnimalWorld) -> Float[np.ndarray, "person 16 16"]:
+    """Return what blocks the way around each person, in its own frame."""
+    maps = [
+        world.floors[scene].around(
+            world.persons.position[row : row + 1], world.persons.heading[row : row + 1]
+        )
+        for row, scene in enumerate(world.scene)
+    ]
+    return np.concatenate(maps)

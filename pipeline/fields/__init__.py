@@ -1,0 +1,1 @@
+"""Canonical fields and Gaussians of scene and agent, skinning and rendering."""

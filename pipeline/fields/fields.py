@@ -1,0 +1,406 @@
+"""The canonical structure T: what is where in the scene and on the agent (paper 001, Eqs. 1-2).
+
+`Field` maps points to signed distance, color and feature: a multi-resolution dense grid or an MLP with
+positional encoding, and two small heads, with a learnable code per video for the scene. Where geometry was
+fused beforehand (`FusedGeometry`), signed distance is fixed and the heads learn color and features alone.
+`density` turns signed distance into the density of volume rendering. `ArticulatedBody` poses the agent's
+field by Gaussian bones. `Reconstruction` holds all of it; `save` and `load` move it to and from a folder.
+Points and distances are in metres.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, assert_never
+
+import torch
+from jaxtyping import Float, Int
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pipeline.fields import fused_depth as fused
+from pipeline.fields import skinning
+from pipeline.fields.fused_depth import FusedGeometry
+from pipeline.geometry import rigid_torch
+
+FEATURE_CHANNELS = 16
+FUSED_CHANNELS = fused.CHANNELS
+SOFTNESS_M = (0.004, 0.02)
+"""range of the density's scale beta: sharper ones lose the gradient between samples, softer ones blur thin
+limbs"""
+START_SOFTNESS_M, START_RANGE_M = 0.1, (0.004, 0.2)
+"""beta and its range where rendering alone has to find surfaces: samples lie about a decimetre apart at
+first"""
+GRID_STD, CODE_STD = 0.01, 0.1
+"""standard deviations of untrained grids and codes"""
+LATTICE_M = 0.05
+"""resolution at which a learned scene is extracted, below its finest cell"""
+CORRECTION_M = 0.1
+"""cells of the learned correction of skinning weights"""
+LEAST_PROBABILITY = 0.02
+"""fused colors are kept this far from 0 and 1 for their logit"""
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """Everything that fixes the parameters' shapes of a field."""
+
+    low_m: tuple[float, float, float]
+    """lower corner of the box"""
+    high_m: tuple[float, float, float]
+    """upper corner of the box"""
+    voxel_m: tuple[float, ...]
+    """edge of the grid's cells, coarse to fine"""
+    grid_channels: int = 4
+    width: int = 64
+    """units of the hidden layer of each head"""
+    videos: int = 0
+    """number of codes; 0 = none"""
+    code_channels: int = 8
+    truncation_m: float | None = None
+    """signed distances saturate here; None = never"""
+    encoding: Literal["grid", "mlp"] = "grid"
+    """dense grids, or the paper's MLP with positional encoding, with wavelengths down to twice the finest
+    cell"""
+    starts_as_box: bool = False
+    """signed distance is learned relative to that inside the box, for geometry learned by rendering alone"""
+
+
+@dataclass(frozen=True)
+class Values:
+    """What a field holds at points."""
+
+    signed_distance: Float[Tensor, "point"]
+    color: Float[Tensor, "point 3"]
+    feature: Float[Tensor, "point 16"]
+
+
+class DenseGrid(nn.Module):
+    """Trilinear interpolation in dense grids of several resolutions; their channels are concatenated."""
+
+    low: Float[Tensor, "3"]
+    extents: Float[Tensor, "level 3"]
+
+    def __init__(
+        self,
+        low_m: Sequence[float],
+        high_m: Sequence[float],
+        voxel_m: Sequence[float],
+        channels: int,
+        initial: float = GRID_STD,
+    ):
+        super().__init__()
+        low, high = torch.tensor(low_m, dtype=torch.float32), torch.tensor(high_m, dtype=torch.float32)
+        self.register_buffer("low", low, persistent=False)
+        self.levels, extents = nn.ParameterList(), []
+        for voxel in voxel_m:
+            nodes = ((high - low) / voxel).ceil().int() + 1
+            extents.append((nodes - 1) * voxel)
+            self.levels.append(nn.Parameter(torch.randn(1, channels, *nodes.flip(0).tolist()) * initial))
+        self.register_buffer("extents", torch.stack(extents), persistent=False)
+        self.channels = channels * len(voxel_m)
+
+    def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
+        """Interpolate at points; outside the box the border's values hold."""
+        found = []
+        for extent, level in zip(self.extents, self.levels, strict=True):
+            place = ((points - self.low) / extent * 2 - 1).view(1, 1, 1, -1, 3)
+            found.append(
+                functional.grid_sample(level, place, padding_mode="border", align_corners=True).view(
+                    level.shape[1], -1
+                )
+            )
+        return torch.cat(found).t()
+
+
+class PositionalMLP(nn.Module):
+    """An MLP on the positional encoding of points, from the box's size to twice ``finest_m`` (paper 001, Sec.
+    3.1).
+    """
+
+    middle: Float[Tensor, "3"]
+    frequency: Float[Tensor, "octave"]
+
+    def __init__(
+        self, low_m: Sequence[float], high_m: Sequence[float], finest_m: float, width: int, layers: int = 3
+    ):
+        super().__init__()
+        low, high = torch.tensor(low_m, dtype=torch.float32), torch.tensor(high_m, dtype=torch.float32)
+        self.register_buffer("middle", (low + high) / 2, persistent=False)
+        longest = float((high - low).max())
+        octaves = max(1, math.ceil(math.log2(longest / finest_m)))
+        self.register_buffer("frequency", math.pi / longest * 2.0 ** torch.arange(octaves), persistent=False)
+        sizes = [3 + 6 * octaves] + [width] * layers
+        self.network = nn.Sequential(
+            *(part for pair in pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU()))
+        )
+        self.channels = width
+
+    def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
+        """Return the MLP's features of points, metres."""
+        place = points - self.middle
+        phase = (place[:, :, None] * self.frequency).flatten(1)
+        return self.network(torch.cat([place, phase.sin(), phase.cos()], dim=1))
+
+
+def encoding_of(shape: FieldShape) -> DenseGrid | PositionalMLP:
+    """Return what a field reads places from."""
+    match shape.encoding:
+        case "grid":
+            return DenseGrid(shape.low_m, shape.high_m, shape.voxel_m, shape.grid_channels)
+        case "mlp":
+            return PositionalMLP(shape.low_m, shape.high_m, min(shape.voxel_m), shape.width)
+        case other:
+            assert_never(other)
+
+
+class Field(nn.Module):
+    """Signed distance, color and feature at points (paper 001, Eqs. 1 and 2)."""
+
+    def __init__(self, shape: FieldShape, free_m: float, fused: FusedGeometry | None = None):
+        """``free_m`` is the signed distance that an untrained field gives where nothing is fused."""
+        super().__init__()
+        self.shape, self.fused = shape, fused
+        self.grid = encoding_of(shape)
+        self.codes = nn.Embedding(max(shape.videos, 1), shape.code_channels) if shape.videos else None
+        inputs = (
+            self.grid.channels
+            + (shape.code_channels if shape.videos else 0)
+            + (FUSED_CHANNELS if fused else 0)
+        )
+        self.geometry = (
+            None
+            if fused
+            else nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 1))
+        )
+        self.appearance = nn.Sequential(
+            nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 3 + FEATURE_CHANNELS)
+        )
+        self.log_beta = nn.Parameter(
+            torch.tensor(math.log(START_SOFTNESS_M) if shape.starts_as_box else -4.0)
+        )
+        if self.codes:
+            nn.init.normal_(self.codes.weight, std=CODE_STD)
+        if fused:
+            nn.init.zeros_(self.appearance[-1].weight.data[:3])
+            nn.init.zeros_(self.appearance[-1].bias.data[:3])
+        elif shape.starts_as_box:
+            nn.init.zeros_(self.geometry[-1].weight)
+            nn.init.zeros_(self.geometry[-1].bias)
+        else:
+            limit = shape.truncation_m
+            nn.init.constant_(
+                self.geometry[-1].bias,
+                torch.atanh(torch.tensor(min(free_m / limit, 0.9))).item() if limit else free_m,
+            )
+
+    @property
+    def lattice_m(self) -> float:
+        """The resolution at which the surface is worth extracting, metres."""
+        return self.fused.voxel_m if self.fused else LATTICE_M
+
+    def encode(
+        self,
+        points: Float[Tensor, "point 3"],
+        video: Int[Tensor, "point"] | None = None,
+        code: Int[Tensor, "point"] | None = None,
+    ) -> Float[Tensor, "point channel"]:
+        """Return the encoding of points, the video's code and fused geometry, the input of both heads.
+
+        Args:
+            points: in the field's frame, metres.
+            video: whose scene; -1 for the scene that the videos share. None without codes.
+            code: whose code instead of the video's own (scene annealing).
+        """
+        read = [self.grid(points)]
+        if self.codes is not None:
+            code = video if code is None else code
+            read.append(
+                torch.where(code[:, None] < 0, self.codes.weight.mean(0), self.codes(code.clamp_min(0)))
+            )
+        if self.fused:
+            read.append(self.fused(points, video))
+        if self.shape.starts_as_box:
+            low, high = (points.new_tensor(corner) for corner in (self.shape.low_m, self.shape.high_m))
+            read.append(torch.minimum(points - low, high - points).amin(-1, keepdim=True))
+        return torch.cat(read, dim=-1)
+
+    def distance(self, encoded: Float[Tensor, "point channel"]) -> Float[Tensor, "point"]:
+        """Return signed distances, metres, positive in free space: fused ones, or else the head's."""
+        limit = self.shape.truncation_m
+        if self.fused:
+            return limit * encoded[:, -FUSED_CHANNELS]
+        if self.shape.starts_as_box:
+            return encoded[:, -1] + self.geometry(encoded[:, :-1])[:, 0]
+        raw = self.geometry(encoded)[:, 0]
+        return limit * torch.tanh(raw) if limit else raw
+
+    def color_and_feature(
+        self, encoded: Float[Tensor, "point channel"]
+    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 16"]]:
+        """Return color in 0..1 and unit-length features; the head corrects fused colors."""
+        encoded = encoded[:, :-1] if self.shape.starts_as_box else encoded
+        color, feature = self.appearance(encoded).split([3, FEATURE_CHANNELS], dim=-1)
+        if self.fused:
+            color = color + encoded[:, 1 - FUSED_CHANNELS : -1].logit(LEAST_PROBABILITY)
+        return color.sigmoid(), functional.normalize(feature, dim=-1, eps=1e-4)
+
+    def forward(
+        self,
+        points: Float[Tensor, "point 3"],
+        video: Int[Tensor, "point"] | None = None,
+        code: Int[Tensor, "point"] | None = None,
+    ) -> Values:
+        """Return all values at points; arguments as `encode`'s."""
+        encoded = self.encode(points, video, code)
+        return Values(self.distance(encoded), *self.color_and_feature(encoded))
+
+    def distance_at(
+        self,
+        points: Float[Tensor, "point 3"],
+        video: Int[Tensor, "point"],
+        code: Int[Tensor, "point"] | None = None,
+    ) -> Float[Tensor, "point"]:
+        """Return signed distances alone, metres; arguments as `encode`'s."""
+        if self.fused:
+            return self.shape.truncation_m * self.fused(points, video)[:, 0]
+        return self.distance(self.encode(points, video, code))
+
+    @property
+    def beta_m(self) -> Float[Tensor, ""]:
+        """The scale of the Laplace distribution in `density`, metres."""
+        return self.log_beta.exp().clamp(*(START_RANGE_M if self.shape.starts_as_box else SOFTNESS_M))
+
+
+def density(signed_distance: Float[Tensor, "*point"], beta_m: Float[Tensor, ""]) -> Float[Tensor, "*point"]:
+    """Turn signed distance into volume density per metre: a Laplace CDF (Yariv et al., VolSDF, Eqs. 2-3)."""
+    tail = 0.5 * torch.exp(-signed_distance.abs() / beta_m)
+    return torch.where(signed_distance > 0, tail, 1 - tail) / beta_m
+
+
+class ArticulatedBody(nn.Module):
+    """The agent's 25 Gaussian bones at rest and the skinning weights they give (paper 001, Eq. 3)."""
+
+    agent_from_bone_rest: Float[Tensor, "bone 4 4"]
+
+    def __init__(
+        self,
+        agent_from_bone_rest: Float[Tensor, "bone 4 4"],
+        bone_scale_m: Float[Tensor, "bone 3"],
+        shape: FieldShape,
+    ):
+        """The learned correction of the weights lives on a grid of `CORRECTION_M` in the box of ``shape``."""
+        super().__init__()
+        self.register_buffer("agent_from_bone_rest", agent_from_bone_rest)
+        self.log_scale = nn.Parameter(bone_scale_m.log())
+        self.delta = DenseGrid(shape.low_m, shape.high_m, (CORRECTION_M,), len(bone_scale_m), initial=0.0)
+
+    @property
+    def bone_scale_m(self) -> Float[Tensor, "bone 3"]:
+        """Standard deviations of the Gaussian bones along their axes."""
+        return self.log_scale.exp()
+
+    def _delta(self, points_rest: Float[Tensor, "*batch point 3"]) -> Float[Tensor, "*batch point bone"]:
+        return self.delta(points_rest.reshape(-1, 3)).view(*points_rest.shape[:-1], -1)
+
+    def weights(self, points_rest: Float[Tensor, "*batch point 3"]) -> Float[Tensor, "*batch point bone"]:
+        """Return the skinning weights of points of the rest shape."""
+        return skinning.skinning_weights(
+            points_rest, self.agent_from_bone_rest, self.bone_scale_m, delta=self._delta(points_rest)
+        )
+
+    def pose(
+        self, points_rest: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]
+    ) -> Float[Tensor, "*batch point 3"]:
+        """Move points of the rest shape to where the posed bones take them (forward warp)."""
+        return skinning.move(
+            skinning.blend(self.weights(points_rest), agent_from_bone, self.agent_from_bone_rest), points_rest
+        )
+
+    def unpose(
+        self, points_posed: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]
+    ) -> Float[Tensor, "*batch point 3"]:
+        """Move posed points back to the rest shape (backward warp).
+
+        The weights come from the posed bones; the learned correction is read where they alone would land.
+        """
+        scale = self.bone_scale_m
+        distance = -skinning.squared_mahalanobis(points_posed, agent_from_bone, scale)
+        with torch.no_grad():
+            landing = self._back(points_posed, agent_from_bone, distance.softmax(-1))
+        return self._back(points_posed, agent_from_bone, (distance + self._delta(landing)).softmax(-1))
+
+    def _back(self, points_posed: Tensor, agent_from_bone: Tensor, weights: Tensor) -> Tensor:
+        posed_from_rest = skinning.blend(weights, agent_from_bone, self.agent_from_bone_rest)
+        return skinning.move(rigid_torch.inverse(posed_from_rest), points_posed)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The canonical structure of one home and its animal, learned from all its videos."""
+
+    scene: Field
+    agent: Field
+    body: ArticulatedBody
+    videos: tuple[str, ...]
+    """ids, in the order of the scene's codes"""
+
+    def video_code(self, video: str | None) -> int:
+        """Return the index of a video's code, or -1, the shared scene, for None."""
+        return -1 if video is None else self.videos.index(video)
+
+
+def save(folder: Path, reconstruction: Reconstruction) -> None:
+    """Write ``scene_field.safetensors``, ``agent_field.safetensors`` (with the body) and ``fields.json``."""
+    agent = {f"field.{key}": value for key, value in reconstruction.agent.state_dict().items()}
+    agent |= {f"body.{key}": value for key, value in reconstruction.body.state_dict().items()}
+    for name, state in (("scene_field", reconstruction.scene.state_dict()), ("agent_field", agent)):
+        save_file(
+            {key: value.detach().cpu().contiguous() for key, value in state.items()},
+            folder / f"{name}.safetensors",
+        )
+    shapes = {"scene": asdict(reconstruction.scene.shape), "agent": asdict(reconstruction.agent.shape)}
+    table = {
+        "unit": "metre",
+        "videos": reconstruction.videos,
+        "bones": len(reconstruction.body.log_scale),
+        **shapes,
+    }
+    (folder / "fields.json").write_text(json.dumps(table, indent=1) + "\n")
+
+
+def load(folder: Path, device: str = "cpu") -> Reconstruction:
+    """Read what `save` wrote, ready to be asked (no gradients)."""
+    table = json.loads((folder / "fields.json").read_text())
+    shapes = {
+        name: FieldShape(
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in table[name].items()}
+        )
+        for name in ("scene", "agent")
+    }
+    state = load_file(folder / "scene_field.safetensors")
+    ground = {key.removeprefix("fused."): value for key, value in state.items() if key.startswith("fused.")}
+    scene = Field(
+        shapes["scene"],
+        free_m=0.1,
+        fused=FusedGeometry(ground["low"], *ground["sizes"].tolist(), ground["table"], ground["blocks"])
+        if ground
+        else None,
+    )
+    agent = Field(shapes["agent"], free_m=0.1)
+    body = ArticulatedBody(
+        torch.eye(4).repeat(table["bones"], 1, 1), torch.ones(table["bones"], 3), shapes["agent"]
+    )
+    scene.load_state_dict(state)
+    state = load_file(folder / "agent_field.safetensors")
+    for prefix, module in (("field.", agent), ("body.", body)):
+        module.load_state_dict(
+            {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        )
+    for module in (scene, agent, body):
+        module.to(device).requires_grad_(False).eval()
+    return Reconstruction(scene, agent, body, tuple(table["videos"]))

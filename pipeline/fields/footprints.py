@@ -1,0 +1,24 @@
+"""What a camera sees of 3D Gaussians before they are blended: the footprint that all rasterizers share."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+NEAREST_M = 0.1
+"""Gaussians nearer than this to the camera are not drawn"""
+ALPHA_LEAST, ALPHA_MOST = 1 / 255, 0.99
+"""opacities below the first are not drawn, those above the second are held there (Kerbl et al. 2023)"""
+REACH = 3.33
+"""footprints end at this many standard deviations, where 0.99 has fallen to 1/255"""
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """Gaussians as one camera sees them."""
+
+    pixel: Float[Tensor, "point 2"]
+    conic: Float[Tensor, "point 3"]
+    """inverse covariance (a, b, c) of a x^2 + 2 b x y + c y^2, 1/pixel^2"""
+    radius_px: Float[Tensor, "point"]
+    depth: Float[Tensor, "point"]

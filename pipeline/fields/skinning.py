@@ -1,0 +1,100 @@
+"""Skin the agent: which bone moves which point, and where the blended bones take it.
+
+`skinning_weights` gives the probability of each bone for each point (Gaussian bones, softmax over the
+negative squared Mahalanobis distance); `blend` mixes the bones' motions by dual quaternions; `move` applies
+the result. Forward (rest to posed) uses the weights at rest. Backward uses the same weights evaluated with
+the posed bones at the posed points, and the inverse of the blended motion (Yang et al., BANMo, Eqs. 4-7).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from pipeline.geometry import rigid_torch
+
+
+def squared_mahalanobis(
+    points_agent: Float[Tensor, "*batch point 3"],
+    agent_from_bone: Float[Tensor, "*batch bone 4 4"],
+    bone_scale_m: Float[Tensor, "bone 3"],
+) -> Float[Tensor, "*batch point bone"]:
+    """Measure each point from each Gaussian bone in units of the bone's scale, squared.
+
+    Each distance is the quadric p' Q p of the homogeneous point p: one matrix product for all points and
+    bones.
+    """
+    inverse_scale = torch.cat([1 / bone_scale_m, torch.zeros_like(bone_scale_m[:, :1])], dim=-1)
+    scaled = inverse_scale[:, :, None] * rigid_torch.inverse(agent_from_bone)
+    quadric = (scaled.transpose(-1, -2) @ scaled).flatten(-2)
+    homogeneous = functional.pad(points_agent, (0, 1), value=1.0)
+    products = (homogeneous[..., :, None] * homogeneous[..., None, :]).flatten(-2)
+    return (products @ quadric.transpose(-1, -2)).clamp_min(0)
+
+
+def skinning_weights(
+    points_agent: Float[Tensor, "*batch point 3"],
+    agent_from_bone_rest: Float[Tensor, "*batch bone 4 4"],
+    bone_scale_m: Float[Tensor, "bone 3"],
+    temperature: float = 1.0,
+    delta: Float[Tensor, "*batch point bone"] | None = None,
+) -> Float[Tensor, "*batch point bone"]:
+    """Return the probability of each bone for each point (paper 001, Sec. 3.1).
+
+    Args:
+        points_agent: points in the agent frame, in metres.
+        agent_from_bone_rest: bones at rest, or posed bones when the points are posed.
+        bone_scale_m: standard deviations of the Gaussian bones along their own axes.
+        temperature: divides the squared distance; larger is smoother.
+        delta: learned correction, added to the logits.
+    """
+    logits = -squared_mahalanobis(points_agent, agent_from_bone_rest, bone_scale_m) / temperature
+    return (logits if delta is None else logits + delta).softmax(-1)
+
+
+def multiply(
+    first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """Multiply quaternions wxyz (Hamilton product); leading axes broadcast."""
+    w, vector, scalar, other = first[..., :1], first[..., 1:], second[..., :1], second[..., 1:]
+    vector, other = torch.broadcast_tensors(vector, other)
+    real = w * scalar - (vector * other).sum(-1, keepdim=True)
+    return torch.cat([real, w * other + scalar * vector + torch.linalg.cross(vector, other)], dim=-1)
+
+
+def blend(
+    weights: Float[Tensor, "*batch point bone"],
+    agent_from_bone: Float[Tensor, "*batch bone 4 4"],
+    agent_from_bone_rest: Float[Tensor, "bone 4 4"],
+) -> Float[Tensor, "*batch point 4 4"]:
+    """Blend bone motions into one rigid motion a point, by dual quaternions (Kavan et al. 2007, Sec. 3).
+
+    Leading axes broadcast: `weights [point bone]` with `agent_from_bone [frame bone 4 4]` gives
+    `[frame point 4 4]`. Quaternions are turned to the hemisphere of each point's strongest bone.
+
+    Returns:
+        `agent_from_rest`: takes points of the rest shape to the posed shape, both in the agent frame.
+    """
+    motion = agent_from_bone @ rigid_torch.inverse(agent_from_bone_rest)
+    real = rigid_torch.quaternion_from_rotation(motion[..., :3, :3])
+    dual = 0.5 * multiply(functional.pad(motion[..., :3, 3], (1, 0)), real)
+    with torch.no_grad():
+        sign = torch.where(real @ real.transpose(-1, -2) < 0, -1.0, 1.0).to(weights)
+        strongest = weights.argmax(-1)
+        shape = torch.broadcast_shapes(strongest.shape[:-1], sign.shape[:-2])
+        index = strongest.expand(*shape, -1)[..., None].expand(*shape, -1, sign.shape[-1])
+        sign = sign.expand(*shape, -1, -1).gather(-2, index)
+    real, dual = ((weights * sign) @ torch.cat([real, dual], dim=-1)).split(4, dim=-1)
+    length = real.norm(dim=-1, keepdim=True)
+    real, dual = real / length, dual / length
+    conjugate = real * real.new_tensor([1.0, -1.0, -1.0, -1.0])
+    translation = 2 * multiply(dual, conjugate)[..., 1:]
+    return rigid_torch.make(rigid_torch.rotation_from_quaternion(real), translation)
+
+
+def move(
+    target_from_source: Float[Tensor, "*batch point 4 4"], points_source: Float[Tensor, "*batch point 3"]
+) -> Float[Tensor, "*batch point 3"]:
+    """Apply one transform a point."""
+    turned = (target_from_source[..., :3, :3] * points_source[..., None, :]).sum(-1)
+    return turned + target_from_source[..., :3, 3]

@@ -1,0 +1,180 @@
+"""Four, or eight, linear-blend weights a vertex that imitate dual-quaternion blending with many.
+
+`blend_dual_quaternions` poses the surface as the reconstruction does; `refit_weights` finds, per vertex, the
+best four and the best eight bones and convex weights for linear blending over a set of poses; `residual_m`
+says what is lost.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int, UInt8
+
+from pipeline.fields import skinning
+
+FOUR, EIGHT = 4, 8
+_DESCENT_STEPS = 150
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Some poses of bones and surface, agent frame, metres."""
+
+    posed_from_rest: Float[np.ndarray, "frame bone 4 4"]
+    """motion of each bone"""
+    posed: Float[np.ndarray, "frame vertex 3"]
+    """the surface that is to be met"""
+
+
+@dataclass(frozen=True)
+class Influences:
+    """Bones of each vertex and their convex weights, heaviest first."""
+
+    joints: UInt8[np.ndarray, "vertex influence"]
+    weights: Float32[np.ndarray, "vertex influence"]
+
+
+def different_poses(
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"], count: int
+) -> Int[np.ndarray, " chosen"]:
+    """Choose poses far from each other, beginning with the one furthest from the mean, so that the extremes
+    are among them.
+    """
+    flat = agent_from_bone[:, :, :3].reshape(len(agent_from_bone), -1)
+    distance = ((flat - flat.mean(0)) ** 2).sum(1)
+    chosen = [int(distance.argmax())]
+    distance = ((flat - flat[chosen[0]]) ** 2).sum(1)
+    while len(chosen) < min(count, len(flat)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, ((flat - flat[chosen[-1]]) ** 2).sum(1))
+    return np.unique(chosen)
+
+
+def blend_dual_quaternions(
+    vertices: Float[np.ndarray, "vertex 3"],
+    weights: Float[np.ndarray, "vertex bone"],
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"],
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
+) -> Float[np.ndarray, "frame vertex 3"]:
+    """Pose the surface as the reconstruction does: dual-quaternion blending with all weights; metres, agent
+    frame.
+    """
+    points, weight, rest = (
+        torch.from_numpy(np.ascontiguousarray(values, np.float32))
+        for values in (vertices, weights, agent_from_bone_rest)
+    )
+    posed = [
+        skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points)
+        for bones in agent_from_bone
+    ]
+    return torch.stack(posed).numpy().astype(np.float64)
+
+
+def refit_weights(
+    vertices: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"], poses: Poses
+) -> tuple[Influences, Influences]:
+    """Return the four and the eight bones, with convex weights, whose linear blend is nearest, in squares, to
+    the posed surface.
+    """
+    candidates = np.argsort(-weights, axis=1, kind="stable")[:, : min(EIGHT, weights.shape[1])]
+    gram = _gram(vertices, candidates, poses)
+    start = np.take_along_axis(weights, candidates, 1)
+    descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
+    chosen = np.argsort(-descended, axis=1, kind="stable")[:, :FOUR]
+    best = np.zeros_like(descended)
+    np.put_along_axis(best, chosen, _best_on_simplex(_chosen(gram, chosen)), 1)
+    nearer = _cost(gram, best) < _cost(gram, descended)
+    return _influences(candidates, best, FOUR), _influences(
+        candidates, np.where(nearer[:, None], best, descended), EIGHT
+    )
+
+
+def _influences(
+    candidates: Int[np.ndarray, "vertex k"], weights: Float[np.ndarray, "vertex k"], count: int
+) -> Influences:
+    """Order by weight and keep, or fill up to, `count`; bones without weight become bone 0, as glTF asks."""
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+    heaviest, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(candidates, order, 1)
+    padding = ((0, 0), (0, count - order.shape[1]))
+    joints, heaviest = np.pad(np.where(heaviest > 0, joints, 0), padding), np.pad(heaviest, padding)
+    return Influences(joints.astype(np.uint8), (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32))
+
+
+def _chosen(
+    gram: Float[np.ndarray, "vertex k k"], chosen: Int[np.ndarray, "vertex n"]
+) -> Float[np.ndarray, "vertex n n"]:
+    return np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
+
+
+def _cost(
+    gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]
+) -> Float[np.ndarray, " vertex"]:
+    """Return w' G w."""
+    return np.einsum("vi,vij,vj->v", weights, gram, weights)
+
+
+def residual_m(
+    vertices: Float[np.ndarray, "vertex 3"], blend: Influences, poses: Poses
+) -> Float[np.ndarray, "frame vertex"]:
+    """Return the distance between the linear blend and the posed surface."""
+    distance = np.empty(poses.posed.shape[:2])
+    for frame, bones in enumerate(poses.posed_from_rest):
+        each = (
+            np.einsum("vkij,vj->vki", bones[blend.joints][..., :3, :3], vertices)
+            + bones[blend.joints][..., :3, 3]
+        )
+        distance[frame] = np.linalg.norm(
+            np.einsum("vk,vki->vi", blend.weights, each) - poses.posed[frame], axis=1
+        )
+    return distance
+
+
+def _gram(
+    vertices: np.ndarray, candidates: Int[np.ndarray, "vertex k"], poses: Poses
+) -> Float[np.ndarray, "vertex k k"]:
+    """Sum over frames the products of each bone's error: for convex w the squared error is w' G w."""
+    gram = np.zeros((len(vertices), candidates.shape[1], candidates.shape[1]))
+    for bones, target in zip(poses.posed_from_rest, poses.posed, strict=True):
+        each = np.einsum("bij,vj->vbi", bones[:, :3, :3], vertices) + bones[None, :, :3, 3]
+        error = np.take_along_axis(each, candidates[:, :, None], 1) - target[:, None]
+        gram += error @ error.transpose(0, 2, 1)
+    return gram / len(poses.posed)
+
+
+def _descend_on_simplex(
+    gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]
+) -> Float[np.ndarray, "vertex k"]:
+    """Minimise w' G w over convex weights by projected gradient descent."""
+    rate = 1.0 / np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-20)[:, None]
+    for _ in range(_DESCENT_STEPS):
+        weights = _project_to_simplex(weights - rate * np.einsum("vij,vj->vi", gram, weights))
+    return weights
+
+
+def _project_to_simplex(values: Float[np.ndarray, "vertex k"]) -> Float[np.ndarray, "vertex k"]:
+    """Return the nearest convex weights (Duchi et al. 2008)."""
+    ordered = -np.sort(-values, axis=1)
+    excess = (np.cumsum(ordered, 1) - 1) / np.arange(1, values.shape[1] + 1)
+    last = (ordered > excess).sum(1) - 1
+    return np.maximum(values - np.take_along_axis(excess, last[:, None], 1), 0)
+
+
+def _best_on_simplex(gram: Float[np.ndarray, "vertex k k"]) -> Float[np.ndarray, "vertex k"]:
+    """Minimise w' G w over convex weights exactly: every support is tried."""
+    count = gram.shape[1]
+    ridge = 1e-9 * (np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(count)
+    best, best_cost = np.zeros(gram.shape[:2]), np.full(len(gram), np.inf)
+    for size in range(1, count + 1):
+        for support in map(list, combinations(range(count), size)):
+            solved = np.linalg.solve(
+                (gram + ridge)[:, support][:, :, support], np.ones((len(gram), size, 1))
+            )[..., 0]
+            total = solved.sum(1, keepdims=True)
+            trial = np.zeros_like(best)
+            trial[:, support] = solved / np.where(total == 0, 1, total)
+            cost = _cost(gram, trial)
+            better = (trial >= 0).all(1) & (total[:, 0] > 0) & (cost < best_cost)
+            best[better], best_cost[better] = trial[better], cost[better]
+    return best

@@ -1,0 +1,1 @@
+"""Rigid transforms, cameras, meshes, rays and volumes. Knows no files and no models."""

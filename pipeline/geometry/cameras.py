@@ -1,0 +1,122 @@
+"""Pinhole cameras in OpenCV axes: x right, y down, z forward; pixel centres at +0.5; depth is z.
+
+This file owns the pixel-centre rule, the OpenGL flip and the quarter turns. Functions that take
+pixels or points work on NumPy arrays and on torch tensors alike.
+"""
+
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Array = TypeVar("Array", np.ndarray, "Tensor")
+"""Functions on pixels and points take NumPy arrays or torch tensors, and return the same."""
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def pixel_grid(height: int, width: int) -> Float[np.ndarray, "height width 2"]:
+    """Return the pixel centres (x, y) of an image."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x, y], axis=-1)
+
+
+def ray_directions(
+    intrinsics: Float[np.ndarray, "3 3"], height: int, width: int
+) -> Float[np.ndarray, "height width 3"]:
+    """Return one ray per pixel in camera axes with z = 1, so that the distance along it is the depth."""
+    return unproject(pixel_grid(height, width), intrinsics)
+
+
+def unproject(pixel: Array, intrinsics: Array) -> Array:
+    """Return ray directions ``[... 3]`` with z = 1 through pixels ``[... 2]``; intrinsics ``[... 3 3]`` of
+    the same batch."""
+    x = (pixel[..., 0] - intrinsics[..., 0, 2]) / intrinsics[..., 0, 0]
+    y = (pixel[..., 1] - intrinsics[..., 1, 2]) / intrinsics[..., 1, 1]
+    return _stack([x, y, x * 0 + 1])
+
+
+def back_project(
+    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "height width 3"]:
+    """Lift a depth image to points in camera axes; unknown depth 0 gives the camera's centre."""
+    return ray_directions(intrinsics, *depth.shape) * depth[..., None]
+
+
+def project(points_camera: Array, intrinsics: Array) -> tuple[Array, Array]:
+    """Project points ``[... 3]`` to pixels ``[... 2]`` and depth ``[...]``; depth <= 0 lies behind the camera
+    and its pixel is meaningless."""
+    z = points_camera[..., 2]
+    safe = z + (abs(z) < 1e-9) * 1e-9
+    x = points_camera[..., 0] / safe * intrinsics[..., 0, 0] + intrinsics[..., 0, 2]
+    y = points_camera[..., 1] / safe * intrinsics[..., 1, 1] + intrinsics[..., 1, 2]
+    return _stack([x, y]), z
+
+
+def read_depth(
+    depth: Float[np.ndarray, "depth_height depth_width"],
+    depth_intrinsics: Float[np.ndarray, "3 3"],
+    rays: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch"]:
+    """Return the depth (metres) that rays of the same camera centre and axes meet; 0 outside the image."""
+    pixel, _ = project(rays, depth_intrinsics)
+    column, row = np.moveaxis(np.floor(pixel).astype(int), -1, 0)
+    inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
+    last_row, last_column = depth.shape[0] - 1, depth.shape[1] - 1
+    return np.where(inside, depth[np.clip(row, 0, last_row), np.clip(column, 0, last_column)], 0)
+
+
+def scale_intrinsics(
+    intrinsics: Float[np.ndarray, "*batch 3 3"], from_size: tuple[int, int], to_size: tuple[int, int]
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Adapt intrinsics to a resized image; sizes are (height, width)."""
+    scaled = np.array(intrinsics, float)
+    scaled[..., 0, :] *= to_size[1] / from_size[1]
+    scaled[..., 1, :] *= to_size[0] / from_size[0]
+    return scaled
+
+
+def opencv_from_opengl(
+    world_from_camera_opengl: Float[np.ndarray, "*batch 4 4"],
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Turn camera poses with OpenGL axes (y up, z backward) into OpenCV axes; the flip is its own inverse."""
+    return world_from_camera_opengl @ OPENCV_FROM_OPENGL
+
+
+def turn_intrinsics(
+    intrinsics: Float[np.ndarray, "*batch 3 3"], size: tuple[int, int], quarter_turns: int
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Adapt intrinsics to an image of (height, width) ``size`` turned clockwise by quarter turns."""
+    turned = np.array(intrinsics, float)
+    height, width = size
+    for _ in range(quarter_turns % 4):
+        before = turned.copy()
+        turned[..., 0, 0], turned[..., 1, 1] = before[..., 1, 1], before[..., 0, 0]
+        turned[..., 0, 2], turned[..., 1, 2] = height - before[..., 1, 2], before[..., 0, 2]
+        height, width = width, height
+    return turned
+
+
+def turn_camera(
+    world_from_camera: Float[np.ndarray, "*batch 4 4"], quarter_turns: int
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Adapt camera poses (OpenCV axes) to images turned clockwise by quarter turns."""
+    before_from_after = np.eye(4)
+    before_from_after[:2, :2] = np.linalg.matrix_power(np.array([[0.0, 1.0], [-1.0, 0.0]]), quarter_turns % 4)
+    return world_from_camera @ before_from_after
+
+
+def turn_image(image: np.ndarray, quarter_turns: int) -> np.ndarray:
+    """Turn an image ``[height width ...]`` clockwise by quarter turns."""
+    return np.ascontiguousarray(np.rot90(image, -quarter_turns, axes=(0, 1)))
+
+
+def _stack(parts: list[Any]) -> Any:
+    if isinstance(parts[0], np.ndarray | float | np.floating):
+        return np.stack(parts, axis=-1)
+    import torch
+
+    return torch.stack(parts, dim=-1)

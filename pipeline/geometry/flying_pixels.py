@@ -1,0 +1,21 @@
+"""Tell depth of thin things from flying pixels, where the sensor itself doubts both."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+SUPPORTERS = 3
+"""neighbours that agree on a surface; along the straight edge of a thing, a pixel that flies between it and
+what lies behind has two"""
+
+
+def supported(
+    depth: Float[np.ndarray, "height width"], tolerance_m: float = 0.03
+) -> Bool[np.ndarray, "height width"]:
+    """Tell which pixels have three of eight neighbours at nearly their own depth (metres, 0 = unknown)."""
+    height, width = depth.shape
+    around = np.pad(depth, 1)
+    count = np.zeros(depth.shape, np.uint8)
+    for row, column in np.ndindex(3, 3):
+        beside = around[row : row + height, column : column + width]
+        count += (np.abs(beside - depth) < tolerance_m) & (beside > 0)
+    return (depth > 0) & (count > SUPPORTERS)

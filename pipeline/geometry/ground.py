@@ -1,0 +1,83 @@
+"""The level surface under something that stands on it, in a world with +y up; and where up is, by the planes
+of a room."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.geometry import align
+
+VOTERS, CANDIDATES = 2000, 1500
+"""surface directions that vote, and directions that they vote on"""
+VOTE_DEG = 6.0
+"""a surface votes for directions that it is square to or along within about this, degrees"""
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """A nearly level plane: ``height(x, z) = offset + slope . (x, z)``."""
+
+    offset_m: float
+    slope: Float[np.ndarray, "2"]
+
+    def above(self, points_world: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape"]:
+        """Return heights above the ground."""
+        return points_world[..., 1] - self.offset_m - points_world[..., [0, 2]] @ self.slope
+
+
+def fit_ground(
+    points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], reach_m: float = 0.5
+) -> GroundPlane:
+    """Fit the surface below the focus that most upward-facing points near it lie on; ``reach_m`` is how far
+    aside counts."""
+    aside = np.linalg.norm((points_world - focus)[:, [0, 2]], axis=1)
+    height = points_world[:, 1]
+    weight = np.exp(-((aside / reach_m) ** 2)) * (height < focus[1] + 0.05)
+    counts, edges = np.histogram(
+        height, np.arange(height.min() - 0.02, height.max() + 0.04, 0.02), weights=weight
+    )
+    offset, slope = edges[counts.argmax()] + 0.01, np.zeros(2)
+    for band in (0.05, 0.03, 0.02):
+        close = np.abs(height - offset - points_world[:, [0, 2]] @ slope) < band
+        design = np.column_stack([points_world[close][:, [0, 2]], np.ones(close.sum())]) * weight[close, None]
+        solution = np.linalg.lstsq(design, height[close] * weight[close], rcond=None)[0]
+        slope, offset = solution[:2], solution[2]
+    return GroundPlane(float(offset), slope)
+
+
+def floor_direction(
+    normals_world: Float[np.ndarray, "point 3"], guess: Float[np.ndarray, "3"], within_deg: float = 40.0
+) -> Float[np.ndarray, "3"]:
+    """Return the direction within so many degrees of a guess of up that most of a room's surfaces are square
+    to or along.
+
+    Floors and tables vote in full, walls by half; the winner of the vote is sharpened by least squares.
+    """
+    voters = np.ascontiguousarray(normals_world[:: max(1, len(normals_world) // VOTERS)])
+    candidates = _cap(guess, np.deg2rad(within_deg), CANDIDATES)
+    cosine2 = (voters @ candidates.T) ** 2
+    width2 = np.sin(np.deg2rad(VOTE_DEG)) ** 2
+    votes = np.exp((cosine2 - 1) / width2).sum(0) + 0.5 * np.exp(-cosine2 / width2).sum(0)
+    up = candidates[votes.argmax()]
+    for limit_deg in (6.0, 4.0):
+        cosine = normals_world @ up
+        along = np.abs(cosine) > np.cos(np.deg2rad(limit_deg))
+        across = np.abs(cosine) < np.sin(np.deg2rad(limit_deg))
+        if along.sum() + across.sum() < 10:
+            break
+        scatter = (
+            normals_world[across].T @ normals_world[across] - normals_world[along].T @ normals_world[along]
+        )
+        axis = np.linalg.eigh(scatter)[1][:, 0]
+        up = axis * np.sign(axis @ guess)
+    return up
+
+
+def _cap(centre: Float[np.ndarray, "3"], radius_rad: float, count: int) -> Float[np.ndarray, "direction 3"]:
+    """Return directions spread evenly within an angle of a centre (a spiral), the centre first."""
+    share = np.arange(count) / count
+    cosine, turn = 1 - share * (1 - np.cos(radius_rad)), np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    sine = np.sqrt(1 - cosine**2)
+    around_z = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1)
+    return around_z @ align.rotation_between(np.array([0.0, 0.0, 1.0]), centre).T

@@ -1,0 +1,168 @@
+"""The scene as a signed distance: how far a point is from the nearest surface, negative inside of things.
+
+`from_mesh` measures it on a grid of voxels (distance by dense samples of the surface, sign by a vote of rays,
+which bears open meshes); `SignedDistance.at` reads it between voxels, differentiably. World frame, metres.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import KDTree
+from torch import Tensor
+from torch.nn import functional
+
+from pipeline.geometry.meshes import Mesh, RayCaster
+
+RAYS = np.array(
+    [
+        [np.sin(turn + rise), rise, np.cos(turn + rise)]
+        for turn in np.arange(4) * np.pi / 2 + 0.4
+        for rise in (-0.3, 0.25, 1.0)
+    ]
+)
+"""Directions of the vote: all around, more up than down, for things on a floor often have no bottom."""
+
+
+@dataclass(frozen=True)
+class SignedDistance:
+    """Distances at the centres of voxels."""
+
+    values: Float[Tensor, "x y z"]
+    origin: Float[Tensor, "3"]
+    """world position of the centre of the first voxel"""
+    voxel_m: float
+
+    def at(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Interpolate trilinearly; beyond the grid the border's value holds."""
+        scale = 2 / (self.voxel_m * (torch.tensor(self.values.shape) - 1)).to(points_world)
+        offset = -1 - scale * self.origin.to(points_world)
+        place = torch.addcmul(offset, points_world, scale).reshape(1, -1, 1, 1, 3)
+        values = self.values.to(points_world).permute(2, 1, 0)[
+            None, None
+        ]  # grid_sample counts the last axis first
+        read = functional.grid_sample(
+            values, place, mode="bilinear", padding_mode="border", align_corners=True
+        )
+        return read.reshape(points_world.shape[:-1])
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points spread evenly over a surface, with unit normals; world frame."""
+
+    points: Float[np.ndarray, "point 3"]
+    normals: Float[np.ndarray, "point 3"]
+
+
+def surface_points(mesh: Mesh, spacing_m: float) -> SurfacePoints:
+    """Spread points over all faces, about one per square of ``spacing_m``, the same for the same mesh."""
+    corner = np.asarray(mesh.vertices, np.float64)[mesh.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    twice_area = np.linalg.norm(normal, axis=1)
+    wanted = twice_area / 2 / spacing_m**2
+    ends = np.floor(np.cumsum(wanted) + 0.5).astype(np.int64)
+    face = np.repeat(np.arange(len(ends)), np.diff(ends, prepend=0))
+    index = np.arange(len(face))
+    u, v = (
+        (index * 0.7548776662466927) % 1,
+        (index * 0.5698402909980532) % 1,
+    )  # the R2 sequence: even and repeatable
+    fold = u + v > 1
+    u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
+    edges = corner[face, 1] - corner[face, 0], corner[face, 2] - corner[face, 0]
+    points = corner[face, 0] + u[:, None] * edges[0] + v[:, None] * edges[1]
+    return SurfacePoints(points, normal[face] / np.maximum(twice_area[face], 1e-12)[:, None])
+
+
+def from_mesh(
+    mesh: Mesh,
+    low: Float[np.ndarray, "3"],
+    high: Float[np.ndarray, "3"],
+    *,
+    voxel_m: float = 0.04,
+    spacing_m: float = 0.015,
+) -> SignedDistance:
+    """Measure the signed distance of a mesh whose faces look out of what is solid, between two corners of a
+    box.
+
+    A voxel is inside where more rays first meet the back of a face than the front, far from any surface by
+    what most voxels around say; surfaces with solid on both sides, as fusion leaves them in walls, do not
+    count: they would lead deeper.
+    """
+    shape = np.maximum(np.ceil((np.asarray(high, float) - low) / voxel_m).astype(int), 2)
+    axes = [low[axis] + voxel_m * np.arange(shape[axis]) for axis in range(3)]
+    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid, surface = centres.reshape(*shape, 3), surface_points(mesh, spacing_m)
+    solid = _agreed(_inside(mesh, centres).reshape(shape), _to_points(surface, grid, voxel_m), voxel_m)
+    surface = _open(surface, solid, np.asarray(low, np.float64), voxel_m)
+    distance = _to_points(surface, grid, voxel_m).reshape(-1)
+    near = np.flatnonzero(distance < 3 * voxel_m)
+    distance[near] = _to_patches(surface, centres[near], spacing_m)
+    values = torch.from_numpy(np.where(solid, -1.0, 1.0) * distance.reshape(shape)).float()
+    return SignedDistance(values, torch.from_numpy(np.asarray(low, np.float64)).float(), voxel_m)
+
+
+def _agreed(
+    solid: Bool[np.ndarray, "x y z"], distance_m: Float[np.ndarray, "x y z"], voxel_m: float
+) -> Bool[np.ndarray, "x y z"]:
+    """Let the majority decide in boxes through which no surface leads, small ones first."""
+    for reach in (1, 2, 4):
+        share = ndimage.uniform_filter(solid.astype(np.float32), 2 * reach + 1, mode="nearest")
+        solid = np.where(distance_m > np.sqrt(3) * reach * voxel_m, share > 0.5, solid)
+    return solid
+
+
+def _open(
+    surface: SurfacePoints, solid: Bool[np.ndarray, "x y z"], low: Float[np.ndarray, "3"], voxel_m: float
+) -> SurfacePoints:
+    """Leave out points with solid on both sides."""
+
+    def within(side: float) -> np.ndarray:
+        index = np.rint((surface.points + side * voxel_m * surface.normals - low) / voxel_m).astype(np.int64)
+        return solid[tuple(np.clip(index, 0, np.array(solid.shape) - 1).T)]
+
+    kept = ~(within(1) & within(-1))
+    return SurfacePoints(surface.points[kept], surface.normals[kept])
+
+
+def _to_points(
+    surface: SurfacePoints, centres: Float[np.ndarray, "x y z 3"], voxel_m: float
+) -> Float[np.ndarray, "x y z"]:
+    """Return the distance to a point of the nearest voxel that holds any: fast, and true to half a voxel."""
+    shape = centres.shape[:3]
+    index = np.rint((surface.points - centres[0, 0, 0]) / voxel_m).astype(np.int64)
+    inside = ((index >= 0) & (index < shape)).all(1)
+    flat = np.ravel_multi_index(index[inside].T, shape)
+    chosen = np.full(np.prod(shape), -1)
+    chosen[flat] = np.flatnonzero(inside)
+    if not len(flat):
+        return np.full(shape, np.inf)
+    nearest = ndimage.distance_transform_edt(
+        (chosen < 0).reshape(shape), return_distances=False, return_indices=True
+    )
+    return np.linalg.norm(centres - surface.points[chosen.reshape(shape)[tuple(nearest)]], axis=-1)
+
+
+def _to_patches(
+    surface: SurfacePoints, points: Float[np.ndarray, "point 3"], spacing_m: float
+) -> Float[np.ndarray, "point"]:
+    """Return the distance to the small flat patch around the nearest point of the surface."""
+    _, nearest = KDTree(surface.points).query(points)
+    away = points - surface.points[nearest]
+    upright = np.abs(np.einsum("pi,pi->p", away, surface.normals[nearest]))
+    beside = np.sqrt(np.maximum((away**2).sum(1) - upright**2, 0))
+    return np.hypot(upright, np.maximum(beside - spacing_m, 0))
+
+
+def _inside(mesh: Mesh, points: Float[np.ndarray, "point 3"]) -> np.ndarray:
+    caster, normals = RayCaster(mesh), mesh.face_normals()
+    votes = np.zeros(len(points), np.int64)
+    for direction in RAYS:
+        hits = caster.cast(points, np.broadcast_to(direction, points.shape))
+        votes += np.where(hits.face >= 0, np.sign(normals[np.maximum(hits.face, 0)] @ direction), 0).astype(
+            np.int64
+        )
+    return votes > 0

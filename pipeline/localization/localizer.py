@@ -1,0 +1,249 @@
+"""Localizers: one picture with depth -> where the camera is, relative to a map (the scene, or the agent).
+
+Three kinds: a bank of patches of rendered views, a scene-coordinate network (both solved by RANSAC over
+closed forms, since depth is known), and the paper's pose regressor. Patches are described by DAISY or by the
+network that the features were fitted with. The inlier ratio is calibrated to a probability. `load` opens a
+trained localizer, `Localizer.localize` queries it.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, TypeVar, assert_never
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from safetensors.numpy import load_file, save_file
+from torch import nn
+
+from pipeline.backends.descriptors import Describer
+from pipeline.geometry import align, rigid
+from pipeline.localization.patch_bank import PatchBank
+from pipeline.localization.patches import Describe, Patches, PatchSampling, PcaBasis, extract_patches
+from pipeline.localization.pose_regressor import PoseRegressor
+from pipeline.localization.scene_coordinates import SceneCoordinateNet
+
+Net = TypeVar("Net", bound=nn.Module)
+Kind = Literal["bank", "coordinates", "regression"]
+LEAST_INLIERS = 4
+"""Fewer agreeing patches give no pose: three fit any."""
+LEAST_SECTOR = 6
+"""Patches without which an azimuth sector is not queried."""
+REGRESSED_POINTS = 60
+"""Patches that a regressed pose keeps as points."""
+LOGIT_LIMIT = 30.0
+"""Logits are clipped to this, so that the exponential stays finite."""
+NEWTON_STEPS, RIDGE = 50, (1e-3, 5e-3)
+"""Steps and penalty (bias, slope) of the logistic fit."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """P(within 2 deg and 5 cm; agent: 15 deg and 8 cm) = logistic(bias + slope * inlier ratio), fitted on
+    held-out renders.
+    """
+
+    bias: float
+    slope: float
+
+    def probability(self, inlier_ratio: Float[np.ndarray, "*any"] | float) -> Float[np.ndarray, "*any"]:
+        """Return probabilities of inlier ratios."""
+        return 1.0 / (
+            1.0
+            + np.exp(
+                -np.clip(self.bias + self.slope * np.asarray(inlier_ratio, float), -LOGIT_LIMIT, LOGIT_LIMIT)
+            )
+        )
+
+
+@dataclass(frozen=True)
+class PoseHypothesis:
+    """One pose of the camera in the map, and its probability."""
+
+    map_from_camera: Float[np.ndarray, "4 4"]
+    inlier_ratio: float
+    """Share of the patches that agree; of a regressed pose its own certainty, 0..1."""
+    probability: float
+    points_map: Float[np.ndarray, "inlier 3"]
+    points_camera: Float[np.ndarray, "inlier 3"]
+
+
+@dataclass(frozen=True)
+class RansacSolver:
+    """How matches of patches become one pose."""
+
+    threshold_m: float
+    """Patches within this of their match agree, metres."""
+    least_side_m: float
+    """Least side of a RANSAC triplet, metres."""
+    iterations: int
+    """RANSAC triplets."""
+    sectors: int
+    """Agent: a bank is queried once per azimuth sector, so that front and back both answer."""
+
+
+@dataclass(frozen=True)
+class Localizer:
+    """What was learned of a map, and how to query it."""
+
+    sampling: PatchSampling
+    basis: PcaBasis
+    model: PatchBank | SceneCoordinateNet | PoseRegressor
+    calibration: Calibration
+    solver: RansacSolver
+    describer: Describer = Describer()
+    """What describes patches: DAISY at the sampling's radii, or a network with its weights."""
+    describe: Describe | None = None
+    """The opened network; None: DAISY."""
+
+    def localize(
+        self,
+        color: UInt8[np.ndarray, "height width 3"],
+        depth: Float[np.ndarray, "depth_height depth_width"],
+        depth_intrinsics: Float[np.ndarray, "3 3"],
+        intrinsics: Float[np.ndarray, "3 3"],
+        mask: Bool[np.ndarray, "height width"] | None = None,
+    ) -> list[PoseHypothesis]:
+        """Return poses, best first; the scene's localizer gives at most one. Depth in metres; mask: where the
+        target may be."""
+        patches = extract_patches(
+            color, depth, depth_intrinsics, intrinsics, mask, self.sampling, self.describe
+        )
+        return [] if patches is None else self.localize_patches(patches)
+
+    def localize_patches(self, patches: Patches) -> list[PoseHypothesis]:
+        """Return poses for patches that are described already."""
+        query = self.basis.project(patches.descriptors)
+        match self.model:
+            case PatchBank() as bank:
+                parts = [None] if self.sampling.target == "scene" else bank.sectors(self.solver.sectors)
+                answers = [
+                    self._solve(patches, *bank.match(query, part))
+                    for part in parts
+                    if part is None or len(part) >= LEAST_SECTOR
+                ]
+            case SceneCoordinateNet() as net:
+                answers = [self._solve(patches, *net.match(query))]
+            case PoseRegressor() as net:
+                answers = [self._regressed(patches, *net.regress(query, patches.cell, self._anchor(patches)))]
+            case _:
+                assert_never(self.model)
+        return sorted(
+            (answer for answer in answers if answer is not None), key=lambda answer: -answer.inlier_ratio
+        )
+
+    def _solve(self, patches, matched, weight) -> PoseHypothesis | None:
+        solver = self.solver
+        map_from_camera, inlier = align.ransac_rigid(
+            patches.points_camera,
+            matched,
+            threshold_m=solver.threshold_m,
+            iterations=solver.iterations,
+            rng=np.random.default_rng(0),
+            weights=weight,
+            least_side_m=solver.least_side_m,
+        )
+        if inlier.sum() < LEAST_INLIERS:
+            return None
+        return self._hypothesis(
+            map_from_camera, float(inlier.mean()), matched[inlier], patches.points_camera[inlier]
+        )
+
+    def _anchor(self, patches) -> Float[np.ndarray, "3"]:
+        """Return the point whose position a regressor predicts: the camera's centre, or the middle of the
+        animal."""
+        return np.zeros(3) if self.sampling.target == "scene" else np.median(patches.points_camera, axis=0)
+
+    def _regressed(self, patches, map_from_camera, certainty) -> PoseHypothesis:
+        some = patches.points_camera[:: max(1, len(patches.points_camera) // REGRESSED_POINTS)]
+        return self._hypothesis(map_from_camera, certainty, rigid.apply(map_from_camera, some), some)
+
+    def _hypothesis(self, map_from_camera, ratio, points_map, points_camera) -> PoseHypothesis:
+        return PoseHypothesis(
+            map_from_camera, ratio, float(self.calibration.probability(ratio)), points_map, points_camera
+        )
+
+
+def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample"]) -> Calibration:
+    """Fit P(good) as a logistic curve of a score in 0..1 by Newton steps; one pseudo-observation at each end
+    and a ridge keep separable data finite.
+    """
+    x = np.concatenate([score, [0.0, 1.0]])
+    y = np.concatenate([good.astype(float), [0.0, 1.0]])
+    design = np.stack([np.ones_like(x), x], axis=1)
+    weights = np.zeros(2)
+    penalty = np.diag(RIDGE)
+    for _ in range(NEWTON_STEPS):
+        p = 1 / (1 + np.exp(-np.clip(design @ weights, -LOGIT_LIMIT, LOGIT_LIMIT)))
+        curvature = design.T @ (design * (p * (1 - p))[:, None]) + penalty
+        weights = weights + np.linalg.solve(curvature, design.T @ (y - p) - penalty @ weights)
+    return Calibration(float(weights[0]), float(weights[1]))
+
+
+def errors(
+    map_from_camera: Float[np.ndarray, "*batch 4 4"], truth: Float[np.ndarray, "*batch 4 4"]
+) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    """Return rotation error (degrees) and the distance of the camera centres (metres)."""
+    rotation = np.rad2deg(rigid.rotation_angle(map_from_camera[..., :3, :3], truth[..., :3, :3]))
+    return rotation, np.linalg.norm(map_from_camera[..., :3, 3] - truth[..., :3, 3], axis=-1)
+
+
+def save(folder: Path, localizer: Localizer, report: dict) -> None:
+    """Write ``localizer.safetensors`` and ``localizer.json``; the report holds the held-out figures."""
+    match localizer.model:
+        case PatchBank() as bank:
+            kind, arguments, arrays = "bank", {}, bank.arrays()
+        case SceneCoordinateNet() as net:
+            kind, arguments, arrays = "coordinates", net.arguments, _weights(net)
+        case PoseRegressor() as net:
+            kind, arguments, arrays = "regression", net.arguments, _weights(net)
+        case _:
+            assert_never(localizer.model)
+    basis = {f"basis.{name}": value for name, value in vars(localizer.basis).items()}
+    save_file(
+        {name: np.ascontiguousarray(value) for name, value in (arrays | basis).items()},
+        folder / "localizer.safetensors",
+    )
+    table = {"kind": kind, "arguments": arguments, "held_out": report}
+    parts = ("sampling", "solver", "calibration", "describer")
+    table |= {name: asdict(getattr(localizer, name)) for name in parts}
+    (folder / "localizer.json").write_text(json.dumps(table, indent=1) + "\n")
+
+
+def load(folder: Path, device: str = "cpu") -> Localizer:
+    """Open a trained localizer; a descriptor network runs on ``device``. Raises InputError MOD-001 to
+    MOD-003."""
+    table = json.loads((folder / "localizer.json").read_text())
+    arrays = load_file(folder / "localizer.safetensors")
+    basis = PcaBasis(arrays.pop("basis.mean"), arrays.pop("basis.components"))
+    kind: Kind = table["kind"]
+    match kind:
+        case "bank":
+            model = PatchBank.from_arrays(arrays)
+        case "coordinates":
+            model = _with_weights(SceneCoordinateNet(**table["arguments"]), arrays)
+        case "regression":
+            model = _with_weights(PoseRegressor(**table["arguments"]), arrays)
+        case _:
+            assert_never(kind)
+    sampling = PatchSampling(**{**table["sampling"], "radii_px": tuple(table["sampling"]["radii_px"])})
+    calibration, solver = Calibration(**table["calibration"]), RansacSolver(**table["solver"])
+    describer = Describer(**table["describer"])
+    return Localizer(
+        sampling, basis, model, calibration, solver, describer, open_describer(describer, device)
+    )
+
+
+def open_describer(describer: Describer, device: str) -> Describe | None:
+    """Open a descriptor network; None for DAISY, which patches describe at their own radii."""
+    return None if describer.backend == "daisy" else describer.open(device)
+
+
+def _weights(net: nn.Module) -> dict[str, np.ndarray]:
+    return {name: value.cpu().numpy() for name, value in net.state_dict().items()}
+
+
+def _with_weights(net: Net, arrays: dict[str, np.ndarray]) -> Net:
+    net.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+    return net.eval()

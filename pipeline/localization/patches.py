@@ -1,0 +1,186 @@
+"""From a picture with depth to patches: resized to one scale, described by DAISY or DINOv2, lifted by depth.
+
+`extract_patches` treats one picture; `PcaBasis` reduces its descriptors. Views of the agent are scaled by
+their depth.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, assert_never
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from pipeline.geometry import cameras
+
+Target = Literal["scene", "agent"]
+Describe = Callable[[np.ndarray, int], np.ndarray]
+"""``describe(color, stride_px) -> [rows columns channel]`` at cell centres, as
+`pipeline.backends.descriptors` opens it."""
+
+LEAST_PATCHES = 6
+"""A picture with fewer patches gives no answer."""
+LEAST_MASK_PX, LEAST_DEPTH_PX, DEPTH_SAMPLES = 30, 10, 400
+"""Agent: least pixels of the mask, least of them with depth, and mask pixels that measure its depth."""
+NEAREST_M = 0.1
+"""Depth below this is none, metres."""
+GREY = 128
+"""Grey value outside the mask."""
+KEYPOINT_PX = 8.0
+"""Size of DAISY's key points, pixels; without effect on unrotated descriptors."""
+BASIS_SAMPLES = 20_000
+"""Descriptors that fit the principal axes."""
+LEAST_NORM = 1e-6
+
+
+@dataclass(frozen=True)
+class PatchSampling:
+    """How pictures are scaled and where patches lie."""
+
+    target: Target
+    focal_px: float
+    """Scene: pictures are resized to this focal length, pixels. Agent: crops are resized to so many pixels
+    per metre."""
+    window_px: int
+    """Agent: edge of the square crop, pixels; scene: unused."""
+    stride_px: int
+    """Distance between patches in the resized picture, pixels."""
+    radii_px: tuple[int, ...]
+    """Radii of the concatenated DAISY descriptors, pixels."""
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Patches of one picture: descriptors and the points under them."""
+
+    descriptors: Float[np.ndarray, "patch channel"]
+    points_camera: Float[np.ndarray, "patch 3"]
+    """Metres."""
+    cell: Int[np.ndarray, "patch 2"]
+    """Row and column of each patch on the picture's grid."""
+
+
+@dataclass(frozen=True)
+class PcaBasis:
+    """The principal axes that descriptors are reduced to."""
+
+    mean: Float[np.ndarray, "channel"]
+    components: Float[np.ndarray, "axis channel"]
+
+    def project(self, descriptors: Float[np.ndarray, "patch channel"]) -> Float[np.ndarray, "patch axis"]:
+        """Project descriptors onto the axes and normalise them to unit length."""
+        low = (descriptors.astype(np.float32) - self.mean) @ self.components.T
+        return low / np.maximum(np.linalg.norm(low, axis=1, keepdims=True), LEAST_NORM)
+
+
+def fit_pca(descriptors: Float[np.ndarray, "patch channel"], axes: int, rng: np.random.Generator) -> PcaBasis:
+    """Fit the principal axes on a sample of descriptors."""
+    chosen = rng.choice(len(descriptors), min(len(descriptors), BASIS_SAMPLES), replace=False)
+    known = descriptors[chosen].astype(np.float64)
+    mean = known.mean(0)
+    _, vectors = np.linalg.eigh((known - mean).T @ (known - mean))
+    components = np.ascontiguousarray(vectors[:, ::-1][:, :axes].T).astype(np.float32)
+    return PcaBasis(mean.astype(np.float32), components)
+
+
+def describe_daisy(
+    picture: UInt8[np.ndarray, "height width 3"], sampling: PatchSampling
+) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
+    """Return DAISY descriptors on the grid of a resized picture and their centres, pixels (Tola et al.
+    2010)."""
+    gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    offset = sampling.stride_px // 2
+    y, x = np.mgrid[offset : gray.shape[0] : sampling.stride_px, offset : gray.shape[1] : sampling.stride_px]
+    pixel = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float32)
+    keypoints = [cv2.KeyPoint(float(column), float(row), KEYPOINT_PX) for column, row in pixel]
+    parts = [
+        cv2.xfeatures2d.DAISY.create(radius, 2, 6, 8, cv2.xfeatures2d.DAISY_NRM_PARTIAL).compute(
+            gray, keypoints
+        )[1]
+        for radius in sampling.radii_px
+    ]
+    return np.concatenate(parts, axis=1), pixel + 0.5
+
+
+def describe_cells(
+    picture: UInt8[np.ndarray, "height width 3"], stride_px: int, describe: Describe
+) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
+    """Return a network's descriptors of a resized picture and their cell centres, pixels."""
+    cells = describe(picture, stride_px)
+    centre = (cameras.pixel_grid(*cells.shape[:2]) * stride_px).reshape(-1, 2)
+    return cells.reshape(-1, cells.shape[-1]), centre
+
+
+def extract_patches(
+    color: UInt8[np.ndarray, "height width 3"],
+    depth: Float[np.ndarray, "depth_height depth_width"],
+    depth_intrinsics: Float[np.ndarray, "3 3"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    mask: Bool[np.ndarray, "height width"] | None,
+    sampling: PatchSampling,
+    describe: Describe | None = None,
+) -> Patches | None:
+    """Describe one picture at the localizer's scale; None where too little of the target is seen.
+
+    Args:
+        color, depth, depth_intrinsics, intrinsics: RGB, metres (0 = unknown), pixels; one camera centre.
+        mask: where the target is; None: everywhere.
+        sampling: scale and grid.
+        describe: a network; None: DAISY at the sampling's radii.
+    """
+    match sampling.target:
+        case "scene":
+            scale = sampling.focal_px / intrinsics[0, 0]
+            size = (round(color.shape[1] * scale), round(color.shape[0] * scale))
+            picture, origin = cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.zeros(2)
+        case "agent":
+            assert mask is not None, "the agent is cropped by its mask"
+            crop = _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling)
+            if crop is None:
+                return None
+            picture, origin, scale = crop
+        case _:
+            assert_never(sampling.target)
+    descriptors, pixel = (
+        describe_daisy(picture, sampling)
+        if describe is None
+        else describe_cells(picture, sampling.stride_px, describe)
+    )
+    cell = (pixel[:, ::-1] / sampling.stride_px).astype(int)
+    pixel = pixel / scale + origin
+    points = _lift(pixel, depth, depth_intrinsics, intrinsics)
+    known = points[:, 2] > NEAREST_M
+    if mask is not None:
+        column, row = np.clip(pixel.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+        known &= mask[row, column] & (pixel >= 0).all(1) & (pixel < mask.shape[::-1]).all(1)
+    enough = known.sum() >= LEAST_PATCHES
+    return Patches(descriptors[known], points[known], cell[known]) if enough else None
+
+
+def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
+    """Cut a square of fixed size in metres around the mask, grey outside it; None without depth in the
+    mask."""
+    row, column = np.nonzero(mask)
+    if len(row) < LEAST_MASK_PX:
+        return None
+    sample = np.stack([column, row], 1)[:: max(1, len(row) // DEPTH_SAMPLES)] + 0.5
+    points = _lift(sample, depth, depth_intrinsics, intrinsics)
+    known = points[:, 2] > NEAREST_M
+    if known.sum() < LEAST_DEPTH_PX:
+        return None
+    scale = sampling.focal_px * float(np.median(points[known, 2])) / intrinsics[0, 0]
+    half = sampling.window_px / 2 / scale
+    origin = np.array([(column.min() + column.max() + 1) / 2, (row.min() + row.max() + 1) / 2]) - half
+    warp = np.array([[scale, 0, -origin[0] * scale], [0, scale, -origin[1] * scale]])
+    size = (sampling.window_px, sampling.window_px)
+    filled = np.where(mask[..., None], color, np.uint8(GREY))
+    crop = cv2.warpAffine(filled, warp, size, flags=cv2.INTER_LINEAR, borderValue=(GREY, GREY, GREY))
+    return crop, origin, scale
+
+
+def _lift(pixel, depth, depth_intrinsics, intrinsics):
+    """Lift colour pixels to camera axes by the depth image, whose camera is the same; z = 0 where depth is
+    unknown."""
+    ray = cameras.unproject(pixel, intrinsics)
+    return ray * cameras.read_depth(depth, depth_intrinsics, ray)[:, None]

@@ -1,0 +1,117 @@
+"""The paper's localizer: a ResNet-18 over dense descriptors regresses the camera's rotation and position (Eq.
+5).
+
+The rotation is a unit quaternion. The expected error is predicted per picture, learned from the errors
+themselves, so that frames can be ranked. A width of 64 is the paper's ResNet-18, with group normalisation.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from pipeline.geometry import rigid, rigid_torch
+
+GRID = 16
+"""The descriptors are laid on a square grid of so many cells."""
+GROUPS, HIDDEN = 8, 256
+"""Groups of the normalisation, and units of the hidden layer of the head."""
+LEAST_LOG, MOST_LOG = -6.0, 3.0
+"""Bounds of the predicted log error (radians + metres)."""
+IDENTITY_BIAS = 1e-3
+"""Added to the quaternion's real part, so that zero output is a rotation."""
+
+
+class _Block(nn.Module):
+    """Two 3x3 convolutions beside a shortcut (He et al. 2016), with normalisation by groups."""
+
+    def __init__(self, before: int, after: int, stride: int):
+        super().__init__()
+        self.first, self.second = nn.Conv2d(before, after, 3, stride, 1), nn.Conv2d(after, after, 3, 1, 1)
+        self.norms = nn.ModuleList([nn.GroupNorm(GROUPS, after), nn.GroupNorm(GROUPS, after)])
+        self.shortcut = (
+            nn.Identity() if before == after and stride == 1 else nn.Conv2d(before, after, 1, stride)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the block's features."""
+        inner = torch.relu(self.norms[0](self.first(x)))
+        return torch.relu(self.norms[1](self.second(inner)) + self.shortcut(x))
+
+
+class PoseRegressor(nn.Module):
+    """Grid of descriptors -> quaternion, position of the anchor in the map (metres), log of the expected
+    error."""
+
+    middle: Tensor
+    extent: Tensor
+
+    def __init__(self, axes: int, width: int):
+        super().__init__()
+        self.arguments = {"axes": axes, "width": width}
+        widths = [width, width, 2 * width, 4 * width, 8 * width]
+        blocks = []
+        for index in range(4):
+            blocks += [
+                _Block(widths[index], widths[index + 1], 1 if index == 0 else 2),
+                _Block(widths[index + 1], widths[index + 1], 1),
+            ]
+        self.trunk = nn.Sequential(nn.Conv2d(axes, width, 3, 1, 1), nn.ReLU(), *blocks)
+        self.head = nn.Sequential(
+            nn.Flatten(), nn.Linear(8 * width * (GRID // 8) ** 2, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 8)
+        )
+        self.register_buffer("middle", torch.zeros(3))
+        self.register_buffer("extent", torch.ones(()))
+
+    def forward(self, grid: Float[Tensor, "batch axis row column"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rotations ``map_from_camera``, positions of the anchor in the map (metres), and log
+        errors."""
+        out = self.head(self.trunk(grid * grid.shape[1] ** 0.5))
+        quaternion = out[:, :4] + out.new_tensor([IDENTITY_BIAS, 0, 0, 0])
+        return (
+            rigid_torch.rotation_from_quaternion(quaternion),
+            self.middle + self.extent * out[:, 4:7],
+            out[:, 7].clamp(LEAST_LOG, MOST_LOG),
+        )
+
+    @torch.no_grad()
+    def regress(
+        self,
+        query: Float[np.ndarray, "patch axis"],
+        cell: Int[np.ndarray, "patch 2"],
+        anchor_camera: Float[np.ndarray, "3"],
+    ) -> tuple[Float[np.ndarray, "4 4"], float]:
+        """Return ``map_from_camera`` of one picture and a certainty in 0..1; the anchor is a point in camera
+        axes, metres."""
+        rotation, position, log_error = self(torch.from_numpy(on_grid(query, cell))[None])
+        matrix = rotation[0].double().numpy()
+        return rigid.make(matrix, position[0].double().numpy() - matrix @ anchor_camera), float(
+            torch.exp(-torch.exp(log_error[0]))
+        )
+
+
+def on_grid(
+    query: Float[np.ndarray, "patch axis"], cell: Int[np.ndarray, "patch 2"]
+) -> Float[np.ndarray, "axis row column"]:
+    """Arrange patches on the network's grid, centred; zero where there is none. Larger pictures are
+    subsampled to fit."""
+    extent = cell.max(0) + 1
+    place = (
+        cell * GRID // max(int(extent.max()), GRID)
+        + (GRID - np.minimum(extent * GRID // max(int(extent.max()), GRID), GRID)) // 2
+    )
+    grid = np.zeros((query.shape[1], GRID, GRID), np.float32)
+    grid[:, place[:, 0], place[:, 1]] = query.T
+    return grid
+
+
+def pose_loss(
+    rotation: Float[Tensor, "batch 3 3"], position: Float[Tensor, "batch 3"],
+    log_error: Float[Tensor, "batch"],
+    true_rotation: Float[Tensor, "batch 3 3"], true_position: Float[Tensor, "batch 3"],
+) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:  # fmt: skip
+    """Return geodesic angle + distance (radians + metres; Eq. 5), and the negative log likelihood of that
+    error."""
+    chord = (rotation - true_rotation).flatten(1).norm(dim=1) / 8**0.5
+    error = 2 * torch.asin(chord.clamp(max=1 - 1e-6)) + (position - true_position).norm(dim=-1)
+    return error, error.detach() * torch.exp(-log_error) + log_error

@@ -1,0 +1,139 @@
+"""The body that moves through a scene: a skinned surface, and the numbers that say how it is posed.
+
+`SkinnedBody` holds any animal's surface at rest; `PosedSurface` blends it to poses in torch; `PoseSpace`
+turns the bones of a frame into a few numbers p and back (the part that SMPL-X's body prior plays in the
+paper). Poses are bones in the agent frame; channels are those of
+`pipeline.behavior.model.channels_from_bones`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from pipeline.behavior.model import channels_from_bones
+from pipeline.data import ply
+from pipeline.data.templates import SKIN
+from pipeline.geometry import rigid, rigid_torch
+from pipeline.geometry.meshes import Mesh
+
+LEVER_M = 0.1
+"""What a radian of a bone's rotation weighs against a metre of its shift in the pose space."""
+
+
+@dataclass(frozen=True)
+class SkinnedBody:
+    """A skinned surface at rest, agent frame, metres."""
+
+    mesh: Mesh
+    weights: Float[np.ndarray, "vertex bone"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    shape: Float[np.ndarray, "channel"]
+    """numbers that distinguish bodies of one kind (betas of SMPL-X); empty for one animal"""
+
+    @property
+    def length_m(self) -> float:
+        """The longest side of the surface's box at rest."""
+        return float(np.ptp(self.mesh.vertices, axis=0).max())
+
+    def sample_vertices(self, count: int) -> Int[np.ndarray, "vertex"]:
+        """Choose vertices that cover the surface evenly (farthest points, from the first vertex on)."""
+        points = np.asarray(self.mesh.vertices, np.float64)
+        chosen, distance = [0], np.full(len(points), np.inf)
+        while len(chosen) < min(count, len(points)):
+            distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1))
+            chosen.append(int(distance.argmax()))
+        return np.sort(np.array(chosen))
+
+
+def load_body(reconstruction: Path) -> SkinnedBody:
+    """Read the reconstructed animal: `agent.ply` and `skin.npz`. Raises InputError where they are damaged."""
+    skin = SKIN.load(reconstruction / "skin.npz", "weights", "agent_from_bone_rest")
+    return SkinnedBody(
+        ply.read_ply(reconstruction / "agent.ply"),
+        skin["weights"],
+        skin["agent_from_bone_rest"].astype(np.float64),
+        np.zeros(0),
+    )
+
+
+class PosedSurface(nn.Module):
+    """Some vertices of a body under linear blending, one matrix product for all frames."""
+
+    blend: Float[Tensor, "vertex bone*4"]
+
+    def __init__(self, body: SkinnedBody, vertices: Int[np.ndarray, "vertex"] | None = None):
+        super().__init__()
+        index = np.arange(len(body.mesh.vertices)) if vertices is None else vertices
+        bone_from_rest = rigid.inverse(body.agent_from_bone_rest)
+        in_bone = rigid.apply(
+            bone_from_rest, np.asarray(body.mesh.vertices, np.float64)[index]
+        )  # bone vertex 3
+        homogeneous = np.concatenate([in_bone, np.ones_like(in_bone[..., :1])], axis=-1)
+        blend = np.einsum("vb,bvk->vbk", body.weights[index], homogeneous).reshape(len(index), -1)
+        self.register_buffer("blend", torch.from_numpy(blend).float(), persistent=False)
+
+    def forward(
+        self, world_from_agent: Float[Tensor, "frame 4 4"], agent_from_bone: Float[Tensor, "frame bone 4 4"]
+    ) -> Float[Tensor, "frame vertex 3"]:
+        """Return the vertices in the world."""
+        world_from_bone = (world_from_agent[:, None] @ agent_from_bone)[..., :3, :]
+        columns = world_from_bone.permute(1, 3, 0, 2).reshape(self.blend.shape[1], -1)  # bone*4 frame*3
+        return (self.blend @ columns).unflatten(1, (-1, 3)).transpose(0, 1)
+
+
+class PoseSpace(nn.Module):
+    """Poses as p: principal components of the bones' channels, each of unit spread in the data."""
+
+    rest: Float[Tensor, "bone 4 4"]
+    mean: Float[Tensor, "channel"]
+    basis: Float[Tensor, "component channel"]
+    inverse: Float[Tensor, "channel component"]
+    explained: Float[Tensor, ""]
+
+    def __init__(self, agent_from_bone_rest: Float[np.ndarray, "bone 4 4"], components: int):
+        super().__init__()
+        channels = 6 * len(agent_from_bone_rest)
+        self.register_buffer("rest", torch.from_numpy(np.asarray(agent_from_bone_rest)).float())
+        self.register_buffer("mean", torch.zeros(channels))
+        self.register_buffer("basis", torch.zeros(components, channels))
+        self.register_buffer("inverse", torch.zeros(channels, components))
+        self.register_buffer("explained", torch.zeros(()))
+
+    @property
+    def components(self) -> int:
+        """Length of p."""
+        return len(self.basis)
+
+    def fit(self, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> "PoseSpace":
+        """Find mean and components from poses; returns itself."""
+        channels = channels_from_bones(agent_from_bone, self.rest.double().numpy())
+        scale = np.tile([LEVER_M] * 3 + [1.0] * 3, agent_from_bone.shape[1])
+        mean = channels.mean(0)
+        _, spread, rows = np.linalg.svd((channels - mean) * scale, full_matrices=False)
+        kept = min(self.components, len(spread))
+        std = np.maximum(spread[:kept] / np.sqrt(len(channels)), 1e-6)
+        rows = rows * np.sign(rows[np.arange(len(rows)), np.abs(rows).argmax(1)])[:, None]
+        self.mean[:] = torch.from_numpy(mean)
+        self.basis[:kept] = torch.from_numpy(rows[:kept] * std[:, None] / scale)
+        self.inverse[:, :kept] = torch.from_numpy((rows[:kept] / std[:, None]).T * scale[:, None])
+        self.explained.fill_(float((spread[:kept] ** 2).sum() / (spread**2).sum()))
+        return self
+
+    def encode(self, channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch component"]:
+        """Turn channels of bones into p."""
+        return (channels - self.mean) @ self.inverse
+
+    def decode(self, p: Float[Tensor, "*batch component"]) -> Float[Tensor, "*batch channel"]:
+        """Turn p into channels of bones."""
+        return self.mean + p @ self.basis
+
+    def bones(self, channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch bone 4 4"]:
+        """Turn channels into `agent_from_bone`."""
+        twist = channels.unflatten(-1, (len(self.rest), 6))
+        return rigid_torch.make(
+            rigid_torch.so3_exp(twist[..., :3]) @ self.rest[:, :3, :3], self.rest[:, :3, 3] + twist[..., 3:]
+        )

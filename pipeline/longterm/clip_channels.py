@@ -1,0 +1,170 @@
+"""Motions and bodies as the networks of `pipeline.longterm.networks` see them, and back.
+
+A clip's frame lies half way between its first and last body. `encode_clips` gives channels (t, r, p) of
+2-second motions and the scene around them; `decode_clip` makes motion of channels; `encode_places` does the
+first for single bodies.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.behavior.model import channels_from_bones
+from pipeline.behavior.perception import world_from_ego
+from pipeline.geometry import rigid, rigid_torch
+from pipeline.longterm.bodies import PoseSpace
+from pipeline.longterm.local_scene import LocalScene, distance_fields
+from pipeline.longterm.networks import BODY_REACH_M, REACH_M, ROOT_CHANNELS
+from pipeline.longterm.short_motions import BodyMotion
+from pipeline.longterm.surroundings import MotionScene
+
+COINCIDENT_M = 0.1
+"""Start and end of a clip that are closer than this have no direction from one to the other."""
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Short motions in their own frames."""
+
+    world_from_clip: Float[np.ndarray, "clip 4 4"]
+    channels: Float[Tensor, "clip frame channel"]
+    """t, r, p"""
+    seen: LocalScene
+    """the scene"""
+    scene: Int[np.ndarray, "clip"]
+    """index of the scene each is in"""
+
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    def __getitem__(self, index: np.ndarray) -> "Clips":
+        """Return some of the clips."""
+        return Clips(self.world_from_clip[index], self.channels[index], self.seen[index], self.scene[index])
+
+
+def root_channels(a_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[Tensor, "*batch 9"]:
+    """Return t and r."""
+    moved = torch.from_numpy(np.asarray(a_from_agent)).float()
+    return torch.cat([moved[..., :3, 3], rigid_torch.rotation_to_6d(moved[..., :3, :3])], dim=-1)
+
+
+def pose_channels(
+    agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], poses: PoseSpace
+) -> Float[Tensor, "*batch pose"]:
+    """Return p."""
+    rest = poses.rest.double().numpy()
+    return poses.encode(
+        torch.from_numpy(channels_from_bones(np.asarray(agent_from_bone, np.float64), rest)).float()
+    )
+
+
+def clip_frames(
+    start_world: Float[np.ndarray, "clip 4 4"], end_world: Float[np.ndarray, "clip 4 4"]
+) -> Float[np.ndarray, "clip 4 4"]:
+    """Return frames half way between start and end, +y up, +z from start to end; where those meet, along the
+    heading.
+    """
+    frame = world_from_ego(start_world, "yaw")
+    way = (end_world - start_world)[:, :3, 3] * [1.0, 0.0, 1.0]
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    forward = np.where(length > COINCIDENT_M, way / np.maximum(length, 1e-9), frame[:, :3, 2])
+    up = np.broadcast_to([0.0, 1.0, 0.0], forward.shape)
+    rotation = np.stack([np.cross(up, forward), up, forward], axis=-1)
+    return rigid.make(rotation, (start_world[:, :3, 3] + end_world[:, :3, 3]) / 2)
+
+
+def encode_clips(
+    root_world: Float[np.ndarray, "clip frame 4 4"],
+    p: Float[Tensor, "clip frame pose"],
+    scene: Int[np.ndarray, "clip"],
+    scenes: Sequence[MotionScene],
+    points: int,
+    rng: np.random.Generator,
+) -> Clips:
+    """Turn short motions, or only their first and last frames, into channels; ``scene`` is the index of the
+    scene each takes place.
+
+    Without ``points`` nothing is seen.
+    """
+    world_from_clip = clip_frames(root_world[:, 0], root_world[:, -1])
+    root = root_channels(rigid.inverse(world_from_clip)[:, None] @ root_world)
+    drawn = _points(world_from_clip, world_from_clip[:, :3, 3], scene, scenes, REACH_M, points, rng)
+    seen = LocalScene(drawn, distance_fields(world_from_clip, scene, scenes if points else []))
+    return Clips(world_from_clip, torch.cat([root, p], dim=-1), seen, scene)
+
+
+def decode_clip(
+    channels: Float[Tensor, "frame channel"],
+    world_from_clip: Float[np.ndarray, "4 4"],
+    poses: PoseSpace,
+    ends: Float[np.ndarray, "2 bone 4 4"] | None = None,
+) -> BodyMotion:
+    """Turn channels of one clip, or of one body, into motion in the world.
+
+    What p leaves out of the given poses ``ends`` is added, from the first's to the last's, so that the motion
+    begins and ends in just these.
+    """
+    with torch.no_grad():
+        posed = poses.decode(channels[..., ROOT_CHANNELS:])
+        if ends is not None:
+            given = torch.from_numpy(
+                channels_from_bones(np.asarray(ends, np.float64), poses.rest.double().numpy())
+            ).float()
+            left = given - poses.decode(poses.encode(given))
+            posed = posed + torch.lerp(left[0], left[1], torch.linspace(0, 1, len(channels))[:, None])
+        bones = poses.bones(posed)
+        clip_from_agent = rigid_torch.make(
+            rigid_torch.rotation_from_6d(channels[..., 3:ROOT_CHANNELS]), channels[..., :3]
+        )
+    return BodyMotion(world_from_clip @ clip_from_agent.double().numpy(), bones.double().numpy())
+
+
+@dataclass(frozen=True)
+class EncodedPlaces:
+    """Places of single bodies, in their heading frames."""
+
+    world_from_place: Float[np.ndarray, "body 4 4"]
+    place: Float[Tensor, "body 7"]
+    """clearance above the scene, r"""
+    points: Float[Tensor, "body point 3"]
+
+
+def encode_places(
+    world_from_agent: Float[np.ndarray, "body 4 4"],
+    scene: Sequence[int],
+    scenes: Sequence[MotionScene],
+    points: int,
+    rng: np.random.Generator,
+) -> EncodedPlaces:
+    """Describe where single bodies are to be: their heading frame, clearance, orientation and scene
+    points.
+    """
+    world_from_place, scene = world_from_ego(world_from_agent, "yaw"), np.asarray(scene)
+    centre = np.asarray(world_from_agent)[:, :3, 3]
+    clearance = torch.zeros(len(scene), 1)
+    for index, each in enumerate(scenes):
+        rows = np.flatnonzero(scene == index)
+        clearance[rows, 0] = each.distance.at(torch.from_numpy(centre[rows]).float())
+    r = root_channels(rigid.inverse(world_from_place) @ world_from_agent)[:, 3:]
+    seen = _points(world_from_place, centre, scene, scenes, BODY_REACH_M, points, rng)
+    return EncodedPlaces(world_from_place, torch.cat([clearance, r], dim=-1), seen)
+
+
+def _points(
+    frames: np.ndarray,
+    centre: np.ndarray,
+    scene: np.ndarray,
+    scenes: Sequence[MotionScene],
+    reach_m: float,
+    count: int,
+    rng: np.random.Generator,
+) -> Float[Tensor, "clip point 3"]:
+    drawn = np.zeros((len(scene), count, 3), np.float32)
+    for index, each in enumerate(scenes):
+        rows = np.flatnonzero(scene == index)
+        drawn[rows] = each.around(frames[rows], centre[rows], reach_m, count, rng)
+    return torch.from_numpy(drawn)

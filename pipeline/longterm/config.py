@@ -1,0 +1,52 @@
+"""Settings of long-term motion: sizes of its networks, length of their training, length of the optimisation.
+
+Standard library only, so that a stage's configuration can be read without torch.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LongTermSizes:
+    """Everything that fixes the shape of the networks; stored in `longterm.json`."""
+
+    pose: int = 32
+    """length of the pose code p, as of the body prior of SMPL-X"""
+    shape: int = 0
+    """length of the shape code (betas of SMPL-X); 0 for one animal"""
+    latent: int = 32
+    """length of the CVAE's code z"""
+    scene: int = 128
+    """length of the code of PointNet (the paper: 256)"""
+    hidden: int = 96
+    """width of each direction of the LSTMs"""
+    width: int = 192
+    """width of linear layers"""
+    points: int = 128
+    """scene points that PointNet sees"""
+
+
+@dataclass(frozen=True)
+class LongTermOptimizerConfig:
+    """Length and learning rate of one network's training."""
+
+    steps: int = 500
+    """steps of Adam"""
+    batch: int = 48
+    """examples a step"""
+    rate: float = 2e-3
+    """peak learning rate; falls to nothing along a cosine (the paper: 1e-3, and five to twenty times the
+    steps)
+    """
+
+
+@dataclass(frozen=True)
+class MotionOptimizationConfig:
+    """Length of the optimisation that makes motion physical; its terms are
+    `motion_optimization.MotionTerms`.
+    """
+
+    steps: int = 200
+    """steps of Adam"""
+    vertices: int = 300
+    """vertices of the surface that collision and smoothness look at"""

@@ -1,0 +1,193 @@
+"""What long-term motion is learned from: stretches of motion in scenes, cut into clips and single bodies.
+
+`MotionDataset` is the common form of reconstructed sessions (`reconstructed_dataset`) and of simulated ones
+(`simulated_lives.load`); `select_clips` and `encode_selection` make clips of it, `sample_static_bodies`
+single bodies.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.trajectories import BehaviorData
+from pipeline.data import ply
+from pipeline.geometry import rigid
+from pipeline.geometry.signed_distance import SignedDistance
+from pipeline.longterm.bodies import PoseSpace, SkinnedBody, load_body
+from pipeline.longterm.clip_channels import (
+    Clips,
+    EncodedPlaces,
+    encode_clips,
+    encode_places,
+    pose_channels,
+    root_channels,
+)
+from pipeline.longterm.short_motions import STEPS, BodyMotion, stretches
+from pipeline.longterm.surroundings import MotionScene
+
+
+@dataclass(frozen=True)
+class MotionDataset:
+    """Stretches of one body's motion at 30 fps, and the scenes they take place in."""
+
+    body: SkinnedBody
+    stretches: tuple[BodyMotion, ...]
+    scene_of: tuple[int, ...]
+    """per stretch, which scene"""
+    scenes: tuple[MotionScene, ...]
+
+    def subset(self, chosen: Sequence[int] | Int[np.ndarray, "some"]) -> "MotionDataset":
+        """Return some of the stretches, with the scenes that they need."""
+        kept = sorted({self.scene_of[index] for index in chosen})
+        return MotionDataset(
+            self.body,
+            tuple(self.stretches[index] for index in chosen),
+            tuple(kept.index(self.scene_of[index]) for index in chosen),
+            tuple(self.scenes[index] for index in kept),
+        )
+
+    @property
+    def distances(self) -> list[SignedDistance]:
+        """The signed distance around each stretch."""
+        return [self.scenes[index].distance for index in self.scene_of]
+
+
+def reconstructed_dataset(reconstruction: Path, data: BehaviorData) -> tuple[MotionDataset, list[str]]:
+    """Read reconstructed sessions: all long enough stretches at 30 fps, and the recording that each
+    is from.
+    """
+    body, mesh = load_body(reconstruction), ply.read_ply(reconstruction / "scene.ply")
+    found = [
+        (video, part) for video, trajectory in data.trajectories.items() for part in stretches(trajectory)
+    ]
+    roots = [
+        trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in data.trajectories.values()
+    ]
+    scene = MotionScene.for_motion(mesh, np.concatenate(roots))
+    return MotionDataset(body, tuple(part for _, part in found), (0,) * len(found), (scene,)), [
+        video for video, _ in found
+    ]
+
+
+STRIDE = 3
+"""Frames (30 fps) between the starts of clips."""
+RESTING_SHARE = 0.3
+"""Share of the clips that end within `MOVED_M` of their start: without any, a model never learns to rest."""
+MOST_CLIPS = 6000
+"""Clips at most; beyond that they are subsampled evenly."""
+LEVEL_SHARE = 0.5
+"""Share of static bodies whose place is given without tilt and exact height, as a user gives it."""
+LEVEL_HEIGHT_M = 0.03
+"""Deviation of the heights of such places."""
+POSE_STRIDE = 3
+"""Every so many frames of motion the pose space is fitted to: neighbours at 30 fps hardly differ."""
+MOVED_M = 0.5
+"""A clip that ends further than this from its start travels (the paper keeps only those)."""
+
+
+@dataclass(frozen=True)
+class StaticBodies:
+    """Single bodies, each described as a place and as what really stands there."""
+
+    places: EncodedPlaces
+    truth: Float[Tensor, "body channel"]
+    """t, r in the place's heading frame, p"""
+    scene: np.ndarray
+
+
+@dataclass(frozen=True)
+class ClipSelection:
+    """Which short motions are taken: stretch and first frame of each."""
+
+    stretch: Int[np.ndarray, "clip"]
+    start: Int[np.ndarray, "clip"]
+
+    def parts(self, dataset: MotionDataset) -> list[BodyMotion]:
+        """Return the motions."""
+        pairs = zip(self.stretch, self.start, strict=True)
+        return [dataset.stretches[stretch][start : start + STEPS + 1] for stretch, start in pairs]
+
+
+def select_clips(
+    dataset: MotionDataset,
+    rng: np.random.Generator,
+    *,
+    stride: int = STRIDE,
+    resting: float = RESTING_SHARE,
+    most: int = MOST_CLIPS,
+) -> ClipSelection:
+    """Choose short motions: those that travel and a share ``resting`` of clips that rest."""
+    starts = [np.arange(0, len(stretch) - STEPS, stride) for stretch in dataset.stretches]
+    stretch, start = np.repeat(np.arange(len(starts)), list(map(len, starts))), np.concatenate(starts)
+    roots = [each.world_from_agent[:, :3, 3] for each in dataset.stretches]
+    way = [
+        np.linalg.norm(root[first + STEPS] - root[first], axis=1)
+        for root, first in zip(roots, starts, strict=True)
+    ]
+    moves = np.concatenate(way) > MOVED_M
+    still = np.flatnonzero(~moves)
+    if moves.any():
+        count = int(moves.sum() * resting / max(1 - resting, 1e-6))
+        still = rng.choice(still, min(count, len(still)), replace=False)
+    chosen = np.sort(np.concatenate([np.flatnonzero(moves), still]))
+    chosen = chosen[:: max(1, int(np.ceil(len(chosen) / most)))]
+    return ClipSelection(stretch[chosen], start[chosen])
+
+
+def encode_selection(
+    dataset: MotionDataset, cuts: ClipSelection, poses: PoseSpace, points: int, rng: np.random.Generator
+) -> Clips:
+    """Encode short motions; the poses of each stretch are encoded once."""
+    p = [pose_channels(stretch.agent_from_bone, poses) for stretch in dataset.stretches]
+    pairs = list(zip(cuts.stretch, cuts.start, strict=True))
+    root = np.stack(
+        [dataset.stretches[stretch].world_from_agent[start : start + STEPS + 1] for stretch, start in pairs]
+    )
+    pose = torch.stack([p[stretch][start : start + STEPS + 1] for stretch, start in pairs])
+    return encode_clips(root, pose, np.asarray(dataset.scene_of)[cuts.stretch], dataset.scenes, points, rng)
+
+
+def sample_static_bodies(
+    dataset: MotionDataset,
+    poses: PoseSpace,
+    points: int,
+    rng: np.random.Generator,
+    *,
+    most: int,
+    level: float = LEVEL_SHARE,
+) -> StaticBodies:
+    """Take single bodies out of the motion and describe their places, some as loosely as a user would."""
+    stride = max(1, int(np.ceil(sum(map(len, dataset.stretches)) / most)))
+    frames = [stretch[::stride] for stretch in dataset.stretches]
+    root = np.concatenate([part.world_from_agent for part in frames])
+    bones = np.concatenate([part.agent_from_bone for part in frames])
+    scene = np.repeat(dataset.scene_of, [len(part) for part in frames])
+    given = root.copy()
+    loose = rng.random(len(root)) < level
+    given[loose] = world_from_ego(root[loose], "yaw")
+    given[loose, 1, 3] += rng.normal(0, LEVEL_HEIGHT_M, loose.sum())
+    places = encode_places(given, scene, dataset.scenes, points, rng)
+    return StaticBodies(places, body_channels(places.world_from_place, BodyMotion(root, bones), poses), scene)
+
+
+def body_channels(
+    world_from_place: Float[np.ndarray, "body 4 4"], moving: BodyMotion, poses: PoseSpace
+) -> Float[Tensor, "body channel"]:
+    """Return t, r and p of bodies in the frames of their places."""
+    root = root_channels(rigid.inverse(world_from_place) @ moving.world_from_agent)
+    return torch.cat([root, pose_channels(moving.agent_from_bone, poses)], dim=-1)
+
+
+def fit_pose_space(
+    stretches: Sequence[BodyMotion], rest: Float[np.ndarray, "bone 4 4"], components: int
+) -> PoseSpace:
+    """Find the pose space of some motion."""
+    return PoseSpace(rest, components).fit(
+        np.concatenate([part.agent_from_bone[::POSE_STRIDE] for part in stretches])
+    )

@@ -1,0 +1,278 @@
+"""Long-term motion as a whole: the trained networks with all they need, and motion between sub-goals.
+
+`LongTerm.load` reads what `train_longterm` wrote; `bodies` puts bodies at places, `short_motions` fills the
+two seconds between pairs of them, `long_motion` does both for a whole row of places;
+`motion_optimization.optimize_motion` finishes it.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from pipeline.geometry import rigid
+from pipeline.longterm.bodies import PoseSpace, SkinnedBody
+from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
+from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
+from pipeline.longterm.contacts import ContactVertices
+from pipeline.longterm.local_scene import LocalScene
+from pipeline.longterm.motion_optimization import ContactBody, settle_bodies
+from pipeline.longterm.networks import ROOT_CHANNELS, PoseNet, RouteNet, StaticBody
+from pipeline.longterm.plausibility import PlausibilityMeter
+from pipeline.longterm.short_motions import (
+    RATE_HZ,
+    STEPS,
+    BodyMotion,
+    concatenate_motions,
+    jump_between_levels,
+    limit_turn_rate,
+    smooth_seams,
+)
+from pipeline.longterm.surroundings import MotionScene
+
+NETWORKS = ("static", "route", "pose")
+JUMP_M = 0.1
+"""A leg between places whose levels differ by more than this is leapt."""
+SWEEPS = 2
+"""How often bodies in passing are made again from what is before and after them."""
+
+
+@dataclass(frozen=True)
+class MotionPrior:
+    """How the body was seen to move."""
+
+    clearance_m: float
+    """median distance of the root from the scene while it travels"""
+    pace_m: float
+    """median way of a two-second motion that travels"""
+    above_m: float
+    """how far the highest bone is above the root, median while it travels"""
+    turn_rad: float
+    """how far the root turns from one frame to the next, 99th percentile"""
+
+
+@dataclass(frozen=True)
+class LongTerm:
+    """Everything that makes long-term motion of one body."""
+
+    sizes: LongTermSizes
+    poses: PoseSpace
+    contacts: ContactVertices
+    motion_prior: MotionPrior
+    static: StaticBody
+    route: RouteNet
+    pose: PoseNet
+
+    def save(self, folder: Path) -> None:
+        """Write `longterm.safetensors` and `longterm.json`."""
+        state = {f"poses.{name}": value for name, value in self.poses.state_dict().items()}
+        for name in NETWORKS:
+            state |= {f"{name}.{key}": value for key, value in getattr(self, name).state_dict().items()}
+        save_file(
+            {name: value.contiguous() for name, value in state.items()}, folder / "longterm.safetensors"
+        )
+        document = {
+            "units": "metres, radians, seconds",
+            "up": [0, 1, 0],
+            "rate_hz": RATE_HZ,
+            "frames": STEPS + 1,
+            "bones": len(self.poses.rest),
+            "sizes": asdict(self.sizes),
+            "sees_scene": self.route.sees_scene,
+            "motion_prior": asdict(self.motion_prior),
+            "contact_vertices": self.contacts.vertices.tolist(),
+            "foot_of_contact_vertex": self.contacts.foot.tolist(),
+        }
+        (folder / "longterm.json").write_text(json.dumps(document, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "LongTerm":
+        """Read a trained model."""
+        document = json.loads((folder / "longterm.json").read_text())
+        state, sizes = load_file(folder / "longterm.safetensors"), LongTermSizes(**document["sizes"])
+        poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
+        nets = (
+            StaticBody(sizes),
+            RouteNet(sizes, sees_scene=document["sees_scene"]),
+            PoseNet(sizes, sees_scene=document["sees_scene"]),
+        )
+        for name, module in zip(("poses", *NETWORKS), (poses, *nets), strict=True):
+            module.load_state_dict(
+                {
+                    key.removeprefix(f"{name}."): value
+                    for key, value in state.items()
+                    if key.startswith(f"{name}.")
+                }
+            )
+        contacts = ContactVertices(
+            np.array(document["contact_vertices"]), np.array(document["foot_of_contact_vertex"])
+        )
+        return cls(
+            sizes, poses, contacts, MotionPrior(**document["motion_prior"]), *(net.eval() for net in nets)
+        )
+
+    def contact_body(self, body: SkinnedBody) -> ContactBody:
+        """Return what the optimisation needs of a body."""
+        return ContactBody(body, self.contacts, self.poses)
+
+    def bodies(
+        self,
+        world_from_agent: Float[np.ndarray, "body 4 4"],
+        body: SkinnedBody,
+        scene: MotionScene,
+        rng: np.random.Generator,
+        *,
+        candidates: int = 8,
+    ) -> BodyMotion:
+        """Put a body at each place: of several that the CVAE draws, the one that stands in the scene best,
+        `settle_bodies` there.
+
+        A good body touches the scene, is not inside it, and stays near its place.
+        """
+        places = encode_places(
+            world_from_agent, np.zeros(len(world_from_agent), int), [scene], self.sizes.points, rng
+        )
+        shape = torch.from_numpy(body.shape).float().expand(len(world_from_agent), -1)
+        judge, best, least = (
+            PlausibilityMeter(body, self.contacts, scene.distance),
+            None,
+            np.full(len(world_from_agent), np.inf),
+        )
+        with torch.no_grad():
+            given = self.static.given(places.place, shape, places.points)
+        for _ in range(candidates):
+            z = torch.from_numpy(rng.standard_normal((len(given), self.sizes.latent))).float()
+            with torch.no_grad():
+                drawn = self.static.decode(z, given)
+            made = placed(drawn, places.world_from_place, self.poses)
+            away = np.linalg.norm((made.world_from_agent - world_from_agent)[:, :3, 3], axis=1)
+            cost = sum(judge.gap_and_penetration(made)) + away
+            better = (cost < least)[:, None, None]
+            best = made if best is None else _where(better, made, best)
+            least = np.minimum(least, cost)
+        return settle_bodies(best, self.contact_body(body), scene.distance, MotionOptimizationConfig())
+
+    def short_motions(
+        self, start: BodyMotion, end: BodyMotion, scene: MotionScene, rng: np.random.Generator
+    ) -> list[BodyMotion]:
+        """Return the 61 frames from each start body to its end body."""
+        root = np.stack([start.world_from_agent, end.world_from_agent], axis=1)
+        p = torch.stack([pose_channels(each.agent_from_bone, self.poses) for each in (start, end)], dim=1)
+        ends = encode_clips(root, p, np.zeros(len(root), int), [scene], self.sizes.points, rng)
+        made = self.between(ends.channels[:, 0], ends.channels[:, 1], ends.seen)
+        bones = np.stack([start.agent_from_bone, end.agent_from_bone], axis=1)
+        parts = zip(made, ends.world_from_clip, bones, strict=True)
+        return [decode_clip(channels, frame, self.poses, given) for channels, frame, given in parts]
+
+    def between(
+        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], seen: LocalScene
+    ) -> Float[Tensor, "clip frame channel"]:
+        """Return t, r, p between first and last frames, in the clips' frames."""
+        with torch.no_grad():
+            route = self.route(start, end, seen)
+            return self.pose(start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:], route, seen.points)
+
+    def long_motion(
+        self,
+        world_from_agent: Float[np.ndarray, "body 4 4"],
+        body: SkinnedBody,
+        scene: MotionScene,
+        rng: np.random.Generator,
+        *,
+        stops: Int[np.ndarray, "stop"] | None = None,
+    ) -> tuple[BodyMotion, BodyMotion]:
+        """Return motion through a row of places, two seconds from one to the next, and the bodies at them.
+
+        A body that stays at its place stays as it is. At places that are none of ``stops`` (None: all are) it
+        is only passing: there its pose is what the networks make of it between a second before and a second
+        after, for a body drawn on its own would be caught at any moment of a stride.
+        """
+        number = np.arange(len(world_from_agent))
+        stays = np.append(False, np.isclose(world_from_agent[1:], world_from_agent[:-1]).all((1, 2)))
+        bodies = self.bodies(world_from_agent, body, scene, rng)[
+            np.maximum.accumulate(np.where(stays, 0, number))
+        ]
+        drawn = (
+            np.isin(number, number if stops is None else [0, *stops, number[-1]])
+            | stays
+            | np.append(stays[1:], False)
+        )
+        for _ in range(SWEEPS if not drawn.all() else 0):
+            bodies = self._passed(bodies, np.flatnonzero(~drawn), scene, rng)
+        rise = np.abs(np.diff(world_from_agent[:, 1, 3]))
+        parts = zip(self.short_motions(bodies[:-1], bodies[1:], scene, rng), rise > JUMP_M, strict=True)
+        made = smooth_seams(
+            concatenate_motions([jump_between_levels(part) if leaps else part for part, leaps in parts])
+        )
+        return limit_turn_rate(made, self.motion_prior.turn_rad), bodies
+
+    def _passed(
+        self,
+        bodies: BodyMotion,
+        passing: Int[np.ndarray, "place"],
+        scene: MotionScene,
+        rng: np.random.Generator,
+    ) -> BodyMotion:
+        middle = _stacked(
+            [part[STEPS // 2] for part in self.short_motions(bodies[:-1], bodies[1:], scene, rng)]
+        )
+        made = self.short_motions(middle[passing - 1], middle[passing], scene, rng)
+        bones = bodies.agent_from_bone.copy()
+        bones[passing] = np.stack([part.agent_from_bone[STEPS // 2] for part in made])
+        return BodyMotion(bodies.world_from_agent, bones)
+
+
+def placed(
+    channels: Float[Tensor, "body channel"], world_from_place: Float[np.ndarray, "body 4 4"], poses: PoseSpace
+) -> BodyMotion:
+    """Turn bodies drawn by the CVAE into bodies in the world."""
+    local = decode_clip(channels, np.eye(4), poses)
+    return BodyMotion(world_from_place @ local.world_from_agent, local.agent_from_bone)
+
+
+def measure_motion_prior(
+    stretches: list[BodyMotion], scenes: list[MotionScene], *, moving_m: float = 0.3
+) -> MotionPrior:
+    """Measure how a body moves; ``moving_m`` is the least way in two seconds that counts as travelling.
+
+    Half a turn within a second counts as possible for any body, also for one that was only seen to rest.
+    """
+    clearance, above, pace, travels, turn = [], [], [], [], []
+    for stretch, scene in zip(stretches, scenes, strict=True):
+        root = stretch.world_from_agent[:, :3, 3]
+        way = np.linalg.norm((root[STEPS:] - root[:-STEPS])[:, [0, 2]], axis=1)
+        middle = slice(STEPS // 2, len(way) + STEPS // 2)
+        up = (
+            stretch.world_from_agent[middle, 1:2, :3]
+            @ np.swapaxes(stretch.agent_from_bone[middle, :, :3, 3], 1, 2)
+        )[:, 0]
+        clearance.append(scene.distance.at(torch.from_numpy(root[middle]).float()).numpy())
+        above.append(up.max(1))
+        pace.append(way)
+        travels.append(way > moving_m)
+        turn.append(
+            rigid.rotation_angle(stretch.world_from_agent[:-1, :3, :3], stretch.world_from_agent[1:, :3, :3])
+        )
+    kept = np.concatenate(travels)
+    kept = kept if kept.any() else ~kept
+    found = (float(np.median(np.concatenate(each)[kept])) for each in (clearance, pace, above))
+    clearance_m, pace_m, above_m = found
+    turn_rad = max(float(np.percentile(np.concatenate(turn), 99)), np.pi / RATE_HZ)
+    return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)
+
+
+def _stacked(frames: list[BodyMotion]) -> BodyMotion:
+    return BodyMotion(
+        np.stack([each.world_from_agent for each in frames]),
+        np.stack([each.agent_from_bone for each in frames]),
+    )
+
+
+def _where(first: np.ndarray, one: BodyMotion, other: BodyMotion) -> BodyMotion:
+    roots = np.where(first, one.world_from_agent, other.world_from_agent)
+    return BodyMotion(roots, np.where(first[..., None], one.agent_from_bone, other.agent_from_bone))

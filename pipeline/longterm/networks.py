@@ -1,0 +1,378 @@
+"""The networks of long-term motion: bodies at sub-goals, routes between them, poses along routes (paper 002,
+Sec. 3).
+
+All speak in a clip's frame: heading and position of its first body, +y up. `t` is the root's position in
+metres, `r` its rotation by its first two columns, `p` the pose by `pipeline.longterm.bodies.PoseSpace`.
+RouteNet, PoseNet and BaseNet say how far the truth lies from the straight line between start and end; at both
+ends that is nothing, so that short motions join without seams.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pipeline.geometry import rigid_torch
+from pipeline.longterm import local_scene
+from pipeline.longterm.bodies import LEVER_M
+from pipeline.longterm.config import LongTermSizes
+from pipeline.longterm.local_scene import LocalScene
+from pipeline.longterm.short_motions import RATE_HZ, STEPS
+
+ROOT_CHANNELS = 9
+"""t and r together"""
+REACH_M = 1.5
+"""scene points of a clip come from this far around the middle between start and end"""
+BODY_REACH_M = 0.8
+"""scene points of a static body come from this far around it"""
+
+IDLE_M_S = 0.1
+"""a body slower than this hardly counts as on the move"""
+
+
+class PointNet(nn.Module):
+    """A code for a set of points: shared layers, then the maximum (no transformation nets, as in
+    the paper).
+    """
+
+    def __init__(self, code: int, sees_scene: bool = True):
+        super().__init__()
+        self.sees_scene, self.code = sees_scene, code
+        self.layers = (
+            nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 64), nn.ReLU(), nn.Linear(64, code))
+            if sees_scene
+            else None
+        )
+
+    def forward(self, points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch code"]:
+        if not self.sees_scene:
+            return points.new_zeros(len(points), self.code)
+        return self.layers(points).amax(1)
+
+
+class ResidualBlock(nn.Module):
+    """Two linear layers and what came in."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(width, width), nn.LeakyReLU(0.2), nn.Linear(width, width), nn.LeakyReLU(0.2)
+        )
+
+    def forward(self, x: Float[Tensor, "batch width"]) -> Float[Tensor, "batch width"]:
+        return x + self.layers(x)
+
+
+class StaticBody(nn.Module):
+    """A conditional VAE of bodies at a place: (t, r, p) given shape, clearance, orientation and scene points
+    (Sec. 3.2).
+    """
+
+    def __init__(self, sizes: LongTermSizes):
+        super().__init__()
+        self.sizes = sizes
+        body, width = ROOT_CHANNELS + sizes.pose, sizes.width
+        self.point_net = PointNet(sizes.scene)
+        self.condition = nn.Sequential(nn.Linear(sizes.scene + sizes.shape + 7, width), nn.LeakyReLU(0.2))
+        self.encoder_in = nn.Linear(body, width)
+        self.encoder = nn.Sequential(ResidualBlock(width), ResidualBlock(width))
+        self.encoder_out = nn.Sequential(
+            nn.Linear(2 * width, width), nn.LeakyReLU(0.2), nn.Linear(width, 2 * sizes.latent)
+        )
+        self.decoder_in = nn.Linear(sizes.latent + width, width)
+        self.decoder = nn.Sequential(ResidualBlock(width), ResidualBlock(width))
+        self.decoder_out = nn.Linear(width, body)
+
+    def given(
+        self,
+        place: Float[Tensor, "batch 7"],
+        shape: Float[Tensor, "batch shape"],
+        points: Float[Tensor, "batch point 3"],
+    ) -> Float[Tensor, "batch width"]:
+        """Encode the condition: ``place`` is the clearance above the scene and r, in the body's own heading
+        frame.
+        """
+        return self.condition(torch.cat([self.point_net(points), shape, place], dim=-1))
+
+    def encode(
+        self, body: Float[Tensor, "batch channel"], given: Float[Tensor, "batch width"]
+    ) -> tuple[Tensor, Tensor]:
+        """Return mean and log variance of z."""
+        features = self.encoder(self.encoder_in(body))
+        return self.encoder_out(torch.cat([features, given], dim=-1)).chunk(2, dim=-1)
+
+    def decode(
+        self, z: Float[Tensor, "batch latent"], given: Float[Tensor, "batch width"]
+    ) -> Float[Tensor, "batch channel"]:
+        """Return a body: t and r in the heading frame of its place, p."""
+        out = self.decoder_out(self.decoder(self.decoder_in(torch.cat([z, given], dim=-1))))
+        upright = out.new_tensor([0.0, 0, 0, 1, 0, 0, 0, 1, 0])
+        return torch.cat([out[:, :ROOT_CHANNELS] * 0.1 + upright, out[:, ROOT_CHANNELS:]], dim=-1)
+
+
+class InbetweenNet(nn.Module):
+    """What RouteNet, PoseNet and BaseNet share: a bi-LSTM over start and end, the scene's code, two linear
+    layers.
+    """
+
+    def __init__(self, channels: int, extra: int, sizes: LongTermSizes, sees_scene: bool):
+        super().__init__()
+        self.point_net = PointNet(sizes.scene, sees_scene)
+        self.lstm = nn.LSTM(3 * channels + extra + 2, sizes.hidden, batch_first=True, bidirectional=True)
+        self.out = nn.Sequential(
+            nn.Linear(2 * sizes.hidden + sizes.scene, sizes.width),
+            nn.ReLU(),
+            nn.Linear(sizes.width, channels),
+        )
+
+    def forward(
+        self,
+        start: Float[Tensor, "batch channel"],
+        end: Float[Tensor, "batch channel"],
+        points: Float[Tensor, "batch point 3"],
+        extra: Float[Tensor, "batch frame extra"] | None = None,
+        coarse: Float[Tensor, "batch frame channel"] | None = None,
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return the channels of all k + 1 frames, those of start and end at the ends: what is added to a
+        draft, or to the line.
+        """
+        share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)[None, :, None].expand(
+            len(start), -1, 1
+        )
+        line = torch.lerp(start[:, None], end[:, None], share)
+        both = torch.cat([start, end], dim=-1)[:, None].expand(-1, STEPS + 1, -1)
+        parts = [line, both, share, 4 * share * (1 - share)] + ([] if extra is None else [extra])
+        features, _ = self.lstm(torch.cat(parts, dim=-1))
+        code = self.point_net(points)[:, None].expand(-1, STEPS + 1, -1)
+        return (line if coarse is None else coarse) + end_window(line) * self.out(
+            torch.cat([features, code], dim=-1)
+        )
+
+
+class CoarseToFine(nn.Module):
+    """A draft made without the scene, and its correction, made knowing what is beside each frame of the
+    draft.
+
+    Distances beside the way that would be gone say what bends it; a code of all points around leaves that to
+    be found.
+    """
+
+    def __init__(self, channels: int, extra: int, sizes: LongTermSizes, sees_scene: bool):
+        super().__init__()
+        self.sees_scene = sees_scene
+        self.coarse = InbetweenNet(channels, extra, sizes, False)
+        smaller = replace(sizes, hidden=max(1, 2 * sizes.hidden // 3))
+        self.fine = InbetweenNet(
+            channels, local_scene.READ_CHANNELS + channels + 2 * ROOT_CHANNELS, smaller, False
+        )
+
+    def stages(
+        self,
+        start: Float[Tensor, "batch channel"],
+        end: Float[Tensor, "batch channel"],
+        seen: LocalScene,
+        extra: Float[Tensor, "batch frame extra"] | None = None,
+    ) -> list[Float[Tensor, "batch frame channel"]]:
+        """Return the draft and what it becomes, with r orthonormal."""
+        coarse = orthonormalized(self.coarse(start, end, seen.points, extra))
+        still = coarse.detach()
+        read = (
+            local_scene.read_distances(seen.field, still[..., :3])
+            if self.sees_scene
+            else still.new_zeros(*still.shape[:2], local_scene.READ_CHANNELS)
+        )
+        known = torch.cat([read, still, with_velocity(still[..., :ROOT_CHANNELS])], dim=-1)
+        return [coarse, orthonormalized(self.fine(start, end, seen.points, known, still))]
+
+
+def end_window(like: Float[Tensor, "batch frame channel"]) -> Float[Tensor, "frame 1"]:
+    """Return a factor for every frame of a short motion that is 0 at both ends and near 1 from a tenth of a
+    second on.
+    """
+    share = torch.linspace(0, 1, STEPS + 1, dtype=like.dtype, device=like.device)[:, None]
+    return torch.tanh(STEPS / 3 * share) * torch.tanh(STEPS / 3 * (1 - share))
+
+
+def orthonormalized(channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch channel"]:
+    """Make the columns of r orthonormal."""
+    r = rigid_torch.rotation_to_6d(rigid_torch.rotation_from_6d(channels[..., 3:ROOT_CHANNELS]))
+    return torch.cat([channels[..., :3], r, channels[..., ROOT_CHANNELS:]], dim=-1)
+
+
+class RouteNet(nn.Module):
+    """Positions and orientations between start and end (Eq. 1); or positions alone, orientations being left
+    to PoseNet.
+
+    Beyond the paper it also sees the poses at both ends, which indicate whether the body is on the move, and
+    corrects a draft by the distances beside it; as in the paper, by a code of the scene's points alone, if
+    ``blind``.
+    """
+
+    def __init__(
+        self,
+        sizes: LongTermSizes,
+        *,
+        sees_scene: bool = True,
+        predicts_rotation: bool = True,
+        blind: bool = False,
+    ):
+        super().__init__()
+        self.predicts_rotation, self.blind, self.sees_scene = predicts_rotation, blind, sees_scene
+        self.between = (
+            InbetweenNet(ROOT_CHANNELS, 0, sizes, sees_scene)
+            if blind
+            else CoarseToFine(ROOT_CHANNELS, 2 * sizes.pose, sizes, sees_scene)
+        )
+
+    def stages(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
+    ) -> list[Float[Tensor, "batch frame 9"]]:
+        """Return the routes that are made one after the other, the last of which counts."""
+        first, last = start[:, :ROOT_CHANNELS], end[:, :ROOT_CHANNELS]
+        if self.blind:
+            routes = [orthonormalized(self.between(first, last, seen.points))]
+        else:
+            poses = torch.cat([start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:]], -1)[:, None].expand(
+                -1, STEPS + 1, -1
+            )
+            routes = self.between.stages(first, last, seen, poses)
+        if self.predicts_rotation:
+            return routes
+        share = torch.linspace(0, 1, STEPS + 1, device=first.device)[None, :, None]
+        straight = torch.lerp(first[:, None, 3:], last[:, None, 3:], share)
+        return [orthonormalized(torch.cat([route[..., :3], straight], dim=-1)) for route in routes]
+
+    def forward(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
+    ) -> Float[Tensor, "batch frame 9"]:
+        """Return t and r of all frames; r on the straight line between the ends where the network does not
+        turn.
+        """
+        return self.stages(start, end, seen)[-1]
+
+
+class GaitPhase(nn.Module):
+    """The poses of both ends, each taken along the route as a gait takes it: around and around with the way
+    and the time on the move.
+
+    A pose is read as ``waves`` complex numbers that turn at learned rates; products of pose and phase are
+    what an LSTM learns slowly, and without them feet glide between the ends.
+    """
+
+    def __init__(self, pose: int, waves: int = 16):
+        super().__init__()
+        self.code = nn.Linear(pose, 2 * waves)
+        step = torch.linspace(0, 1, waves)
+        self.rate = nn.Parameter(
+            2 * torch.pi * torch.stack([0.4 + 2 * step, 0.4 + 2 * ((7 * step) % 1), 0 * step], dim=-1)
+        )
+
+    @property
+    def channels(self) -> int:
+        """How many numbers a frame gets."""
+        return 2 * self.code.out_features
+
+    def forward(
+        self,
+        start: Float[Tensor, "batch pose"],
+        end: Float[Tensor, "batch pose"],
+        route: Float[Tensor, "batch frame 9"],
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return start turned forward and end turned backward."""
+        phase = gait_progress(route) @ self.rate.T
+        return torch.cat([self._turned(start, phase), self._turned(end, phase - phase[:, -1:])], dim=-1)
+
+    def _turned(
+        self, pose: Float[Tensor, "batch pose"], phase: Float[Tensor, "batch frame wave"]
+    ) -> Float[Tensor, "batch frame channel"]:
+        real, imaginary = self.code(pose)[:, None].chunk(2, dim=-1)
+        cosine, sine = torch.cos(phase), torch.sin(phase)
+        return torch.cat([real * cosine - imaginary * sine, real * sine + imaginary * cosine], dim=-1)
+
+
+class PoseNet(nn.Module):
+    """Poses between start and end along a route (Eq. 2); blind to the route, or also turning the body, as
+    variants.
+
+    Beyond the paper it carries the poses of both ends along the route (`GaitPhase`); not where ``strides`` is
+    false.
+    """
+
+    def __init__(
+        self,
+        sizes: LongTermSizes,
+        *,
+        sees_scene: bool = True,
+        follows_route: bool = True,
+        predicts_rotation: bool = False,
+        strides: bool = True,
+    ):
+        super().__init__()
+        self.follows_route, self.predicts_rotation = follows_route, predicts_rotation
+        self.strides = GaitPhase(sizes.pose) if follows_route and strides else None
+        extra = 2 * ROOT_CHANNELS * follows_route + (self.strides.channels if self.strides is not None else 0)
+        self.between = InbetweenNet(sizes.pose + (6 if predicts_rotation else 0), extra, sizes, sees_scene)
+        self.short = nn.Linear(self.strides.channels, sizes.pose) if self.strides is not None else None
+
+    def forward(
+        self,
+        start: Float[Tensor, "batch pose"],
+        end: Float[Tensor, "batch pose"],
+        route: Float[Tensor, "batch frame 9"],
+        points: Float[Tensor, "batch point 3"],
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return t, r and p of all frames: the route's, with the poses and, as a variant, the turns."""
+        if self.predicts_rotation:
+            start, end = torch.cat([route[:, 0, 3:], start], -1), torch.cat([route[:, -1, 3:], end], -1)
+        if self.strides is None:
+            made = self.between(start, end, points, with_velocity(route) if self.follows_route else None)
+        else:
+            carried = self.strides(start, end, route)
+            made = self.between(start, end, points, torch.cat([with_velocity(route), carried], dim=-1))
+            made = made + end_window(made) * self.short(carried)
+        if self.predicts_rotation:
+            return orthonormalized(torch.cat([route[..., :3], made], dim=-1))
+        return torch.cat([route, made], dim=-1)
+
+
+def with_velocity(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 18"]:
+    """Return a route with its change per tenth of a second, the velocity in the body's own axes."""
+    rate = functional.pad(route[:, 1:] - route[:, :-1], (0, 0, 0, 1), mode="replicate") * (STEPS / 20)
+    own = rigid_torch.rotation_from_6d(route[..., 3:]).transpose(-1, -2)
+    return torch.cat([route, (own @ rate[..., :3, None])[..., 0], rate[..., 3:]], dim=-1)
+
+
+def gait_progress(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 3"]:
+    """Return how far a gait has come since the start: metres gone, seconds on the move, and turns of the
+    heading.
+    """
+    gone = (route[:, 1:, :3] - route[:, :-1, :3])[..., [0, 2]].norm(dim=-1)
+    ahead = rigid_torch.rotation_from_6d(route[..., 3:])[..., 2]
+    turned = (ahead[:, 1:] - ahead[:, :-1]).norm(dim=-1)
+    drive = RATE_HZ * (gone + LEVER_M * turned)
+    steps = torch.stack([gone, drive / (drive + IDLE_M_S) / RATE_HZ, turned], dim=-1)
+    return functional.pad(steps.cumsum(1), (0, 0, 1, 0))
+
+
+class BaseNet(nn.Module):
+    """Route and poses from one network (ablation), which also corrects its draft by the distances
+    beside it.
+    """
+
+    def __init__(self, sizes: LongTermSizes, *, sees_scene: bool = True):
+        super().__init__()
+        self.between = CoarseToFine(ROOT_CHANNELS + sizes.pose, 0, sizes, sees_scene)
+
+    def stages(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
+    ) -> list[Float[Tensor, "batch frame channel"]]:
+        """Return the motions that are made one after the other, the last of which counts."""
+        return self.between.stages(start, end, seen)
+
+    def forward(
+        self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
+    ) -> Float[Tensor, "batch frame channel"]:
+        """Return t, r and p of all frames."""
+        return self.stages(start, end, seen)[-1]

@@ -1,0 +1,142 @@
+"""Motion at 30 fps and its 2-second pieces, in which long-term motion is learned and made.
+
+`BodyMotion` is a stretch of motion of one body; `resample_motion` brings a trajectory to 30 fps (spline on
+positions, slerp on rotations), `stretches` cuts it where frames are missing; `smooth_seams` smooths where
+short motions were `concatenate_motions`, `limit_turn_rate` takes the time for a turn that an animal needs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from pipeline.behavior.trajectories import Trajectory
+from pipeline.geometry import rigid
+
+RATE_HZ = 30
+STEPS = 60
+"""k of the paper: a short motion has k + 1 frames, the first and the last of which are given"""
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """Consecutive frames of one body at one rate."""
+
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.world_from_agent)
+
+    def __getitem__(self, frames: slice | np.ndarray) -> "BodyMotion":
+        """Return some of the frames."""
+        return BodyMotion(self.world_from_agent[frames], self.agent_from_bone[frames])
+
+
+def concatenate_motions(parts: Sequence[BodyMotion]) -> BodyMotion:
+    """Put stretches one after the other; frames in which one ends and the next begins count once."""
+    first, *rest = parts
+    kept = [first, *(part[1:] for part in rest)]
+    return BodyMotion(
+        np.concatenate([part.world_from_agent for part in kept]),
+        np.concatenate([part.agent_from_bone for part in kept]),
+    )
+
+
+def jump_between_levels(motion: BodyMotion, hop_m: float = 0.08) -> BodyMotion:
+    """Let a motion that ends on another level go up before it goes across, or down after: straight, it would
+    go through the edge.
+    """
+    share, (start, end) = np.linspace(0, 1, len(motion)), motion.world_from_agent[[0, -1], :3, 3]
+    early, late = (_smoothstep(share, *span) for span in ((0.2, 0.55), (0.45, 0.8)))
+    upward, across = (early, late) if end[1] > start[1] else (late, early)
+    roots = motion.world_from_agent.copy()
+    roots[:, :3, 3] = start + np.stack([across, upward, across], axis=-1) * (end - start)
+    roots[:, 1, 3] += hop_m * _smoothstep(share, 0.2, 0.45) * (1 - _smoothstep(share, 0.55, 0.8))
+    return BodyMotion(roots, motion.agent_from_bone)
+
+
+def _smoothstep(share: Float[np.ndarray, "frame"], low: float, high: float) -> Float[np.ndarray, "frame"]:
+    part = np.clip((share - low) / (high - low), 0, 1)
+    return part * part * (3 - 2 * part)
+
+
+def smooth_seams(motion: BodyMotion, every: int = STEPS, reach: int = 6) -> BodyMotion:
+    """Take the snap out of the seams at every ``every``-th frame: the ``reach`` frames on both sides lead
+    there evenly.
+
+    Each short motion ends in a body that was made without it, and turns to it within its last frames.
+    """
+    frame, last = np.arange(len(motion)), (len(motion) - 1) // every - 1
+    if last < 1:
+        return motion
+    seam = np.clip(np.round(frame / every), 1, last) * every
+    away = np.abs(frame - seam)
+    kept = np.flatnonzero((away == 0) | (away > reach))
+    bones = [
+        _interpolate(kept, motion.agent_from_bone[kept, bone], frame)
+        for bone in range(motion.agent_from_bone.shape[1])
+    ]
+    return BodyMotion(_interpolate(kept, motion.world_from_agent[kept], frame), np.stack(bones, axis=1))
+
+
+def limit_turn_rate(motion: BodyMotion, most_rad: float) -> BodyMotion:
+    """Spread turns of the root that are faster than ``most_rad`` a frame over the frames before and after;
+    positions and poses stay.
+
+    Asked to face about within two seconds, networks that give orientations as two vectors flip within a frame
+    or two.
+    """
+    rotation = Rotation.from_matrix(motion.world_from_agent[:, :3, :3])
+    turned = np.concatenate([[0.0], np.cumsum((rotation[:-1].inv() * rotation[1:]).magnitude())])
+    frame = np.arange(len(motion))
+    ramp = max(most_rad, turned[-1] / max(len(motion) - 1, 1)) * frame
+    late, early = (
+        np.minimum.accumulate(turned - ramp) + ramp,
+        np.maximum.accumulate((turned - ramp)[::-1])[::-1] + ramp,
+    )
+    wanted = np.clip((late + early) / 2, turned[-1] - ramp[::-1], ramp)
+    roots = motion.world_from_agent.copy()
+    roots[:, :3, :3] = Slerp(frame, rotation)(np.interp(wanted, turned + 1e-9 * frame, frame)).as_matrix()
+    return BodyMotion(roots, motion.agent_from_bone)
+
+
+def resample_motion(
+    timestamp_s: Float[np.ndarray, "frame"], moving: BodyMotion, rate_hz: float = RATE_HZ
+) -> BodyMotion:
+    """Bring motion to an even rate: cubic spline on positions, slerp on rotations; roots and bones alike."""
+    count = int(np.floor((timestamp_s[-1] - timestamp_s[0]) * rate_hz + 1e-6)) + 1
+    query_s = np.minimum(timestamp_s[0] + np.arange(count) / rate_hz, timestamp_s[-1])
+    bones = [
+        _interpolate(timestamp_s, moving.agent_from_bone[:, bone], query_s)
+        for bone in range(moving.agent_from_bone.shape[1])
+    ]
+    return BodyMotion(_interpolate(timestamp_s, moving.world_from_agent, query_s), np.stack(bones, axis=1))
+
+
+def stretches(trajectory: Trajectory, shortest_s: float = STEPS / RATE_HZ) -> list[BodyMotion]:
+    """Return every uninterrupted stretch of a trajectory that is long enough, at 30 fps."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], trajectory.valid, [False]]).astype(np.int8)))
+    found = []
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        when = trajectory.timestamp_s[start:end]
+        if len(when) > 2 and when[-1] - when[0] >= shortest_s - 1e-6:
+            found.append(
+                resample_motion(
+                    when,
+                    BodyMotion(trajectory.world_from_agent[start:end], trajectory.agent_from_bone[start:end]),
+                )
+            )
+    return found
+
+
+def _interpolate(
+    timestamp_s: np.ndarray, a_from_b: Float[np.ndarray, "frame 4 4"], query_s: np.ndarray
+) -> Float[np.ndarray, "sample 4 4"]:
+    rotation = Slerp(timestamp_s, Rotation.from_matrix(np.asarray(a_from_b[:, :3, :3], np.float64)))(
+        query_s
+    ).as_matrix()
+    return rigid.make(rotation, CubicSpline(timestamp_s, a_from_b[:, :3, 3])(query_s))

@@ -1,0 +1,95 @@
+"""People as bodies: SMPL-X through the `smplx` package, for those who have its model files.
+
+`smplx_body` gives the surface of one person, its joints as bones; `motion_from_parameters` turns recorded
+SMPL-X parameters into motion of that body. Corrective blend shapes and faces are left out: skinning alone
+moves the surface.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from pipeline.core.errors import InputError
+from pipeline.data import npz
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
+from pipeline.longterm.bodies import SkinnedBody
+from pipeline.longterm.short_motions import BodyMotion
+
+SHAPES = 10
+"""betas of the paper"""
+
+
+@dataclass(frozen=True)
+class Person:
+    """A body and the tree of its joints."""
+
+    body: SkinnedBody
+    parent: Int[np.ndarray, "bone"]
+    """bone above each; -1 of the pelvis"""
+
+
+def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> Person:
+    """Read an SMPL-X model file (npz) and shape it. The agent frame is the pelvis at rest, +y up, +z ahead.
+
+    Raises InputError LTM-003 where the package is missing, LTM-004 where the file is, or is none of SMPL-X.
+    """
+    try:
+        from smplx import SMPLXLayer
+        from smplx.lbs import blend_shapes, vertices2joints
+    except ImportError as error:
+        remedy = "install it beside the others: .venv/bin/pip install --no-deps smplx"
+        raise InputError("LTM-003", "SMPL-X bodies need the package smplx", str(model), remedy) from error
+    if not model.is_file():
+        raise InputError(
+            "LTM-004",
+            "there is no such SMPL-X model",
+            str(model),
+            "get SMPLX_NEUTRAL.npz from its authors' site",
+        )
+    npz.load(model, ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs"))
+    try:
+        layer = SMPLXLayer(str(model), ext="npz", num_betas=SHAPES, use_pca=False)
+    except (KeyError, AttributeError, ValueError, RuntimeError, AssertionError, IndexError) as error:
+        raise InputError(
+            "LTM-004", f"not a model of SMPL-X: {error!r}", str(model), "give SMPLX_NEUTRAL.npz as it came"
+        ) from error
+    shape = np.zeros(SHAPES) if betas is None else np.asarray(betas, float)[:SHAPES]
+    with torch.no_grad():
+        known = layer.shapedirs[:, :, : len(shape)]
+        surface = layer.v_template[None] + blend_shapes(torch.from_numpy(shape).to(known)[None], known)
+        joints = vertices2joints(layer.J_regressor, surface)[0].double().numpy()
+    vertices = surface[0].numpy() - joints[0].astype(np.float32)
+    rest = rigid.make(np.eye(3)[None], joints - joints[0])
+    mesh = Mesh(vertices, np.asarray(layer.faces, np.int32))
+    parent = layer.parents.numpy().astype(np.int64).copy()
+    parent[0] = -1
+    return Person(SkinnedBody(mesh, layer.lbs_weights.double().numpy(), rest, shape), parent)
+
+
+def motion_from_parameters(
+    person: Person,
+    transl: Float[np.ndarray, "frame 3"],
+    global_orient: Float[np.ndarray, "frame 3"],
+    pose: Float[np.ndarray, "frame 3*joint"],
+) -> BodyMotion:
+    """Return motion of SMPL-X parameters: rotation vectors of the pelvis and of the joints after it, as many
+    as there are.
+
+    SMPL-X turns a body about its pelvis at rest, which stands away from its origin: the root carries both.
+    """
+    frames, rest = len(transl), person.body.agent_from_bone_rest
+    turn = np.zeros((frames, len(rest), 3))
+    given = np.asarray(pose, float).reshape(frames, -1, 3)
+    turn[:, 1 : 1 + given.shape[1]] = given
+    local = rigid.rotation_from_vector(turn)
+    bones = np.broadcast_to(np.eye(4), (frames, len(rest), 4, 4)).copy()
+    for bone in range(1, len(rest)):
+        above = person.parent[bone]
+        offset = rest[bone, :3, 3] - rest[above, :3, 3]
+        bones[:, bone] = bones[:, above] @ rigid.make(local[:, bone], np.broadcast_to(offset, (frames, 3)))
+    root = rigid.make(rigid.rotation_from_vector(np.asarray(global_orient, float)), np.asarray(transl, float))
+    return BodyMotion(root, bones)

@@ -1,0 +1,156 @@
+"""Depth scans against a surface: point-to-plane correspondences for `pipeline.mapping.pose_optimization`.
+
+`scan` subsamples a depth image to points with their noise; `SurfaceMap` pairs them with the nearest surface.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.geometry import cameras, rigid, subsampling
+from pipeline.geometry.meshes import Mesh
+from pipeline.mapping.pose_optimization import MAP, Correspondences
+
+NOISE_M, NOISE_SHARE = 0.008, 0.004
+"""Noise of phone LiDAR: 8 mm and 0.4 % of the depth, metres."""
+FURTHEST_M = 4.5
+"""LiDAR of phones is not metric beyond, metres."""
+NEAREST_M = 0.1
+"""Depth below this is none, metres."""
+STEP_M, STEP_SHARE = 0.05, 0.05
+"""A pixel whose neighbour differs by more than this (metres and share of the depth) bounds a surface and is
+not used."""
+NORMAL_JUMP_M, NORMAL_JUMP_SHARE = 0.05, 0.06
+"""The same over the span of `image_normals`."""
+QUERY_REACH = 1.5
+"""The nearest vertex may be farther than the plane through it: search radius over reach."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Points that one frame measured, in camera axes, and their standard deviation along any direction."""
+
+    points_camera: Float[np.ndarray, "point 3"]
+    sigma_m: Float[np.ndarray, "point"]
+    pixel_index: Int[np.ndarray, "point"]
+    """Row-major index into the depth image."""
+
+    def subsampled(self, most: int) -> "Scan":
+        """Keep at most so many points, evenly over the picture."""
+        chosen = subsampling.evenly(len(self.sigma_m), most)
+        return Scan(self.points_camera[chosen], self.sigma_m[chosen], self.pixel_index[chosen])
+
+
+def depth_noise(depth_m: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    """Return the standard deviation of phone LiDAR at a depth, metres."""
+    return NOISE_M + NOISE_SHARE * depth_m
+
+
+def image_normals(
+    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4
+) -> Float[np.ndarray, "height width 3"]:
+    """Return unit normals towards the camera from central differences over ``span_px``; zero at edges and
+    unknown depth.
+    """
+    points = cameras.back_project(depth, intrinsics)
+    normals = np.zeros_like(points)
+    inner = slice(span_px, -span_px)
+    right = points[inner, 2 * span_px :] - points[inner, : -2 * span_px]
+    down = points[2 * span_px :, inner] - points[: -2 * span_px, inner]
+    cross = np.cross(down, right)
+    length = np.linalg.norm(cross, axis=-1)
+    centre = depth[inner, inner]
+    limit = NORMAL_JUMP_M + NORMAL_JUMP_SHARE * centre
+    known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
+    for shifted in (
+        depth[inner, 2 * span_px :],
+        depth[inner, : -2 * span_px],
+        depth[2 * span_px :, inner],
+        depth[: -2 * span_px, inner],
+    ):
+        known &= shifted > 0
+    normals[inner, inner] = np.where(known[..., None], cross / np.maximum(length, 1e-9)[..., None], 0)
+    return normals
+
+
+def scan(
+    depth: Float[np.ndarray, "height width"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    *,
+    stride: int,
+    confidence: UInt8[np.ndarray, "height width"] | None = None,
+    ignore: Bool[np.ndarray, "height width"] | None = None,
+    furthest_m: float = FURTHEST_M,
+) -> Scan:
+    """Keep one pixel in ``stride`` each way where depth (metres) is known, of confidence >= 1 and away from
+    depth edges."""
+    usable = (depth > NEAREST_M) & (depth < furthest_m)
+    if confidence is not None:
+        usable &= confidence >= 1
+    if ignore is not None:
+        usable &= ~ignore
+    step = np.maximum(
+        np.abs(np.diff(depth, axis=0, append=depth[-1:])),
+        np.abs(np.diff(depth, axis=1, append=depth[:, -1:])),
+    )
+    usable &= step < STEP_M + STEP_SHARE * depth
+    offset = stride // 2
+    grid = np.zeros_like(usable)
+    grid[offset::stride, offset::stride] = True
+    index = np.flatnonzero(usable & grid)
+    points = cameras.back_project(depth, intrinsics).reshape(-1, 3)[index]
+    return Scan(points, depth_noise(points[:, 2]), index)
+
+
+class SurfaceMap:
+    """A mesh's vertices and normals, ready for nearest-neighbour queries."""
+
+    def __init__(self, mesh: Mesh):
+        normals = mesh.vertex_normals()
+        used = np.linalg.norm(normals, axis=1) > 0.5
+        self.points_world, self.normals_world = np.asarray(mesh.vertices, float)[used], normals[used]
+        self._tree = KDTree(self.points_world)
+
+    def correspondences(
+        self,
+        frames: Int[np.ndarray, "scan"],
+        scans: list[Scan],
+        world_from_camera: Float[np.ndarray, "frame 4 4"],
+        reach_m: float,
+        inflation: float = 1.0,
+    ) -> Correspondences:
+        """Pair every scanned point with the nearest vertex within reach (metres) whose normal faces the
+        camera, point to plane.
+
+        ``inflation`` multiplies the depth noise, since neighbouring pixels err together.
+        """
+        first = np.repeat(frames, [len(scan.points_camera) for scan in scans])
+        points = np.concatenate([scan.points_camera for scan in scans])
+        sigma = np.concatenate([scan.sigma_m for scan in scans])
+        world = np.concatenate(
+            [
+                rigid.apply(world_from_camera[frame], scan.points_camera)
+                for frame, scan in zip(frames, scans, strict=True)
+            ]
+        )
+        distance, nearest = self._tree.query(world, distance_upper_bound=QUERY_REACH * reach_m)
+        matched = np.flatnonzero(np.isfinite(distance))
+        nearest, first, world = nearest[matched], first[matched], world[matched]
+        normal = self.normals_world[nearest]
+        facing = np.einsum("ci,ci->c", normal, world_from_camera[first, :3, 3] - world) > 0
+        matched, nearest, first, normal = matched[facing], nearest[facing], first[facing], normal[facing]
+        return Correspondences(
+            first,
+            np.full(len(matched), MAP),
+            points[matched],
+            self.points_world[nearest],
+            normal,
+            inflation * sigma[matched],
+        )
+
+    def distance(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
+        """Return the distance along the nearest normal, negative behind the surface, metres."""
+        _, nearest = self._tree.query(points_world)
+        return np.einsum("pi,pi->p", points_world - self.points_world[nearest], self.normals_world[nearest])

@@ -1,0 +1,234 @@
+"""Optimize camera poses by correspondences and relative poses: one sparse, robust Gauss-Newton for maps and
+sessions.
+
+A correspondence pairs a point seen by one camera with a point seen by another, or with one of the fixed map;
+its residual is their distance along one direction, so point-to-plane, point-to-line and point-to-point terms
+share one form. A relative pose factor is what odometry measured between two frames. Cost is linear in frames.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from pipeline.geometry import rigid
+
+MAP = -1
+"""Stands for the fixed map in ``Correspondences.second``; its points are in world axes."""
+LEAST_SIGMA = 0.001
+"""Deviation of odometry at zero time, radians and metres."""
+SHORTEST_S = 1e-3
+"""Least time between frames, seconds."""
+DAMPING = 1e-6
+"""Damping of a step, share of each diagonal element and of their mean; directions that nothing measures stay
+still."""
+PRIOR_PRECISION = 1e-9
+"""Added to the information so that frames that nothing holds have a finite covariance."""
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Pairs of points that should coincide along ``direction``; ``points_*`` in the axes of their camera (or
+    the map), metres."""
+
+    first: Int[np.ndarray, "match"]
+    second: Int[np.ndarray, "match"]
+    points_first: Float[np.ndarray, "match 3"]
+    points_second: Float[np.ndarray, "match 3"]
+    direction_world: Float[np.ndarray, "match 3"]
+    sigma_m: Float[np.ndarray, "match"]
+
+    @staticmethod
+    def join(*parts: "Correspondences") -> "Correspondences":
+        """Concatenate sets of correspondences."""
+        return Correspondences(
+            **{
+                field.name: np.concatenate([getattr(part, field.name) for part in parts])
+                for field in fields(Correspondences)
+            }
+        )
+
+
+@dataclass(frozen=True)
+class RelativePoseFactors:
+    """Measured relative motions ``first_from_second`` with their standard deviations (isotropic in each
+    part)."""
+
+    first: Int[np.ndarray, "edge"]
+    second: Int[np.ndarray, "edge"]
+    first_from_second: Float[np.ndarray, "edge 4 4"]
+    sigma_rad: Float[np.ndarray, "edge"]
+    sigma_m: Float[np.ndarray, "edge"]
+
+
+@dataclass(frozen=True)
+class OptimizedPoses:
+    """Optimized poses, and the correspondences of the last round with their residuals."""
+
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    correspondences: Correspondences
+    residual_m: Float[np.ndarray, "match"]
+
+
+def odometry_factors(
+    timestamp_s: Float[np.ndarray, "frame"],
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    *,
+    drift_rad_s: float,
+    drift_m_s: float,
+) -> RelativePoseFactors:
+    """Turn odometry into one factor per neighbouring pair; its deviations grow with the time between
+    (radians, metres)."""
+    first = np.arange(len(timestamp_s) - 1)
+    gap_s = np.maximum(np.diff(timestamp_s), SHORTEST_S)
+    first_from_second = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
+    return RelativePoseFactors(
+        first,
+        first + 1,
+        first_from_second,
+        drift_rad_s * gap_s + LEAST_SIGMA,
+        drift_m_s * gap_s + LEAST_SIGMA,
+    )
+
+
+def optimize_poses(
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    find_correspondences: Callable[[Float[np.ndarray, "frame 4 4"], float], Correspondences],
+    relative_poses: RelativePoseFactors | None,
+    *,
+    reach_m: tuple[float, ...],
+    fixed: Bool[np.ndarray, "frame"] | None = None,
+) -> OptimizedPoses:
+    """Minimise sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses; rho is Geman-McClure's of width
+    ``reach_m``.
+
+    Each round finds the correspondences anew within its reach (metres) and takes one Gauss-Newton step on the
+    right-hand twist of each camera. ``fixed`` frames stay where they are.
+    """
+    poses = np.array(world_from_camera, float)
+    free = np.ones(len(poses), bool) if fixed is None else ~fixed
+    for reach in reach_m:
+        correspondences = find_correspondences(poses, reach)
+        poses = poses @ rigid.exp(
+            _solve(*_normal_equations(poses, correspondences, relative_poses, reach), free)
+        )
+    correspondences = find_correspondences(poses, reach_m[-1])
+    return OptimizedPoses(poses, correspondences, residuals(poses, correspondences))
+
+
+def marginal_covariance(
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    correspondences: Correspondences,
+    relative_poses: RelativePoseFactors,
+    reach_m: float,
+) -> Float[np.ndarray, "frame 6 6"]:
+    """Return the marginal covariance of each camera's right-hand twist (rotation in radians, translation in
+    metres).
+
+    Diagonal blocks of the inverse Gauss-Newton matrix. Correspondences must be with the map and factors
+    between neighbours, so that the matrix is block tridiagonal and one forward and one backward pass suffice.
+    """
+    normal, _ = _normal_equations(world_from_camera, correspondences, relative_poses, reach_m)
+    blocks = sparse.bsr_array(normal, blocksize=(6, 6))
+    row = np.repeat(np.arange(len(world_from_camera)), np.diff(blocks.indptr))
+    assert (np.abs(row - blocks.indices) <= 1).all(), "contacts between cameras"
+    own, next_to = np.zeros((2, len(world_from_camera), 6, 6))
+    own[row[row == blocks.indices]] = blocks.data[row == blocks.indices]
+    next_to[row[row + 1 == blocks.indices]] = blocks.data[row + 1 == blocks.indices]
+    own = own + PRIOR_PRECISION * np.eye(6)
+    past, future = own.copy(), own.copy()
+    for frame in range(1, len(own)):
+        past[frame] -= next_to[frame - 1].T @ np.linalg.solve(past[frame - 1], next_to[frame - 1])
+        back = len(own) - 1 - frame
+        future[back] -= next_to[back] @ np.linalg.solve(future[back + 1], next_to[back].T)
+    return np.linalg.inv(past + future - own)
+
+
+def residuals(
+    world_from_camera: Float[np.ndarray, "frame 4 4"], correspondences: Correspondences
+) -> Float[np.ndarray, "match"]:
+    """Return the signed distance of each correspondence along its direction, metres."""
+    gap = _world(world_from_camera, correspondences.first, correspondences.points_first) - _world(
+        world_from_camera, correspondences.second, correspondences.points_second
+    )
+    return np.einsum("ci,ci->c", gap, correspondences.direction_world)
+
+
+def _normal_equations(poses, correspondences, relative_poses, reach):
+    """Return matrix and gradient of one Gauss-Newton step."""
+    jacobian, residual = _correspondence_rows(poses, correspondences)
+    robust = (reach**2 / (reach**2 + residual**2)) ** 2
+    weight = robust / correspondences.sigma_m**2
+    normal = (jacobian.T @ sparse.diags_array(weight) @ jacobian).tocsc()
+    gradient = jacobian.T @ (weight * residual)
+    if relative_poses is not None and len(relative_poses.first):
+        edge_jacobian, edge_residual = _edge_rows(poses, relative_poses)
+        normal = normal + edge_jacobian.T @ edge_jacobian
+        gradient = gradient + edge_jacobian.T @ edge_residual
+    return normal, gradient
+
+
+def _world(world_from_camera, index, points):
+    moved = (
+        np.einsum("cij,cj->ci", world_from_camera[index, :3, :3], points) + world_from_camera[index, :3, 3]
+    )
+    return np.where((index == MAP)[:, None], points, moved)
+
+
+def _correspondence_rows(poses, correspondences):
+    residual = residuals(poses, correspondences)
+    blocks, columns, rows = [], [], []
+    for index, points, sign in (
+        (correspondences.first, correspondences.points_first, 1.0),
+        (correspondences.second, correspondences.points_second, -1.0),
+    ):
+        row = np.flatnonzero(index != MAP)
+        direction = np.einsum("cij,ci->cj", poses[index[row], :3, :3], correspondences.direction_world[row])
+        blocks.append(sign * np.concatenate([np.cross(points[row], direction), direction], axis=1))
+        columns.append(index[row, None] * 6 + np.arange(6))
+        rows.append(np.repeat(row[:, None], 6, axis=1))
+    entries = [np.concatenate(part).ravel() for part in (blocks, rows, columns)]
+    return sparse.csr_array(
+        (entries[0], (entries[1], entries[2])), shape=(len(residual), 6 * len(poses))
+    ), residual
+
+
+def _edge_rows(poses, relative_poses):
+    second_from_first = rigid.inverse(relative_poses.first_from_second)
+    error = second_from_first @ rigid.inverse(poses[relative_poses.first]) @ poses[relative_poses.second]
+    whiten = 1.0 / np.stack([relative_poses.sigma_rad] * 3 + [relative_poses.sigma_m] * 3, axis=-1)
+    count = len(relative_poses.first)
+    row = np.broadcast_to(np.arange(6 * count).reshape(count, 6, 1), (count, 6, 6))
+    values = [
+        -_adjoint(second_from_first) * whiten[..., None],
+        np.broadcast_to(np.eye(6), (count, 6, 6)) * whiten[..., None],
+    ]
+    columns = [
+        np.broadcast_to(index[:, None, None] * 6 + np.arange(6), (count, 6, 6))
+        for index in (relative_poses.first, relative_poses.second)
+    ]
+    entries = (np.stack(values).ravel(), (np.stack([row, row]).ravel(), np.stack(columns).ravel()))
+    return sparse.csr_array(entries, shape=(6 * count, 6 * len(poses))), (rigid.log(error) * whiten).ravel()
+
+
+def _adjoint(a_from_b):
+    """Return the 6x6 map of twists (rotation, translation) from frame b to frame a."""
+    rotation, (x, y, z) = a_from_b[..., :3, :3], np.moveaxis(a_from_b[..., :3, 3], -1, 0)
+    zero = np.zeros_like(x)
+    hat = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+    adjoint = np.zeros((*x.shape, 6, 6))
+    adjoint[..., :3, :3] = adjoint[..., 3:, 3:] = rotation
+    adjoint[..., 3:, :3] = hat @ rotation
+    return adjoint
+
+
+def _solve(normal, gradient, free):
+    index = np.flatnonzero(np.repeat(free, 6))
+    part = sparse.csc_array(normal)[index][:, index]
+    damping = DAMPING * (part.diagonal() + part.diagonal().mean()) + np.finfo(float).tiny
+    step = np.zeros(len(gradient))
+    step[index] = spsolve((part + sparse.diags_array(damping)).tocsc(), -gradient[index])
+    return step.reshape(-1, 6)

@@ -1,0 +1,50 @@
+"""SIFT points with depth: described in the picture, lifted to camera axes, matched between frames."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.geometry import cameras
+
+RATIO = 0.8
+"""Ratio test: the best match must be this much nearer than the second (Lowe 2004)."""
+LEAST_NORM = 1e-6
+
+
+@dataclass(frozen=True)
+class SiftPoints:
+    """Points of one frame that have depth."""
+
+    descriptors: Float[np.ndarray, "point 128"]
+    """RootSIFT (Arandjelovic and Zisserman 2012)."""
+    points_camera: Float[np.ndarray, "point 3"]
+
+
+def sift_points(
+    gray: UInt8[np.ndarray, "height width"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    depth: Float[np.ndarray, "depth_height depth_width"],
+    depth_intrinsics: Float[np.ndarray, "3 3"],
+    most: int,
+) -> SiftPoints:
+    """Describe the ``most`` strongest points of a picture and keep those with depth (metres); pixels of one
+    camera centre."""
+    keypoints, descriptors = cv2.SIFT.create(most).detectAndCompute(gray, None)
+    if not keypoints:
+        return SiftPoints(np.zeros((0, 128), np.float32), np.zeros((0, 3)))
+    ray = cameras.unproject(np.array([point.pt for point in keypoints]) + 0.5, intrinsics)
+    z = cameras.read_depth(depth, depth_intrinsics, ray)
+    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), LEAST_NORM))
+    return SiftPoints(rooted[z > 0], (ray * z[:, None])[z > 0])
+
+
+def matches(first: SiftPoints, second: SiftPoints) -> Int[np.ndarray, "match 2"]:
+    """Return index pairs (first, second) of distinctive descriptors by the ratio test."""
+    if len(second.descriptors) < 2:
+        return np.zeros((0, 2), int)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    return np.array(
+        [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance], int
+    ).reshape(-1, 2)

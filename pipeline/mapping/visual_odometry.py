@@ -1,0 +1,182 @@
+"""Visual odometry with depth: optical flow pairs pixels, depth lifts them, a robust closed form gives the
+motion.
+
+`prepare_frame` resizes and lifts a frame, `relative_motion` compares two, `chain_motions` treats a whole
+recording that has no odometry of its own.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.geometry import align, cameras, rigid
+from pipeline.mapping import pose_optimization, sift
+
+HEIGHT_PX = 240
+"""Shorter side of the pictures that flow is computed on, pixels: DIS is fast there and still sub-pixel."""
+STRIDE_PX = 7
+"""One pixel in so many, each way, takes part."""
+AGREE_M = 0.03
+"""Point pairs within this agree, metres at 2 m depth; grows with depth as the noise does."""
+AGREE_DEPTH_M, NEAREST_SCALE = 2.0, 0.5
+"""Depth at which `AGREE_M` holds, metres, and the least factor on it for nearer points."""
+RANSAC_TRIPLETS = 100
+REFINE_ROUNDS = 5
+"""Reweighted closed forms after RANSAC; the weights have settled by then."""
+LEAST_PAIRS = 20
+"""Fewer pairs with depth give no motion."""
+NEAREST_M = 0.1
+"""Depth below this is none, metres."""
+LEAST_SHARE = 0.35
+"""Share of the pairs that must agree; below, the motion counts as unknown (a tracking jump)."""
+ENOUGH_SHARE = 0.7
+"""With this share no other explanation is searched."""
+SIGMA_RAD, SIGMA_M = float(np.deg2rad(0.25)), 0.008
+"""Standard deviations of one motion, radians and metres, measured on rendered sessions."""
+JUMP_INFLATION = 60.0
+"""The deviations of an unknown motion are so many times larger."""
+SIFT_FEATURES = 500
+"""SIFT points per picture where flow fails."""
+FAR_M = 1e3
+"""Depth that stands for unknown depth where the second picture is warped, metres."""
+CLAHE_CLIP, CLAHE_TILES = 4.0, (6, 8)
+"""Local contrast equalisation before flow: clip limit and tiles (columns, rows)."""
+
+
+@dataclass(frozen=True)
+class FlowFrame:
+    """A frame, ready to be compared."""
+
+    gray: UInt8[np.ndarray, "height width"]
+    points_camera: Float[np.ndarray, "height width 3"]
+    """Per pixel, metres; z = 0 where depth is unknown or masked."""
+    intrinsics: Float[np.ndarray, "3 3"]
+    """Of the picture at this size, pixels."""
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """A recording's own odometry, from its device or from its pictures."""
+
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"]
+    jumps: Bool[np.ndarray, "frame"]
+    """The motion from the frame before is unknown; False for the first."""
+    relative_poses: pose_optimization.RelativePoseFactors
+
+
+def prepare_frame(
+    color: UInt8[np.ndarray, "height width 3"],
+    depth: Float[np.ndarray, "depth_height depth_width"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    depth_intrinsics: Float[np.ndarray, "3 3"],
+    usable: Bool[np.ndarray, "height width"],
+) -> FlowFrame:
+    """Resize a frame for optical flow and lift its usable pixels; colour and depth (metres) share a
+    camera."""
+    scale = min(1.0, HEIGHT_PX / min(color.shape[:2]))
+    size = (round(color.shape[0] * scale), round(color.shape[1] * scale))
+    gray = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
+    scaled = cameras.scale_intrinsics(intrinsics, color.shape[:2], size)
+    rays = cameras.ray_directions(scaled, *size)
+    z = cameras.read_depth(depth, depth_intrinsics, rays)
+    keep = cv2.resize(usable.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    return FlowFrame(gray, rays * np.where(keep, z, 0)[..., None], scaled)
+
+
+def relative_motion(
+    first: FlowFrame,
+    second: FlowFrame,
+    rng: np.random.Generator,
+    last_motion: Float[np.ndarray, "4 4"] | None = None,
+) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Return ``first_from_second`` and the share of the pairs that agree with it; the identity and 0 without
+    pairs.
+
+    Flow starts from the last motion, since phones move steadily and floors repeat. Where that explains
+    little, it starts from no motion and from matched SIFT points, which survive large turns; the best
+    explanation wins.
+    """
+    best = _motion_from_guess(first, second, np.eye(4) if last_motion is None else last_motion, rng)
+    guesses: list[Callable[[], np.ndarray]] = [] if last_motion is None else [lambda: np.eye(4)]
+    for guess in [*guesses, lambda: _motion_from_sift(first, second, rng)]:
+        if best[1] >= ENOUGH_SHARE:
+            break
+        best = max(best, _motion_from_guess(first, second, guess(), rng), key=lambda each: each[1])
+    return best
+
+
+def _motion_from_guess(first, second, guess, rng):
+    """Compare the first picture with the second, warped to the first's viewpoint by the guessed motion."""
+    height, width = first.gray.shape
+    row, column = np.mgrid[STRIDE_PX // 2 : height : STRIDE_PX, STRIDE_PX // 2 : width : STRIDE_PX].reshape(
+        2, -1
+    )
+    end = _flow_targets(first, second, guess, row, column)
+    inside = ((end >= 0) & (end < (width, height))).all(1)
+    source = second.points_camera[end[inside, 1], end[inside, 0]]
+    target = first.points_camera[row[inside], column[inside]]
+    known = (source[:, 2] > NEAREST_M) & (target[:, 2] > NEAREST_M)
+    source, target = source[known], target[known]
+    if len(source) < LEAST_PAIRS:
+        return np.eye(4), 0.0
+    scale = np.maximum(target[:, 2] / AGREE_DEPTH_M, NEAREST_SCALE)
+    first_from_second, _ = align.ransac_rigid(
+        source, target, threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng, weights=1 / scale
+    )
+
+    def gap() -> np.ndarray:
+        return np.linalg.norm(rigid.apply(first_from_second, source) - target, axis=1) / scale
+
+    for _ in range(REFINE_ROUNDS):
+        weight = (AGREE_M**2 / (AGREE_M**2 + gap() ** 2)) ** 2 / scale**2
+        first_from_second = align.kabsch(source, target, weight)
+    return first_from_second, float((gap() < AGREE_M).mean())
+
+
+def _flow_targets(first, second, guess, row, column):
+    """Return the pixels (column, row) of the second picture that flow pairs with pixels of the first."""
+    z = first.points_camera[..., 2:]
+    far = FAR_M * cameras.ray_directions(first.intrinsics, *first.gray.shape)
+    moved = rigid.apply(rigid.inverse(guess), np.where(z > 0, first.points_camera, far))
+    there = cameras.project(moved, second.intrinsics)[0].astype(np.float32)
+    warped = cv2.remap(second.gray, there[..., 0] - 0.5, there[..., 1] - 0.5, cv2.INTER_LINEAR)
+    contrast = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
+        contrast.apply(first.gray), contrast.apply(warped), None
+    )
+    end = (np.stack([column, row], axis=1) + flow[row, column]).astype(np.float32)
+    return np.floor(cv2.remap(there, end[None], None, cv2.INTER_LINEAR, borderValue=(-1, -1))[0]).astype(int)
+
+
+def _motion_from_sift(first, second, rng):
+    """Return the motion of matched SIFT points."""
+    points = [
+        sift.sift_points(
+            each.gray, each.intrinsics, each.points_camera[..., 2], each.intrinsics, SIFT_FEATURES
+        )
+        for each in (first, second)
+    ]
+    pairs = sift.matches(*points)
+    source, target = points[1].points_camera[pairs[:, 1]], points[0].points_camera[pairs[:, 0]]
+    return align.ransac_rigid(source, target, threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng)[0]
+
+
+def chain_motions(frames: Iterable[FlowFrame], rng: np.random.Generator) -> Odometry:
+    """Chain the motions between neighbouring frames; an unknown one is a jump, over which nothing moves."""
+    steps, jumps, before = [], [False], None
+    for frame in frames:
+        if before is not None:
+            last_motion = None if jumps[-1] or not steps else steps[-1]
+            step, share = relative_motion(before, frame, rng, last_motion)
+            jumps.append(share < LEAST_SHARE)
+            steps.append(np.eye(4) if jumps[-1] else step)
+        before = frame
+    inflation = np.where(jumps[1:], JUMP_INFLATION, 1.0)
+    motions, first = np.array(steps).reshape(-1, 4, 4), np.arange(len(steps))
+    factors = pose_optimization.RelativePoseFactors(
+        first, first + 1, motions, SIGMA_RAD * inflation, SIGMA_M * inflation
+    )
+    return Odometry(rigid.accumulate(motions), np.array(jumps), factors)

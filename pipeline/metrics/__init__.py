@@ -1,0 +1,1 @@
+"""Metrics: best-of-K errors, energy score, bootstrap intervals."""

@@ -1,0 +1,76 @@
+"""Intervals for means and medians over overlapping windows: whole episodes are drawn again, not single
+windows.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean, or a median, and its 95 % interval; NaN bounds where one episode alone says
+    nothing of others.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+    def as_figures(self, name: str) -> dict[str, float | None]:
+        """Return it as three figures of a table; None for bounds that are not known."""
+        values = (self.mean, self.low, self.high)
+        return {
+            each: value if np.isfinite(value) else None
+            for each, value in zip(names_of(name), values, strict=True)
+        }
+
+
+def names_of(name: str) -> tuple[str, str, str]:
+    """Return the names under which a mean and its interval stand in a table of figures."""
+    return name, f"{name}_ci95_low", f"{name}_ci95_high"
+
+
+def formatted_interval(figures: Mapping[str, float | None], name: str, form: str = ".4g") -> str:
+    """Write a figure of a table with its interval, where it has one; ``-`` where it is nothing."""
+    mean, *ends = (figures.get(each) for each in names_of(name))
+    if mean is None:
+        return "-"
+    return format(mean, form) + (
+        f" [{' '.join(format(end, form) for end in ends)}]" if None not in ends else ""
+    )
+
+
+def episodes(
+    start: Int[np.ndarray, "window"], video: Int[np.ndarray, "window"], frames: int
+) -> Int[np.ndarray, "window"]:
+    """Number stretches of ``frames`` frames, so that windows of different episodes hardly overlap."""
+    return np.unique(np.stack([video, start // frames], axis=1), axis=0, return_inverse=True)[1].ravel()
+
+
+def bootstrapped(
+    values: Float[np.ndarray, "window"],
+    episode: Int[np.ndarray, "window"],
+    draws: int,
+    rng: np.random.Generator,
+    *,
+    median: bool = False,
+) -> Interval:
+    """Resample episodes with replacement and return the mean, or the median, with its percentiles 2.5 and
+    97.5.
+    """
+    middle = float(np.median(values) if median else values.mean())
+    count = episode.max() + 1
+    if count < 2:
+        return Interval(middle, np.nan, np.nan)
+    chosen = rng.integers(0, count, (draws, count))
+    if median:
+        parts = [values[episode == number] for number in range(count)]
+        drawn = [np.median(np.concatenate([parts[number] for number in row])) for row in chosen]
+    else:
+        drawn = np.bincount(episode, values, count)[chosen].sum(1) / np.bincount(episode, minlength=count)[
+            chosen
+        ].sum(1)
+    return Interval(middle, *(float(bound) for bound in np.percentile(drawn, (2.5, 97.5))))

@@ -1,0 +1,70 @@
+"""How good sampled futures are: the best of K samples (minDE, minADE), and the energy score, which spread
+does not fool.
+
+Each returns one number per window; the paper averages them over trials and all test windows.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.behavior.trajectories import Future
+from pipeline.geometry import rigid
+from pipeline.rivals.predictors import Samples
+
+GOAL_SCORES = ("goal_minde_m", "goal_energy_score_m")
+PLAN_SCORES = ("path_minade_m", "orientation_minade_rad", "joints_minade_rad")
+
+
+def goal_distances(samples: Samples, future: Future) -> Float[np.ndarray, "window sample"]:
+    """Return the distance of every sampled goal, metres."""
+    return np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1)
+
+
+def path_distances(samples: Samples, future: Future) -> Float[np.ndarray, "window sample"]:
+    """Return the mean distance along every sampled path, metres."""
+    return np.linalg.norm(samples.path - future.path_world[:, None], axis=-1).mean(-1)
+
+
+def goal_minde(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
+    """Return the distance of the best of the sampled goals, metres."""
+    return goal_distances(samples, future).min(1)
+
+
+def goal_energy_score(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
+    """Return E|X - y| - E|X - X'| / 2 (Gneiting & Raftery 2007), with the fair estimate of the
+    second term.
+    """
+    count = samples.goal.shape[1]
+    to_truth = goal_distances(samples, future).mean(1)
+    among = np.linalg.norm(samples.goal[:, :, None] - samples.goal[:, None], axis=-1).sum((1, 2))
+    return to_truth - among / (2 * count * (count - 1))
+
+
+def path_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
+    """Return the mean distance along the best of the sampled paths, metres."""
+    return path_distances(samples, future).min(1)
+
+
+def orientation_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
+    """Return the mean geodesic angle of the root along the best sample, radians."""
+    true = np.broadcast_to(future.world_from_agent[:, None, :, :3, :3], samples.rotation.shape)
+    return rigid.rotation_angle(samples.rotation, true).mean(-1).min(1)
+
+
+def joints_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
+    """Return the mean geodesic angle of the bones along the best sample, radians."""
+    true = np.broadcast_to(future.agent_from_bone[:, None], samples.agent_from_bone.shape)
+    angle = rigid.rotation_angle(samples.agent_from_bone[..., :3, :3], true[..., :3, :3])
+    return angle.mean((-1, -2)).min(1)
+
+
+SCORES: dict[str, Callable[[Samples, Future], Float[np.ndarray, "window"]]] = {
+    "goal_minde_m": goal_minde,
+    "goal_energy_score_m": goal_energy_score,
+    "path_minade_m": path_minade,
+    "orientation_minade_rad": orientation_minade,
+    "joints_minade_rad": joints_minade,
+}
+"""All scores by the names of their figures."""

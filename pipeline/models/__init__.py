@@ -1,1 +1,0 @@
-"""The learned and fitted models that stages share; a checkpoint is meaningless without its class."""

@@ -1,0 +1,1 @@
+"""Baselines that behavior and long-term motion are compared with."""

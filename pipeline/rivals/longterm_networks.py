@@ -1,0 +1,94 @@
+"""The networks that long-term motion is compared with (Table 1 of the paper), all with one face:
+`Ablated.between`.
+
+`ABLATIONS` names them; `build` makes one, `Ablated.load` reads one back.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from pipeline.longterm.config import LongTermSizes
+from pipeline.longterm.local_scene import LocalScene
+from pipeline.longterm.networks import ROOT_CHANNELS, BaseNet, PoseNet, RouteNet
+
+
+@dataclass(frozen=True)
+class AblationSpec:
+    """What one of them may do."""
+
+    sees_scene: bool = True
+    """see the scene"""
+    route_turns: bool = True
+    """RouteNet predicts orientations; else PoseNet does"""
+    paper: bool = False
+    """RouteNet makes no draft and sees positions, orientations and scene points only; PoseNet has no
+    `Strides` and learns along such routes
+    """
+    follows_route: bool = True
+    """PoseNet is given the route"""
+    one: bool = False
+    """BaseNet: one network for everything"""
+
+
+ABLATIONS: dict[str, AblationSpec] = {
+    "ours_no_scene": AblationSpec(sees_scene=False),
+    "as_paper": AblationSpec(paper=True),
+    "route_t_pose": AblationSpec(route_turns=False, follows_route=False),
+    "route_t_pose_no_scene": AblationSpec(sees_scene=False, route_turns=False, follows_route=False),
+    "route_tr_pose": AblationSpec(follows_route=False),
+    "route_tr_pose_no_scene": AblationSpec(sees_scene=False, follows_route=False),
+    "base": AblationSpec(one=True),
+    "base_no_scene": AblationSpec(sees_scene=False, one=True),
+}
+
+RIVALS = ("ours_no_scene", "base")
+"""Those that say whether the scene, and two networks instead of one, are worth it."""
+
+
+class AblatedNetworks(nn.Module):
+    """Short motions by other networks."""
+
+    def __init__(self, route: RouteNet | None, pose: PoseNet | None, base: BaseNet | None):
+        super().__init__()
+        self.route, self.pose, self.base = route, pose, base
+
+    def between(
+        self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], seen: LocalScene
+    ) -> Float[Tensor, "clip frame channel"]:
+        """Return t, r, p between first and last frames, in the clips' frames."""
+        with torch.no_grad():
+            if self.base is not None:
+                return self.base(start, end, seen)
+            route = self.route(start, end, seen)
+            return self.pose(start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:], route, seen.points)
+
+    def save(self, path: Path) -> None:
+        """Write the weights."""
+        save_file({name: value.contiguous() for name, value in self.state_dict().items()}, path)
+
+
+def build(kind: AblationSpec, sizes: LongTermSizes) -> AblatedNetworks:
+    """Make untrained networks."""
+    if kind.one:
+        return AblatedNetworks(None, None, BaseNet(sizes, sees_scene=kind.sees_scene))
+    route = RouteNet(sizes, sees_scene=kind.sees_scene, predicts_rotation=kind.route_turns, blind=kind.paper)
+    pose = PoseNet(
+        sizes,
+        sees_scene=kind.sees_scene,
+        follows_route=kind.follows_route,
+        predicts_rotation=not kind.route_turns,
+        strides=not kind.paper,
+    )
+    return AblatedNetworks(route, pose, None)
+
+
+def load(path: Path, kind: AblationSpec, sizes: LongTermSizes) -> AblatedNetworks:
+    """Read networks that `Ablated.save` wrote."""
+    made = build(kind, sizes)
+    made.load_state_dict(load_file(path))
+    return made.eval()

@@ -1,0 +1,201 @@
+"""Predictors of goal, path and body, all met through one call: ``sample(context, count, rng) -> Samples``.
+
+`Ats` is the behaviour model; `LocationPrior`, `StandStill` and `ConstantVelocity` are the honest baselines,
+with noise fitted on the training windows.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.behavior import model as behavior
+from pipeline.behavior.config import Ego, PlanSamplingConfig
+from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
+from pipeline.behavior.perception import FeatureVolume, world_from_ego
+from pipeline.behavior.planning import Observation, Sampler, TorchNetworks, observe
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, Context, Future
+from pipeline.geometry import rigid
+from pipeline.rivals.samplers import sampler_of
+
+STEPS = np.arange(1, FUTURE + 1) / FUTURE
+WINDOWS_AT_ONCE = 32
+"""bounds the memory of scene grids and bones"""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Sampled futures in the world frame; None where a method does not predict it."""
+
+    goal: Float[np.ndarray, "window sample 3"]
+    path: Float[np.ndarray, "window sample 56 3"] | None = None
+    rotation: Float[np.ndarray, "window sample 56 3 3"] | None = None
+    """of ``world_from_agent``"""
+    agent_from_bone: Float[np.ndarray, "window sample 56 bone 4 4"] | None = None
+
+
+class Predictor(Protocol):
+    """Anything that predicts the next 5.6 s."""
+
+    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw ``count`` futures for each window of the context."""
+
+
+@dataclass(frozen=True)
+class LocationPrior:
+    """A histogram of the goals in the ego frame (Ziebart et al. 2009), blind to scene, observer and past."""
+
+    cell: Int[np.ndarray, "cell 3"]
+    probability: Float[np.ndarray, "cell"]
+    cell_m: float
+    ego: Ego
+
+    @classmethod
+    def fit(
+        cls, context: Context, future: Future, *, cell_m: float = 0.1, ego: Ego = "yaw"
+    ) -> "LocationPrior":
+        """Count the goals of training windows in cells."""
+        ego_from_world = rigid.inverse(world_from_ego(context.world_from_agent[:, -1], ego))
+        goal = rigid.apply(ego_from_world, future.goal_world[:, None])[:, 0]
+        cell, count = np.unique(np.floor(goal / cell_m).astype(np.int64), axis=0, return_counts=True)
+        return cls(cell, count / count.sum(), cell_m, ego)
+
+    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw cells by their probability and points uniformly inside."""
+        chosen = rng.choice(len(self.cell), (len(context), count), p=self.probability)
+        goal = (self.cell[chosen] + rng.random((*chosen.shape, 3))) * self.cell_m
+        return Samples(rigid.apply(world_from_ego(context.world_from_agent[:, -1], self.ego), goal))
+
+
+@dataclass(frozen=True)
+class StandStill:
+    """The animal stays where it is, in its posture, up to Gaussian noise that grows as it did in training."""
+
+    std: Float[np.ndarray, "56 3"]
+
+    @classmethod
+    def fit(cls, context: Context, future: Future) -> "StandStill":
+        """Fit the noise to the displacements of training windows."""
+        return cls(_spread(future.path_world - _held(context)))
+
+    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw one deviation per sample and let it grow with time."""
+        return _straight(context, _held(context), self.std, count, rng)
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """The animal goes on at the velocity of its last 0.7 s, in its posture, up to Gaussian noise."""
+
+    std: Float[np.ndarray, "56 3"]
+
+    @classmethod
+    def fit(cls, context: Context, future: Future) -> "ConstantVelocity":
+        """Fit the noise to the residuals of training windows."""
+        return cls(_spread(future.path_world - _coasting(context)))
+
+    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw one deviation per sample and let it grow with time."""
+        return _straight(context, _coasting(context), self.std, count, rng)
+
+
+def _held(context: Context) -> Float[np.ndarray, "window 56 3"]:
+    return np.repeat(context.world_from_agent[:, -1:, :3, 3], FUTURE, axis=1)
+
+
+def _coasting(context: Context) -> Float[np.ndarray, "window 56 3"]:
+    position = context.world_from_agent[..., :3, 3]
+    velocity = (position[:, -1] - position[:, 0]) * (RATE_HZ / (PAST - 1))
+    return _held(context) + velocity[:, None] * (STEPS * FUTURE / RATE_HZ)[:, None]
+
+
+def _spread(residual: Float[np.ndarray, "window 56 3"]) -> Float[np.ndarray, "56 3"]:
+    """Return the root mean square per frame: horizontal axes together, height apart."""
+    level = np.sqrt((residual[..., ::2] ** 2).mean((0, 2)))
+    return np.stack([level, np.sqrt((residual[..., 1] ** 2).mean(0)), level], axis=-1)
+
+
+def _straight(
+    context: Context,
+    mean: Float[np.ndarray, "window 56 3"],
+    std: Float[np.ndarray, "56 3"],
+    count: int,
+    rng: np.random.Generator,
+) -> Samples:
+    path = mean[:, None] + rng.standard_normal((len(context), count, 1, 3)) * std
+    shape = (len(context), count, FUTURE)
+    rotation = np.broadcast_to(context.world_from_agent[:, -1, :3, :3][:, None, None], (*shape, 3, 3))
+    bones = context.agent_from_bone[:, -1]
+    return Samples(
+        path[:, :, -1], path, rotation, np.broadcast_to(bones[:, None, None], (*shape, *bones.shape[1:]))
+    )
+
+
+@dataclass(frozen=True)
+class Ats:
+    """The behaviour model: goal, path and body by diffusion from the perception code."""
+
+    sampler: Sampler
+    volume: FeatureVolume | Scenes
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    ego: Ego
+    sampling: PlanSamplingConfig
+
+    @classmethod
+    def load(
+        cls, model: Path, volume: FeatureVolume | Scenes, sampling: PlanSamplingConfig, *, device: str = "cpu"
+    ) -> "Ats":
+        """Read a trained model (`behavior/`)."""
+        architecture, nets, scaling, schedule, rest = behavior.load(model)
+        sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
+        knows = architecture.ablated_input != "scene"
+        return cls(
+            sampler,
+            volume,
+            rest,
+            architecture.ego,
+            replace(sampling, avoid_solid=sampling.avoid_solid and knows),
+        )
+
+    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw ``count`` plans for each window; goal and path are each as sampled."""
+        parts = [self._plans(chunk, count, rng) for chunk in _chunks(context)]
+        return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+    def goals(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw goals only, which costs a hundredth of whole plans."""
+        goals = []
+        for chunk in _chunks(context):
+            codes = self.sampler.codes(self._observe(chunk), self.sampling, count)
+            goal = self.sampler.goals(codes, self.sampling, rng).reshape(len(chunk), count, 3)
+            goals.append(rigid.apply(world_from_ego(chunk.world_from_agent[:, -1], self.ego), goal))
+        return Samples(np.concatenate(goals))
+
+    def _plans(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        plan = self.sampler.plan(self._observe(context), self.sampling, rng, count=count)
+        frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
+        root = plan.world_from_agent(frame)
+        bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest).astype(
+            np.float32
+        )
+        goal = rigid.apply(frame, plan.goal[:, None])[:, 0]
+        split = (len(context), count)
+        return Samples(
+            *(a.reshape(*split, *a.shape[1:]) for a in (goal, root[..., :3, 3], root[..., :3, :3], bones))
+        )
+
+    @cached_property
+    def scenes(self) -> Scenes:
+        """The map as scenes, of which there may be one."""
+        return self.volume if isinstance(self.volume, Scenes) else Scenes.of(self.volume)
+
+    def _observe(self, context: Context) -> Observation:
+        return observe(context, self.scenes, self.agent_from_bone_rest, self.ego)
+
+
+def _chunks(context: Context) -> list[Context]:
+    return [context[start : start + WINDOWS_AT_ONCE] for start in range(0, len(context), WINDOWS_AT_ONCE)]

@@ -1,0 +1,219 @@
+"""Artifacts: folders that exist whole or not at all.
+
+`create` yields a hidden temporary folder beside the final one; when the block ends well it writes
+`manifest.json` (sha256 of every file), syncs the disk and renames. `opened` and `read_manifest` are
+how everyone else looks at one. What varies between runs (seconds, host, commit) is a record, never
+part of an artifact. Standard library only: the planner and the runner use this file too.
+"""
+
+import contextlib
+import ctypes
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.errors import InputError
+
+MANIFEST = "manifest.json"
+STAMP = ".ok"
+"""Touched by the runner when an artifact is known to be up to date; what Make looks at."""
+_VERSIONS = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "pycolmap", "onnxruntime")
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What an artifact is and what it was made from."""
+
+    stage: str
+    """Program that wrote it."""
+    key: str | None
+    """Hash of everything that decides its content; None when a stage was run by hand."""
+    content: str
+    """Hash of the names and bytes of its files."""
+    inputs: dict[str, str]
+    """`content` of every artifact that was read, by name."""
+    config: dict[str, Any]
+    """The stage's full configuration, defaults included."""
+    versions: dict[str, str]
+    """Python and the libraries that decide numbers."""
+    files: dict[str, str]
+    """sha256 per file, by path inside the folder."""
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """Return the manifest of `folder`, or None where there is no finished artifact."""
+    try:
+        return Manifest(**json.loads((folder / MANIFEST).read_bytes()))
+    except (FileNotFoundError, NotADirectoryError, ValueError, TypeError):
+        return None
+
+
+def opened(folder: Path, name: str) -> Manifest:
+    """Return the manifest of the finished artifact at `folder`; raise `InputError` ART-001 where there is
+    none.
+    """
+    manifest = read_manifest(folder)
+    if manifest is None:
+        raise InputError(
+            "ART-001", f"{name} is missing or unfinished", str(folder), "build it first with `make`"
+        )
+    return manifest
+
+
+@contextlib.contextmanager
+def create(
+    out: Path, *, stage: str, config: Mapping[str, Any], inputs: Mapping[str, str], key: str | None = None
+) -> Iterator[Path]:
+    """Yield a folder to fill and publish it as `out` if, and only if, the block ends well.
+
+    Whatever happens, an artifact that stood at `out` before stays until the new one is complete.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(f".{out.name}.tmp.{os.getpid()}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    try:
+        yield temporary
+        files = digests(temporary)
+        if not files:
+            raise InputError(
+                "ART-002", f"{stage} wrote nothing", str(out), "this is a fault of the stage: report it"
+            )
+        manifest = Manifest(
+            stage, key, content_of(files), dict(sorted(inputs.items())), dict(config), versions(), files
+        )
+        (temporary / MANIFEST).write_text(json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
+        sync_disk(temporary)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    _replace(temporary, out)
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Return the sha256 of every file under `folder` by its relative path; manifest and stamp do not
+    count.
+    """
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return {name: digest_of_file(folder / name) for name in names if name not in (MANIFEST, STAMP)}
+
+
+def damaged(folder: Path) -> list[str]:
+    """Return the files of the finished artifact at `folder` that are not what was written, or are gone."""
+    manifest, found = read_manifest(folder), digests(folder)
+    return [name for name, digest in manifest.files.items() if found.get(name) != digest] if manifest else []
+
+
+def digest_of_file(path: Path) -> str:
+    """Return the sha256 of one file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def content_of(files: Mapping[str, str]) -> str:
+    """Hash an artifact's files, given their digests."""
+    return digest_of(dict(files))
+
+
+def digest_of(value: Any) -> str:
+    """Hash a value made of plain JSON types."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def clean(*outs: Path) -> None:
+    """Remove what writers of these artifacts and small files that died have left; the caller holds the job's
+    lock.
+    """
+    for out in outs:
+        for left in (*out.parent.glob(f".{out.name}.tmp*"), *out.parent.glob(f".{out.name}.old.*")):
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def held(lock: Path, waiting: str = "") -> Iterator[None]:
+    """Hold a kernel lock: it dies with its owner. Where another has it, say `waiting` and wait."""
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if waiting:
+                print(waiting, file=sys.stderr, flush=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of those libraries in use that decide numbers."""
+    import importlib.metadata  # late: the planner does without
+
+    found = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in _VERSIONS:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
+
+
+def write_if_changed(path: Path, text: str, *, sync: bool = True) -> bool:
+    """Replace a small file atomically; leave it, and so its age, alone when it says the same already.
+
+    Writers of the same file hold a lock, so that what one that died has left is overwritten by the next.
+    Without `sync` the caller flushes the disk itself (`sync_disk`) before anything relies on the file.
+    """
+    data = text.encode()
+    with contextlib.suppress(FileNotFoundError):
+        if path.read_bytes() == data:
+            return False
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("wb") as file:
+        file.write(data)
+        if sync:
+            file.flush()
+            os.fsync(file.fileno())
+    temporary.replace(path)
+    return True
+
+
+def _replace(temporary: Path, out: Path) -> None:
+    """Give `temporary` its final name; a reader sees the old artifact, none, or the new one, never a
+    mixture.
+    """
+    old = out.with_name(f".{out.name}.old.{os.getpid()}")
+    if out.exists():
+        out.rename(old)
+    temporary.rename(out)
+    _sync_folder(out.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def sync_disk(path: Path) -> None:
+    """Flush the file system that holds `path`: one call instead of one per file."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if hasattr(libc, "syncfs"):
+            if libc.syncfs(handle) != 0:
+                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(path))
+        else:
+            os.sync()
+    finally:
+        os.close(handle)
+
+
+def _sync_folder(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,256 @@
+"""What lies in `captures/<agent>/`.
+
+From file names and the recipe's `[videos]` to recordings with roles and a split.
+
+`find` looks at the disk, `assign` decides roles and split; both raise `InputError` before anything is
+written. User file names go into `videos.json` and nowhere else. Standard library only.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.core import config
+from pipeline.core.errors import InputError
+from pipeline.core.videos import ROLES, SPLITS, Role, Split, Video
+from pipeline.recordings.formats import UNDERSTOOD, format_of
+from pipeline.workflow import dag
+from pipeline.workflow.dag import Flow
+
+SIDECAR = ".toml"
+"""`<recording>.toml` beside a recording may hold the same keys as its table in the recipe's `[videos]`."""
+_NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
+    "recordings": (
+        ("walkthrough", "one slow walk through the empty room, named walkthrough..."),
+        ("turnaround", "one circle around the resting animal, named turnaround..."),
+        ("session", "one or more clips of the animal, named anything else"),
+    ),
+    "trajectories": (("session", "one or more tables of its motion, CSV or NPZ"),),
+}
+LONGEST_NAME_BYTES = 200
+"""of a recording: file systems end at 255, and sidecars are named after it"""
+TABLES = (".csv", ".npz")
+"""Kinds of files that hold motion."""
+
+
+@dataclass(frozen=True)
+class Remarks:
+    """What the user says about one recording, in the recipe's `[videos]` or in a sidecar.
+
+    None where nothing.
+    """
+
+    role: str | None = None
+    """`walkthrough`, `turnaround`, `session` or `heldout`; otherwise the name decides."""
+    split: str | None = None
+    """`train` or `test` for a session; otherwise the last session is the test."""
+    synchronized_with: str | None = None
+    """File name of the recording whose clock this one shares."""
+    offset_s: float | None = None
+    """Time in that recording = time in this one + offset, seconds."""
+
+
+def find(folder: Path, flow: Flow = "recordings") -> list[str]:
+    """Return the names of the recordings in `folder`, of every format that is understood, or of the
+    tables of motion.
+    """
+    if not folder.is_dir():
+        return []
+    understood = format_of if flow == "recordings" else _is_table
+    return sorted(
+        path.name for path in folder.iterdir() if not path.name.startswith(".") and understood(path)
+    )
+
+
+def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
+    """Return the names of whatever else lies there."""
+    found, kinds = find(folder, flow), {"", *(f".{kind}" for node in dag.FLOW for kind in node.sidecars)}
+    known = {*found, *(f"{name}{kind}{SIDECAR}" for name in found for kind in kinds)} | {
+        name for node in dag.FLOW for name in node.extra_inputs
+    }
+    return sorted(
+        path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith(".")
+    )
+
+
+def named(path: Path, flow: Flow = "recordings") -> str:
+    """Return a stranger's name for a message: with what is amiss with it, where that can be told."""
+    if not path.exists():
+        return f"{path.name!r} (a link that leads nowhere)"
+    inner = find(path, flow)
+    return f"{path.name!r} (move {inner[0]!r} out of it: that is one)" if inner else repr(path.name)
+
+
+def refuse_strangers(folder: Path, flow: Flow = "recordings") -> None:
+    """Raise CAP-003 where something was put into `folder`, but nothing that a flow can begin with."""
+    strangers = (
+        [name for name in not_understood(folder, flow) if not name.endswith(SIDECAR)]
+        if folder.is_dir()
+        else []
+    )
+    if strangers:
+        what = (
+            "holds no recording of a known format, only "
+            f"{', '.join(named(folder / name, flow) for name in strangers)}"
+        )
+        tables = "tables of motion, CSV or NPZ"
+        known = (
+            f"{UNDERSTOOD}; {tables}, where the recipe's [flow] begins at trajectories"
+            if flow == "recordings"
+            else tables
+        )
+        raise InputError(
+            "CAP-003", what, str(folder), f"known: {known}; or empty the folder for the built-in capture"
+        )
+
+
+def extra_inputs(agent: str, names: Sequence[str]) -> list[Path]:
+    """Return those files of these names beside an agent's recordings that exist."""
+    return [path for path in (Path("captures", agent, name) for name in names) if path.is_file()]
+
+
+def sidecars(agent: str, file: str, names: Sequence[str]) -> dict[str, Path]:
+    """Return, by name, those files that tell something of one recording and exist."""
+    paths = {name: Path("captures", agent, f"{file}.{name}{SIDECAR}") for name in names}
+    return {name: path for name, path in paths.items() if path.is_file()}
+
+
+def remarks(
+    folder: Path, names: Sequence[str], overrides: Mapping[str, Any], where: str
+) -> dict[str, Remarks]:
+    """Return what the user says about each recording; the recipe's word counts more than a sidecar's."""
+    config.refuse_unknown(overrides, names, where=f"{where}: [videos]", kind="recording")
+    said = {}
+    for name in names:
+        if len(name.encode()) > LONGEST_NAME_BYTES:
+            what = f"the name of {name[:40]!r}... is longer than {LONGEST_NAME_BYTES} bytes"
+            raise InputError("CAP-041", what, str(folder), "give it a shorter name")
+        sidecar = folder / f"{name}{SIDECAR}"
+        table = config.read_table(sidecar) if sidecar.is_file() else {}
+        remark = config.from_table(
+            Remarks, {**table, **overrides.get(name, {})}, where=f"{where}: [videos.{name!r}]"
+        )
+        if remark.offset_s is not None and not math.isfinite(remark.offset_s):
+            raise InputError("CAP-041", f"{name!r} has no finite offset_s", where, "give seconds")
+        said[name] = remark
+    return said
+
+
+def assign(
+    said: Mapping[str, Remarks],
+    known_ids: Mapping[str, str],
+    hashes: Mapping[str, str | None],
+    where: str,
+    flow: Flow = "recordings",
+) -> tuple[Video, ...]:
+    """Give every recording its id, role, split and clock.
+
+    `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another
+    file. Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be).
+    """
+    roles = {name: role_of(name, remark, where) for name, remark in said.items()}
+    for role, what in missing_roles(list(roles.values()), flow):
+        raise InputError("CAP-040", f"there is no {role} among the recordings", where, f"add {what}")
+    order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
+    splits = _splits([name for name in order if roles[name] == "session"], said, where)
+    ids = _ids(order, known_ids)
+    return tuple(
+        Video(
+            id=ids[name],
+            file=name,
+            role=roles[name],
+            split=splits.get(name, "none"),
+            sha256=hashes[name],
+            synchronized_with=_partner(name, said, ids, where),
+            offset_s=said[name].offset_s or 0.0,
+        )
+        for name in sorted(said, key=ids.__getitem__)
+    )
+
+
+def role_of(name: str, remark: Remarks, where: str) -> Role:
+    """Return a recording's role: the user's word, else the beginning of its name.
+
+    Raises CAP-041 for an unknown one.
+    """
+    if remark.role is None:
+        return next((role for role in ROLES if name.lower().startswith(role)), "session")
+    if remark.role not in ROLES:
+        raise InputError(
+            "CAP-041", f"{name!r} cannot have the role {remark.role!r}", where, f"roles: {', '.join(ROLES)}"
+        )
+    return remark.role
+
+
+def missing_roles(roles: Sequence[Role], flow: Flow = "recordings") -> list[tuple[Role, str]]:
+    """Return the roles that a build still needs beside recordings of these, each with what to add."""
+    return [(role, what) for role, what in _NEEDED[flow] if role not in roles]
+
+
+def builtin(session_count: int, heldout_of: int, foreign_sessions: int = 0) -> dict[str, Remarks]:
+    """Return the recordings that `synthesize_capture` writes.
+
+    `heldout_of` counts sessions from 1, 0 is none.
+    """
+    sessions = [f"session-{i}.r3d" for i in range(1, session_count + foreign_sessions + 1)]
+    plain = dict.fromkeys(("walkthrough.r3d", "turnaround.r3d", *sessions), Remarks())
+    if foreign_sessions:  # the test video stays the last one that is filmed at home
+        plain |= {
+            name: Remarks(split="test" if name == sessions[session_count - 1] else "train")
+            for name in sessions
+        }
+    if not heldout_of:
+        return plain
+    return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}
+
+
+def builtin_lives(
+    homes: int, sessions_per_home: int, test_homes: int, test_sessions: int
+) -> dict[str, Remarks]:
+    """Return the recordings that `synthesize_capture.lives` writes; those of the last homes are the test."""
+    splits: list[Split] = ["train"] * (homes * sessions_per_home) + ["test"] * (test_homes * test_sessions)
+    return {f"session-{number:02d}.npz": Remarks(split=split) for number, split in enumerate(splits, start=1)}
+
+
+def _is_table(path: Path) -> bool:
+    return path.suffix.lower() in TABLES or (path / "trajectory.csv").is_file()
+
+
+def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) -> dict[str, Split]:
+    for name, remark in said.items():
+        allowed = SPLITS if name in sessions else ("none", None)
+        if remark.split not in (*allowed, None):
+            raise InputError(
+                "CAP-041",
+                f"{name!r} cannot be in the split {remark.split!r}",
+                where,
+                "sessions: train or test",
+            )
+    if any(said[name].split == "test" for name in sessions) or len(sessions) < 2:
+        return {name: said[name].split or "train" for name in sessions}
+    return {name: said[name].split or ("test" if name == sessions[-1] else "train") for name in sessions}
+
+
+def _ids(order: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:
+    following = 1 + max((int(id[1:]) for id in known.values()), default=-1)
+    ids = {}
+    for name in order:
+        ids[name] = known.get(name) or f"v{following:03d}"
+        following += name not in known
+    return ids
+
+
+def _partner(name: str, said: Mapping[str, Remarks], ids: Mapping[str, str], where: str) -> str | None:
+    partner = said[name].synchronized_with
+    if partner is None:
+        return None
+    if partner not in ids or partner == name:
+        raise InputError(
+            "CAP-041",
+            f"{name!r} shares no clock with {partner!r}",
+            where,
+            f"recordings: {', '.join(sorted(ids))}",
+        )
+    return ids[partner]

@@ -1,0 +1,351 @@
+"""The command line of every stage program: options -> `Inputs` and `Config` -> `run` -> exit code.
+
+`main` derives the options from the fields of the stage's `Inputs`, checks the configuration strictly, opens
+the inputs as finished artifacts, has `run` fill the new artifact, and turns `InputError` into one message and
+exit code 2.
+"""
+
+import argparse
+import ast
+import dataclasses
+import inspect
+import itertools
+import os
+import signal
+import sys
+import tempfile
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.core import config as configuration
+from pipeline.core import devices, videos
+from pipeline.core.errors import InputError, coded_disk_errors
+from pipeline.core.videos import Role, Split, Video
+from pipeline.workflow import artifact, dag
+
+
+@dataclasses.dataclass(frozen=True)
+class InputField:
+    """One field of a stage's `Inputs`, as the command line sees it."""
+
+    name: str
+    required: bool
+    several: bool
+    """A folder per recording, trial or variant instead of one path."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One run of one stage: its inputs, its configuration and the artifact it is to make."""
+
+    stage: str
+    config: Any
+    """The stage's own `Config`."""
+    out: Path
+    """Where the artifact will stand."""
+    video: str | None
+    """Id of the recording, for stages that treat one at a time."""
+    videos: tuple[Video, ...]
+    """All recordings of the agent; empty when run by hand without `--videos`."""
+    resume: Path | None
+    """Folder for checkpoints; None: a killed run begins again."""
+    threads: int
+    key: str | None
+    paths: dict[str, Path]
+    """Inputs as given."""
+    requested_device: str
+    contents: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Hash of every artifact opened so far, for the manifest."""
+
+    @property
+    def device(self) -> str:
+        """`cpu` or `cuda`; raises DEP-002 as `devices.choose` does."""
+        return devices.choose(self.requested_device)
+
+    def has(self, name: str) -> bool:
+        """Tell whether the optional input `name` was given."""
+        return name in self.paths
+
+    def input(self, name: str) -> Path:
+        """Return the folder of the finished artifact `name`, or the plain file or folder where it is none."""
+        path = self.paths[name]
+        if name in dag.NODES:
+            return self._opened(path, name)
+        if not path.exists():
+            raise InputError("ART-003", f"{name} does not exist", str(path), "give an existing path")
+        return path
+
+    def field(self, field: InputField) -> Path | dict[str, Path] | None:
+        """Return what a field of the stage's `Inputs` holds; None for an optional input that was not
+        given.
+        """
+        if not self.has(field.name):
+            return None
+        if not field.several:
+            return self.input(field.name)
+        needs = [need for node in dag.FLOW if node.stage == self.stage for need in dag.needs_of(node)]
+        if field.name == "variants":
+            several = [need for need in needs if need.variants]
+            return self.per_variant(several[0].artifact, several[0].variants)
+        if dag.NODES[field.name].trials == "each":
+            return self.per_trial(field.name, dag.trial_ids(self.config.methods, self.config.seeds))
+        for need in needs:
+            if need.artifact == field.name:
+                return self.per_video(field.name, need.roles, need.splits)
+        return self.per_video(field.name)
+
+    def recording(self) -> Video | None:
+        """Return the recording to treat; None where the stage was run by hand without saying which."""
+        if self.video is None:
+            return None
+        for video in self.videos:
+            if video.id == self.video:
+                return video
+        raise InputError(
+            "ART-004",
+            f"which recording is {self.video!r}?",
+            self.stage,
+            "give --videos build/<agent>/plan/videos.json that lists it",
+        )
+
+    def per_video(
+        self, name: str, roles: tuple[Role, ...] | None = None, splits: tuple[Split, ...] | None = None
+    ) -> dict[str, Path]:
+        """Return the folder of `name` for every recording of `roles` and `splits`, by id, in id order.
+
+        By default: every recording for which the flow makes this artifact.
+        """
+        if not self.videos:
+            raise InputError(
+                "ART-004",
+                f"which recordings of {name}?",
+                self.stage,
+                "give --videos build/<agent>/plan/videos.json",
+            )
+        chosen_roles = dag.NODES[name].roles if roles is None else roles
+        chosen = sorted(
+            v.id for v in self.videos if v.role in chosen_roles and (splits is None or v.split in splits)
+        )
+        return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in chosen}
+
+    def per_trial(self, name: str, trials: Sequence[str]) -> dict[str, Path]:
+        """Return the folder of `name` for every one of the trials, by id."""
+        return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in trials}
+
+    def per_variant(self, name: str, variants: Sequence[str]) -> dict[str, Path]:
+        """Return the folder of `name` in every one of the agent's variants, by the variant's name."""
+        folder = self.input("variants")
+        return {variant: self._opened(folder / variant / name, f"{variant}/{name}") for variant in variants}
+
+    @contextmanager
+    def create(self) -> Iterator[Path]:
+        """Yield the folder to fill; it becomes the artifact if, and only if, the block ends well."""
+        settings = dataclasses.asdict(self.config)
+        stage = self.stage.rpartition(".")[2]
+        with artifact.create(
+            self.out, stage=stage, config=settings, inputs=self.contents, key=self.key
+        ) as folder:
+            yield folder
+
+    def _opened(self, path: Path, name: str) -> Path:
+        made, kind = artifact.opened(path, name), name.partition("/")[0]
+        maker = dag.NODES[kind].stage.rpartition(".")[2] if kind in dag.NODES else made.stage
+        if made.stage != maker:
+            raise InputError(
+                "ART-006", f"is no {kind}: {made.stage} wrote it", str(path), f"give what {maker} wrote"
+            )
+        self.contents[name] = made.content
+        return path
+
+
+def main(
+    doc: str | None, run: Callable[..., object], inputs: type, config: type, *, options: tuple[str, ...] = ()
+) -> None:
+    """Run a stage program: parse the command line, open its inputs, have `run` fill the artifact, and exit.
+
+    `doc` is the front's docstring and becomes `--help`. `inputs` is a dataclass of paths: `Path` is a
+    required option, `Path | None` an optional one, `Mapping[str, Path]` one folder per recording, trial or
+    variant, as the flow declares. `run(inputs, config, out, ...)` gets by keyword what its signature names
+    among `device`, `threads`, `resume` (folder for checkpoints or None), `videos` (all recordings) and
+    `video` (the one to treat, or None). `options` are fields of the configuration that the command line may
+    set as well.
+    """
+    fields = input_fields(inputs)
+    helping = not {"-h", "--help"}.isdisjoint(sys.argv)
+    settings = (
+        ["settings of the stage's table, with their defaults:", *_settings(config())] if helping else []
+    )
+    required = tuple(field.name for field in fields if field.required)
+    optional = tuple(field.name for field in fields if not field.required)
+    parser = _parser(_program(run), doc, "\n".join(settings) or None, required, optional)
+    for name in options:
+        _add_option(parser, name, typing.get_type_hints(config)[name])
+    try:
+        given = parser.parse_args()
+        with coded_disk_errors(str(given.out)):
+            _run(run, inputs, fields, _task(given, _program(run), config, required + optional, options))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
+
+
+def input_fields(inputs: type) -> tuple[InputField, ...]:
+    """Return the fields of a stage's `Inputs`; a field of any other type than those `main` knows is a
+    fault.
+    """
+    kinds = {Path: False, Mapping[str, Path]: True}
+    found = []
+    for name, hint in typing.get_type_hints(inputs).items():
+        choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+        known = [kind for kind in choices if kind is not types.NoneType]
+        assert len(known) == 1 and known[0] in kinds, f"{inputs.__qualname__}.{name}: {hint}"
+        found.append(InputField(name, required=types.NoneType not in choices, several=kinds[known[0]]))
+    return tuple(found)
+
+
+def _program(run: Callable[..., object]) -> str:
+    """Return the name of the stage program that `run` belongs to, as the flow declares it."""
+    parts = run.__module__.split(".")
+    return ".".join(parts[1:-1]) if parts[0] == "stages" else Path(sys.argv[0]).parent.name
+
+
+def _run(run: Callable[..., object], inputs: type, fields: Sequence[InputField], task: Task) -> None:
+    given = inputs(**{field.name: task.field(field) for field in fields})
+    accepted = inspect.signature(run).parameters
+    offered: dict[str, Callable[[], object]] = {
+        "device": lambda: task.device,
+        "threads": lambda: task.threads,
+        "resume": lambda: task.resume,
+        "videos": lambda: task.videos,
+        "video": task.recording,
+    }
+    known = {name: offer() for name, offer in offered.items() if name in accepted}
+    with task.create() if _leads() else tempfile.TemporaryDirectory() as folder:
+        run(given, task.config, Path(folder), **known)
+
+
+def _leads() -> bool:
+    """Return whether this process publishes the artifact: of those that torchrun started, the first alone."""
+    return os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
+
+
+def _settings(defaults: Any, table: str = "") -> Iterator[str]:
+    """Yield a line per setting, name, default and what the source says beneath it; those of inner tables
+    after their names.
+    """
+    documented: dict[str, str] = {}
+    for cls in (cls for cls in reversed(type(defaults).__mro__) if dataclasses.is_dataclass(cls)):
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+        for line, beneath in itertools.pairwise(body):
+            if (
+                isinstance(line, ast.AnnAssign)
+                and isinstance(beneath, ast.Expr)
+                and isinstance(beneath.value, ast.Constant)
+            ):
+                documented[line.target.id] = " ".join(str(beneath.value.value).split())
+    for name, default in vars(defaults).items():
+        if dataclasses.is_dataclass(default):
+            yield from _settings(default, f"{table}{name}.")
+        else:
+            yield f"  {table}{name} = {default!r}  {documented.get(name, '')}".rstrip()
+
+
+def _parser(
+    stage: str, doc: str | None, epilog: str | None, reads: tuple[str, ...], optional: tuple[str, ...]
+) -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog=f"python -m stages.{stage}",
+        description=doc,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    for name in reads + optional:
+        option = f"--{name.replace('_', '-')}"
+        parser.add_argument(
+            option, dest=name, type=Path, required=name in reads, metavar="PATH", help=_what(name)
+        )
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="this stage's table, JSON or TOML (default: all defaults)"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="artifact to write; appears when complete"
+    )
+    parser.add_argument("--video", metavar="ID", help="the recording to treat, for example v002")
+    parser.add_argument(
+        "--videos", type=Path, metavar="FILE", help="the agent's recordings: build/<agent>/plan/videos.json"
+    )
+    parser.add_argument(
+        "--resume", type=Path, metavar="DIR", help="folder for checkpoints (default: none are kept)"
+    )
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute (default: auto)"
+    )
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads to use (default: 1)")
+    parser.add_argument("--key", help=argparse.SUPPRESS)
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Refuses a command line with a coded error in place of the usage."""
+
+    def error(self, message: str) -> typing.NoReturn:
+        raise InputError("RUN-004", message, self.prog, "see --help")
+
+
+def _add_option(parser: argparse.ArgumentParser, name: str, hint: Any) -> None:
+    option, text = f"--{name.replace('_', '-')}", f"the setting `{name}`"
+    if hint is bool:
+        parser.add_argument(option, dest=name, action="store_true", default=None, help=text)
+    elif typing.get_origin(hint) is typing.Literal:
+        parser.add_argument(option, dest=name, choices=typing.get_args(hint), help=text)
+    else:
+        parser.add_argument(option, dest=name, type=hint, metavar=hint.__name__.upper(), help=text)
+
+
+def _what(name: str) -> str:
+    if name not in dag.NODES:
+        return f"path of the {name}"
+    several = " (or the folder with one per recording)" if dag.NODES[name].roles else ""
+    several = " (or the folder with one per trial)" if dag.NODES[name].trials == "each" else several
+    return f"finished artifact `{name}`{several}"
+
+
+def _task(
+    given: argparse.Namespace, stage: str, config: type, names: tuple[str, ...], options: tuple[str, ...]
+) -> Task:
+    _limit_threads(given.threads)
+    table = configuration.read_table(given.config) if given.config else {}
+    table |= {name: value for name in options if (value := getattr(given, name)) is not None}
+    return Task(
+        stage=stage,
+        config=configuration.from_table(config, table, where=str(given.config or stage)),
+        out=given.out,
+        video=given.video,
+        videos=videos.read(given.videos) if given.videos else (),
+        resume=given.resume,
+        threads=given.threads,
+        key=given.key,
+        paths={name: path for name in names if (path := getattr(given, name)) is not None},
+        requested_device=given.device,
+    )
+
+
+def _limit_threads(threads: int) -> None:
+    """Hold every library that is loaded, or will be, to `threads`."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(threads)
+    if "numba" in sys.modules:
+        sys.modules["numba"].set_num_threads(min(threads, sys.modules["numba"].config.NUMBA_NUM_THREADS))
+    else:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)

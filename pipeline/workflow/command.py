@@ -1,0 +1,67 @@
+"""The command `agent-to-sim` of an installed package.
+
+    agent-to-sim stage NAME ...    one stage program, for example `agent-to-sim stage segment_agent --help`
+    agent-to-sim plan ...          the planner, in a folder with agents/ and captures/
+    agent-to-sim run HOME JOB      one planned job
+    agent-to-sim doctor            what this machine lacks
+
+In a checkout `make` calls the same modules.
+"""
+
+import importlib.util
+import runpy
+import sys
+from collections.abc import Sequence
+
+from pipeline.core.errors import InputError
+
+MODULES = {
+    "plan": "pipeline.workflow.plan",
+    "run": "pipeline.workflow.run",
+    "doctor": "pipeline.workflow.doctor",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one of the commands in this process; returns the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ("-h", "--help"):
+        print(__doc__)
+        return 0
+    try:
+        module, rest = _module(given)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    sys.argv = [f"agent-to-sim {' '.join(given[: len(given) - len(rest)])}", *rest]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    return 0
+
+
+def _module(given: list[str]) -> tuple[str, list[str]]:
+    """Return the module that a command line means, and the arguments that are left for it."""
+    match given:
+        case ["stage", name, *rest] if _is_stage(name):
+            return f"stages.{name}", rest
+        case ["stage", *_]:
+            named = f"there is no stage {given[1]!r}" if given[1:] else "which stage?"
+            raise InputError("RUN-002", named, "agent-to-sim stage", "names: the folders of stages/")
+        case [command, *rest] if command in MODULES:
+            return MODULES[command], rest
+    raise InputError(
+        "RUN-003", f"there is no command {given[0]!r}", "agent-to-sim", f"one of: stage, {', '.join(MODULES)}"
+    )
+
+
+def _is_stage(name: str) -> bool:
+    """Return whether `name` is a stage program, without importing it."""
+    if not all(part.isidentifier() for part in name.split(".")):
+        return False
+    try:
+        return importlib.util.find_spec(f"stages.{name}.__main__") is not None
+    except ModuleNotFoundError:
+        return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,387 @@
+"""The one declaration of the flow: which program makes which artifact, from what, for which recordings.
+
+`plan` expands it for an agent's recordings, `run` runs one job of it, and Make and Snakemake see
+only what `plan` wrote. Standard library only, no side effects.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from pipeline.core.videos import Role, Split
+
+Flow = Literal["recordings", "trajectories"]
+"""Where an agent's flow begins: at recordings of it, or at tables of its motion, which spares all that comes
+before behaviour."""
+BUILTIN: dict[Flow, str] = {"recordings": "synthetic_capture", "trajectories": "synthetic_lives"}
+"""What stands in where `captures/<agent>/` is empty."""
+VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
+"""Roles that models may see; the held-out phone is for `evaluate` alone."""
+AGENT: tuple[Role, ...] = ("turnaround", "session")
+"""Roles in which the animal is meant to be seen."""
+BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
+REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only")
+"""Variants of an agent that Table 1 compares its registration with."""
+RECONSTRUCTION_VARIANTS = (
+    "no_localizer",
+    "no_feature_loss",
+    "no_annealing",
+    "mlp_fields",
+    "totalrecon",
+    "totalrecon_single",
+)
+"""Variants of an agent that Table 3 compares its reconstruction with."""
+VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}
+PLUMBING = (
+    "core.errors",
+    "core.config",
+    "core.processes",
+    "core.progress",
+    "core.videos",
+    "workflow.artifact",
+    "workflow.cli",
+    "workflow.dag",
+)
+"""Files of `pipeline/` whose change cannot change what a stage computes."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """One input of a node; of an input that exists per recording, which recordings."""
+
+    artifact: str
+    roles: tuple[Role, ...] | None = None
+    """None: every recording that has it."""
+    splits: tuple[Split, ...] = ("train", "test", "none")
+    part: str | None = None
+    """Subfolder that is read, where it is not the whole artifact."""
+    option: str | None = None
+    """Command line option without dashes; the artifact's name if None."""
+    variants: tuple[str, ...] = ()
+    """Variants of the agent whose artifact of this name is read as well; the folder of all variants is given
+    as --variants."""
+    flow: Flow | None = None
+    """The flow in which it is an input; None: in all that the node is part of."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """One artifact, or one per recording, and the program that makes it."""
+
+    artifact: str
+    stage: str
+    """Program: `python -m stages.<stage>`."""
+    needs: tuple[Need | str, ...] = ()
+    roles: tuple[Role, ...] = ()
+    """One job per recording of these roles; none: one job in all."""
+    role_dependencies: tuple[Role, ...] = ()
+    """Roles whose set and split decide the result although no per-recording input depends on them."""
+    fixed: dict[str, object] = field(default_factory=dict)
+    """Keys of the configuration that tell two nodes of one program apart."""
+    version: int = 1
+    """Raise it when results change although no code of the stage does."""
+    threads: int = 1
+    gpu: int = 0
+    memory_mb: int = 3000
+    """What a scheduler reserves; not a limit."""
+    memory_mb_per_1000_frames: int = 0
+    """What it reserves in addition, for the frames of all recordings that the job reads."""
+    seconds_per_frame: float = 0.02
+    """Of those frames, on two cores without a GPU; what a scheduler grants is several times as long."""
+    resumable: bool = False
+    """Owns a folder for checkpoints that survives a kill."""
+    distributed: bool = False
+    """Several processes, each with a GPU of its own, can do it together."""
+    extra_inputs: tuple[str, ...] = ()
+    """Files in the capture folder that it reads where they exist, each as `--<stem>`."""
+    sidecars: tuple[str, ...] = ()
+    """The same per recording: `<recording>.<name>.toml`, as `--<name>`."""
+    flows: tuple[Flow, ...] = ("recordings",)
+    """The flows that it is part of."""
+    trials: Literal["none", "each", "all"] = "none"
+    """Made only for the tables of `make behavior-tables`: one job per trial (a method with a seed), or one
+    over all."""
+    table: str | None = None
+    """The recipe's table that configures it, where it is another node's too."""
+    on_demand: bool = False
+    """Made only where it is requested by its name, or needed by something that is."""
+
+
+def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Need, ...]:
+    """Return one need per artifact, over the recordings of `roles`."""
+    return tuple(Need(artifact, roles) for artifact in artifacts)
+
+
+FLOW: tuple[Node, ...] = (
+    Node("synthetic_capture", "synthesize_capture", threads=2),
+    Node(
+        "frames",
+        "extract_frames",
+        (Need("synthetic_capture", part="recordings", option="recording"),),
+        roles=("walkthrough", "turnaround", "session", "heldout"),
+        seconds_per_frame=0.006,
+    ),
+    Node("flow", "estimate_flow", ("frames",), roles=AGENT, seconds_per_frame=0.06),
+    Node(
+        "masks",
+        "segment_agent",
+        ("frames", "flow"),
+        roles=AGENT,
+        sidecars=("prompt",),
+        seconds_per_frame=0.11,
+    ),
+    Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, splits=("train", "none")),)),
+    Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
+    Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),
+    Node(
+        "agent_template",
+        "build_agent_template",
+        merging("frames", "masks", "features", roles=("turnaround",)),
+    ),
+    Node(
+        "scene_localizer",
+        "train_localizer",
+        ("feature_basis", "scene_template", *merging("frames", roles=("walkthrough",))),
+        fixed={"target": "scene"},
+        gpu=1,
+    ),
+    Node(
+        "agent_localizer",
+        "train_localizer",
+        ("feature_basis", "agent_template"),
+        fixed={"target": "agent"},
+        gpu=1,
+    ),
+    Node(
+        "video_poses",
+        "register_videos",
+        (
+            "frames",
+            "masks",
+            "features",
+            "scene_template",
+            "agent_template",
+            "scene_localizer",
+            "agent_localizer",
+        ),
+        roles=("session",),
+        gpu=1,
+        seconds_per_frame=0.08,
+    ),
+    Node("registration", "gather_registration", merging("video_poses")),
+    Node(
+        "reconstruction",
+        "reconstruct",
+        (
+            "registration",
+            *merging("frames", roles=VIEWED),
+            *merging("masks", "flow", "features"),
+            "scene_template",
+            "agent_template",
+        ),
+        role_dependencies=("heldout",),
+        threads=2,
+        gpu=1,
+        memory_mb=3000,
+        memory_mb_per_1000_frames=500,
+        seconds_per_frame=0.1,
+        resumable=True,
+        distributed=True,
+    ),
+    Node(
+        "splats",
+        "refine_gaussians",
+        ("reconstruction", *merging("frames", roles=VIEWED), *merging("masks", "flow")),
+        gpu=1,
+        memory_mb_per_1000_frames=300,
+        resumable=True,
+        seconds_per_frame=0.03,
+    ),
+    Node("synthetic_lives", "synthesize_capture.lives", flows=("trajectories",)),
+    Node(
+        "trajectories",
+        "read_trajectories",
+        (Need("synthetic_lives", part="recordings", option="recording"),),
+        roles=("session",),
+        flows=("trajectories",),
+    ),
+    Node(
+        "behavior_data",
+        "slice_behavior",
+        (Need("reconstruction", flow="recordings"), Need("trajectories", flow="trajectories")),
+        role_dependencies=("session",),
+        flows=BOTH,
+    ),
+    Node("behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True, flows=BOTH),
+    Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True),
+    Node("longterm_world", "synthesize_capture.motions", on_demand=True),
+    Node(
+        "longterm_ablations",
+        "train_longterm",
+        ("reconstruction", "behavior_data"),
+        fixed={"ablations": "rivals"},
+        resumable=True,
+        on_demand=True,
+    ),
+    Node(
+        "longterm_study",
+        "train_longterm",
+        ("longterm_world",),
+        fixed={"ablations": "all"},
+        resumable=True,
+        on_demand=True,
+    ),
+    Node(
+        "behavior_trials",
+        "train_behavior",
+        ("behavior_data",),
+        table="train_behavior",
+        fixed={"export": False},
+        gpu=1,
+        resumable=True,
+        flows=BOTH,
+        trials="each",
+    ),
+    Node(
+        "behavior_scores",
+        "score_behavior",
+        (
+            "behavior_data",
+            "behavior_trials",
+            Need("synthetic_lives", part="approaches", option="approaches", flow="trajectories"),
+        ),
+        flows=BOTH,
+        trials="each",
+    ),
+    Node(
+        "behavior_tables",
+        "tabulate_behavior",
+        ("behavior_data", "behavior_trials", "behavior_scores"),
+        flows=BOTH,
+        trials="all",
+    ),
+    Node(
+        "longterm_tables",
+        "tabulate_longterm",
+        (
+            "reconstruction",
+            "behavior_data",
+            "behavior",
+            "longterm_ablations",
+            "longterm_world",
+            "longterm_study",
+        ),
+        on_demand=True,
+    ),
+    Node("simulator", "export_simulator", ("reconstruction", "splats", "behavior", "behavior_data")),
+    Node(
+        "evaluation",
+        "evaluate",
+        (
+            *merging("frames", "masks", "flow"),
+            "scene_template",
+            "agent_template",
+            "scene_localizer",
+            "registration",
+            "reconstruction",
+            "splats",
+            "behavior_data",
+            "behavior",
+            Need("synthetic_capture", part="truth", option="truth"),
+        ),
+        role_dependencies=("session", "heldout"),
+        gpu=1,
+        extra_inputs=("clicks.json",),
+    ),
+    Node(
+        "registration_tables",
+        "evaluate.registration_tables",
+        (
+            Need("registration", variants=REGISTRATION_VARIANTS),
+            "scene_template",
+            *merging("frames", roles=("walkthrough", "session")),
+            Need("synthetic_capture", part="truth", option="truth"),
+        ),
+        on_demand=True,
+    ),
+    Node(
+        "reconstruction_tables",
+        "evaluate.reconstruction_tables",
+        (
+            Need("reconstruction", variants=RECONSTRUCTION_VARIANTS),
+            "scene_template",
+            "agent_template",
+            *merging("frames"),
+            Need("synthetic_capture", part="truth", option="truth"),
+        ),
+        on_demand=True,
+    ),
+    Node(
+        "report",
+        "report",
+        (
+            *merging("frames", "flow", "masks"),
+            "feature_basis",
+            *merging("features"),
+            "scene_template",
+            "agent_template",
+            "scene_localizer",
+            "agent_localizer",
+            *merging("video_poses"),
+            "registration",
+            "reconstruction",
+            "splats",
+            "behavior_data",
+            "behavior",
+            "longterm",
+            "simulator",
+            "evaluation",
+        ),
+    ),
+)
+NODES = {node.artifact: node for node in FLOW}
+
+
+def table_of(node: Node) -> str:
+    """Return the name of the recipe's table that configures `node`: its program's, or its own where they
+    share one.
+    """
+    shared = sum(other.stage == node.stage and other.table is None for other in FLOW) > 1
+    return node.table or (node.artifact if shared or "." in node.stage else node.stage)
+
+
+def nodes_of(flow: Flow, *, trials: bool = False) -> tuple[Node, ...]:
+    """Return the nodes of one flow, in declared order, without those that are made for tables only, or with
+    them.
+    """
+    return tuple(node for node in FLOW if flow in node.flows and (trials or node.trials == "none"))
+
+
+def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
+    """Return the node's inputs, in declared order; those of one flow only, if given."""
+    needs = tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
+    return tuple(need for need in needs if flow is None or need.flow in (None, flow))
+
+
+def trial_ids(methods: Sequence[str], seeds: int) -> tuple[str, ...]:
+    """Return the ids of the trials that the tables are made of: `<method>-<seed>`."""
+    return tuple(f"{method}-{seed}" for method in methods for seed in range(seeds))
+
+
+def check() -> None:
+    """Assert that every input is declared before it is used and exists for every recording that asks for
+    it.
+    """
+    declared: dict[str, Node] = {}
+    for node in FLOW:
+        for need in needs_of(node):
+            assert need.artifact in declared, (
+                f"{node.artifact} needs {need.artifact}, declared later or not at all"
+            )
+            source = declared[need.artifact]
+            if node.roles and source.roles:
+                assert set(node.roles) <= set(source.roles), (
+                    f"{node.artifact}: no {need.artifact} for every role"
+                )
+        assert node.artifact not in declared, f"{node.artifact} is declared twice"
+        declared[node.artifact] = node

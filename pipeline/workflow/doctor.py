@@ -1,0 +1,174 @@
+"""`make doctor`: look at this machine and say what a build would miss.
+
+Each check returns one finding; the exit code is 2 when something that every build needs is missing.
+"""
+
+import ctypes.util
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pipeline.core import config
+from pipeline.core.errors import InputError
+from pipeline.workflow import captures, recipes
+
+LIBRARIES = (
+    "torch",
+    "numpy",
+    "scipy",
+    "cv2",
+    "pycolmap",
+    "OpenEXR",
+    "av",
+    "lzfse",
+    "numba",
+    "embreex",
+    "trimesh",
+    "kornia",
+    "onnxruntime",
+    "onnxscript",
+    "pygltflib",
+    "skimage",
+    "safetensors",
+    "matplotlib",
+    "jinja2",
+)
+NEEDED_DISK_GB = 10
+NEEDED_MEMORY_GB = 8
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found."""
+
+    subject: str
+    state: Literal["ok", "warn", "fail"]
+    text: str
+
+
+def python() -> Finding:
+    """Check the interpreter."""
+    good = (3, 11) <= sys.version_info[:2] < (3, 14)
+    return Finding(
+        "python",
+        "ok" if good else "fail",
+        f"{sys.version.split()[0]} (3.11 to 3.13 {'will do' if good else 'is needed'})",
+    )
+
+
+def libraries() -> Finding:
+    """Import what the stages import."""
+    missing = []
+    for name in LIBRARIES:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            missing.append(f"{name} ({error})")
+    text = f"missing: {', '.join(missing)}; remedy: envs/setup" if missing else f"all {len(LIBRARIES)} import"
+    return Finding("libraries", "fail" if missing else "ok", text)
+
+
+def meshes() -> Finding:
+    """Import pymeshlab, in a process of its own, as the stage that uses it does."""
+    found = subprocess.run([sys.executable, "-c", "import pymeshlab"], capture_output=True, text=True)
+    remedy = "missing system libraries; remedy: apt-get install libgl1 libopengl0"
+    return Finding(
+        "pymeshlab", "fail" if found.returncode else "ok", remedy if found.returncode else "imports"
+    )
+
+
+def processors() -> Finding:
+    """Count cores and look for a GPU that torch can use."""
+    try:
+        import torch  # late: it costs seconds
+    except ImportError:
+        return Finding("processors", "fail", f"{os.cpu_count()} cores; torch is missing; remedy: envs/setup")
+    gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none, everything runs on the CPU"
+    return Finding("processors", "ok", f"{os.cpu_count()} cores; GPU: {gpu}")
+
+
+def lock() -> Finding:
+    """Compare the lock that the environment was made from with what this machine has."""
+    try:
+        kind = Path(".venv", "lock").read_text().strip()
+    except OSError:
+        return Finding("lock", "warn", "unknown which: this environment was not made by envs/setup")
+    has_gpu = shutil.which("nvidia-smi") is not None
+    if has_gpu and kind == "cpu":
+        return Finding("lock", "warn", "envs/cpu.txt, although there is a GPU; remedy: make doctor LOCK=cuda")
+    without = "" if has_gpu or kind == "cpu" else "; this machine has no GPU, others may"
+    return Finding("lock", "ok", f"envs/{kind}.txt{without}")
+
+
+def memory() -> Finding:
+    """Check the machine's memory."""
+    total_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    state = "ok" if total_gb >= NEEDED_MEMORY_GB else "warn"
+    return Finding(
+        "memory", state, f"{total_gb:.1f} GB (a full build wants {NEEDED_MEMORY_GB}; with less, use -j1)"
+    )
+
+
+def disk() -> Finding:
+    """Check the free space where builds stand."""
+    free_gb = shutil.disk_usage(".").free / 2**30
+    return Finding(
+        "disk",
+        "ok" if free_gb >= NEEDED_DISK_GB else "warn",
+        f"{free_gb:.0f} GB free (wanted: {NEEDED_DISK_GB})",
+    )
+
+
+def browser() -> Finding:
+    """Look for the browser that the page test drives; builds do without."""
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    return Finding(
+        "browser",
+        "ok" if found else "warn",
+        found or "none: the page test cannot run; remedy: apt-get install chromium",
+    )
+
+
+def recordings() -> Finding:
+    """Count the recordings of every agent."""
+    counts = {}
+    for recipe in sorted(Path("agents").glob("*.toml")):
+        try:
+            flow = recipes.flow(config.read_table(recipe).get(recipes.FLOW_TABLE, {}), str(recipe))
+        except InputError as error:
+            return Finding("recordings", "warn", str(error))
+        counts[recipe.stem] = len(captures.find(Path("captures", recipe.stem), flow))
+    return Finding(
+        "recordings", "ok", ", ".join(f"{name}: {count or 'built-in'}" for name, count in counts.items())
+    )
+
+
+def opengl() -> Finding:
+    """Look for the system libraries that meshes need."""
+    missing = [name for name in ("GL", "OpenGL") if ctypes.util.find_library(name) is None]
+    return Finding(
+        "OpenGL", "fail" if missing else "ok", f"missing lib{', lib'.join(missing)}" if missing else "found"
+    )
+
+
+CHECKS: tuple[Callable[[], Finding], ...] = (
+    python, libraries, opengl, meshes, processors, lock, memory, disk, browser, recordings,
+)  # fmt: skip
+
+
+def main() -> int:
+    """Print every finding; return the exit code."""
+    findings = [check() for check in CHECKS]
+    for finding in findings:
+        print(f"{finding.state:5}{finding.subject:12}{finding.text}")
+    return 2 if any(finding.state == "fail" for finding in findings) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""What the Snakefile knows of the flow: homes, targets, and per rule its inputs and resources.
+
+The process that the user starts plans; jobs on other machines only read the small file of the job that they
+do. Standard library only.
+"""
+
+import csv
+import functools
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.errors import InputError
+from pipeline.workflow import artifact, dag, jobs
+
+FRAMES_UNKNOWN = 1000
+"""Frames reckoned per recording that has not been extracted yet: 100 s at 10 Hz."""
+LEAST_RUNTIME_MIN = 60
+"""What every job is granted on its first attempt, minutes."""
+RUNTIME_FACTOR = 4
+"""How much slower than the measured machine a node may be."""
+MEMORY_GROWTH = 1.5
+"""Memory of each attempt, relative to the one before."""
+HOME = r"[a-z0-9][a-z0-9_-]*(?:/variants/[a-z0-9][a-z0-9_-]*)?"
+"""The homes that a rule's output may belong to."""
+
+
+def homes(config: Mapping[str, Any]) -> list[str]:
+    """Return the homes to build: `agents=[...]`, a table `homes=homes.tsv` (agent, variant), or one
+    `agent=`.
+    """
+    variant = config.get("variant")
+    if config.get("homes"):
+        path = Path(config["homes"])
+        try:
+            with path.open(newline="") as file:
+                rows = list(csv.DictReader(file, delimiter="\t"))
+            named = [(row["agent"], row.get("variant") or variant) for row in rows]
+        except (OSError, UnicodeDecodeError, KeyError, csv.Error) as error:
+            remedy = "write a tab-separated table with a column `agent` and, if needed, `variant`"
+            raise InputError("REC-003", f"is no list of homes: {error}", str(path), remedy) from error
+    else:
+        agents = config.get("agents") or [config.get("agent", "cat")]
+        named = [(agent, variant) for agent in ([agents] if isinstance(agents, str) else agents)]
+    found = [f"{agent}/variants/{variant}" if variant else str(agent) for agent, variant in named]
+    return [str(jobs.Home.parse(home)) for home in found]
+
+
+def plan(homes: list[str]) -> None:
+    """Bring the plans of all homes up to date, in one process."""
+    command = [sys.executable, "-SE", "-m", "pipeline.workflow.plan", "plan", *homes]
+    subprocess.run(command, check=True, stdout=sys.stderr)
+
+
+def targets(homes: list[str]) -> list[str]:
+    """Return the stamps of everything that a build of these homes makes."""
+    found: dict[str, None] = {}
+    for home in homes:
+        planned = json.loads((jobs.Home.parse(home).plan / "dag.json").read_text())
+        found |= dict.fromkeys(job["stamp"] for job in planned if not job["on_demand"])
+    return list(found)
+
+
+def output(node: dag.Node) -> str:
+    """Return the stamp of a node's jobs, as a pattern."""
+    return f"build/{{home}}/{node.artifact}/{'{part}/' if is_several(node) else ''}{artifact.STAMP}"
+
+
+def benchmark(node: dag.Node) -> str:
+    """Return the file for Snakemake's own measurements of a node's jobs, as a pattern."""
+    return f"build/{{home}}/benchmarks/{node.artifact}{'.{part}' if is_several(node) else ''}.tsv"
+
+
+def is_several(node: dag.Node) -> bool:
+    """Return whether there is one job per recording or trial."""
+    return bool(node.roles) or node.trials == "each"
+
+
+def job_id(node: dag.Node) -> Callable[[Any], str]:
+    """Return a function from a rule's wildcards to the id of the job."""
+    return lambda wildcards: f"{node.artifact}.{wildcards.part}" if is_several(node) else node.artifact
+
+
+def inputs(node: dag.Node) -> Callable[[Any], list[str]]:
+    """Return a function from a rule's wildcards to all files that the job depends on."""
+
+    def of(wildcards: Any) -> list[str]:
+        job = _job(wildcards.home, job_id(node)(wildcards))
+        return [*(f"{each['path']}/{artifact.STAMP}" for each in job["inputs"]), *job["keys"]]
+
+    return of
+
+
+def memory_mb(node: dag.Node) -> Callable[..., int]:
+    """Return a function from wildcards and attempt to the memory that the job reserves."""
+
+    def of(wildcards: Any, attempt: int) -> int:
+        frames = _frames(wildcards.home, job_id(node)(wildcards)) if node.memory_mb_per_1000_frames else 0
+        needed = node.memory_mb + node.memory_mb_per_1000_frames * frames / 1000
+        return math.ceil(needed * MEMORY_GROWTH ** (attempt - 1))
+
+    return of
+
+
+def runtime_min(node: dag.Node) -> Callable[..., int]:
+    """Return a function from wildcards and attempt to the time that the job is granted, minutes."""
+
+    def of(wildcards: Any, attempt: int) -> int:
+        frames = _frames(wildcards.home, job_id(node)(wildcards))
+        return math.ceil(
+            (LEAST_RUNTIME_MIN + RUNTIME_FACTOR * node.seconds_per_frame * frames / 60) * attempt
+        )
+
+    return of
+
+
+@functools.cache
+def _job(home: str, id: str) -> dict[str, Any]:
+    path = jobs.job_file(home, id)
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InputError("RUN-001", f"has no job {id!r}", home, f"see {path.parent}") from None
+
+
+@functools.cache
+def _frames(home: str, id: str) -> int:
+    """Return how many frames the recordings hold that a job reads, as far as they have been extracted."""
+    folders = [each["path"] for each in _job(home, id)["inputs"] if each["name"].startswith("frames/")]
+    return sum(map(_frames_in, folders)) or FRAMES_UNKNOWN
+
+
+@functools.cache
+def _frames_in(folder: str) -> int:
+    try:
+        return len(os.listdir(f"{folder}/color"))
+    except FileNotFoundError:
+        return FRAMES_UNKNOWN

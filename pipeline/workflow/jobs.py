@@ -1,0 +1,266 @@
+"""What there is to make: the declaration expanded for one agent's recordings, job by job.
+
+Standard library only, nothing is written here: `plan` writes it down, `run` does the jobs.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.errors import InputError
+from pipeline.core.videos import Video
+from pipeline.recordings import formats
+from pipeline.workflow import artifact, captures, dag
+from pipeline.workflow.dag import Flow, Need, Node
+from pipeline.workflow.recipes import Trial
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}\Z")
+NAME_RULE = "use a-z, 0-9, _ and -, beginning with a letter or digit, 63 at most"
+
+
+@dataclass(frozen=True)
+class Home:
+    """Where artifacts stand: an agent's own folder or one of its variants'."""
+
+    agent: str
+    variant: str | None = None
+    tables: bool = False
+    """A plan of its own, with the trials of `make behavior-tables`, whose artifacts stand among the
+    agent's."""
+
+    @classmethod
+    def parse(cls, text: str) -> "Home":
+        """Read `agent`, `agent/tables` or `agent/variants/name`; raises REC-004 for names that are no plain
+        names.
+        """
+        agent, *rest = text.removesuffix("/tables").split("/variants/", 1)
+        for name in (agent, *rest):
+            if not NAME.match(name):
+                raise InputError(
+                    "REC-004", f"{name!r} is no name for an agent or a variant", remedy=NAME_RULE
+                )
+        return cls(agent, *rest, tables=text.endswith("/tables"))
+
+    def __str__(self) -> str:
+        name = self.agent if self.variant is None else f"{self.agent}/variants/{self.variant}"
+        return f"{name}/tables" if self.tables else name
+
+    @property
+    def folder(self) -> Path:
+        """Return where its artifacts stand."""
+        return Path("build", str(self).removesuffix("/tables"))
+
+    @property
+    def plan(self) -> Path:
+        """Return where its plan stands."""
+        return Path("build", str(self), "plan")
+
+    @property
+    def base(self) -> "Home":
+        """Return the agent's own home."""
+        return Home(self.agent)
+
+
+@dataclass(frozen=True)
+class Input:
+    """One artifact that a job reads."""
+
+    name: str
+    path: str
+    part: str | None
+    """Prefix of the files that count, where it is not the whole artifact."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One artifact to make, with all that `run` needs to know."""
+
+    id: str
+    artifact: str
+    stage: str
+    video: str | None
+    trial: str | None
+    home: str
+    out: str
+    inputs: tuple[Input, ...]
+    keys: tuple[str, ...]
+    """Files that, with the inputs, decide the result."""
+    arguments: tuple[str, ...]
+    threads: int
+    gpu: int
+    memory_mb: int
+    resumable: bool
+    distributed: bool
+    on_demand: bool
+
+    @property
+    def stamp(self) -> str:
+        """Return the file that Make looks at."""
+        return f"{self.out}/{artifact.STAMP}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain JSON types, with its stamp."""
+        return {**vars(self), "inputs": [vars(each) for each in self.inputs], "stamp": self.stamp}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that is known before the first stage runs."""
+
+    home: Home
+    videos: tuple[Video, ...]
+    builtin: bool
+    """Whether there are no recordings and the built-in capture stands in."""
+    tables: dict[str, dict[str, Any]]
+    """Per artifact: its stage's table, with the variant's changes."""
+    touched: frozenset[str]
+    """Artifacts that the variant makes anew; all of them for an agent itself."""
+    flow: Flow = "recordings"
+    trials: tuple[Trial, ...] = ()
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """Return what is to be made, in flow order."""
+        found = dag.nodes_of(self.flow, trials=self.home.tables)
+        return tuple(node for node in found if self.builtin or node.artifact not in dag.BUILTIN.values())
+
+    def home_of(self, name: str) -> Home:
+        """Return where the artifact `name` stands."""
+        return self.home if name in self.touched else self.home.base
+
+
+def jobs(plan: Plan) -> list[Job]:
+    """Expand the declaration for the plan's recordings and trials, in flow order."""
+
+    def parts(node: Node) -> list[Video | Trial | None]:
+        if node.trials == "each":
+            return list(plan.trials)
+        return [video for video in plan.videos if video.role in node.roles] if node.roles else [None]
+
+    return [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
+
+
+def deciding_videos(plan: Plan, node: Node) -> list[Video]:
+    """Return the recordings whose set and split decide the result of a node that is one job for all."""
+    if node.roles:
+        return []
+    roles, splits = (
+        set(node.role_dependencies),
+        {role: {"train", "test", "none"} for role in node.role_dependencies},
+    )
+    for need in dag.needs_of(node, plan.flow):
+        for role in need.roles or dag.NODES[need.artifact].roles:
+            roles.add(role)
+            splits.setdefault(role, set()).update(need.splits)
+    return [video for video in plan.videos if video.role in roles and video.split in splits[video.role]]
+
+
+def job_file(home: str, job_id: str) -> Path:
+    """Return the file that holds one job, for `run` and other engines."""
+    return Path("build", home, "plan", "jobs", f"{job_id}.json")
+
+
+def redo_mark(home: str, job_id: str) -> Path:
+    """Return the file whose presence has `run` do a job although its key is unchanged."""
+    return Path("build", home, "plan", "redo", job_id)
+
+
+def lock_file(home: str, job_id: str) -> Path:
+    """Return the file whose kernel lock a runner holds while it does a job."""
+    return Path("build", home, "plan", "locks", job_id)
+
+
+def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
+    home, video, trial = (
+        plan.home_of(node.artifact),
+        part if isinstance(part, Video) else None,
+        part if isinstance(part, Trial) else None,
+    )
+    out = home.folder / node.artifact / (part.id if part else "")
+    folder, deciding = Path("captures", plan.home.agent), [video.id] if video else []
+    inputs: list[Input] = []
+    arguments: list[str] = []
+    for need in dag.needs_of(node, plan.flow):
+        if need.artifact in dag.BUILTIN.values() and not plan.builtin:
+            if video:
+                scale_from = formats.scale_sources(folder, video, plan.videos)
+                arguments += [
+                    f"--{need.option}",
+                    f"{folder}/{video.file}",
+                    *(["--captures", str(folder)] if scale_from else []),
+                ]
+                deciding += [other.id for other in scale_from]
+            continue
+        found = list(_inputs(plan, need, node, part))
+        inputs += found
+        source = dag.NODES[need.artifact]
+        several = (source.roles and not node.roles) or (source.trials == "each" and not trial)
+        path = (
+            plan.home_of(need.artifact).folder / need.artifact
+            if several
+            else Path(found[0].path, found[0].part or "")
+        )
+        arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
+        arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
+    named = f"{node.artifact}.{trial.id}" if trial else node.artifact
+    arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
+    arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
+    keys = [
+        str(home.plan / f"keys/{named}.json"),
+        *(str(home.base.plan / f"keys/video.{id}.json") for id in deciding),
+    ]
+    for file in captures.extra_inputs(plan.home.agent, node.extra_inputs):
+        keys, arguments = (
+            [*keys, str(home.base.plan / f"keys/extra.{file.name}")],
+            [*arguments, f"--{file.stem}", str(file)],
+        )
+    for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items() if video else ():
+        keys, arguments = (
+            [*keys, str(home.base.plan / f"keys/{name}.{video.id}.json")],
+            [*arguments, f"--{name}", str(file)],
+        )
+    return Job(
+        id=f"{node.artifact}.{part.id}" if part else node.artifact,
+        artifact=node.artifact,
+        stage=node.stage,
+        video=video.id if video else None,
+        trial=trial.id if trial else None,
+        home=str(home),
+        out=str(out),
+        inputs=tuple(inputs),
+        keys=tuple(keys),
+        arguments=tuple(arguments),
+        threads=node.threads,
+        gpu=node.gpu,
+        memory_mb=node.memory_mb,
+        resumable=node.resumable,
+        distributed=node.distributed,
+        on_demand=node.on_demand,
+    )
+
+
+def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> Iterator[Input]:
+    """Yield the artifacts that one need of one job means."""
+    source = dag.NODES[need.artifact]
+    folder = plan.home_of(need.artifact).folder / need.artifact
+    if source.trials == "each":
+        for trial in [part] if isinstance(part, Trial) else plan.trials:
+            yield Input(f"{need.artifact}/{trial.id}", str(folder / trial.id), need.part)
+        return
+    if not source.roles:
+        inner = f"{need.part}/{part.file}" if need.part and isinstance(part, Video) else need.part
+        yield Input(need.artifact, str(folder), inner)
+        others = [Home(plan.home.agent, variant) for variant in need.variants]
+        yield from (
+            Input(f"{other}/{need.artifact}", str(other.folder / need.artifact), inner) for other in others
+        )
+        return
+    for other in [part] if node.roles else plan.videos:
+        if node.roles or (
+            other.role in (need.roles or source.roles)
+            and other.role in source.roles
+            and other.split in need.splits
+        ):
+            yield Input(f"{need.artifact}/{other.id}", str(folder / other.id), need.part)

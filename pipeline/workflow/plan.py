@@ -1,0 +1,360 @@
+"""The planner: recipe + recordings + declaration -> `build/<home>/plan/`, which Make, Snakemake and `run`
+read.
+
+    python -SE -m pipeline.workflow.plan plan HOME...
+    python -SE -m pipeline.workflow.plan redo HOME ARTIFACT        have one artifact made again
+    python -SE -m pipeline.workflow.plan inputs HOME ARTIFACT...   options that name artifacts to a stage
+    python -SE -m pipeline.workflow.plan new AGENT [TAKEN...]      recipe and capture folder of a new animal
+
+HOME is an agent, <agent>/variants/<name>, or <agent>/tables; TAKEN are names that no animal may have.
+
+Every check of the user's input happens before anything is written; a file is rewritten only when its content
+changes, so that its age tells Make what is to be looked at. Standard library only: it runs at every `make`.
+"""
+
+import json
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.errors import InputError, coded_disk_errors
+from pipeline.workflow import artifact, captures, dag, recipes, sources
+from pipeline.workflow.jobs import Home, Job, Plan, deciding_videos, job_file, jobs, lock_file, redo_mark
+
+CODE_CACHE = Path("build", "code-cache.json")
+"""What the planner read of the code, for all homes; lost, it only costs time."""
+
+
+def read(home: Home, cache: sources.Cache) -> Plan:
+    """Check recipe and recordings and return the plan; changes nothing on disk."""
+    recipe, where = recipes.read(Path("agents", f"{home.agent}.toml"))
+    flow = recipes.flow(recipe.get(recipes.FLOW_TABLE, {}), where)
+    overlay = {}
+    if home.variant:
+        overlay, _ = recipes.read(Path("agents", "variants", f"{home.variant}.toml"))
+    tables = {n.artifact: {**recipe.get(dag.table_of(n), {}), **n.fixed} for n in dag.FLOW}
+    changed = {
+        n.artifact: {**recipes.merged(tables[n.artifact], overlay.get(dag.table_of(n), {})), **n.fixed}
+        for n in dag.FLOW
+    }
+    folder = Path("captures", home.agent)
+    names = captures.find(folder, flow)
+    if names:
+        said = captures.remarks(folder, names, recipe.get(recipes.VIDEOS_TABLE, {}), where)
+        hashes = {name: _digest_of_recording(folder / name, cache) for name in names}
+    else:
+        captures.refuse_strangers(folder, flow)
+        said = recipes.builtin_remarks(flow, recipe, where)
+        hashes = dict.fromkeys(said)
+    videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
+    touched = _touched(tables, changed) if home.variant else frozenset(dag.NODES)
+    if home.tables:
+        touched = frozenset(n.artifact for n in dag.FLOW if n.trials != "none")
+    trials = tuple(recipes.trials(recipe.get(recipes.TABLES_STAGE, {}))) if home.tables else ()
+    return Plan(home, videos, not names, changed, touched, flow, trials)
+
+
+def write(plan: Plan, cache: sources.Cache) -> None:
+    """Write the plan's files, each only if it changed."""
+    all_jobs = jobs(plan)
+    base = plan.home.base.plan
+    _write(
+        base / "ids.json", _json(_known_ids(plan.home.base) | {video.file: video.id for video in plan.videos})
+    )
+    _write(base / "videos.json", _json([asdict(video) for video in plan.videos]))
+    for video in plan.videos:
+        _write(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
+    for file in (
+        file for node in dag.FLOW for file in captures.extra_inputs(plan.home.agent, node.extra_inputs)
+    ):
+        _write(base / f"keys/extra.{file.name}", _json({"sha256": cache.get(file, artifact.digest_of_file)}))
+    with_sidecars = [node for node in dag.FLOW if node.sidecars]
+    for node, video in ((node, video) for node in with_sidecars for video in plan.videos):
+        for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items():
+            digest = cache.get(file, artifact.digest_of_file)
+            _write(base / f"keys/{name}.{video.id}.json", _json({"sha256": digest}))
+    own = [job for job in all_jobs if job.home == str(plan.home)]
+    for name, trial in {(job.artifact, job.trial) for job in own}:
+        _write_key(plan, cache, name, trial)
+    for job in all_jobs:  # there from the start, so that a job that fails leaves no trace
+        lock_file(job.home, job.id).parent.mkdir(parents=True, exist_ok=True)
+        lock_file(job.home, job.id).touch()
+    for number, job in enumerate(all_jobs, start=1):
+        if job.home == str(plan.home):
+            one = job.as_dict() | {"place": f"{number} of {len(all_jobs)}"}
+            _write(job_file(job.home, job.id), json.dumps(one, sort_keys=True) + "\n")
+    lines = [json.dumps(job.as_dict(), sort_keys=True) for job in all_jobs]
+    _write(plan.home.plan / "dag.json", "[\n" + ",\n".join(lines) + "\n]\n")
+    _write(plan.home.plan / "rules.mk", _rules(plan, all_jobs))
+
+
+def _write(path: Path, text: str) -> None:
+    """Write one of the plan's many files; the disk is flushed once, after all of them."""
+    artifact.write_if_changed(path, text, sync=False)
+
+
+def _write_key(plan: Plan, cache: sources.Cache, name: str, trial: str | None) -> None:
+    """Write the table of one artifact, or of one trial of it, and what decides its content beside its
+    inputs.
+    """
+    node, table = dag.NODES[name], plan.tables[name]
+    overlay = next((each.overlay for each in plan.trials if each.id == trial), {})
+    if trial and dag.table_of(node) == recipes.TRIED_TABLE:
+        table = recipes.merged(table, overlay)
+    name = f"{name}.{trial}" if trial else name
+    _write(plan.home.plan / f"configs/{name}.json", _json(table))
+    deciding = deciding_videos(plan, node)
+    key = {
+        "stage": node.stage,
+        "version": node.version,
+        "code": sources.digest(node.stage, cache),
+        "table": table,
+        "videos": [[v.id, v.role, v.split, v.synchronized_with, v.offset_s] for v in deciding],
+    }
+    _write(plan.home.plan / f"keys/{name}.json", _json(key))
+
+
+def mark_redo(home: Home, name: str) -> None:
+    """Have the artifact `name` of `home` made again by the next build, although nothing changed."""
+    known = json.loads((home.plan / "dag.json").read_text())
+    marked = [job for job in known if job["artifact"] == name]
+    if not marked:
+        raise InputError("REC-007", f"no artifact {name!r}", str(home), f"artifacts: {', '.join(dag.NODES)}")
+    for job in marked:
+        artifact.write_if_changed(redo_mark(job["home"], job["id"]), "made again by the next build\n")
+        Path(job["stamp"]).unlink(missing_ok=True)
+
+
+def inputs(home: Home, names: Sequence[str]) -> str:
+    """Return `--name path` of finished artifacts, each where a variant or the agent it stands on has it."""
+    known = {job["artifact"]: Path(job["out"]) for job in json.loads((home.plan / "dag.json").read_text())}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(
+            "REC-007", f"no artifact {unknown[0]!r}", str(home), f"artifacts: {', '.join(known)}"
+        )
+    several = {name for name in names if dag.NODES[name].roles}
+    return " ".join(
+        f"--{name.replace('_', '-')} {known[name].parent if name in several else known[name]}"
+        for name in names
+    )
+
+
+def new_agent(name: str, taken: Sequence[str] = ()) -> None:
+    """Write the recipe and the capture folder of a new animal; an existing recipe stays as it is."""
+    home = Home.parse(name)
+    if name in taken:
+        raise InputError("REC-004", f"`make {name}` means something else already", remedy="take another name")
+    recipe = Path("agents", f"{home.agent}.toml")
+    if not recipe.exists():
+        template = Path("agents", "cat.toml").read_text()
+        renamed = template.replace("captures/cat/", f"captures/{home.agent}/").replace(
+            'name = "cat"', f'name = "{home.agent}"'
+        )
+        artifact.write_if_changed(recipe, renamed)
+    Path("captures", home.agent).mkdir(parents=True, exist_ok=True)
+    print(f"recipe {recipe}; put recordings into captures/{home.agent}/, then: make {home.agent}")
+
+
+def _digest_of_recording(path: Path, cache: sources.Cache) -> str:
+    if path.is_file():
+        return cache.get(path, artifact.digest_of_file)
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    return artifact.digest_of(
+        {file.relative_to(path).as_posix(): cache.get(file, artifact.digest_of_file) for file in files}
+    )
+
+
+def _known_ids(base: Home) -> dict[str, str]:
+    """Return the ids handed out so far, by file name; a file that holds anything else is written anew, as a
+    lost one is.
+    """
+    try:
+        known = json.loads((base.plan / "ids.json").read_text())
+    except (FileNotFoundError, ValueError):
+        return {}
+    ids = list(known.values()) if isinstance(known, dict) else [None]
+    sound = all(isinstance(id, str) and re.fullmatch(r"v[0-9]{3,}", id) for id in ids) and len(
+        set(ids)
+    ) == len(ids)
+    return known if sound else {}
+
+
+def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any]) -> frozenset[str]:
+    """Return what an overlay changes: the artifacts with another table, and all that is made from them."""
+    touched: set[str] = set()
+    for node in dag.FLOW:
+        from_touched = any(need.artifact in touched for need in dag.needs_of(node))
+        if tables[node.artifact] != changed[node.artifact] or from_touched:
+            touched.add(node.artifact)
+    return frozenset(touched)
+
+
+def _rules(plan: Plan, all_jobs: list[Job]) -> str:
+    """Return the Make rules: one stamp per job, one target per artifact, and the agent's own."""
+    name, home = plan.home.agent, plan.home
+    lines = ["# written by pipeline/workflow/plan.py"]
+    stamps: dict[str, list[str]] = {}
+    for job in all_jobs:
+        stamps.setdefault(job.artifact, []).append(job.stamp)
+        needed = dict.fromkeys([*(f"{i.path}/{artifact.STAMP}" for i in job.inputs), *job.keys])
+        lines += [f"{job.stamp}: {' '.join(needed)}", f"\t@$(RUN) {job.home} {job.id}"]
+    for node, made in stamps.items():
+        lines += [f".PHONY: {name}.{node} {name}.{node}.redo", f"{name}.{node}: {' '.join(made)}"]
+        lines += [
+            f"{name}.{node}.redo:",
+            f"\t@$(PLAN) redo {home} {node}",
+            f"\t@$(MAKE) $(NESTING) {name}.{node}",
+        ]
+    if not home.tables:
+        pages = [
+            f"{plan.home_of(node).folder}/{node}/index.html"
+            for node in ("report", "simulator")
+            if node in stamps
+        ]
+        lines += [
+            f".PHONY: {name}",
+            f"{name}: {' '.join(job.stamp for job in all_jobs if not dag.NODES[job.artifact].on_demand)}",
+        ]
+        lines += [
+            f"\t@echo '[{home}] done.{' Open:' if pages else ''}'",
+            *(f"\t@echo '  {page}'" for page in pages),
+        ]
+        following = (
+            f"make {name}.<artifact>[.redo], make {name} VARIANT=no_scene, make new AGENT=<name>, make help"
+        )
+        lines += [f"\t@echo 'Next: {following}'"]
+    return "\n".join(lines) + "\n"
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=1, sort_keys=True) + "\n"
+
+
+def _cache(home: Home) -> sources.Cache:
+    """Return what earlier runs of the planner read, by size and time of the files; lost, it only costs
+    time.
+    """
+    known: dict[str, Any] = {}
+    for path in (CODE_CACHE, home.plan / "cache.json"):
+        try:
+            read_before = json.loads(path.read_text())
+        except (FileNotFoundError, ValueError):
+            continue
+        known |= read_before if sources.fits(read_before) else {}
+    return sources.Cache(known)
+
+
+def _keep(cache: sources.Cache, home: Home) -> None:
+    """Write down what was read: of the code for all homes, of recordings for theirs."""
+    of_code = {path: entry for path, entry in cache.fresh.items() if Path(path).is_relative_to(sources.CODE)}
+    of_home = {path: entry for path, entry in cache.fresh.items() if path not in of_code}
+    with artifact.held(CODE_CACHE.with_suffix(".lock")):
+        _write(CODE_CACHE, json.dumps(of_code, sort_keys=True))
+    _write(home.plan / "cache.json", json.dumps(of_home, sort_keys=True))
+
+
+def _read_marks(home: Home) -> str:
+    """Hash name, size and time of all that a plan is made from."""
+    folders = (
+        sources.CODE / "pipeline",
+        sources.CODE / "stages",
+        Path("agents"),
+        Path("captures", home.agent),
+    )
+    return artifact.digest_of([sources.marks(folder) for folder in folders])
+
+
+def _written_marks(home: Home) -> str:
+    """Hash the times of a plan's files; of the folders with a file per job or key, their own."""
+    found = []
+    for plan in dict.fromkeys((home.base.plan, home.plan)):
+        names = (
+            "dag.json",
+            "rules.mk",
+            "videos.json",
+            "ids.json",
+            "cache.json",
+            "jobs",
+            "keys",
+            "configs",
+            "redo",
+        )
+        paths = [plan / name for name in names]
+        found += [[str(path), path.stat().st_mtime_ns] for path in paths if path.exists()]
+    return artifact.digest_of(found)
+
+
+def _plan(home: Home, cache: sources.Cache) -> None:
+    """Plan `home`, unless nothing that a plan is made from has changed; a variant stands on a plan of its
+    agent.
+    """
+    read_marks, state = _read_marks(home), home.plan / "state.json"
+    try:
+        before = json.loads(state.read_text())
+        if before["read"] == read_marks and before["written"] == _written_marks(home):
+            print(*before["messages"], sep="\n", end="\n" if before["messages"] else "")
+            return
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        pass
+    cache.known |= _cache(home).known
+    planned = [read(each, cache) for each in dict.fromkeys((home.base, home))]
+    with artifact.held(home.base.folder / "plan.lock"):
+        for plan in planned:
+            write(plan, cache)
+        _keep(cache, home)
+        artifact.sync_disk(home.plan)
+        messages = _messages(planned[0], home)
+        print(*messages, sep="\n", end="\n" if messages else "", flush=True)
+        done = {"read": read_marks, "written": _written_marks(home), "messages": messages}
+        artifact.write_if_changed(state, _json(done))
+
+
+def _messages(plan: Plan, home: Home) -> list[str]:
+    """Return what the user should know of the recordings."""
+    folder = Path("captures", home.agent)
+    if plan.builtin:
+        return [f"[{home}] nothing in {folder}/: building from the built-in synthetic capture"]
+    strangers = captures.not_understood(folder, plan.flow)
+    unused = [v.file for v in plan.videos if v.role == "heldout" and v.synchronized_with is None]
+    return [
+        *(
+            f"[{home}] not a recording, left alone: {captures.named(folder / n, plan.flow)}"
+            for n in strangers
+        ),
+        *(
+            f"[{home}] {file!r} measures nothing until the recipe's [videos] sets its synchronized_with"
+            for file in unused
+        ),
+    ]
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line of the planner; returns its exit code."""
+    try:
+        with coded_disk_errors("build"):
+            match arguments:
+                case ["plan", *homes] if homes:
+                    cache = sources.Cache()
+                    for home in map(Home.parse, homes):
+                        _plan(home, cache)
+                case ["redo", home, name]:
+                    mark_redo(Home.parse(home), name)
+                case ["inputs", home, *names]:
+                    print(inputs(Home.parse(home), names))
+                case ["new", name, *taken]:
+                    new_agent(name, taken)
+                case _:
+                    print(__doc__, file=sys.stderr)
+                    return 2
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

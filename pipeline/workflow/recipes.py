@@ -1,0 +1,148 @@
+"""The recipe of an agent and the overlays of its variants: which tables and keys there may be, and what they
+mean.
+
+`read` refuses what no stage knows; `flow`, `builtin_remarks` and `trials` draw from it what the planner must
+know before any stage runs. Standard library only.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from pipeline.core import config
+from pipeline.core.errors import InputError
+from pipeline.workflow import captures, dag, sources
+from pipeline.workflow.dag import Flow
+
+VIDEOS_TABLE, FLOW_TABLE, TABLES_STAGE, TRIED_TABLE = "videos", "flow", "tabulate_behavior", "train_behavior"
+OURS = "ats"
+"""The method that all others of the tables are compared with."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One method with one seed, for the tables."""
+
+    id: str
+    """`<method>-<seed>`."""
+    overlay: dict[str, Any]
+    """Keys of the trained stage's table that differ."""
+
+
+def read(path: Path) -> tuple[dict[str, Any], str]:
+    """Read a recipe or an overlay and refuse tables and keys that no stage knows, and values of a kind that
+    it does not want.
+    """
+    if not path.is_file():
+        known = ", ".join(sorted(other.stem for other in path.parent.glob("*.toml"))) or "none"
+        remedy = f"known: {known}" + (
+            "" if path.parent.name == "variants" else "; a new animal: make new AGENT=..."
+        )
+        raise InputError("REC-005", "there is no such recipe", str(path), remedy)
+    recipe = config.read_table(path)
+    stages = {dag.table_of(node): node for node in reversed(dag.FLOW)}
+    config.refuse_unknown(recipe, {*stages, VIDEOS_TABLE, FLOW_TABLE}, where=str(path), kind="table")
+    for name, table in recipe.items():
+        if not isinstance(table, dict):
+            raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
+        if name not in stages:
+            continue
+        declared = sources.config_of(stages[name].stage)
+        keys = {field.name for field in fields(declared)} - stages[name].fixed.keys()
+        config.refuse_unknown(table, keys, where=f"{path}: [{name}]")
+        config.from_table(declared, table, where=f"{path}: [{name}]")
+    return recipe, str(path)
+
+
+def flow(table: Mapping[str, Any], where: str) -> Flow:
+    """Return where the agent's flow begins, as the recipe's `[flow]` says."""
+    config.refuse_unknown(table, ("begins_at",), where=f"{where}: [flow]")
+    begins = table.get("begins_at", "recordings")
+    if begins not in dag.BUILTIN:
+        raise InputError(
+            "REC-002",
+            f"no flow begins at {begins!r}",
+            f"{where}: [flow]",
+            f"begins_at: {' or '.join(dag.BUILTIN)}",
+        )
+    return begins
+
+
+def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
+    """Yield every trained method of the tables with every seed; a method is a variant of that name."""
+    settings = {**_defaults(TABLES_STAGE), **table}
+    count, methods = _count(settings, "seeds", TABLES_STAGE), settings.get("methods", ())
+    if not isinstance(methods, list | tuple) or not all(isinstance(method, str) for method in methods):
+        raise InputError(
+            "REC-002",
+            f"{methods!r} is no list of methods",
+            f"[{TABLES_STAGE}]: methods",
+            'write ["ats", ...]',
+        )
+    if OURS not in methods or not count:
+        what = f"{count} trainings of {', '.join(methods) or 'no method'} make no tables"
+        raise InputError(
+            "REC-002",
+            what,
+            f"[{TABLES_STAGE}]: methods, seeds",
+            f"one seed at least, and {OURS!r} among the methods",
+        )
+    for method in methods:
+        path = Path("agents", "variants", f"{method}.toml")
+        overlay, _ = read(path)
+        config.refuse_unknown(overlay, (TRIED_TABLE,), where=f"{path}, a method of the tables", kind="table")
+        for seed, id in enumerate(dag.trial_ids((method,), count)):
+            yield Trial(id, {**overlay.get(TRIED_TABLE, {}), "seed": seed})
+
+
+def merged(table: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the table with the overlay's keys, table by table where tables lie in it."""
+    inner = {
+        key: merged(table[key], value)
+        for key, value in overlay.items()
+        if isinstance(value, Mapping) and key in table
+    }
+    return {**table, **overlay, **inner}
+
+
+def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], where: str) -> dict[str, captures.Remarks]:
+    """Return the built-in capture's recordings; an override may change them as it may a user's."""
+    node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
+    settings = {**_defaults(node.stage), **recipe.get(dag.table_of(node), {})}
+    if begins == "recordings":
+        said = captures.builtin(
+            *(_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions"))
+        )
+    else:
+        said = captures.builtin_lives(
+            *(
+                _count(settings, key, where)
+                for key in ("homes", "sessions_per_home", "test_homes", "test_sessions")
+            )
+        )
+    for name in (name for name in overrides if name not in said):
+        known = ", ".join(said)
+        remedy = f"copy it into captures/, beside the others; without any, the built-in capture has {known}"
+        raise InputError("REC-001", f"unknown recording {name!r}", f"{where}: [videos]", remedy)
+    given = {
+        name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()
+    }
+    return {
+        name: config.from_table(
+            captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]"
+        )
+        for name in said
+    }
+
+
+def _defaults(stage: str) -> dict[str, Any]:
+    return {field.name: config.default_of(field) for field in fields(sources.config_of(stage))}
+
+
+def _count(settings: Mapping[str, Any], key: str, where: str) -> int:
+    if type(settings[key]) is not int or settings[key] < 0:
+        raise InputError(
+            "REC-002", f"{settings[key]!r} is no count", f"{where}: {key}", "give a whole number"
+        )
+    return settings[key]

@@ -1,0 +1,369 @@
+"""The runner: do one job so that its artifact is complete or absent. What Make, Snakemake and schedulers
+call.
+
+    python -SE -m pipeline.workflow.run [OPTIONS] HOME JOB      for example `toy masks.v002`
+
+lock -> key -> unchanged? refresh the stamp -> clean up after the dead -> run the stage program, which
+publishes atomically -> record -> stamp. Exit codes: the stage's own (2 bad input, 75 stopped but resumable,
+76 diverged), 128 + n when signal n ended it. --processes: as many per machine fit one model together
+(torchrun); across machines --launcher starts torchrun on each, for example `srun --ntasks-per-node=1`, and
+torchrun's own variables (PET_NNODES, PET_RDZV_ENDPOINT ...) say how they meet. --attempt: of an engine that
+tries again; above 1, a job that ended with 2 or 76 and has the same key is not run. What a job printed stands
+in build/<home>/logs/<job>.<number>.log. Standard library only.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, TextIO
+
+from pipeline.core import processes
+from pipeline.core.errors import InputError, coded_disk_errors
+from pipeline.workflow import artifact, jobs, sources
+
+LEAST_FREE_BYTES = 1 << 29
+"""A stage does not begin on a disk with less than this free."""
+LONGEST_S = 7 * 24 * 3600
+"""A stage that takes longer hangs."""
+GRACE_S = 30
+"""Time that a stage gets to save itself after SIGTERM."""
+FINAL_CODES = (2, 76)
+"""Bad input and divergence: they end the same way again as long as the key is the same."""
+LOGS_KEPT = 9
+"""Logs of one job that are kept, the latest ones."""
+EXPLAINED = {
+    75: "stopped after saving; run the same again to go on",
+    76: "training diverged; its diagnosis stands above",
+    128 + signal.SIGINT: "stopped; run the same again to go on",
+    128 + signal.SIGTERM: "stopped; run the same again to go on",
+    128
+    + signal.SIGKILL: "killed; if nobody did it, memory was full: close other programs, or build with -j1",
+}
+
+
+@dataclass(frozen=True)
+class Engine:
+    """How the caller wants a job to be run."""
+
+    processes: int = 1
+    """Per machine, for what several can do together."""
+    launcher: tuple[str, ...] = ()
+    """Starts a command on every machine."""
+    attempt: int = 1
+
+
+def run(home: str, job_id: str, engine: Engine = Engine()) -> int:
+    """Do the job if anything that decides its artifact has changed; return the exit code."""
+    job = _job(home, job_id)
+    out, stamp = Path(job["out"]), Path(job["stamp"])
+    resume = Path("build", job["home"], "resume", job_id)
+    redo = jobs.redo_mark(job["home"], job_id)
+    waiting = f"[{job_id}] is being made by another build; waiting for it"
+    with artifact.held(jobs.lock_file(job["home"], job_id), waiting):
+        artifact.clean(out, _record(job), _failure(job))
+        key = _key(job)
+        made = artifact.read_manifest(out)
+        if made is None or made.key != key or redo.exists():
+            if engine.attempt > 1 and (code := _failed_before(job, key)):
+                _say(
+                    job_id, f"not tried again: it ended with exit code {code}, and nothing has changed since"
+                )
+                return code
+            if redo.exists() or _other_key(resume, key):
+                shutil.rmtree(resume, ignore_errors=True)
+            code = _do(job, key, resume, engine)
+            if code:
+                _write_json(_failure(job), {"key": key, "code": code})
+                return code
+        _failure(job).unlink(missing_ok=True)
+        stamp.touch()
+        shutil.rmtree(resume, ignore_errors=True)
+        redo.unlink(missing_ok=True)
+    return 0
+
+
+def _job(home: str, job_id: str) -> dict[str, Any]:
+    """Return a planned job of `home`, or of the agent whose variant `home` is."""
+    parsed = jobs.Home.parse(home)
+    paths = [jobs.job_file(str(each), job_id) for each in dict.fromkeys((parsed, parsed.base))]
+    for path in paths:
+        try:
+            return json.loads(path.read_text())
+        except FileNotFoundError:
+            continue
+        except (ValueError, RecursionError) as error:
+            remedy = f"delete {path.parent}, and run `make {home}`"
+            raise InputError("RUN-001", "is no planned job", str(path), remedy) from error
+    if not parsed.plan.is_dir():
+        raise InputError("RUN-001", "is not planned yet", home, f"run `make {home}`")
+    raise InputError("RUN-001", f"has no job {job_id!r}", home, f"see {paths[0].parent}")
+
+
+def _record(job: dict[str, Any]) -> Path:
+    return Path("build", job["home"], "records", f"{job['id']}.json")
+
+
+def _failure(job: dict[str, Any]) -> Path:
+    return Path("build", job["home"], "failures", f"{job['id']}.json")
+
+
+def _failed_before(job: dict[str, Any], key: str) -> int:
+    """Return the exit code with which the job failed last, if it would fail in the same way again; else 0."""
+    try:
+        last = json.loads(_failure(job).read_text())
+    except (FileNotFoundError, ValueError, RecursionError):
+        return 0
+    return last["code"] if last["key"] == key and last["code"] in FINAL_CODES else 0
+
+
+def _key(job: dict[str, Any]) -> str:
+    """Hash all that decides the artifact: stage, code, table, recordings, and the content of every input."""
+    contents = {}
+    for entry in job["inputs"]:
+        manifest = artifact.opened(Path(entry["path"]), entry["name"])
+        part = entry["part"]
+        chosen = {
+            n: digest
+            for n, digest in manifest.files.items()
+            if part and (n == part or n.startswith(f"{part}/"))
+        }
+        contents[entry["name"]] = artifact.content_of(chosen) if part else manifest.content
+    return artifact.digest_of([contents, [json.loads(Path(path).read_text()) for path in job["keys"]]])
+
+
+def _other_key(resume: Path, key: str) -> bool:
+    """Tell whether checkpoints, if any, belong to another key; they must never be gone on from."""
+    try:
+        return (resume / "key").read_text() != key
+    except FileNotFoundError:
+        return True
+
+
+def _do(job: dict[str, Any], key: str, resume: Path, engine: Engine) -> int:
+    """Run the stage program and, if its artifact stands, record how it went."""
+    out = Path(job["out"])
+    if not sources.CODE.joinpath("stages", *job["stage"].split("."), "__main__.py").is_file():
+        raise InputError(
+            "RUN-002", f"there is no stage program {job['stage']!r}", "stages/", "this build is incomplete"
+        )
+    free = shutil.disk_usage("build").free
+    if free < LEAST_FREE_BYTES:
+        raise InputError(
+            "SYS-001",
+            f"only {free >> 20} MB free on the disk",
+            str(out),
+            "free some space and run the same again",
+        )
+    arguments = [*job["arguments"], "--key", key, "--threads", str(job["threads"])]
+    if job["resumable"]:
+        resume.mkdir(parents=True, exist_ok=True)
+        artifact.write_if_changed(resume / "key", key)
+        arguments += ["--resume", str(resume)]
+    with _log(job).open("w") as log:
+        return _publish(job, key, [*_python(job, engine), f"stages.{job['stage']}", *arguments], log)
+
+
+def _publish(job: dict[str, Any], key: str, command: list[str], log: TextIO) -> int:
+    """Run the stage program to its end and write the record of its artifact."""
+    _say(job["id"], f"begins ({job['place']})", log)
+    out, start = Path(job["out"]), time.time()
+    code, peak_mb = _spawn(job, command, log)
+    seconds = time.time() - start
+    if code:
+        _say(job["id"], EXPLAINED.get(code, f"failed with exit code {code}"), log)
+        if code not in EXPLAINED:
+            _report_damage(job, log)
+        return code
+    made = artifact.read_manifest(out)
+    assert made is not None and made.key == key, f"{job['stage']} ended well without writing {out}"
+    record = {
+        "key": key,
+        "seconds": round(seconds, 2),
+        "peak_memory_mb": round(peak_mb),
+        "threads": job["threads"],
+        "host": platform.node(),
+        "commit": _commit(),
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    _write_json(_record(job), record)
+    _say(job["id"], f"done in {seconds:.1f} s, peak {peak_mb:.0f} MB{_quality(out)}", log)
+    return 0
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    artifact.write_if_changed(path, json.dumps(value, indent=1, sort_keys=True) + "\n")
+
+
+def _python(job: dict[str, Any], engine: Engine) -> list[str]:
+    """Return the command that runs a module: Python, or torchrun where several processes work together."""
+    across = any(name in os.environ for name in ("PET_NNODES", "PET_RDZV_ENDPOINT"))
+    if not job["distributed"] or not (engine.processes > 1 or across):
+        return [sys.executable, "-m"]
+    meeting = [] if across else ["--standalone"]
+    torchrun = ["torch.distributed.run", *meeting, f"--nproc-per-node={engine.processes}", "-m"]
+    return [*engine.launcher, sys.executable, "-m", *torchrun]
+
+
+def _log(job: dict[str, Any]) -> Path:
+    """Return the next log file of a job; all but the latest `LOGS_KEPT` are removed."""
+    folder = Path("build", job["home"], "logs")
+    folder.mkdir(parents=True, exist_ok=True)
+    names = (
+        path.name.removeprefix(f"{job['id']}.").removesuffix(".log")
+        for path in folder.glob(f"{job['id']}.*.log")
+    )
+    numbers = sorted(int(name) for name in names if name.isdigit())
+    for old in numbers[: max(0, len(numbers) - LOGS_KEPT + 1)]:
+        (folder / f"{job['id']}.{old}.log").unlink(missing_ok=True)
+    return folder / f"{job['id']}.{(numbers or [0])[-1] + 1}.log"
+
+
+def _report_damage(job: dict[str, Any], log: TextIO) -> None:
+    """Report which inputs are not what was written, for which alone a stage may have failed."""
+    for folder in (Path(entry["path"]) for entry in job["inputs"]):
+        if changed := artifact.damaged(folder):
+            what = "has been damaged, changed or deleted since it was made"
+            error = InputError(
+                "ART-005", what, str(folder / changed[0]), f"rm -r {folder}, and run the same again"
+            )
+            for line in f"error: {error}".splitlines():
+                _say(job["id"], line, log)
+
+
+def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, float]:
+    """Run `command` with its output forwarded line by line, and logged; return exit code and peak memory in
+    MB.
+    """
+    child = subprocess.Popen(
+        command,
+        env=_environment(job["threads"]),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        preexec_fn=_bind_to_parent,
+    )
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        child.terminate()
+        killer = threading.Timer(GRACE_S, child.kill)
+        killer.daemon = True  # a stage that ends in time is not waited for any longer
+        killer.start()
+
+    old = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
+    old[signal.SIGINT] = signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # the child has its own; what it saves is waited for
+    reader = threading.Thread(target=_forward, args=(job["id"], child.stdout, log), daemon=True)
+    reader.start()
+    watchdog = threading.Timer(LONGEST_S, child.kill)
+    watchdog.daemon = True
+    watchdog.start()
+    try:
+        _, status, usage = os.wait4(child.pid, 0)
+    finally:
+        watchdog.cancel()
+        for number, handler in old.items():
+            signal.signal(number, handler)
+    reader.join(timeout=2)
+    code = os.waitstatus_to_exitcode(status)
+    child.returncode = code
+    return (128 - code if code < 0 else code), usage.ru_maxrss / 1024
+
+
+def _bind_to_parent() -> None:
+    """In the child: die with the runner, leave no core dump."""
+    processes.die_with_parent()
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """Return the environment of a stage: fixed hashing, as many threads as declared, no spinning, bounded
+    decoders.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+    return {
+        **os.environ,
+        **dict.fromkeys(names, str(threads)),
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "GOMP_SPINCOUNT": "0",
+        "CUBLAS_WORKSPACE_CONFIG": ":4096:8",
+        "OPENCV_IO_MAX_IMAGE_PIXELS": str(32 << 20),
+        "PYTHONHASHSEED": "0",
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def _forward(job_id: str, lines: Any, log: TextIO) -> None:
+    for line in lines:
+        _say(job_id, line.decode(errors="replace").rstrip(), log)
+
+
+def _say(job_id: str, text: str, log: TextIO | None = None) -> None:
+    print(f"[{job_id}] {text}", file=sys.stderr, flush=True)
+    if log is not None and not log.closed:
+        print(text, file=log, flush=True)
+
+
+def _quality(out: Path) -> str:
+    """Return what the artifact says about itself, for the last line."""
+    try:
+        report = json.loads((out / "qa.json").read_text())
+    except (FileNotFoundError, ValueError):
+        return ""
+    worries = [
+        f"{check['name']} {_short(check['value'])} {check['unit']}".strip()
+        for check in report["checks"]
+        if check["status"] != "ok"
+    ]
+    return f", quality {report['status']}" + (f": {'; '.join(worries)}" if worries else "")
+
+
+def _short(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
+
+
+def _commit() -> str | None:
+    try:
+        return subprocess.run(
+            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line of the runner; returns its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--launcher", default="")
+    parser.add_argument("--attempt", type=int, default=1)
+    parser.add_argument("home")
+    parser.add_argument("job")
+    given = parser.parse_args(arguments)
+    engine = Engine(given.processes, tuple(shlex.split(given.launcher)), given.attempt)
+    try:
+        with coded_disk_errors(given.job):
+            return run(given.home, given.job, engine)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

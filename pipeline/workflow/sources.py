@@ -1,0 +1,163 @@
+"""What the code of a stage is, read from its syntax trees without importing anything.
+
+`digest` changes when the meaning of a program or of a local module it imports can have changed, not with
+comments, docstrings or layout; `config_of` imports the settings of a stage. Standard library only.
+"""
+
+import ast
+import functools
+import importlib
+import os
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from pipeline.workflow import artifact, dag
+
+
+@dataclass(frozen=True)
+class Source:
+    """One Python file, as far as the planner cares."""
+
+    digest: str
+    imports: tuple[str, ...]
+    """Local modules that it may import, dotted."""
+
+
+CODE = Path(__file__).parents[2]
+"""What `pipeline` and `stages` stand in: the checkout, or where the package was installed."""
+READER = 4
+"""Raise it when more is read of a file, so that what was read before is read again."""
+
+
+@dataclass
+class Cache:
+    """What was read before, by path, for as long as size and time of a file stay the same."""
+
+    known: dict[str, Any] = field(default_factory=dict)
+    fresh: dict[str, Any] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
+    """Of stages, as far as this process computed them."""
+
+    def get(self, path: Path, read: Any) -> Any:
+        """Return `read(path)`, a value of plain JSON types, or what it was last time."""
+        stat = path.stat()
+        mark = [READER, stat.st_size, stat.st_mtime_ns]
+        entry = self.fresh.get(str(path)) or self.known.get(str(path))
+        if entry is None or entry["mark"] != mark:
+            entry = {"mark": mark, "value": read(path)}
+        self.fresh[str(path)] = entry
+        return entry["value"]
+
+
+def fits(known: Any) -> bool:
+    """Tell whether this is what a `Cache` kept."""
+    entries = known.values() if isinstance(known, dict) else [None]
+    values = [
+        entry["value"] if isinstance(entry, dict) and entry.keys() == {"mark", "value"} else None
+        for entry in entries
+    ]
+    names = {field.name for field in fields(Source)}
+    return all(
+        isinstance(value, str) or (isinstance(value, dict) and value.keys() == names) for value in values
+    )
+
+
+def digest(stage: str, cache: Cache) -> str:
+    """Hash the program `stage`, the local modules below it, and the other files of its room (pages,
+    templates).
+    """
+    if stage in cache.digests:
+        return cache.digests[stage]
+    waiting, seen = [f"stages.{stage}.__main__"], {}
+    while waiting:
+        module = waiting.pop()
+        path = _path_of(module)
+        if module in seen or path is None or _is_plumbing(module):
+            continue
+        source = Source(**cache.get(path, _read))
+        seen[module] = source.digest
+        waiting += source.imports
+    cache.digests[stage] = artifact.digest_of([seen, _assets(Path("stages", *stage.split(".")), cache)])
+    return cache.digests[stage]
+
+
+def marks(folder: Path) -> list[list[Any]]:
+    """Return path, size and time of every file below `folder`, in order; what changes them has the planner
+    look again.
+    """
+    found: list[list[Any]] = []
+    try:
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except (FileNotFoundError, NotADirectoryError):
+        return found
+    for entry in entries:
+        if entry.name in ("__pycache__", "node_modules"):
+            continue
+        if entry.is_dir():
+            found += marks(Path(entry.path))
+        else:
+            stat = entry.stat(follow_symlinks=entry.is_file())
+            found.append([entry.path, stat.st_size, stat.st_mtime_ns])
+    return found
+
+
+def config_of(stage: str) -> type:
+    """Return the `Config` of a stage, from `stages/<stage>/config.py`."""
+    return importlib.import_module(f"stages.{stage}.config").Config
+
+
+@functools.cache
+def _path_of(module: str) -> Path | None:
+    path = CODE.joinpath(*module.split("."))
+    return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
+
+
+def _is_plumbing(module: str) -> bool:
+    return module.removeprefix("pipeline.") in dag.PLUMBING
+
+
+def _assets(room: Path, cache: Cache) -> dict[str, str]:
+    """Return the digests of the room's files that are not Python and that the stage may read."""
+    found = {}
+    for path in sorted((CODE / room).iterdir()) if (CODE / room).is_dir() else ():
+        if path.name.startswith((".", "__pycache__", "node_modules")) or path.suffix == ".py":
+            continue
+        if path.is_dir():
+            found |= _assets(room / path.name, cache)
+        else:
+            found[(room / path.name).as_posix()] = cache.get(path, artifact.digest_of_file)
+    return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        tree = ast.parse(path.read_bytes(), str(path))
+    except SyntaxError:  # breaks the stages that import it, when they run; not the plan of all the others
+        return asdict(Source(artifact.digest_of_file(path), ()))
+    imports = {
+        name for node in ast.walk(tree) for name in _imported(node) if name.startswith(("pipeline", "stages"))
+    }
+    for node in ast.walk(tree):
+        _drop_docstrings(node)
+    return asdict(Source(artifact.digest_of(ast.dump(tree)), tuple(sorted(imports))))
+
+
+def _imported(node: ast.AST) -> list[str]:
+    """Return the modules that a statement may import; `from a import b` may mean `a.b`, and imports package
+    `a`.
+    """
+    if isinstance(node, ast.Import):
+        names = [alias.name for alias in node.names]
+    elif isinstance(node, ast.ImportFrom) and node.module:
+        names = [f"{node.module}.{alias.name}" for alias in node.names]
+    else:
+        return []
+    return [".".join(name.split(".")[: i + 1]) for name in names for i in range(name.count(".") + 1)]
+
+
+def _drop_docstrings(node: ast.AST) -> None:
+    body = getattr(node, "body", None)
+    if isinstance(body, list):
+        kept = [n for n in body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
+        node.body = kept or [ast.Pass()]
