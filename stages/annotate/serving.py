@@ -1,6 +1,7 @@
 """The page's server on 127.0.0.1: pictures, fits, and the file of clicks. Nothing leaves the machine."""
 
 import json
+import os
 import re
 import threading
 from collections.abc import Mapping
@@ -13,19 +14,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.files import clicks
-from pipeline.files.clicks import Pair, Recorded
+from pipeline.core.errors import InputError
+from pipeline.data import clicks
+from pipeline.data.clicks import ClickedClip, ClickedPair
 
 HOST = "127.0.0.1"
+MAX_DIGITS = 10
+"""a Content-Length of more digits is refused"""
 PICTURE = re.compile(r"/picture/(\d+)/(\d+)\.jpg\Z")
 
 
 @dataclass(frozen=True)
-class Desk:
+class ClickSession:
     """What is clicked on, and where clicks are kept."""
 
-    recordings: Mapping[str, Recorded]
+    recordings: Mapping[str, ClickedClip]
     """by file name"""
     shown: Mapping[str, list[int]]
     """frames to click in, by file name"""
@@ -40,33 +43,51 @@ class Desk:
         names = list(self.recordings)
         frames = {
             name: [
-                {"source_index": int(self.recordings[name].source_index[frame]), "url": f"/picture/{names.index(name)}/{frame}.jpg"}
+                {
+                    "source_index": int(self.recordings[name].source_index[frame]),
+                    "url": f"/picture/{names.index(name)}/{frame}.jpg",
+                }
                 for frame in self.shown[name]
             ]
             for name in names
         }
         pairs = clicks.read(self.path) if self.path.exists() else []
-        return {"reference": self.reference, "wanted": clicks.WANTED, "frames": frames, "pairs": [asdict(pair) for pair in pairs]}
+        return {
+            "reference": self.reference,
+            "wanted": clicks.WANTED,
+            "frames": frames,
+            "pairs": [asdict(pair) for pair in pairs],
+        }
 
-    def fits(self, pairs: list[Pair]) -> dict[str, Any]:
-        """Return, per frame with enough pairs, what is left of each pair in millimetres (null without depth)."""
+    def fits(self, pairs: list[ClickedPair]) -> dict[str, Any]:
+        """Return, per frame with enough pairs, what is left of each pair in millimetres (null without
+        depth).
+        """
         found = {}
         for name, recorded in self.recordings.items():
             for source_index, group in clicks.by_frame(pairs, name).items():
                 fit = clicks.fit(group, recorded, self.recordings[self.reference], self.world_from_reference)
                 if fit is not None:
                     left = [None if np.isnan(m) else round(1000 * float(m), 1) for m in fit.residual_m]
-                    found[f"{name}/{source_index}"] = {"typical_mm": round(1000 * fit.typical_m, 1), "left_mm": left}
+                    found[f"{name}/{source_index}"] = {
+                        "typical_mm": round(1000 * fit.typical_m, 1),
+                        "left_mm": left,
+                    }
         return found
 
-    def keep(self, pairs: list[Pair]) -> None:
+    def keep(self, pairs: list[ClickedPair]) -> None:
         """Replace the file of clicks; names must be of recordings that are shown."""
         for pair in pairs:
             if pair.seen.recording not in self.recordings or pair.reference.recording != self.reference:
-                raise ValueError(f"{pair.seen.recording!r} and {pair.reference.recording!r} are not what is clicked on")
+                raise ValueError(
+                    f"{pair.seen.recording!r} and {pair.reference.recording!r} are not what is clicked on"
+                )
         self.path.parent.mkdir(parents=True, exist_ok=True)
         fresh = self.path.with_name(f".{self.path.name}.tmp")
-        fresh.write_text(clicks.text(pairs))
+        with open(fresh, "w") as file:
+            file.write(clicks.text(pairs))
+            file.flush()
+            os.fsync(file.fileno())
         fresh.replace(self.path)
 
     def picture(self, recording: int, frame: int) -> bytes:
@@ -77,8 +98,11 @@ class Desk:
         return (self.recordings[name].clip.folder / "color" / f"{frame:06d}.jpg").read_bytes()
 
 
-def server(desk: Desk, port: int) -> ThreadingHTTPServer:
-    """Return a server that is bound but not yet running; port 0 takes any free one."""
+def server(desk: ClickSession, port: int) -> ThreadingHTTPServer:
+    """Return a server that is bound but not yet running; port 0 takes any free one.
+
+    Raises InputError SYS-002 for a port in use.
+    """
     keeping = threading.Lock()  # requests have a thread each, and write one file
 
     class Handler(BaseHTTPRequestHandler):
@@ -102,8 +126,13 @@ def server(desk: Desk, port: int) -> ThreadingHTTPServer:
 
         def do_POST(self) -> None:
             """Keep the clicks and answer with their fits."""
-            length = int(self.headers.get("Content-Length") or 0)
-            if not self._from_here() or self.path != "/clicks" or self.headers.get("Content-Type") != "application/json":
+            stated = self.headers.get("Content-Length") or ""
+            length = int(stated) if stated.isascii() and stated.isdigit() and len(stated) < MAX_DIGITS else 0
+            if (
+                not self._from_here()
+                or self.path != "/clicks"
+                or self.headers.get("Content-Type") != "application/json"
+            ):
                 return self._send(403, b"", "text/plain")
             if not 0 < length <= clicks.MAX_BYTES:
                 return self._send(413, b"", "text/plain")
@@ -122,16 +151,26 @@ def server(desk: Desk, port: int) -> ThreadingHTTPServer:
             """Refuse other sites that point a name or a form at this server."""
             own = {f"{name}:{self.server.server_address[1]}" for name in (HOST, "localhost")}
             origin = self.headers.get("Origin")
-            return self.headers.get("Host") in own and (origin is None or origin.removeprefix("http://") in own)
+            return self.headers.get("Host") in own and (
+                origin is None or origin.removeprefix("http://") in own
+            )
 
         def _json(self, value: Any) -> None:
             self._send(200, json.dumps(value).encode(), "application/json")
 
         def _send(self, code: int, body: bytes, kind: str) -> None:
             self.send_response(code)
-            for name, text in (("Content-Type", kind), ("Content-Length", str(len(body))), ("Cache-Control", "no-store")):
+            for name, text in (
+                ("Content-Type", kind),
+                ("Content-Length", str(len(body))),
+                ("Cache-Control", "no-store"),
+            ):
                 self.send_header(name, text)
             self.end_headers()
             self.wfile.write(body)
 
-    return ThreadingHTTPServer((HOST, port), Handler)
+    try:
+        return ThreadingHTTPServer((HOST, port), Handler)
+    except OSError as error:
+        what = f"port {port}: {error.strerror}"
+        raise InputError("SYS-002", what, HOST, "give another with --port") from error

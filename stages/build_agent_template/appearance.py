@@ -1,4 +1,4 @@
-"""Colour and features of the surface: what the frames that see a vertex say, averaged."""
+"""Color and features of the surface, averaged over the frames that see a vertex."""
 
 from collections.abc import Sequence
 
@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 
-from pipeline.space import cameras, rigid
-from pipeline.space.meshes import Mesh, RayCaster, render_view
+from pipeline.geometry import cameras, rigid
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 
 
 def visibility(
@@ -17,11 +17,16 @@ def visibility(
     size: tuple[int, int],
     tolerance_m: float = 0.01,
 ) -> tuple[Float[np.ndarray, "view vertex"], Float[np.ndarray, "view vertex 2"]]:
-    """Return how squarely each view sees each vertex (0: hidden, 1: face to face) and at which colour pixel.
+    """Return how squarely each view sees each vertex (0: hidden, 1: face to face) and at which color pixel.
 
-    ``size`` is (height, width) of the colour pictures; hidden means behind the mesh by more than the tolerance.
+    ``size`` is (height, width) of the color pictures; hidden means behind the mesh by more than the
+    tolerance.
     """
-    caster, normals, vertices = RayCaster(mesh_agent), mesh_agent.vertex_normals(), mesh_agent.vertices.astype(float)
+    caster, normals, vertices = (
+        RayCaster(mesh_agent),
+        mesh_agent.vertex_normals(),
+        mesh_agent.vertices.astype(float),
+    )
     coarse = (size[0] // 2, size[1] // 2)
     weights, pixels = [], []
     for pose, k in zip(agent_from_camera, intrinsics, strict=True):
@@ -38,8 +43,12 @@ def visibility(
     return np.stack(weights), np.stack(pixels)
 
 
-def on_mask(pixel: Float[np.ndarray, "vertex 2"], labels: UInt8[np.ndarray, "height width"]) -> Bool[np.ndarray, "vertex"]:
-    """Tell which vertices are seen on the mask (255): where a limb moved, other frames show what lies behind it."""
+def on_mask(
+    pixel: Float[np.ndarray, "vertex 2"], labels: UInt8[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "vertex"]:
+    """Return which vertices project onto the mask (255): where a limb moved, other frames show the
+    background.
+    """
     height, width = labels.shape
     column, row = np.floor(pixel).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -53,8 +62,13 @@ def gather(
     pictures: Sequence[Float[np.ndarray, "height width channel"]],
     stride_px: int,
 ) -> Float[np.ndarray, "vertex channel"]:
-    """Average pictures (one cell per ``stride_px`` colour pixels) over the views; unseen vertices take the nearest seen one's."""
-    total = sum(w[:, None] * _sample(picture, at / stride_px) for w, at, picture in zip(weight, pixel, pictures, strict=True))
+    """Average pictures (one cell per ``stride_px`` color pixels) over the views; unseen vertices take the
+    nearest seen one's.
+    """
+    total = sum(
+        w[:, None] * _sample(picture, at / stride_px)
+        for w, at, picture in zip(weight, pixel, pictures, strict=True)
+    )
     seen = weight.sum(0) > 0.05
     mean = total / np.maximum(weight.sum(0), 1e-9)[:, None]
     if seen.any() and not seen.all():
@@ -71,5 +85,9 @@ def _sample(
     low = np.floor(grid).astype(int)
     part = grid - low
     picture = picture.astype(np.float32)
-    rows = [(1 - part[:, :1]) * picture[low[:, 1] + dy, low[:, 0]] + part[:, :1] * picture[low[:, 1] + dy, low[:, 0] + 1] for dy in (0, 1)]
+    rows = [
+        (1 - part[:, :1]) * picture[low[:, 1] + dy, low[:, 0]]
+        + part[:, :1] * picture[low[:, 1] + dy, low[:, 0] + 1]
+        for dy in (0, 1)
+    ]
     return (1 - part[:, 1:]) * rows[0] + part[:, 1:] * rows[1]

@@ -1,7 +1,7 @@
 """Gaussian bones along the limbs: the body's cells, grouped by distance *through* the body.
 
-Seeds spread by farthest distance reach every paw, the tail's tip and the head first; a few rounds of k-medoids even
-them out, thin parts counting more than thick ones so that limbs get bones of their own.
+Seeds spread by farthest distance reach every paw, the tail's tip and the head first; a few rounds of
+k-medoids even them out, thin parts counting more than thick ones so that limbs get bones of their own.
 """
 
 from dataclasses import dataclass
@@ -12,23 +12,16 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 
-
-@dataclass(frozen=True)
-class Skeleton:
-    """How bones are laid."""
-
-    bones: int = 25
-    """number of bones"""
-    rounds: int = 6
-    """rounds of k-medoids after spreading the seeds"""
-    cells: int = 5000
-    """cells of the body that are used"""
-    widen: float = 1.3
-    """scale of a bone in standard deviations of its cells: larger blends softer"""
-    least_scale_m: float = 0.012
-    """smallest scale of a bone"""
+ROUNDS = 6
+"""rounds of k-medoids after spreading the seeds"""
+CELLS = 5000
+"""cells of the body that are used"""
+WIDEN, LEAST_SCALE_M = 1.3, 0.012
+"""scale of a bone in standard deviations of its cells (larger blends softer), and the smallest scale"""
+NEAR_M = 0.04
+"""cells count by how few others lie this near: limbs are thin"""
 
 
 @dataclass(frozen=True)
@@ -39,26 +32,32 @@ class Bones:
     bone_scale_m: Float[np.ndarray, "bone 3"]
 
 
-def lay_bones(inside_agent: Float[np.ndarray, "cell 3"], voxel_m: float, options: Skeleton, rng: np.random.Generator) -> Bones:
-    """Divide the body's cells (agent frame) into bones ordered from front to back; z of a bone is its longest axis."""
-    cells = inside_agent[np.sort(rng.permutation(len(inside_agent))[: options.cells])]
+def lay_bones(
+    inside_agent: Float[np.ndarray, "cell 3"], voxel_m: float, bones: int, rng: np.random.Generator
+) -> Bones:
+    """Divide the body's cells (agent frame) into bones ordered from front to back; z of a bone is its longest
+    axis.
+    """
+    cells = inside_agent[np.sort(rng.permutation(len(inside_agent))[:CELLS])]
     graph = body_graph(cells, voxel_m * max(1.0, (len(inside_agent) / len(cells)) ** (1 / 3)))
-    label = group_cells(graph, cells, _thinness(cells, inside_agent, voxel_m), options)
+    label = group_cells(graph, cells, _thinness(cells, inside_agent), bones)
     frames, scales = [], []
-    for bone in range(options.bones):
+    for bone in range(bones):
         own = cells[label == bone]
         middle = own.mean(0)
-        spread, axes = np.linalg.eigh(np.cov((own - middle).T) if len(own) > 3 else np.eye(3) * voxel_m**2)
+        variance, axes = np.linalg.eigh(np.cov((own - middle).T) if len(own) > 3 else np.eye(3) * voxel_m**2)
         axes *= np.where(axes[np.abs(axes).argmax(0), range(3)] < 0, -1, 1)
         axes[:, 0] = np.cross(axes[:, 1], axes[:, 2])
         frames.append(rigid.make(axes, middle))
-        scales.append(np.maximum(options.widen * np.sqrt(np.maximum(spread, 0)), options.least_scale_m))
+        scales.append(np.maximum(WIDEN * np.sqrt(np.maximum(variance, 0)), LEAST_SCALE_M))
     order = np.argsort([-frame[2, 3] for frame in frames])
     return Bones(np.stack(frames)[order], np.stack(scales)[order])
 
 
 def body_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sparse.csr_matrix:
-    """Connect cells nearer than two spacings, weighted by distance; loose parts are tied to the rest at their nearest points."""
+    """Connect cells nearer than two spacings, weighted by distance; loose parts are tied to the rest at their
+    nearest points.
+    """
     pairs = cKDTree(cells).query_pairs(2.0 * spacing_m, output_type="ndarray")
     length = np.linalg.norm(cells[pairs[:, 0]] - cells[pairs[:, 1]], axis=1)
     graph = scipy.sparse.coo_matrix((length, pairs.T), shape=(len(cells),) * 2).tocsr()
@@ -71,26 +70,29 @@ def body_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sp
 
 
 def group_cells(
-    graph: scipy.sparse.csr_matrix, cells: Float[np.ndarray, "cell 3"], weight: Float[np.ndarray, "cell"], options: Skeleton
+    graph: scipy.sparse.csr_matrix,
+    cells: Float[np.ndarray, "cell 3"],
+    weight: Float[np.ndarray, "cell"],
+    bones: int,
 ) -> Int[np.ndarray, "cell"]:
     """Return each cell's bone: farthest-point seeds, then k-medoids by distance through the body."""
     first = int(np.linalg.norm(cells - cells.mean(0), axis=1).argmin())
     seeds, distance = [], dijkstra(graph, directed=False, indices=first)
-    for _ in range(options.bones):
+    for _ in range(bones):
         seeds.append(int(distance.argmax()))
         distance = np.minimum(distance, dijkstra(graph, directed=False, indices=seeds[-1]))
     label = np.zeros(len(cells), int)
-    for _ in range(options.rounds):
+    for _ in range(ROUNDS):
         reach = dijkstra(graph, directed=False, indices=seeds)
         label = reach.argmin(0)
-        for bone in range(options.bones):
+        for bone in range(bones):
             own = np.flatnonzero(label == bone)
             middle = np.average(cells[own], axis=0, weights=weight[own])
             seeds[bone] = int(own[np.linalg.norm(cells[own] - middle, axis=1).argmin()])
     return dijkstra(graph, directed=False, indices=seeds).argmin(0)
 
 
-def _thinness(cells: np.ndarray, inside: np.ndarray, voxel_m: float) -> Float[np.ndarray, "cell"]:
-    """Weigh each cell by how few others lie within 4 cm of it."""
-    count = cKDTree(inside).query_ball_point(cells, 0.04, return_length=True)
+def _thinness(cells: np.ndarray, inside: np.ndarray) -> Float[np.ndarray, "cell"]:
+    """Weigh each cell by how few others lie within `NEAR_M` of it."""
+    count = cKDTree(inside).query_ball_point(cells, NEAR_M, return_length=True)
     return 1.0 / np.maximum(count, 1)

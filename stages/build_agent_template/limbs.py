@@ -1,7 +1,7 @@
-"""Limbs that moved while the phone went round: a tail that swings is carved away when all frames judge together.
+"""Limbs that moved while the phone circled the animal: a swinging tail is carved away when all frames count.
 
-What is measured beside the still body tells where such a limb has been. The place far out where most frames saw it
-chooses the frames in which it stood alike, and there these alone say what is solid.
+Points measured off the still body show where such a limb has been. The place far out where most frames saw it
+selects the frames in which it stood alike, and there only these are fused.
 """
 
 from collections.abc import Mapping
@@ -11,27 +11,20 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from pipeline.space.tsdf import Volume
+from pipeline.geometry.tsdf import Volume
 
-
-@dataclass(frozen=True)
-class Moving:
-    """How limbs that moved are found."""
-
-    beside_m: float = 0.025
-    """a measured point this far from the still body belongs to what moved"""
-    farthest_m: float = 0.35
-    """unless it lies farther away than this"""
-    lowest_m: float = 0.02
-    """or nearer to the ground than this"""
-    alike_m: float = 0.03
-    """frames are alike that saw the limb within this of one place"""
-    least_points: int = 3
-    """with at least so many points"""
-    least_frames: int = 12
-    """fewer alike frames cannot tell its shape"""
-    around_m: float = 0.03
-    """the limb's space reaches this far around all that was measured of it"""
+BESIDE_M = 0.025
+"""measured points this far from the still body belong to what moved"""
+FARTHEST_M = 0.35
+"""unless they lie farther away than this"""
+LOWEST_M = 0.02
+"""or nearer to the ground than this"""
+ALIKE_M = 0.03
+"""frames are alike that saw the limb within this of one place"""
+LEAST_POINTS, LEAST_FRAMES = 3, 12
+"""with at least so many points; fewer alike frames do not determine its shape"""
+AROUND_M = 0.03
+"""the limb's space reaches this far around all that was measured of it"""
 
 
 @dataclass(frozen=True)
@@ -47,40 +40,41 @@ def find_limb(
     points_world: Mapping[int, Float[np.ndarray, "point 3"]],
     above_ground_m: Mapping[int, Float[np.ndarray, "point"]],
     inside_world: Float[np.ndarray, "cell 3"],
-    options: Moving,
 ) -> Limb | None:
-    """Find what moved among the points measured on the animal in each frame; None when (nearly) all stood still."""
+    """Find what moved among the points measured on the animal in each frame; None when (nearly) all stood
+    still.
+    """
     body = cKDTree(inside_world)
-    found = {}
+    off_body = {}
     for frame, points in points_world.items():
-        away, _ = body.query(points, distance_upper_bound=options.farthest_m)
-        found[frame] = (away > options.beside_m) & np.isfinite(away) & (above_ground_m[frame] > options.lowest_m)
-    points = np.concatenate([points_world[frame][beside] for frame, beside in found.items()])
-    frame = np.concatenate([np.full(beside.sum(), frame) for frame, beside in found.items()])
+        away, _ = body.query(points, distance_upper_bound=FARTHEST_M)
+        off_body[frame] = (away > BESIDE_M) & np.isfinite(away) & (above_ground_m[frame] > LOWEST_M)
+    points = np.concatenate([points_world[frame][moved] for frame, moved in off_body.items()])
+    frame = np.concatenate([np.full(moved.sum(), frame) for frame, moved in off_body.items()])
     if not len(points):
         return None
-    place = _common_place(points, frame, body.query(points)[0], options.alike_m)
-    seen, count = np.unique(frame[np.linalg.norm(points - place, axis=1) < options.alike_m], return_counts=True)
-    alike = seen[count >= options.least_points]
-    return Limb(alike, points) if len(alike) >= options.least_frames else None
+    place = _common_place(points, frame, body.query(points)[0])
+    seen, count = np.unique(frame[np.linalg.norm(points - place, axis=1) < ALIKE_M], return_counts=True)
+    matching = seen[count >= LEAST_POINTS]
+    return Limb(matching, points) if len(matching) >= LEAST_FRAMES else None
 
 
 def _common_place(
-    points: Float[np.ndarray, "point 3"], frame: Int[np.ndarray, "point"], away_m: Float[np.ndarray, "point"], size_m: float
+    points: Float[np.ndarray, "point 3"], frame: Int[np.ndarray, "point"], away_m: Float[np.ndarray, "point"]
 ) -> Float[np.ndarray, "3"]:
     """Return the place that many frames saw, far out: the most frames times distance from the body."""
-    _, cell = np.unique(np.floor(points / size_m).astype(int), axis=0, return_inverse=True)
+    _, cell = np.unique(np.floor(points / ALIKE_M).astype(int), axis=0, return_inverse=True)
     cell = cell.ravel()
     frames = np.bincount(np.unique(np.stack([cell, frame]), axis=1)[0])
     away = np.bincount(cell, away_m) / np.bincount(cell)
     place = points[cell == (frames * away).argmax()].mean(0)
     for _ in range(3):
-        place = points[np.linalg.norm(points - place, axis=1) < size_m].mean(0)
+        place = points[np.linalg.norm(points - place, axis=1) < ALIKE_M].mean(0)
     return place
 
 
-def space_of(limb: Limb, volume: Volume, options: Moving) -> Bool[np.ndarray, "x y z"]:
-    """Tell which cells of a volume lie near where the limb has been."""
+def space_of(limb: Limb, volume: Volume) -> Bool[np.ndarray, "x y z"]:
+    """Return which cells of a volume lie near where the limb has been."""
     axes = [volume.origin[axis] + np.arange(volume.weight.shape[axis]) * volume.voxel_m for axis in range(3)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    return np.isfinite(cKDTree(limb.points_world).query(cells, distance_upper_bound=options.around_m)[0])
+    return np.isfinite(cKDTree(limb.points_world).query(cells, distance_upper_bound=AROUND_M)[0])

@@ -5,16 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.errors import InputError
-from pipeline.files.clips import Clip, Masks
-from pipeline.space import rigid
-from pipeline.space.depth_alignment import DepthView, depth_view
-from pipeline.space.ground import Ground, fit_ground
-from pipeline.space.straightening import Straightened, Straightening, chain, level, straighten
+from pipeline.core.errors import InputError
+from pipeline.data.clips import Clip, Masks, usable_depth
+from pipeline.geometry import rigid
+from pipeline.geometry.ground import GroundPlane, fit_ground
+from pipeline.mapping.icp import DepthImage, depth_image
+from pipeline.mapping.odometry import CorrectedOdometry, align_gravity, chain_alignments, correct_drift
 
 STRIDE = 2
+LOOPS = 5
+"""Earlier views each keyframe is aligned to: a circle around one animal sees the same place often."""
 LEAST_POINTS = 200
-"""points of depth, over some 40 frames at that stride, without which nothing can be told"""
+"""points of depth, over some 40 frames at that stride, without which no template is built"""
 
 
 @dataclass(frozen=True)
@@ -22,44 +24,52 @@ class Circle:
     """The turnaround in a world of its own, +y up, with the ground the animal stands on."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
-    ground: Ground
-    straightened: Straightened
+    ground: GroundPlane
+    odometry_fit: CorrectedOdometry
 
 
-def walk_around(clip: Clip, masks: Masks, options: Straightening) -> Circle:
-    """Place all cameras by the whole still scene, the animal included; the ground is the level surface around it.
+def walk_around(clip: Clip, masks: Masks) -> Circle:
+    """Place all cameras by the whole still scene, the animal included; the ground is the level surface around
+    it.
 
     Raises InputError AGT-001 where hardly any depth was measured on the animal, or on a level surface.
     """
 
-    def view(frame: int) -> DepthView:
-        return depth_view(clip.depth(frame), clip.depth_intrinsics[frame], clip.confidence(frame) > 0, STRIDE)
+    def view(frame: int) -> DepthImage:
+        depth = usable_depth(clip, frame)
+        return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, STRIDE)
 
     odometry = clip.odometry_from_camera
     if odometry is None:
-        odometry = chain(view, lambda _, last: last, len(clip), options)
-    straightened = straighten(view, clip.timestamp_s, odometry, options)
-    poses = straightened.world_from_camera
+        odometry = chain_alignments(view, lambda _, last: last, len(clip))
+    odometry_fit = correct_drift(view, clip.timestamp_s, odometry, loops=LOOPS)
+    poses = odometry_fit.world_from_camera
     if clip.odometry_from_camera is None or not clip.gravity_known:
-        poses = level(view, poses)
+        poses = align_gravity(view, poses)
     animal, floor = [], []
     for frame in np.flatnonzero(masks.visible)[:: max(1, int(masks.visible.sum()) // 40)]:
         seen = view(frame)
         label = depth_labels(masks[frame], clip.depth_size)[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-        points = rigid.apply(poses[frame], seen.points.reshape(-1, 3).astype(float)).reshape(seen.points.shape)
+        points = rigid.apply(poses[frame], seen.points.reshape(-1, 3).astype(float)).reshape(
+            seen.points.shape
+        )
         up = seen.normals @ poses[frame, 1, :3]
         known = seen.points[..., 2] > 0
         animal.append(points[known & (label == 255)])
         floor.append(points[known & (label == 0) & (up > 0.9)])
     on_animal, on_floor = np.concatenate(animal), np.concatenate(floor)
     if min(len(on_animal), len(on_floor)) < LEAST_POINTS:
-        what = f"only {len(on_animal)} points of depth were measured on the animal and {len(on_floor)} on level ground"
-        remedy = "circle it from about 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
+        what = f"only {len(on_animal)} depth points lie on the animal and {len(on_floor)} on level ground"
+        remedy = (
+            "circle it from about 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
+        )
         raise InputError("AGT-001", what, str(masks.folder), remedy)
-    return Circle(poses, fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=0.4), straightened)
+    return Circle(poses, fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=0.4), odometry_fit)
 
 
-def depth_labels(labels: UInt8[np.ndarray, "height width"], size: tuple[int, int]) -> UInt8[np.ndarray, "depth_height depth_width"]:
+def depth_labels(
+    labels: UInt8[np.ndarray, "height width"], size: tuple[int, int]
+) -> UInt8[np.ndarray, "depth_height depth_width"]:
     """Sample a mask (colour resolution) at the centres of the depth pixels."""
     rows = ((np.arange(size[0]) + 0.5) * labels.shape[0] / size[0]).astype(int)
     columns = ((np.arange(size[1]) + 0.5) * labels.shape[1] / size[1]).astype(int)

@@ -4,25 +4,22 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.files import arrays, meshes
-from pipeline.files.clips import Clip
-from stages.build_agent_template.template import Template
+from pipeline.data import ply
+from pipeline.data.clips import Clip
+from pipeline.data.templates import AgentCameras, SkinTable, write_vertex_features
+from stages.build_agent_template.template import CanonicalTemplate
 
 
-def write(folder: Path, template: Template, clip: Clip) -> None:
+def write(folder: Path, template: CanonicalTemplate, clip: Clip) -> None:
     """Write the surface, its skin and features, and the cameras around it."""
-    meshes.write_ply(folder / "agent.ply", template.mesh)
-    arrays.save(
-        folder / "skin.npz",
-        weights=template.weights.astype(np.float32),
-        agent_from_bone_rest=template.bones.agent_from_bone_rest.astype(np.float32),
-        bone_scale_m=template.bones.bone_scale_m.astype(np.float32),
+    ply.write_ply(folder / "agent.ply", template.mesh)
+    SkinTable(template.weights, template.bones.agent_from_bone_rest, template.bones.bone_scale_m).write(
+        folder
     )
-    arrays.save(folder / "vertex_features.npz", features=template.features.astype(np.float16))
-    arrays.save(
-        folder / "cameras.npz",
+    write_vertex_features(folder, template.features)
+    AgentCameras(
         timestamp_s=clip.timestamp_s,
         agent_from_camera=template.agent_from_camera,
         intrinsics=clip.intrinsics,
         registered=np.isfinite(template.agent_from_camera[:, 0, 0]),
-    )
+    ).write(folder)

@@ -1,1 +1,2 @@
-"""Build the scene template: structure from motion, metric scale and gravity, depth fusion to a coloured mesh."""
+"""Build the scene template: structure from motion, metric scale and gravity, depth fusion to a coloured
+mesh."""

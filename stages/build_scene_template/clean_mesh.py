@@ -1,5 +1,5 @@
-"""Clean a mesh with MeshLab's filters; run as a program of its own with one thread: ``clean_mesh.py IN.ply OUT.ply
-LEAST_FACES``.
+"""Clean a mesh with MeshLab's filters; run as a program of its own with one thread: ``clean_mesh.py IN.ply
+OUT.ply LEAST_FACES``.
 
 MeshLab's library is GPL-3 and is only ever talked to through files. Islands with fewer faces than
 LEAST_FACES, duplicates, slivers and non-manifold edges go; colours and the outline of holes stay.
@@ -21,7 +21,9 @@ def clean(source: str, target: str, least_faces: int) -> None:
     meshes.meshing_repair_non_manifold_edges()
     meshes.apply_coord_taubin_smoothing(stepsmoothnum=3)
     meshes.meshing_remove_unreferenced_vertices()
-    meshes.save_current_mesh(target, save_vertex_normal=False, save_vertex_quality=False, save_wedge_texcoord=False)
+    meshes.save_current_mesh(
+        target, save_vertex_normal=False, save_vertex_quality=False, save_wedge_texcoord=False
+    )
 
 
 if __name__ == "__main__":

@@ -1,112 +1,126 @@
-"""Fuse the walk-through's depth and colour into a surface, align every frame to it, clean it, and give it features."""
+"""Fuse the walk-through's depth and colour into a surface, align every frame to it, clean it, and give it
+features."""
 
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.errors import InputError
-from pipeline.files import meshes as mesh_files
-from pipeline.files.clips import Clip
-from pipeline.progress import track
-from pipeline.space import cameras, relax, rigid, surface, tsdf
-from pipeline.space.meshes import Mesh
-from stages.build_scene_template.refine import RefineOptions, odometry_edges
+from pipeline.core.errors import InputError
+from pipeline.core.progress import track
+from pipeline.data import ply as mesh_files
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid, subsampling, tsdf
+from pipeline.geometry.meshes import Mesh
+from pipeline.mapping import depth_scans, pose_optimization
+from stages.build_scene_template.config import FusionConfig, RefinementConfig
+from stages.build_scene_template.refine import DEPTH_INFLATION, odometry_factors
 
 MOST_VOXELS = 150_000_000
 """More would take over 4 GB."""
 
 
-@dataclass(frozen=True)
-class FuseOptions:
-    """Resolution and reach of the fusion."""
-
-    voxel_m: float = 0.025
-    """Edge of a voxel, metres."""
-    truncation_m: float = 0.1
-    """Distances are clipped here, metres; about three times the depth noise at the far end."""
-    furthest_m: float = 4.5
-    """Depth beyond this is not fused, metres."""
-    trust: tuple[float, float, float] = (0.2, 0.6, 1.0)
-    """Weight of depth of low, medium and high confidence; rims and thin legs are seen with low confidence only."""
-    least_views: float = 0.15
-    """A voxel needs this much weight, in views from one metre, to carry surface."""
-    island_faces: int = 120
-    """Smaller separate pieces of surface are dropped, faces."""
-    align_rounds: int = 4
-    """Gauss-Newton steps that align every frame to the surface."""
-    align_stride_px: int = 9
-    """One depth pixel in so many, each way, takes part in the alignment."""
-    align_points: int = 400_000
-    """Depth points that take part; scans of larger or more pictures are thinned evenly, so that memory stays bounded ..."""
-    align_least_points: int = 40
-    """... but a scan keeps so many."""
-    feature_frames: int = 80
-    """Frames that lend their features to the vertices, spread evenly."""
+CONFIDENCE_WEIGHT = (0.2, 0.6, 1.0)
+"""Weight of depth of low, medium and high confidence; rims and thin legs are seen with low confidence
+only."""
+LEAST_WEIGHT = 0.15
+"""A voxel needs this weight, in views from one metre, to carry surface."""
+EXTENT_STRIDE_PX, EXTENT_STEP, EXTENT_TRIM = 12, 4, 0.001
+"""Pixels and keyframes that measure the room's extent, and the share of points cut at each end."""
+ALIGN_REACH_M = (0.1, 0.04)
+"""Width of the robust weight in the first and last round of the alignment to the surface, metres."""
+ALIGN_POINTS, ALIGN_LEAST_POINTS = 400_000, 40
+"""Depth points that take part, so that memory stays bounded, and least number per frame."""
+NEAREST_M, SEEN_WITHIN_M = 0.2, 0.06
+"""A vertex is seen by a frame when it lies beyond the first and measured depth agrees within the second,
+metres."""
 
 
-def fuse(clip: Clip, frames: Int[np.ndarray, "view"], world_from_camera: Float[np.ndarray, "frame 4 4"], options: FuseOptions) -> Mesh:
-    """Integrate the frames into one volume and extract what was seen. Raises InputError MAP-005 where that is too large."""
-    scans = [surface.scan(clip.depth(int(f)), clip.depth_intrinsics[f], stride=12, furthest_m=options.furthest_m) for f in frames[::4]]
-    points = np.concatenate([rigid.apply(world_from_camera[f], scan.points_camera) for f, scan in zip(frames[::4], scans, strict=True)])
-    extent_m = np.ptp(np.quantile(points, [0.001, 0.999], axis=0), axis=0)
-    if np.prod(extent_m / options.voxel_m) > MOST_VOXELS:
-        what = f"the walk-through spans {' x '.join(f'{side:.0f}' for side in extent_m)} m: too much for voxels of {options.voxel_m:g} m"
-        raise InputError(
-            "MAP-005", what, str(clip.folder), "walk through one room, or set a larger voxel_m in [build_scene_template.fusion]"
+def fuse(
+    clip: Clip,
+    frames: Int[np.ndarray, "view"],
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    config: FusionConfig,
+) -> Mesh:
+    """Integrate the frames into one volume and extract what was seen. Raises InputError MAP-005 where that is
+    too large."""
+    scans = [
+        depth_scans.scan(
+            clip.depth(int(f)),
+            clip.depth_intrinsics[f],
+            stride=EXTENT_STRIDE_PX,
+            furthest_m=config.furthest_m,
         )
-    volume = tsdf.enclose(points, voxel_m=options.voxel_m, truncation_m=options.truncation_m)
+        for f in frames[::EXTENT_STEP]
+    ]
+    points = np.concatenate(
+        [
+            rigid.apply(world_from_camera[f], scan.points_camera)
+            for f, scan in zip(frames[::EXTENT_STEP], scans, strict=True)
+        ]
+    )
+    extent_m = np.ptp(np.quantile(points, [EXTENT_TRIM, 1 - EXTENT_TRIM], axis=0), axis=0)
+    if np.prod(extent_m / config.voxel_m) > MOST_VOXELS:
+        spans = " x ".join(f"{side:.0f}" for side in extent_m)
+        what = f"the walk-through spans {spans} m: too much for voxels of {config.voxel_m:g} m"
+        raise InputError(
+            "MAP-005",
+            what,
+            str(clip.folder),
+            "walk through one room, or set a larger voxel_m in [build_scene_template.fusion]",
+        )
+    volume = tsdf.enclose(points, voxel_m=config.voxel_m, truncation_m=config.truncation_m)
     for frame in track(frames.tolist(), "fusing frames"):
         depth = clip.depth(frame)
-        depth = np.where(depth < options.furthest_m, depth, 0)
-        trust = np.array(options.trust, np.float32)[clip.confidence(frame)]
+        depth = np.where(depth < config.furthest_m, depth, 0)
+        weight = np.array(CONFIDENCE_WEIGHT, np.float32)[clip.confidence(frame)]
         volume.integrate(
             depth,
             clip.depth_intrinsics[frame],
             clip.color(frame),
             clip.intrinsics[frame],
             world_from_camera[frame],
-            trust,
+            weight,
         )
-    return volume.surface(options.least_views)
+    return volume.surface(LEAST_WEIGHT)
 
 
 def align_frames(
     clip: Clip,
     mesh: Mesh,
     world_from_camera: Float[np.ndarray, "frame 4 4"],
-    options: FuseOptions,
-    weights: RefineOptions,
+    config: FusionConfig,
+    refinement: RefinementConfig,
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
-    """Relax every frame against the surface and the odometry; also return each frame's median gap in metres."""
-    place, frames = surface.Surface(mesh), np.arange(len(clip))
-    most = max(options.align_points // len(clip), options.align_least_points)
+    """Optimize every frame against the surface and the odometry; also return each frame's median gap,
+    metres."""
+    surface, frames = depth_scans.SurfaceMap(mesh), np.arange(len(clip))
+    most = max(ALIGN_POINTS // len(clip), ALIGN_LEAST_POINTS)
     scans = [
-        surface.scan(
+        depth_scans.scan(
             clip.depth(f),
             clip.depth_intrinsics[f],
-            stride=options.align_stride_px,
+            stride=config.align_stride_px,
             confidence=clip.confidence(f),
-            furthest_m=options.furthest_m,
-        ).thinned(most)
-        for f in frames
+            furthest_m=config.furthest_m,
+        ).subsampled(most)
+        for f in range(len(clip))
     ]
 
     def find(poses, reach_m):
-        found = place.contacts(frames, scans, poses, reach_m)
-        sigma = np.full(len(found.first), weights.depth_inflation) * found.sigma_m
-        return relax.Contacts(found.first, found.second, found.points_first, found.points_second, found.direction_world, sigma)
+        return surface.correspondences(frames, scans, poses, reach_m, DEPTH_INFLATION)
 
-    reach = tuple(np.geomspace(0.1, 0.04, options.align_rounds))
-    relaxed = relax.relax(world_from_camera, find, odometry_edges(clip, frames, weights), reach_m=reach)
+    reach = tuple(np.geomspace(*ALIGN_REACH_M, config.align_rounds))
+    optimized = pose_optimization.optimize_poses(
+        world_from_camera, find, odometry_factors(clip, frames, refinement), reach_m=reach
+    )
     gap = np.full(len(clip), np.nan)
     for frame in range(len(clip)):
-        mine = np.abs(relaxed.residual_m[relaxed.contacts.first == frame])
-        gap[frame] = np.median(mine) if len(mine) else np.nan
-    return relaxed.world_from_camera, gap
+        own = np.abs(optimized.residual_m[optimized.correspondences.first == frame])
+        gap[frame] = np.median(own) if len(own) else np.nan
+    return optimized.world_from_camera, gap
 
 
 def clean(mesh: Mesh, workspace: Path, island_faces: int) -> Mesh:
@@ -139,21 +153,24 @@ def vertex_features(
     world_from_camera: Float[np.ndarray, "frame 4 4"],
     frames: int,
 ) -> Float[np.ndarray, "vertex channel"]:
-    """Average the features of the frames that see each vertex (depth within 6 cm), L2-normalised; zero where none
-    does.
+    """Average the features of the frames that see each vertex (depth agrees), weighted by 1 / depth,
+    L2-normalised; zero where none does.
     """
     total = np.zeros((len(mesh.vertices), features.shape[-1]))
-    for frame in np.unique(np.linspace(0, len(clip) - 1, frames).astype(int)):
+    for frame in subsampling.evenly(len(clip), frames):
         local = rigid.apply(rigid.inverse(world_from_camera[frame]), mesh.vertices.astype(float))
         pixel, z = cameras.project(local, clip.intrinsics[frame])
         height, width = clip.color_size
-        inside = np.flatnonzero((z > 0.2) & (pixel > 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height))
+        inside = np.flatnonzero(
+            (z > NEAREST_M) & (pixel > 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+        )
         depth = clip.depth(int(frame))
         scale = np.array(depth.shape[::-1]) / (width, height)
         column, row = np.minimum((pixel[inside] * scale).astype(int), np.array(depth.shape[::-1]) - 1).T
-        inside = inside[np.abs(depth[row, column] - z[inside]) < 0.06]
-        cell = np.minimum(pixel[inside] * np.array(features.shape[2:0:-1]) / (width, height), np.array(features.shape[2:0:-1]) - 1).astype(
-            int
-        )
+        inside = inside[np.abs(depth[row, column] - z[inside]) < SEEN_WITHIN_M]
+        cell = np.minimum(
+            pixel[inside] * np.array(features.shape[2:0:-1]) / (width, height),
+            np.array(features.shape[2:0:-1]) - 1,
+        ).astype(int)
         total[inside] += np.asarray(features[frame][cell[:, 1], cell[:, 0]], float) / z[inside, None]
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)

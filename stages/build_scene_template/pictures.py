@@ -1,23 +1,27 @@
-"""What the quality page of the scene template shows: a turntable, the bird's-eye coverage, real against rendered
-frames.
-"""
+"""Quality page of the scene template: a turntable, the bird's-eye coverage, real beside rendered frames."""
 
 import numpy as np
 
-from pipeline.files.clips import Clip
-from pipeline.qa import Check, Picture
-from pipeline.space import overview, rigid
-from pipeline.space.meshes import RayCaster
-from stages.build_scene_template.template import Template
+from pipeline.data import plots
+from pipeline.data.clips import Clip
+from pipeline.data.qa import Check, Picture
+from pipeline.geometry import rigid
+from pipeline.geometry import views as overview
+from pipeline.geometry.meshes import RayCaster
+from stages.build_scene_template.template import SceneTemplate
 
 UP = np.array([0.0, 1.0, 0.0])
 
 
-def pictures(template: Template, clip: Clip) -> list[Picture]:
+def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
     """Draw the template for people."""
     caster = RayCaster(template.mesh)
     return [
-        Picture("turntable", turntable(template, caster), "The fused mesh from four sides, seen through its walls' backs."),
+        Picture(
+            "turntable",
+            turntable(template, caster),
+            "The fused mesh from four sides, seen through its walls' backs.",
+        ),
         Picture("coverage", coverage(template), "From above: the seen surface and the walk-through's path."),
         Picture(
             "frames",
@@ -27,7 +31,7 @@ def pictures(template: Template, clip: Clip) -> list[Picture]:
     ]
 
 
-def turntable(template: Template, caster: RayCaster) -> np.ndarray:
+def turntable(template: SceneTemplate, caster: RayCaster) -> np.ndarray:
     """Draw the mesh from four raised corners."""
     low, high = np.quantile(template.mesh.vertices, [0.01, 0.99], axis=0)
     centre, reach = (low + high) / 2, np.linalg.norm(high - low) * 0.95
@@ -36,26 +40,29 @@ def turntable(template: Template, caster: RayCaster) -> np.ndarray:
     for angle in np.pi * (np.arange(4) / 2 + 0.25):
         eye = centre + reach * np.array([np.cos(angle) * 0.75, 0.65, np.sin(angle) * 0.75])
         views.append(overview.view(caster, rigid.look_at(eye, centre, UP), intrinsics, 240, 320))
-    return overview.tile(views, 2)
+    return plots.grid(views, 2)
 
 
-def coverage(template: Template) -> np.ndarray:
+def coverage(template: SceneTemplate) -> np.ndarray:
     """Draw the path of the walk-through over the seen surface."""
     picture = overview.bird_view(template.mesh, floor_m=template.floor_m)
     picture.draw(template.world_from_camera[:, :3, 3], (220, 40, 40))
     return picture.image
 
 
-def frames(template: Template, clip: Clip, caster: RayCaster) -> np.ndarray:
+def frames(template: SceneTemplate, clip: Clip, caster: RayCaster) -> np.ndarray:
     """Put frames beside the mesh as their cameras see it."""
     chosen = np.linspace(0, len(clip) - 1, 7).astype(int)[1:-1]
     height, width = clip.color_size
     real = [clip.color(int(frame)) for frame in chosen]
-    drawn = [overview.view(caster, template.world_from_camera[frame], clip.intrinsics[frame], height, width) for frame in chosen]
-    return overview.tile(real + drawn, len(chosen))
+    drawn = [
+        overview.view(caster, template.world_from_camera[frame], clip.intrinsics[frame], height, width)
+        for frame in chosen
+    ]
+    return plots.grid(real + drawn, len(chosen))
 
 
-def checks(template: Template) -> list[Check]:
+def checks(template: SceneTemplate) -> list[Check]:
     """Judge the template."""
     start = template.start
     surface = [
@@ -66,9 +73,16 @@ def checks(template: Template) -> list[Check]:
     if template.own_mesh:
         return surface
     return [
-        Check("keyframes registered by COLMAP", len(start.registered) / template.keyframes, "share", 0.8, 0.0, "higher"),
+        Check(
+            "keyframes registered by COLMAP",
+            len(start.registered) / template.keyframes,
+            "share",
+            0.8,
+            0.0,
+            "higher",
+        ),
         Check("reprojection error", template.reprojection_px, "px", 1.5),
-        Check("scale against depth, relative spread", start.scale_spread, "", 0.05),
+        Check("scale against depth, relative spread", start.scale_deviation, "", 0.05),
         Check(
             "scale against odometry",
             None if start.odometry_scale is None else abs(start.odometry_scale - 1),
@@ -79,8 +93,8 @@ def checks(template: Template) -> list[Check]:
     ]
 
 
-def _scale(template: Template) -> str:
-    """Say in words what makes lengths metres."""
+def _scale(template: SceneTemplate) -> str:
+    """Return what makes lengths metres, in words."""
     if template.scale == "relative":
         return "relative: from pictures alone, lengths are no metres"
     if template.scale != "measured":
@@ -88,7 +102,7 @@ def _scale(template: Template) -> str:
     return "depth under COLMAP's tracks" if template.start.source == "colmap" else "odometry and depth"
 
 
-def world(template: Template) -> dict:
+def world(template: SceneTemplate) -> dict:
     """Describe the world frame and how it was found, for ``world.json``."""
     start = template.start
     low, high = template.mesh.vertices.min(0), template.mesh.vertices.max(0)
@@ -104,7 +118,7 @@ def world(template: Template) -> dict:
         "keyframes": template.keyframes,
         "keyframes_registered": len(start.registered),
         "reprojection_px": template.reprojection_px,
-        "scale_spread": start.scale_spread,
+        "scale_spread": start.scale_deviation,
         "scale_against_odometry": start.odometry_scale,
         "depth_gap_m": start.gap_m,
         "surface_gap_m": float(np.nanmedian(template.gap_m)),

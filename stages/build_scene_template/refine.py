@@ -1,7 +1,9 @@
-"""Refine the walk-through's cameras: keyframes against each other, then every frame against the fused surface.
+"""Refine the walk-through's cameras: keyframes against each other, then every frame against the fused
+surface.
 
-Keyframes are tied by what they share: SfM tracks (sideways, by pixel noise) and overlapping depth
-(along surface normals), with odometry between neighbours. All terms are contacts of `pipeline.space.relax`.
+Keyframes are tied by what they share: SfM tracks (sideways, by pixel noise) and overlapping depth (along
+surface normals), with odometry between neighbours. All terms are contacts of
+`pipeline.mapping.pose_optimization`.
 """
 
 from dataclasses import dataclass
@@ -9,78 +11,81 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.files.clips import Clip
-from pipeline.space import cameras, relax, rigid, surface
-from pipeline.space.sparse import Sparse
+from pipeline.data.clips import Clip, usable_depth
+from pipeline.geometry import cameras, rigid
+from pipeline.mapping import depth_scans, pose_optimization
+from pipeline.mapping.sparse_model import SparseModel
+from stages.build_scene_template.config import RefinementConfig
 from stages.build_scene_template.matches import points_under
 
-
-@dataclass(frozen=True)
-class RefineOptions:
-    """Weights and reach of the refinement."""
-
-    pixel_sigma_px: float = 1.5
-    """Standard deviation of a SIFT feature's position, colour pixels."""
-    depth_inflation: float = 4.0
-    """Depth noise is multiplied by this, since neighbouring pixels err together."""
-    drift_deg_s: float = 0.5
-    """Odometry's rotational drift, degrees a second."""
-    drift_m_s: float = 0.02
-    """Odometry's translational drift, metres a second."""
-    stride_px: int = 10
-    """One depth pixel in so many, each way, is used."""
-    neighbours: int = 8
-    """Keyframes that each keyframe's depth is compared with."""
-    rounds: int = 10
-    """Gauss-Newton steps of the keyframe graph."""
+PIXEL_SIGMA_PX = 1.5
+"""Standard deviation of a SIFT feature's position, colour pixels."""
+DEPTH_INFLATION = 4.0
+"""Depth noise is multiplied by this, since neighbouring pixels err together."""
+STRIDE_PX = 10
+"""One depth pixel in so many, each way, is used."""
+REACH_M = (0.15, 0.04)
+"""Width of the robust weight in the first and last round, metres."""
+CANDIDATE_REACH = 1.5
+"""Point pairs up to so many reaches apart are candidates."""
+NEAREST_M = 0.1
+"""Depth below this is none, metres."""
+TRACK_HOPS = (1, 3)
+"""Observations of a track are paired with the next one and the third after it."""
+OVERLAP_STEP, LEAST_OVERLAP = 7, 0.3
+"""One point in so many measures the overlap of two keyframes, and the least share that makes them
+neighbours."""
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What the refinement keeps of one keyframe: thinned points, and the full depth to compare with."""
+    """One keyframe: subsampled points, and the full depth to compare with (metres, camera axes)."""
 
-    scan: surface.Scan
+    scan: depth_scans.Scan
     depth: Float[np.ndarray, "height width"]
     normals: Float[np.ndarray, "height width 3"]
     intrinsics: Float[np.ndarray, "3 3"]
 
 
-def load_keyframe(clip: Clip, frame: int, stride_px: int) -> Keyframe:
-    """Read one frame's depth, its thinned points and its normals (camera axes, zero where unknown)."""
-    depth, intrinsics = clip.depth(frame), clip.depth_intrinsics[frame]
-    depth = np.where(clip.confidence(frame) >= 1, depth, 0)
-    return Keyframe(surface.scan(depth, intrinsics, stride=stride_px), depth, surface.image_normals(depth, intrinsics), intrinsics)
+def load_keyframe(clip: Clip, frame: int) -> Keyframe:
+    """Read one frame's depth, its subsampled points and its normals (camera axes, zero where unknown)."""
+    depth, intrinsics = usable_depth(clip, frame), clip.depth_intrinsics[frame]
+    return Keyframe(
+        depth_scans.scan(depth, intrinsics, stride=STRIDE_PX),
+        depth,
+        depth_scans.image_normals(depth, intrinsics),
+        intrinsics,
+    )
 
 
-def depth_contacts(
+def depth_correspondences(
     keyframes: list[Keyframe],
     pairs: Int[np.ndarray, "pair 2"],
     world_from_camera: Float[np.ndarray, "key 4 4"],
     reach_m: float,
-    inflation: float,
-) -> relax.Contacts:
-    """Project each pair's thinned points into the other's depth image and tie them to the plane seen there."""
-    parts = [_pair_contacts(keyframes, int(a), int(b), world_from_camera, reach_m, inflation) for a, b in pairs]
-    return relax.Contacts.join(*parts)
+) -> pose_optimization.Correspondences:
+    """Project each pair's points into the other's depth image and pair them with the plane seen there."""
+    parts = [_pair_correspondences(keyframes, int(a), int(b), world_from_camera, reach_m) for a, b in pairs]
+    return pose_optimization.Correspondences.join(*parts)
 
 
-def _pair_contacts(keyframes, first, second, world_from_camera, reach_m, inflation):
+def _pair_correspondences(keyframes, first, second, world_from_camera, reach_m):
     source, target = keyframes[first].scan, keyframes[second]
     second_from_first = rigid.inverse(world_from_camera[second]) @ world_from_camera[first]
     moved = rigid.apply(second_from_first, source.points_camera)
     pixel, z = cameras.project(moved, target.intrinsics)
     column, row = np.floor(pixel).astype(int).T
     height, width = target.depth.shape
-    inside = np.flatnonzero((z > 0.1) & (row >= 0) & (column >= 0) & (row < height) & (column < width))
+    inside = np.flatnonzero((z > NEAREST_M) & (row >= 0) & (column >= 0) & (row < height) & (column < width))
     row, column = row[inside], column[inside]
     met = cameras.unproject(pixel[inside], target.intrinsics) * target.depth[row, column, None]
     normal = target.normals[row, column]
     gap = np.abs(np.einsum("ci,ci->c", moved[inside] - met, normal))
-    good = (np.abs(normal).sum(1) > 0) & (gap < 1.5 * reach_m)
+    good = (np.abs(normal).sum(1) > 0) & (gap < CANDIDATE_REACH * reach_m)
     inside, met, normal = inside[good], met[good], normal[good]
     count = len(inside)
-    sigma = inflation * np.hypot(source.sigma_m[inside], surface.depth_noise(met[:, 2]))
-    return relax.Contacts(
+    sigma = DEPTH_INFLATION * np.hypot(source.sigma_m[inside], depth_scans.depth_noise(met[:, 2]))
+    return pose_optimization.Correspondences(
         np.full(count, first),
         np.full(count, second),
         source.points_camera[inside],
@@ -91,7 +96,7 @@ def _pair_contacts(keyframes, first, second, world_from_camera, reach_m, inflati
 
 
 @dataclass(frozen=True)
-class Ties:
+class TrackMatches:
     """Depth points under the same SfM track in two keyframes, camera axes, and their sideways noise."""
 
     first: Int[np.ndarray, "tie"]
@@ -100,19 +105,26 @@ class Ties:
     points_second: Float[np.ndarray, "tie 3"]
     sigma_m: Float[np.ndarray, "tie"]
 
-    def contacts(self, world_from_camera: Float[np.ndarray, "key 4 4"]) -> relax.Contacts:
-        """Tie the points across the second camera's viewing ray: along the ray depth is the better witness."""
+    def correspondences(
+        self, world_from_camera: Float[np.ndarray, "key 4 4"]
+    ) -> pose_optimization.Correspondences:
+        """Constrain the points across the second camera's viewing ray; along the ray depth is more
+        accurate."""
         ray = self.points_second / np.linalg.norm(self.points_second, axis=1, keepdims=True)
         sides = []
         for axis in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
             side = axis - (ray @ axis)[:, None] * ray
             side /= np.linalg.norm(side, axis=1, keepdims=True)
             direction = np.einsum("cij,cj->ci", world_from_camera[self.second, :3, :3], side)
-            sides.append(relax.Contacts(self.first, self.second, self.points_first, self.points_second, direction, self.sigma_m))
-        return relax.Contacts.join(*sides)
+            sides.append(
+                pose_optimization.Correspondences(
+                    self.first, self.second, self.points_first, self.points_second, direction, self.sigma_m
+                )
+            )
+        return pose_optimization.Correspondences.join(*sides)
 
 
-def tie_tracks(sparse: Sparse, clip: Clip, key_of_view: Int[np.ndarray, "view"], sigma_px: float) -> Ties:
+def match_tracks(sparse: SparseModel, clip: Clip, key_of_view: Int[np.ndarray, "view"]) -> TrackMatches:
     """Pair each observation of a track that has depth with the track's next one and the third after it."""
     points = np.full((len(sparse.observed_key), 3), np.nan)
     for view, frame in enumerate(sparse.frame):
@@ -121,27 +133,37 @@ def tie_tracks(sparse: Sparse, clip: Clip, key_of_view: Int[np.ndarray, "view"],
     order = np.lexsort((sparse.observed_key, sparse.observed_point))
     order = order[np.isfinite(points[order, 0])]
     track = sparse.observed_point[order]
-    ties = [np.stack([order[:-hop], order[hop:]], 1)[track[:-hop] == track[hop:]] for hop in (1, 3) if len(order) > hop]
-    first, second = np.concatenate([np.zeros((0, 2), int), *ties]).T
+    hops = [
+        np.stack([order[:-hop], order[hop:]], 1)[track[:-hop] == track[hop:]]
+        for hop in TRACK_HOPS
+        if len(order) > hop
+    ]
+    first, second = np.concatenate([np.zeros((0, 2), int), *hops]).T
     focal = clip.intrinsics[sparse.frame[sparse.observed_key[second]], 0, 0]
-    views = [key_of_view[sparse.observed_key[index]] for index in (first, second)]
-    return Ties(*views, points[first], points[second], sigma_px * points[second, 2] / focal)
+    first_key, second_key = key_of_view[sparse.observed_key[first]], key_of_view[sparse.observed_key[second]]
+    return TrackMatches(
+        first_key, second_key, points[first], points[second], PIXEL_SIGMA_PX * points[second, 2] / focal
+    )
 
 
-def overlapping(world_from_camera: Float[np.ndarray, "key 4 4"], keyframes: list[Keyframe], neighbours: int) -> Int[np.ndarray, "pair 2"]:
+def overlapping(
+    world_from_camera: Float[np.ndarray, "key 4 4"], keyframes: list[Keyframe], neighbours: int
+) -> Int[np.ndarray, "pair 2"]:
     """Pick for each keyframe its successor and the others that see most of its points."""
     pairs = []
     for first, keyframe in enumerate(keyframes):
-        points = keyframe.scan.points_camera[::7]
+        points = keyframe.scan.points_camera[::OVERLAP_STEP]
         seen = np.zeros(len(keyframes))
         for second in range(len(keyframes)):
             local = rigid.apply(rigid.inverse(world_from_camera[second]) @ world_from_camera[first], points)
             pixel, z = cameras.project(local, keyframe.intrinsics)
-            inside = (z > 0.1) & (pixel > 0).all(1) & (pixel < np.array(keyframe.depth.shape[::-1])).all(1)
+            inside = (
+                (z > NEAREST_M) & (pixel > 0).all(1) & (pixel < np.array(keyframe.depth.shape[::-1])).all(1)
+            )
             seen[second] = inside.mean() if len(points) else 0
         seen[first] = 0
-        spread = np.argsort(-seen, kind="stable")
-        best = spread[seen[spread] > 0.3]
+        ranked = np.argsort(-seen, kind="stable")
+        best = ranked[seen[ranked] > LEAST_OVERLAP]
         chosen = set(best[:: max(1, len(best) // neighbours)][:neighbours].tolist()) | (
             {first + 1} if first + 1 < len(keyframes) else set()
         )
@@ -154,25 +176,38 @@ def refine_keyframes(
     frames: Int[np.ndarray, "key"],
     keyframes: list[Keyframe],
     world_from_camera: Float[np.ndarray, "key 4 4"],
-    sparse: Sparse | None,
-    options: RefineOptions,
+    sparse: SparseModel | None,
+    config: RefinementConfig,
 ) -> Float[np.ndarray, "key 4 4"]:
-    """Relax the keyframes against each other by depth, tracks and odometry; the first one stays where it is."""
-    pairs = overlapping(world_from_camera, keyframes, options.neighbours)
-    ties = None if sparse is None else tie_tracks(sparse, clip, np.searchsorted(frames, sparse.frame), options.pixel_sigma_px)
+    """Optimize the keyframes against each other by depth, SfM tracks and odometry; the first one is fixed."""
+    pairs = overlapping(world_from_camera, keyframes, config.neighbours)
+    tracks = None if sparse is None else match_tracks(sparse, clip, np.searchsorted(frames, sparse.frame))
 
     def find(poses, reach_m):
-        contacts = depth_contacts(keyframes, pairs, poses, reach_m, options.depth_inflation)
-        return contacts if ties is None else relax.Contacts.join(contacts, ties.contacts(poses))
+        correspondences = depth_correspondences(keyframes, pairs, poses, reach_m)
+        return (
+            correspondences
+            if tracks is None
+            else pose_optimization.Correspondences.join(correspondences, tracks.correspondences(poses))
+        )
 
-    held = np.arange(len(frames)) == 0
-    reach = tuple(np.geomspace(0.15, 0.04, options.rounds))
-    return relax.relax(world_from_camera, find, odometry_edges(clip, frames, options), reach_m=reach, held=held).world_from_camera
+    fixed = np.arange(len(frames)) == 0
+    reach = tuple(np.geomspace(*REACH_M, config.rounds))
+    return pose_optimization.optimize_poses(
+        world_from_camera, find, odometry_factors(clip, frames, config), reach_m=reach, fixed=fixed
+    ).world_from_camera
 
 
-def odometry_edges(clip: Clip, frames: Int[np.ndarray, "key"], options: RefineOptions) -> relax.Relatives | None:
-    """Return the odometry between neighbouring frames of a selection, None where the phone gave none."""
+def odometry_factors(
+    clip: Clip, frames: Int[np.ndarray, "key"], config: RefinementConfig
+) -> pose_optimization.RelativePoseFactors | None:
+    """Return the odometry between neighbouring frames of a selection, None where there is none."""
     if clip.odometry_from_camera is None:
         return None
-    drift = np.deg2rad(options.drift_deg_s)
-    return relax.chain(clip.timestamp_s[frames], clip.odometry_from_camera[frames], drift_rad_s=drift, drift_m_s=options.drift_m_s)
+    drift = np.deg2rad(config.drift_deg_s)
+    return pose_optimization.odometry_factors(
+        clip.timestamp_s[frames],
+        clip.odometry_from_camera[frames],
+        drift_rad_s=drift,
+        drift_m_s=config.drift_m_s,
+    )

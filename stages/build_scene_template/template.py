@@ -1,4 +1,4 @@
-"""The whole way from a walk-through to its template: what the front calls, and what it gets back."""
+"""From a walk-through to its template: structure from motion, refinement, fusion and alignment, in order."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,21 +7,26 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float
 
-from pipeline.errors import InputError
-from pipeline.files.clips import Clip
-from pipeline.progress import log
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
-from pipeline.space.sparse import Sparse
+from pipeline.core.errors import InputError
+from pipeline.core.progress import log
+from pipeline.data.clips import Clip
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
+from pipeline.mapping.sparse_model import SparseModel
 from stages.build_scene_template import anchor, fuse, refine, sfm
+from stages.build_scene_template.config import Config
 
 LEAST_POINTS = 100
-"""measured points with a surface direction below which there is nothing to fuse"""
+"""Measured points with a normal, and faces of the fused mesh, below which there is no surface."""
+REGISTERED_WITHIN_M = 0.1
+"""A frame whose median depth gap is larger is not registered, metres."""
+UP_COSINE, FLOOR_SHARE = 0.9, 0.05
+"""Surface is level above this cosine; the floor is the height below which this share of it lies."""
 
 
 @dataclass(frozen=True)
-class Template:
-    """The scene's surface in the world, the walk-through's cameras, and how they were found."""
+class SceneTemplate:
+    """The scene's surface in the world, the walk-through's cameras, and the source of both."""
 
     mesh: Mesh
     features: Float[np.ndarray, "vertex channel"]
@@ -29,7 +34,7 @@ class Template:
     registered: Bool[np.ndarray, "frame"]
     gap_m: Float[np.ndarray, "frame"]
     """Median distance of each frame's depth from the surface."""
-    start: anchor.Trajectory
+    start: anchor.InitialTrajectory
     keyframes: int
     reprojection_px: float | None
     gravity: str
@@ -42,23 +47,15 @@ class Template:
 
 
 def build(
-    clip: Clip,
-    features: Float[np.ndarray, "frame height width channel"],
-    *,
-    structure: sfm.SfmOptions,
-    believe: anchor.AnchorOptions,
-    weights: refine.RefineOptions,
-    fusion: fuse.FuseOptions,
-    workspace: Path,
-    seed: int,
-) -> tuple[Template, Sparse | None]:
-    """Build the template; the sparse model comes back in the world, ready to be written. Raises InputError MAP-001
-    and MAP-002.
+    clip: Clip, features: Float[np.ndarray, "frame height width channel"], config: Config, workspace: Path
+) -> tuple[SceneTemplate, SparseModel | None]:
+    """Build the template; the sparse model comes back in the world, ready to be written. Raises InputError
+    MAP-001 and MAP-002.
     """
-    sparse = sfm.reconstruct(clip, structure, workspace, seed)
-    frames = sfm.choose_keyframes(clip, structure)
-    keyframes = [refine.load_keyframe(clip, int(frame), weights.stride_px) for frame in frames]
-    start = anchor.choose_start(clip, frames, keyframes, sparse, believe)
+    sparse = sfm.reconstruct(clip, config.sfm, workspace, config.seed)
+    frames = sfm.choose_keyframes(clip, config.sfm)
+    keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
+    start = anchor.choose_start(clip, frames, keyframes, sparse)
     if start is None:
         raise InputError(
             "MAP-001",
@@ -71,25 +68,36 @@ def build(
         f"{len(start.registered)} of {len(frames)} keyframes in the model"
     )
     trusted = sparse if start.source == "colmap" else None
-    keys = refine.refine_keyframes(clip, frames, keyframes, start.world_from_camera[frames], trusted, weights)
-    poses = anchor.bridge(clip, frames, keys)
-    normals = np.concatenate([(k.normals.reshape(-1, 3)[k.scan.pixel_index]) @ p[:3, :3].T for k, p in zip(keyframes, keys, strict=True)])
-    points = np.concatenate([rigid.apply(p, k.scan.points_camera) for k, p in zip(keyframes, keys, strict=True)])
+    keys = refine.refine_keyframes(
+        clip, frames, keyframes, start.world_from_camera[frames], trusted, config.refinement
+    )
+    poses = anchor.propagate(clip, frames, keys)
+    normals = np.concatenate(
+        [
+            (k.normals.reshape(-1, 3)[k.scan.pixel_index]) @ p[:3, :3].T
+            for k, p in zip(keyframes, keys, strict=True)
+        ]
+    )
+    points = np.concatenate(
+        [rigid.apply(p, k.scan.points_camera) for k, p in zip(keyframes, keys, strict=True)]
+    )
     known = np.abs(normals).sum(1) > 0
     if known.sum() < LEAST_POINTS:
         raise _no_surface(clip)
     upright_from_world, gravity = anchor.upright(clip, poses, points[known], normals[known])
-    mesh = fuse.fuse(clip, frames, upright_from_world @ poses, fusion)
-    if len(mesh.faces) < 100:
+    mesh = fuse.fuse(clip, frames, upright_from_world @ poses, config.fusion)
+    if len(mesh.faces) < LEAST_POINTS:
         raise _no_surface(clip)
-    poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, fusion, weights)
-    mesh = fuse.clean(fuse.fuse(clip, np.arange(len(clip)), poses, fusion), workspace, fusion.island_faces)
+    poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, config.refinement)
+    mesh = fuse.clean(
+        fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion), workspace, config.fusion.island_faces
+    )
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
-    made = Template(
+    made = SceneTemplate(
         mesh=mesh,
-        features=fuse.vertex_features(clip, features, mesh, poses, fusion.feature_frames),
+        features=fuse.vertex_features(clip, features, mesh, poses, config.fusion.feature_frames),
         world_from_camera=poses,
-        registered=np.nan_to_num(gap, nan=np.inf) < 0.1,
+        registered=np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M,
         gap_m=gap,
         start=start,
         keyframes=len(frames),
@@ -102,22 +110,36 @@ def build(
 
 
 def _no_surface(clip: Clip) -> InputError:
-    return InputError("MAP-002", "depth fused to no surface", str(clip.folder), "check that the recording has LiDAR depth within 4 m")
+    return InputError(
+        "MAP-002",
+        "depth fused to no surface",
+        str(clip.folder),
+        "check that the recording has LiDAR depth within 4 m",
+    )
 
 
 def floor_height(mesh: Mesh) -> float:
     """Return the height below which only a twentieth of the upward-facing surface lies."""
-    up = mesh.vertex_normals()[:, 1] > 0.9
-    return float(np.quantile(mesh.vertices[up, 1], 0.05)) if up.any() else float(mesh.vertices[:, 1].min())
+    up = mesh.vertex_normals()[:, 1] > UP_COSINE
+    return (
+        float(np.quantile(mesh.vertices[up, 1], FLOOR_SHARE))
+        if up.any()
+        else float(mesh.vertices[:, 1].min())
+    )
 
 
-def write_model(sparse: Sparse | None, world_from_camera: Float[np.ndarray, "frame 4 4"], folder: Path) -> None:
-    """Write COLMAP's model as text, moved into the world by the similarity that best takes its camera centres there."""
+def write_model(
+    sparse: SparseModel | None, world_from_camera: Float[np.ndarray, "frame 4 4"], folder: Path
+) -> None:
+    """Write COLMAP's model as text, moved into the world by the similarity that best takes its camera centres
+    there."""
     folder.mkdir()
     if sparse is None:
         (folder / "README.txt").write_text("COLMAP found no model in this walk-through.\n")
         return
-    world_from_model = pycolmap.estimate_sim3d(sparse.model_from_camera[:, :3, 3], world_from_camera[sparse.frame][:, :3, 3])
+    world_from_model = pycolmap.estimate_sim3d(
+        sparse.model_from_camera[:, :3, 3], world_from_camera[sparse.frame][:, :3, 3]
+    )
     if world_from_model is not None:
         sparse.reconstruction.transform(world_from_model)
     sparse.reconstruction.write_text(folder)

@@ -1,64 +1,76 @@
-"""Check recordings before a build, in under a minute each: what each is, how good it is, and what to do better.
+"""Check recordings before a build, in under a minute each.
+
+What each is, how good it is, and what to do better.
 
 make capture-check AGENT=luna        or: python -m stages.check_captures captures/luna
 """
 
 import argparse
+import itertools
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from pipeline import captures, config
-from pipeline.errors import InputError
-from pipeline.videos import Role
-from stages.check_captures import checking
-
-
-@dataclass(frozen=True)
-class Config:
-    """Settings of the check."""
-
-    samples: int = 40
-    """Frames that are looked at per recording."""
-    seed: int = 0
-    """Of random fits."""
+from pipeline.core import config
+from pipeline.core.errors import InputError, printable
+from pipeline.core.videos import Role
+from pipeline.workflow import captures
+from stages.check_captures import stage
+from stages.check_captures.config import Config
+from stages.check_captures.stage import CaptureVerdict
 
 
 def main(arguments: list[str]) -> int:
     """Print a verdict per recording; return 2 when one cannot be used or the set is not complete."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="captures/<agent>, or another folder with recordings")
-    parser.add_argument("--recipe", type=Path, help="recipe whose [videos] table gives roles (default: agents/<folder's name>.toml)")
-    given, settings = parser.parse_args(arguments), Config()
+    parser.add_argument(
+        "--recipe",
+        type=Path,
+        help="recipe whose [videos] table gives roles (default: agents/<folder's name>.toml)",
+    )
+    given = parser.parse_args(arguments)
     try:
-        files = _files(given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml"))
+        files, refused = _files(given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml"))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     unusable = 0
-    for verdict in checking.check(files, settings.samples, np.random.default_rng(settings.seed)):
+    for verdict in itertools.chain(refused, stage.run(files, Config())):
         unusable += not verdict.usable
-        print(f"{verdict.text}\n", flush=True)
+        print(f"{printable(verdict.text)}\n", flush=True)
     for name in captures.not_understood(given.folder):
-        print(f"{captures.named(given.folder / name)}  left alone: not a recording of a known format (CAP-003)\n")
+        print(
+            f"{printable(captures.named(given.folder / name))}  left alone: not a "
+            "recording of a known format (CAP-003)\n"
+        )
     missing = captures.missing_roles([role for _, role in files])
     for role, what in missing:
         print(f"CAP-040 there is no {role} among the recordings\n    -> add {what}")
     return 2 if unusable or missing else 0
 
 
-def _files(folder: Path, recipe: Path) -> list[tuple[Path, Role]]:
-    """Return the recordings and their roles, from names, sidecars and the recipe."""
+def _files(folder: Path, recipe: Path) -> tuple[list[tuple[Path, Role]], list[CaptureVerdict]]:
+    """Return the recordings with their roles, from names, sidecars and the recipe, and those with a bad
+    sidecar.
+    """
     names = captures.find(folder)
     if not names:
         captures.refuse_strangers(folder)
         what = "there are no recordings; make builds from the built-in capture"
         raise InputError("CAP-042", what, str(folder), "copy recordings there (README: your own animal)")
     overrides = config.read_table(recipe).get("videos", {}) if recipe.is_file() else {}
-    said = captures.remarks(folder, names, overrides, str(recipe))
-    return [(folder / name, captures.role_of(name, said[name], str(folder))) for name in names]
+    config.refuse_unknown(overrides, names, where=f"{recipe}: [videos]", kind="recording")
+    files, refused = [], []
+    for name in names:
+        try:
+            own = {name: overrides[name]} if name in overrides else {}
+            remark = captures.remarks(folder, [name], own, str(recipe))[name]
+            files.append((folder / name, captures.role_of(name, remark, str(folder))))
+        except InputError as error:
+            refused.append(stage.refused(folder / name, "session", error))
+    return files, refused
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Whether a recording shows the room of the walk-through: SIFT points lifted by depth, a rigid fit, agreement over time."""
+"""Whether a recording shows the room of the walk-through.
+
+SIFT points lifted by depth, a rigid fit, agreement over time.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.space import align, rigid, sift_points
-from pipeline.space.sift_points import SiftPoints
-from stages.check_captures.looking import Shot
+from pipeline.geometry import align, rigid
+from pipeline.mapping import sift
+from pipeline.mapping.sift import SiftPoints
+from stages.check_captures.sampling import SampledFrame
 
 POINTS = 600
 WITHIN_M = 0.06
@@ -20,28 +24,39 @@ TRIALS = 300
 
 
 @dataclass(frozen=True)
-class Described:
+class DescribedFrame:
     """One frame and its points that have depth."""
 
-    shot: Shot
+    shot: SampledFrame
     points: SiftPoints
 
 
-def describe(shots: Sequence[Shot]) -> list[Described]:
+def describe(shots: Sequence[SampledFrame]) -> list[DescribedFrame]:
     """Describe frames; those with too few points are left out."""
     found = [
-        Described(shot, sift_points.sift_points(shot.gray, shot.intrinsics, shot.depth, shot.depth_intrinsics, POINTS)) for shot in shots
+        DescribedFrame(
+            shot, sift.sift_points(shot.gray, shot.intrinsics, shot.depth, shot.depth_intrinsics, POINTS)
+        )
+        for shot in shots
     ]
     return [each for each in found if len(each.points.points_camera) >= LEAST]
 
 
-def placed_share(walkthrough: Sequence[Described], session: Sequence[Described], rng: np.random.Generator) -> float:
-    """Return the share (0..1) of session frames that are found in the walk-through, at places that agree with each other."""
+def placed_share(
+    walkthrough: Sequence[DescribedFrame], session: Sequence[DescribedFrame], rng: np.random.Generator
+) -> float:
+    """Return the share (0..1) of session frames that are found in the walk-through, at places that agree
+    with each other.
+    """
     if not session or not walkthrough:
         return 0.0
     votes = [_best_place(walkthrough, frame, rng) for frame in session]
     placed = [vote for vote in votes if vote is not None]
-    if not placed or walkthrough[0].shot.odometry_from_camera is None or session[0].shot.odometry_from_camera is None:
+    if (
+        not placed
+        or walkthrough[0].shot.odometry_from_camera is None
+        or session[0].shot.odometry_from_camera is None
+    ):
         return len(placed) / len(session)
     places = np.stack(placed)
     degrees = np.degrees(rigid.rotation_angle(places[:, None, :3, :3], places[None, :, :3, :3]))
@@ -50,11 +65,15 @@ def placed_share(walkthrough: Sequence[Described], session: Sequence[Described],
     return agreeing / len(session) if agreeing >= 2 else 0.0
 
 
-def _best_place(walkthrough: Sequence[Described], frame: Described, rng: np.random.Generator) -> Float[np.ndarray, "4 4"] | None:
-    """Return where one frame puts its odometry in the walk-through's (4 x 4), or None where no walk-through frame fits."""
+def _best_place(
+    walkthrough: Sequence[DescribedFrame], frame: DescribedFrame, rng: np.random.Generator
+) -> Float[np.ndarray, "4 4"] | None:
+    """Return where one frame puts its odometry in the walk-through's (4 x 4), or None where no walk-
+    through frame fits.
+    """
     best, place = LEAST - 1, None
     for known in walkthrough:
-        mine, theirs = sift_points.matches(frame.points, known.points).T
+        mine, theirs = sift.matches(frame.points, known.points).T
         if len(mine) <= best:
             continue
         matched = (frame.points.points_camera[mine], known.points.points_camera[theirs])
@@ -64,7 +83,9 @@ def _best_place(walkthrough: Sequence[Described], frame: Described, rng: np.rand
     return place
 
 
-def _in_odometry(known: Shot, known_from_frame: np.ndarray, frame: Shot) -> Float[np.ndarray, "4 4"]:
+def _in_odometry(
+    known: SampledFrame, known_from_frame: np.ndarray, frame: SampledFrame
+) -> Float[np.ndarray, "4 4"]:
     if known.odometry_from_camera is None or frame.odometry_from_camera is None:
         return known_from_frame
     return known.odometry_from_camera @ known_from_frame @ rigid.inverse(frame.odometry_from_camera)

@@ -1,4 +1,7 @@
-"""Whether a video without depth can be mapped from its pictures: do neighbours show the same things, from elsewhere."""
+"""Whether a video without depth can be mapped from its pictures.
+
+Do neighbours show the same things, from elsewhere.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -7,13 +10,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stages.check_captures.looking import Shot
+from stages.check_captures.sampling import SampledFrame
 
 SIDE_PX, POINTS, RATIO, WITHIN_PX = 480, 800, 0.8, 2.0
 LINKED = 25
 """matches on which two views must agree to show the same things"""
 TURNED = 0.9
-"""share of these that a mere turn of the camera (or one plane) explains, beyond which the pair tells nothing of depth"""
+"""share of these that a mere turn of the camera (or one plane) explains, beyond which the pair has no
+parallax
+"""
 
 
 @dataclass(frozen=True)
@@ -22,31 +27,39 @@ class Parallax:
 
     linked: float
     """pairs that show the same things"""
-    telling: float
+    with_parallax: float
     """of these, pairs in which things shift against each other"""
 
 
-def parallax(shots: Sequence[Shot]) -> Parallax:
+def parallax(shots: Sequence[SampledFrame]) -> Parallax:
     """Match neighbouring pictures and compare two views of a scene with a mere turn."""
     described = [_described(shot) for shot in shots]
-    links = [link for first, second in itertools.pairwise(described) if (link := _link(first, second)) is not None]
+    links = [
+        link for first, second in itertools.pairwise(described) if (link := _link(first, second)) is not None
+    ]
     pairs = max(len(shots) - 1, 1)
-    return Parallax(len(links) / pairs, float(np.mean([turned < TURNED for turned in links])) if links else 0.0)
+    return Parallax(
+        len(links) / pairs, float(np.mean([turned < TURNED for turned in links])) if links else 0.0
+    )
 
 
-def _described(shot: Shot) -> tuple[np.ndarray, np.ndarray | None]:
+def _described(shot: SampledFrame) -> tuple[np.ndarray, np.ndarray | None]:
     scale = min(1.0, SIDE_PX / max(shot.gray.shape))
     small = cv2.resize(shot.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     keypoints, descriptors = cv2.SIFT.create(POINTS).detectAndCompute(small, None)
     return np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2), descriptors
 
 
-def _link(first: tuple[np.ndarray, np.ndarray | None], second: tuple[np.ndarray, np.ndarray | None]) -> float | None:
+def _link(
+    first: tuple[np.ndarray, np.ndarray | None], second: tuple[np.ndarray, np.ndarray | None]
+) -> float | None:
     """Return the share of a pair's matches that a turn explains; None where the pair has too few."""
     if min(len(first[0]), len(second[0])) < LINKED:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first[1], second[1], k=2)
-    good = np.array([(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance], int).reshape(-1, 2)
+    good = np.array(
+        [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance], int
+    ).reshape(-1, 2)
     if len(good) < LINKED:
         return None
     mine, theirs = first[0][good[:, 0]], second[0][good[:, 1]]

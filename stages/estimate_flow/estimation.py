@@ -1,9 +1,10 @@
 """Optical flow by dense inverse search (DIS, Kroeger et al. 2016), chained over growing gaps.
 
-Coarse-to-fine search loses small things that move against the camera, so neighbouring frames are searched twice, from
-coarse levels and on the finest level only, and each place keeps what matches better. Search fails altogether when the
-picture moves far, so longer gaps chain two flows of half the gap and search again on the finest level from there.
-Make one `Estimator` per video; `flows` yields pair after pair and keeps no more than the longest gap needs.
+Coarse-to-fine search loses small things that move against the camera, so neighbouring frames are searched
+twice, from coarse levels and on the finest level only, and each place keeps what matches better. Search fails
+altogether when the picture moves far, so longer gaps chain two flows of half the gap and search again on the
+finest level from there. Make one `Estimator` per video; `flows` yields pair after pair and keeps no more than
+the longest gap needs.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -13,30 +14,28 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-STRIDE_PX = 4
+from pipeline.data.flow import STRIDE_PX
+
 """colour pixels per stored flow vector"""
 MATCH_WINDOW_PX = 5
 """side of the window over which two candidates are compared, pixels at half the reduced size"""
 MATCH_MARGIN = 2.0
-"""brightness difference (of 255) by which the second candidate must be better: on plain walls chance is not enough"""
+"""brightness difference (of 255) by which the second candidate must be better: on plain walls chance is not
+enough"""
 MATCH_CLIP = 40.0
 """brightness difference (of 255) beyond which a mismatch is not worse"""
+
+PATCH_STRIDE_PX = 3
+"""distance between patches, reduced pixels: denser than DIS's own fast presets (4), for limbs a few pixels
+wide"""
+DESCENT_STEPS = 50
+"""gradient-descent iterations per patch: more than the presets' 16 to 25, for motion blur and weak texture"""
+TOLERANCE_PX = 1.5
+"""forward-backward error at which confidence is 1/e, reduced pixels"""
 
 Gray = UInt8[np.ndarray, "working_height working_width"]
 Dense = Float[np.ndarray, "dense_height dense_width 2"]
 """flow at half the reduced size, where the search ends, in pixels of that size"""
-
-
-@dataclass(frozen=True)
-class Search:
-    """How hard to search; pixels are those of the reduced pictures."""
-
-    working_side_px: int
-    """longer side of the reduced pictures"""
-    patch_stride_px: int
-    """distance between patches"""
-    iterations: int
-    """descent steps per patch"""
 
 
 @dataclass(frozen=True)
@@ -51,16 +50,18 @@ class Flow:
 class Estimator:
     """Flow between pictures of one size."""
 
-    def __init__(self, color_size: tuple[int, int], search: Search, *, tolerance_px: float) -> None:
-        """Prepare for pictures of (height, width); confidence falls to 1/e at ``tolerance_px`` reduced pixels."""
-        scale = min(1.0, search.working_side_px / max(color_size))
+    def __init__(self, color_size: tuple[int, int], working_side_px: int) -> None:
+        """Prepare for pictures of (height, width), reduced until the longer side is at most
+        ``working_side_px``.
+        """
+        scale = min(1.0, working_side_px / max(color_size))
         self.dense_size = tuple(max(round(side * scale / 2), 8) for side in color_size)
         self.grid_px = grid_centers(color_size)
         self._color_size = color_size
         self._color_per_dense = (np.array(color_size) / self.dense_size)[::-1].astype(np.float32)
-        self._tolerance_px = tolerance_px / scale
+        self._tolerance_px = TOLERANCE_PX / scale
         # A search that was given a guess remembers it in later ones: so one of its own for those.
-        self._coarse, self._fine, self._guided = (_search(search, fine_only=fine) for fine in (False, True, True))
+        self._coarse, self._fine, self._guided = (_search(fine_only=fine) for fine in (False, True, True))
         self._pixel = _index_grid(*self.dense_size)
 
     def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> Gray:
@@ -93,26 +94,39 @@ class Estimator:
 
     def _better(self, first: Gray, second: Gray, candidates: Sequence[Dense]) -> Dense:
         """Keep the first candidate but where the second one clearly makes the pictures look more alike."""
-        first, second = (cv2.resize(gray, self.dense_size[::-1], interpolation=cv2.INTER_AREA) for gray in (first, second))
+        first, second = (
+            cv2.resize(gray, self.dense_size[::-1], interpolation=cv2.INTER_AREA) for gray in (first, second)
+        )
         mismatch = []
         for candidate in candidates:
             difference = cv2.absdiff(_sampled(second, self._pixel + candidate), first).astype(np.float32)
             mismatch.append(cv2.blur(np.minimum(difference, MATCH_CLIP), (MATCH_WINDOW_PX, MATCH_WINDOW_PX)))
         return np.where((mismatch[1] + MATCH_MARGIN < mismatch[0])[..., None], candidates[1], candidates[0])
 
-    def _searched(self, search: cv2.DISOpticalFlow, first: Gray, second: Gray, guess: Dense | None = None) -> Dense:
-        start = None if guess is None else 2 * cv2.resize(guess, first.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        return cv2.resize(search.calc(first, second, start), self.dense_size[::-1], interpolation=cv2.INTER_AREA) / 2
+    def _searched(
+        self, search: cv2.DISOpticalFlow, first: Gray, second: Gray, guess: Dense | None = None
+    ) -> Dense:
+        start = (
+            None
+            if guess is None
+            else 2 * cv2.resize(guess, first.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        )
+        return (
+            cv2.resize(search.calc(first, second, start), self.dense_size[::-1], interpolation=cv2.INTER_AREA)
+            / 2
+        )
 
     def _on_grid(self, dense: Dense) -> Float[np.ndarray, "height width 2"]:
         return _sampled(dense, self.grid_px / self._color_per_dense - 0.5) * self._color_per_dense
 
 
-def flows(gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimator: Estimator) -> Iterator[tuple[int, Flow, Flow]]:
+def flows(
+    gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimator: Estimator
+) -> Iterator[tuple[int, Flow, Flow]]:
     """Yield (gap, forward, backward) for gaps that double from 1; ``gray(i)`` gives frame i reduced.
 
-    The pairs of one gap come in the order of their first frames 0, 1, ...; those of all gaps mix, as soon as their last frame
-    is there.
+    The pairs of one gap come in the order of their first frames 0, 1, ...; those of all gaps mix, as soon as
+    their last frame is there.
     """
     assert list(gaps) == [2**power for power in range(len(gaps))], gaps
     known: dict[tuple[int, int], tuple[Dense, Dense]] = {}
@@ -136,7 +150,9 @@ def flows(gray: Callable[[int], Gray], frames: int, gaps: Sequence[int], estimat
 
 def chain(first_to_middle: Dense, middle_to_last: Dense) -> Dense:
     """Follow one flow, then the other."""
-    return first_to_middle + _sampled(middle_to_last, _index_grid(*first_to_middle.shape[:2]) + first_to_middle)
+    return first_to_middle + _sampled(
+        middle_to_last, _index_grid(*first_to_middle.shape[:2]) + first_to_middle
+    )
 
 
 def grid_centers(color_size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
@@ -155,12 +171,12 @@ def _sampled(image: np.ndarray, index: Float[np.ndarray, "height width 2"]) -> n
     return cv2.remap(image, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _search(settings: Search, *, fine_only: bool) -> cv2.DISOpticalFlow:
+def _search(*, fine_only: bool) -> cv2.DISOpticalFlow:
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(1)
     if fine_only:
         search.setCoarsestScale(1)
-    search.setPatchStride(settings.patch_stride_px)
-    search.setGradientDescentIterations(settings.iterations)
+    search.setPatchStride(PATCH_STRIDE_PX)
+    search.setGradientDescentIterations(DESCENT_STEPS)
     search.setVariationalRefinementIterations(0)
     return search

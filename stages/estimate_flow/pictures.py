@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline import qa
-from pipeline.files import arrays
-from stages.estimate_flow.estimation import STRIDE_PX
+from pipeline.data import qa
+from pipeline.data.flow import STRIDE_PX, open_confidence, open_flow
 
 SHOWN_FRAMES = 6
 CERTAIN = 128
@@ -31,7 +30,7 @@ class Review:
 
 def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "height width 3"]]) -> Review:
     """Summarise the forward flow of one gap as it was written; ``color(i)`` gives frame i."""
-    flows, confidences = (arrays.open_lazily(folder / f"flow_{gap}_fw.npz", name) for name in ("flow", "confidence"))
+    flows, confidences = open_flow(folder, gap), open_confidence(folder, gap)
     if len(flows) == 0:
         return Review(gap, float("nan"), float("nan"), None)
     agreement, speed_px = [], []
@@ -61,21 +60,25 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
     ] + [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
     pictures = [
         qa.Picture(
-            f"gap_{each.gap}", each.strip, f"frames, flow to {each.gap} later (hue = direction, as the disc shows), dark where uncertain"
+            f"gap_{each.gap}",
+            each.strip,
+            f"frames, flow to {each.gap} later (hue = direction, as the disc shows), dark where uncertain",
         )
         for each in reviews
         if each.strip is not None
     ]
     qa.write(
         folder,
-        good="one smooth colour for the moving camera, another one inside the animal's outline, dark only at edges",
+        good="one smooth colour for the moving camera, another inside the animal, dark only at edges",
         bad="speckles of all colours, large dark areas in the middle",
         checks=checks,
         pictures=pictures,
     )
 
 
-def flow_wheel(flow: Float[np.ndarray, "height width 2"], full_px: float) -> UInt8[np.ndarray, "height width 3"]:
+def flow_wheel(
+    flow: Float[np.ndarray, "height width 2"], full_px: float
+) -> UInt8[np.ndarray, "height width 3"]:
     """Colour vectors: hue is direction, brightness is length up to ``full_px``."""
     flow = flow.astype(np.float32)
     hue = np.degrees(np.arctan2(flow[..., 1], flow[..., 0])) % 360 / 2
@@ -85,7 +88,9 @@ def flow_wheel(flow: Float[np.ndarray, "height width 2"], full_px: float) -> UIn
 
 
 def _key(height: int, edge: int = 96) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw what the colours mean: the disc shows at each place the colour of motion towards it, brighter when faster."""
+    """Draw what the colours mean: the disc shows at each place the colour of motion towards it, brighter when
+    faster.
+    """
     key = np.full((height, edge, 3), 255, np.uint8)
     along = np.arange(edge) - (edge - 1) / 2
     towards = np.stack(np.meshgrid(along, along), axis=-1)
@@ -97,7 +102,9 @@ def _key(height: int, edge: int = 96) -> UInt8[np.ndarray, "height width 3"]:
     return key
 
 
-def _column(color: np.ndarray, flow: np.ndarray, confidence: np.ndarray) -> UInt8[np.ndarray, "height width 3"]:
+def _column(
+    color: np.ndarray, flow: np.ndarray, confidence: np.ndarray
+) -> UInt8[np.ndarray, "height width 3"]:
     full_px = max(float(np.percentile(np.linalg.norm(flow.astype(np.float32), axis=-1), 95)), 1.0)
     wheel = flow_wheel(flow, full_px) * (0.25 + 0.75 * confidence[..., None] / 255)
     size = (2 * flow.shape[1], 2 * flow.shape[0])

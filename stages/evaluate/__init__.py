@@ -1,6 +1,7 @@
 """Measure a build: against truth where there is truth, against simple rivals everywhere.
 
-The only room that reads truth. `reading` opens artifacts and brings truth into our frames (one SE(3) from the
-walk-through's cameras, one constant agent SE(3) from the turnaround); `registration`, `localizing`, `perception`,
-`heldout`, `surfaces` (by `triangles`) and `behavior` each return `Figures`; `evaluation` asks them one after the other.
+The only stage that reads truth. `reading` opens artifacts and brings truth into our frames (one SE(3) from
+the walk-through's cameras, one constant agent SE(3) from the turnaround); `registration`, `localizing`,
+`perception`, `heldout`, `surfaces` and `behavior` each return `Metrics`; `measuring` calls them one after the
+other.
 """

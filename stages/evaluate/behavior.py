@@ -1,8 +1,10 @@
-"""Predictions of the next 5.6 s on the test video: our model, a location prior, standing still, constant velocity.
+"""Predictions of the next 5.6 s on the test video: our model, a location prior, standing still, constant
+velocity.
 
-Each method draws 16 samples a window in several trials; the best of 16 counts (minADE), and the energy score rewards
-the whole distribution. Truth is the reconstructed future of the test video, as in the paper. Every method is met
-through `predictors.Predictor`; goals are judged on all windows, paths and bodies on some, spread evenly.
+Each method draws 16 samples a window in several trials; the best of 16 counts (minADE), and the energy score
+rewards the whole distribution. Truth is the reconstructed future of the test video, as in the paper. Every
+method is met through `predictors.Predictor`; goals are judged on all windows, paths and bodies on some,
+spread evenly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,34 +13,33 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.intervals import Interval, bootstrapped, episodes
-from pipeline.models.predictors import WINDOWS_AT_ONCE, Ats, ConstantVelocity, LocationPrior, Predictor, Samples, StandStill
-from pipeline.models.scores import GOAL_SCORES, PLAN_SCORES, SCORES, goal_distances, path_distances
-from pipeline.models.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData
+from pipeline.data import plots
+from pipeline.metrics.intervals import Interval, bootstrapped, episodes
+from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES, goal_distances, path_distances
+from pipeline.rivals.predictors import (
+    WINDOWS_AT_ONCE,
+    Ats,
+    ConstantVelocity,
+    LocationPrior,
+    Predictor,
+    Samples,
+    StandStill,
+)
 from stages.evaluate import best_of
-from stages.evaluate.figures import Figures
+from stages.evaluate.config import Config
 
 OURS = "ats"
 RIVALS = ("location_prior", "stand_still", "constant_velocity")
 MOVING_M = 0.1
-CURVES = "Error of the best of K sampled goals and paths on the test windows against K: ours and the simple rivals."
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """How predictions are judged."""
-
-    samples: int
-    """per window and trial"""
-    trials: int
-    """of goals"""
-    plan_trials: int
-    """of paths and bodies"""
-    plan_windows: int
-    """on which paths and bodies are judged, at most"""
-    draws: int
-    """of the bootstrap"""
-    seed: int
+"""An animal that gets further than this in 5.6 s moves."""
+BOOTSTRAP_DRAWS = 2000
+"""Resamples of every interval: its ends then move by a hundredth of its width between seeds."""
+CURVES = (
+    "Error of the best of K sampled goals and paths on the test "
+    "windows against K: ours and the simple rivals."
+)
 
 
 def rivals(data: BehaviorData) -> dict[str, Predictor]:
@@ -48,25 +49,28 @@ def rivals(data: BehaviorData) -> dict[str, Predictor]:
     return {name: method.fit(context, future) for name, method in zip(RIVALS, methods, strict=True)}
 
 
-def behavior_figures(data: BehaviorData, ours: Predictor, protocol: Protocol) -> Figures:
+def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Metrics:
     """Judge all methods on the test windows, with intervals and paired intervals of the differences."""
-    figures, test = Figures(), data.indices(TEST)
+    metrics, test = Metrics(), data.indices(TEST)
     every = np.concatenate([test, data.indices(TRAIN)])
-    figures.put("behavior/moving_windows_share", moving_share(data, every), "no windows")
-    figures.put("behavior/test_windows", len(test))
+    metrics.put("behavior/moving_windows_share", moving_share(data, every), "no windows")
+    metrics.put("behavior/test_windows", len(test))
     reason = "fewer than two sessions, or none long enough for a window: there is no test video"
     if len(test) == 0 or len(data.indices(TRAIN)) == 0:
-        figures.skip(_names(), reason)
-        return figures
-    plans = np.unique(np.linspace(0, len(test) - 1, protocol.plan_windows).astype(int))
-    figures.put("behavior/plan_windows", len(plans))
-    figures.put("behavior/plan_trials", protocol.plan_trials)
+        metrics.skip(_names(), reason)
+        return metrics
+    plans = plots.sample(len(test), config.plan_windows)
+    metrics.put("behavior/plan_windows", len(plans))
+    metrics.put("behavior/plan_trials", 1)
     episode = episodes(data.start[test], data.video[test], PAST + FUTURE)
-    judged = {name: _judged(method, data, test, test[plans], protocol) for name, method in ({OURS: ours} | rivals(data)).items()}
+    judged = {
+        name: _judged(method, data, test, test[plans], config)
+        for name, method in ({OURS: ours} | rivals(data)).items()
+    }
     episode_of = dict.fromkeys(GOAL_SCORES, episode) | dict.fromkeys(PLAN_SCORES, episode[plans])
-    _report(figures, {name: each.scores for name, each in judged.items()}, episode_of, protocol)
-    figures.charts[CURVES] = best_of.drawn({name: each.distances for name, each in judged.items()})
-    return figures
+    _report(metrics, {name: each.scores for name, each in judged.items()}, episode_of, config)
+    metrics.charts[CURVES] = best_of.drawn({name: each.distances for name, each in judged.items()})
+    return metrics
 
 
 def moving_share(data: BehaviorData, index: Int[np.ndarray, "window"]) -> float:
@@ -89,56 +93,76 @@ class _Judged:
 
 
 def _judged(
-    method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], chosen: Int[np.ndarray, "window"], protocol: Protocol
+    method: Predictor,
+    data: BehaviorData,
+    test: Int[np.ndarray, "window"],
+    chosen: Int[np.ndarray, "window"],
+    config: Config,
 ) -> _Judged:
     """Judge one method: its goals on all test windows, its plans on the chosen ones."""
-    rng = np.random.default_rng(protocol.seed)
-    goals = _goals_judged(method, data, test, protocol, rng)
-    plans = _plans_judged(method, data, chosen, protocol, rng)
+    rng = np.random.default_rng(config.seed)
+    goals = _goals_judged(method, data, test, config, rng)
+    plans = _plans_judged(method, data, chosen, config, rng)
     return _Judged(goals.scores | plans.scores, goals.distances | plans.distances)
 
 
 def _goals_judged(
-    method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], protocol: Protocol, rng: np.random.Generator
+    method: Predictor,
+    data: BehaviorData,
+    test: Int[np.ndarray, "window"],
+    config: Config,
+    rng: np.random.Generator,
 ) -> _Judged:
-    goals, parts = _goals(method, data, test, protocol.samples * protocol.trials, rng), []
+    goals, parts = _goals(method, data, test, config.samples * config.trials, rng), []
     for window, drawn in zip(_chunks(test), _chunks(goals), strict=True):
         future = data.windows(window, bones=False)[1]
-        trials = [Samples(trial) for trial in np.split(drawn, protocol.trials, axis=1)]
-        found = {name: np.mean([SCORES[name](trial, future) for trial in trials], axis=0) for name in GOAL_SCORES}
+        trials = [Samples(trial) for trial in np.split(drawn, config.trials, axis=1)]
+        found = {
+            name: np.mean([SCORES[name](trial, future) for trial in trials], axis=0) for name in GOAL_SCORES
+        }
         parts.append(_Judged(found, {"goal": goal_distances(Samples(drawn), future)}))
     return _joined(parts)
 
 
 def _goals(
-    method: Predictor, data: BehaviorData, test: Int[np.ndarray, "window"], count: int, rng: np.random.Generator
+    method: Predictor,
+    data: BehaviorData,
+    test: Int[np.ndarray, "window"],
+    count: int,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "window sample 3"]:
-    """Draw goals only where a method can, which spares the networks of path and body; others a chunk at a time, for their paths are large.
+    """Draw goals only where a method can, which spares the networks of path and body; others a chunk at a
+    time, for their paths are large.
 
-    What is drawn must not hang on the chunks: the location prior, which draws all cells before the places in them, gets one.
+    What is drawn must not hang on the chunks: the location prior, which draws all cells before the places in
+    them, gets one.
     """
     at_once = isinstance(method, LocationPrior)
     draw = method.goals if isinstance(method, Ats) else method.sample
     parts = [test] if at_once else _chunks(test)
     # Goals may be the ends of paths: without a copy these would stay.
-    return np.concatenate([draw(data.windows(part, bones=not at_once)[0], count, rng).goal.copy() for part in parts])
+    return np.concatenate(
+        [draw(data.windows(part, bones=not at_once)[0], count, rng).goal.copy() for part in parts]
+    )
 
 
 def _plans_judged(
-    method: Predictor, data: BehaviorData, chosen: Int[np.ndarray, "window"], protocol: Protocol, rng: np.random.Generator
+    method: Predictor,
+    data: BehaviorData,
+    chosen: Int[np.ndarray, "window"],
+    config: Config,
+    rng: np.random.Generator,
 ) -> _Judged:
-    """Judge whole plans, where a method makes them; distances are those of the last trial."""
-    trials = []
-    for _ in range(protocol.plan_trials):
-        parts = []
-        for window in _chunks(chosen):
-            context, future = data.windows(window)
-            samples = method.sample(context, protocol.samples, rng)
-            if samples.path is None:
-                return _Judged({}, {})
-            parts.append(_Judged({name: SCORES[name](samples, future) for name in PLAN_SCORES}, {"path": path_distances(samples, future)}))
-        trials.append(_joined(parts))
-    return _Judged({name: np.mean([trial.scores[name] for trial in trials], axis=0) for name in PLAN_SCORES}, trials[-1].distances)
+    """Judge whole plans, one trial of them, where a method makes them."""
+    parts = []
+    for window in _chunks(chosen):
+        context, future = data.windows(window)
+        samples = method.sample(context, config.samples, rng)
+        if samples.path is None:
+            return _Judged({}, {})
+        scores = {name: SCORES[name](samples, future) for name in PLAN_SCORES}
+        parts.append(_Judged(scores, {"path": path_distances(samples, future)}))
+    return _joined(parts)
 
 
 def _chunks(array: np.ndarray) -> list[np.ndarray]:
@@ -148,33 +172,36 @@ def _chunks(array: np.ndarray) -> list[np.ndarray]:
 def _joined(parts: Sequence[_Judged]) -> _Judged:
     """Put the windows of several chunks one after the other."""
     scores, distances = (
-        {name: np.concatenate([getattr(part, field)[name] for part in parts]) for name in getattr(parts[0], field)}
+        {
+            name: np.concatenate([getattr(part, field)[name] for part in parts])
+            for name in getattr(parts[0], field)
+        }
         for field in ("scores", "distances")
     )
     return _Judged(scores, distances)
 
 
 def _report(
-    figures: Figures,
+    metrics: Metrics,
     scores: Mapping[str, Mapping[str, Float[np.ndarray, "window"]]],
     episode: Mapping[str, Int[np.ndarray, "window"]],
-    protocol: Protocol,
+    config: Config,
 ) -> None:
     def interval(name: str, values: Float[np.ndarray, "window"]) -> Interval:
         drawn = np.unique(episode[name], return_inverse=True)[1]
-        return bootstrapped(values, drawn, protocol.draws, np.random.default_rng(protocol.seed))
+        return bootstrapped(values, drawn, BOOTSTRAP_DRAWS, np.random.default_rng(config.seed))
 
     for method, of_method in scores.items():
         for name in SCORES:
             if name in of_method:
-                figures.put_mean(f"behavior/{method}/{name}", interval(name, of_method[name]))
+                metrics.put_mean(f"behavior/{method}/{name}", interval(name, of_method[name]))
             else:
-                figures.skip([f"behavior/{method}/{name}"], "this method predicts goals only")
+                metrics.skip([f"behavior/{method}/{name}"], "this method predicts goals only")
     for rival in RIVALS:
         for name in SCORES:
             if name in scores[rival]:
                 difference = interval(name, scores[OURS][name] - scores[rival][name])
-                figures.put_mean(f"behavior/{OURS}_minus_{rival}/{name}", difference)
+                metrics.put_mean(f"behavior/{OURS}_minus_{rival}/{name}", difference)
 
 
 def _names() -> list[str]:

@@ -7,9 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from skimage.metrics import structural_similarity
 
-from stages.evaluate.figures import Figures
+from pipeline.data import plots
+from pipeline.metrics.lpips import Lpips
+from pipeline.metrics.metrics import Metrics
 
 UNSEEN = "no held-out phone, or none that films while its session does"
+NO_LPIPS = "LPIPS needs the weights of AlexNet: name their folder in `[evaluate] lpips_weights`"
+UNMEASURED_LPIPS = "not in view of the held-out phone, or its pictures are smaller than 63 pixels"
 TOLERANCE_M = 0.1
 RANGE_M = 5.0
 PARTS = ("all", "agent", "scene")
@@ -20,7 +24,7 @@ NAMES = (
 
 
 @dataclass(frozen=True)
-class Shot:
+class HeldoutShot:
     """What the held-out phone truly saw at one time."""
 
     world_from_camera: Float[np.ndarray, "4 4"]
@@ -34,50 +38,64 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class View:
+class HeldoutView:
     """A true picture and ours of the same camera and time."""
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
     """metres, 0 = nothing"""
-    true: Shot
+    true: HeldoutShot
 
     @classmethod
-    def empty(cls, true: Shot) -> "View":
+    def empty(cls, true: HeldoutShot) -> "HeldoutView":
         """Draw nothing: what a session that was refused has to show."""
         return cls(np.zeros_like(true.color), np.zeros_like(true.depth), true)
 
 
-def view_figures(views: Sequence[View]) -> Figures:
-    """Average over all pixels (depth) and over pictures (PSNR, SSIM); phones may differ in the shape of their pictures."""
-    figures = Figures()
+def view_metrics(views: Sequence[HeldoutView], lpips: Lpips | None = None) -> Metrics:
+    """Average over all pixels (depth) and over pictures (PSNR, SSIM, LPIPS).
+
+    Phones may differ in the shape of their pictures. Without ``lpips`` LPIPS is not measured.
+    """
+    metrics = Metrics()
     known = np.concatenate([((view.true.depth > 0) & (view.true.depth <= RANGE_M)).ravel() for view in views])
     right = np.concatenate([depth_is_right(view).ravel() for view in views])
     agent = np.concatenate([view.true.agent.ravel() for view in views])
     for part, chosen in (("all", known), ("agent", known & agent), ("scene", known & ~agent)):
         value = float(right[chosen].mean()) if chosen.any() else np.nan
-        figures.put(f"reconstruction/depth_acc_{part}", value, "not in view of the held-out phone")
-    figures.add(picture_figures("reconstruction", views))
-    figures.skip((f"reconstruction/lpips_{part}" for part in PARTS), "LPIPS needs learned weights, none are shipped")
-    return figures
+        metrics.put(f"reconstruction/depth_acc_{part}", value, "not in view of the held-out phone")
+    metrics.add(picture_metrics("reconstruction", views))
+    names = [f"reconstruction/lpips_{part}" for part in PARTS]
+    if lpips is None:
+        metrics.skip(names, NO_LPIPS)
+    else:
+        rows = np.array([learned_distances(lpips, view) for view in views])
+        for name, column in zip(names, rows.T, strict=True):
+            known = column[np.isfinite(column)]
+            metrics.put(name, float(known.mean()) if len(known) else np.nan, UNMEASURED_LPIPS)
+    return metrics
 
 
-def picture_figures(name: str, views: Sequence[View]) -> Figures:
+def picture_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
     """Average PSNR and SSIM over pictures."""
-    figures, rows = Figures(), np.array([picture_quality(view) for view in views])
+    metrics, rows = Metrics(), np.array([picture_quality(view) for view in views])
     for column, (kind, part) in enumerate((kind, part) for kind in ("psnr", "ssim") for part in PARTS):
         values = rows[:, column][np.isfinite(rows[:, column])]
         value = float(values.mean()) if len(values) else np.nan
-        figures.put(f"{name}/{kind}_{part}", value, "not in view of the held-out phone")
-    return figures
+        metrics.put(f"{name}/{kind}_{part}", value, "not in view of the held-out phone")
+    return metrics
 
 
-def side_by_side(views: Sequence[View], count: int = 6) -> UInt8[np.ndarray, "height width 3"]:
-    """Put some views beside each other: truth, ours, true depth, our depth; below smaller ones it stays black."""
-    chosen = [views[index] for index in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
+def side_by_side(views: Sequence[HeldoutView], count: int = 6) -> UInt8[np.ndarray, "height width 3"]:
+    """Put some views beside each other: truth, ours, true depth, our depth; below smaller ones it stays
+    black.
+    """
+    chosen = [views[index] for index in plots.sample(len(views), count)]
     columns = [(view.true.color, view.color, _gray(view.true.depth), _gray(view.depth)) for view in chosen]
     height = max(len(column[0]) for column in columns)
-    padded = [[np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in column] for column in columns]
+    padded = [
+        [np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in column] for column in columns
+    ]
     return np.concatenate([np.concatenate(column) for column in padded], axis=1)
 
 
@@ -86,20 +104,37 @@ def _gray(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height
     return np.repeat(near.astype(np.uint8)[..., None], 3, axis=-1)
 
 
-def depth_is_right(view: View) -> Bool[np.ndarray, "height width"]:
+def depth_is_right(view: HeldoutView) -> Bool[np.ndarray, "height width"]:
     """Tell which pixels are within 0.1 m of truth; holes are wrong."""
     return (view.depth > 0) & (np.abs(view.depth - view.true.depth) <= TOLERANCE_M)
 
 
-def picture_quality(view: View) -> list[float]:
+def picture_quality(view: HeldoutView) -> list[float]:
     """Return PSNR (all, agent, scene) in dB, then SSIM; NaN for a part that is not in the picture."""
-    true = view.true.color.astype(np.float64) / 255
-    ours = exposed(view.color.astype(np.float64) / 255, true, view.depth > 0)
+    ours, true = compared_colors(view)
     squared = ((ours - true) ** 2).mean(-1)
     similar = structural_similarity(true, ours, channel_axis=-1, data_range=1.0, full=True)[1].mean(-1)
+    return [-10 * np.log10(max(error, 1e-10)) for error in _per_part(squared, view)] + _per_part(
+        similar, view
+    )
+
+
+def learned_distances(lpips: Lpips, view: HeldoutView) -> list[float]:
+    """Return LPIPS (all, agent, scene); NaN for a part that is not in the picture."""
+    return _per_part(lpips.distance(*compared_colors(view)), view)
+
+
+def compared_colors(
+    view: HeldoutView,
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
+    """Return our colours, their exposure compensated, and the true ones; 0..1."""
+    true = view.true.color.astype(np.float64) / 255
+    return exposed(view.color.astype(np.float64) / 255, true, view.depth > 0), true
+
+
+def _per_part(values: Float[np.ndarray, "height width"], view: HeldoutView) -> list[float]:
     parts = (np.ones_like(view.true.agent), view.true.agent, ~view.true.agent)
-    psnr = [-10 * np.log10(max(float(squared[part].mean()), 1e-10)) if part.any() else np.nan for part in parts]
-    return psnr + [float(similar[part].mean()) if part.any() else np.nan for part in parts]
+    return [float(values[part].mean()) if part.any() else np.nan for part in parts]
 
 
 def exposed(

@@ -1,9 +1,9 @@
-"""The stage's own judgement of the figures that matter most."""
+"""The stage's own judgement of the metrics that matter most."""
 
 from pathlib import Path
 
-from pipeline import qa
-from stages.evaluate.figures import Figures
+from pipeline.data import qa
+from pipeline.metrics.metrics import Metrics
 
 LIMITS = (
     ("registration/rotation_deg_median", "deg", 1.0, "lower"),
@@ -17,15 +17,19 @@ LIMITS = (
 )
 
 
-def report_quality(folder: Path, figures: Figures) -> None:
-    """Write the notes for the report; figures that do not apply are left out."""
+def report_quality(folder: Path, metrics: Metrics) -> None:
+    """Write the notes for the report; metrics that do not apply are left out."""
     checks = [
-        qa.Check(name, figures.values[name], unit, warn=limit, better=better)
+        qa.Check(name, metrics.values[name], unit, warn=limit, better=better)
         for name, unit, limit, better in LIMITS
-        if figures.values.get(name) is not None
+        if metrics.values.get(name) is not None
     ]
     good = "errors of a few centimetres and of less than a degree, and all simple rivals clearly worse"
     bad = "a simple rival as good as ours: then the capture is too easy, or the model has learned nothing"
-    named = (("chart", figures.charts), ("view", figures.pictures))
-    pictures = [qa.Picture(f"{kind}_{n}", image, caption) for kind, shown in named for n, (caption, image) in enumerate(shown.items())]
+    named = (("chart", metrics.charts), ("view", metrics.pictures))
+    pictures = [
+        qa.Picture(f"{kind}_{n}", image, caption)
+        for kind, shown in named
+        for n, (caption, image) in enumerate(shown.items())
+    ]
     qa.write(folder, good=good, bad=bad, checks=checks, pictures=pictures)

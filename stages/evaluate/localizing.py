@@ -1,7 +1,7 @@
 """Single frames of real sessions placed on the map without odometry: our localizer and two simple rivals.
 
-The rivals show that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only), and the
-pose of the most similar walk-through picture.
+The rivals show that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only),
+and the pose of the most similar walk-through picture.
 """
 
 from collections.abc import Sequence
@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from pipeline.files.clips import Clip
-from pipeline.models.features import describe
-from pipeline.models.localizer import Localizer
-from pipeline.space import cameras, rigid
-from stages.evaluate.alignment import PoseErrors
-from stages.evaluate.figures import Figures, median
+from pipeline.backends.daisy import describe
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid
+from pipeline.localization.localizer import Localizer
+from pipeline.metrics.metrics import Metrics, median
+from pipeline.metrics.pose_errors import PoseErrors
 
 RETRIEVAL_STRIDE_PX = 40
 REPROJECTION_PX = 4.0
@@ -39,29 +39,31 @@ class Gallery:
     world_from_camera: Float[np.ndarray, "picture 4 4"]
 
 
-def figures_of(name: str, errors: PoseErrors) -> Figures:
-    """Summarise errors of single frames under a name's beginning; frames that were not placed count as failures."""
-    figures = Figures()
-    figures.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
-    figures.put(f"{name}translation_m_median", median(errors.meters), FAILED)
+def metrics_of(name: str, errors: PoseErrors) -> Metrics:
+    """Summarise errors of single frames under a name's beginning; frames that were not placed count as
+    failures.
+    """
+    metrics = Metrics()
+    metrics.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
+    metrics.put(f"{name}translation_m_median", median(errors.meters), FAILED)
     within = (errors.degrees <= 5) & (errors.meters <= 0.2)
-    figures.put(f"{name}within_5deg_20cm_share", float(within.mean()) if len(within) else np.nan)
-    return figures
+    metrics.put(f"{name}within_5deg_20cm_share", float(within.mean()) if len(within) else np.nan)
+    return metrics
 
 
 def placed_by_localizer(
-    localizer: Localizer, clip: Clip, frames: Sequence[int], hide: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``world_from_camera [frame 4 4]``, NaN where not placed, and the probabilities told with it (0 where not placed);
-    ``hide`` marks the agent's pixels.
+    localizer: Localizer, clip: Clip, frames: Sequence[int], hide: Sequence[Bool[np.ndarray, "height width"]]
+) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
+    """Return ``world_from_camera [frame 4 4]``, NaN where not placed, and the probability of each (0 where
+    not placed); ``hide`` marks the agent's pixels.
     """
-    found, told = [], []
+    found, probability = [], []
     for frame, hidden in zip(frames, hide, strict=True):
         camera = (clip.depth_intrinsics[frame], clip.intrinsics[frame])
         answers = localizer.localize(clip.color(frame), clip.depth(frame), *camera, ~hidden)
-        found.append(answers[0].world_from_camera if answers else np.full((4, 4), np.nan))
-        told.append(answers[0].probability if answers else 0.0)
-    return np.array(found).reshape(-1, 4, 4), np.array(told)
+        found.append(answers[0].map_from_camera if answers else np.full((4, 4), np.nan))
+        probability.append(answers[0].probability if answers else 0.0)
+    return np.array(found).reshape(-1, 4, 4), np.array(probability)
 
 
 def sift_map(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> SiftMap:
@@ -79,7 +81,7 @@ def sift_map(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], fram
     return SiftMap(np.concatenate(descriptors), np.concatenate(points))
 
 
-def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> np.ndarray:
+def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> Float[np.ndarray, "frame 4 4"]:
     """Match each frame's SIFT points to the map and solve PnP with RANSAC; NaN where that fails."""
     matcher, found = cv2.BFMatcher(cv2.NORM_L2), []
     for frame in frames:
@@ -90,7 +92,12 @@ def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> np.ndar
         points = known.points_world[[match.trainIdx for match in matcher.match(described, known.descriptors)]]
         cv2.setRNGSeed(0)
         ok, turn, shift, inliers = cv2.solvePnPRansac(
-            points, pixel, clip.intrinsics[frame], None, iterationsCount=2000, reprojectionError=REPROJECTION_PX
+            points,
+            pixel,
+            clip.intrinsics[frame],
+            None,
+            iterationsCount=2000,
+            reprojectionError=REPROJECTION_PX,
         )
         if ok and inliers is not None and len(inliers) >= 8:
             found[-1] = rigid.inverse(rigid.make(rigid.rotation_from_vector(turn[:, 0]), shift[:, 0]))
@@ -99,10 +106,12 @@ def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> np.ndar
 
 def gallery(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> Gallery:
     """Describe walk-through frames as a whole."""
-    return Gallery(np.stack([_whole(clip.color(frame)) for frame in frames]), world_from_camera[np.array(frames)])
+    return Gallery(
+        np.stack([_whole(clip.color(frame)) for frame in frames]), world_from_camera[np.array(frames)]
+    )
 
 
-def placed_by_retrieval(known: Gallery, clip: Clip, frames: Sequence[int]) -> np.ndarray:
+def placed_by_retrieval(known: Gallery, clip: Clip, frames: Sequence[int]) -> Float[np.ndarray, "frame 4 4"]:
     """Give each frame the camera of the most similar walk-through frame."""
     nearest = [int(np.argmax(known.descriptors @ _whole(clip.color(frame)))) for frame in frames]
     return known.world_from_camera[nearest]

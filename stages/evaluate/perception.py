@@ -6,10 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.files.clips import Masks
-from stages.evaluate.figures import Figures
-from stages.evaluate.truth import TrueFlow, Truth
+from pipeline.data.clips import Masks
+from pipeline.metrics.metrics import Metrics
+from stages.evaluate.reliability import reliability_metrics
+from stages.evaluate.truth import RecordingTruth, TrueFlow
 
+RIGHT_IOU = 0.75
+"""A mask that overlaps this much with truth is right: the bar of the report."""
 SEEN_SHARE = 0.001
 """share of the picture that must be agent, in truth or in ours, for a frame to count"""
 
@@ -20,11 +23,15 @@ class Overlaps:
 
     iou: Float[np.ndarray, "frame"]
     resting: Bool[np.ndarray, "frame"]
+    confidence: Float[np.ndarray, "frame"]
+    """that the masks report"""
 
 
-def overlaps(masks: Masks, truth: Truth) -> Overlaps:
-    """Compare every frame in which the agent is visible, in truth or according to us; unknown pixels do not count."""
-    iou, resting = [], []
+def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
+    """Compare every frame in which the agent is visible, in truth or according to us; unknown pixels do not
+    count.
+    """
+    iou, resting, confidence = [], [], []
     for frame in range(len(masks)):
         label, true = masks[frame], truth.masks[frame]
         ours, counts = label == 255, label != 128
@@ -33,18 +40,21 @@ def overlaps(masks: Masks, truth: Truth) -> Overlaps:
         union = ((ours | true) & counts).sum()
         iou.append((ours & true & counts).sum() / union if union else 0.0)
         resting.append(not truth.moving[frame])
-    return Overlaps(np.array(iou, float), np.array(resting, bool))
+        confidence.append(masks.confidence[frame])
+    return Overlaps(np.array(iou, float), np.array(resting, bool), np.array(confidence, float))
 
 
-def mask_figures(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Figures:
+def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Metrics:
     """Summarise overlaps of all sessions; the turnaround stands apart, it is the easy one."""
-    figures = Figures()
+    metrics = Metrics()
     iou = np.concatenate([each.iou for each in sessions]) if sessions else np.zeros(0)
     resting = np.concatenate([each.resting for each in sessions]) if sessions else np.zeros(0, bool)
-    figures.put("masks/iou_mean", _mean(iou), "the animal is never visible")
-    figures.put("masks/iou_resting", _mean(iou[resting]), "the animal never rests in view")
-    figures.put("masks/iou_turnaround", _mean(turnaround.iou) if turnaround else np.nan, "no turnaround")
-    return figures
+    metrics.put("masks/iou_mean", _mean(iou), "the animal is never visible")
+    metrics.put("masks/iou_resting", _mean(iou[resting]), "the animal never rests in view")
+    confidence = np.concatenate([each.confidence for each in sessions]) if sessions else np.zeros(0)
+    metrics.add(reliability_metrics("masks", confidence, iou >= RIGHT_IOU))
+    metrics.put("masks/iou_turnaround", _mean(turnaround.iou) if turnaround else np.nan, "no turnaround")
+    return metrics
 
 
 @dataclass(frozen=True)
@@ -56,16 +66,23 @@ class FlowPair:
     agent: Bool[np.ndarray, "height width"]
 
 
-def flow_pairs(ours: Float[np.ndarray, "frame height width 2"], true: TrueFlow, masks: np.ndarray) -> list[FlowPair]:
+def flow_pairs(
+    ours: Float[np.ndarray, "frame height width 2"],
+    true: TrueFlow,
+    masks: Bool[np.ndarray, "frame row column"],
+) -> list[FlowPair]:
     """Pair up flow of gap 1; the agent's cells are those whose centre it covers."""
     stride = masks.shape[1] // ours.shape[1]
     agent = masks[:, stride // 2 :: stride, stride // 2 :: stride][:, : ours.shape[1], : ours.shape[2]]
-    return [FlowPair(ours[first].astype(np.float32), flow, agent[first]) for first, flow in zip(true.first, true.flow, strict=True)]
+    return [
+        FlowPair(ours[first].astype(np.float32), flow, agent[first])
+        for first, flow in zip(true.first, true.flow, strict=True)
+    ]
 
 
-def flow_figures(pairs: Sequence[FlowPair]) -> Figures:
+def flow_metrics(pairs: Sequence[FlowPair]) -> Metrics:
     """Return end-point errors, of ours and of predicting no motion at all."""
-    figures, why = Figures(), "no truth for neighbouring frames"
+    metrics, why = Metrics(), "no truth for neighbouring frames"
     ours, zero, agent = [], [], []
     for pair in pairs:
         known = np.isfinite(pair.true).all(-1)
@@ -74,8 +91,8 @@ def flow_figures(pairs: Sequence[FlowPair]) -> Figures:
         agent.append(error[known & pair.agent])
         zero.append(np.linalg.norm(pair.true, axis=-1)[known])
     for name, parts in (("epe_px_mean", ours), ("epe_px_agent_mean", agent), ("zero_flow_epe_px_mean", zero)):
-        figures.put(f"flow/{name}", _mean(np.concatenate(parts) if parts else np.zeros(0)), why)
-    return figures
+        metrics.put(f"flow/{name}", _mean(np.concatenate(parts) if parts else np.zeros(0)), why)
+    return metrics
 
 
 def _mean(values: np.ndarray) -> float:

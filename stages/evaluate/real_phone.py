@@ -1,6 +1,7 @@
-"""The held-out phone of a real capture: its cameras from clicks, else from registration; what it measured stands for truth.
+"""The held-out phone of a real capture: its cameras from clicks, else from registration; what it measured
+stands for truth.
 
-Its own depth sensor is compared with, as the paper does; there are no masks, so animal and room are not told apart.
+Its own depth sensor is compared with, as the paper does; without masks animal and room are not judged apart.
 """
 
 from collections.abc import Sequence
@@ -9,14 +10,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files.clips import Clip
-from pipeline.models import localizer as localizers
-from pipeline.space import rigid
-from pipeline.videos import Video
+from pipeline.core.videos import Video
+from pipeline.data import plots
+from pipeline.data.clips import Clip, usable_depth
+from pipeline.geometry import rigid
+from pipeline.localization import localizer as localizers
 from stages.evaluate import reading
 from stages.evaluate.clicked import Clicked, all_cameras
-from stages.evaluate.heldout import NAMES, RANGE_M, Shot
-from stages.evaluate.reading import Folders
+from stages.evaluate.heldout import NAMES, RANGE_M, HeldoutShot
+from stages.evaluate.reading import BuildFolders
 
 LOCALIZED = 40
 """frames that vote where registration places the phone"""
@@ -28,23 +30,36 @@ NO_MASKS = "the held-out phone of a real capture has no masks"
 PARTS_WITHOUT_MASKS = tuple(name for name in NAMES if name.endswith(("_agent", "_scene")))
 
 
-def cameras_of(folders: Folders, video: Video, clicked: Clicked | None) -> tuple[Float[np.ndarray, "frame 4 4"], str] | None:
-    """Return ``world_from_camera`` of all frames (NaN where unknown) and where it comes from; None where nothing places it."""
+def cameras_of(
+    folders: BuildFolders, video: Video, clicked: Clicked | None
+) -> tuple[Float[np.ndarray, "frame 4 4"], str] | None:
+    """Return ``world_from_camera`` of all frames (NaN where unknown) and where it comes from; None where
+    nothing places it.
+    """
     clip = Clip.open(folders.frames[video.id])
     if clicked is not None and clicked.trusted.any():
-        return all_cameras(clicked, clip.odometry_from_camera, len(clip)), f"clicked correspondences in {int(clicked.trusted.sum())} frames"
+        return all_cameras(
+            clicked, clip.odometry_from_camera, len(clip)
+        ), f"clicked correspondences in {int(clicked.trusted.sum())} frames"
     if clip.odometry_from_camera is None:
         return None
     model = localizers.load(folders.scene_localizer)
     votes = []
-    for frame in np.unique(np.linspace(0, len(clip) - 1, LOCALIZED).astype(int)).tolist():
-        answers = model.localize(clip.color(frame), clip.depth(frame), clip.depth_intrinsics[frame], clip.intrinsics[frame])
-        votes += [answers[0].world_from_camera @ rigid.inverse(clip.odometry_from_camera[frame])] if answers else []
+    for frame in plots.sample(len(clip), LOCALIZED).tolist():
+        answers = model.localize(
+            clip.color(frame), clip.depth(frame), clip.depth_intrinsics[frame], clip.intrinsics[frame]
+        )
+        votes += (
+            [answers[0].map_from_camera @ rigid.inverse(clip.odometry_from_camera[frame])] if answers else []
+        )
     agreed = agreement(np.array(votes).reshape(-1, 4, 4))
     return (
         None
         if agreed is None
-        else (agreed[0] @ clip.odometry_from_camera, f"registration: {agreed[1]} of {len(votes)} single frames agree")
+        else (
+            agreed[0] @ clip.odometry_from_camera,
+            f"registration: {agreed[1]} of {len(votes)} single frames agree",
+        )
     )
 
 
@@ -58,17 +73,32 @@ def agreement(votes: Float[np.ndarray, "vote 4 4"]) -> tuple[Float[np.ndarray, "
     group = near[near.sum(1).argmax()]
     if group.sum() < LEAST_VOTES:
         return None
-    return rigid.make(rigid.mean_rotation(votes[group][:, :3, :3]), np.median(votes[group][:, :3, 3], axis=0)), int(group.sum())
+    return rigid.make(
+        rigid.mean_rotation(votes[group][:, :3, :3]), np.median(votes[group][:, :3, 3], axis=0)
+    ), int(group.sum())
 
 
-def shots(folders: Folders, video: Video, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> Sequence[Shot]:
-    """Return what the phone saw and measured while its session was filmed, in up to ``count`` frames whose camera is known."""
+def shots(
+    folders: BuildFolders, video: Video, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int
+) -> Sequence[HeldoutShot]:
+    """Return what the phone saw and measured while its session was filmed, in up to ``count`` frames whose
+    camera is known.
+    """
     clip, found = Clip.open(folders.frames[video.id]), []
     together = reading.filmed_together(folders, video)
     known = together[np.isfinite(world_from_camera[together]).all((1, 2))]
-    for frame in reading.spread(known, count).tolist():
-        depth = np.where((clip.confidence(frame) > 0) & (clip.depth(frame) <= RANGE_M), clip.depth(frame), 0).astype(np.float32)
+    for frame in reading.subsampled(known, count).tolist():
+        depth = usable_depth(clip, frame, farthest_m=RANGE_M)
         color = cv2.resize(clip.color(frame), depth.shape[::-1], interpolation=cv2.INTER_AREA)
         time_s = float(clip.timestamp_s[frame] + video.offset_s)
-        found.append(Shot(world_from_camera[frame], clip.depth_intrinsics[frame], time_s, color, depth, np.zeros(depth.shape, bool)))
+        found.append(
+            HeldoutShot(
+                world_from_camera[frame],
+                clip.depth_intrinsics[frame],
+                time_s,
+                color,
+                depth,
+                np.zeros(depth.shape, bool),
+            )
+        )
     return found

@@ -8,17 +8,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.models import skinning
-from pipeline.space import rigid
-from pipeline.space.meshes import RayCaster
-from stages.evaluate.figures import Figures, median, percentile
-from stages.evaluate.triangles import Surface
+from pipeline.fields import skinning
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import RayCaster
+from pipeline.metrics.metrics import Metrics, median, percentile
 
 RANGE_M = 5.0
 
 
 @dataclass(frozen=True)
-class Skin:
+class SkinnedPoints:
     """The agent's surface points and how bones move them."""
 
     points_agent: Float[np.ndarray, "point 3"]
@@ -37,31 +36,34 @@ class Skin:
         moved = skinning.move(skinning.blend(weights, bones, rest), points).numpy().astype(np.float64)
         return rigid.apply(world_from_agent, moved)
 
-    def only(self, index: Int[np.ndarray, "chosen"]) -> "Skin":
+    def only(self, index: Int[np.ndarray, "chosen"]) -> "SkinnedPoints":
         """Return some of the points."""
-        return Skin(self.points_agent[index], self.weights[index], self.agent_from_bone_rest)
+        return SkinnedPoints(self.points_agent[index], self.weights[index], self.agent_from_bone_rest)
 
 
 def matched_once(
     points_agent: Float[np.ndarray, "point 3"], true_vertices_agent: Iterable[Float[np.ndarray, "vertex 3"]]
 ) -> Int[np.ndarray, "point"]:
-    """Match our points at rest to true vertices in that frame of several whose surface lies nearest to them; all in our agent frame."""
+    """Match our points at rest to true vertices in that frame of several whose surface lies nearest to them;
+    all in our agent frame.
+    """
     answers = [KDTree(vertices).query(points_agent) for vertices in true_vertices_agent]
     return min(answers, key=lambda answer: answer[0].mean())[1]
 
 
-def track_figures(distances: Sequence[Float[np.ndarray, "point"]]) -> Figures:
-    """Summarise distances of followed points over all frames of all sessions; unknown poses count as failures."""
-    figures = Figures()
+def track_metrics(distances: Sequence[Float[np.ndarray, "point"]]) -> Metrics:
+    """Summarise distances of followed points over all frames of all sessions; unknown poses count as
+    failures.
+    """
+    metrics = Metrics()
     every = np.concatenate(distances) if len(distances) else np.zeros(0)
-    figures.put("reconstruction/agent_track_m_median", median(every), "more than half of the frames have no pose")
-    figures.put("reconstruction/agent_track_m_p90", percentile(every, 90), "a tenth of the frames has no pose")
-    return figures
-
-
-def chamfer(ours: Surface, true: Surface, count: int, rng: np.random.Generator) -> float:
-    """Return the mean of both directions' mean distances between ``count`` points of one surface and the other, metres."""
-    return float((true.distance(ours.sample(count, rng)).mean() + ours.distance(true.sample(count, rng)).mean()) / 2)
+    metrics.put(
+        "reconstruction/agent_track_m_median", median(every), "more than half of the frames have no pose"
+    )
+    metrics.put(
+        "reconstruction/agent_track_m_p90", percentile(every, 90), "a tenth of the frames has no pose"
+    )
+    return metrics
 
 
 def seen_by(

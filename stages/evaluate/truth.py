@@ -6,15 +6,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.files import arrays
+from pipeline.data import npz
 
 CAMERA = ("world_from_camera", "intrinsics", "agent_visible", "moving")
 AGENT = ("world_from_agent", "agent_vertices_world")
 
 
 @dataclass(frozen=True)
-class Truth:
-    """Everything known of a recording, in the truth's own frames; the agent's parts are None without an agent."""
+class RecordingTruth:
+    """Everything known of a recording, in the truth's own frames; the agent's parts are None without an
+    agent.
+    """
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     intrinsics: Float[np.ndarray, "frame 3 3"]
@@ -26,9 +28,9 @@ class Truth:
     masks: Bool[np.ndarray, "frame height width"] | None
 
     @classmethod
-    def open(cls, folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> "Truth":
+    def open(cls, folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> "RecordingTruth":
         """Read ``<name>.npz`` and ``<name>.masks.npz`` for the extracted frames."""
-        table = arrays.load(folder / f"{name}.npz")
+        table = npz.load(folder / f"{name}.npz")
         camera = [table[key][source_index] for key in CAMERA]
         agent = [table[key][source_index] if key in table else None for key in AGENT]
         masks = folder / f"{name}.masks.npz"
@@ -49,7 +51,7 @@ class TrueDepth:
 
 def read_depth(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> TrueDepth:
     """Read ``<name>.depth.npz`` for the extracted frames."""
-    table = arrays.load(folder / f"{name}.depth.npz")
+    table = npz.load(folder / f"{name}.depth.npz")
     intrinsics = table["depth_intrinsics"]
     if intrinsics.ndim == 2:
         intrinsics = np.broadcast_to(intrinsics, (len(table["depth"]), 3, 3))
@@ -71,15 +73,18 @@ def read_flow(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -
     path = folder / f"{name}.flow.npz"
     if not path.exists():
         return None
-    table = arrays.load(path)
+    table = npz.load(path)
     position = {int(source): frame for frame, source in enumerate(source_index)}
     sources = zip(table["frame_index"].tolist(), table["second_index"].tolist(), strict=True)
-    pairs = [(position.get(first, -1), position.get(second, -9), row) for row, (first, second) in enumerate(sources)]
-    kept = [(first, row) for first, second, row in pairs if first >= 0 and second == first + 1]
-    first, row = np.array(kept, int).reshape(-1, 2).T
+    pairs = [
+        (position.get(first, -1), position.get(second, -9), row)
+        for row, (first, second) in enumerate(sources)
+    ]
+    neighbours = [(first, row) for first, second, row in pairs if first >= 0 and second == first + 1]
+    first, row = np.array(neighbours, int).reshape(-1, 2).T
     return TrueFlow(first, table["flow"][row].astype(np.float32))
 
 
 def _masks(path: Path) -> Bool[np.ndarray, "frame height width"]:
-    table = arrays.load(path)
+    table = npz.load(path)
     return np.unpackbits(table["packed"], axis=-1)[..., : table["shape"][2]].astype(bool)

@@ -1,7 +1,9 @@
-"""Motion capture files, two kinds: flat (six channels a joint, exact) and a fitted tree (rotations about pivots).
+"""Motion capture files, two kinds: flat (six channels a joint, exact) and a fitted tree (rotations about
+pivots).
 
-The tree: for each pair of bones the point that both carry along most alike over all motions (least squares) is their
-pivot; a minimum spanning tree over what is left apart joins the bones; what the tree loses is reported.
+The tree: for each pair of bones the point that both carry along most alike over all motions (least squares)
+is their pivot; a minimum spanning tree over what is left apart joins the bones; what the tree loses is
+reported.
 """
 
 from dataclasses import dataclass
@@ -12,10 +14,10 @@ from jaxtyping import Float
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
-from pipeline.files.glb import Action
-from pipeline.space import rigid
+from pipeline.data.glb import Action
+from pipeline.geometry import rigid
 from stages.export.reading import Agent
-from stages.export.writing import Told
+from stages.export.writing import ExportRecord
 
 _ORDER = "ZXY"
 _ROOT_CHANNELS = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
@@ -35,7 +37,7 @@ class Tree:
     """at rest, agent frame"""
 
 
-def write(folder: Path, agent: Agent) -> Told:
+def write(folder: Path, agent: Agent) -> ExportRecord:
     """Write `<motion>.flat.bvh` and `<motion>.tree.bvh` for every motion."""
     rest, names = agent.skin.agent_from_bone_rest, list(agent.skin.bone_names)
     recorded = np.concatenate([action.agent_from_bone for action in agent.actions])
@@ -47,17 +49,27 @@ def write(folder: Path, agent: Agent) -> Told:
         (folder / f"{action.name}.tree.bvh").write_text(treelike(action, tree, rest, names))
         truth = action.world_from_agent[:, None] @ action.agent_from_bone
         exact.append(read_places(folder / f"{action.name}.flat.bvh", names) - truth[..., :3, 3])
-        lost.append(read_places(folder / f"{action.name}.tree.bvh", [f"{name}_centre" for name in names]) - truth[..., :3, 3])
+        lost.append(
+            read_places(folder / f"{action.name}.tree.bvh", [f"{name}_centre" for name in names])
+            - truth[..., :3, 3]
+        )
     distances = {"flat": np.concatenate(exact), "tree": np.concatenate(lost)}
     loss: dict[str, float] = {}
     for kind, apart in distances.items():
         apart_mm = 1000 * np.linalg.norm(apart, axis=-1)
-        loss |= {f"{kind}_mean": round(float(apart_mm.mean()), 4), f"{kind}_max": round(float(apart_mm.max()), 4)}
-    remark = "metres, +y up, rotations in the order Z X Y; give 1.0 as the scale; distances of the bones' centres"
-    return Told("own writer", loss, "own reader, with forward kinematics", remark)
+        loss |= {
+            f"{kind}_mean": round(float(apart_mm.mean()), 4),
+            f"{kind}_max": round(float(apart_mm.max()), 4),
+        }
+    remark = (
+        "metres, +y up, rotations in the order Z X Y; give 1.0 as the scale; distances of the bones' centres"
+    )
+    return ExportRecord("own writer", loss, "own reader, with forward kinematics", remark)
 
 
-def fitted_tree(posed_from_rest: Float[np.ndarray, "frame bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]) -> Tree:
+def fitted_tree(
+    posed_from_rest: Float[np.ndarray, "frame bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
+) -> Tree:
     """Find pivots and the tree that is torn least."""
     count = posed_from_rest.shape[1]
     pivots, torn = np.zeros((count, count, 3)), np.zeros((count, count))
@@ -71,13 +83,18 @@ def fitted_tree(posed_from_rest: Float[np.ndarray, "frame bone 4 4"], rest: Floa
     order, before = breadth_first_order(links, root, directed=False)
     parent = [int(before[bone]) if bone != root else -1 for bone in range(count)]
     pivot = np.stack(
-        [rest[root, :3, 3] if bone == root else pivots[min(bone, parent[bone]), max(bone, parent[bone])] for bone in range(count)]
+        [
+            rest[root, :3, 3] if bone == root else pivots[min(bone, parent[bone]), max(bone, parent[bone])]
+            for bone in range(count)
+        ]
     )
     return Tree(parent, [int(bone) for bone in order], pivot)
 
 
 def _pivot(first: np.ndarray, second: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point at rest that two moving bones keep nearest together, and the squared distance left, metres²."""
+    """Return the point at rest that two moving bones keep nearest together, and the squared distance left,
+    metres².
+    """
     turn, shift = first[:, :3, :3] - second[:, :3, :3], first[:, :3, 3] - second[:, :3, 3]
     middle = rest[:, :3, 3].mean(0)
     gram = np.einsum("fki,fkj->ij", turn, turn) / len(turn) + _PULL_TO_MIDDLE * np.eye(3)
@@ -91,14 +108,26 @@ def flat(action: Action, names: list[str]) -> str:
     """Every bone beneath the root with six channels: nothing is lost."""
     lines = ["HIERARCHY", "ROOT agent", "{", "OFFSET 0 0 0", _ROOT_CHANNELS]
     for name in names:
-        lines += [f"JOINT {name}", "{", "OFFSET 0 0 0", _ROOT_CHANNELS, "End Site", "{", "OFFSET 0 0 0.02", "}", "}"]
+        lines += [
+            f"JOINT {name}",
+            "{",
+            "OFFSET 0 0 0",
+            _ROOT_CHANNELS,
+            "End Site",
+            "{",
+            "OFFSET 0 0 0.02",
+            "}",
+            "}",
+        ]
     poses = np.concatenate([action.world_from_agent[:, None], action.agent_from_bone], 1)
     channels = np.concatenate([poses[..., :3, 3], _turns(poses[..., :3, :3])], -1)
     return _text([*lines, "}"], action, channels.reshape(len(poses), -1))
 
 
 def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], names: list[str]) -> str:
-    """A joint per bone, at its pivot; all zero is the pose at rest. Each bone's centre is an end named `<bone>_centre`."""
+    """A joint per bone, at its pivot; all zero is the pose at rest. Each bone's centre is an end named
+    `<bone>_centre`.
+    """
     lines = ["HIERARCHY"]
     root = tree.order[0]
     written: list[int] = []
@@ -109,7 +138,9 @@ def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], na
         lines.extend([f"{kind} {names[bone]}", "{", _offset(offset), channels])
         for child in (other for other in tree.order if tree.parent[other] == bone):
             put(child, tree.pivot_agent[child] - tree.pivot_agent[bone])
-        lines.extend([f"JOINT {names[bone]}_centre", "{", _offset(rest[bone, :3, 3] - tree.pivot_agent[bone])])
+        lines.extend(
+            [f"JOINT {names[bone]}_centre", "{", _offset(rest[bone, :3, 3] - tree.pivot_agent[bone])]
+        )
         lines.extend(["CHANNELS 0", "End Site", "{", "OFFSET 0 0 0.02", "}", "}", "}"])
 
     put(root, np.zeros(3))
@@ -118,7 +149,11 @@ def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], na
     columns = [action.world_from_agent[:, :3, :3] @ action.agent_from_bone[:, root, :3, 3, None]]
     columns = [columns[0][..., 0] + action.world_from_agent[:, :3, 3]]
     for bone in written:
-        local = world[:, bone] if bone == root else np.swapaxes(world[:, tree.parent[bone]], 1, 2) @ world[:, bone]
+        local = (
+            world[:, bone]
+            if bone == root
+            else np.swapaxes(world[:, tree.parent[bone]], 1, 2) @ world[:, bone]
+        )
         columns.append(_turns(local))
     return _text(lines, action, np.concatenate(columns, 1))
 
@@ -144,7 +179,11 @@ def read_places(path: Path, names: list[str]) -> Float[np.ndarray, "frame joint 
                 count = int(rest[0])
                 values, column = rows[:, column : column + count], column + count
                 place = values[:, :3] if count == 6 else np.zeros((len(rows), 3))
-                turn = Rotation.from_euler(_ORDER, values[:, -3:], degrees=True).as_matrix() if count else np.eye(3)
+                turn = (
+                    Rotation.from_euler(_ORDER, values[:, -3:], degrees=True).as_matrix()
+                    if count
+                    else np.eye(3)
+                )
                 stack[-1] = stack[-1] @ rigid.make(np.broadcast_to(turn, (len(rows), 3, 3)), place)
                 places[name] = stack[-1][:, :3, 3]
             case "}":

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import trimesh
 
-from pipeline.files import glb
+from pipeline.data import glb
 from stages.export.reading import Agent
-from stages.export.writing import Told, version
+from stages.export.writing import ExportRecord, version
 
 
-def write(folder: Path, agent: Agent, scene: bytes) -> Told:
+def write(folder: Path, agent: Agent, scene: bytes) -> ExportRecord:
     """Write `agent.glb` and `scene.glb`."""
     data = glb.skinned(agent.mesh, agent.skin, agent.actions)
     (folder / "agent.glb").write_bytes(data)
@@ -19,5 +19,9 @@ def write(folder: Path, agent: Agent, scene: bytes) -> Told:
         opened = trimesh.load(io.BytesIO(content), file_type="glb")
         assert len(opened.geometry) == 1, "one surface a file"
     loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()}
-    remark = f"metres, +y up; joints are siblings under one root; {agent.skin.joints.shape[1]} influences a vertex; one action per motion"
-    return Told(version("pygltflib"), loss, version("trimesh"), remark)
+    influences = agent.skin.joints.shape[1]
+    remark = (
+        f"metres, +y up; joints are siblings under one root; {influences} influences a vertex; "
+        "one action per motion"
+    )
+    return ExportRecord(version("pygltflib"), loss, version("trimesh"), remark)

@@ -1,7 +1,7 @@
 """MuJoCo: one mocap body a bone that carries the animal's skin, and the room as boxes.
 
-A mocap body is moved by the simulation's user: `motions.npz` holds, per motion, what to put into `data.mocap_pos`
-and `data.mocap_quat` at each key.
+A mocap body is moved by the simulation's user: `motions.npz` holds, per motion, what to put into
+`data.mocap_pos` and `data.mocap_quat` at each key.
 """
 
 from pathlib import Path
@@ -10,18 +10,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.files import arrays
-from pipeline.space import rigid
+from pipeline.data import npz
+from pipeline.geometry import rigid
 from stages.export.reading import Agent, Occupancy
-from stages.export.writing import Told, extra, version
+from stages.export.writing import ExportRecord, extra, version
 
 _ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-def write(folder: Path, agent: Agent, occupancy: Occupancy) -> Told:
+def write(folder: Path, agent: Agent, occupancy: Occupancy) -> ExportRecord:
     """Write `agent.xml` (z up, as MuJoCo has it) and `motions.npz`; compile the model and pose it."""
     mujoco = extra("mujoco", "mujoco")
-    poses = {action.name: _ZUP_FROM_WORLD @ action.world_from_agent[:, None] @ action.agent_from_bone for action in agent.actions}
+    poses = {
+        action.name: _ZUP_FROM_WORLD @ action.world_from_agent[:, None] @ action.agent_from_bone
+        for action in agent.actions
+    }
     first = next(iter(poses.values()))[0]
     (folder / "agent.xml").write_text(model(agent, first, boxes(occupancy.solid), occupancy))
     motions: dict[str, np.ndarray] = {}
@@ -29,16 +32,21 @@ def write(folder: Path, agent: Agent, occupancy: Occupancy) -> Told:
         motions[f"{action.name}/time_s"] = action.time_s
         motions[f"{action.name}/mocap_pos"] = poses[action.name][..., :3, 3]
         motions[f"{action.name}/mocap_quat"] = rigid.quaternion_from_rotation(poses[action.name][..., :3, :3])
-    arrays.save(folder / "motions.npz", **motions)
+    npz.save(folder / "motions.npz", **motions)
     loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()}
     loss["bodies"] = round(1000 * _posed(mujoco, folder / "agent.xml", motions, agent.actions[0].name), 4)
     loss["room_voxel"] = 1000 * occupancy.voxel_m
-    remark = "metres, +z up; drive data.mocap_pos and data.mocap_quat with motions.npz; the room's boxes are as coarse as its voxels"
-    return Told(version("mujoco"), loss, version("mujoco"), remark)
+    remark = (
+        "metres, +z up; drive data.mocap_pos and data.mocap_quat with motions.npz; "
+        "the room's boxes are as coarse as its voxels"
+    )
+    return ExportRecord(version("mujoco"), loss, version("mujoco"), remark)
 
 
 def boxes(solid: Bool[np.ndarray, "x y z"]) -> Int[np.ndarray, "box 2 3"]:
-    """Cover solid voxels by few boxes that do not overlap: lowest and highest voxel (exclusive) of each, greedily."""
+    """Cover solid voxels by few boxes that do not overlap: lowest and highest voxel (exclusive) of each,
+    greedily.
+    """
     left, found = solid.copy(), []
     while left.any():
         low = np.array(np.unravel_index(left.argmax(), left.shape))
@@ -55,7 +63,12 @@ def boxes(solid: Bool[np.ndarray, "x y z"]) -> Int[np.ndarray, "box 2 3"]:
     return np.array(found, int).reshape(-1, 2, 3)
 
 
-def model(agent: Agent, zup_from_bone: Float[np.ndarray, "bone 4 4"], room: Int[np.ndarray, "box 2 3"], occupancy: Occupancy) -> str:
+def model(
+    agent: Agent,
+    zup_from_bone: Float[np.ndarray, "bone 4 4"],
+    room: Int[np.ndarray, "box 2 3"],
+    occupancy: Occupancy,
+) -> str:
     """Return the MJCF text; the skin's bones are bound at rest."""
     bodies, bones = [], []
     turns = rigid.quaternion_from_rotation(zup_from_bone[:, :3, :3])
@@ -64,13 +77,17 @@ def model(agent: Agent, zup_from_bone: Float[np.ndarray, "bone 4 4"], room: Int[
     for bone, name in enumerate(agent.skin.bone_names):
         place, turn = _row(zup_from_bone[bone, :3, 3]), _row(turns[bone])
         bodies.append(
-            f'<body name="{name}" mocap="true" pos="{place}" quat="{turn}"><geom type="sphere" size="0.02" contype="0" conaffinity="0" group="4"/></body>'
+            f'<body name="{name}" mocap="true" pos="{place}" quat="{turn}">'
+            '<geom type="sphere" size="0.02" contype="0" conaffinity="0" group="4"/></body>'
         )
         weight = np.where(agent.skin.joints == bone, agent.skin.weights, 0).sum(1)
         moved = np.flatnonzero(weight > 0)
         if len(moved):
             bound = f'bindpos="{_row(rest[bone, :3, 3])}" bindquat="{_row(rest_turns[bone])}"'
-            bones.append(f'<bone body="{name}" {bound} vertid="{" ".join(map(str, moved))}" vertweight="{_row(weight[moved])}"/>')
+            vertices = " ".join(map(str, moved))
+            bones.append(
+                f'<bone body="{name}" {bound} vertid="{vertices}" vertweight="{_row(weight[moved])}"/>'
+            )
     vertices, faces = _row(agent.mesh.vertices.ravel()), " ".join(map(str, agent.mesh.faces.ravel()))
     color = _row((np.full(3, 150) if agent.mesh.color is None else agent.mesh.color.mean(0)) / 255)
     return "\n".join(
@@ -101,7 +118,9 @@ def _room(room: Int[np.ndarray, "box 2 3"], occupancy: Occupancy) -> list[str]:
 
 
 def _posed(mujoco: Any, path: Path, motions: dict[str, np.ndarray], name: str) -> float:
-    """Compile the file, put a key of a motion into it, and return how far bodies are from where they belong, metres."""
+    """Compile the file, put a key of a motion into it, and return how far bodies are from where they belong,
+    metres.
+    """
     compiled = mujoco.MjModel.from_xml_path(str(path))
     assert compiled.nskin == 1, "the animal's skin"
     data = mujoco.MjData(compiled)

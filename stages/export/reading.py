@@ -1,20 +1,21 @@
-"""Open what is exported: the skinned animal with its motions, sessions frame by frame, pictures with their cameras."""
+"""Open what is exported: the skinned animal with its motions, sessions frame by frame, pictures with their
+cameras.
+"""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.files import arrays, gaussian_rows, images
-from pipeline.files import glb as gltf
-from pipeline.files.glb import Action, Skin
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
-
-Influences = Literal["4", "8"]
+from pipeline.data import gaussian_ply, images, npz
+from pipeline.data import glb as gltf
+from pipeline.data.glb import Action, Skin
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
+from stages.export.config import Influences
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Session:
 
 
 @dataclass(frozen=True)
-class Shot:
+class CameraFrame:
     """One picture and its camera (OpenCV axes); files are read when they are written."""
 
     video: str
@@ -86,15 +87,20 @@ class Occupancy:
 
 
 def agent(simulator: Path, take: Path | None, rate_hz: float, influences: Influences = "4") -> Agent:
-    """Read the animal from `agent.glb`; a generated take becomes one motion more. Keys are resampled to `rate_hz`."""
+    """Read the animal from `agent.glb`; a generated take becomes one motion more. Keys are resampled to
+    `rate_hz`.
+    """
     mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
     if take:
         names = ("timestamp_s", "world_from_agent", "agent_from_bone")
-        made = arrays.load(take, names)
+        made = npz.load(take, names)
         actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in names))]
     loss = "skinning_residual_mm"
     if influences == "8":
-        skin, loss = replace(skin, **arrays.load(simulator / "skin_8.npz", ("joints", "weights"))), "skinning_residual_8_mm"
+        skin, loss = (
+            replace(skin, **npz.load(simulator / "skin_8.npz", ("joints", "weights"))),
+            "skinning_residual_8_mm",
+        )
     about = json.loads((simulator / "simulator.json").read_bytes())
     return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], about["agent"][loss])
 
@@ -108,42 +114,62 @@ def sessions(reconstruction: Path) -> list[Session]:
     """Read every session's motion, in id order."""
     found = []
     for file in sorted(reconstruction.glob("*/motion.npz")):
-        table = arrays.load(file)
-        keys = ("timestamp_s", "world_from_agent", "world_from_camera", "agent_from_bone", "confidence", "agent_visible")
+        table = npz.load(file)
+        keys = (
+            "timestamp_s",
+            "world_from_agent",
+            "world_from_camera",
+            "agent_from_bone",
+            "confidence",
+            "agent_visible",
+        )
         found.append(Session(file.parent.name, *(table[key] for key in keys)))
     return found
 
 
-def shots(reconstruction: Path, frames: dict[str, Path], masks: dict[str, Path], per_video: int) -> list[Shot]:
+def camera_frames(
+    reconstruction: Path, frames: Mapping[str, Path], masks: Mapping[str, Path], per_video: int
+) -> list[CameraFrame]:
     """Choose frames with a known camera from the walk-through and all sessions, evenly spread over each."""
     found = []
     for video, folder in frames.items():
         motion = reconstruction / video / "motion.npz"
         motion = motion if motion.exists() else reconstruction / "templates" / f"{video}.npz"
-        if not motion.exists() or (video in masks and motion.parent.name == "templates"):  # the turnaround has a world of its own
+        if not motion.exists() or (
+            video in masks and motion.parent.name == "templates"
+        ):  # the turnaround has a world of its own
             continue
-        cameras = arrays.load(motion, ("world_from_camera",))["world_from_camera"]
-        intrinsics = arrays.load(folder / "frames.npz", ("intrinsics",))["intrinsics"]
+        cameras = npz.load(motion, ("world_from_camera",))["world_from_camera"]
+        intrinsics = npz.load(folder / "frames.npz", ("intrinsics",))["intrinsics"]
         known = np.flatnonzero(np.isfinite(cameras).all((1, 2)))
-        chosen = known[np.unique(np.linspace(0, len(known) - 1, min(per_video, len(known))).round().astype(int))] if len(known) else known
-        found += [Shot(video, int(i), cameras[i], intrinsics[i], folder, masks.get(video)) for i in chosen]
+        chosen = (
+            known[np.unique(np.linspace(0, len(known) - 1, min(per_video, len(known))).round().astype(int))]
+            if len(known)
+            else known
+        )
+        found += [
+            CameraFrame(video, int(i), cameras[i], intrinsics[i], folder, masks.get(video)) for i in chosen
+        ]
     return found
 
 
 def occupancy(behavior_data: Path) -> Occupancy:
     """Read the room's solid voxels."""
-    volume = arrays.load(behavior_data / "volume.npz", ("occupancy", "origin", "voxel_m"))
+    volume = npz.load(behavior_data / "volume.npz", ("occupancy", "origin", "voxel_m"))
     return Occupancy(volume["occupancy"] == 1, volume["origin"], float(volume["voxel_m"]))
 
 
 def gaussians(splats: Path) -> dict[str, Float[np.ndarray, "point 62"]]:
     """Read both clouds as standard rows."""
-    return {name: gaussian_rows.read(splats / f"{name}.ply") for name in ("scene", "agent")}
+    return {name: gaussian_ply.read(splats / f"{name}.ply") for name in ("scene", "agent")}
 
 
 def _resampled(action: Action, rate_hz: float) -> Action:
     count = int(np.floor((action.time_s[-1] - action.time_s[0]) * rate_hz + 1e-4)) + 1
     query_s = np.minimum(action.time_s[0] + np.arange(count) / rate_hz, action.time_s[-1])
-    bones = [rigid.interpolate(action.time_s, action.agent_from_bone[:, b], query_s) for b in range(action.agent_from_bone.shape[1])]
+    bones = [
+        rigid.interpolate(action.time_s, action.agent_from_bone[:, b], query_s)
+        for b in range(action.agent_from_bone.shape[1])
+    ]
     root = rigid.interpolate(action.time_s, action.world_from_agent, query_s)
     return Action(action.name, query_s - query_s[0], root, np.stack(bones, 1))

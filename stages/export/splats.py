@@ -5,19 +5,26 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import gaussian_rows
-from pipeline.models import gaussians
-from stages.export.writing import Told
+from pipeline.data import gaussian_ply
+from pipeline.fields import gaussians
+from stages.export.writing import ExportRecord
 
 _OPACITY, _ROTATION = 54, slice(58, 62)
 
 
-def write(folder: Path, clouds: dict[str, Float[np.ndarray, "point 62"]]) -> Told:
-    """Write `scene.ply` (world frame) and `agent.ply` (agent frame, at rest) without broken and invisible rows."""
+def write(folder: Path, clouds: dict[str, Float[np.ndarray, "point 62"]]) -> ExportRecord:
+    """Write `scene.ply` (world frame) and `agent.ply` (agent frame, at rest) without broken and invisible
+    rows.
+    """
     for name, rows in clouds.items():
         opacity = 1 / (1 + np.exp(-rows[:, _OPACITY].astype(np.float64)))
         kept = rows[np.isfinite(rows).all(1) & (opacity >= 1 / 255)].copy()
         kept[:, _ROTATION] /= np.linalg.norm(kept[:, _ROTATION], axis=1, keepdims=True)
-        gaussian_rows.write(folder / f"{name}.ply", kept)
+        gaussian_ply.write(folder / f"{name}.ply", kept)
         assert len(gaussians.load_ply(folder / f"{name}.ply")) == len(kept)
-    return Told("own writer", {}, "the project's own reader; the layout is that of the 3DGS reference viewer", "metres, +y up")
+    return ExportRecord(
+        "own writer",
+        {},
+        "the project's own reader; the layout is that of the 3DGS reference viewer",
+        "metres, +y up",
+    )

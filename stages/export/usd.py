@@ -1,4 +1,6 @@
-"""Universal Scene Description: the animal as SkelRoot with one SkelAnimation per motion, and the room as a mesh."""
+"""Universal Scene Description: the animal as SkelRoot with one SkelAnimation per motion, and the room as a
+mesh.
+"""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -6,18 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.files.glb import Action
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
+from pipeline.data.glb import Action
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
 from stages.export.reading import Agent
-from stages.export.writing import Told, extra, version
+from stages.export.writing import ExportRecord, extra, version
 
 _ROOT = "root"
 
 
-def write(folder: Path, agent: Agent, room: Mesh) -> Told:
+def write(folder: Path, agent: Agent, room: Mesh) -> ExportRecord:
     """Write `agent_<motion>.usdc`, one per motion, and `scene.usdc`."""
-    pxr = SimpleNamespace(**{name: extra(f"pxr.{name}", "usd-core") for name in ("Gf", "Usd", "UsdGeom", "UsdSkel", "Vt")})
+    pxr = SimpleNamespace(
+        **{name: extra(f"pxr.{name}", "usd-core") for name in ("Gf", "Usd", "UsdGeom", "UsdSkel", "Vt")}
+    )
     worst_mm = 0.0
     for action in agent.actions:
         path = folder / f"agent_{action.name}.usdc"
@@ -26,8 +30,12 @@ def write(folder: Path, agent: Agent, room: Mesh) -> Told:
     stage = _stage(pxr, folder / "scene.usdc")
     stage.SetDefaultPrim(_mesh(pxr, stage, "/scene", room).GetPrim())
     stage.Save()
-    loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()} | {"joints": round(worst_mm, 4)}
-    return Told(version("usd-core"), loss, f"UsdSkel of {version('usd-core')}", "metres, +y up, time codes in frames")
+    loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()} | {
+        "joints": round(worst_mm, 4)
+    }
+    return ExportRecord(
+        version("usd-core"), loss, f"UsdSkel of {version('usd-core')}", "metres, +y up, time codes in frames"
+    )
 
 
 def _stage(pxr: Any, path: Path) -> Any:
@@ -47,7 +55,9 @@ def _mesh(pxr: Any, stage: Any, path: str, mesh: Mesh) -> Any:
     surface.CreateSubdivisionSchemeAttr("none")
     surface.CreateDoubleSidedAttr(True)
     if mesh.color is not None:
-        linear = np.where(mesh.color <= 10, mesh.color / 255 / 12.92, ((mesh.color / 255 + 0.055) / 1.055) ** 2.4)
+        linear = np.where(
+            mesh.color <= 10, mesh.color / 255 / 12.92, ((mesh.color / 255 + 0.055) / 1.055) ** 2.4
+        )
         shown = surface.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex)
         shown.Set(pxr.Vt.Vec3fArray.FromNumpy(linear.astype(np.float32)))
     return surface
@@ -82,7 +92,9 @@ def _write_agent(pxr: Any, path: Path, agent: Agent, action: Action) -> None:
     binding.CreateGeomBindTransformAttr(pxr.Gf.Matrix4d(1))
     animation = pxr.UsdSkel.Animation.Define(stage, "/agent/motion")
     _keys(pxr, animation, joints, action)
-    pxr.UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    pxr.UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
+        [animation.GetPath()]
+    )
     stage.Save()
 
 
@@ -93,12 +105,16 @@ def _keys(pxr: Any, animation: Any, joints: list[str], action: Action) -> None:
     animation.CreateScalesAttr([pxr.Gf.Vec3h(1, 1, 1)] * len(joints))
     places, rotations = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr()
     for frame in range(len(poses)):
-        places.Set(pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(poses[frame, :, :3, 3], np.float32)), frame)
+        places.Set(
+            pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(poses[frame, :, :3, 3], np.float32)), frame
+        )
         rotations.Set(pxr.Vt.QuatfArray([pxr.Gf.Quatf(*map(float, turn)) for turn in turns[frame]]), frame)
 
 
 def _opened(pxr: Any, path: Path, action: Action) -> float:
-    """Open the file as a player would and return how far joints are from where they belong, metres, in one pose."""
+    """Open the file as a player would and return how far joints are from where they belong, metres, in one
+    pose.
+    """
     stage = pxr.Usd.Stage.Open(str(path))
     cache = pxr.UsdSkel.Cache()
     cache.Populate(pxr.UsdSkel.Root(stage.GetPrimAtPath("/agent")), pxr.Usd.PrimDefaultPredicate)

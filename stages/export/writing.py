@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 
-from pipeline.errors import InputError
+from pipeline.core.errors import InputError
 
 
 @dataclass(frozen=True)
-class Told:
-    """What an export tells."""
+class ExportRecord:
+    """What stands in `export.json`."""
 
     library: str
     """what wrote it, with its version"""
@@ -29,7 +29,12 @@ def extra(module: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError("EXP-010", f"this format needs {package}: {error}", "the Python environment", "install it: make extras") from error
+        raise InputError(
+            "EXP-010",
+            f"this format needs {package}: {error}",
+            "the Python environment",
+            "install it: make extras",
+        ) from error
 
 
 def version(package: str) -> str:
@@ -37,10 +42,14 @@ def version(package: str) -> str:
     return f"{package} {importlib.metadata.version(package)}"
 
 
-def tell(folder: Path, name: str, told: Told) -> None:
+def write_record(folder: Path, name: str, record: ExportRecord) -> None:
     """Write `export.json` beside the files."""
-    files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in sorted(folder.rglob("*")) if path.is_file()}
+    files = {
+        path.relative_to(folder).as_posix(): path.stat().st_size
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
     pictures = [file for file in files if file.endswith((".jpg", ".png"))]
     listed = {file: size for file, size in files.items() if file not in pictures}
-    table = {"format": name, **asdict(told), "files": listed, "pictures": len(pictures)}
+    table = {"format": name, **asdict(record), "files": listed, "pictures": len(pictures)}
     (folder / "export.json").write_text(json.dumps(table, indent=1) + "\n")

@@ -1,1 +1,3 @@
-"""The simulator page and the animated files: surfaces are thinned, weights re-fitted, motion resampled, all packed."""
+"""The simulator page and the animated files: surfaces are thinned, weights re-fitted, motion resampled, all
+packed.
+"""

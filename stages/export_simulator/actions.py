@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 
 
 @dataclass(frozen=True)
-class Motion:
+class SessionClip:
     """One session: the agent and its observer in the world, every frame valid."""
 
     name: str
@@ -29,10 +29,10 @@ def longest_run(valid: Bool[np.ndarray, " frame"]) -> slice:
     return slice(int(starts[longest]), int(ends[longest]))
 
 
-def cut(motion: Motion, frames: slice) -> Motion:
+def cut(motion: SessionClip, frames: slice) -> SessionClip:
     """Keep some frames and let time start at zero."""
     timestamp_s = motion.timestamp_s[frames]
-    return Motion(
+    return SessionClip(
         motion.name,
         timestamp_s - timestamp_s[0],
         motion.world_from_agent[frames],
@@ -41,8 +41,10 @@ def cut(motion: Motion, frames: slice) -> Motion:
     )
 
 
-def resample(motion: Motion, rate_hz: float) -> Motion:
-    """Resample to even keys from the first to the last frame: slerp for rotations, linear for translations."""
+def resample(motion: SessionClip, rate_hz: float) -> SessionClip:
+    """Resample to even keys from the first to the last frame: slerp for rotations, linear for
+    translations.
+    """
     count = int(np.floor((motion.timestamp_s[-1] - motion.timestamp_s[0]) * rate_hz + 1e-6)) + 1
     query_s = motion.timestamp_s[0] + np.arange(count) / rate_hz
 
@@ -50,4 +52,10 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
         return rigid.interpolate(motion.timestamp_s, a_from_b, query_s)
 
     bones = [at(motion.agent_from_bone[:, bone]) for bone in range(motion.agent_from_bone.shape[1])]
-    return Motion(motion.name, query_s - query_s[0], at(motion.world_from_agent), np.stack(bones, 1), at(motion.world_from_camera))
+    return SessionClip(
+        motion.name,
+        query_s - query_s[0],
+        at(motion.world_from_agent),
+        np.stack(bones, 1),
+        at(motion.world_from_camera),
+    )

@@ -1,4 +1,4 @@
-"""Say in one table what the page and every other player of the simulator must know: `simulator.json`."""
+"""Assemble in one table what the page and every other player of the simulator must know: `simulator.json`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,18 +7,28 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files.glb import Skin
-from pipeline.models.simulator import Chaining
-from pipeline.space import rigid
-from stages.export_simulator.actions import Motion
+from pipeline.behavior.config import ReplanningConfig
+from pipeline.behavior.model import exported
+from pipeline.data.glb import Skin
+from pipeline.geometry import rigid
+from stages.export_simulator.actions import SessionClip
 
-VERSION = 2
+VERSION = 3
+"""Of the contract's keys; players refuse another."""
+GOAL_CHOICES = (1, 4, 16)
+"""Goals that a visitor may let the animal consider at once."""
+GOALS = 4
+"""Goals that are considered until a visitor chooses: a fan that can be told apart."""
+FINE_STEPS = 50
+"""Denoising steps of the finer of both choices, as in the paper."""
 _WALKING_M_S = 0.15
+"""A root faster than this walks; slower it shifts its weight."""
 _DEFAULT_PACE_M_S = 0.4
+"""Pace of an animal that no recording shows walking."""
 
 
 @dataclass(frozen=True)
-class Setting:
+class RoomExtent:
     """The room as a place to move in: world frame, metres."""
 
     floor_m: float
@@ -29,13 +39,19 @@ def contract(
     *,
     name: str,
     behavior: dict[str, Any],
-    setting: Setting,
-    motions: list[Motion],
+    setting: RoomExtent,
+    motions: list[SessionClip],
     skin: Skin,
     residuals_m: Mapping[str, Float[np.ndarray, "frame vertex"]],
     volume: dict[str, Any],
+    labels: Mapping[str, str],
+    warning: str | None,
 ) -> dict[str, Any]:
-    """Assemble the table; `behavior` is the sampler's own contract, passed on unchanged; `residuals_m` go by their key."""
+    """Assemble the table.
+
+    `behavior` is the sampler's own contract, passed on unchanged; `residuals_m` go by their key, `labels` of
+    recordings by their id; `warning` is what a visitor should know of the scene.
+    """
     observers = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions])
     heights = np.concatenate([motion.world_from_agent[:, 1, 3] for motion in motions])
     starts = np.cumsum([0] + [len(motion.timestamp_s) for motion in motions])
@@ -47,7 +63,11 @@ def contract(
         "quaternion": "wxyz",
         "rows": "a row is a rigid motion: place x y z, quaternion w x y z; "
         "a clip's frame is world_from_agent, agent_from_bone of each bone, world_from_camera",
-        "scene": {"floor_m": round(setting.floor_m, 4), "bounds_m": np.round(setting.bounds_m, 4).tolist()},
+        "scene": {
+            "floor_m": round(setting.floor_m, 4),
+            "bounds_m": np.round(setting.bounds_m, 4).tolist(),
+            "warning": warning,
+        },
         "observer": {
             "eye_height_m": round(float(np.median(observers[:, 1]) - setting.floor_m), 4),
             "start_m": np.round(np.median(observers[:, [0, 2]], axis=0), 4).tolist(),
@@ -60,12 +80,32 @@ def contract(
             **{key: loss_mm(residual_m) for key, residual_m in residuals_m.items()},
         },
         "clips": [
-            {"name": motion.name, "start": int(start), "count": len(motion.timestamp_s)}
+            {
+                "name": motion.name,
+                "label": labels.get(motion.name, motion.name),
+                "start": int(start),
+                "count": len(motion.timestamp_s),
+            }
             for motion, start in zip(motions, starts[:-1], strict=True)
         ],
         "volume": volume,
-        "chaining": vars(Chaining()),
+        "controls": controls(behavior["sampling"]),
+        "chaining": exported(vars(ReplanningConfig())),
         "behavior": behavior,
+    }
+
+
+def controls(sampling: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return what a visitor sets, its range and its default, which is the sampler's: the only place that has
+    one.
+
+    `interactivity` is the scale of classifier-free guidance on the observer.
+    """
+    steps = int(sampling["sequence_steps"])
+    return {
+        "interactivity": {"least": 0.0, "most": 1.0, "default": min(float(sampling["guidance"]), 1.0)},
+        "samples": {"choices": list(GOAL_CHOICES), "default": GOALS},
+        "steps": {"choices": sorted({steps, FINE_STEPS}), "default": steps},
     }
 
 
@@ -78,11 +118,15 @@ def loss_mm(residual_m: Float[np.ndarray, "frame vertex"]) -> dict[str, float]:
 
 def rigid_rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
     """Turn rigid motions into rows of place and quaternion wxyz."""
-    return np.concatenate([a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1)
+    return np.concatenate(
+        [a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1
+    )
 
 
-def gait(motions: list[Motion]) -> dict[str, float]:
-    """Say how fast the animal walks when it walks, and how high its root then is: medians of all recordings."""
+def gait(motions: list[SessionClip]) -> dict[str, float]:
+    """Return how fast the animal walks when it walks, and how high its root then is: medians of all
+    recordings.
+    """
     speeds, heights = [], []
     for motion in motions:
         place = motion.world_from_agent[:, :3, 3]

@@ -1,6 +1,8 @@
-"""Assemble the page: one HTML file that holds its scripts, the WebAssembly runtime and every asset, compressed.
+"""Assemble the page: one HTML file that holds its scripts, the WebAssembly runtime and every asset,
+compressed.
 
-Arrays are stored byte by byte of their records (first all first bytes, then all second ones), which compresses better.
+Arrays are stored byte by byte of their records (first all first bytes, then all second ones), which
+compresses better.
 """
 
 import base64
@@ -14,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.export_simulator.actions import Motion
+from stages.export_simulator.actions import SessionClip
 from stages.export_simulator.contract import rigid_rows
 
 _BUNDLE = "web/dist"
@@ -30,14 +32,17 @@ class Asset:
     record: int = 1
 
 
-def clip_rows(motions: list[Motion]) -> bytes:
+def clip_rows(motions: list[SessionClip]) -> bytes:
     """Write all frames of all clips as float32 rows: root, bones, camera; place and quaternion wxyz each.
 
     Numbers are rounded to 1/4096 (0.12 mm): the rest is noise that would not compress.
     """
     frames = []
     for motion in motions:
-        poses = np.concatenate([motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]], axis=1)
+        poses = np.concatenate(
+            [motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]],
+            axis=1,
+        )
         frames.append(rigid_rows(poses))
     return (np.rint(np.concatenate(frames) * _STEPS) / _STEPS).astype("<f4").tobytes()
 
@@ -53,7 +58,9 @@ def light_page(*, contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> t
     """Return a page that loads its assets from beside it, and these files by name; it wants a static host."""
     files = compressed(contract, assets)
     tags = [_tag(name, assets, f' data-file="assets/{name}.gz"') for name in files]
-    return _assembled(contract, tags, connect="'self'"), {f"assets/{name}.gz": file for name, file in files.items()}
+    return _assembled(contract, tags, connect="'self'"), {
+        f"assets/{name}.gz": file for name, file in files.items()
+    }
 
 
 def compressed(contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> dict[str, bytes]:
@@ -73,7 +80,8 @@ def planes(asset: Asset) -> bytes:
 
 def _tag(name: str, assets: Mapping[str, Asset], more: str = "", content: str = "") -> str:
     record = assets[name].record if name in assets else 1
-    return f'<script type="application/octet-stream" id="asset-{name}" data-record="{record}"{more}>{content}</script>'
+    kind = 'type="application/octet-stream"'
+    return f'<script {kind} id="asset-{name}" data-record="{record}"{more}>{content}</script>'
 
 
 def _assembled(contract: Mapping[str, Any], tags: list[str], connect: str) -> str:

@@ -1,6 +1,9 @@
-"""Open what the simulator is made of: surfaces, skin, Gaussians, recorded motion, networks, feature volume."""
+"""Open what the simulator is made of: surfaces, skin, Gaussians, recorded motion, networks, feature
+volume.
+"""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,19 +11,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.files import arrays, gaussian_rows, meshes
-from pipeline.models.support import CARRIES, FLIGHT
-from pipeline.models.trajectories import BehaviorData
-from pipeline.space.meshes import Mesh
-from stages.export_simulator.actions import Motion, cut, longest_run
+from pipeline.behavior.support import JUMP_KERNEL, SUPPORTED
+from pipeline.behavior.trajectories import BehaviorData
+from pipeline.core.errors import InputError
+from pipeline.data import gaussian_ply, npz, ply
+from pipeline.data.templates import SKIN
+from pipeline.geometry.meshes import Mesh
+from stages.export_simulator.actions import SessionClip, cut, longest_run
 
 NETWORKS = ("perception", "goal", "path", "body")
 _SHORTEST_CLIP_FRAMES = 16
 
 
 @dataclass(frozen=True)
-class Body:
+class CanonicalAgent:
     """The canonical agent: surface and skin, agent frame, metres."""
 
     mesh: Mesh
@@ -29,7 +33,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Gaussians:
+class SplatClouds:
     """Room (world frame) and animal (agent frame, at rest) as standard rows of 3D Gaussians."""
 
     scene: Float[np.ndarray, "point 62"]
@@ -38,11 +42,11 @@ class Gaussians:
 
 
 @dataclass(frozen=True)
-class Minds:
+class BehaviorAssets:
     """The behaviour models as files, and the scene's features they perceive."""
 
-    behavior: dict[str, Any]
-    """the sampler's contract"""
+    contract: dict[str, Any]
+    """of the sampler"""
     networks: dict[str, bytes]
     volume: dict[str, Any]
     """shape, origin and voxel size of `features`"""
@@ -50,13 +54,15 @@ class Minds:
     """half precision, channel first"""
     allowed: bytes
     """one byte per voxel: where the animal may be"""
+    supported: float | None
+    """share of recorded frames whose root is above something that carries it; None where that is unknown"""
 
 
-def body(reconstruction: Path) -> Body:
+def body(reconstruction: Path) -> CanonicalAgent:
     """Read the agent's surface and skin."""
-    skin = arrays.load(reconstruction / "skin.npz", names=("weights", "agent_from_bone_rest"))
-    return Body(
-        meshes.read_ply(reconstruction / "agent.ply"),
+    skin = SKIN.load(reconstruction / "skin.npz", "weights", "agent_from_bone_rest")
+    return CanonicalAgent(
+        ply.read_ply(reconstruction / "agent.ply"),
         skin["weights"].astype(np.float64),
         skin["agent_from_bone_rest"].astype(np.float64),
     )
@@ -64,14 +70,16 @@ def body(reconstruction: Path) -> Body:
 
 def scene(reconstruction: Path) -> Mesh:
     """Read the room's surface, world frame."""
-    return meshes.read_ply(reconstruction / "scene.ply")
+    return ply.read_ply(reconstruction / "scene.ply")
 
 
-def motions(behavior_data: Path) -> list[Motion]:
-    """Read the longest unbroken stretch of every session. Raises InputError EXP-001 where none is long enough."""
+def motions(behavior_data: Path) -> list[SessionClip]:
+    """Read the longest unbroken stretch of every session. Raises InputError EXP-001 where none is long
+    enough.
+    """
     found = []
     for video, track in BehaviorData.load(behavior_data).trajectories.items():
-        whole = Motion(
+        whole = SessionClip(
             video,
             track.timestamp_s,
             track.world_from_agent,
@@ -91,20 +99,39 @@ def motions(behavior_data: Path) -> list[Motion]:
     return found
 
 
-def support(range_m: Float[np.ndarray, "2 2"]) -> dict[str, Any] | None:
-    """Return what puts paths on what carries the animal, where that is known; see `pipeline.models.support`."""
+def support_contract(range_m: Float[np.ndarray, "2 2"]) -> dict[str, Any] | None:
+    """Return what puts paths on what carries the animal, where that is known; see
+    `pipeline.behavior.support`.
+    """
     if not np.isfinite(range_m).all():
         return None
-    return {"mark": CARRIES, "range_m": np.asarray(range_m, float).tolist(), "flight": FLIGHT.tolist()}
+    return {"mark": SUPPORTED, "range_m": np.asarray(range_m, float).tolist(), "flight": JUMP_KERNEL.tolist()}
 
 
-def gaussians(splats: Path) -> Gaussians:
+def supported_share(volume: Mapping[str, np.ndarray], data: BehaviorData) -> float | None:
+    """Return the share of recorded frames with a carrying voxel beneath the root; None where
+    nothing carries.
+    """
+    carries = volume["allowed"] >= SUPPORTED
+    if not carries.any():
+        return None
+    roots = np.concatenate([t.world_from_agent[t.valid, :3, 3] for t in data.trajectories.values()])
+    column = np.floor((roots - volume["origin"]) / volume["voxel_m"]).astype(int)
+    inside = ((column >= 0) & (column < carries.shape)).all(1)
+    x, y, z = column[inside].T
+    beneath = (carries[x, :, z] & (np.arange(carries.shape[1]) <= y[:, None])).any(1)
+    return float(beneath.sum() / max(len(roots), 1))
+
+
+def gaussians(splats: Path) -> SplatClouds:
     """Read room and animal as Gaussians, and the animal's skin."""
-    weights = arrays.load(splats / "splats.npz", names=("agent_weights",))["agent_weights"]
-    return Gaussians(gaussian_rows.read(splats / "scene.ply"), gaussian_rows.read(splats / "agent.ply"), weights)
+    weights = gaussian_ply.SPLATS.load(splats / "splats.npz", "agent_weights")["agent_weights"]
+    return SplatClouds(
+        gaussian_ply.read(splats / "scene.ply"), gaussian_ply.read(splats / "agent.ply"), weights
+    )
 
 
-def minds(behavior: Path, behavior_data: Path) -> Minds:
+def behavior_assets(behavior: Path, behavior_data: Path) -> BehaviorAssets:
     """Read the sampler's contract, the four networks, and the scene's features that they perceive.
 
     Raises InputError EXP-002 for a variant that the page's sampler does not know.
@@ -113,17 +140,23 @@ def minds(behavior: Path, behavior_data: Path) -> Minds:
     family, ego = (contract["architecture"][key] for key in ("family", "ego"))
     if family != "diffusion" or ego == "world":
         what = f"the page cannot sample a model of the family {family} with the ego frame {ego}"
-        raise InputError("EXP-002", what, str(behavior), "take another variant: family diffusion, ego yaw or full")
-    table = arrays.load(behavior_data / "volume.npz", names=("features", "allowed", "origin", "voxel_m", "stands_m"))
-    return Minds(
-        behavior=contract,
+        raise InputError(
+            "EXP-002", what, str(behavior), "take another variant: family diffusion, ego yaw or full"
+        )
+    table = npz.load(
+        behavior_data / "volume.npz", names=("features", "allowed", "origin", "voxel_m", "stands_m")
+    )
+    data = BehaviorData.load(behavior_data)
+    return BehaviorAssets(
+        contract=contract,
         networks={name: (behavior / f"{name}.onnx").read_bytes() for name in NETWORKS},
         volume={
             "shape": list(table["features"].shape),
             "origin": table["origin"].tolist(),
             "voxel_m": float(table["voxel_m"]),
-            "support": support(table["stands_m"]),
+            "support": support_contract(table["stands_m"]),
         },
         allowed=table["allowed"].astype(np.uint8).tobytes(),
+        supported=supported_share(table, data),
         features=table["features"].astype("<f2").tobytes(),
     )

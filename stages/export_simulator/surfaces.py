@@ -1,4 +1,6 @@
-"""Make surfaces light enough for a page: thin them, keep their colour and weights, find the floor, shrink splats."""
+"""Make surfaces light enough for a page: thin them, keep their colour and weights, find the floor, shrink
+splats.
+"""
 
 from dataclasses import dataclass
 
@@ -7,14 +9,16 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import cKDTree
 
-from pipeline.space.meshes import Mesh
+from pipeline.geometry.meshes import Mesh
 
-_SPLAT_ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+_SPLAT_ROW = np.dtype(
+    [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
+)
 _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not compress
 _BAND_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
-def thin(mesh: Mesh, max_faces: int) -> tuple[Mesh, Int[np.ndarray, " vertex"]]:
+def decimate(mesh: Mesh, max_faces: int) -> tuple[Mesh, Int[np.ndarray, " vertex"]]:
     """Collapse edges until `max_faces` are left; also return, per new vertex, the nearest old one."""
     if len(mesh.faces) <= max_faces:
         return mesh, np.arange(len(mesh.vertices))
@@ -49,8 +53,10 @@ def bounds(mesh: Mesh) -> Float[np.ndarray, "2 3"]:
     return np.percentile(mesh.vertices, [0.5, 99.5], axis=0)
 
 
-def facing(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
-    """Orient all faces alike so that most of the area faces a point inside the room: walls then vanish from behind."""
+def orient_towards(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
+    """Orient all faces alike so that most of the area faces a point inside the room: walls then vanish from
+    behind.
+    """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     towards = np.einsum("fi,fi->f", normals, inside - corners.mean(1))
@@ -70,11 +76,15 @@ class SkinnedSplats:
 
 
 def splat_rows(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> bytes:
-    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation; the faintest go first."""
+    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation; the
+    faintest go first.
+    """
     return _packed(gaussians[_weightiest(gaussians, max_points)])
 
 
-def skinned_splats(gaussians: Float[np.ndarray, "point 62"], weights: Float[np.ndarray, "point bone"], max_points: int) -> SkinnedSplats:
+def skinned_splats(
+    gaussians: Float[np.ndarray, "point 62"], weights: Float[np.ndarray, "point bone"], max_points: int
+) -> SkinnedSplats:
     """Shrink the animal's Gaussians likewise and keep each one's four heaviest bones."""
     kept = _weightiest(gaussians, max_points)
     joints = np.argsort(-weights[kept], axis=1, kind="stable")[:, :4]
@@ -82,7 +92,8 @@ def skinned_splats(gaussians: Float[np.ndarray, "point 62"], weights: Float[np.n
     padding = ((0, 0), (0, 4 - joints.shape[1]))
     shares = _bytes(255 * heaviest / heaviest.sum(1, keepdims=True))
     return SkinnedSplats(
-        _packed(gaussians[kept]), np.concatenate([np.pad(joints, padding), np.pad(shares, padding)], 1).astype(np.uint8).tobytes()
+        _packed(gaussians[kept]),
+        np.concatenate([np.pad(joints, padding), np.pad(shares, padding)], 1).astype(np.uint8).tobytes(),
     )
 
 
@@ -98,7 +109,9 @@ def _packed(gaussians: Float[np.ndarray, "point 62"]) -> bytes:
     rows = np.zeros(len(gaussians), _SPLAT_ROW)
     rows["position"] = np.rint(gaussians[:, :3] * _STEPS) / _STEPS
     rows["scale"] = np.maximum(np.rint(np.exp(gaussians[:, 55:58].astype(np.float64)) * _STEPS), 1) / _STEPS
-    rows["color"] = _bytes(np.concatenate([gaussians[:, 6:9] * _BAND_0 + 0.5, _opacity(gaussians)[:, None]], 1) * 255)
+    rows["color"] = _bytes(
+        np.concatenate([gaussians[:, 6:9] * _BAND_0 + 0.5, _opacity(gaussians)[:, None]], 1) * 255
+    )
     rotation = gaussians[:, 58:62] / np.linalg.norm(gaussians[:, 58:62], axis=1, keepdims=True)
     rows["rotation"] = _bytes(rotation * 128 + 128)
     return rows.tobytes()

@@ -1,51 +1,77 @@
 """Write the simulator's files and say how good they are."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, assert_never
+from typing import Any, assert_never
 
 import numpy as np
 
-from pipeline.files import arrays, glb
-from pipeline.qa import Check, Picture
+from pipeline.data import glb, npz
+from pipeline.data.qa import Check, Picture
 from stages.export_simulator import page, pictures
+from stages.export_simulator.config import Layout
 from stages.export_simulator.contract import contract
-from stages.export_simulator.export import Made
+from stages.export_simulator.export import SimulatorParts
 from stages.export_simulator.page import Asset
-from stages.export_simulator.reading import Minds
+from stages.export_simulator.reading import BehaviorAssets
 
-Layout = Literal["file", "folder"]
+LEAST_SUPPORTED = 0.9
+"""Share of recorded frames above something solid or filled floor below which the page and the report warn."""
+WARN_PAGE_MB = 25.0
+"""Megabytes above which the report warns about the page: some mail programs and hosts refuse more."""
 
 
-def write_simulator(folder: Path, made: Made, minds: Minds, name: str, layout: Layout) -> float:
-    """Write the page, the animated agent, the room and the contract; return the size of what a visitor loads, megabytes."""
+def write_simulator(
+    folder: Path,
+    parts: SimulatorParts,
+    behavior: BehaviorAssets,
+    name: str,
+    layout: Layout,
+    labels: Mapping[str, str],
+) -> float:
+    """Write the page, the animated agent, the scene and the contract; return megabytes that a
+    visitor loads.
+    """
     about = contract(
         name=name,
-        behavior=minds.behavior,
-        setting=made.setting,
-        motions=made.motions,
-        skin=made.skin,
-        residuals_m={"skinning_residual_mm": made.residual_m, "skinning_residual_8_mm": made.eight_residual_m},
-        volume=minds.volume,
+        behavior=behavior.contract,
+        setting=parts.setting,
+        motions=parts.motions,
+        skin=parts.skin,
+        residuals_m={
+            "skinning_residual_mm": parts.residual_m,
+            "skinning_residual_8_mm": parts.eight_residual_m,
+        },
+        volume=behavior.volume,
+        labels=labels,
+        warning=support_warning(behavior.supported),
     )
-    room = glb.static(made.scene, "scene")
+    room = glb.static(parts.scene, "scene")
     assets = {
         "room": Asset(room, 4),
-        "agent": Asset(glb.skinned(made.agent, made.skin, []), 4),
-        "clips": Asset(page.clip_rows(made.motions), 4),
-        "splats": Asset(made.splat_rows, 32),
-        "agent-splats": Asset(made.agent_splats.rows, 32),
-        "agent-skin": Asset(made.agent_splats.skin, 8),
-        "volume": Asset(minds.features, 2),
-        "allowed": Asset(minds.allowed),
-        **{name: Asset(network, 4) for name, network in minds.networks.items()},
+        "agent": Asset(glb.skinned(parts.agent, parts.skin, []), 4),
+        "clips": Asset(page.clip_rows(parts.motions), 4),
+        "splats": Asset(parts.splat_rows, 32),
+        "agent-splats": Asset(parts.agent_splats.rows, 32),
+        "agent-skin": Asset(parts.agent_splats.skin, 8),
+        "volume": Asset(behavior.features, 2),
+        "allowed": Asset(behavior.allowed),
+        **{name: Asset(network, 4) for name, network in behavior.networks.items()},
     }
     size = _write_page(folder, about, assets, layout)
-    (folder / "agent.glb").write_bytes(glb.skinned(made.agent, made.skin, made.actions))
+    (folder / "agent.glb").write_bytes(glb.skinned(parts.agent, parts.skin, parts.actions))
     (folder / "scene.glb").write_bytes(room)
-    arrays.save(folder / "skin_8.npz", joints=made.eight.joints, weights=made.eight.weights)
+    npz.save(folder / "skin_8.npz", joints=parts.eight.joints, weights=parts.eight.weights)
     (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
     return size / 1e6
+
+
+def support_warning(supported: float | None) -> str | None:
+    """Return the warning that the page shows for a scene that carries too little of the recorded motion."""
+    if supported is not None and supported >= LEAST_SUPPORTED:
+        return None
+    return "Little of this floor was recorded: the animal may float or sink."
 
 
 def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], layout: Layout) -> int:
@@ -62,23 +88,30 @@ def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], l
     return len(text.encode()) + sum(map(len, files.values()))
 
 
-def quality(made: Made, size_mb: float, warn_page_mb: float) -> dict[str, Any]:
-    """Return what `qa.write` tells of the simulator."""
-    residual_mm = made.residual_m * 1000
+def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> dict[str, Any]:
+    """Return checks and pictures of the simulator for `qa.write`."""
+    residual_mm = parts.residual_m * 1000
     return {
-        "good": "the page opens within seconds and the skin of `agent.glb` follows the reconstruction within 2 mm",
+        "good": "the page opens within seconds; the skin of `agent.glb` is within 2 mm of the reconstruction",
         "bad": "limbs of `agent.glb` that thin out at the joints, or a page too big to send",
         "checks": [
-            Check("size of the page", size_mb, "MB", warn=warn_page_mb, fail=2 * warn_page_mb),
+            Check("size of the page", size_mb, "MB", warn=WARN_PAGE_MB, fail=2 * WARN_PAGE_MB),
             Check("skinning loss, mean", float(residual_mm.mean()), "mm", warn=2.0, fail=10.0),
             Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
             Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),
-            Check("sessions to replay", len(made.motions), "", warn=1, better="higher"),
+            Check(
+                "recorded motion that the scene carries",
+                supported,
+                "share",
+                warn=LEAST_SUPPORTED,
+                better="higher",
+            ),
+            Check("sessions to replay", len(parts.motions), "", warn=1, better="higher"),
         ],
         "pictures": [
             Picture(
                 "visits",
-                pictures.visits(made.scene, made.setting, made.motions),
+                pictures.visits(parts.scene, parts.setting, parts.motions),
                 "the room from above: where the animal (amber) and the person (blue) have been",
             )
         ],

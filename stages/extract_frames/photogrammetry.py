@@ -1,120 +1,113 @@
-"""A video without depth, filmed through a room in which nothing moves: poses, lens and depth from its pictures alone.
+"""A video without depth, filmed through a room in which nothing moves.
 
-Keyframes (`structure`) are posed by COLMAP, `sweep` gives them depth, `scaling` metres where a recording with depth shows
-the same room. What comes out is a plan and frames like any other's; frames that found no place are left out and told.
+Poses, lens and depth from its pictures alone.
+
+Keyframes (`structure`) are posed by COLMAP, `sweep` gives them depth, `scaling` metres where a recording
+with depth shows the same room. What comes out is a plan and frames like any other's; frames that were not
+registered are left out and reported.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.errors import InputError
-from pipeline.files import images
-from pipeline.progress import track
+from pipeline.core.errors import InputError
+from pipeline.core.progress import track
+from pipeline.data import images
+from pipeline.geometry import cameras
+from pipeline.mapping import sift
+from pipeline.mapping.sparse_model import SparseModel
 from pipeline.recordings import extraction, upright
-from pipeline.recordings.conventions import OPENCV, TOLERANCE_M, SelfCheck
-from pipeline.recordings.extraction import Frame, Plan
+from pipeline.recordings.conventions import OPENCV, TOLERANCE_M, PoseCheck
+from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan, choose_frames
 from pipeline.recordings.recording import Recording
-from pipeline.recordings.selection import choose_frames
-from pipeline.space import cameras, sift_points
-from pipeline.space.sparse import Sparse
 from stages.extract_frames import scaling, structure, sweep
-from stages.extract_frames.scaling import ScalingOptions
-from stages.extract_frames.structure import Structure, StructureOptions
-from stages.extract_frames.sweep import SweepOptions, View
+from stages.extract_frames.config import Config, PhotogrammetryConfig
+from stages.extract_frames.structure import Structure
+from stages.extract_frames.sweep import SweepView
+
+LEAST_AGREEING = 2
+"""pictures that must confirm a depth; one more makes it trusted"""
+LEAST_MAPPED = 0.3
+"""share of the keyframes below which the largest model is no map of the walk"""
+TYPICAL_DEPTH_M = 2.0
+"""median depth that a model without metric scale is given: a room's, metres"""
+SEED = 0
+"""of COLMAP's random choices"""
+KEYFRAME_JPEG_QUALITY = 98
+"""of the keyframes that COLMAP reads: no visible loss"""
 
 
 @dataclass(frozen=True)
-class PhotogrammetryOptions:
-    """How a walk-through without depth is mapped."""
+class PicturesMapped:
+    """Frames made from pictures alone, and a sentence about them."""
 
-    structure: StructureOptions = field(default_factory=StructureOptions)
-    """Keyframes, SIFT, matching and mapping."""
-    sweep: SweepOptions = field(default_factory=SweepOptions)
-    """Depth from the posed pictures."""
-    scaling: ScalingOptions = field(default_factory=ScalingOptions)
-    """Metres from recordings with depth."""
-    least_agree: int = 2
-    """Pictures that must confirm a depth; one more makes it trusted."""
-    least_mapped: float = 0.3
-    """Share of the keyframes below which the largest model is no map of the walk."""
-    typical_depth_m: float = 2.0
-    """Where nothing tells metres, the unit is such that the median depth is this."""
-    seed: int = 0
-    """Seed of COLMAP's random choices."""
-
-
-@dataclass(frozen=True)
-class Mapped:
-    """Frames made from pictures alone, and what is to be told about them."""
-
-    plan: Plan
-    frames: Iterator[Frame]
+    plan: ExtractionPlan
+    frames: Iterator[ExtractedFrame]
     placed: float
     """Share (0..1) of the keyframes that found a place."""
-    told: str
+    summary: str
     """One sentence."""
 
 
 def map_pictures(
-    recording: Recording,
-    measured: Mapping[str, Recording],
-    options: PhotogrammetryOptions,
-    *,
-    rate_hz: float,
-    max_side_px: int,
-    max_depth_m: float,
-    jpeg_quality: int,
-    workspace: Path,
-) -> Mapped:
-    """Map a video without depth; ``measured`` are recordings with depth that may tell metres, by id. Raises MAP-004."""
-    size = extraction.reduced_size(recording.color_size, max_side_px)
-    rows = _write_keyframes(recording, size, rate_hz, options.structure, workspace / "pictures")
-    solved = _solved(recording, rows, size, options, workspace)
+    recording: Recording, measured: Mapping[str, Recording], settings: Config, workspace: Path
+) -> PicturesMapped:
+    """Map a video without depth; ``measured`` are recordings with depth that may supply metric scale, by id.
+
+    Raises MAP-004.
+    """
+    config, max_depth_m = settings.without_depth, settings.max_depth_m
+    size = extraction.reduced_size(recording.color_size, settings.max_side_px)
+    rows = _write_keyframes(recording, size, settings.rate_hz, config, workspace / "pictures")
+    solved = _solved(recording, rows, size, config, workspace)
     sparse = solved.sparse
     pictures = [_undistorted(workspace / "pictures" / f"{row:06d}.jpg", solved) for row in sparse.frame]
-    views = [_view(picture, solved, key, options.sweep) for key, picture in enumerate(pictures)]
-    depth, confidence = _depths(views, sparse, options)
-    unit_m, scale = _unit_m(solved, pictures, views, depth, measured, options)
+    views = [_view(picture, solved, key, config) for key, picture in enumerate(pictures)]
+    depth, confidence = _depths(views, sparse, config)
+    unit_m, scale = _unit_m(solved, pictures, views, depth, measured, config)
     depth = [np.where(each * unit_m < max_depth_m, each * unit_m, 0).astype(np.float32) for each in depth]
     world_from_camera = sparse.model_from_camera.copy()
     world_from_camera[:, :3, 3] *= unit_m
     views_m = [(each, view.intrinsics) for each, view in zip(depth, views, strict=True)]
     turns = recording.quarter_turns or upright.quarter_turns_from_room(world_from_camera, views_m)
     plan = _plan(recording, solved, views, world_from_camera, turns, size, scale)
-    frames = (_frame(*each, turns, jpeg_quality) for each in zip(pictures, depth, confidence, strict=True))
+    upright_frames = zip(pictures, depth, confidence, strict=True)
+    frames = (_frame(*each, turns, settings.jpeg_quality) for each in upright_frames)
     placed = len(sparse.frame) / len(rows)
-    return Mapped(plan, frames, placed, _told(recording, rows, solved, scale))
+    return PicturesMapped(plan, frames, placed, _summary(recording, rows, solved, scale))
 
 
 def _write_keyframes(
-    recording: Recording, size: tuple[int, int], rate_hz: float, options: StructureOptions, folder: Path
+    recording: Recording, size: tuple[int, int], rate_hz: float, config: PhotogrammetryConfig, folder: Path
 ) -> Int[np.ndarray, "key"]:
     """Write the keyframes as ``<row in the recording>.jpg`` and return their rows."""
     folder.mkdir()
-    motion, rows, sharpness = structure.Motion(), [], []
+    motion, rows, sharpness = structure.PictureMotion(), [], []
     for row in track(choose_frames(recording.timestamp_s, rate_hz).tolist(), "looking at pictures"):
         color = _picture(recording, row, size)
         if color is not None:
             motion.add(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
             rows.append(row)
             sharpness.append(extraction.picture_statistics(color)[0])
-    if len(rows) < options.least_keyframes:
+    if len(rows) < structure.LEAST_KEYFRAMES:
         raise no_map(recording, f"only {len(rows)} pictures can be read")
-    keys = structure.choose_keyframes(np.array(motion.travelled), np.array(sharpness), options)
+    keys = structure.choose_keyframes(np.array(motion.travelled), np.array(sharpness), config)
     chosen = np.array(rows)[keys]
     for row in chosen.tolist():
         color = _picture(recording, row, size)
         assert color is not None, "a picture that could be read before"
-        (folder / f"{row:06d}.jpg").write_bytes(images.encode_jpeg(color, 98))
+        (folder / f"{row:06d}.jpg").write_bytes(images.encode_jpeg(color, KEYFRAME_JPEG_QUALITY))
     return chosen
 
 
-def _picture(recording: Recording, row: int, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"] | None:
+def _picture(
+    recording: Recording, row: int, size: tuple[int, int]
+) -> UInt8[np.ndarray, "height width 3"] | None:
     stored = recording.read_color(int(recording.index[row]))
     if stored is None:
         return None
@@ -122,24 +115,35 @@ def _picture(recording: Recording, row: int, size: tuple[int, int]) -> UInt8[np.
     return color if color.shape[:2] == size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
 
 
-def _solved(recording: Recording, rows: np.ndarray, size: tuple[int, int], options: PhotogrammetryOptions, workspace: Path) -> Structure:
-    if len(rows) < options.structure.least_keyframes:
+def _solved(
+    recording: Recording,
+    rows: np.ndarray,
+    size: tuple[int, int],
+    config: PhotogrammetryConfig,
+    workspace: Path,
+) -> Structure:
+    if len(rows) < structure.LEAST_KEYFRAMES:
         raise no_map(recording, "the camera hardly moves")
-    told = None
+    known_intrinsics = None
     if recording.intrinsics is not None:
-        told = np.median(cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size), axis=0)
+        known_intrinsics = np.median(
+            cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size), axis=0
+        )
     names = [f"{row:06d}.jpg" for row in rows]
-    solved = structure.solve(workspace / "pictures", names, told, options.structure, workspace, options.seed)
+    solved = structure.solve(workspace / "pictures", names, known_intrinsics, config, workspace, SEED)
     if solved is None:
         raise no_map(recording, "its pictures do not fit together to one model")
-    if len(solved.sparse.frame) < options.least_mapped * len(rows):
+    if len(solved.sparse.frame) < LEAST_MAPPED * len(rows):
         raise no_map(recording, f"its largest model holds {len(solved.sparse.frame)} of {len(rows)} pictures")
     return solved
 
 
 def no_map(recording: Recording, why: str) -> InputError:
     """Make the error for pictures from which no map can be made."""
-    remedy = "walk sideways through the room instead of turning on the spot, slowly, in good light; or record with a LiDAR phone"
+    remedy = (
+        "walk sideways through the room instead of turning on the spot, slowly, "
+        "in good light; or record with a LiDAR phone"
+    )
     return InputError("MAP-004", f"no map can be made from pictures alone: {why}", recording.where, remedy)
 
 
@@ -149,50 +153,63 @@ def _undistorted(path: Path, solved: Structure) -> UInt8[np.ndarray, "height wid
     return cv2.undistort(images.read_color(path), centred, np.array([solved.radial, 0, 0, 0]))
 
 
-def _view(picture: UInt8[np.ndarray, "height width 3"], solved: Structure, key: int, options: SweepOptions) -> View:
+def _view(
+    picture: UInt8[np.ndarray, "height width 3"], solved: Structure, key: int, config: PhotogrammetryConfig
+) -> SweepView:
     height, width = picture.shape[:2]
-    share = options.side_px / max(height, width)
+    share = config.depth_side_px / max(height, width)
     size = (round(height * share), round(width * share))
     gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
     intrinsics = cameras.scale_intrinsics(solved.intrinsics, (height, width), size)
-    return View(gray.astype(np.float32), intrinsics, solved.sparse.model_from_camera[key])
+    return SweepView(gray.astype(np.float32), intrinsics, solved.sparse.model_from_camera[key])
 
 
-def _depths(views: list[View], sparse: Sparse, options: PhotogrammetryOptions) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _depths(
+    views: list[SweepView], sparse: SparseModel, config: PhotogrammetryConfig
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return depth (model units, 0 = unknown) and confidence (0..2) of every view."""
-    others = sweep.neighbours(sparse, options.sweep)
+    others = sweep.neighbours(sparse, config)
     swept = [
-        sweep.sweep(view, [views[other] for other in others[key]], sweep.depth_range(sparse, key), options.sweep)
+        sweep.sweep(view, [views[other] for other in others[key]], sweep.depth_range(sparse, key), config)
         if len(others[key])
         else np.zeros_like(view.gray)
         for key, view in enumerate(track(views, "depth from pictures"))
     ]
     depth, confidence = [], []
     for key, view in enumerate(views):
-        agree = sweep.agreement(swept[key], view, [(swept[other], views[other]) for other in others[key]], options.sweep)
-        depth.append(np.where(agree >= options.least_agree, swept[key], 0))
-        confidence.append(np.clip(agree.astype(int) - options.least_agree + 1, 0, 2).astype(np.uint8))
+        agree = sweep.agreement(swept[key], view, [(swept[other], views[other]) for other in others[key]])
+        depth.append(np.where(agree >= LEAST_AGREEING, swept[key], 0))
+        confidence.append(np.clip(agree.astype(int) - LEAST_AGREEING + 1, 0, 2).astype(np.uint8))
     return depth, confidence
 
 
 def _unit_m(
     solved: Structure,
     pictures: list[np.ndarray],
-    views: list[View],
+    views: list[SweepView],
     depth: list[np.ndarray],
     measured: Mapping[str, Recording],
-    options: PhotogrammetryOptions,
+    config: PhotogrammetryConfig,
 ) -> tuple[float, str]:
-    """Return metres per unit of the model, and how they were found: the id of a recording with depth, or `relative`."""
+    """Return metres per unit of the model, and how they were found.
+
+    The id of a recording with depth, or `relative`.
+    """
     known = np.concatenate([each[each > 0] for each in depth])
-    nominal = options.typical_depth_m / float(np.median(known)) if len(known) else 1.0
+    nominal = TYPICAL_DEPTH_M / float(np.median(known)) if len(known) else 1.0
     mapped = [
-        sift_points.sift_points(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), solved.intrinsics, each, view.intrinsics, options.scaling.points)
+        sift.sift_points(
+            cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY),
+            solved.intrinsics,
+            each,
+            view.intrinsics,
+            scaling.POINTS,
+        )
         for picture, view, each in zip(pictures, views, depth, strict=True)
         if measured
     ]
     for name, recording in measured.items():
-        unit_m = scaling.meters_per_unit(mapped, recording, options.scaling, options.seed)
+        unit_m = scaling.meters_per_unit(mapped, recording, SEED)
         if unit_m is not None:
             return unit_m, name
     return nominal, extraction.RELATIVE
@@ -201,44 +218,67 @@ def _unit_m(
 def _plan(
     recording: Recording,
     solved: Structure,
-    views: list[View],
+    views: list[SweepView],
     world_from_camera: Float[np.ndarray, "key 4 4"],
     turns: int,
     size: tuple[int, int],
     scale: str,
-) -> Plan:
+) -> ExtractionPlan:
     rows = solved.sparse.frame
     reason = "poses and depth from the pictures alone"
-    return Plan(
+    return ExtractionPlan(
         chosen=rows,
         timestamp_s=recording.timestamp_s[rows],
         stored_size=size,
-        intrinsics=np.repeat(cameras.turn_intrinsics(solved.intrinsics, size, turns)[None], len(rows), axis=0),
-        depth_intrinsics=np.stack([cameras.turn_intrinsics(view.intrinsics, view.gray.shape, turns) for view in views]),
+        intrinsics=np.repeat(
+            cameras.turn_intrinsics(solved.intrinsics, size, turns)[None], len(rows), axis=0
+        ),
+        depth_intrinsics=np.stack(
+            [cameras.turn_intrinsics(view.intrinsics, view.gray.shape, turns) for view in views]
+        ),
         odometry_from_camera=cameras.turn_camera(world_from_camera, turns),
         gravity_known=False,
         quarter_turns=turns,
-        self_check=SelfCheck("untested", OPENCV, 0, np.nan, np.nan, TOLERANCE_M, reason),
+        pose_check=PoseCheck("untested", OPENCV, 0, np.nan, np.nan, TOLERANCE_M, reason),
         scale=scale,
     )
 
 
-def _frame(picture: np.ndarray, depth: np.ndarray, confidence: np.ndarray, turns: int, jpeg_quality: int) -> Frame:
+def _frame(
+    picture: np.ndarray, depth: np.ndarray, confidence: np.ndarray, turns: int, jpeg_quality: int
+) -> ExtractedFrame:
     confidence = np.where(depth > 0, confidence, 0).astype(np.uint8)
     color, depth, confidence = (cameras.turn_image(image, turns) for image in (picture, depth, confidence))
     statistics = extraction.picture_statistics(color)
-    return Frame(color, images.encode_jpeg(color, jpeg_quality), depth, confidence, *statistics, float((depth > 0).mean()))
+    return ExtractedFrame(
+        color,
+        images.encode_jpeg(color, jpeg_quality),
+        depth,
+        confidence,
+        *statistics,
+        float((depth > 0).mean()),
+    )
 
 
-def _told(recording: Recording, rows: np.ndarray, solved: Structure, scale: str) -> str:
+def _summary(recording: Recording, rows: np.ndarray, solved: Structure, scale: str) -> str:
     lost = np.setdiff1d(rows, solved.sparse.frame)
     seconds = ", ".join(f"{recording.timestamp_s[row]:.1f}" for row in lost[:12])
-    left_out = f"; {len(lost)} found no place, at {seconds}{' ...' if len(lost) > 12 else ''} s" if len(lost) else ""
+    left_out = (
+        (f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > 12 else ''} s")
+        if len(lost)
+        else ""
+    )
     split = f", the largest of {solved.models} models" if solved.models > 1 else ""
-    metres = "the scale is relative: lengths are no metres" if scale == extraction.RELATIVE else f"metres from the depth of {scale}"
+    metres = (
+        "the scale is relative: lengths are no metres"
+        if scale == extraction.RELATIVE
+        else f"metres from the depth of {scale}"
+    )
     focal = solved.intrinsics[0, 0]
-    told = "told" if recording.intrinsics is not None else "found"
+    focal_source = "given" if recording.intrinsics is not None else "calibrated"
     return (
-        f"{recording.where}: {recording.kind}, mapped from {len(solved.sparse.frame)} of {len(rows)} pictures{split}{left_out}; "
-        f"focal length {focal:.0f} px ({told}), reprojection {solved.sparse.reprojection_px:.2f} px; {metres}"
+        f"{recording.where}: {recording.kind}, mapped from {len(solved.sparse.frame)} "
+        f"of {len(rows)} pictures{split}{left_out}; "
+        f"focal length {focal:.0f} px ({focal_source}), reprojection "
+        f"{solved.sparse.reprojection_px:.2f} px; {metres}"
     )

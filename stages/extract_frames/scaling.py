@@ -1,76 +1,85 @@
-"""Metres for a map without them: recordings with depth that show the same room tell how long its unit is.
+"""Metres for a map without them: recordings with depth of the same room give the length of its unit.
 
-Points that look alike in a frame of the map and in a frame with measured depth are fitted by a similarity; the median of
-its scale over the pairs that agree is taken, and only when enough of them do.
+Points that look alike in a frame of the map and in a frame with measured depth are fitted by a
+similarity; the median of its scale over the pairs that agree is taken, and only when enough of them do.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pycolmap
 
+from pipeline.mapping import sift
+from pipeline.mapping.sift import SiftPoints
 from pipeline.recordings import extraction
 from pipeline.recordings.recording import Recording
-from pipeline.space import sift_points
-from pipeline.space.sift_points import SiftPoints
+
+FRAMES = 24
+"""frames looked at per recording with depth"""
+POINTS = 800
+"""SIFT points per frame"""
+WITHIN_M = 0.08
+"""matched points this close after the fit agree, metres: the noise of phone depth at some metres"""
+LEAST_EXTENT_M = 5 * WITHIN_M
+"""the points that agree must reach this far along some axis, or their scale is uncertain"""
+LEAST_POINTS = 15
+"""points that must agree for a pair of frames to count"""
+LEAST_PAIRS = 4
+"""pairs that must agree for the scale to be believed"""
+AGREE_SHARE = 0.1
+"""relative difference of scale within which pairs agree"""
+RANSAC_TRIALS = 2000
+RATE_HZ, MAX_DEPTH_M, MAX_SIDE_PX, JPEG_QUALITY = 10.0, 5.0, 640, 50
+"""how a recording with depth is read here; its pictures are never kept"""
 
 
-@dataclass(frozen=True)
-class ScalingOptions:
-    """When recordings with depth are believed to tell the map's scale."""
+def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int) -> float | None:
+    """Return how many metres a unit of the map is by one recording with depth.
 
-    frames: int = 24
-    """Frames looked at per recording with depth."""
-    points: int = 800
-    """SIFT points per frame."""
-    within_m: float = 0.08
-    """Matched points this close after the fit agree, metres."""
-    least_points: int = 15
-    """Points that must agree for a pair of frames to count."""
-    least_pairs: int = 4
-    """Pairs that must agree for the scale to be believed."""
-    agree_share: float = 0.1
-    """Relative difference of scale within which pairs agree."""
-
-
-def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, options: ScalingOptions, seed: int) -> float | None:
-    """Return how many metres a unit of the map is by one recording with depth; None where it does not tell."""
+    None where too few frames agree.
+    """
     scales = []
-    for frame in _described(measured, options):
-        found = [scale for known in mapped if (scale := _scale(known, frame, options, seed)) is not None]
+    for frame in _described(measured):
+        found = [scale for known in mapped if (scale := _scale(known, frame, seed)) is not None]
         scales += found
     if not scales:
         return None
     centre = float(np.median(scales))
-    agreeing = np.abs(np.array(scales) / centre - 1) < options.agree_share
-    if agreeing.sum() < max(options.least_pairs, 0.5 * len(scales)):
+    agreeing = np.abs(np.array(scales) / centre - 1) < AGREE_SHARE
+    if agreeing.sum() < max(LEAST_PAIRS, 0.5 * len(scales)):
         return None
     return float(np.median(np.array(scales)[agreeing]))
 
 
-def _described(recording: Recording, options: ScalingOptions) -> Iterator[SiftPoints]:
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=5.0, pairs=6, max_side_px=640)
-    rows = np.unique(np.linspace(0, len(plan.chosen) - 1, options.frames).round().astype(int))
+def _described(recording: Recording) -> Iterator[SiftPoints]:
+    plan = extraction.understand(recording, rate_hz=RATE_HZ, max_depth_m=MAX_DEPTH_M, max_side_px=MAX_SIDE_PX)
+    rows = np.unique(np.linspace(0, len(plan.chosen) - 1, FRAMES).round().astype(int))
     sample = replace(plan, chosen=plan.chosen[rows])
-    for row, frame in zip(rows, extraction.frames(recording, sample, max_depth_m=5.0, jpeg_quality=50), strict=True):
+    for row, frame in zip(
+        rows,
+        extraction.frames(recording, sample, max_depth_m=MAX_DEPTH_M, jpeg_quality=JPEG_QUALITY),
+        strict=True,
+    ):
         if frame is not None:
             gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-            yield sift_points.sift_points(gray, plan.intrinsics[row], frame.depth, plan.depth_intrinsics[row], options.points)
+            yield sift.sift_points(
+                gray, plan.intrinsics[row], frame.depth, plan.depth_intrinsics[row], POINTS
+            )
 
 
-def _scale(known: SiftPoints, frame: SiftPoints, options: ScalingOptions, seed: int) -> float | None:
+def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:
     """Return metres per unit by one pair of frames, None where too few points agree."""
-    mine, theirs = sift_points.matches(frame, known).T
-    if len(mine) < options.least_points:
+    mine, theirs = sift.matches(frame, known).T
+    if len(mine) < LEAST_POINTS:
         return None
     source, target = known.points_camera[theirs], frame.points_camera[mine]
-    ransac = pycolmap.RANSACOptions(max_error=options.within_m, random_seed=seed, max_num_trials=2000)
+    ransac = pycolmap.RANSACOptions(max_error=WITHIN_M, random_seed=seed, max_num_trials=RANSAC_TRIALS)
     fitted = pycolmap.estimate_sim3d_robust(source, target, ransac)
     if fitted is None:
         return None
     close = target[np.asarray(fitted["inlier_mask"], bool)]
-    if len(close) < options.least_points or np.ptp(close, axis=0).max() < 5 * options.within_m:
+    if len(close) < LEAST_POINTS or np.ptp(close, axis=0).max() < LEAST_EXTENT_M:
         return None
     return float(fitted["tgt_from_src"].scale)

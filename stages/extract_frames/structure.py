@@ -1,7 +1,9 @@
-"""Where the camera stood, from pictures alone: keyframes by their motion, then COLMAP, on one thread with fixed seeds.
+"""Where the camera stood, from pictures alone.
 
-`choose_keyframes` thins a video by what its pictures show, `solve` finds poses and, where nothing tells it, the lens.
-The model's scale is its own.
+Keyframes by their motion, then COLMAP, on one thread with fixed seeds.
+
+`choose_keyframes` thins a video by what its pictures show, `solve` finds poses and, where it is unknown,
+the lens. The model's scale is its own.
 """
 
 import itertools
@@ -13,42 +15,32 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.progress import log
-from pipeline.space import colmap
-from pipeline.space.sparse import Sparse, sparse_from_model
+from pipeline.core.progress import log
+from pipeline.mapping import colmap
+from pipeline.mapping.sparse_model import SparseModel, read_sparse_model
+from stages.extract_frames.config import PhotogrammetryConfig
 
-
-@dataclass(frozen=True)
-class StructureOptions:
-    """How pictures are chosen, matched and mapped."""
-
-    keyframe_share: float = 0.06
-    """A keyframe follows the last one when the picture has moved by this share of its width."""
-    most_keyframes: int = 120
-    """Upper bound; steps are widened until it holds."""
-    least_keyframes: int = 8
-    """A model with fewer pictures is none."""
-    features: int = 2000
-    """SIFT features kept per keyframe."""
-    peak_threshold: float = 0.004
-    """SIFT's contrast threshold; plain walls need a low one."""
-    overlap: int = 8
-    """Keyframes matched with this many successors."""
-    look_alikes: int = 8
-    """And with so many others that share the most visual words."""
-    words: int = 256
-    """Visual words, learned from the recording itself."""
-    least_telling: float = 0.03
-    """Share of the matched pairs that must show depth, not a mere turn or one plane."""
-    focal_share: float = 0.85
-    """Focal length that calibration begins from, share of the picture's longer side."""
+LEAST_KEYFRAMES = 8
+"""a model with fewer pictures is none"""
+PEAK_THRESHOLD = 0.004
+"""SIFT's contrast threshold; plain walls need a low one (COLMAP's default is 0.0067)"""
+VISUAL_WORDS = 256
+"""learned from the recording itself"""
+LEAST_PARALLAX_PAIRS = 0.03
+"""share of the matched pairs that must show parallax, not a mere rotation or one plane"""
+MOTION_WIDTH_PX = 240
+"""width to which pictures are reduced before corners are followed"""
+LOST_STEP = 0.1
+"""share of the width by which a picture counts as moved where too few corners survive"""
+LEAST_CORNERS, LEAST_FOLLOWED = 12, 0.4
+"""corners in a picture, and share of them found again, below which the tracking is lost"""
 
 
 @dataclass(frozen=True)
 class Structure:
     """The largest model, the lens it was seen through, and how many models the pictures fell into."""
 
-    sparse: Sparse
+    sparse: SparseModel
     intrinsics: Float[np.ndarray, "3 3"]
     """Pixels of the pictures that were given."""
     radial: float
@@ -56,7 +48,7 @@ class Structure:
     models: int
 
 
-class Motion:
+class PictureMotion:
     """How far the picture has moved since the first one, shares of its width, picture by picture."""
 
     def __init__(self) -> None:
@@ -64,8 +56,15 @@ class Motion:
         self._last: UInt8[np.ndarray, "height width"] | None = None
 
     def add(self, gray: UInt8[np.ndarray, "height width"]) -> None:
-        """Follow corners into the next picture; where too few survive, it counts as moved by a tenth of its width."""
-        small = cv2.resize(gray, (240, round(240 * gray.shape[0] / gray.shape[1])), interpolation=cv2.INTER_AREA)
+        """Follow corners into the next picture.
+
+        Where too few survive, it counts as moved by a tenth of its width.
+        """
+        small = cv2.resize(
+            gray,
+            (MOTION_WIDTH_PX, round(MOTION_WIDTH_PX * gray.shape[0] / gray.shape[1])),
+            interpolation=cv2.INTER_AREA,
+        )
         step = 0.0 if self._last is None else self._step(self._last, small)
         self.travelled.append(step + (self.travelled[-1] if self.travelled else 0.0))
         self._last = small
@@ -73,20 +72,20 @@ class Motion:
     @staticmethod
     def _step(before: np.ndarray, after: np.ndarray) -> float:
         corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
-        if corners is None or len(corners) < 12:
-            return 0.1
+        if corners is None or len(corners) < LEAST_CORNERS:
+            return LOST_STEP
         moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)
         good = found[:, 0] == 1
-        if good.sum() < 0.4 * len(corners):
-            return 0.1
+        if good.sum() < LEAST_FOLLOWED * len(corners):
+            return LOST_STEP
         return float(np.median(np.linalg.norm((moved - corners)[good, 0], axis=1)) / before.shape[1])
 
 
 def choose_keyframes(
-    travelled: Float[np.ndarray, "frame"], sharpness: Float[np.ndarray, "frame"], options: StructureOptions
+    travelled: Float[np.ndarray, "frame"], sharpness: Float[np.ndarray, "frame"], config: PhotogrammetryConfig
 ) -> Int[np.ndarray, "key"]:
     """Pick the sharpest frame of every step of motion."""
-    steps = min(travelled[-1] / options.keyframe_share, options.most_keyframes - 1)
+    steps = min(travelled[-1] / config.keyframe_share, config.most_keyframes - 1)
     step = np.floor(travelled / max(travelled[-1], 1e-9) * steps).astype(int)
     starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
     bounds = np.append(starts, len(step))
@@ -94,38 +93,57 @@ def choose_keyframes(
 
 
 def solve(
-    pictures: Path, names: list[str], intrinsics: Float[np.ndarray, "3 3"] | None, options: StructureOptions, workspace: Path, seed: int
+    pictures: Path,
+    names: list[str],
+    intrinsics: Float[np.ndarray, "3 3"] | None,
+    config: PhotogrammetryConfig,
+    workspace: Path,
+    seed: int,
 ) -> Structure | None:
-    """Pose the pictures ``names`` (six digits, in time order); None where no model of enough of them comes out."""
+    """Pose the pictures ``names`` (six digits, in time order).
+
+    None where no model of enough of them comes out.
+    """
     colmap.seed_everything(seed)
     database = workspace / "database.db"
-    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", default_focal_length_factor=options.focal_share)
-    sift = {"max_num_features": options.features, "peak_threshold": options.peak_threshold}
-    colmap.extract(database, pictures, names, reader if intrinsics is None else colmap.pinhole(intrinsics), sift)
-    pairs = _pairs(_descriptors(database, names), options, seed)
+    reader = pycolmap.ImageReaderOptions(
+        camera_model="SIMPLE_RADIAL", default_focal_length_factor=config.focal_share
+    )
+    sift = {"max_num_features": config.features, "peak_threshold": PEAK_THRESHOLD}
+    colmap.extract(
+        database, pictures, names, reader if intrinsics is None else colmap.pinhole(intrinsics), sift
+    )
+    pairs = _pairs(_descriptors(database, names), config, seed)
     colmap.match(database, ((names[first], names[second]) for first, second in pairs), seed)
-    if _telling(database) < options.least_telling:
+    if _parallax_share(database) < LEAST_PARALLAX_PAIRS:
         log("between none of the pictures the camera moves sideways: it turns on the spot")
         return None
     mapping = colmap.mapping_options(seed, calibrate=intrinsics is None)
-    mapping.min_model_size = options.least_keyframes
+    mapping.min_model_size = LEAST_KEYFRAMES
     models = pycolmap.incremental_mapping(database, pictures, workspace, mapping)
     sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     log(f"COLMAP: {len(pairs)} pairs of {len(names)} keyframes; models of {sizes or 'no'} pictures")
-    if not sizes or sizes[0] < options.least_keyframes:
+    if not sizes or sizes[0] < LEAST_KEYFRAMES:
         return None
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     camera = next(iter(largest.cameras.values()))
     radial = float(camera.params[3]) if intrinsics is None else 0.0
-    return Structure(sparse_from_model(largest), camera.calibration_matrix(), radial, len(sizes))
+    return Structure(read_sparse_model(largest), camera.calibration_matrix(), radial, len(sizes))
 
 
-def _telling(database: Path) -> float:
+def _parallax_share(database: Path) -> float:
     """Return the share of matched pairs that only two different places explain."""
-    places = (pycolmap.TwoViewGeometryConfiguration.CALIBRATED, pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED)
+    places = (
+        pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+        pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED,
+    )
     with pycolmap.Database.open(database) as table:
         kinds = [geometry.config for geometry in table.read_two_view_geometries()[1]]
-    return float(np.mean([pycolmap.TwoViewGeometryConfiguration(kind) in places for kind in kinds])) if kinds else 0.0
+    return (
+        float(np.mean([pycolmap.TwoViewGeometryConfiguration(kind) in places for kind in kinds]))
+        if kinds
+        else 0.0
+    )
 
 
 def _descriptors(database: Path, names: list[str]) -> list[UInt8[np.ndarray, "feature 128"]]:
@@ -134,22 +152,34 @@ def _descriptors(database: Path, names: list[str]) -> list[UInt8[np.ndarray, "fe
         return [np.asarray(table.read_descriptors(images[name]).data) for name in names]
 
 
-def _pairs(descriptors: list[np.ndarray], options: StructureOptions, seed: int) -> Int[np.ndarray, "pair 2"]:
-    """Pair each keyframe with its successors and with those that share the most words (weighted by rarity)."""
+def _pairs(
+    descriptors: list[np.ndarray], config: PhotogrammetryConfig, seed: int
+) -> Int[np.ndarray, "pair 2"]:
+    """Pair each keyframe with its successors and with those that share the most words (weighted by
+    rarity).
+    """
     count = len(descriptors)
     first, second = np.triu_indices(count, 1)
-    chosen = second - first <= options.overlap
-    alike = _likeness([np.sqrt(rows.astype(np.float32)) for rows in descriptors], options.words, seed)
+    chosen = second - first <= config.overlap
+    similarity = _bag_of_words_similarity(
+        [np.sqrt(rows.astype(np.float32)) for rows in descriptors], VISUAL_WORDS, seed
+    )
     for key in range(count):
-        others = np.argsort(-np.where(np.abs(np.arange(count) - key) <= options.overlap, -1.0, alike[key]), kind="stable")
-        for other in others[: options.look_alikes]:
-            if alike[key, other] > 0 and abs(other - key) > options.overlap:
+        others = np.argsort(
+            -np.where(np.abs(np.arange(count) - key) <= config.overlap, -1.0, similarity[key]), kind="stable"
+        )
+        for other in others[: config.retrieved]:
+            if similarity[key, other] > 0 and abs(other - key) > config.overlap:
                 chosen |= (first == min(key, other)) & (second == max(key, other))
     return np.stack([first[chosen], second[chosen]], axis=1)
 
 
-def _likeness(descriptors: list[np.ndarray], words: int, seed: int) -> Float[np.ndarray, "key key"]:
-    """Return the cosine of the keyframes' word histograms, words weighted by their rarity (Sivic and Zisserman 2003)."""
+def _bag_of_words_similarity(
+    descriptors: list[np.ndarray], words: int, seed: int
+) -> Float[np.ndarray, "key key"]:
+    """Return the cosine of the keyframes' word histograms, words weighted by their rarity (Sivic and
+    Zisserman 2003).
+    """
     everything = np.concatenate(descriptors)
     sample = everything[np.random.default_rng(seed).permutation(len(everything))[: 40 * words]]
     if len(sample) < words:
@@ -157,7 +187,12 @@ def _likeness(descriptors: list[np.ndarray], words: int, seed: int) -> Float[np.
     cv2.setRNGSeed(seed)
     centres = cv2.kmeans(sample, words, None, (cv2.TERM_CRITERIA_MAX_ITER, 8, 0), 1, cv2.KMEANS_PP_CENTERS)[2]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    counts = np.stack([np.bincount([match.trainIdx for match in matcher.match(rows, centres)], minlength=words) for rows in descriptors])
+    counts = np.stack(
+        [
+            np.bincount([match.trainIdx for match in matcher.match(rows, centres)], minlength=words)
+            for rows in descriptors
+        ]
+    )
     weighted = np.sqrt(counts) * np.log(len(counts) / np.maximum((counts > 0).sum(0), 1))
     weighted /= np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-9)
     return weighted @ weighted.T

@@ -1,7 +1,7 @@
 """Depth from posed pictures: a plane sweep, smoothed along eight paths, kept where other pictures agree.
 
-Everything is in the units of the poses. `neighbours` picks the pictures that each one is compared with, `sweep` makes
-one picture's depth, `agreement` counts how many others confirm it.
+Everything is in the units of the poses. `neighbours` picks the pictures that each one is compared with,
+`sweep` makes one picture's depth, `agreement` counts how many others confirm it.
 """
 
 from dataclasses import dataclass
@@ -11,38 +11,34 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numba import njit
 
-from pipeline.space import cameras, rigid
-from pipeline.space.sparse import Sparse
+from pipeline.geometry import cameras, rigid
+from pipeline.mapping.sparse_model import SparseModel
+from stages.extract_frames.config import PhotogrammetryConfig
 
 PATHS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
-@dataclass(frozen=True)
-class SweepOptions:
-    """How depth is made from posed pictures."""
+BASELINE_DEG = (2.0, 25.0)
+"""angles between rays to a shared point that pictures are chosen for, degrees"""
+LEAST_SHARED = 8
+"""points that two pictures must share to be compared"""
+DEPTH_QUANTILES, DEPTH_MARGINS = (0.01, 0.99), (0.6, 1.6)
+"""the sweep reaches from the nearest to the farthest point in view, and so much beyond"""
+WINDOW_PX = (7, 7)
+"""size of the compared patches"""
+CONTRAST_FLOOR = 3.0
+"""grey levels (of 255) of contrast below which a patch carries little information"""
+SMALL_STEP, LARGE_STEP = np.float32(0.04), np.float32(0.5)
+"""P1 and P2 of semi-global matching, in correlation.
 
-    side_px: int = 224
-    """Longer side of the depth pictures."""
-    planes: int = 112
-    """Distances that are tried, evenly spaced in 1 / distance."""
-    sources: int = 6
-    """Pictures that each one is compared with."""
-    angle_deg: tuple[float, float] = (2.0, 25.0)
-    """Angles between rays to a shared point that pictures are chosen for, degrees."""
-    window_px: int = 7
-    """Side of the compared patches."""
-    texture: float = 3.0
-    """Grey levels (of 255) of contrast below which a patch says little."""
-    small_step: float = 0.04
-    """Cost of a step of one plane between neighbouring pixels, in correlation."""
-    large_step: float = 0.5
-    """Cost of a larger step."""
-    agree_share: float = 0.03
-    """Relative difference of depth within which another picture agrees."""
+A step of one plane between neighbours, and a larger one
+"""
+AGREE_SHARE = 0.03
+"""relative difference of depth within which another picture agrees"""
 
 
 @dataclass(frozen=True)
-class View:
+class SweepView:
     """One posed picture, at the size of its depth."""
 
     gray: Float[np.ndarray, "height width"]
@@ -51,78 +47,98 @@ class View:
     world_from_camera: Float[np.ndarray, "4 4"]
 
 
-def neighbours(sparse: Sparse, options: SweepOptions) -> list[Int[np.ndarray, "source"]]:
+def neighbours(sparse: SparseModel, config: PhotogrammetryConfig) -> list[Int[np.ndarray, "source"]]:
     """Pick for each key the others that share the most points under a good angle, best first."""
     count = len(sparse.frame)
     seen = np.zeros((count, len(sparse.points_model)), bool)
     seen[sparse.observed_key, sparse.observed_point] = True
     centres = sparse.model_from_camera[:, :3, 3]
-    low, high = options.angle_deg
+    low, high = BASELINE_DEG
     chosen = []
     for key in range(count):
         shared = seen & seen[key]
         score = np.zeros(count)
-        for other in np.flatnonzero(shared.sum(1) >= 8):
+        for other in np.flatnonzero(shared.sum(1) >= LEAST_SHARED):
             if other != key:
                 points = sparse.points_model[shared[other]]
                 angle = _angle_deg(centres[key] - points, centres[other] - points)
                 score[other] = np.clip(np.minimum(angle / low, high / np.maximum(angle, 1e-6)), 0, 1).sum()
         order = np.argsort(-score, kind="stable")
-        chosen.append(order[score[order] > 0][: options.sources])
+        chosen.append(order[score[order] > 0][: config.depth_sources])
     return chosen
 
 
-def depth_range(sparse: Sparse, key: int) -> tuple[float, float]:
-    """Return the (nearest, furthest) distance worth trying for a key: that of the points it sees, and some more."""
+def depth_range(sparse: SparseModel, key: int) -> tuple[float, float]:
+    """Return the (nearest, furthest) distance worth trying for a key.
+
+    That of the points it sees, and some more.
+    """
     points = sparse.points_model[sparse.observed_point[sparse.observed_key == key]]
     z = rigid.apply(rigid.inverse(sparse.model_from_camera[key]), points)[:, 2]
-    near, far = np.quantile(z[z > 0], [0.01, 0.99])
-    return 0.6 * float(near), 1.6 * float(far)
+    near, far = np.quantile(z[z > 0], DEPTH_QUANTILES)
+    return DEPTH_MARGINS[0] * float(near), DEPTH_MARGINS[1] * float(far)
 
 
-def sweep(view: View, others: list[View], reach: tuple[float, float], options: SweepOptions) -> Float[np.ndarray, "height width"]:
-    """Return the depth at which the patches of a picture look most alike in the others, smooth but for edges."""
-    distances = 1 / np.linspace(1 / reach[1], 1 / reach[0], options.planes)
-    alike = np.stack([_correlation(view, other, distances, options) for other in others])
-    cost = _combined(alike)
+def sweep(
+    view: SweepView, others: list[SweepView], reach: tuple[float, float], config: PhotogrammetryConfig
+) -> Float[np.ndarray, "height width"]:
+    """Return the depth at which the patches of a picture correlate best with the others, smooth but for
+    edges.
+    """
+    distances = 1 / np.linspace(1 / reach[1], 1 / reach[0], config.depth_planes)
+    correlation = np.stack([_correlation(view, other, distances) for other in others])
+    cost = _combined(correlation)
     total = np.zeros_like(cost)
     for down, right in PATHS:
-        _add_path(cost, total, down, right, np.float32(options.small_step), np.float32(options.large_step), view.gray)
+        _add_path(cost, total, down, right, SMALL_STEP, LARGE_STEP, view.gray)
     return _between(total, distances)
 
 
-def _correlation(view: View, other: View, distances: np.ndarray, options: SweepOptions) -> Float[np.ndarray, "plane height width"]:
-    """Return the normalised correlation of patches, plane by plane; -1 where the other picture does not reach."""
+def _correlation(
+    view: SweepView, other: SweepView, distances: np.ndarray
+) -> Float[np.ndarray, "plane height width"]:
+    """Return the normalised correlation of patches, plane by plane.
+
+    -1 where the other picture does not reach.
+    """
     height, width = view.gray.shape
-    window = (options.window_px, options.window_px)
 
     def mean(picture):
-        return cv2.boxFilter(picture, cv2.CV_32F, window)
+        return cv2.boxFilter(picture, cv2.CV_32F, WINDOW_PX)
 
     relative = rigid.inverse(other.world_from_camera) @ view.world_from_camera
     centred = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
     to_pixel, from_pixel = centred @ other.intrinsics, np.linalg.inv(centred @ view.intrinsics)
     own_mean = mean(view.gray)
     own_variance = np.maximum(mean(view.gray**2) - own_mean**2, 0)
-    inside, alike = np.full(other.gray.shape, 255, np.uint8), np.empty((len(distances), height, width), np.float32)
+    inside, correlation = (
+        np.full(other.gray.shape, 255, np.uint8),
+        np.empty((len(distances), height, width), np.float32),
+    )
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     for plane, distance in enumerate(distances):
         through = relative[:3, :3].copy()
         through[:, 2] += relative[:3, 3] / distance
         homography = to_pixel @ through @ from_pixel
-        warped = cv2.warpPerspective(other.gray, homography, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        known = cv2.warpPerspective(inside, homography, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+        warped = cv2.warpPerspective(
+            other.gray, homography, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+        known = cv2.warpPerspective(
+            inside, homography, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        )
         their_mean = mean(warped)
         variance = np.maximum(mean(warped**2) - their_mean**2, 0)
         together = mean(warped * view.gray) - their_mean * own_mean
-        alike[plane] = np.where(known > 0, together / (np.sqrt(own_variance * variance) + options.texture**2), -1)
-    return alike
+        correlation[plane] = np.where(
+            known > 0, together / (np.sqrt(own_variance * variance) + CONTRAST_FLOOR**2), -1
+        )
+    return correlation
 
 
 @njit(cache=True, nogil=True)
-def _combined(alike):
+def _combined(correlation):
     """Average 1 - correlation over the better half of the pictures that reach a pixel; 1 where none does."""
-    sources, planes, height, width = alike.shape
+    sources, planes, height, width = correlation.shape
     cost = np.ones((planes, height, width), np.float32)
     best = np.empty(sources, np.float32)
     for plane in range(planes):
@@ -130,7 +146,7 @@ def _combined(alike):
             for column in range(width):
                 count = 0
                 for source in range(sources):
-                    value = alike[source, plane, row, column]
+                    value = correlation[source, plane, row, column]
                     if value > -1:
                         place = count
                         while place > 0 and best[place - 1] < value:
@@ -149,7 +165,10 @@ def _combined(alike):
 
 @njit(cache=True, nogil=True)
 def _add_path(cost, total, down, right, small, large, gray):
-    """Add one direction of semi-global matching (Hirschmueller 2008); large steps are cheaper across edges."""
+    """Add one direction of semi-global matching (Hirschmueller 2008).
+
+    Large steps are cheaper across edges.
+    """
     planes, height, width = cost.shape
     path = np.zeros((height, width, planes), np.float32)
     for step_row in range(height):
@@ -175,7 +194,9 @@ def _add_path(cost, total, down, right, small, large, gray):
                 total[plane, row, column] += path[row, column, plane]
 
 
-def _between(total: Float[np.ndarray, "plane height width"], distances: np.ndarray) -> Float[np.ndarray, "height width"]:
+def _between(
+    total: Float[np.ndarray, "plane height width"], distances: np.ndarray
+) -> Float[np.ndarray, "height width"]:
     """Return the distance of least cost, between planes by a parabola; 0 at the ends of the range."""
     best = total.argmin(0)
     inner = np.clip(best, 1, len(distances) - 2)
@@ -188,22 +209,31 @@ def _between(total: Float[np.ndarray, "plane height width"], distances: np.ndarr
 
 def agreement(
     depth: Float[np.ndarray, "height width"],
-    view: View,
-    others: list[tuple[Float[np.ndarray, "height width"], View]],
-    options: SweepOptions,
+    view: SweepView,
+    others: list[tuple[Float[np.ndarray, "height width"], SweepView]],
 ) -> UInt8[np.ndarray, "height width"]:
-    """Count, per pixel, the other pictures whose depth there says the same."""
-    points_world = rigid.apply(view.world_from_camera, cameras.back_project(depth, view.intrinsics).reshape(-1, 3))
+    """Count, per pixel, the other pictures that agree with the depth."""
+    points_world = rigid.apply(
+        view.world_from_camera, cameras.back_project(depth, view.intrinsics).reshape(-1, 3)
+    )
     count = np.zeros(depth.size, np.uint8)
     for theirs, other in others:
-        pixel, z = cameras.project(rigid.apply(rigid.inverse(other.world_from_camera), points_world), other.intrinsics)
-        inside = np.flatnonzero((depth.ravel() > 0) & (z > 0) & (pixel >= 0).all(1) & (pixel < theirs.shape[::-1]).all(1))
+        pixel, z = cameras.project(
+            rigid.apply(rigid.inverse(other.world_from_camera), points_world), other.intrinsics
+        )
+        inside = np.flatnonzero(
+            (depth.ravel() > 0) & (z > 0) & (pixel >= 0).all(1) & (pixel < theirs.shape[::-1]).all(1)
+        )
         column, row = np.floor(pixel[inside]).astype(int).T
         met = theirs[row, column]
-        count[inside] += (met > 0) & (np.abs(met - z[inside]) < options.agree_share * z[inside])
+        count[inside] += (met > 0) & (np.abs(met - z[inside]) < AGREE_SHARE * z[inside])
     return count.reshape(depth.shape)
 
 
-def _angle_deg(first: Float[np.ndarray, "ray 3"], second: Float[np.ndarray, "ray 3"]) -> Float[np.ndarray, "ray"]:
-    cosine = (first * second).sum(1) / np.maximum(np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1), 1e-12)
+def _angle_deg(
+    first: Float[np.ndarray, "ray 3"], second: Float[np.ndarray, "ray 3"]
+) -> Float[np.ndarray, "ray"]:
+    cosine = (first * second).sum(1) / np.maximum(
+        np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1), 1e-12
+    )
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))

@@ -1,4 +1,4 @@
-"""Write frames as the ``frames/<id>`` artifact and say how good they are."""
+"""Write frames as the ``frames/<id>`` artifact and check their quality."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -8,10 +8,17 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline import qa
-from pipeline.errors import InputError
-from pipeline.files import arrays, images, meshes
-from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, Frame, Plan, quality_of
+from pipeline.core.errors import InputError
+from pipeline.data import images, ply, qa
+from pipeline.data.clips import FRAMES
+from pipeline.recordings.extraction import (
+    DARK,
+    MEASURED,
+    RELATIVE,
+    ExtractedFrame,
+    ExtractionPlan,
+    quality_of,
+)
 from pipeline.recordings.recording import Recording, damaged
 
 MOST_LOST = 0.5
@@ -23,7 +30,7 @@ SHEET_HEIGHT_PX = 200
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenFrames:
     """What came out of a recording."""
 
     kept: Bool[np.ndarray, "frame"]
@@ -37,10 +44,13 @@ class Written:
     depth_strip: UInt8[np.ndarray, "height width 3"]
 
 
-def write_frames(folder: Path, frames: Iterable[Frame | None], *, total: int, min_depth_valid: float, where: str) -> Written:
+def write_frames(
+    folder: Path, frames: Iterable[ExtractedFrame | None], *, total: int, min_depth_valid: float, where: str
+) -> WrittenFrames:
     """Write the frames that have enough depth, numbered without gaps.
 
-    Raises InputError CAP-007 when fewer than five have, CAP-001 when the file is damaged in more than half of them.
+    Raises InputError CAP-007 when fewer than five have, CAP-001 when the file is damaged in more than
+    half of them.
     """
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir()
@@ -63,41 +73,46 @@ def write_frames(folder: Path, frames: Iterable[Frame | None], *, total: int, mi
     if lost > MOST_LOST * total:
         raise damaged(where, f"{lost} of {total} pictures cannot be decoded")
     if len(statistics) < LEAST_FRAMES:
-        what = f"{min_depth_valid:.0%} of the depth is known in {len(statistics)} of {total} frames; {LEAST_FRAMES} are the least"
+        what = (
+            f"{min_depth_valid:.0%} of the depth is known in {len(statistics)} of "
+            f"{total} frames; {LEAST_FRAMES} are the least"
+        )
         remedy = "record some seconds at least, things within 5 m, in light, with the LiDAR camera"
         raise InputError("CAP-007", what=what, where=where, remedy=remedy)
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))
-    return Written(kept, lost / total, *np.array(statistics).T, color_strip, depth_strip)
+    return WrittenFrames(kept, lost / total, *np.array(statistics).T, color_strip, depth_strip)
 
 
-def write_table(folder: Path, recording: Recording, plan: Plan, written: Written) -> None:
+def write_table(folder: Path, recording: Recording, plan: ExtractionPlan, written: WrittenFrames) -> None:
     """Write ``frames.npz`` for the kept frames."""
     kept = written.kept
-    odometry = {} if plan.odometry_from_camera is None else {"odometry_from_camera": plan.odometry_from_camera[kept]}
-    arrays.save(
+    odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[kept]
+    FRAMES.save(
         folder / "frames.npz",
         timestamp_s=plan.timestamp_s[kept],
         intrinsics=plan.intrinsics[kept],
         depth_intrinsics=plan.depth_intrinsics[kept],
-        **odometry,
+        odometry_from_camera=odometry,
         gravity_known=np.array(plan.gravity_known),
         scale=np.array(plan.scale),
-        source_index=recording.index[plan.chosen][kept].astype(np.int64),
-        quarter_turns=np.array(plan.quarter_turns, np.int64),
-        sharpness=written.sharpness.astype(np.float32),
-        brightness=written.brightness.astype(np.float32),
-        depth_valid=written.depth_valid.astype(np.float32),
-        quality=quality_of(written.sharpness, written.brightness, written.depth_valid).astype(np.float32),
+        source_index=recording.index[plan.chosen][kept],
+        quarter_turns=np.array(plan.quarter_turns),
+        sharpness=written.sharpness,
+        brightness=written.brightness,
+        depth_valid=written.depth_valid,
+        quality=quality_of(written.sharpness, written.brightness, written.depth_valid),
     )
 
 
-def write_mesh(folder: Path, recording: Recording, plan: Plan) -> None:
-    """Write the app's own surface of the room as ``mesh.ply`` where it has one and device poses tell where it stands."""
+def write_mesh(folder: Path, recording: Recording, plan: ExtractionPlan) -> None:
+    """Write the app's own surface of the room as ``mesh.ply`` where it has one and device poses give its
+    place.
+    """
     if recording.read_mesh is not None and plan.odometry_from_camera is not None:
-        meshes.write_ply(folder / "mesh.ply", recording.read_mesh())
+        ply.write_ply(folder / "mesh.ply", recording.read_mesh())
 
 
-def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float) -> None:
+def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *, rate_hz: float) -> None:
     """Write the stage's own judgement: what was understood, how much of it is usable, a contact sheet."""
     timestamp_s = plan.timestamp_s[written.kept]
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
@@ -109,12 +124,21 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
         qa.Check("frames a second", (len(timestamp_s) - 1) / max(duration_s, 1e-6), "Hz"),
         qa.Check("missing ticks", 100 * missing, "%", warn=20.0),
         qa.Check("dark frames", 100 * float((written.brightness < DARK).mean()), "%", warn=20.0),
-        qa.Check("blurred frames", 100 * float((written.sharpness < 0.4 * median_sharpness).mean()), "%", warn=25.0),
+        qa.Check(
+            "blurred frames", 100 * float((written.sharpness < 0.4 * median_sharpness).mean()), "%", warn=25.0
+        ),
         qa.Check("known depth", 100 * float(written.depth_valid.mean()), "%", warn=50.0, better="higher"),
-        qa.Check("frames dropped for lack of depth", 100 * (float((~written.kept).mean()) - written.lost), "%", warn=10.0),
+        qa.Check(
+            "frames dropped for lack of depth",
+            100 * (float((~written.kept).mean()) - written.lost),
+            "%",
+            warn=10.0,
+        ),
         qa.Check("damaged frames", 100 * written.lost, "%", warn=0.0),
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
-        qa.Check("device poses usable", float(plan.odometry_from_camera is not None), "", warn=0.5, better="higher"),
+        qa.Check(
+            "device poses usable", float(plan.odometry_from_camera is not None), "", warn=0.5, better="higher"
+        ),
         _check_of_poses(plan),
     ]
     pictures = [
@@ -130,19 +154,36 @@ def report_quality(folder: Path, plan: Plan, written: Written, *, rate_hz: float
     )
 
 
-def _check_of_poses(plan: Plan) -> qa.Check:
-    """Say how well device poses fit the depth; where both were made from pictures, what its lengths are worth."""
-    check = plan.self_check
+def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
+    """Say how well device poses fit the depth.
+
+    Where both were made from pictures, what its lengths are worth.
+    """
+    check = plan.pose_check
     if plan.scale != MEASURED:
-        told = "relative: lengths are no metres" if plan.scale == RELATIVE else f"metres from the depth of {plan.scale}"
-        return qa.Check(f"scale known ({check.reason}; {told})", float(plan.scale != RELATIVE), "", warn=0.5, better="higher")
+        scale_text = (
+            "relative: lengths are no metres"
+            if plan.scale == RELATIVE
+            else f"metres from the depth of {plan.scale}"
+        )
+        return qa.Check(
+            f"scale known ({check.reason}; {scale_text})",
+            float(plan.scale != RELATIVE),
+            "",
+            warn=0.5,
+            better="higher",
+        )
     residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None
-    return qa.Check(f"device poses against depth ({check.reason})", residual_mm, "mm", warn=1000 * check.tolerance_m)
+    return qa.Check(
+        f"device poses against depth ({check.reason})", residual_mm, "mm", warn=1000 * check.tolerance_m
+    )
 
 
 def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
     scale = SHEET_HEIGHT_PX / image.shape[0]
-    return cv2.resize(image, (max(round(image.shape[1] * scale), 1), SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        image, (max(round(image.shape[1] * scale), 1), SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA
+    )
 
 
 def _colored_depth(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:

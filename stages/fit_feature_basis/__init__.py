@@ -1,1 +1,3 @@
-"""Fit one linear feature basis to all recordings that models may learn from; `sampling` draws the descriptors."""
+"""Fit one linear feature basis to all recordings that models may learn from; `sampling` draws the
+descriptors.
+"""

@@ -5,19 +5,22 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files.clips import Clip
+from pipeline.data.clips import Clip
 
 Describe = Callable[[np.ndarray, int], np.ndarray]
+FRAMES_PER_RECORDING = 16
+"""Frames described per recording: a minute at one every four seconds, so that each recording counts alike."""
+STRIDE_PX = 16
+"""Distance between sampled descriptors, colour pixels: about their own size, nearer ones repeat each
+other."""
 
 
-def sample_descriptors(
-    clips: Iterable[Clip], describe: Describe, *, frames_per_clip: int, stride_px: int
-) -> Float[np.ndarray, "sample channel"]:
-    """Describe ``frames_per_clip`` frames of each recording, evenly spread in time."""
-    return np.concatenate([_of_clip(clip, describe, frames_per_clip, stride_px) for clip in clips])
+def sample_descriptors(clips: Iterable[Clip], describe: Describe) -> Float[np.ndarray, "sample channel"]:
+    """Describe `FRAMES_PER_RECORDING` frames of each recording, evenly spread in time."""
+    return np.concatenate([_of_clip(clip, describe) for clip in clips])
 
 
-def _of_clip(clip: Clip, describe: Describe, frames: int, stride_px: int) -> Float[np.ndarray, "sample channel"]:
-    chosen = np.unique(np.linspace(0, len(clip) - 1, frames).round().astype(int))
-    described = (describe(clip.color(int(frame)), stride_px) for frame in chosen)
+def _of_clip(clip: Clip, describe: Describe) -> Float[np.ndarray, "sample channel"]:
+    chosen = np.unique(np.linspace(0, len(clip) - 1, FRAMES_PER_RECORDING).round().astype(int))
+    described = (describe(clip.color(int(frame)), STRIDE_PX) for frame in chosen)
     return np.concatenate([raw.reshape(-1, raw.shape[-1]) for raw in described])

@@ -1,26 +1,16 @@
 """Motion capture as joint positions becomes a root and bones, whatever the skeleton.
 
-Nobody says which joint hangs on which: joints that keep their distance are joined (a minimum spanning tree over how
-much distances vary), and each joint's bone points to its neighbour away from the root.
+Nobody says which joint hangs on which: joints that keep their distance are joined (a minimum spanning tree
+over how much distances vary), and each joint's bone points to its neighbour away from the root.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from pipeline.space import rigid
-
-
-@dataclass(frozen=True)
-class Skeleton:
-    """What must be known of a motion capture."""
-
-    rate_hz: float
-    root: int
-    front: int
+from pipeline.geometry import rigid
+from stages.read_trajectories.config import Config
 
 
 def parents(joints: Float[np.ndarray, "frame joint 3"], root: int) -> Int[np.ndarray, "joint"]:
@@ -32,20 +22,28 @@ def parents(joints: Float[np.ndarray, "frame joint 3"], root: int) -> Int[np.nda
     return np.where(before < 0, -1, before)
 
 
-def root_from_joints(joints: Float[np.ndarray, "frame joint 3"], skeleton: Skeleton) -> Float[np.ndarray, "frame 4 4"]:
+def root_from_joints(
+    joints: Float[np.ndarray, "frame joint 3"], config: Config
+) -> Float[np.ndarray, "frame 4 4"]:
     """Return ``world_from_agent``: at the root joint, +z to the front joint, +y as far up as that allows."""
-    forward = joints[:, skeleton.front] - joints[:, skeleton.root]
+    forward = joints[:, config.front_joint] - joints[:, config.root_joint]
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     side = np.cross([0.0, 1.0, 0.0], forward)
     side = side / np.linalg.norm(side, axis=-1, keepdims=True)
-    return rigid.make(np.stack([side, np.cross(forward, side), forward], axis=-1), joints[:, skeleton.root])
+    return rigid.make(
+        np.stack([side, np.cross(forward, side), forward], axis=-1), joints[:, config.root_joint]
+    )
 
 
 def bones_from_joints(
     joints_agent: Float[np.ndarray, "frame joint 3"], parent: Int[np.ndarray, "joint"]
 ) -> tuple[Float[np.ndarray, "frame joint 4 4"], Float[np.ndarray, "joint 4 4"]]:
-    """Return ``agent_from_bone`` and its rest, one bone per joint, turned as its direction turns against the mean."""
-    child = np.array([next((c for c in range(len(parent)) if parent[c] == j), -1) for j in range(len(parent))])
+    """Return ``agent_from_bone`` and its rest, one bone per joint, turned as its direction turns against the
+    mean.
+    """
+    child = np.array(
+        [next((c for c in range(len(parent)) if parent[c] == j), -1) for j in range(len(parent))]
+    )
     other = np.where(child >= 0, child, parent)
     direction = _unit(joints_agent[:, other] - joints_agent)
     rest = np.tile(np.eye(4), (len(parent), 1, 1))
@@ -57,8 +55,12 @@ def _unit(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True).clip(1e-9)
 
 
-def _shortest_turn(start: Float[np.ndarray, "joint 3"], end: Float[np.ndarray, "frame joint 3"]) -> Float[np.ndarray, "frame joint 3 3"]:
-    """Return the smallest rotations that take ``start`` to ``end``; none where a joint has no direction (twin joints)."""
+def _shortest_turn(
+    start: Float[np.ndarray, "joint 3"], end: Float[np.ndarray, "frame joint 3"]
+) -> Float[np.ndarray, "frame joint 3 3"]:
+    """Return the smallest rotations that take ``start`` to ``end``; none where a joint has no direction (twin
+    joints).
+    """
     start = np.broadcast_to(start, end.shape)
     axis = np.cross(start, end)
     angle = np.arctan2(np.linalg.norm(axis, axis=-1), (start * end).sum(-1))

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.models.perception import FeatureVolume
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.core.errors import InputError
 from stages.read_trajectories.tables import columns, numbers
 
 CHANNELS = 16
@@ -14,25 +14,36 @@ FLOOR, OBSTACLE = 0, 1
 """Channels that are 1 in the floor's and in obstacles' voxels."""
 MARGIN_M = 1.0
 HEADROOM_M = 1.0
+OBSTACLE_TOP_M = 1.0
+"""Height of obstacles whose table has none, metres above the floor: as high as furniture."""
 MOST_VOXELS = 10_000_000
 
 
 def no_scene() -> FeatureVolume:
     """Return a volume of one voxel of which nothing is known."""
-    return FeatureVolume(np.zeros((CHANNELS, 1, 1, 1), np.float16), np.full((1, 1, 1), 2, np.uint8), np.zeros(3), 0.1)
+    return FeatureVolume(
+        np.zeros((CHANNELS, 1, 1, 1), np.float16), np.full((1, 1, 1), 2, np.uint8), np.zeros(3), 0.1
+    )
 
 
-def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: float, top_m: float) -> FeatureVolume:
-    """Read occupied cells (x, z, optionally bottom and top) around the animal's ways. Raises TRJ-001 as `columns` does."""
+def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: float) -> FeatureVolume:
+    """Read occupied cells (x, z, optionally bottom and top) around the animal's ways. Raises TRJ-001 as
+    `columns` does.
+    """
     table = columns(path, ("x", "z"))
     x, z = numbers(path, table, "x"), numbers(path, table, "z")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):
-        raise InputError("TRJ-001", "has cells without x or z", str(path), "give both of every occupied cell, metres")
+        raise InputError(
+            "TRJ-001", "has cells without x or z", str(path), "give both of every occupied cell, metres"
+        )
     floor = float(np.nanmin(visited[:, 1])) if len(visited) else 0.0
     floor = 0.0 if 0.0 <= floor < HEADROOM_M else floor
-    told = {name: numbers(path, table, name) if name in table else np.full(len(x), np.nan) for name in ("bottom", "top")}
-    bottom = np.where(np.isfinite(told["bottom"]), told["bottom"], floor)
-    top = np.where(np.isfinite(told["top"]), told["top"], floor + top_m)
+    heights = {
+        name: numbers(path, table, name) if name in table else np.full(len(x), np.nan)
+        for name in ("bottom", "top")
+    }
+    bottom = np.where(np.isfinite(heights["bottom"]), heights["bottom"], floor)
+    top = np.where(np.isfinite(heights["top"]), heights["top"], floor + OBSTACLE_TOP_M)
     corners = np.concatenate([np.stack([x, bottom, z], -1), np.stack([x, top, z], -1), visited])
     around = np.array([MARGIN_M, 0.0, MARGIN_M])
     low = np.floor((np.nanmin(corners, axis=0) - around) / cell_m) * cell_m
@@ -40,7 +51,8 @@ def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: f
     high = np.nanmax(corners, axis=0) + around + [0.0, HEADROOM_M, 0.0]
     size = np.ceil((high - low) / cell_m)
     if size.prod() > MOST_VOXELS:
-        what = f"ways and obstacles span {' x '.join(f'{metres:g}' for metres in high - low)} m, too much for cells of {cell_m:g} m"
+        span = " x ".join(f"{metres:g}" for metres in high - low)
+        what = f"tracks and obstacles span {span} m, too much for cells of {cell_m:g} m"
         raise InputError("TRJ-001", what, str(path), "write metres; or set cell_m in the recipe")
     shape = size.astype(int)
     kind = np.full(shape, -1)

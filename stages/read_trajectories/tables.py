@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.space import rigid
-from stages.read_trajectories.life import APART_S, NOBODY_M, nobody, one_after_another
+from pipeline.core.errors import InputError
+from pipeline.geometry import rigid
+from stages.read_trajectories.motion import ABSENT_OBSERVER_M, CLIP_GAP_S, absent_observer, concatenated_times
 
-NEEDED = ("time", "x", "y", "z", "heading")
-OBSERVER = ("observer_x", "observer_y", "observer_z")
-LONGEST_STEP_S = 1.0
-"""Rows that are typically further apart tell no motion: their times are no seconds."""
+REQUIRED_COLUMNS = ("time", "x", "y", "z", "heading")
+OBSERVER_COLUMNS = ("observer_x", "observer_y", "observer_z")
+MAX_STEP_S = 1.0
+"""Rows that are typically further apart hold no motion: their times are no seconds."""
 SURPLUS = "more cells than the header"
 
 
@@ -25,7 +25,15 @@ def columns(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file, skipinitialspace=True, restkey=SURPLUS)
-            found = {name.strip().lower(): [] for name in rows.fieldnames or ()}
+            names = [name.strip().lower() for name in rows.fieldnames or ()]
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                what, remedy = (
+                    f"column {', '.join(twice)} appears more than once",
+                    "keep one of each, whatever its case",
+                )
+                raise InputError("TRJ-001", what, str(path), remedy)
+            found: dict[str, list[str]] = {name: [] for name in names}
             for row in rows:
                 if SURPLUS in row:
                     remedy = "commas between cells, points in numbers"
@@ -33,10 +41,13 @@ def columns(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
                 for name, value in row.items():
                     found[name.strip().lower()].append((value or "").strip())
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError("TRJ-001", f"cannot be read as CSV: {error}", str(path), "save it as comma-separated UTF-8") from error
+        raise InputError(
+            "TRJ-001", f"cannot be read as CSV: {error}", str(path), "save it as comma-separated UTF-8"
+        ) from error
     missing = [name for name in needed if name not in found]
     if missing:
-        remedy = f"name the columns {','.join(needed)} in the first line, with commas; it says {','.join(found) or 'nothing'}"
+        present = ",".join(found) or "nothing"
+        remedy = f"name the columns {','.join(needed)} in the first line, with commas; it has {present}"
         raise InputError("TRJ-001", f"has no column {', '.join(missing)}", str(path), remedy)
     return found
 
@@ -48,49 +59,66 @@ def numbers(path: Path, table: dict[str, list[str]], name: str) -> Float[np.ndar
         return np.where(np.isinf(found), np.nan, found)
     except ValueError as error:
         raise InputError(
-            "TRJ-001", f"column {name} is not numeric: {error}", str(path), "one number per cell, metres or seconds"
+            "TRJ-001",
+            f"column {name} is not numeric: {error}",
+            str(path),
+            "one number per cell, metres or seconds",
         ) from error
 
 
 def motion_from_csv(
     path: Path,
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame 4 4"]]:
-    """Return times, ``world_from_agent`` and ``world_from_camera``; ids follow each other on one clock, as do stretches of one id
-    that lie further apart than clips are put.
+    """Return times, ``world_from_agent`` and ``world_from_camera``; ids follow each other on one clock, as do
+    stretches of one id that lie further apart than clips are put.
 
     Rows without a position are frames in which the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
     """
-    table = columns(path, NEEDED)
-    observed = any(name in table for name in OBSERVER)
+    table = columns(path, REQUIRED_COLUMNS)
+    observed = any(name in table for name in OBSERVER_COLUMNS)
     if observed:
-        columns(path, OBSERVER)
-    value = {name: numbers(path, table, name) for name in (*NEEDED, *(OBSERVER if observed else ()))}
+        columns(path, OBSERVER_COLUMNS)
+    value = {
+        name: numbers(path, table, name)
+        for name in (*REQUIRED_COLUMNS, *(OBSERVER_COLUMNS if observed else ()))
+    }
     if not np.isfinite(value["time"]).all() or not len(value["time"]):
-        raise InputError("TRJ-002", "has rows without a time, or no rows", str(path), "give every row its time in seconds")
+        raise InputError(
+            "TRJ-002", "has rows without a time, or no rows", str(path), "give every row its time in seconds"
+        )
     names = table.get("id", [""] * len(value["time"]))
     rows = [np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)]
     rows = [mine[np.argsort(value["time"][mine], kind="stable")] for mine in rows]
     _refuse_impossible_times(path, [value["time"][mine] for mine in rows])
-    rows = [clip for mine in rows for clip in np.split(mine, 1 + np.flatnonzero(np.diff(value["time"][mine]) > APART_S))]
+    rows = [
+        clip
+        for mine in rows
+        for clip in np.split(mine, 1 + np.flatnonzero(np.diff(value["time"][mine]) > CLIP_GAP_S))
+    ]
     order = np.concatenate(rows)
     turn = np.zeros((len(order), 3))
     turn[:, 1] = value["heading"][order]
-    agent = rigid.make(rigid.rotation_from_vector(np.nan_to_num(turn)), np.stack([value[axis][order] for axis in "xyz"], axis=-1))
+    agent = rigid.make(
+        rigid.rotation_from_vector(np.nan_to_num(turn)),
+        np.stack([value[axis][order] for axis in "xyz"], axis=-1),
+    )
     agent[~np.isfinite(turn[:, 1])] = np.nan
-    camera = nobody(len(order))
+    camera = absent_observer(len(order))
     if observed:
-        seen = np.stack([value[name][order] for name in OBSERVER], axis=-1)
-        camera[:, :3, 3] = np.where(np.isfinite(seen), seen, NOBODY_M)
-    return one_after_another([value["time"][mine] for mine in rows]), agent, camera
+        seen = np.stack([value[name][order] for name in OBSERVER_COLUMNS], axis=-1)
+        camera[:, :3, 3] = np.where(np.isfinite(seen), seen, ABSENT_OBSERVER_M)
+    return concatenated_times([value["time"][mine] for mine in rows]), agent, camera
 
 
 def _refuse_impossible_times(path: Path, clips: list[Float[np.ndarray, "row"]]) -> None:
-    """Raise TRJ-001 for sorted times, one array per id, of which two are the same, or which can be no seconds."""
+    """Raise TRJ-001 for sorted times, one array per id, of which two are the same, or which can be no
+    seconds.
+    """
     for time in clips:
         step = np.diff(time)
         if (step == 0).any():
             what = f"two rows of one id have the same time, {time[1:][step == 0][0]:g} s"
             raise InputError("TRJ-001", what, str(path), "give each animal or clip an id of its own")
-        if len(step) and np.median(step) > LONGEST_STEP_S:
+        if len(step) and np.median(step) > MAX_STEP_S:
             what = f"its rows are typically {np.median(step):g} s apart"
             raise InputError("TRJ-001", what, str(path), "write times in seconds, several rows per second")

@@ -1,1 +1,1 @@
-"""Reconstruct scene, agent and motion in 4D from registered recordings; see `stages/reconstruct/__main__.py`."""
+"""Reconstruct scene, agent and motion in 4D from registered recordings."""

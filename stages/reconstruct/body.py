@@ -1,7 +1,8 @@
-"""The agent's losses: masked depth against its field, its posed surface against picture and mask, and priors on motion.
+"""The agent's losses: masked depth against its field, its posed surface against picture and mask, and priors
+on motion.
 
-They serve twice: `posing` poses the template to the frames before the field learns, and the joint phase uses the same
-terms while everything learns.
+They serve twice: `posing` poses the template to the frames before the field learns, and the joint phase uses
+the same terms while everything learns.
 """
 
 from dataclasses import dataclass
@@ -11,30 +12,50 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor
 from torch.nn import functional
 
-from pipeline.space import cameras, rigid_torch
+from pipeline.geometry import cameras, rigid_torch
 from stages.reconstruct import losses
+from stages.reconstruct.config import LossWeights
 from stages.reconstruct.problem import Problem, pick
 from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
 from stages.reconstruct.scene import Terms
-from stages.reconstruct.settings import Weights
 
 DECIMETRE = 0.1
+"""unit of most losses of the posed surface, metres"""
 REACH_M = 0.05
 """signed distances on the agent are compared up to here"""
 OUTLIER_M = 0.1
-"""measured points this far from the agent count half; all keep pulling, or the body could hide behind the scene"""
+"""measured points this far from the agent count half; all keep pulling, or the body could hide behind the
+scene"""
 ROOT_M, ROOT_RAD = 0.05, 0.05
-"""registered roots are about this good"""
+"""accuracy of registered roots"""
 EDGE_M = 0.01
-"""masks' edges are about this good"""
+"""accuracy of the masks' edges"""
 STILL = 0.01
 """steps of bones and root below this, radians and decimetres, count as none"""
 TOUCH_M, STRIDE_M = 0.02, 0.06
-"""soles this near to something touch it; those that move by more than this from frame to frame are not held"""
+"""soles this near to something touch it; those that move by more than this from frame to frame are not
+held"""
 COVER_M = 0.015
 """a masked pixel is covered when a sample of the posed surface is seen this near to it"""
 MARGIN_M = 0.03
 """the posed surface may stand this much before the measured depth"""
+NEAREST_M = 0.1
+"""points nearer to the camera than this are not in view"""
+OUTSIDE_WEIGHT, UNCOVERED_WEIGHT, FREE_WEIGHT, PENETRATION_WEIGHT = 2.0, 2.0, 0.5, 2.0
+"""posed surface outside the mask, masked pixels that it leaves uncovered, surface in space seen free, surface
+inside solid things; each per decimetre. Tuned on the built-in cat; all are multiplied by
+`LossWeights.posed_surface`"""
+RIGIDITY_WEIGHT, REST_WEIGHT, SMOOTH_WEIGHT, STILL_WEIGHT = 5.0, 0.05, 0.3, 0.1
+"""bones disagree at joints (per decimetre), twists from rest, accelerations, and steps that are not squared:
+most of the time most of an animal rests. All are multiplied by `LossWeights.motion_prior`"""
+COMMON_REST = 20.0
+"""twists that all bones share weigh so many times more at rest: the root has to make them"""
+ROOT_SMOOTH, ROOT_STILL = 4.0, 0.5
+"""the same for the root, relative to bones"""
+ROOT_WEIGHT = 0.005
+"""the agent's root stays near the registered one, per `ROOT_M` and `ROOT_RAD`, squared"""
+FLOOR_EVERY = 4
+"""one in so many surface points is tested for penetration, which costs most"""
 
 
 @dataclass(frozen=True)
@@ -46,7 +67,8 @@ class Pose:
     world_from_agent: Float[Tensor, "frame 4 4"]
     agent_from_bone: Float[Tensor, "frame bone 4 4"]
     world_from_initial: Float[Tensor, "frame 4 4"]
-    """where the agent's root starts, to which priors draw it: as registered, leaning if it sits"""
+    """where the agent's root starts, to which priors draw it: as registered, or leaning in a sitting
+    stance"""
 
     @property
     def agent_from_camera(self) -> Float[Tensor, "frame 4 4"]:
@@ -65,25 +87,37 @@ class Pose:
         return Pose(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
-def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, generator: Generator, near: int = 2) -> Terms:
-    """Fit the agent where the sensor measured it: masked rays ``[frame * ray]`` of known depth, mapped back to rest."""
+def measured_terms(
+    problem: Problem, pose: Pose, rays: Rays, weights: LossWeights, generator: Generator, near: int = 2
+) -> Terms:
+    """Fit the agent where the sensor measured it: masked rays ``[frame * ray]`` of known depth, mapped back
+    to rest.
+    """
     frames, number = len(pose.frame), len(rays) // len(pose.frame)
     offset = (torch.rand(len(rays), near, generator=generator).to(problem.device) * 2 - 1) * REACH_M
     depth = torch.cat([rays.depth[:, None], rays.depth[:, None] + offset], dim=1)
-    points = rigid_torch.apply(pose.agent_from_camera, (rays.direction[:, None] * depth[..., None]).view(frames, -1, 3))
+    points = rigid_torch.apply(
+        pose.agent_from_camera, (rays.direction[:, None] * depth[..., None]).view(frames, -1, 3)
+    )
     rest = problem.body.unpose(points, pose.agent_from_bone)
     encoded = problem.agent.encode(rest.reshape(-1, 3))
     distance = problem.agent.distance(encoded).view(len(rays), 1 + near)
     target = (rays.depth[:, None] - depth) * rays.slope[:, None]
-    color, feature = problem.agent.look(encoded.view(len(rays), 1 + near, -1)[:, 0])
+    color, feature = problem.agent.color_and_feature(encoded.view(len(rays), 1 + near, -1)[:, 0])
     good = (rays.label == AGENT) & (rays.depth > 0)
     trust = problem.trust[rays.frame] / (1 + distance[:, 0].detach().abs() / OUTLIER_M)
     terms = {
-        "agent distance": (weights.agent_distance, (trust[:, None] * losses.truncated_distance(distance, target, REACH_M))[good]),
+        "agent distance": (
+            weights.agent_distance,
+            (trust[:, None] * losses.truncated_distance(distance, target, REACH_M))[good],
+        ),
         "agent color": (weights.color, (trust * losses.color(color, rays.color / 255))[good]),
     }
     if weights.feature:
-        terms["agent feature"] = (weights.feature, (trust * losses.feature(feature, rays.feature / 127))[good])
+        terms["agent feature"] = (
+            weights.feature,
+            (trust * losses.feature(feature, rays.feature / 127))[good],
+        )
     if weights.cycle:
         at_depth, back_to = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
         back = problem.body.pose(back_to, pose.agent_from_bone)
@@ -91,10 +125,17 @@ def measured_terms(problem: Problem, pose: Pose, rays: Rays, weights: Weights, g
     return terms
 
 
-def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, generator: Generator, masked: Rays | None = None) -> Terms:
-    """Keep the posed surface inside the mask, unless something stands before it, and out of space seen free and of solid things.
+def surface_terms(
+    problem: Problem,
+    pose: Pose,
+    number: int,
+    weights: LossWeights,
+    generator: Generator,
+    masked: Rays | None = None,
+) -> Terms:
+    """Keep the posed surface inside the mask unless occluded, out of free space and out of solid things.
 
-    Rays ``[frame * ray]`` on the mask, with or without depth, must be covered too.
+    Rays ``masked`` ``[frame * ray]`` on the mask, with or without depth, must be covered too.
     """
     views, chosen = problem.store.views, pick(len(problem.surface.points), number, generator, problem.device)
     posed = problem.body.pose(problem.surface.points[chosen], pose.agent_from_bone)
@@ -103,34 +144,48 @@ def surface_terms(problem: Problem, pose: Pose, number: int, weights: Weights, g
     size_px = views.size_px[pose.frame]
     outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel, size_px)
     with torch.no_grad():
-        measured, nearest = (_nearest(each[pose.frame].float(), pixel) for each in (views.depth, views.occluder))
+        measured, nearest = (
+            _nearest(each[pose.frame].float(), pixel) for each in (views.depth, views.occluder)
+        )
         inside_picture = ((pixel >= 0) & (pixel <= size_px[:, None])).all(-1)
-        in_view = inside_picture & (depth > 0.1)
-        hidden = (nearest > 0) & (nearest < depth - MARGIN_M)
-    outside_m = functional.relu(outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None] - EDGE_M)
+        in_view = inside_picture & (depth > NEAREST_M)
+        occluded = (nearest > 0) & (nearest < depth - MARGIN_M)
+    outside_m = functional.relu(
+        outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None] - EDGE_M
+    )
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
+    in_front = (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]
     terms = {
-        "outside": (weights.outside, (trust * outside_m / DECIMETRE)[in_view & ~hidden]),
-        "in front": (weights.in_front, (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]),
+        "outside": (OUTSIDE_WEIGHT, (trust * outside_m / DECIMETRE)[in_view & ~occluded]),
+        "in front": (FREE_WEIGHT, in_front),
     }
     if problem.scene.fused:
-        terms["solid"] = (weights.solid, (trust * buried_m(problem, pose, posed[:, ::4]) / DECIMETRE)[problem.has_scene[pose.frame]])
+        depth_m = penetration_depth_m(problem, pose, posed[:, ::FLOOR_EVERY])
+        terms["penetration"] = (
+            PENETRATION_WEIGHT,
+            (trust * depth_m / DECIMETRE)[problem.has_scene[pose.frame]],
+        )
     if masked is not None:
-        terms["cover"] = (weights.cover, trust * bare_m(points, masked) / DECIMETRE)
-    return terms
+        terms["uncovered"] = UNCOVERED_WEIGHT, trust * silhouette_residual_m(points, masked) / DECIMETRE
+    return {name: (weights.posed_surface * weight, values) for name, (weight, values) in terms.items()}
 
 
-def buried_m(problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"]) -> Float[Tensor, "frame point"]:
-    """Measure how deep points lie below the scene's surface: feet stand on the ground."""
+def penetration_depth_m(
+    problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"]
+) -> Float[Tensor, "frame point"]:
+    """Return how deep points lie below the scene's surface, metres."""
     return functional.relu(-height_m(problem, pose, rigid_torch.apply(pose.world_from_agent, points_agent)))
 
 
-def height_m(problem: Problem, pose: Pose, world: Float[Tensor, "frame point 3"]) -> Float[Tensor, "frame point"]:
-    """Measure how far points are outside the scene's surface as each frame's video saw it.
+def height_m(
+    problem: Problem, pose: Pose, world: Float[Tensor, "frame point 3"]
+) -> Float[Tensor, "frame point"]:
+    """Return the signed distance of world points from the scene as each frame's video saw it, metres.
 
-    What is fused tells it near surfaces alone and holds all that was never seen for free: below the floor, the floor tells it.
+    Fused geometry knows it near surfaces alone and takes unseen space as free; below the floor, the floor
+    counts.
     """
     video = problem.video[pose.frame][:, None].expand(world.shape[:2])
     video = torch.where(problem.has_scene[pose.frame, None], video, -1)
@@ -138,83 +193,115 @@ def height_m(problem: Problem, pose: Pose, world: Float[Tensor, "frame point 3"]
     return torch.minimum(outside, world[..., 1] - problem.floor_m)
 
 
-def bare_m(points_camera: Float[Tensor, "frame point 3"], masked: Rays) -> Float[Tensor, "frame ray"]:
-    """Measure how far beside each ray the nearest surface point passes, metres beyond what counts as covered."""
+def silhouette_residual_m(
+    points_camera: Float[Tensor, "frame point 3"], masked: Rays
+) -> Float[Tensor, "frame ray"]:
+    """Return how far from each masked ray the nearest surface point is seen, metres beyond `COVER_M`, at most
+    0.2 m.
+    """
     target = masked.direction[:, :2].view(len(points_camera), -1, 2)
-    depth = points_camera[..., 2:].clamp_min(0.1)
-    place = points_camera[..., :2] / depth
+    depth = points_camera[..., 2:].clamp_min(NEAREST_M)
+    image_point = points_camera[..., :2] / depth
     with torch.no_grad():
-        near = torch.cdist(target, place).argmin(-1, keepdim=True)
-    gap = place.gather(1, near.expand(-1, -1, 2)) - target
-    return functional.relu(gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach() - COVER_M).clamp_max(2 * DECIMETRE)
+        near = torch.cdist(target, image_point).argmin(-1, keepdim=True)
+    gap = image_point.gather(1, near.expand(-1, -1, 2)) - target
+    return functional.relu(gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach() - COVER_M).clamp_max(
+        2 * DECIMETRE
+    )
 
 
-def prior_terms(problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: Weights) -> Terms:
-    """Keep bones together where they meet, near rest, and moving smoothly and seldom within runs of consecutive frames, soles planted."""
+def prior_terms(
+    problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: LossWeights
+) -> Terms:
+    """Keep joints together, bones near rest and their motion smooth and sparse in runs of frames, soles
+    planted.
+    """
     rest, joints = problem.body.agent_from_bone_rest, problem.joints
     motion = pose.agent_from_bone @ rigid_torch.inverse(rest)
 
     def carried(bone: Int[Tensor, "joint"]) -> Float[Tensor, "frame joint 3"]:
         return (motion[:, bone, :3, :3] @ joints.place[..., None])[..., 0] + motion[:, bone, :3, 3]
 
-    torn = (carried(joints.first) - carried(joints.second)) / DECIMETRE
+    joint_gap = (carried(joints.first) - carried(joints.second)) / DECIMETRE
     root = rigid_torch.inverse(pose.world_from_initial) @ pose.world_from_agent
+    root_error = (root[:, :3, 3] / ROOT_M).square().sum(-1) + _squared_angle(root) / ROOT_RAD**2
+    common = twist.mean(1, keepdim=True).square().sum(-1)
     terms = {
-        "root": (weights.root, problem.trust[pose.frame] * ((root[:, :3, 3] / ROOT_M).square().sum(-1) + _turned(root) / ROOT_RAD**2)),
-        "rigidity": (weights.rigidity, torn.square().sum(-1)),
-        "rest": (weights.rest, twist.square().sum(-1) + 20 * twist.mean(1, keepdim=True).square().sum(-1)),
+        "rigidity": (RIGIDITY_WEIGHT, joint_gap.square().sum(-1)),
+        "rest": (REST_WEIGHT, twist.square().sum(-1) + COMMON_REST * common),
     }
     if run >= 3:
-        bend, roots = twist.view(-1, run, *twist.shape[1:]), pose.world_from_agent.reshape(-1, run, 4, 4)
-        path = torch.diff(roots[:, :, :3].flatten(2), n=2, dim=1)
+        change, roots = twist.view(-1, run, *twist.shape[1:]), pose.world_from_agent.reshape(-1, run, 4, 4)
+        acceleration = torch.diff(roots[:, :, :3].flatten(2), n=2, dim=1)
         step = rigid_torch.inverse(roots[:, :-1]) @ roots[:, 1:]
-        terms["smoothness"] = (weights.smoothness, torch.diff(bend, n=2, dim=1).square().sum(-1))
-        terms["root smoothness"] = (4 * weights.smoothness, path.square().sum(-1))
-        terms["still"] = (weights.still, _size(torch.diff(bend, dim=1).square().sum(-1)))
-        terms["root still"] = (0.5 * weights.still, _size((step[..., :3, 3] / DECIMETRE).square().sum(-1) + _turned(step)))
-        if problem.scene.fused:
-            terms["planted"] = (weights.planted, slid(problem, pose, run))
+        root_step = (step[..., :3, 3] / DECIMETRE).square().sum(-1) + _squared_angle(step)
+        bone_step = torch.diff(change, dim=1).square().sum(-1)
+        terms["smoothness"] = SMOOTH_WEIGHT, torch.diff(change, n=2, dim=1).square().sum(-1)
+        terms["root smoothness"] = ROOT_SMOOTH * SMOOTH_WEIGHT, acceleration.square().sum(-1)
+        terms["still"] = STILL_WEIGHT, _smooth_length(bone_step)
+        terms["root still"] = ROOT_STILL * STILL_WEIGHT, _smooth_length(root_step)
+    terms = {name: (weights.motion_prior * weight, values) for name, (weight, values) in terms.items()}
+    terms["root"] = ROOT_WEIGHT, problem.trust[pose.frame] * root_error
+    if run >= 3 and problem.scene.fused and weights.planted:
+        terms["planted"] = weights.planted, foot_skate(problem, pose, run)
     return terms
 
 
-def slid(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run step sole"]:
-    """Tell how far soles move between frames in which they touch something: 0 = not at all, 1 = by much more than `STRIDE_M`.
+def foot_skate(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run step sole"]:
+    """Return how far soles move between frames in which they touch something: 0 at rest, 1 beyond `STRIDE_M`.
 
-    Legs that are hidden would go with the body, or swing as they like; 0 for soles in the air.
+    Occluded legs would otherwise follow the body. Soles in the air give 0.
     """
-    world = rigid_torch.apply(pose.world_from_agent, problem.body.pose(problem.surface.sole, pose.agent_from_bone))
+    world = rigid_torch.apply(
+        pose.world_from_agent, problem.body.pose(problem.surface.sole, pose.agent_from_bone)
+    )
     with torch.no_grad():
-        near = torch.exp(-(height_m(problem, pose, world).clamp_min(0) / TOUCH_M).square()) * problem.has_scene[pose.frame, None]
-    touch = near.view(-1, run, near.shape[1])
+        near = (
+            torch.exp(-(height_m(problem, pose, world).clamp_min(0) / TOUCH_M).square())
+            * problem.has_scene[pose.frame, None]
+        )
+    contact = near.view(-1, run, near.shape[1])
     squared = torch.diff(world.view(-1, run, *world.shape[1:]), dim=1).square().sum(-1)
-    return torch.minimum(touch[:, 1:], touch[:, :-1]) * squared / (squared + STRIDE_M**2)
+    return torch.minimum(contact[:, 1:], contact[:, :-1]) * squared / (squared + STRIDE_M**2)
 
 
-def _turned(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
+def _squared_angle(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:
     """Return the squared angle of small rotations."""
     return 3 - motion[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
-def _size(squared: Float[Tensor, "*step"]) -> Float[Tensor, "*step"]:
-    """Turn squares to lengths, smooth at 0: what rests most of the time may leap at others."""
+def _smooth_length(squared: Float[Tensor, "*step"]) -> Float[Tensor, "*step"]:
+    """Return lengths from their squares, smooth at 0: a prior for motion that is sparse in time."""
     return (squared.clamp_min(0) + STILL**2).sqrt() - STILL
 
 
 def _bilinear(
-    images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"], size_px: Float[Tensor, "frame 2"]
+    images: Float[Tensor, "frame height width"],
+    pixel: Float[Tensor, "frame point 2"],
+    size_px: Float[Tensor, "frame 2"],
 ) -> Float[Tensor, "frame point"]:
-    """Read thumbnails between their pixels, with gradients towards the place; at a picture's border, not what pads it there."""
+    """Interpolate thumbnails, with gradients towards the pixel; outside the picture its border holds, not the
+    padding.
+    """
     last = (size_px // THUMBNAIL - 0.5)[:, None] * THUMBNAIL
     place = _normalized(images, torch.minimum(pixel.clamp_min(0.5 * THUMBNAIL), last))
-    return functional.grid_sample(images[:, None], place[:, :, None], padding_mode="border", align_corners=False)[:, 0, :, 0]
+    return functional.grid_sample(
+        images[:, None], place[:, :, None], padding_mode="border", align_corners=False
+    )[:, 0, :, 0]
 
 
-def _nearest(images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point"]:
+def _nearest(
+    images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]
+) -> Float[Tensor, "frame point"]:
     """Read thumbnails at the nearest pixel."""
     place = _normalized(images, pixel)
-    return functional.grid_sample(images[:, None], place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False)[:, 0, :, 0]
+    return functional.grid_sample(
+        images[:, None], place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False
+    )[:, 0, :, 0]
 
 
 def _normalized(images: Tensor, pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point 2"]:
-    size = torch.tensor([images.shape[2], images.shape[1]], device=pixel.device, dtype=torch.float32) * THUMBNAIL
+    size = (
+        torch.tensor([images.shape[2], images.shape[1]], device=pixel.device, dtype=torch.float32) * THUMBNAIL
+    )
     return (pixel / size * 2 - 1).clamp(-4, 4)

@@ -1,6 +1,8 @@
-"""Limbs as a tree of bones: what turns a thigh turns the whole leg, so that one number lifts a tail.
+"""The kinematic tree of the bones: a thigh's rotation carries the whole leg, so that one parameter lifts a
+tail.
 
-Bones lie in no order and know no parents. The tree that shares most skin gives both, from the middle of the body outward.
+Gaussian bones come without parents. The minimum spanning tree over shared skin gives them, from the body's
+middle out.
 """
 
 from dataclasses import dataclass
@@ -11,10 +13,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from torch import Tensor, nn
 
-from pipeline.space import rigid_torch
+from pipeline.geometry import rigid_torch
 
-NEVER = 1e-9
-"""share of skin from which on bones count as strangers"""
+LEAST_SHARE = 1e-9
+"""shared skin below this counts as none; keeps logarithms finite"""
 LOW, GROUND = 0.45, 0.15
 """legs are below this share of the animal's height, and reach below this"""
 
@@ -27,8 +29,8 @@ def shared_skin(weights: Float[Tensor, "point bone"]) -> Float[Tensor, "bone bon
 
 
 @dataclass(frozen=True)
-class Limbs:
-    """Which bone hangs on which, and where it turns."""
+class KinematicTree:
+    """Each bone's parent, and the joint about which it turns."""
 
     order: Int[Tensor, "bone"]
     """from the middle of the body outward, parents before children"""
@@ -39,23 +41,27 @@ class Limbs:
 
     @classmethod
     def of(
-        cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"], agent_from_bone_rest: Float[Tensor, "bone 4 4"]
-    ) -> "Limbs":
-        """Hang each bone, seen from the one nearest to the agent's origin, on that with which it shares most skin."""
-        strangeness = -np.log(shared_skin(weights).double().numpy().clip(NEVER, 0.999))
-        tree = minimum_spanning_tree(strangeness)
+        cls,
+        points: Float[Tensor, "point 3"],
+        weights: Float[Tensor, "point bone"],
+        agent_from_bone_rest: Float[Tensor, "bone 4 4"],
+    ) -> "KinematicTree":
+        """Make the tree of most shared skin, rooted at the bone nearest to the agent's origin."""
+        cost = -np.log(shared_skin(weights).double().numpy().clip(LEAST_SHARE, 0.999))
+        tree = minimum_spanning_tree(cost)
         centre = agent_from_bone_rest[:, :3, 3]
         order, parent = breadth_first_order(tree + tree.T, int(centre.norm(dim=-1).argmin()), directed=False)
         order = torch.from_numpy(order).long()
         parent = torch.from_numpy(parent).long()[order]
         parent[0] = order[0]
-        both = weights[:, order] * weights[:, parent] + NEVER
+        both = weights[:, order] * weights[:, parent] + LEAST_SHARE
         return cls(order, order.argsort()[parent], both.T @ points / both.sum(0)[:, None])
 
     def motion(self, turn: Float[Tensor, "frame bone 3"]) -> Float[Tensor, "frame bone 4 4"]:
-        """Carry each bone by its own turn (rotation vector about its joint) and by those of all that it hangs on; agent frame.
+        """Return each bone's motion in the agent frame: its own rotation vector about its joint after its
+        ancestors'.
 
-        The middle stays: it turns with the root.
+        The root bone stays: it moves with the agent's root.
         """
         rotation = rigid_torch.so3_exp(turn[:, self.order])
         local = rigid_torch.make(rotation, self.joint - (rotation @ self.joint[..., None])[..., 0])
@@ -64,16 +70,22 @@ class Limbs:
             moved.append(moved[parent] @ local[:, place])
         return torch.stack(moved, dim=1)[:, self.order.argsort()]
 
-    def to(self, device: str) -> "Limbs":
+    def to(self, device: str) -> "KinematicTree":
         """Move all to a device."""
-        return Limbs(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return KinematicTree(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
 
-def legs(limbs: Limbs, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> Bool[Tensor, "bone"]:
-    """Tell which bones are the uppermost of legs: they and all that hangs on them are low, and something of it stands on the ground."""
+def legs(
+    limbs: KinematicTree, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]
+) -> Bool[Tensor, "bone"]:
+    """Return which bones are the uppermost of legs: they and their descendants are low, and one reaches the
+    ground.
+    """
     height = (points[:, 1] - points[:, 1].min()) / (points[:, 1].max() - points[:, 1].min())
     low = weights.T @ height < LOW * weights.sum(0)
-    stands = torch.stack([(height[weights.argmax(1) == bone] < GROUND).any() for bone in range(weights.shape[1])])
+    stands = torch.stack(
+        [(height[weights.argmax(1) == bone] < GROUND).any() for bone in range(weights.shape[1])]
+    )
     low, stands, parent = low[limbs.order], stands[limbs.order], limbs.parent.tolist()
     for place in range(len(parent) - 1, 0, -1):
         low[parent[place]] &= low[place]
@@ -81,16 +93,19 @@ def legs(limbs: Limbs, points: Float[Tensor, "point 3"], weights: Float[Tensor, 
     return (low & stands & ~low[limbs.parent])[limbs.order.argsort()]
 
 
-class Waves(nn.Module):
-    """A motion over consecutive frames as the sum of slower and quicker ones: knots on several time scales, linear between them.
+class MultiscaleTurns(nn.Module):
+    """Rotations over consecutive frames, coarse to fine: sums of linear splines with knots on several time
+    scales.
 
-    What moves for a second is found at once by the slow ones, frame by frame it would take many steps.
+    Slow motion is found by few coarse parameters; frame by frame it would take many steps.
     """
 
     def __init__(self, frames: int, bones: int, knot_frames: tuple[int, ...]):
         super().__init__()
         self.each = nn.Parameter(torch.zeros(frames, bones, 3))
-        self.knots = nn.ParameterList(nn.Parameter(torch.zeros((frames - 1) // span + 2, bones, 3)) for span in knot_frames)
+        self.knots = nn.ParameterList(
+            nn.Parameter(torch.zeros((frames - 1) // span + 2, bones, 3)) for span in knot_frames
+        )
         self.knot_frames = knot_frames
 
     def forward(self) -> Float[Tensor, "frame bone 3"]:

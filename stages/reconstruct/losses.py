@@ -10,50 +10,79 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline import together
+from pipeline.core import distributed
+
+DISTANCE_KNEE, COLOR_KNEE, FLOW_KNEE, DEPTH_KNEE = 0.3, 0.2, 0.5, 1.0
+"""where Huber losses go over from squares to lines, in the units of each loss"""
+FLOW_UNIT_PX, DEPTH_UNIT_M = 10.0, 0.1
+"""units of flow and of rendered depth"""
+LEAST_PROBABILITY = 1e-3
+"""keeps the logarithms of opacities finite"""
 
 
-def truncated_distance(found_m: Float[Tensor, "*point"], target_m: Float[Tensor, "*point"], limit_m: float) -> Float[Tensor, "*point"]:
+def truncated_distance(
+    distance_m: Float[Tensor, "*point"], target_m: Float[Tensor, "*point"], limit_m: float
+) -> Float[Tensor, "*point"]:
     """Compare signed distances, both cut at ``limit_m`` and in units of it, robustly."""
     target = target_m.clamp(-limit_m, limit_m)
-    return functional.huber_loss(found_m / limit_m, target / limit_m, reduction="none", delta=0.3)
+    return functional.huber_loss(
+        distance_m / limit_m, target / limit_m, reduction="none", delta=DISTANCE_KNEE
+    )
 
 
-def color(found: Float[Tensor, "*point 3"], target: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point"]:
-    """Compare colours in 0..1, robustly."""
-    return functional.huber_loss(found, target, reduction="none", delta=0.2).mean(-1)
+def color(predicted: Float[Tensor, "*point 3"], target: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point"]:
+    """Compare colors in 0..1, robustly."""
+    return functional.huber_loss(predicted, target, reduction="none", delta=COLOR_KNEE).mean(-1)
 
 
-def feature(found: Float[Tensor, "*point channel"], target: Float[Tensor, "*point channel"]) -> Float[Tensor, "*point"]:
+def feature(
+    predicted: Float[Tensor, "*point channel"], target: Float[Tensor, "*point channel"]
+) -> Float[Tensor, "*point"]:
     """Compare unit-length features: half the squared chord, the cosine distance for unit vectors."""
-    return 0.5 * (found - target).square().sum(-1)
+    return 0.5 * (predicted - target).square().sum(-1)
 
 
-def silhouette(found: Float[Tensor, "*ray"], agent: Float[Tensor, "*ray"]) -> Float[Tensor, "*ray"]:
+def silhouette(predicted: Float[Tensor, "*ray"], agent: Float[Tensor, "*ray"]) -> Float[Tensor, "*ray"]:
     """Compare the agent's rendered opacity with the mask (0 or 1)."""
-    return functional.binary_cross_entropy(found.clamp(1e-3, 1 - 1e-3), agent, reduction="none")
+    return functional.binary_cross_entropy(
+        predicted.clamp(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY), agent, reduction="none"
+    )
 
 
-def flow(found_px: Float[Tensor, "*ray 2"], target_px: Float[Tensor, "*ray 2"], scale_px: float = 10.0) -> Float[Tensor, "*ray"]:
-    """Compare where points are seen later, in units of ``scale_px``, robustly."""
-    return functional.huber_loss(found_px / scale_px, target_px / scale_px, reduction="none", delta=0.5).sum(-1)
+def flow(pixel_px: Float[Tensor, "*ray 2"], target_px: Float[Tensor, "*ray 2"]) -> Float[Tensor, "*ray"]:
+    """Compare where points are seen later, in units of `FLOW_UNIT_PX`, robustly."""
+    return functional.huber_loss(
+        pixel_px / FLOW_UNIT_PX, target_px / FLOW_UNIT_PX, reduction="none", delta=FLOW_KNEE
+    ).sum(-1)
 
 
-def depth(found_m: Float[Tensor, "*ray"], target_m: Float[Tensor, "*ray"], scale_m: float = 0.1) -> Float[Tensor, "*ray"]:
-    """Compare rendered and measured depth in units of ``scale_m``, robustly."""
-    return functional.huber_loss(found_m / scale_m, target_m / scale_m, reduction="none", delta=1.0)
+def depth(depth_m: Float[Tensor, "*ray"], target_m: Float[Tensor, "*ray"]) -> Float[Tensor, "*ray"]:
+    """Compare rendered and measured depth in units of `DEPTH_UNIT_M`, robustly."""
+    return functional.huber_loss(
+        depth_m / DEPTH_UNIT_M, target_m / DEPTH_UNIT_M, reduction="none", delta=DEPTH_KNEE
+    )
 
 
-def eikonal(distance: Float[Tensor, "point"], beside: Float[Tensor, "3 point"], step_m: float) -> Float[Tensor, "point"]:
-    """Ask for a gradient of length 1, by differences along the three axes."""
-    return (((beside - distance) / step_m).square().sum(0).clamp_min(1e-8).sqrt() - 1).square()
+def eikonal(
+    distance: Float[Tensor, "point"], shifted: Float[Tensor, "3 point"], step_m: float
+) -> Float[Tensor, "point"]:
+    """Penalize gradients whose length is not 1, by differences of ``step_m`` along the three axes (Gropp et
+    al. 2020).
+    """
+    return (((shifted - distance) / step_m).square().sum(0).clamp_min(1e-8).sqrt() - 1).square()
 
 
 def weighted(terms: Mapping[str, tuple[float, Tensor]], shared: bool = False) -> dict[str, Tensor]:
     """Average each term over its elements and weigh it; terms without elements vanish.
 
-    With ``shared``, the elements of all processes count (`pipeline.together`), whose gradients will be averaged.
+    With ``shared``, the elements of all processes count (`pipeline.core.distributed`), whose gradients will
+    be averaged.
     """
     counts = torch.tensor([float(values.numel()) for _, values in terms.values()])
-    counts = (together.total(counts).clamp_min(1) / together.size() if shared else counts.clamp_min(1)).tolist()
-    return {name: weight * (values.sum() / count) for (name, (weight, values)), count in zip(terms.items(), counts, strict=True)}
+    counts = (
+        distributed.total(counts).clamp_min(1) / distributed.size() if shared else counts.clamp_min(1)
+    ).tolist()
+    return {
+        name: weight * (values.sum() / count)
+        for (name, (weight, values)), count in zip(terms.items(), counts, strict=True)
+    }

@@ -1,4 +1,4 @@
-"""Pictures and figures of the reconstruction for the report: reference, render, depth, opposite view, bones."""
+"""Pictures and metrics of the reconstruction for the report: picture, render, depth, opposite view, bones."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,34 +7,39 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline import qa
-from pipeline.files.clips import Clip, Masks
-from pipeline.fit import FitRecord
-from pipeline.models.fields import Reconstruction
-from pipeline.models.motion import Motion
-from pipeline.models.render import Renderer
-from pipeline.space import cameras, rigid
+from pipeline.core.training import FitRecord
+from pipeline.data import plots, qa
+from pipeline.data.clips import Clip, Masks
+from pipeline.data.motion import Motion
+from pipeline.fields.fields import Reconstruction
+from pipeline.fields.render import Renderer
+from pipeline.geometry import cameras, rigid
 
 LONG_SIDE_PX = 320
 """of each drawn picture"""
-DEPTH_RANGE_M = 4.0
+SESSIONS, FRAMES = 4, 4
+"""sessions that are compared, and frames of each"""
 
 
 def report_quality(
     folder: Path,
     reconstruction: Reconstruction,
     motions: Mapping[str, Motion],
-    inputs: Mapping[str, Mapping[str, Path]],
+    frames: Mapping[str, Path],
+    masks: Mapping[str, Path],
     records: Mapping[str, FitRecord],
 ) -> None:
-    """Write qa.json: agreement with the sensor on a few frames of the first sessions, pictures of three of them."""
+    """Write qa.json: agreement with the sensor on a few frames of the first sessions, pictures of three of
+    them.
+    """
     rows, pictures = [], []
-    for id, motion in list(motions.items())[:4]:
-        clip, masks = Clip.open(inputs["frames"][id]), Masks.open(inputs["masks"][id])
+    for id, motion in list(motions.items())[:SESSIONS]:
+        clip, labels = Clip.open(frames[id]), Masks.open(masks[id])
         renderer = Renderer(reconstruction, id)
-        frames = chosen_frames(motion, 4)
-        compared = [compare(renderer, clip, masks[frame], motion, frame) for frame in frames]
-        rows += [figures for figures, _ in compared]
+        compared = [
+            compare(renderer, clip, labels[frame], motion, frame) for frame in chosen_frames(motion, FRAMES)
+        ]
+        rows += [metrics for metrics, _ in compared]
         if compared and len(pictures) < 3:
             pictures.append(
                 qa.Picture(
@@ -43,7 +48,13 @@ def report_quality(
                     f"{id}: picture, render, depth measured and rendered, opposite view, bones",
                 )
             )
-    pictures.append(qa.Picture("losses", loss_curves(records), "losses of each phase, running mean, logarithmic"))
+    pictures.append(
+        qa.Picture(
+            "losses",
+            plots.loss_curves({name: {"total": record.total()} for name, record in records.items()}),
+            "losses of each phase, running mean, logarithmic",
+        )
+    )
     psnr, depth, iou = (np.mean(column) for column in zip(*rows, strict=True)) if rows else (np.nan,) * 3
     checks = [
         qa.Check("PSNR of rendered training frames", float(psnr), "dB", 20, 15, "higher"),
@@ -62,9 +73,11 @@ def report_quality(
 def chosen_frames(motion: Motion, number: int) -> list[int]:
     """Choose frames spread over those where camera and agent are known."""
     known = np.flatnonzero(
-        np.isfinite(motion.world_from_agent).all((1, 2)) & np.isfinite(motion.world_from_camera).all((1, 2)) & motion.agent_visible
+        np.isfinite(motion.world_from_agent).all((1, 2))
+        & np.isfinite(motion.world_from_camera).all((1, 2))
+        & motion.agent_visible
     )
-    return [int(known[i]) for i in np.unique(np.linspace(0, len(known) - 1, number).astype(int))] if len(known) else []
+    return known[plots.sample(len(known), number)].tolist()
 
 
 def compare(
@@ -73,28 +86,39 @@ def compare(
     """Render one frame; return (PSNR, share of depth within 0.1 m, IoU) and one row of pictures."""
     height, width = (round(side * LONG_SIDE_PX / max(clip.color_size)) for side in clip.color_size)
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, (height, width))
-    camera, root, bones = motion.world_from_camera[frame], motion.world_from_agent[frame], motion.agent_from_bone[frame]
+    camera, root, bones = (
+        motion.world_from_camera[frame],
+        motion.world_from_agent[frame],
+        motion.agent_from_bone[frame],
+    )
     drawn = renderer.draw(camera, intrinsics, height, width, root, bones)
-    color = cv2.resize(clip.color(frame), (width, height), interpolation=cv2.INTER_AREA)
+    color = plots.resized(clip.color(frame), (height, width))
     measured = cv2.resize(clip.depth(frame), (width, height), interpolation=cv2.INTER_NEAREST)
     opposite = renderer.draw(_opposite(camera, root), intrinsics, height, width, root, bones)
     row = [
         color,
         drawn.color,
-        depth_colors(measured),
-        depth_colors(drawn.depth),
+        plots.depth_colors(measured),
+        plots.depth_colors(drawn.depth),
         opposite.color,
         draw_bones(color, camera, intrinsics, root, bones),
     ]
-    known, agent = (measured > 0.1) & (measured < 5), cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) == 255
+    known, agent = (
+        (measured > 0.1) & (measured < 5),
+        cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) == 255,
+    )
     error = np.mean((color.astype(float) - drawn.color)[drawn.depth > 0] ** 2)
     iou = (agent & drawn.agent).sum() / max((agent | drawn.agent).sum(), 1)
     share = np.mean(np.abs(drawn.depth - measured)[known] < 0.1) if known.any() else np.nan
     return (10 * np.log10(255**2 / max(error, 1e-6)), float(share), float(iou)), np.hstack(row)
 
 
-def _opposite(world_from_camera: Float[np.ndarray, "4 4"], world_from_agent: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Return a camera on the other side of the agent, at the same height, at most 0.8 m away so that no wall comes between."""
+def _opposite(
+    world_from_camera: Float[np.ndarray, "4 4"], world_from_agent: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Return a camera on the other side of the agent, at the same height, at most 0.8 m away so that no wall
+    comes between.
+    """
     target, eye = world_from_agent[:3, 3], world_from_camera[:3, 3]
     beyond = (target - eye)[[0, 2]]
     beyond *= min(1.0, 0.8 / max(np.linalg.norm(beyond), 1e-6))
@@ -102,41 +126,27 @@ def _opposite(world_from_camera: Float[np.ndarray, "4 4"], world_from_agent: Flo
     return rigid.look_at(across, target, np.array([0.0, 1.0, 0.0]))
 
 
-def depth_colors(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Colour depth from near (yellow) to 4 m (violet); unknown is black."""
-    scaled = np.clip(255 * (1 - depth / DEPTH_RANGE_M), 0, 255).astype(np.uint8)
-    return cv2.applyColorMap(scaled, cv2.COLORMAP_VIRIDIS)[..., ::-1] * (depth > 0)[..., None].astype(np.uint8)
-
-
 def draw_bones(
-    image: UInt8[np.ndarray, "height width 3"], world_from_camera: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "3 3"],
+    image: UInt8[np.ndarray, "height width 3"],
+    world_from_camera: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "3 3"],
     world_from_agent: Float[np.ndarray, "4 4"], agent_from_bone: Float[np.ndarray, "bone 4 4"],
 ) -> UInt8[np.ndarray, "height width 3"]:  # fmt: skip
     """Draw each bone's axes (x red, y green, z blue) over a picture."""
     camera_from_bone = rigid.inverse(world_from_camera) @ world_from_agent @ agent_from_bone
     tips = np.concatenate([np.zeros((1, 3)), 0.03 * np.eye(3)])
-    pixel = np.rint(cameras.project(rigid.apply(camera_from_bone, tips[None]), intrinsics)[0] * 16).astype(int)
+    pixel = np.rint(cameras.project(rigid.apply(camera_from_bone, tips[None]), intrinsics)[0] * 16).astype(
+        int
+    )
     drawn = np.ascontiguousarray(image)
     for bone in np.clip(pixel, -(1 << 20), 1 << 20):
         for axis in range(3):
-            cv2.line(drawn, bone[0].tolist(), bone[1 + axis].tolist(), [255 * (k == axis) for k in range(3)], 1, cv2.LINE_AA, shift=4)
+            cv2.line(
+                drawn,
+                bone[0].tolist(),
+                bone[1 + axis].tolist(),
+                [255 * (k == axis) for k in range(3)],
+                1,
+                cv2.LINE_AA,
+                shift=4,
+            )
     return drawn
-
-
-def loss_curves(records: Mapping[str, FitRecord], height: int = 240, width: int = 480) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the total loss of each phase, one panel a phase."""
-    panels = []
-    for name, record in records.items():
-        panel = np.full((height, width, 3), 255, np.uint8)
-        total = record.total()
-        if len(total) > 1:
-            window = max(1, len(total) // 50)
-            mean = np.convolve(np.nan_to_num(np.log10(np.maximum(total, 1e-6))), np.ones(window) / window, "valid")
-            low, high = mean.min(), mean.max() + 1e-6
-            x = np.linspace(10, width - 10, len(mean))
-            y = 30 + (high - mean) / (high - low) * (height - 40)
-            cv2.polylines(panel, [np.rint(np.stack([x, y], axis=-1)).astype(np.int32)], False, (40, 80, 200), 2, cv2.LINE_AA)
-            name = f"{name}: {10 ** mean[0]:.3f} -> {10 ** mean[-1]:.3f}"
-        cv2.putText(panel, name, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-        panels.append(panel)
-    return np.hstack(panels)

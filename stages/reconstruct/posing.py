@@ -1,4 +1,4 @@
-"""Pose the template in consecutive frames of one video: root, limbs and single bones move, field and skin are held."""
+"""Pose the template in consecutive frames: root, limbs and bones move, field and skin are fixed."""
 
 from dataclasses import replace
 
@@ -7,23 +7,30 @@ from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from pipeline.space import rigid, rigid_torch
+from pipeline.geometry import rigid, rigid_torch
 from stages.reconstruct import losses
 from stages.reconstruct.body import Pose, measured_terms, prior_terms, surface_terms
-from stages.reconstruct.limbs import Waves
+from stages.reconstruct.config import LossWeights
+from stages.reconstruct.limbs import MultiscaleTurns
 from stages.reconstruct.problem import Problem, RaysByFrame
 from stages.reconstruct.rays import AGENT
-from stages.reconstruct.settings import Batches, Rates, Weights
 from stages.reconstruct.stances import Stance
 
 KNOT_FRAMES = (32, 8)
-"""limbs turn on these time scales, and frame by frame"""
+"""distances of the knots of limbs' rotations, which also change frame by frame"""
 ROOT_SHARE = 0.25
-"""of the steps in which the root moves alone"""
+"""share of the steps in which the root moves alone"""
+POSED_RAYS, POSED_POINTS = 96, 384
+"""masked rays and surface points per frame and step"""
+SLOW_RATE, FRAME_RATE = 2e-2, 1e-2
+"""learning rates of the root and of slow rotations of limbs, and of what changes from frame to frame; metres
+and radians a step of Adam"""
+MOMENTUM = (0.8, 0.99)
+"""Adam's, shorter than usual for few steps"""
 
 
 class Chunk(nn.Module):
-    """What moves in a stretch of frames: the root, the limbs' turns, and each bone by itself.
+    """What moves in a segment of frames: the root, the limbs' rotations, and each bone by itself.
 
     They start as the motion table has them, or from a stance.
     """
@@ -33,25 +40,29 @@ class Chunk(nn.Module):
         self.frame, motion = frame, problem.motion
         self.initial = motion.initial_agent[frame] @ stance.lean if stance else motion.initial_agent[frame]
         self.root = nn.Parameter(motion.root.detach()[frame].clone())
-        self.bone = nn.Parameter(stance.bone.repeat(len(frame), 1, 1) if stance else motion.bone.detach()[frame].clone())
-        self.turn = Waves(len(frame), motion.bone.shape[1], KNOT_FRAMES).to(problem.device)
+        self.bone = nn.Parameter(
+            stance.bone.repeat(len(frame), 1, 1) if stance else motion.bone.detach()[frame].clone()
+        )
+        self.turn = MultiscaleTurns(len(frame), motion.bone.shape[1], KNOT_FRAMES).to(problem.device)
 
-    def groups(self, rates: Rates) -> list[dict]:
-        """Return what learns, with its rates."""
-        shared = {"weight_decay": 0.0, "betas": (0.8, 0.99)}
+    def groups(self) -> list[dict]:
+        """Return the optimizer's parameter groups."""
+        shared = {"weight_decay": 0.0, "betas": MOMENTUM}
         slow, quick = [self.root, *self.turn.knots], [self.bone, self.turn.each]
-        return [{"params": slow, "lr": rates.body, **shared}, {"params": quick, "lr": rates.body_frame, **shared}]
+        return [{"params": slow, "lr": SLOW_RATE, **shared}, {"params": quick, "lr": FRAME_RATE, **shared}]
 
     def pose(self, problem: Problem, bones_move: bool = True) -> tuple[Pose, Float[Tensor, "frame twist 6"]]:
-        """Return the current poses, and the twists that keep near rest: those of bones, and the limbs' turns."""
+        """Return the current poses, and the twists that priors keep near rest: of bones and of limbs."""
         motion, turn, bone = problem.motion, self.turn(), self.bone
         if not bones_move:
             turn, bone = turn.detach(), bone.detach()
         with torch.no_grad():
             world_from_camera = motion.world_from_camera(self.frame)
         root = self.initial @ rigid_torch.se3_exp(self.root)
-        bones = problem.limbs.motion(turn) @ motion.agent_from_bone_rest @ rigid_torch.se3_exp(bone)
-        return Pose(self.frame, world_from_camera, root, bones, self.initial), torch.cat([bone, functional.pad(turn, (0, 3))], dim=1)
+        bones = problem.tree.motion(turn) @ motion.agent_from_bone_rest @ rigid_torch.se3_exp(bone)
+        return Pose(self.frame, world_from_camera, root, bones, self.initial), torch.cat(
+            [bone, functional.pad(turn, (0, 3))], dim=1
+        )
 
     @torch.no_grad()
     def write(self, problem: Problem) -> None:
@@ -59,17 +70,21 @@ class Chunk(nn.Module):
         pose, _ = self.pose(problem)
         bone = rigid_torch.inverse(problem.motion.agent_from_bone_rest) @ pose.agent_from_bone
         problem.motion.root[self.frame] = self.root
-        problem.motion.bone[self.frame] = torch.from_numpy(rigid.log(bone.double().cpu().numpy())).to(self.bone)
+        problem.motion.bone[self.frame] = torch.from_numpy(rigid.log(bone.double().cpu().numpy())).to(
+            self.bone
+        )
 
 
 class ChunkLoss:
-    """What the poses of a stretch of frames lack.
+    """The loss of the poses of a segment of frames, with a ``share`` of the usual rays and points.
 
-    Features do not help here, whose cells mix thin limbs with what is behind, nor do cycles, since the skin is held.
+    Features do not help here, whose cells mix thin limbs with the background, nor do cycles, since the skin
+    is fixed.
     """
 
-    def __init__(self, problem: Problem, chunk: Chunk, weights: Weights, batches: Batches):
-        self.problem, self.chunk, self.batches = problem, chunk, batches
+    def __init__(self, problem: Problem, chunk: Chunk, weights: LossWeights, share: float = 1.0):
+        self.problem, self.chunk = problem, chunk
+        self.rays, self.points = round(share * POSED_RAYS), round(share * POSED_POINTS)
         self.weights = replace(weights, feature=0.0, cycle=0.0)
         self.masked = torch.nonzero(problem.store.agent.label == AGENT)[:, 0]
         self.masked_rays = RaysByFrame.of(problem.store.agent.frame[self.masked], len(problem.video))
@@ -81,7 +96,7 @@ class ChunkLoss:
 
     @torch.no_grad()
     def of_parts(self, length: int, generator: Generator) -> Float[Tensor, "part"]:
-        """Return the losses of each ``length`` frames by themselves; NaN where nothing of the agent is seen."""
+        """Return the loss of each ``length`` frames; NaN where the agent is not in view."""
         pose, twist = self.chunk.pose(self.problem)
         parts = [slice(first, first + length) for first in range(0, len(pose.frame), length)]
         terms = [self._terms(pose.at(part), twist[part], self.seen[part], generator) for part in parts]
@@ -89,12 +104,18 @@ class ChunkLoss:
         return torch.stack([sum(each.values()) for each in terms]).where(seen, torch.nan)
 
     def _terms(
-        self, pose: Pose, twist: Float[Tensor, "frame twist 6"], seen: Bool[Tensor, "frame"], generator: Generator
+        self,
+        pose: Pose,
+        twist: Float[Tensor, "frame twist 6"],
+        seen: Bool[Tensor, "frame"],
+        generator: Generator,
     ) -> dict[str, Tensor]:
         problem, terms = self.problem, {}
         if seen.any():
             shown = pose.at(seen)
-            rays = problem.store.agent.at(self.masked[self.masked_rays.pick(shown.frame, self.batches.posed_rays, generator).flatten()])
+            rays = problem.store.agent.at(
+                self.masked[self.masked_rays.pick(shown.frame, self.rays, generator).flatten()]
+            )
             terms = measured_terms(problem, shown, rays, self.weights, generator, near=0)
-            terms |= surface_terms(problem, shown, self.batches.posed_points, self.weights, generator, rays)
+            terms |= surface_terms(problem, shown, self.points, self.weights, generator, rays)
         return losses.weighted(terms | prior_terms(problem, pose, twist, len(pose.frame), self.weights))

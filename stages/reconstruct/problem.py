@@ -9,44 +9,54 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Generator, Tensor, nn
 
-from pipeline.errors import InputError
-from pipeline.models.fields import Body, Field
-from pipeline.models.motion import MotionTable
-from pipeline.space.meshes import Mesh
-from stages.reconstruct.limbs import Limbs, shared_skin
-from stages.reconstruct.rays import Store
+from pipeline.core.errors import InputError
+from pipeline.data.motion import MotionTable
+from pipeline.fields.fields import ArticulatedBody, Field
+from pipeline.geometry.meshes import Mesh
+from stages.reconstruct.limbs import KinematicTree, shared_skin
+from stages.reconstruct.rays import RayStore
 
 TRUSTED = 0.1
-"""frames whose masks count less are not looked at together with their neighbours"""
-FIRMEST = 100.0
-"""times as firmly as at even odds is a camera held that registration is certain of: losses err by a millimetre and a twentieth of a degree"""
-SOLE = 0.07
-"""soles are below this share of the animal's height"""
+"""frames whose mask weighs less are left out of runs of consecutive frames"""
+MOST_PRECISE = 100.0
+"""prior precision of a camera that registration is certain of, relative to one at even odds; losses alone err
+by a millimetre and a twentieth of a degree"""
+MOST_JOINTS, LEAST_SKIN = 4, 0.02
+"""joints of a bone, and the share of skin that two bones must have in common to be tied"""
+SOLE, SOLES = 0.07, 32
+"""soles are below this share of the animal's height; so many points of them are looked at"""
+ON_SURFACE, AROUND = 4000, 40000
+"""samples of the template's surface and of the space around it"""
+AROUND_MARGIN_M = 0.25
+"""the space around the template reaches this far"""
+NOISE_M = (0.01, 0.04)
+"""half of the samples around the template lie this far from its surface, standard deviations"""
 
 
 @dataclass(frozen=True)
 class Problem:
     """All that the phases read and change; tensors and modules live on one device."""
 
-    store: Store
+    store: RayStore
     scene: Field
     agent: Field
-    body: Body
+    body: ArticulatedBody
     motion: MotionTable
     video: Int[Tensor, "frame"]
     """index of each frame's video"""
     has_scene: Bool[Tensor, "frame"]
     """False for the turnaround: its world is the agent"""
-    surface: "Surface"
+    surface: "TemplateSurface"
     joints: "Joints"
-    limbs: Limbs
+    tree: KinematicTree
     agent_frames: Int[Tensor, "frame"]
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
     trust: Float[Tensor, "frame"]
-    """how much a frame's mask counts for the agent, 0..1: less where its root was given up or little of it is seen"""
-    firm: Float[Tensor, "knot"]
-    """how many times as firmly as a doubtful one registration holds each knot of camera corrections"""
+    """weight of each frame's mask, 0..1: less where the root was an outlier or little of the agent is in
+    view"""
+    camera_precision: Float[Tensor, "knot"]
+    """prior precision of each knot's camera correction, relative to that of a camera at even odds"""
     floor_m: float
     """nothing is below this height of the world"""
 
@@ -60,14 +70,17 @@ class Problem:
         return {"scene": self.scene, "agent": self.agent, "body": self.body, "motion": self.motion}
 
     def share(self, rank: int, size: int) -> "Problem":
-        """Return the same problem with the measurements of one process's videos alone; the longest are dealt out first.
+        """Return the same problem with the measurements of one process's videos alone; the longest are dealt
+        out first.
 
         Raises `InputError` RCN-002 where a process would get no video in which the agent is seen.
         """
         frames = torch.bincount(self.video)
         with_agent = torch.bincount(self.video[self.agent_frames], minlength=len(frames)) > 0
         with_scene = torch.bincount(self.video[self.has_scene], minlength=len(frames)) > 0
-        order = sorted(range(len(frames)), key=lambda video: (not (with_agent & with_scene)[video], -int(frames[video])))
+        order = sorted(
+            range(len(frames)), key=lambda video: (not (with_agent & with_scene)[video], -int(frames[video]))
+        )
         if int((with_agent & with_scene).sum()) < size:
             raise InputError(
                 "RCN-002",
@@ -76,23 +89,27 @@ class Problem:
                 remedy="take fewer processes",
             )
         own = torch.isin(self.video, torch.tensor(order[rank::size], device=self.device))
-        scene, agent = (rays.at(torch.nonzero(own[rays.frame])[:, 0]) for rays in (self.store.scene, self.store.agent))
+        scene, agent = (
+            rays.at(torch.nonzero(own[rays.frame])[:, 0]) for rays in (self.store.scene, self.store.agent)
+        )
         return replace(
             self,
-            store=Store(scene, agent, self.store.views),
+            store=RayStore(scene, agent, self.store.views),
             agent_frames=self.agent_frames[own[self.agent_frames]],
             agent_rays=RaysByFrame.of(agent.frame, len(self.video)),
         )
 
     def runs(self, length: int) -> Int[Tensor, "run"]:
-        """Return first frames of stretches of usable frames of one video that are trusted, as far as any is."""
+        """Return first frames of runs of usable frames of one video; only trusted ones if there are any."""
         first = self.agent_frames.cpu()
         trusted = self.trust.cpu()[first] > TRUSTED
         first = first[trusted] if trusted.any() else first
         usable = torch.zeros(len(self.video) + length, dtype=torch.bool)
         usable[first] = True
         video = torch.cat([self.video.cpu(), torch.full((length,), -1)])
-        good = torch.stack([usable[first + k] & (video[first + k] == video[first]) for k in range(length)]).all(0)
+        good = torch.stack(
+            [usable[first + k] & (video[first + k] == video[first]) for k in range(length)]
+        ).all(0)
         return first[good]
 
 
@@ -109,7 +126,9 @@ class RaysByFrame:
         count = torch.bincount(frame, minlength=frames)
         return cls(count.cumsum(0) - count, count)
 
-    def pick(self, frame: Int[Tensor, "frame"], number: int, generator: Generator) -> Int[Tensor, "frame ray"]:
+    def pick(
+        self, frame: Int[Tensor, "frame"], number: int, generator: Generator
+    ) -> Int[Tensor, "frame ray"]:
         """Choose rays of each frame at random, with repetition."""
         share = torch.rand(len(frame), number, generator=generator).to(frame.device)
         return self.start[frame][:, None] + (share * self.count[frame][:, None]).long()
@@ -117,7 +136,7 @@ class RaysByFrame:
 
 @dataclass(frozen=True)
 class Joints:
-    """Where bones meet: pairs that move the same skin, however near other limbs may stand, and the places that both must carry alike."""
+    """Joints between bones that share skin: pairs of bones, and the points on which both must agree."""
 
     first: Int[Tensor, "joint"]
     second: Int[Tensor, "joint"]
@@ -125,11 +144,15 @@ class Joints:
     """at rest, agent frame, metres"""
 
     @classmethod
-    def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"], most: int = 4, least: float = 0.02) -> "Joints":
-        """Tie each bone to those with which it shares most skin: up to ``most``, of a share of at least ``least``, but always one."""
+    def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> "Joints":
+        """Tie each bone to the `MOST_JOINTS` with which it shares most skin, at least `LEAST_SKIN`, but
+        always to one.
+        """
         share = shared_skin(weights)
         ranked = share.argsort(dim=1, descending=True)
-        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :most], True) & (share > least)
+        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MOST_JOINTS], True) & (
+            share > LEAST_SKIN
+        )
         tied = tied.scatter_(1, ranked[:, :1], True)
         first, second = torch.nonzero((tied | tied.T).triu(1), as_tuple=True)
         both = weights[:, first] * weights[:, second]
@@ -141,7 +164,7 @@ class Joints:
 
 
 @dataclass(frozen=True)
-class Surface:
+class TemplateSurface:
     """The agent template: samples of its surface and of the space around it."""
 
     points: Float[Tensor, "point 3"]
@@ -158,55 +181,58 @@ class Surface:
 
     @classmethod
     def of(
-        cls,
-        mesh: Mesh,
-        feature: Float[np.ndarray, "vertex 16"],
-        rng: np.random.Generator,
-        margin_m: float = 0.25,
-        on: int = 4000,
-        off: int = 40000,
-        soles: int = 32,
-    ) -> "Surface":
-        """Sample a template mesh; distances are to the nearest of many surface samples, signed by their normals."""
+        cls, mesh: Mesh, feature: Float[np.ndarray, "vertex 16"], rng: np.random.Generator
+    ) -> "TemplateSurface":
+        """Sample a template mesh; distances are to the nearest of many surface samples, signed by their
+        normals.
+        """
         corner = mesh.vertices[mesh.faces].astype(np.float64)
         area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1)
-        face = rng.choice(len(mesh.faces), 8 * on, p=area / area.sum())
+        face = rng.choice(len(mesh.faces), 8 * ON_SURFACE, p=area / area.sum())
         bary = rng.dirichlet(np.ones(3), len(face))
         points = np.einsum("pk,pkd->pd", bary, corner[face])
         normal = mesh.face_normals()[face]
-        low, high = mesh.vertices.min(0) - margin_m, mesh.vertices.max(0) + margin_m
-        spread = rng.choice([0.01, 0.04], off // 2)[:, None]
-        around = np.concatenate(
-            [
-                points[rng.integers(len(points), size=off // 2)] + rng.normal(size=(off // 2, 3)) * spread,
-                rng.uniform(low, high, (off // 2, 3)),
-            ]
-        )
+        low, high = mesh.vertices.min(0) - AROUND_MARGIN_M, mesh.vertices.max(0) + AROUND_MARGIN_M
+        half = AROUND // 2
+        noise = rng.choice(NOISE_M, half)[:, None]
+        near = points[rng.integers(len(points), size=half)] + rng.normal(size=(half, 3)) * noise
+        around = np.concatenate([near, rng.uniform(low, high, (half, 3))])
         near_m, near = cKDTree(points).query(around, 8)
         side = ((around[:, None] - points[near]) * normal[near]).sum(-1).mean(-1)
         distance = near_m[:, 0] * np.where(side < 0, -1, 1)
         vertex = mesh.faces[face[near[:, 0]]]
         mix = bary[near[:, 0]]
-        color = np.einsum("pk,pkc->pc", mix, (mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128))[vertex] / 255)
+        color = np.einsum(
+            "pk,pkc->pc",
+            mix,
+            (mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128))[vertex] / 255,
+        )
         features = np.einsum("pk,pkc->pc", mix, feature[vertex].astype(np.float64))
         features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-6)
-        points, normal = points[:on], normal[:on]
+        points, normal = points[:ON_SURFACE], normal[:ON_SURFACE]
         height = points[:, 1] - points[:, 1].min()
-        sole = points[height < SOLE * height.max()][:soles]
-        return cls(*(torch.from_numpy(array).float() for array in (points, normal, around, distance, color, features, sole)))
+        sole = points[height < SOLE * height.max()][:SOLES]
+        return cls(
+            *(
+                torch.from_numpy(array).float()
+                for array in (points, normal, around, distance, color, features, sole)
+            )
+        )
 
-    def to(self, device: str) -> "Surface":
+    def to(self, device: str) -> "TemplateSurface":
         """Move all to a device."""
-        return Surface(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return TemplateSurface(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
 
-def firmness(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Float[Tensor, "knot"]:
-    """Tell how firmly the knots of camera corrections are held: once up to even odds of the cameras around, `FIRMEST` times if certain."""
-    sure = 1 + (FIRMEST - 1) * (2 * torch.from_numpy(confidence).float() - 1).clamp(0, 1).square()
+def prior_precision(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Float[Tensor, "knot"]:
+    """Return the prior precision of each camera knot: 1 up to even odds of its frames, `MOST_PRECISE` if
+    certain.
+    """
+    precision = 1 + (MOST_PRECISE - 1) * (2 * torch.from_numpy(confidence).float() - 1).clamp(0, 1).square()
     total, count = torch.zeros(2, len(motion.camera))
     for knot in (motion.knot, motion.knot + 1):
-        total.index_add_(0, knot, sure)
-        count.index_add_(0, knot, torch.ones_like(sure))
+        total.index_add_(0, knot, precision)
+        count.index_add_(0, knot, torch.ones_like(precision))
     return total / count
 
 

@@ -1,8 +1,8 @@
-"""Turn recordings into a compact store of rays, so that fitting never opens a picture again.
+"""Turn recordings into a compact store of rays, so that optimization never opens a picture again.
 
-`collect` reads each frame of one video once and keeps a few pixels of it: some anywhere, some on and around the
-agent. `Views` also keeps thumbnails of each frame (depth, distance from the agent's mask, what may hide it) to test the
-posed surface against. `join` strings the videos together on one frame axis.
+`collect` reads each frame of one video once and keeps a few pixels of it: some anywhere, some on and around
+the agent. `Views` keeps thumbnails of each frame (depth, distance from the agent's mask, occluders) for the
+losses of the posed surface. `join` puts the videos on one frame axis.
 """
 
 import functools
@@ -19,12 +19,23 @@ from scipy.ndimage import minimum_filter
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.files import arrays
-from pipeline.files.clips import Clip, Masks
-from pipeline.space import cameras
-from pipeline.space.thin_depth import supported
+from pipeline.data import npz
+from pipeline.data.clips import Clip, Masks, usable_depth
+from pipeline.data.features import cell_of as feature_cell
+from pipeline.data.flow import cell_of as flow_cell
+from pipeline.geometry import cameras
+from pipeline.geometry.flying_pixels import supported
+from stages.reconstruct.config import PixelSampling
 
 AGENT, UNKNOWN, NOT_AGENT = 255, 128, 0
+"""values of a mask"""
+RING_PX, RING_SHARE = 10, 0.25
+"""width of the ring around the mask, color pixels, and its share of the pixels kept for the agent"""
+LEAST_SLOPE = 0.15
+"""surfaces are taken as no more oblique than this: normals of noisy depth err"""
+EDGE_M, EDGE_SHARE = 0.1, 0.05
+"""depth that changes by more than this within 3 pixels, plus this share of itself, is an edge and not
+trusted"""
 THUMBNAIL = 4
 """colour pixels along the edge of a thumbnail's pixel"""
 FAR_PX = 255.0
@@ -68,7 +79,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Views:
-    """One entry per frame: intrinsics and thumbnails, which lie in the upper left corner where pictures differ in size."""
+    """Intrinsics and thumbnails of each frame; smaller ones lie in the upper left corner."""
 
     intrinsics: Float[Tensor, "frame 3 3"]
     """colour pixels"""
@@ -77,9 +88,10 @@ class Views:
     depth: Float[Tensor, "frame height width"]
     """metres, half precision; 0 = unknown"""
     outside_px: Float[Tensor, "frame height width"]
-    """colour pixels outside the agent's mask, negative inside, half precision; `FAR_PX` = farther or no mask"""
+    """colour pixels outside the agent's mask, negative inside, half precision; `FAR_PX` = farther or no
+    mask"""
     occluder: Float[Tensor, "frame height width"]
-    """depth of what may hide the agent (`occluder_depth`)"""
+    """depth of what may occlude the agent (`occluder_depth`)"""
     agent_seen: Bool[Tensor, "frame"]
     """the mask of this frame can be trusted"""
 
@@ -89,35 +101,23 @@ class Views:
 
 
 @dataclass(frozen=True)
-class Store:
+class RayStore:
     """The rays of all videos, split by purpose, on one frame axis."""
 
     scene: Rays
-    """anywhere in the picture but on the agent; empty of turnaround frames"""
+    """anywhere in the picture except on the agent; none of the turnaround"""
     agent: Rays
     """on the agent's mask and in a ring around it"""
     views: Views
 
     @functools.cached_property
     def farthest_m(self) -> float:
-        """How far from the phone anything was measured, metres."""
+        """The largest measured depth, metres."""
         return float(self.views.depth.max())
 
 
 @dataclass(frozen=True)
-class Sampling:
-    """How many pixels of a frame are kept."""
-
-    scene_per_frame: int
-    agent_per_frame: int
-    ring_px: int = 10
-    """width of the ring around the mask, colour pixels"""
-    ring_share: float = 0.25
-    """share of the pixels kept for the agent that lie in the ring, if the mask is large enough"""
-
-
-@dataclass(frozen=True)
-class Source:
+class RaySource:
     """One video's inputs."""
 
     clip: Clip
@@ -130,22 +130,24 @@ class Source:
     """False for the turnaround, whose cameras are known relative to the agent only"""
 
 
-def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
+def collect(source: RaySource, sampling: PixelSampling, rng: Generator) -> RayStore:
     """Read every frame of a video once; frames count from 0."""
     scene, agent, depths, outsides, occluders = [], [], [], [], []
     for frame in range(len(source.clip)):
         depth, slope = trusted_depth(source.clip, frame)
         mask = source.masks[frame] if source.masks is not None else np.zeros(source.clip.color_size, np.uint8)
         seen = source.masks is not None and source.masks.visible[frame]
-        near = near_agent(mask, sampling.ring_px) if seen else np.zeros(mask.shape, bool)
+        near = near_agent(mask, RING_PX) if seen else np.zeros(mask.shape, bool)
         if source.has_scene:
             reader = _Reader(source, frame, mask, depth, slope)
             scene.append(reader.read(_choose(mask == NOT_AGENT, sampling.scene_per_frame, rng), rng))
         if seen:
             reader = _Reader(source, frame, mask, thin_depth(source.clip, frame), slope)
-            agent.append(reader.read(choose_on_agent(mask, near, sampling, rng), rng))
+            agent.append(reader.read(choose_on_agent(mask, near, sampling.agent_per_frame, rng), rng))
         small = tuple(size // THUMBNAIL for size in mask.shape)
-        depths.append(cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16))
+        depths.append(
+            cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
+        )
         outsides.append(distance_outside(mask, small) if seen else np.full(small, FAR_PX, np.float16))
         occluders.append(occluder_depth(depths[-1], outsides[-1]))
     visible = source.masks.visible if source.masks is not None else np.zeros(len(source.clip), bool)
@@ -157,18 +159,19 @@ def collect(source: Source, sampling: Sampling, rng: Generator) -> Store:
         torch.from_numpy(np.stack(occluders)),
         torch.from_numpy(visible.astype(bool)),
     )
-    return Store(_concatenate(scene), _concatenate(agent), views)
+    return RayStore(_concatenate(scene), _concatenate(agent), views)
 
 
-def join(stores: Iterable[Store], folder: Path | None, size: tuple[int, int] | None = None) -> Store:
-    """String videos together; frame indices of later videos are shifted by the frames before them.
+def join(stores: Iterable[RayStore], folder: Path | None, size: tuple[int, int] | None = None) -> RayStore:
+    """Put videos on one frame axis; frame indices of later videos are shifted by the frames before them.
 
-    What comes out lies in unnamed files in ``folder``, so that memory does not grow with the frames (`arrays.Column`).
+    The result lies in unnamed files in ``folder``, so that memory does not grow with the frames
+    (`npz.Column`).
 
     Args:
         size: height and width of all thumbnails; those of the first store if None.
     """
-    parts = [[arrays.Column(folder) for _ in fields(kind)] for kind in (Rays, Rays, Views)]
+    parts = [[npz.Column(folder) for _ in fields(kind)] for kind in (Rays, Rays, Views)]
     frames = 0
     for store in stores:
         size = size or tuple(store.views.depth.shape[1:])
@@ -177,16 +180,23 @@ def join(stores: Iterable[Store], folder: Path | None, size: tuple[int, int] | N
             for column, field in zip(columns, fields(table), strict=True):
                 column.append(getattr(table, field.name).numpy())
         frames += len(store.views.intrinsics)
-    return Store(
-        *(kind(*(torch.from_numpy(column.array()) for column in columns)) for kind, columns in zip((Rays, Rays, Views), parts, strict=True))
+    return RayStore(
+        *(
+            kind(*(torch.from_numpy(column.array()) for column in columns))
+            for kind, columns in zip((Rays, Rays, Views), parts, strict=True)
+        )
     )
 
 
 def _padded(views: Views, height: int, width: int) -> Views:
-    """Widen thumbnails to the right and below with unknown depth and no mask: recordings may be upright or wide."""
+    """Widen thumbnails to the right and below with unknown depth and no mask: recordings may be upright or
+    wide.
+    """
     edge = (0, width - views.depth.shape[2], 0, height - views.depth.shape[1])
     depth, occluder = functional.pad(views.depth, edge), functional.pad(views.occluder, edge)
-    return replace(views, depth=depth, occluder=occluder, outside_px=functional.pad(views.outside_px, edge, value=FAR_PX))
+    return replace(
+        views, depth=depth, occluder=occluder, outside_px=functional.pad(views.outside_px, edge, value=FAR_PX)
+    )
 
 
 def _shift(rays: Rays, start: int) -> Rays:
@@ -215,30 +225,41 @@ def _concatenate(parts: Sequence[Rays]) -> Rays:
 def occluder_depth(
     depth: Float[np.ndarray, "height width"], outside_px: Float[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "height width"]:
-    """Fill what is not known of a thumbnail with the nearest that is measured beside it, but on the agent: edges have no depth."""
-    beside = np.where((depth > 0) & (outside_px > 0), depth, np.inf)
-    nearest = minimum_filter(beside.astype(np.float32), 3, mode="constant", cval=np.inf)
+    """Fill unknown depth of a thumbnail with the nearest depth of its neighbours off the agent: edges have
+    none.
+    """
+    off_agent = np.where((depth > 0) & (outside_px > 0), depth, np.inf)
+    nearest = minimum_filter(off_agent.astype(np.float32), 3, mode="constant", cval=np.inf)
     return np.where((depth > 0) | np.isinf(nearest), depth, nearest).astype(depth.dtype)
 
 
-def trusted_depth(clip: Clip, frame: int) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """Return depth (0 where the sensor doubts it) and each pixel's slope from the depth's own normals."""
-    depth = clip.depth(frame).astype(np.float32)
-    depth[(clip.confidence(frame) == 0) | (depth < NEAREST_M)] = 0
+def trusted_depth(
+    clip: Clip, frame: int
+) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Return depth, metres (0 where its confidence is 0 or at edges), and each pixel's slope from its
+    normals.
+    """
+    depth = usable_depth(clip, frame, nearest_m=NEAREST_M)
     directions = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape).astype(np.float32)
-    smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(cv2.blur((depth > 0).astype(np.float32), (3, 3)), 1e-6)
+    smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(
+        cv2.blur((depth > 0).astype(np.float32), (3, 3)), 1e-6
+    )
     points = directions * smooth[..., None]
     across, down = np.zeros_like(points), np.zeros_like(points)
     across[:, 1:-1], down[1:-1] = points[:, 2:] - points[:, :-2], points[2:] - points[:-2]
     normal = np.cross(across, down)
     slope = np.abs((normal * directions).sum(-1)) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
-    jump = cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3))) > 0.1 + 0.05 * depth
+    jump = (
+        cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3))) > EDGE_M + EDGE_SHARE * depth
+    )
     depth[jump] = 0
-    return depth, np.clip(slope, 0.15, None).astype(np.float32)
+    return depth, np.clip(slope, LEAST_SLOPE, None).astype(np.float32)
 
 
 def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Return depth (0 = unknown) that neighbours support, however much the sensor doubts it: thin limbs are all edge."""
+    """Return depth, metres (0 = unknown), that neighbours support, of any confidence: thin limbs are all
+    edge.
+    """
     depth = clip.depth(frame).astype(np.float32)
     return np.where(supported(depth) & (depth >= NEAREST_M), depth, 0)
 
@@ -249,21 +270,31 @@ def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np
     return cv2.dilate((mask == AGENT).astype(np.uint8), kernel) > 0
 
 
-def distance_outside(mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]) -> Float16[np.ndarray, "small_height small_width"]:
-    """Return how many colour pixels the middles of a thumbnail's pixels lie outside the mask's edge, negative inside.
+def distance_outside(
+    mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]
+) -> Float16[np.ndarray, "small_height small_width"]:
+    """Return how many colour pixels the middles of a thumbnail's pixels lie outside the mask's edge, negative
+    inside.
 
-    The edge runs between pixels. It is found at full resolution; the thumbnail averages a distance, not labels.
+    The edge runs between pixels. It is found at full resolution; the thumbnail averages a distance, not
+    labels.
     """
     outside = (mask == NOT_AGENT).astype(np.uint8)
     if outside.all():
         return np.full(small, FAR_PX, np.float16)
-    beyond, within = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (outside, 1 - outside))
+    beyond, within = (
+        cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (outside, 1 - outside)
+    )
     signed = np.where(outside, beyond - 0.5, 0.5 - within)
     height, width = (size * THUMBNAIL for size in small)
-    return cv2.resize(np.clip(signed[:height, :width], -FAR_PX, FAR_PX), small[::-1], interpolation=cv2.INTER_AREA).astype(np.float16)
+    return cv2.resize(
+        np.clip(signed[:height, :width], -FAR_PX, FAR_PX), small[::-1], interpolation=cv2.INTER_AREA
+    ).astype(np.float16)
 
 
-def _choose(allowed: Bool[np.ndarray, "height width"], count: int, rng: Generator) -> Int[np.ndarray, "ray 2"]:
+def _choose(
+    allowed: Bool[np.ndarray, "height width"], count: int, rng: Generator
+) -> Int[np.ndarray, "ray 2"]:
     """Choose up to ``count`` allowed pixels (row, column), without repetition."""
     flat = np.flatnonzero(allowed)
     picked = np.sort(rng.choice(flat, min(count, len(flat)), replace=False))
@@ -271,24 +302,28 @@ def _choose(allowed: Bool[np.ndarray, "height width"], count: int, rng: Generato
 
 
 def choose_on_agent(
-    mask: UInt8[np.ndarray, "height width"], near: Bool[np.ndarray, "height width"], sampling: Sampling, rng: Generator
+    mask: UInt8[np.ndarray, "height width"],
+    near: Bool[np.ndarray, "height width"],
+    count: int,
+    rng: Generator,
 ) -> Int[np.ndarray, "ray 2"]:
-    """Choose pixels (row, column) on the agent, where it is thin more densely, and in the ring around it."""
-    count = sampling.agent_per_frame
+    """Choose ``count`` pixels (row, column) on the agent, where it is thin more densely, and in the ring
+    around it.
+    """
     inside = cv2.distanceTransform((mask == AGENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3).ravel()
     flat = np.flatnonzero(inside)
-    wanted = min(count - int(count * sampling.ring_share), len(flat))
+    number = min(count - int(count * RING_SHARE), len(flat))
     density = 1 / inside[flat]
-    on_mask = rng.choice(flat, wanted, replace=False, p=density / density.sum()) if wanted else flat
+    on_mask = rng.choice(flat, number, replace=False, p=density / density.sum()) if number else flat
     around = np.flatnonzero(near.ravel() & (inside == 0))
-    beside = rng.choice(around, min(count - wanted, len(around)), replace=False)
-    return np.stack(np.unravel_index(np.sort(np.concatenate([on_mask, beside])), mask.shape), axis=-1)
+    in_ring = rng.choice(around, min(count - number, len(around)), replace=False)
+    return np.stack(np.unravel_index(np.sort(np.concatenate([on_mask, in_ring])), mask.shape), axis=-1)
 
 
 class _Reader:
     """Reads what is known at chosen pixels of one frame."""
 
-    def __init__(self, source: Source, frame: int, mask: np.ndarray, depth: np.ndarray, slope: np.ndarray):
+    def __init__(self, source: RaySource, frame: int, mask: np.ndarray, depth: np.ndarray, slope: np.ndarray):
         self.source, self.frame, self.mask, self.depth, self.slope = source, frame, mask, depth, slope
         self.color = source.clip.color(frame)
 
@@ -298,10 +333,13 @@ class _Reader:
         pixel = np.stack([column, row], axis=-1) + 0.5
         direction = cameras.unproject(pixel, clip.intrinsics[self.frame])
         at_depth = cameras.project(direction, clip.depth_intrinsics[self.frame])[0].astype(int)
-        x, y = np.clip(at_depth[:, 0], 0, self.depth.shape[1] - 1), np.clip(at_depth[:, 1], 0, self.depth.shape[0] - 1)
+        x, y = (
+            np.clip(at_depth[:, 0], 0, self.depth.shape[1] - 1),
+            np.clip(at_depth[:, 1], 0, self.depth.shape[0] - 1),
+        )
         features = self.source.features
         feature = np.asarray(features[self.frame])[
-            np.minimum(row // 8, features.shape[1] - 1), np.minimum(column // 8, features.shape[2] - 1)
+            feature_cell(row, features.shape[1]), feature_cell(column, features.shape[2])
         ]
         flow, confidence, gap = self._flow(place, rng)
         measured = (
@@ -312,14 +350,19 @@ class _Reader:
             np.rint(feature.astype(np.float32) * 127).astype(np.int8),
         )
         measured += (self.mask[row, column], (pixel + flow).astype(np.float32), confidence, gap)
-        return Rays(torch.full((len(place),), self.frame), *(torch.from_numpy(np.ascontiguousarray(array)) for array in measured))
+        return Rays(
+            torch.full((len(place),), self.frame),
+            *(torch.from_numpy(np.ascontiguousarray(array)) for array in measured),
+        )
 
-    def _flow(self, place: Int[np.ndarray, "ray 2"], rng: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _flow(
+        self, place: Int[np.ndarray, "ray 2"], rng: Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return displacement, confidence and gap, one gap for all pixels of the frame."""
         possible = [flow for flow in self.source.flows if self.frame < len(flow[1])]
         if not possible:
             return np.zeros((len(place), 2)), np.zeros(len(place), np.uint8), np.ones(len(place), np.int8)
         gap, forward, confidence = possible[rng.integers(len(possible))]
-        row, column = np.minimum(place[:, 0] // 4, forward.shape[1] - 1), np.minimum(place[:, 1] // 4, forward.shape[2] - 1)
+        row, column = (flow_cell(place[:, 0], forward.shape[1]), flow_cell(place[:, 1], forward.shape[2]))
         found = np.asarray(forward[self.frame])[row, column].astype(np.float64)
         return found, np.asarray(confidence[self.frame])[row, column], np.full(len(place), gap, np.int8)

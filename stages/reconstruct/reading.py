@@ -7,126 +7,164 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import progress, threads
-from pipeline.errors import InputError
-from pipeline.files import arrays, meshes
-from pipeline.files.clips import Clip, Masks
-from stages.reconstruct.assemble import Template, Video
-from stages.reconstruct.rays import Sampling, Source, collect, join
-
-FLOW_GAPS = (1, 2, 4, 8)
+from pipeline.core import progress, threads
+from pipeline.core.errors import InputError
+from pipeline.data import features, flow, ply, templates
+from pipeline.data.clips import Clip, Masks
+from pipeline.data.poses import RegisteredPoses
+from pipeline.data.templates import AgentCameras, SceneCameras, SkinTable
+from stages.reconstruct.assemble import AgentTemplate, RegisteredVideo
+from stages.reconstruct.config import PixelSampling
+from stages.reconstruct.rays import RaySource, collect, join
 
 
 @dataclass(frozen=True)
-class Folders:
-    """Where the inputs stand; per-recording ones by id."""
+class Inputs:
+    """What the stage reads; per-recording folders by id."""
 
     frames: Mapping[str, Path]
+    """of walk-through, turnaround and sessions"""
     masks: Mapping[str, Path]
     flow: Mapping[str, Path]
     features: Mapping[str, Path]
     registration: Path
     scene_template: Path
     agent_template: Path
-    scratch: Path | None = None
-    """where unnamed files with what was read may stand; None: where temporary files do"""
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Reads recordings into rays."""
+
+    inputs: Inputs
+    sampling: PixelSampling
+    seed: int
+    scratch: Path | None
+
+    def walkthrough(self, id: str) -> RegisteredVideo:
+        """Read the walk-through, in which there is no agent."""
+        table = SceneCameras.open(self.inputs.scene_template)
+        cameras = table.world_from_registered
+        source = RaySource(
+            Clip.open(self.inputs.frames[id]), features.open_features(self.inputs.features[id])
+        )
+        return RegisteredVideo(
+            id,
+            table.timestamp_s,
+            cameras,
+            np.full_like(cameras, np.nan),
+            np.ones(len(cameras)),
+            np.zeros(len(cameras), bool),
+            camera_free=False,
+            has_scene=True,
+            store=join([collect(source, self.sampling, self._rng(id))], self.scratch),
+            source=source,
+        )
+
+    def turnaround(self, id: str) -> RegisteredVideo:
+        """Read the turnaround; its world is the agent, so the root is the identity wherever the camera is
+        known.
+        """
+        table, source = AgentCameras.open(self.inputs.agent_template), self._masked(id, has_scene=False)
+        cameras = table.agent_from_registered
+        known = np.isfinite(cameras).all((1, 2))
+        return RegisteredVideo(
+            id,
+            table.timestamp_s,
+            cameras,
+            np.where(known[:, None, None], np.eye(4), np.nan),
+            known.astype(float),
+            known,
+            camera_free=False,
+            has_scene=False,
+            store=join([collect(source, self.sampling, self._rng(id))], self.scratch),
+        )
+
+    def session(self, id: str) -> RegisteredVideo:
+        """Read a registered session."""
+        table = RegisteredPoses.open(self.inputs.registration / id)
+        assert table is not None, f"{id} was refused"
+        source = self._masked(id, has_scene=True)
+        return RegisteredVideo(
+            id,
+            table.timestamp_s,
+            table.world_from_camera,
+            table.world_from_agent,
+            table.confidence,
+            table.agent_visible,
+            camera_free=True,
+            has_scene=True,
+            store=join([collect(source, self.sampling, self._rng(id))], self.scratch),
+            source=source,
+            agent_confidence=table.agent_confidence,
+        )
+
+    def _masked(self, id: str, has_scene: bool) -> RaySource:
+        inputs = self.inputs
+        flows = tuple(
+            (gap, flow.open_flow(inputs.flow[id], gap), flow.open_confidence(inputs.flow[id], gap))
+            for gap in flow.GAPS
+            if flow.path_of(inputs.flow[id], gap).exists()
+        )
+        return RaySource(
+            Clip.open(inputs.frames[id]),
+            features.open_features(inputs.features[id]),
+            Masks.open(inputs.masks[id]),
+            flows,
+            has_scene,
+        )
+
+    def _rng(self, id: str) -> np.random.Generator:
+        return np.random.default_rng([self.seed, *id.encode()])
 
 
 def read_videos(
-    folders: Folders,
+    inputs: Inputs,
     walkthrough: str,
     turnaround: str,
-    sampling: Sampling,
+    sampling: PixelSampling,
     seed: int,
     only: Collection[str | None] | None = None,
+    scratch: Path | None = None,
     workers: int = 1,
-) -> list[Video]:
+) -> list[RegisteredVideo]:
     """Read the walk-through, the turnaround and every registered session once into rays with their poses.
 
-    With ``only``, the first registered one of these sessions, of all where it is empty, stands alone, with the turnaround that
-    made its template.
-    So many ``workers`` read sessions at once.
-    Raises `InputError` RCN-001 when no session was registered.
+    Args:
+        only: the first registered one of these sessions (of all where it is empty) stands alone, with the
+            turnaround.
+        scratch: folder of unnamed files with the rays; None: where temporary files stand.
+        workers: sessions read at once.
+
+    Raises:
+        InputError: RCN-001 when no session was registered.
     """
-    sessions = [id for id in sorted(folders.frames) if (folders.registration / id / "poses.npz").exists() and (not only or id in only)]
+    sessions = [
+        id
+        for id in sorted(inputs.frames)
+        if (inputs.registration / id / "poses.npz").exists() and (not only or id in only)
+    ]
     if not sessions:
-        raise InputError("RCN-001", "no session was registered", str(folders.registration), "see registration/summary.json for the reasons")
+        raise InputError(
+            "RCN-001",
+            "no session was registered",
+            str(inputs.registration),
+            "see registration/summary.json for the reasons",
+        )
+    reader = _Reader(inputs, sampling, seed, scratch)
     if only is not None:
-        return [_turnaround(turnaround, folders, sampling, seed), _session(sessions[0], folders, sampling, seed)]
-    videos = [_walkthrough(walkthrough, folders, sampling, seed), _turnaround(turnaround, folders, sampling, seed)]
-    read = threads.ordered(lambda id: _session(id, folders, sampling, seed), sessions, workers)
+        return [reader.turnaround(turnaround), reader.session(sessions[0])]
+    videos = [reader.walkthrough(walkthrough), reader.turnaround(turnaround)]
+    read = threads.ordered(reader.session, sessions, workers)
     return videos + list(progress.track(read, "reading sessions", total=len(sessions)))
 
 
-def _walkthrough(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
-    table = arrays.load(folders.scene_template / "cameras.npz")
-    cameras = np.where(table["registered"][:, None, None], table["world_from_camera"], np.nan)
-    source = Source(Clip.open(folders.frames[id]), _features(folders, id))
-    nowhere, nothing = np.full_like(cameras, np.nan), np.zeros(len(cameras), bool)
-    store = join([collect(source, sampling, _rng(seed, id))], folders.scratch)
-    return Video(
-        id,
-        table["timestamp_s"],
-        cameras,
-        nowhere,
-        np.ones(len(cameras)),
-        nothing,
-        camera_free=False,
-        has_scene=True,
-        store=store,
-        source=source,
-    )
-
-
-def _turnaround(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
-    """Read the turnaround; its world is the agent, so the root is the identity wherever the camera is known."""
-    table = arrays.load(folders.agent_template / "cameras.npz")
-    cameras = np.where(table["registered"][:, None, None], table["agent_from_camera"], np.nan)
-    known = np.isfinite(cameras).all((1, 2))
-    root = np.where(known[:, None, None], np.eye(4), np.nan)
-    store = join([collect(_masked(id, folders, has_scene=False), sampling, _rng(seed, id))], folders.scratch)
-    return Video(id, table["timestamp_s"], cameras, root, known.astype(float), known, camera_free=False, has_scene=False, store=store)
-
-
-def _session(id: str, folders: Folders, sampling: Sampling, seed: int) -> Video:
-    table, source = arrays.load(folders.registration / id / "poses.npz"), _masked(id, folders, has_scene=True)
-    store = join([collect(source, sampling, _rng(seed, id))], folders.scratch)
-    return Video(
-        id,
-        table["timestamp_s"],
-        table["world_from_camera"],
-        table["world_from_agent"],
-        table["confidence"],
-        table["agent_visible"],
-        camera_free=True,
-        has_scene=True,
-        store=store,
-        source=source,
-        agent_confidence=table["agent_confidence"],
-    )
-
-
-def _masked(id: str, folders: Folders, has_scene: bool) -> Source:
-    flows = []
-    for gap in FLOW_GAPS:
-        path = folders.flow[id] / f"flow_{gap}_fw.npz"
-        if path.exists():
-            flows.append((gap, arrays.open_lazily(path, "flow"), arrays.open_lazily(path, "confidence")))
-    return Source(Clip.open(folders.frames[id]), _features(folders, id), Masks.open(folders.masks[id]), tuple(flows), has_scene)
-
-
-def _features(folders: Folders, id: str) -> np.ndarray:
-    return arrays.open_lazily(folders.features[id] / "features.npz", "features")
-
-
-def _rng(seed: int, id: str) -> np.random.Generator:
-    return np.random.default_rng([seed, *id.encode()])
-
-
-def read_template(folder: Path) -> Template:
+def read_template(folder: Path) -> AgentTemplate:
     """Read the agent template."""
-    skin, feature = arrays.load(folder / "skin.npz"), arrays.load(folder / "vertex_features.npz")["features"]
-    return Template(meshes.read_ply(folder / "agent.ply"), feature, skin["agent_from_bone_rest"], skin["bone_scale_m"])
+    skin, feature = SkinTable.open(folder), templates.read_vertex_features(folder)
+    return AgentTemplate(
+        ply.read_ply(folder / "agent.ply"), feature, skin.agent_from_bone_rest, skin.bone_scale_m
+    )
 
 
 def read_floor(folder: Path) -> float:

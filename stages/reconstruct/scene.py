@@ -4,32 +4,52 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from pipeline.models.fields import density
-from pipeline.models.motion import MotionTable
-from pipeline.models.render import Layer, composite
+from pipeline.data.motion import MotionTable
+from pipeline.fields.fields import Field, density
+from pipeline.fields.render import Layer, composite, importance_depths
 from stages.reconstruct import losses
+from stages.reconstruct.config import LossWeights, RayBatches
 from stages.reconstruct.problem import Problem, pick
 from stages.reconstruct.rays import Rays
-from stages.reconstruct.settings import Batches, Weights
 
 Terms = dict[str, tuple[float, Tensor]]
+"""weight and values per element of each loss"""
 FREE_FROM_M = 0.1
+"""rays begin here"""
+NEAR, FREE = 4, 3
+"""samples of a ray near its measured depth, and in the free space before it"""
 BEHIND_M = 0.06
 """samples behind a measured surface; deeper ones would fill thin things and what lies behind edges"""
+LEAST_SLOPE = 0.3
+"""reach of the samples near depth grows on oblique surfaces, but no further than at this slope"""
+REACH_M = 0.15
+"""half of the samples of rendered rays lie this near to measured depth"""
 EIKONAL_STEP_M = 0.04
+"""step of finite differences, half a cell of the finest grid"""
+EIKONAL_SHARE = 8
+"""the eikonal loss looks at one ray in so many"""
+DRIFT_WEIGHT, ANCHOR_WEIGHT, CAMERA_M = 0.1, 0.05, 0.01
+"""corrections of neighbouring camera knots agree, and are small, per centimetre (0.6 degrees) squared"""
 
 
-def swap_probability(progress: float, batches: Batches) -> float:
-    """Return how often codes are swapped, linearly from first to last (paper 001, scene annealing)."""
+def swap_probability(progress: float, batches: RayBatches) -> float:
+    """Return the probability of code swaps, linear from first to last (paper 001, scene annealing)."""
     return batches.swap_first + (batches.swap_last - batches.swap_first) * progress
 
 
-def swap(video: Int[Tensor, "ray"], videos: int, probability: float, generator: Generator) -> Int[Tensor, "ray"]:
-    """Replace the code's index by another video's with some probability (paper 001, scene annealing); without codes nothing changes."""
+def swap(
+    video: Int[Tensor, "ray"], videos: int, probability: float, generator: Generator
+) -> Int[Tensor, "ray"]:
+    """Replace each code's index by a random one with some probability (paper 001, scene annealing).
+
+    Without codes nothing changes.
+    """
     if not videos:
         return video
     other = torch.randint(videos, video.shape, generator=generator).to(video.device)
-    return torch.where((torch.rand(video.shape, generator=generator) < probability).to(video.device), other, video)
+    return torch.where(
+        (torch.rand(video.shape, generator=generator) < probability).to(video.device), other, video
+    )
 
 
 def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
@@ -38,63 +58,97 @@ def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"],
     return pose[:, :3, 3], (pose[:, :3, :3] @ rays.direction[..., None])[..., 0]
 
 
-def sample_depths(rays: Rays, near: int, free: int, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
-    """Return the measured depth, samples from ``reach_m`` before the surface to just behind it, and samples in the free space before it."""
-    device, depth = rays.depth.device, rays.depth[:, None]
-    place = torch.rand(len(rays), near, generator=generator).to(device)
-    around = place * (reach_m / rays.slope[:, None].clamp_min(0.3) + BEHIND_M) - BEHIND_M
-    step = (torch.arange(free, device=device) + torch.rand(len(rays), free, generator=generator).to(device)) / max(free, 1)
-    before = FREE_FROM_M + (depth - reach_m - FREE_FROM_M).clamp_min(0) * step
+def sample_depths(rays: Rays, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
+    """Return the measured depth, `NEAR` samples from ``reach_m`` before it to just behind, and `FREE` before
+    those; metres.
+    """
+    depth = rays.depth[:, None]
+    place = torch.rand(len(rays), NEAR, generator=generator).to(depth.device)
+    around = place * (reach_m / rays.slope[:, None].clamp_min(LEAST_SLOPE) + BEHIND_M) - BEHIND_M
+    before = FREE_FROM_M + (depth - reach_m - FREE_FROM_M).clamp_min(0) * strata(rays, FREE, generator)
     return torch.cat([depth, depth - around, before], dim=1)
 
 
+def strata(rays: Rays, count: int, generator: Generator) -> Float[Tensor, "ray sample"]:
+    """Return ``count`` stratified random numbers in 0..1 for each ray, increasing."""
+    device = rays.depth.device
+    offset = torch.rand(len(rays), count, generator=generator).to(device)
+    return (torch.arange(count, device=device) + offset) / count
+
+
 def measured_terms(
-    problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, batches: Batches, generator: Generator
+    problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: LossWeights, generator: Generator
 ) -> Terms:
     """Fit the scene where the sensor measured: rays of known depth."""
     field, limit = problem.scene, problem.scene.shape.truncation_m
+    assert limit is not None, "a scene that never saturates is learned by rendering"
     origin, direction = world_rays(problem.motion, rays)
-    depth = sample_depths(rays, batches.near, batches.free, limit, generator)
+    depth = sample_depths(rays, limit, generator)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     video, samples = problem.video[rays.frame], depth.shape[1]
-    distance = field.distance_at(points.view(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)).view(-1, samples)
+    distance = field.distance_at(
+        points.view(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
+    ).view(-1, samples)
     target = (rays.depth[:, None] - depth) * rays.slope[:, None]
-    target[:, 1 + batches.near :] = target[:, 1 + batches.near :].clamp_min(limit)
-    color, feature = field.look(field.encode(points[:, 0], video, code_of))
+    target[:, 1 + NEAR :] = target[:, 1 + NEAR :].clamp_min(limit)
+    color, feature = field.color_and_feature(field.encode(points[:, 0], video, code_of))
     terms = {
         "distance": (weights.distance, losses.truncated_distance(distance, target, limit)),
         "color": (weights.color, losses.color(color, rays.color / 255)),
         "feature": (weights.feature, losses.feature(feature, rays.feature / 127)),
     }
     if field.fused is None:
-        few = slice(0, len(rays) // 8)
-        beside = points[few, 0].detach() + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
-        shifted = field.distance_at(beside.reshape(-1, 3), video[few].repeat(3), code_of[few].repeat(3)).view(3, -1)
-        terms["eikonal"] = (weights.eikonal, losses.eikonal(distance[few, 0], shifted, EIKONAL_STEP_M))
+        few = slice(0, len(rays) // EIKONAL_SHARE)
+        terms["eikonal"] = weights.eikonal, eikonal(field, points[few, 0].detach(), video[few], code_of[few])
     return terms
 
 
+def eikonal(
+    field: Field,
+    points_world: Float[Tensor, "point 3"],
+    video: Int[Tensor, "point"],
+    code_of: Int[Tensor, "point"],
+) -> Float[Tensor, "point"]:
+    """Return the eikonal loss of the scene's field at points, by finite differences."""
+    neighbours = points_world + EIKONAL_STEP_M * torch.eye(3, device=points_world.device)[:, None]
+    distance = field.distance_at(points_world, video, code_of)
+    shifted = field.distance_at(neighbours.reshape(-1, 3), video.repeat(3), code_of.repeat(3)).view(3, -1)
+    return losses.eikonal(distance, shifted, EIKONAL_STEP_M)
+
+
 def rendered_terms(
-    problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: Weights, depth: Float[Tensor, "ray sample"]
+    problem: Problem,
+    rays: Rays,
+    code_of: Int[Tensor, "ray"],
+    weights: LossWeights,
+    depth: Float[Tensor, "ray sample"],
 ) -> Terms:
-    """Fit the scene by volume rendering at samples ``depth``: any rays, with or without measured depth."""
+    """Fit the scene by volume rendering at samples ``depth``, metres: any rays, with or without measured
+    depth.
+    """
     origin, direction = world_rays(problem.motion, rays)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     scene = scene_layer(problem, points, problem.video[rays.frame], code_of)
-    empty = Layer(torch.zeros_like(scene.density), torch.zeros_like(scene.color), torch.zeros_like(scene.feature))
-    seen = composite(depth, direction.norm(dim=-1), scene, empty)
+    rendered = composite(depth, direction.norm(dim=-1), scene)
     known = rays.depth > 0
     return {
-        "rendered color": (weights.rendered_color, losses.color(seen.color, rays.color / 255)),
-        "rendered feature": (weights.rendered_feature, losses.feature(seen.feature, rays.feature / 127)),
-        "rendered depth": (weights.rendered_depth, losses.depth(seen.depth, rays.depth)[known]),
+        "rendered color": (weights.rendered_color, losses.color(rendered.color, rays.color / 255)),
+        "rendered feature": (weights.rendered_feature, losses.feature(rendered.feature, rays.feature / 127)),
+        "rendered depth": (weights.rendered_depth, losses.depth(rendered.depth, rays.depth)[known]),
     }
 
 
-def scene_layer(problem: Problem, points: Float[Tensor, "ray sample 3"], video: Int[Tensor, "ray"], code_of: Int[Tensor, "ray"]) -> Layer:
-    """Ask the scene's field along rays, each with its video's scene and some video's code."""
+def scene_layer(
+    problem: Problem,
+    points: Float[Tensor, "ray sample 3"],
+    video: Int[Tensor, "ray"],
+    code_of: Int[Tensor, "ray"],
+) -> Layer:
+    """Evaluate the scene's field along rays, each with its video's geometry and some video's code."""
     field, (rays, samples) = problem.scene, points.shape[:2]
-    values = field(points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples))
+    values = field(
+        points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
+    )
     return Layer(
         density(values.signed_distance, field.beta_m).view(rays, samples),
         values.color.view(rays, samples, 3),
@@ -102,60 +156,95 @@ def scene_layer(problem: Problem, points: Float[Tensor, "ray sample 3"], video: 
     )
 
 
-def render_depths(
-    rays: Rays, farthest_m: float, generator: Generator, around: int = 12, along: int = 12, reach_m: float = 0.15
+def scene_density(
+    problem: Problem,
+    points: Float[Tensor, "ray sample 3"],
+    video: Int[Tensor, "ray"],
+    code_of: Int[Tensor, "ray"],
 ) -> Float[Tensor, "ray sample"]:
-    """Place samples for rendering: half around the measured depth, half up to it (up to ``farthest_m`` where it is unknown)."""
-    device = rays.depth.device
+    """Return the scene's density along rays, per metre; arguments as `scene_layer`'s."""
+    field, (rays, samples) = problem.scene, points.shape[:2]
+    distance = field.distance_at(
+        points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
+    )
+    return density(distance, field.beta_m).view(rays, samples)
+
+
+def render_depths(
+    rays: Rays, farthest_m: float, samples: int, generator: Generator
+) -> Float[Tensor, "ray sample"]:
+    """Place samples of rendered rays, z in metres: half around measured depth, half before it.
+
+    Where depth is unknown they reach up to ``farthest_m``.
+    """
     end = torch.where(rays.depth > 0, rays.depth, torch.full_like(rays.depth, farthest_m))[:, None]
-
-    def strata(count: int) -> Tensor:
-        return (torch.arange(count, device=device) + torch.rand(len(rays), count, generator=generator).to(device)) / count
-
-    near = end + (strata(around) * 2 - 1) * reach_m
-    far = FREE_FROM_M + (end - reach_m - FREE_FROM_M).clamp_min(0.01) * strata(along)
-    return torch.cat([far, near], dim=1).sort(dim=1).values
+    near = end + (strata(rays, samples // 2, generator) * 2 - 1) * REACH_M
+    before = (end - REACH_M - FREE_FROM_M).clamp_min(0.01) * strata(rays, samples - samples // 2, generator)
+    return torch.cat([FREE_FROM_M + before, near], dim=1).sort(dim=1).values
 
 
-def even_depths(rays: Rays, farthest_m: float, samples: int, generator: Generator) -> Float[Tensor, "ray sample"]:
-    """Place samples evenly up to ``farthest_m``, wherever the surface is."""
-    step = torch.arange(samples) + torch.rand(len(rays), samples, generator=generator)
-    return (FREE_FROM_M + (farthest_m - FREE_FROM_M) * step / samples).to(rays.depth.device)
+def even_depths(
+    rays: Rays, farthest_m: float, samples: int, generator: Generator
+) -> Float[Tensor, "ray sample"]:
+    """Place samples evenly up to ``farthest_m``, z in metres, wherever the surface is."""
+    return FREE_FROM_M + (farthest_m - FREE_FROM_M) * strata(rays, samples, generator)
 
 
-def drift_term(problem: Problem, weights: Weights) -> Terms:
-    """Keep the corrections of cameras small where registration is sure, and those of neighbouring knots alike: 1 cm and half a degree."""
-    motion, unit = problem.motion, 0.01
+def camera_prior(problem: Problem) -> Terms:
+    """Keep corrections of cameras small where registration is certain, and alike at neighbouring knots."""
+    correction = problem.motion.camera / CAMERA_M
     return {
-        "drift": (weights.drift, (torch.diff(motion.camera, dim=0) / unit).square()),
-        "anchor": (weights.anchor, problem.firm[:, None] * (motion.camera / unit).square()),
+        "drift": (DRIFT_WEIGHT, torch.diff(correction, dim=0).square()),
+        "anchor": (ANCHOR_WEIGHT, problem.camera_precision[:, None] * correction.square()),
     }
 
 
 class SceneLoss:
     """The loss of the first phase: scene and cameras, feature-metric loss included."""
 
-    def __init__(self, problem: Problem, weights: Weights, batches: Batches, steps: int):
+    def __init__(
+        self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
+    ):
+        """``rendered``: differentiable rendering alone, at even and importance samples (paper 001, A.1)."""
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
+        self.rendered = rendered
         self.measured = torch.nonzero(problem.store.scene.depth > 0)[:, 0].int()
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
-        return losses.weighted(
-            self.terms(self.batches.scene_rays, swap_probability(step / self.steps, self.batches), generator)
-            | drift_term(self.problem, self.weights),
-            shared=True,
-        )
+        probability = swap_probability(step / self.steps, self.batches)
+        terms = self.terms(self.batches.scene_rays, probability, generator)
+        return losses.weighted(terms | camera_prior(self.problem), shared=True)
 
     def terms(self, number: int, probability: float, generator: Generator) -> Terms:
-        """Return the scene's terms over random rays."""
+        """Return the scene's terms over random rays; codes are swapped with a ``probability``."""
+        if self.rendered:
+            return self._rendered(number, probability, generator)
         problem, store, batches = self.problem, self.problem.store, self.batches
-        if batches.places == "even":
-            rays = store.scene.at(pick(len(store.scene), number // 6, generator, problem.device))
-            code_of = swap(problem.video[rays.frame], problem.scene.shape.videos, probability, generator)
-            return rendered_terms(problem, rays, code_of, self.weights, even_depths(rays, store.farthest_m, batches.even, generator))
         rays = store.scene.at(self.measured[pick(len(self.measured), number, generator, problem.device)])
         others = store.scene.at(pick(len(store.scene), batches.rendered_rays // 2, generator, problem.device))
         videos = problem.scene.shape.videos
-        code_of, other_code = (swap(problem.video[some.frame], videos, probability, generator) for some in (rays, others))
-        found = measured_terms(problem, rays, code_of, self.weights, batches, generator)
-        return found | rendered_terms(problem, others, other_code, self.weights, render_depths(others, store.farthest_m, generator))
+        code_of, other_code = (
+            swap(problem.video[some.frame], videos, probability, generator) for some in (rays, others)
+        )
+        terms = measured_terms(problem, rays, code_of, self.weights, generator)
+        depth = render_depths(others, store.farthest_m, batches.rendered_samples, generator)
+        return terms | rendered_terms(problem, others, other_code, self.weights, depth)
+
+    def _rendered(self, number: int, probability: float, generator: Generator) -> Terms:
+        problem, field = self.problem, self.problem.scene
+        rays = problem.store.scene.at(pick(len(problem.store.scene), number, generator, problem.device))
+        video = problem.video[rays.frame]
+        code_of = swap(video, field.shape.videos, probability, generator)
+        coarse = even_depths(rays, problem.store.farthest_m, self.batches.rendered_samples // 2, generator)
+        origin, direction = world_rays(problem.motion, rays)
+        with torch.no_grad():
+            points = origin[:, None] + direction[:, None] * coarse[..., None]
+            density_ = scene_density(problem, points, video, code_of)
+            fine = importance_depths(coarse, direction.norm(dim=-1), density_, generator)
+        depth = torch.cat([coarse, fine], dim=1).sort(dim=1).values
+        terms = rendered_terms(problem, rays, code_of, self.weights, depth)
+        if not field.fused:
+            chosen = torch.randint(depth.shape[1], (len(rays), 1), generator=generator).to(depth.device)
+            place = (origin + direction * depth.gather(1, chosen)).detach()
+            terms["eikonal"] = self.weights.eikonal, eikonal(field, place, video, code_of)
+        return terms

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.files import arrays, meshes
-from pipeline.models import fields, motion
-from pipeline.models.fields import Reconstruction
-from pipeline.models.motion import Motion
-from pipeline.space.meshes import Mesh
+from pipeline.data import motion, ply
+from pipeline.data.motion import TRACKS, Motion
+from pipeline.data.templates import SkinTable
+from pipeline.data.volumes import FEATURE_VOLUME
+from pipeline.fields import fields
+from pipeline.fields.fields import Reconstruction
 from stages.reconstruct import results
 from stages.reconstruct.problem import Problem
 
@@ -20,27 +21,29 @@ def write(
     reconstruction: Reconstruction,
     motions: Mapping[str, Motion],
     sessions: Collection[str],
-    scene: Mesh,
-    agent: Mesh,
 ) -> None:
-    """Write motion per video (those of the templates apart), surfaces, skin, fields, feature volume and track points."""
+    """Write motion per video (of the templates apart), surfaces, skin, fields, feature volume and track
+    points.
+    """
     (folder / "templates").mkdir()
-    for id, found in motions.items():
+    for id, of_video in motions.items():
         if id in sessions:
             (folder / id).mkdir()
-        motion.save(folder / id / "motion.npz" if id in sessions else folder / "templates" / f"{id}.npz", found)
-    meshes.write_ply(folder / "scene.ply", scene)
-    meshes.write_ply(folder / "agent.ply", agent)
+            motion.save(folder / id / "motion.npz", of_video)
+        else:
+            motion.save(folder / "templates" / f"{id}.npz", of_video)
+    agent = results.agent_surface(problem)
+    ply.write_ply(folder / "scene.ply", results.scene_surface(problem))
+    ply.write_ply(folder / "agent.ply", agent)
     body = reconstruction.body
-    arrays.save(
-        folder / "skin.npz",
-        weights=results.skin_weights(problem, agent).astype(np.float32),
-        agent_from_bone_rest=body.agent_from_bone_rest.cpu().numpy().astype(np.float32),
-        bone_scale_m=body.bone_scale_m.detach().cpu().numpy().astype(np.float32),
-    )
+    SkinTable(
+        results.skin_weights(problem, agent),
+        body.agent_from_bone_rest.cpu().numpy(),
+        body.bone_scale_m.detach().cpu().numpy(),
+    ).write(folder)
     fields.save(folder, reconstruction)
     volume = results.feature_volume(problem)
-    arrays.save(
+    FEATURE_VOLUME.save(
         folder / "feature_volume.npz",
         compress=True,
         features=volume.features,
@@ -49,4 +52,4 @@ def write(
         voxel_m=np.float64(results.VOXEL_M),
     )
     index, rest = results.track_points(agent)
-    arrays.save(folder / "tracks.npz", vertex_index=index.astype(np.int64), rest_agent=rest.astype(np.float32))
+    TRACKS.save(folder / "tracks.npz", vertex_index=index, rest_agent=rest)

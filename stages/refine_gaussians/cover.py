@@ -1,9 +1,9 @@
-"""Cover the reconstruction's surfaces with Gaussians, and give those of the scene the colours that the pictures show.
+"""Cover the reconstruction's surfaces with Gaussians, in the colors of the pictures.
 
-`spread` puts many points on the surface that all videos share and on what single videos saw elsewhere (a chair that is
-moved between sessions), `watch` looks at them in some pictures of every video that they stand in (what stands where the
-sensor measured it counts, near views most) and tells colours and each video's exposure, `thin` keeps most of them where
-colours change fast and where cameras looked: there a coarse cover costs most.
+`sample_surfaces` puts many points on the surface that all videos share and on what single videos saw
+elsewhere (a chair that is moved between sessions). `observe` projects them into some pictures of every video
+that shows them and averages colors, near views most, and fits each video's exposure. `subsample` keeps most
+of them where colors change fast and where cameras looked: there a coarse cover costs most.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,50 +14,56 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from pipeline.models import gaussians, surfaces
-from pipeline.models.fields import Field
-from pipeline.models.gaussians import Gaussians, Spread
-from pipeline.space import cameras, rigid
+from pipeline.data.clips import usable_depth
+from pipeline.fields import gaussians, marching_cubes
+from pipeline.fields.fields import Field
+from pipeline.fields.gaussians import Gaussians, SurfaceSamples
+from pipeline.geometry import cameras, rigid
 from stages.refine_gaussians.refine import Sequence4D, usable_frames
 from stages.refine_gaussians.views import AGENT, UNKNOWN
 
+CANDIDATES = 6
+"""points that are sampled for each that is kept"""
+REACH_M = 0.05
+"""a point is seen where measured depth is this near at a distance of 1 m, twice that at 2 m"""
+PLAIN = 0.02
+"""color differences between neighbours, 0..1, that count as none"""
+WIDEST = 0.9
+"""Gaussians are no wider than this quantile of their spacing: isolated points stay small"""
+EVEN = 0.4
+"""share of the Gaussians that is spread evenly"""
+SHELL_M = 0.12
+"""unseen points this near to a seen one are its back, and left out"""
+LEAST_SEEN = 100
+"""points without which a video's exposure is not fitted"""
+RIDGE = 0.001
+"""pulls exposures to the identity where colors do not determine them"""
+NEAREST_M = 0.2
+"""nearer points are not looked at"""
+NEIGHBOURS = 6
+"""of a point, over which its color gradient is averaged"""
+SPACING_NEIGHBOUR, LEAST_SPACING_M = 4, 0.001
+"""the distance to this neighbour is a point's spacing, at least this"""
+CURVE_CELL_M, CURVE_BITS = 0.005, 20
+"""cells of the space-filling curve, and bits of their numbers"""
+
 
 @dataclass(frozen=True)
-class Cover:
-    """How the scene's surface is covered."""
-
-    candidates: int = 6
-    """points that are looked at for each that is kept"""
-    frames: int = 240
-    """pictures that are looked at, over all videos"""
-    reach_m: float = 0.05
-    """a point is seen where measured depth is this near, and at 1 m; twice that at 2 m"""
-    plain: float = 0.02
-    """difference of neighbouring colours, 0..1, that counts as none"""
-    widest: float = 0.9
-    """Gaussians are no wider than this share of them would be: what stands alone is small"""
-    even: float = 0.4
-    """share of the Gaussians that lies evenly on all that is there"""
-    shell_m: float = 0.12
-    """what no picture showed and lies this near to something that one showed is its back, and left out"""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What pictures tell of points."""
+class ObservedColors:
+    """Colors and visibility of points in the pictures."""
 
     color: Float[np.ndarray, "point 3"]
-    """0..1, in the light of the surface's own colours; those where never seen"""
+    """0..1, in the light of the surface's own colors; those where never seen"""
     weight: Float[np.ndarray, "point"]
     """sum of 1 / depth squared over the pictures that show a point"""
     through: Float[np.ndarray, "point"]
     """the same over the pictures that show what lies behind it: it was moved, or never there"""
     appearance: Float[np.ndarray, "video 3 4"]
-    """what turns these colours into each video's"""
+    """what turns these colors into each video's"""
 
 
 @dataclass(frozen=True)
-class Covered:
+class CoveredScene:
     """The scene in Gaussians."""
 
     gaussians: Gaussians
@@ -68,74 +74,98 @@ class Covered:
 
 
 def scene(
-    field: Field, codes: Sequence[int], number: int, sequences: Sequence[Sequence4D], cover: Cover, rng: np.random.Generator
-) -> Covered:
-    """Cover the scene as all videos share it and as single ones saw it; ``codes`` are the videos' in the field."""
-    points, layer, stands = spread(field, codes, cover.candidates * number, rng)
-    seen = watch(points, stands, sequences, cover)
-    kept, spacing_m = thin(points.points, layer, seen, number, cover, rng)
-    cloud = gaussians.on_surface(points.points[kept], points.normal[kept], seen.color[kept], spacing_m)
-    return Covered(cloud, stands[:, kept], seen.appearance)
-
-
-def spread(
-    field: Field, codes: Sequence[int], number: int, rng: np.random.Generator
-) -> tuple[Spread, Int[np.ndarray, "point"], Bool[np.ndarray, "row point"]]:
-    """Spread points over all surfaces: ``number`` on the shared one and as densely on those of single videos.
-
-    Returns the points, on whose surface each lies (-1: the shared one) and where it stands, as `Covered.stands`.
+    field: Field,
+    codes: Sequence[int],
+    number: int,
+    sequences: Sequence[Sequence4D],
+    frames: int,
+    rng: np.random.Generator,
+) -> CoveredScene:
+    """Cover the shared scene and what single videos saw; ``codes`` are the videos' in the field, ``frames``
+    as in the recipe.
     """
-    shared, keep_own = surfaces.extract_scene(field, -1, field.lattice_m), list(codes) if field.fused else []
-    spreads, layers = [gaussians.spread(shared, number, rng)], [np.full(number, -1)]
+    points, layer, stands = sample_surfaces(field, codes, CANDIDATES * number, rng)
+    seen = observe(points, stands, sequences, frames)
+    chosen, spacing_m = subsample(points.points, layer, seen, number, rng)
+    cloud = gaussians.surface_gaussians(
+        points.points[chosen], points.normal[chosen], seen.color[chosen], spacing_m
+    )
+    return CoveredScene(cloud, stands[:, chosen], seen.appearance)
+
+
+def sample_surfaces(
+    field: Field, codes: Sequence[int], number: int, rng: np.random.Generator
+) -> tuple[SurfaceSamples, Int[np.ndarray, "point"], Bool[np.ndarray, "row point"]]:
+    """Sample points on all surfaces: ``number`` on the shared one and as densely on those of single videos.
+
+    Returns the points, on whose surface each lies (-1: the shared one) and where it stands, as
+    `CoveredScene.stands`.
+    """
+    shared, keep_own = (
+        marching_cubes.extract_scene(field, -1, field.lattice_m),
+        list(codes) if field.fused else [],
+    )
+    parts, layers = [gaussians.sample_surface(shared, number, rng)], [np.full(number, -1)]
     for code in keep_own:
-        moved = surfaces.extract_moved(field, code)
-        count = round(moved.area_m2 / spreads[0].spacing_m ** 2)
+        moved = marching_cubes.extract_moved(field, code)
+        count = round(moved.area_m2 / parts[0].spacing_m ** 2)
         if count:
-            spreads.append(gaussians.spread(moved, count, rng))
+            parts.append(gaussians.sample_surface(moved, count, rng))
             layers.append(np.full(count, code))
     layer = np.concatenate(layers)
-    joined = (np.concatenate([getattr(part, name) for part in spreads]) for name in ("points", "normal", "color"))
-    together = Spread(*joined, spreads[0].spacing_m)
+    joined = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "normal", "color")
+    )
+    together = SurfaceSamples(*joined, parts[0].spacing_m)
     stands = np.stack([(layer == -1) | (layer == code) for code in (*codes, -1)])
     for row, code in zip(stands, keep_own, strict=False):
         own = field.fused.is_own(torch.from_numpy(together.points), code).numpy() & (layer == -1)
-        row[own] = surfaces.stands(field, together.points[own], code)
+        row[own] = marching_cubes.on_surface(field, together.points[own], code)
     return together, layer, stands
 
 
-def watch(spread: Spread, stands: Bool[np.ndarray, "row point"], sequences: Sequence[Sequence4D], cover: Cover) -> Seen:
-    """Average the pictures' colours at points; each video's exposure is fitted to the colours that the points have."""
-    points, color = spread.points, spread.color
+def observe(
+    samples: SurfaceSamples,
+    stands: Bool[np.ndarray, "row point"],
+    sequences: Sequence[Sequence4D],
+    frames: int,
+) -> ObservedColors:
+    """Average the pictures' colors at points; each video's exposure is fitted to the colors that the points
+    have.
+    """
+    points, color = samples.points, samples.color
     videos = [sequence for sequence in sequences if sequence.video is not None]
     total, appearance = np.zeros_like(color), np.tile(np.eye(3, 4), (len(videos), 1, 1))
     weight, through = np.zeros(len(points)), np.zeros(len(points))
-    every = max(1, sum(len(usable_frames(sequence)) for sequence in videos) // cover.frames)
+    every = max(1, sum(len(usable_frames(sequence)) for sequence in videos) // frames)
     for sequence in videos:
         sums, weights = np.zeros_like(color), np.zeros(len(points))
-        for look in _looks(spread, stands[sequence.video], sequence, every, cover.reach_m):
+        for look in _looks(samples, stands[sequence.video], sequence, every):
             sums[look.shown] += look.shown_weight[:, None] * look.color
             weights[look.shown] += look.shown_weight
             through[look.through] += look.through_weight
         shown = weights > 0
-        if shown.sum() < 100:
+        if shown.sum() < LEAST_SEEN:
             continue
         mean = sums[shown] / weights[shown, None]
         ours = exposure(color[shown], mean, weights[shown])
         appearance[sequence.video] = ours
         total[shown] += weights[shown, None] * ((mean - ours[:, 3]) @ np.linalg.inv(ours[:, :3]).T)
         weight += weights
-    found = np.clip(total / np.maximum(weight, 1e-9)[:, None], 0, 1)
-    return Seen(np.where(weight[:, None] > 0, found, color), weight, through, appearance)
+    mean = np.clip(total / np.maximum(weight, 1e-9)[:, None], 0, 1)
+    return ObservedColors(np.where(weight[:, None] > 0, mean, color), weight, through, appearance)
 
 
 def exposure(
-    source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"], weight: Float[np.ndarray, "point"], ridge: float = 0.001
+    source: Float[np.ndarray, "point 3"],
+    target: Float[np.ndarray, "point 3"],
+    weight: Float[np.ndarray, "point"],
 ) -> Float[np.ndarray, "3 4"]:
-    """Fit the affine map of colours from source to target, near the identity where they do not tell."""
+    """Fit the affine map of colors from source to target, near the identity where it is undetermined."""
     share = weight / weight.sum()
     inputs = np.concatenate([source, np.ones((len(source), 1))], axis=1)
-    normal = (inputs * share[:, None]).T @ inputs + ridge * np.eye(4)
-    return np.linalg.solve(normal, (inputs * share[:, None]).T @ target + ridge * np.eye(4, 3)).T
+    normal = (inputs * share[:, None]).T @ inputs + RIDGE * np.eye(4)
+    return np.linalg.solve(normal, (inputs * share[:, None]).T @ target + RIDGE * np.eye(4, 3)).T
 
 
 @dataclass(frozen=True)
@@ -149,47 +179,53 @@ class _Look:
     through_weight: Float[np.ndarray, "through"]
 
 
-def _looks(spread: Spread, stands: np.ndarray, sequence: Sequence4D, every: int, reach_m: float) -> Iterator[_Look]:
-    """Look at the points that stand in a video in some of its frames; only what faces the camera is shown, and nothing at the animal."""
+def _looks(samples: SurfaceSamples, stands: np.ndarray, sequence: Sequence4D, every: int) -> Iterator[_Look]:
+    """Project the points of a video into some of its frames; back faces and the animal's pixels show none."""
     clip, masks = sequence.recording.clip, sequence.recording.masks
-    homogeneous = np.concatenate([spread.points, np.ones((len(spread.points), 1))], axis=1).astype(np.float32)
+    homogeneous = np.concatenate([samples.points, np.ones((len(samples.points), 1))], axis=1).astype(
+        np.float32
+    )
     for frame in usable_frames(sequence)[::every]:
         world_from_camera = sequence.motion.world_from_camera[frame]
         points_camera = homogeneous @ rigid.inverse(world_from_camera)[:3].T.astype(np.float32)
-        ahead = np.flatnonzero(stands & (points_camera[:, 2] > 0.2))
+        ahead = np.flatnonzero(stands & (points_camera[:, 2] > NEAREST_M))
         pixel, z = cameras.project(points_camera[ahead], clip.intrinsics[frame])
         height, width = clip.color_size
         inside = (pixel >= 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
         index, z, (column, row) = ahead[inside], z[inside], pixel[inside].astype(int).T
-        depth = np.where(clip.confidence(frame) > 0, clip.depth(frame), 0)
+        depth = usable_depth(clip, frame)
         measured = depth[row * depth.shape[0] // height, column * depth.shape[1] // width]
         if masks is not None:
             label = masks[frame][row, column]
             measured = np.where((label == AGENT) | (label == UNKNOWN), 0, measured)
-        towards = ((world_from_camera[:3, 3] - spread.points[index]) * spread.normal[index]).sum(-1) > 0
-        shown = (measured > 0) & (np.abs(measured - z) < reach_m * z) & towards
-        through, weight = measured - z > 2 * reach_m * z, 1 / z.astype(float) ** 2
+        towards = ((world_from_camera[:3, 3] - samples.points[index]) * samples.normal[index]).sum(-1) > 0
+        shown = (measured > 0) & (np.abs(measured - z) < REACH_M * z) & towards
+        through, weight = measured - z > 2 * REACH_M * z, 1 / z.astype(float) ** 2
         color = clip.color(frame)[row[shown], column[shown]] / 255
         yield _Look(index[shown], color, weight[shown], index[through], weight[through])
 
 
-def thin(
-    points: Float[np.ndarray, "point 3"], layer: Int[np.ndarray, "point"], seen: Seen, number: int, cover: Cover, rng: np.random.Generator
-) -> tuple[np.ndarray, Float[np.ndarray, "kept"]]:
-    """Choose about ``number`` points; returns their indices and how far the fourth of their neighbours on the same surface is, metres.
+def subsample(
+    points: Float[np.ndarray, "point 3"],
+    layer: Int[np.ndarray, "point"],
+    seen: ObservedColors,
+    number: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, Float[np.ndarray, "chosen"]]:
+    """Choose about ``number`` points; returns their indices and their spacing on the same surface, metres.
 
-    The error of a cover with spacing s is about (slope of colours * s)^2 times how often it is looked at; for a given
-    number of points it is least where their density goes with the slope and the root of the visits. What more pictures saw
-    through than saw is left out.
+    The error of a cover with spacing s is about (slope of colors * s)^2 times how often it is looked at; for
+    a given number of points it is least where their density goes with the slope and the root of the visits.
+    Points that more pictures saw through than saw are left out.
     """
     shown = seen.weight > 0
     gone = seen.through > seen.weight
-    gone[~shown] |= np.isfinite(cKDTree(points[shown]).query(points[~shown], distance_upper_bound=cover.shell_m)[0])
-    near = cKDTree(points).query(points, 7)[1][:, 1:]
-    slope = np.abs(seen.color[near] - seen.color[:, None]).mean((1, 2)) + cover.plain
+    gone[~shown] |= np.isfinite(cKDTree(points[shown]).query(points[~shown], distance_upper_bound=SHELL_M)[0])
+    near = cKDTree(points).query(points, NEIGHBOURS + 1)[1][:, 1:]
+    slope = np.abs(seen.color[near] - seen.color[:, None]).mean((1, 2)) + PLAIN
     visits = seen.weight / max(seen.weight.mean(), 1e-9)
-    wanted = np.where(gone, 0, slope * np.sqrt(visits))
-    share = cover.even * ~gone / (~gone).sum() + (1 - cover.even) * wanted / max(wanted.sum(), 1e-9)
+    density = np.where(gone, 0, slope * np.sqrt(visits))
+    share = EVEN * ~gone / (~gone).sum() + (1 - EVEN) * density / max(density.sum(), 1e-9)
     share = _capped(number * share, 1.0)
     order = np.argsort(_along_a_curve(points))
     steps = np.cumsum(share[order]) + rng.random()
@@ -197,14 +233,19 @@ def thin(
     fourth_m = np.empty(len(chosen))
     for one in np.unique(layer[chosen]):
         here = points[chosen[layer[chosen] == one]]
-        fourth_m[layer[chosen] == one] = cKDTree(here).query(here, min(5, len(here)))[0].reshape(len(here), -1)[:, -1]
-    return chosen, np.clip(fourth_m, 0.001, np.quantile(fourth_m, cover.widest))
+        fourth_m[layer[chosen] == one] = (
+            cKDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0].reshape(len(here), -1)[:, -1]
+        )
+    return chosen, np.clip(fourth_m, LEAST_SPACING_M, np.quantile(fourth_m, WIDEST))
 
 
-def _along_a_curve(points: Float[np.ndarray, "point 3"], cell_m: float = 0.005) -> np.ndarray:
+def _along_a_curve(points: Float[np.ndarray, "point 3"]) -> np.ndarray:
     """Return each point's place on a curve through space along which neighbours stay near (Morton's)."""
-    cell, place = np.floor((points - points.min(0)) / cell_m).astype(np.uint64), np.zeros(len(points), np.uint64)
-    for bit in range(20):
+    cell, place = (
+        np.floor((points - points.min(0)) / CURVE_CELL_M).astype(np.uint64),
+        np.zeros(len(points), np.uint64),
+    )
+    for bit in range(CURVE_BITS):
         for axis in range(3):
             place |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     return place

@@ -1,4 +1,4 @@
-"""Refine Gaussians and motion: draw one frame a step, compare colour, depth, silhouette and flow."""
+"""Refine Gaussians and motion: draw one frame a step, compare color, depth, silhouette and flow."""
 
 import math
 from collections.abc import Sequence
@@ -11,55 +11,35 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from pipeline.fit import FitRecord, fit
-from pipeline.models.gaussians import Cloud, Splats, see, together
-from pipeline.models.motion import Motion
-from pipeline.models.rasterize import REACH, Backend, in_view
-from pipeline.space import cameras, rigid_torch
-from stages.refine_gaussians.views import Recording, Target, drawn_size, flow_lattice, read
+from pipeline.core.training import FitRecord, fit
+from pipeline.data.motion import Motion
+from pipeline.fields.footprints import REACH
+from pipeline.fields.gaussians import Cloud, Splats, concatenate, render
+from pipeline.fields.rasterize import Backend, in_view
+from pipeline.geometry import cameras, rigid_torch
+from stages.refine_gaussians.config import GaussianWeights
+from stages.refine_gaussians.views import DrawnRecording, Target, drawn_size, flow_lattice, read
 
-
-@dataclass(frozen=True)
-class Weights:
-    """How much each loss counts."""
-
-    color: float = 1.0
-    """absolute difference of colours 0..1"""
-    depth: float = 0.3
-    """absolute difference of depth in units of 0.2 m, at most 1"""
-    silhouette: float = 0.3
-    """absolute difference of the agent's share and its mask"""
-    flow: float = 0.05
-    """difference of flow in drawn pixels, at most 4"""
-    stay: float = 1.0
-    """motion stays near the reconstruction's (1 cm, 1 degree count alike)"""
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Learning rates of Adam; all fall to a tenth."""
-
-    means: float = 5e-4
-    """metres"""
-    rotation: float = 2e-3
-    """quaternions"""
-    log_scale: float = 1e-2
-    """logarithms of metres"""
-    opacity: float = 3e-2
-    """logits"""
-    color: float = 1e-2
-    """coefficients of the constant harmonic"""
-    appearance: float = 2e-3
-    """exposure per video"""
-    motion: float = 3e-4
-    """root and bones, metres and radians"""
+RATES = {"means": 5e-4, "rotation": 2e-3, "log_scale": 1e-2, "opacity_logit": 3e-2, "band0": 1e-2}
+"""learning rates of Adam: metres, quaternions, logarithms of metres, logits, coefficients of the constant
+harmonic; all fall to a tenth"""
+EXPOSURE_RATE, MOTION_RATE = 2e-3, 3e-4
+"""of each video's exposure, and of root and bones, metres and radians"""
+LAST_RATE = 0.1
+"""learning rates fall to this share"""
+DEPTH_UNIT_M, MOTION_UNIT = 0.2, 0.1
+"""units of the losses of depth, and of corrections of motion (metres and radians)"""
+MOST_FLOW_PX = 100.0
+"""rendered flow is clamped to this, drawn pixels: points at the camera's side project anywhere"""
+MOST_FLOW_LOSS, LEAST_COVERAGE = 4.0, 0.5
+"""flow errors saturate, and count where the Gaussians cover so much of a pixel"""
 
 
 @dataclass(frozen=True)
 class Sequence4D:
     """One video with its motion on the frame axis of all videos."""
 
-    recording: Recording
+    recording: DrawnRecording
     motion: Motion
     first: int
     """index of its first frame"""
@@ -72,24 +52,32 @@ class MotionDeltas(nn.Module):
 
     def __init__(self, frames: int, bones: int):
         super().__init__()
-        self.root, self.bone = nn.Parameter(torch.zeros(frames, 6)), nn.Parameter(torch.zeros(frames, bones, 6))
+        self.root, self.bone = (
+            nn.Parameter(torch.zeros(frames, 6)),
+            nn.Parameter(torch.zeros(frames, bones, 6)),
+        )
 
     def apply(
-        self, world_from_agent: Float[Tensor, "*batch 4 4"], agent_from_bone: Float[Tensor, "*batch bone 4 4"], frame
+        self,
+        world_from_agent: Float[Tensor, "*batch 4 4"],
+        agent_from_bone: Float[Tensor, "*batch bone 4 4"],
+        frame,
     ) -> tuple[Tensor, Tensor]:
         """Return the corrected root and bones of frames."""
-        return world_from_agent @ rigid_torch.se3_exp(self.root[frame]), agent_from_bone @ rigid_torch.se3_exp(self.bone[frame])
+        return world_from_agent @ rigid_torch.se3_exp(
+            self.root[frame]
+        ), agent_from_bone @ rigid_torch.se3_exp(self.bone[frame])
 
 
 class FrameLoss:
-    """The loss of one random frame; before a random colour, so that no hole looks right."""
+    """The loss of one random frame, before a background of random color, so that holes cost."""
 
     def __init__(
         self,
         splats: Splats,
         deltas: MotionDeltas,
         sequences: Sequence[Sequence4D],
-        weights: Weights,
+        weights: GaussianWeights,
         long_side_px: int,
         backend: Backend,
     ):
@@ -106,7 +94,7 @@ class FrameLoss:
         camera = self.camera(sequence, frame)
         cloud = self.cloud(sequence, frame, camera, target)
         later = self._later_pixels(sequence, frame, target, cloud)
-        view = see(cloud, camera, target.intrinsics, *size, self.backend, extra=later)
+        view = render(cloud, camera, target.intrinsics, *size, self.backend, extra=later)
         room = torch.ones_like(target.agent) if cloud.agent.any() else ~target.agent
         everywhere = room if sequence.video is not None else target.agent
         measured = (target.depth > 0) & everywhere
@@ -114,48 +102,77 @@ class FrameLoss:
         behind = torch.rand(3, generator=generator).to(self.device)
         color = view.color + (1 - view.coverage)[..., None] * behind
         terms["color"] = weights.color * (color - target.color).abs().mean(-1)[everywhere & target.known]
-        terms["depth"] = weights.depth * ((view.depth - target.depth).abs() / 0.2).clamp_max(1)[measured]
+        terms["depth"] = (
+            weights.depth * ((view.depth - target.depth).abs() / DEPTH_UNIT_M).clamp_max(1)[measured]
+        )
         terms["silhouette"] = weights.silhouette * (view.agent - target.agent.float()).abs()[target.known]
         if later is not None:
-            terms["flow"] = weights.flow * self._flow_errors(sequence, target, view.extra, view.coverage, everywhere)
+            terms["flow"] = weights.flow * self._flow_errors(
+                sequence, target, view.extra, view.coverage, everywhere
+            )
         index = sequence.first + frame
-        terms["stay"] = weights.stay * torch.cat([self.deltas.root[index : index + 1], self.deltas.bone[index]]).square() / 0.01
+        correction = torch.cat([self.deltas.root[index : index + 1], self.deltas.bone[index]])
+        terms["motion"] = weights.motion * (correction / MOTION_UNIT).square()
         return {name: values.mean() if values.numel() else values.sum() for name, values in terms.items()}
 
-    def cloud(self, sequence: Sequence4D, frame: int, camera_from_world: Float[Tensor, "4 4"], target: Target) -> Cloud:
-        """Return what stands before the camera in one frame."""
+    def cloud(
+        self, sequence: Sequence4D, frame: int, camera_from_world: Float[Tensor, "4 4"], target: Target
+    ) -> Cloud:
+        """Return the Gaussians in view of one frame's camera."""
         parts = []
         if sequence.video is not None:
             scene = self.splats.scene
-            seen = in_view(scene.means, scene.log_scale, camera_from_world, target.intrinsics, *target.depth.shape)
+            seen = in_view(
+                scene.means, scene.log_scale, camera_from_world, target.intrinsics, *target.depth.shape
+            )
             parts.append(self.splats.place_scene(sequence.video, seen))
         if sequence.video is None or self._shows_agent(sequence, frame, camera_from_world, target):
             parts.append(self.splats.place_agent(*self._pose(sequence, frame), sequence.video))
-        return together(*parts)
+        return concatenate(*parts)
 
-    def _shows_agent(self, sequence: Sequence4D, frame: int, camera_from_world: Tensor, target: Target) -> bool:
-        """Tell whether the agent's pose is known, and whether it may be in the picture: a ball as large as it at rest is."""
+    def _shows_agent(
+        self, sequence: Sequence4D, frame: int, camera_from_world: Tensor, target: Target
+    ) -> bool:
+        """Return whether the agent's pose is known and its bounding ball is in view."""
         if not sequence.motion.agent_known[frame]:
             return False
         root = torch.from_numpy(sequence.motion.world_from_agent[frame]).float().to(self.device)
         radius = self.splats.agent.means.detach().norm(dim=-1).amax() / REACH
         centre = root[None, :3, 3]
-        return len(in_view(centre, radius.log().expand(1, 3), camera_from_world, target.intrinsics, *target.depth.shape)) > 0
+        return (
+            len(
+                in_view(
+                    centre,
+                    radius.log().expand(1, 3),
+                    camera_from_world,
+                    target.intrinsics,
+                    *target.depth.shape,
+                )
+            )
+            > 0
+        )
 
     def _pose(self, sequence: Sequence4D, frame: int) -> tuple[Tensor, Tensor]:
         root, bones = (
-            torch.from_numpy(a[frame]).float().to(self.device) for a in (sequence.motion.world_from_agent, sequence.motion.agent_from_bone)
+            torch.from_numpy(a[frame]).float().to(self.device)
+            for a in (sequence.motion.world_from_agent, sequence.motion.agent_from_bone)
         )
         return self.deltas.apply(root, bones, sequence.first + frame)
 
     def camera(self, sequence: Sequence4D, frame: int) -> Float[Tensor, "4 4"]:
         """Return ``camera_from_world`` of one frame."""
-        return torch.from_numpy(np.linalg.inv(sequence.motion.world_from_camera[frame])).float().to(self.device)
+        return (
+            torch.from_numpy(np.linalg.inv(sequence.motion.world_from_camera[frame])).float().to(self.device)
+        )
 
     def _later_pixels(self, sequence: Sequence4D, frame: int, target: Target, cloud: Cloud) -> Tensor | None:
         """Return where each Gaussian is seen one frame later, in drawn pixels from where it is now."""
         motion, later = sequence.motion, frame + 1
-        if target.flow_px is None or later >= len(motion.timestamp_s) or not np.isfinite(motion.world_from_camera[later]).all():
+        if (
+            target.flow_px is None
+            or later >= len(motion.timestamp_s)
+            or not np.isfinite(motion.world_from_camera[later]).all()
+        ):
             return None
         means = cloud.means
         if cloud.agent.any():
@@ -163,15 +180,28 @@ class FrameLoss:
                 return None
             moved = self.splats.place_agent(*self._pose(sequence, later), sequence.video).means
             means = torch.cat([cloud.means[: len(cloud.means) - len(moved)], moved])
-        now = cameras.project(rigid_torch.apply(self.camera(sequence, frame), cloud.means), target.intrinsics)[0]
+        now = cameras.project(
+            rigid_torch.apply(self.camera(sequence, frame), cloud.means), target.intrinsics
+        )[0]
         then = cameras.project(rigid_torch.apply(self.camera(sequence, later), means), target.intrinsics)[0]
-        return (then - now).clamp(-100, 100)
+        return (then - now).clamp(-MOST_FLOW_PX, MOST_FLOW_PX)
 
-    def _flow_errors(self, sequence: Sequence4D, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor) -> Tensor:
-        row, column = flow_lattice(*target.flow_confidence.shape, sequence.recording.clip.color_size, tuple(target.color.shape[:2]))
+    def _flow_errors(
+        self, sequence: Sequence4D, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor
+    ) -> Tensor:
+        lattice = flow_lattice(
+            *target.flow_confidence.shape, sequence.recording.clip.color_size, tuple(target.color.shape[:2])
+        )
+        row, column = (index.to(self.device) for index in lattice)
         found = drawn[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
-        error = functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0).sum(-1).clamp_max(4)
-        return (error * target.flow_confidence)[(coverage[row, column] > 0.5) & everywhere[row, column]]
+        error = (
+            functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0)
+            .sum(-1)
+            .clamp_max(MOST_FLOW_LOSS)
+        )
+        return (error * target.flow_confidence)[
+            (coverage[row, column] > LEAST_COVERAGE) & everywhere[row, column]
+        ]
 
 
 def usable_frames(sequence: Sequence4D) -> list[int]:
@@ -182,15 +212,13 @@ def usable_frames(sequence: Sequence4D) -> list[int]:
     return np.flatnonzero(good).tolist()
 
 
-def refine(loss: FrameLoss, rates: Rates, steps: int, seed: int, resume: Path | None, save_every: int) -> FitRecord:
-    """Optimise Gaussians, exposure and motion in place."""
+def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_every: int) -> FitRecord:
+    """Optimize Gaussians, exposure and motion in place."""
     splats, deltas = loss.splats, loss.deltas
-    groups = [{"params": [splats.appearance], "lr": rates.appearance}]
+    groups = [{"params": [splats.appearance], "lr": EXPOSURE_RATE}]
     for gaussians in (splats.scene, splats.agent):
-        named = (gaussians.means, rates.means), (gaussians.rotation, rates.rotation), (gaussians.log_scale, rates.log_scale)
-        named += (gaussians.opacity_logit, rates.opacity), (gaussians.band0, rates.color)
-        groups += [{"params": [parameter], "lr": rate} for parameter, rate in named]
-    groups.append({"params": list(deltas.parameters()), "lr": rates.motion, "betas": (0.0, 0.99)})
+        groups += [{"params": [getattr(gaussians, name)], "lr": rate} for name, rate in RATES.items()]
+    groups.append({"params": list(deltas.parameters()), "lr": MOTION_RATE, "betas": (0.0, 0.99)})
     return fit(
         modules={"splats": splats, "motion": deltas},
         optimizer=torch.optim.Adam(groups, lr=1.0, fused=True),
@@ -199,7 +227,7 @@ def refine(loss: FrameLoss, rates: Rates, steps: int, seed: int, resume: Path | 
         seed=seed,
         resume=resume,
         save_every=save_every,
-        schedule=lambda progress: 0.1**progress,
+        schedule=lambda progress: LAST_RATE**progress,
         label="gaussians",
         clip_norm=math.inf,
     )
@@ -217,5 +245,10 @@ def refined(motion: Motion, deltas: MotionDeltas, first: int) -> Motion:
     root, bones = deltas.double().apply(root, bones, frame.to(device))
     deltas.float()
     return Motion(
-        motion.timestamp_s, motion.world_from_camera, root.cpu().numpy(), bones.cpu().numpy(), motion.confidence, motion.agent_visible
+        motion.timestamp_s,
+        motion.world_from_camera,
+        root.cpu().numpy(),
+        bones.cpu().numpy(),
+        motion.confidence,
+        motion.agent_visible,
     )

@@ -1,4 +1,4 @@
-"""Read single frames at drawing size: colour, depth, mask, flow, and which Gaussians they can speak about."""
+"""Read single frames at drawing size: color, depth, mask, flow, and their flow."""
 
 from dataclasses import dataclass
 
@@ -8,22 +8,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.files.clips import Clip, Masks
-from pipeline.space import cameras
+from pipeline.data.clips import Clip, Masks, usable_depth
+from pipeline.data.flow import STRIDE_PX
+from pipeline.geometry import cameras
 
 AGENT, UNKNOWN = 255, 128
-FLOW_STRIDE = 4
+"""values of a mask"""
 
 
 @dataclass(frozen=True)
-class Recording:
+class DrawnRecording:
     """One video's files."""
 
     id: str
     clip: Clip
     masks: Masks | None
     flow: np.ndarray | None
-    """forward flow of gap 1, [frame height width 2], colour pixels at stride 4, memory-mapped"""
+    """forward flow of gap 1, [frame height width 2], color pixels at stride 4, memory-mapped"""
     flow_confidence: np.ndarray | None
 
 
@@ -36,27 +37,25 @@ class Target:
     """metres; 0 = unknown"""
     agent: Bool[Tensor, "height width"]
     known: Bool[Tensor, "height width"]
-    """the mask says agent or not"""
+    """the mask is not unknown"""
     intrinsics: Float[Tensor, "3 3"]
     flow_px: Float[Tensor, "row column 2"] | None
     """displacement in drawn pixels, on flow's own lattice"""
     flow_confidence: Float[Tensor, "row column"] | None
 
 
-def drawn_size(recording: Recording, long_side_px: int) -> tuple[int, int]:
+def drawn_size(recording: DrawnRecording, long_side_px: int) -> tuple[int, int]:
     """Return height and width of drawn pictures, in the shape of the recording's."""
     longest = max(recording.clip.color_size)
     height, width = (round(side * long_side_px / longest) for side in recording.clip.color_size)
     return height, width
 
 
-def read(recording: Recording, frame: int, size: tuple[int, int], device: str) -> Target:
+def read(recording: DrawnRecording, frame: int, size: tuple[int, int], device: str) -> Target:
     """Read one frame and shrink it to (height, width)."""
     clip, small = recording.clip, size[::-1]
     color = cv2.resize(clip.color(frame), small, interpolation=cv2.INTER_AREA)
-    depth = clip.depth(frame)
-    depth = np.where(clip.confidence(frame) > 0, depth, 0)
-    depth = cv2.resize(depth, small, interpolation=cv2.INTER_NEAREST_EXACT)
+    depth = cv2.resize(usable_depth(clip, frame), small, interpolation=cv2.INTER_NEAREST_EXACT)
     mask = np.zeros(size, np.uint8)
     if recording.masks is not None:
         mask = cv2.resize(recording.masks[frame], small, interpolation=cv2.INTER_NEAREST_EXACT)
@@ -70,8 +69,10 @@ def read(recording: Recording, frame: int, size: tuple[int, int], device: str) -
     return Target(*(torch.from_numpy(array).to(device) for array in (*tensors, intrinsics)), flow, confidence)
 
 
-def flow_lattice(rows: int, columns: int, color_size: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def flow_lattice(
+    rows: int, columns: int, color_size: tuple[int, int], size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
     """Return the drawn pixel (row, column) nearest to each cell centre of the flow."""
-    row = (torch.arange(rows) * FLOW_STRIDE + FLOW_STRIDE / 2) * size[0] / color_size[0]
-    column = (torch.arange(columns) * FLOW_STRIDE + FLOW_STRIDE / 2) * size[1] / color_size[1]
+    row = (torch.arange(rows) * STRIDE_PX + STRIDE_PX / 2) * size[0] / color_size[0]
+    column = (torch.arange(columns) * STRIDE_PX + STRIDE_PX / 2) * size[1] / color_size[1]
     return row.long().clamp_max(size[0] - 1)[:, None], column.long().clamp_max(size[1] - 1)[None]

@@ -1,22 +1,26 @@
-"""What the quality page of a registered recording shows, its checks, and its status file."""
+"""Quality page, checks and status file of a registered recording."""
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files.clips import Clip
-from pipeline.qa import Check, Picture
-from pipeline.space import overview, rigid
-from pipeline.space.meshes import RayCaster, render_view
-from pipeline.space.surface import Surface
-from stages.register_videos.registration import Maps, Refused, Registered
+from pipeline.data import plots
+from pipeline.data.clips import Clip
+from pipeline.data.qa import Check, Picture
+from pipeline.geometry import rigid, views
+from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.mapping.depth_scans import SurfaceMap
+from stages.register_videos.registration import Maps, Registered, Rejected
 
 EDGE, PHONE, ANIMAL, HEAD = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
 
 
-def status(found: Registered | Refused, walk_time_s: Float[np.ndarray, "walk"], walk: Float[np.ndarray, "walk 4 4"]) -> dict:
-    """Describe the outcome for ``status.json``; the nearest view is told as a moment of the walk-through as well."""
-    votes = found.votes
+def status(
+    result: Registered | Rejected, walk_time_s: Float[np.ndarray, "walk"], walk: Float[np.ndarray, "walk 4 4"]
+) -> dict:
+    """Describe the outcome for ``status.json``; the nearest view is also given as a moment of the
+    walk-through."""
+    votes = result.votes
     figures = {"frames_localized": votes.asked, "votes": len(votes.frame)}
     nearest = (
         None
@@ -27,79 +31,89 @@ def status(found: Registered | Refused, walk_time_s: Float[np.ndarray, "walk"], 
             "world_from_camera": votes.nearest.map_from_camera.round(6).tolist(),
         }
     )
-    if isinstance(found, Refused):
-        return {"registered": False, "reason": found.reason, "nearest_view": nearest, "figures": figures}
+    if isinstance(result, Rejected):
+        return {"registered": False, "reason": result.reason, "nearest_view": nearest, "figures": figures}
     figures |= {
-        "votes_agreeing": int(found.supports.sum()),
-        "depth_gap_m": _told(found.aligned.usual_gap_m),
-        "depth_fit": _told(found.aligned.usual_fit),
-        "likeness": found.likeness,
-        "confidence": float(found.confidence.mean()),
-        "agent_frames": int(found.roots.visible.sum()),
-        "agent_confidence": float(found.agent_confidence[found.roots.visible].mean()) if found.roots.visible.any() else 0.0,
+        "votes_agreeing": int(result.supports.sum()),
+        "depth_gap_m": _finite(result.aligned.median_gap_m),
+        "depth_fit": _finite(result.aligned.median_fit),
+        "appearance": result.appearance,
+        "confidence": float(result.confidence.mean()),
+        "agent_frames": int(result.roots.visible.sum()),
+        "agent_confidence": float(result.agent_confidence[result.roots.visible].mean())
+        if result.roots.visible.any()
+        else 0.0,
     }
     return {"registered": True, "reason": None, "nearest_view": nearest, "figures": figures}
 
 
-def _told(figure):
-    """Return a figure as JSON knows it: null where nothing was measured."""
+def _finite(figure):
+    """Return a figure for JSON: null where nothing was measured."""
     return figure if np.isfinite(figure) else None
 
 
 def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[np.ndarray, "4 4"]) -> int:
-    """Return the frame of the walk-through that was taken most nearly from there: a metre counts as much as a radian."""
+    """Return the frame of the walk-through that was taken most nearly from there: a metre counts as much as a
+    radian."""
     away = np.linalg.norm(walk[:, :3, 3] - world_from_camera[:3, 3], axis=1)
     return int(np.argmin(away + rigid.rotation_angle(walk[:, :3, :3], world_from_camera[:3, :3])))
 
 
-def checks(found: Registered | Refused) -> list[Check]:
+def checks(result: Registered | Rejected) -> list[Check]:
     """Judge the outcome."""
-    if isinstance(found, Refused):
+    if isinstance(result, Rejected):
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
-        Check("frame votes that agree", float(found.supports.mean()) if len(found.supports) else None, "share", 0.5, 0.25, "higher"),
-        Check("depth against the template", found.aligned.usual_gap_m * 100, "cm, median", 2.5, 6.0),
-        Check("static depth within 5 cm", found.aligned.usual_fit, "share", 0.6, 0.35, "higher"),
-        Check("likeness of frames and renderings", found.likeness, "share", 0.5, None, "higher"),
-        Check("camera confidence", float(found.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
-        Check("animal placed", float(found.roots.visible.mean()), "share of frames", 0.4, None, "higher"),
+        Check(
+            "frame votes that agree",
+            float(result.supports.mean()) if len(result.supports) else None,
+            "share",
+            0.5,
+            0.25,
+            "higher",
+        ),
+        Check("depth against the template", result.aligned.median_gap_m * 100, "cm, median", 2.5, 6.0),
+        Check("static depth within 5 cm", result.aligned.median_fit, "share", 0.6, 0.35, "higher"),
+        Check("appearance of frames and renderings", result.appearance, "share", 0.5, None, "higher"),
+        Check("camera confidence", float(result.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
+        Check("animal placed", float(result.roots.visible.mean()), "share of frames", 0.4, None, "higher"),
     ]
 
 
-def pictures(found: Registered | Refused, clip: Clip, maps: Maps) -> list[Picture]:
+def pictures(result: Registered | Rejected, clip: Clip, maps: Maps) -> list[Picture]:
     """Draw the outcome for people."""
-    if isinstance(found, Refused):
-        return _refused(found, clip, maps)
+    if isinstance(result, Rejected):
+        return _refused(result, clip, maps)
     scene, agent = RayCaster(maps.scene), RayCaster(maps.agent)
     chosen = np.linspace(0, len(clip) - 1, 9).astype(int)[1:-1]
     return [
         Picture(
             "edges",
-            overview.tile([outlined(found, clip, scene, agent, int(frame)) for frame in chosen], len(chosen)),
+            plots.grid([outlined(result, clip, scene, agent, int(frame)) for frame in chosen], len(chosen)),
             "Template edges (magenta) and the placed animal (orange) over frames.",
         ),
         Picture(
             "bird",
-            paths(found, maps),
+            paths(result, maps),
             "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
         ),
         Picture(
             "depth",
-            depth_on_map(found, maps),
+            depth_on_map(result, maps),
             "Static depth on the map from above: green within 5 cm of the surface, red further away.",
         ),
     ]
 
 
-def outlined(found: Registered, clip: Clip, scene: RayCaster, agent: RayCaster, frame: int) -> np.ndarray:
+def outlined(result: Registered, clip: Clip, scene: RayCaster, agent: RayCaster, frame: int) -> np.ndarray:
     """Draw the depth edges of the rendered template and the animal's outline over one frame."""
     height, width = clip.color_size
-    camera = found.aligned.world_from_camera[frame]
+    camera = result.aligned.world_from_camera[frame]
     picture = clip.color(frame).copy()
     depth, _ = render_view(scene, camera, clip.intrinsics[frame], height, width)
     picture[_edges(depth, 0.08)] = EDGE
-    root = found.roots.world_from_agent[frame]
+    root = result.roots.world_from_agent[frame]
     if np.isfinite(root).all():
         body, _ = render_view(agent, rigid.inverse(root) @ camera, clip.intrinsics[frame], height, width)
         picture[_edges((body > 0).astype(np.float32) * 9, 1.0)] = ANIMAL
@@ -111,24 +125,26 @@ def _edges(depth, jump_m):
     return cv2.dilate(depth, window) - cv2.erode(depth, window) > jump_m * (1 + depth / 3)
 
 
-def paths(found: Registered, maps: Maps) -> np.ndarray:
+def paths(result: Registered, maps: Maps) -> np.ndarray:
     """Draw both paths over the room."""
-    picture = overview.bird_view(maps.scene, floor_m=_floor(maps))
-    root = found.roots.world_from_agent
-    picture.draw(found.aligned.world_from_camera[:, :3, 3], PHONE)
+    picture = views.bird_view(maps.scene, floor_m=_floor(maps))
+    root = result.roots.world_from_agent
+    picture.draw(result.aligned.world_from_camera[:, :3, 3], PHONE)
     picture.draw(root[:, :3, 3], ANIMAL)
-    for frame in np.flatnonzero(found.roots.visible)[::10]:
+    for frame in np.flatnonzero(result.roots.visible)[::10]:
         picture.draw(np.stack([root[frame, :3, 3], root[frame, :3, 3] + 0.2 * root[frame, :3, 2]]), HEAD)
     return picture.image
 
 
-def depth_on_map(found: Registered, maps: Maps) -> np.ndarray:
+def depth_on_map(result: Registered, maps: Maps) -> np.ndarray:
     """Draw the static depth of some frames over the room, coloured by its distance from the surface."""
-    picture = overview.bird_view(maps.scene, floor_m=_floor(maps))
-    place = Surface(maps.scene)
-    for frame in range(0, len(found.aligned.scans), 10):
-        points = rigid.apply(found.aligned.world_from_camera[frame], found.aligned.scans[frame].points_camera[::3])
-        distance = np.abs(place.distance(points))
+    picture = views.bird_view(maps.scene, floor_m=_floor(maps))
+    surface = SurfaceMap(maps.scene)
+    for frame in range(0, len(result.aligned.scans), 10):
+        points = rigid.apply(
+            result.aligned.world_from_camera[frame], result.aligned.scans[frame].points_camera[::3]
+        )
+        distance = np.abs(surface.distance(points))
         for pixel, far in zip(np.round(picture.pixel(points)).astype(int), distance, strict=True):
             cv2.circle(
                 picture.image,
@@ -144,16 +160,18 @@ def _floor(maps):
     return float(np.quantile(maps.scene.vertices[:, 1], 0.02))
 
 
-def _refused(found, clip, maps):
+def _refused(result, clip, maps):
     middle = clip.color(len(clip) // 2)
-    if found.votes.nearest is None:
+    if result.votes.nearest is None:
         return [Picture("frame", middle, "A frame of the recording; no view of the template is like it.")]
     frame = len(clip) // 2
-    near = overview.view(RayCaster(maps.scene), found.votes.nearest.map_from_camera, clip.intrinsics[frame], *clip.color_size)
+    near = views.view(
+        RayCaster(maps.scene), result.votes.nearest.map_from_camera, clip.intrinsics[frame], *clip.color_size
+    )
     return [
         Picture(
             "nearest",
-            overview.tile([middle, near], 2),
+            plots.grid([middle, near], 2),
             "A frame of the recording, and the nearest view of the template.",
         )
     ]

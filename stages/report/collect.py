@@ -1,9 +1,12 @@
-"""Gather what the stages wrote about themselves: `qa.json`, its pictures, and the settings in the manifest."""
+"""Gather what the stages wrote about themselves: `qa.json`, its pictures, and what the manifest records.
+
+`read_chapter` reads one, `with_verdicts` adds to each what it stands on.
+"""
 
 import base64
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -12,8 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.files import images
-from pipeline.videos import Video
+from pipeline.core.videos import Video
+from pipeline.data import images
 from stages.report.chapters import Chapter
 
 LIGHTS = ("none", "ok", "warn", "fail")
@@ -26,7 +29,7 @@ _STRIP = 2.4
 
 
 @dataclass(frozen=True)
-class Picture:
+class EmbeddedPicture:
     """One picture, ready to stand in a page."""
 
     source: str
@@ -37,81 +40,164 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class RecordingLabel:
+    """How a recording is called."""
+
+    name: str
+    """its file's name; its id where names may reveal people"""
+    role: str
+
+
+@dataclass(frozen=True)
 class Note:
-    """What one artifact says about itself; per recording where there is one for each."""
+    """What one artifact reports about itself; per recording where there is one for each."""
 
     video: str | None
-    about: str
-    """the recording's file and role"""
+    label: RecordingLabel
     light: str
     good: str
     bad: str
     checks: list[dict[str, Any]]
-    pictures: list[Picture]
+    pictures: list[EmbeddedPicture]
+
+
+NO_LABEL = RecordingLabel("", "")
 
 
 @dataclass(frozen=True)
-class Told:
-    """A chapter with all its notes."""
+class ChapterReport:
+    """A chapter with all its notes and its verdict."""
 
     chapter: Chapter
     notes: list[Note]
     settings: dict[str, Any]
+    stands_on: frozenset[str] = frozenset()
+    """artifacts that it was made from"""
+    bars: str = "ok"
+    """the worst light of the bars that it is judged by"""
+    causes: tuple[Chapter, ...] = ()
+    """chapters it stands on, at whatever distance, whose own light is worse than its own"""
+    inherited: str = "ok"
+    """the worst light of these"""
+
+    @property
+    def own_light(self) -> str:
+        """The worst light of all notes and bars."""
+        found = [note.light for note in self.notes] + ([self.bars] if self.bars != "ok" else [])
+        return max(found, key=LIGHTS.index, default="none")
 
     @property
     def light(self) -> str:
-        """The worst light of all notes."""
-        return max((note.light for note in self.notes), key=LIGHTS.index, default="none")
+        """The verdict: the worst of its own light and of what it stands on."""
+        return max(self.own_light, self.inherited, key=LIGHTS.index) if self.causes else self.own_light
 
     @property
     def worries(self) -> list[tuple[Note, dict[str, Any]]]:
         """Checks that are not fine, worst first."""
-        found = [(note, check) for note in self.notes for check in note.checks if check["status"] in ("warn", "fail")]
+        found = [
+            (note, check)
+            for note in self.notes
+            for check in note.checks
+            if check["status"] in ("warn", "fail")
+        ]
         return sorted(found, key=lambda pair: -LIGHTS.index(pair[1]["status"]))
 
     @property
-    def cover(self) -> Picture | None:
+    def cover(self) -> EmbeddedPicture | None:
         """The first picture there is."""
         return next((picture for note in self.notes for picture in note.pictures), None)
 
 
-def about(video: Video, safe: bool) -> str:
-    """Say which recording it is and what it is for; names of files may tell of people, so not where the report is to be ``safe``."""
+def label(video: Video, safe: bool) -> RecordingLabel:
+    """Return how a recording is called; names of files may reveal people, so not where the report is to be
+    ``safe``.
+    """
     role = f"{video.role}, {video.split}" if video.role == "session" else video.role
-    return role if safe else f"{video.file}, {role}"
+    return RecordingLabel(video.id if safe else video.file, role)
 
 
-def told(
-    chapter: Chapter, folders: Mapping[str | None, Path], abouts: Mapping[str, str], settings: Mapping[str, Any], safe: bool = False
-) -> Told:
+def read_chapter(
+    chapter: Chapter,
+    folders: Mapping[str | None, Path],
+    labels: Mapping[str, RecordingLabel],
+    safe: bool = False,
+) -> ChapterReport:
     """Read the notes of one chapter; `folders` are its artifacts by recording (None: one in all).
 
-    With `safe` every picture that a person or the home can be in is blurred beyond recognition as a whole: where people
-    stand in it is not known, finders of people miss some, and a room tells where somebody lives.
+    With `safe` every picture that a person or the home can be in is blurred beyond recognition as a whole:
+    where people stand in it is not known, finders of people miss some, and a room shows where somebody lives.
     """
     raw = {video: _read(folder) for video, folder in folders.items()}
-    files = [folder / entry["file"] for folder, qa in zip(folders.values(), raw.values(), strict=True) for entry in qa["pictures"]]
+    manifests = [manifest for folder in folders.values() if (manifest := read_manifest(folder))]
+    files = [
+        folder / entry["file"]
+        for folder, qa in zip(folders.values(), raw.values(), strict=True)
+        for entry in qa["pictures"]
+    ]
     total = sum(file.stat().st_size for file in files)
     shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
 
     def blurred(file: str) -> bool:
         return safe and not any(fnmatch(Path(file).stem, name) for name in chapter.nobody_in)
 
-    notes = [_note(video, abouts.get(video or "", ""), folders[video], qa, shrink, blurred) for video, qa in raw.items()]
-    return Told(chapter, notes, dict(settings))
+    notes = [
+        _note(video, labels.get(video or "", NO_LABEL), folders[video], qa, shrink, blurred)
+        for video, qa in raw.items()
+    ]
+    stands_on = frozenset(name.partition("/")[0] for manifest in manifests for name in manifest["inputs"])
+    return ChapterReport(chapter, notes, dict(manifests[0]["config"]) if manifests else {}, stands_on)
+
+
+def with_verdicts(chapters: Sequence[ChapterReport], bars: Mapping[str, str]) -> list[ChapterReport]:
+    """Give every chapter the light of its bars, and that of what it stands on; chapters come in flow
+    order.
+    """
+    found: dict[str, ChapterReport] = {}
+    reached: dict[str, frozenset[str]] = {}
+    for each in chapters:
+        name, mine = each.chapter.artifact, replace(each, bars=bars.get(each.chapter.artifact, "ok"))
+        direct = [below for below in mine.stands_on if below in found]
+        reached[name] = frozenset(direct).union(*(reached[below] for below in direct))
+        own = LIGHTS.index(mine.own_light)
+        worse = [found[below] for below in found if below in reached[name]]
+        worse = [below for below in worse if LIGHTS.index(below.own_light) > max(own, LIGHTS.index("ok"))]
+        inherited = max((below.own_light for below in worse), key=LIGHTS.index, default="ok")
+        causes = tuple(below.chapter for below in worse if below.own_light == inherited)
+        found[name] = replace(mine, causes=causes, inherited=inherited)
+    return list(found.values())
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Return the manifest of a finished artifact; None for a plain folder."""
+    path = folder / "manifest.json"
+    return json.loads(path.read_bytes()) if path.exists() else None
 
 
 def _read(folder: Path) -> dict[str, Any]:
     path = folder / "qa.json"
-    return json.loads(path.read_bytes()) if path.exists() else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
+    return (
+        json.loads(path.read_bytes())
+        if path.exists()
+        else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
+    )
 
 
-def _note(video: str | None, about: str, folder: Path, qa: dict[str, Any], shrink: float, blurred: Callable[[str], bool]) -> Note:
-    pictures = [_picture(folder / entry["file"], entry["caption"], shrink, blurred(entry["file"])) for entry in qa["pictures"]]
-    return Note(video, about, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures)
+def _note(
+    video: str | None,
+    label: RecordingLabel,
+    folder: Path,
+    qa: dict[str, Any],
+    shrink: float,
+    blurred: Callable[[str], bool],
+) -> Note:
+    pictures = [
+        _picture(folder / entry["file"], entry["caption"], shrink, blurred(entry["file"]))
+        for entry in qa["pictures"]
+    ]
+    return Note(video, label, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures)
 
 
-def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> Picture:
+def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> EmbeddedPicture:
     """Embed a picture; where a page would grow too big to send, smaller."""
     color = images.read_color(path)
     kind, content = path.suffix[1:], path.read_bytes()
@@ -121,11 +207,13 @@ def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> Picture:
         size = [max(_SMALLEST_PX, round(length / shrink)) for length in color.shape[1::-1]]
         kind, content = "jpeg", images.encode_jpeg(cv2.resize(color, size, interpolation=cv2.INTER_AREA), 85)
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-    return Picture(source, caption, color.shape[1] > _STRIP * color.shape[0])
+    return EmbeddedPicture(source, caption, color.shape[1] > _STRIP * color.shape[0])
 
 
 def _beyond_recognition(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
     """Keep one colour per 24 pixels: layout and light stay, faces, pictures and writing go."""
     height, width, _ = color.shape
-    few = cv2.resize(color, (max(1, width // _BLUR_PX), max(1, height // _BLUR_PX)), interpolation=cv2.INTER_AREA)
+    few = cv2.resize(
+        color, (max(1, width // _BLUR_PX), max(1, height // _BLUR_PX)), interpolation=cv2.INTER_AREA
+    )
     return cv2.resize(few, (width, height), interpolation=cv2.INTER_LINEAR)

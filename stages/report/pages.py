@@ -1,12 +1,13 @@
-"""Turn chapters and figures into pages: one index and one page per chapter, each a file of its own."""
+"""Turn chapters and metrics into pages: one index and one page per chapter, each a file of its own."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jinja2
 
+from pipeline.metrics import words as metric_words
 from stages.report.bars import Judged
-from stages.report.collect import Told
+from stages.report.collect import ChapterReport
 from stages.report.remedies import remedy
 
 WORDS = {"ok": "fine", "warn": "to look at", "fail": "not good", "none": "without a note"}
@@ -16,10 +17,11 @@ MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
 def render(
     *,
     name: str,
-    chapters: Sequence[Told],
+    chapters: Sequence[ChapterReport],
     judged: Sequence[Judged],
-    figures: Mapping[str, Mapping[str, Any]],
+    metrics: Mapping[str, Mapping[str, Any]],
     reasons: Mapping[str, str],
+    methods: str,
 ) -> dict[str, str]:
     """Return the text of every page by file name."""
     environment = jinja2.Environment(
@@ -30,16 +32,28 @@ def render(
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["number"] = number
+    environment.filters["in_words"] = in_words
+    environment.globals["describe"] = metric_words.describe
     environment.globals["remedy"] = remedy
     shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": MARKS}
-    index = environment.get_template("index.html").render(**shared, judged=judged, figures=figures, reasons=reasons)
+    index = environment.get_template("index.html").render(
+        **shared, judged=judged, metrics=metrics, reasons=reasons, methods=methods
+    )
     pages = {"index.html": index}
     chapter = environment.get_template("chapter.html")
-    for place, told in enumerate(chapters):
+    for place, shown in enumerate(chapters):
         before = chapters[place - 1] if place else None
         after = chapters[place + 1] if place + 1 < len(chapters) else None
-        pages[f"{told.chapter.artifact}.html"] = chapter.render(**shared, told=told, before=before, after=after)
+        pages[f"{shown.chapter.artifact}.html"] = chapter.render(
+            **shared, shown=shown, before=before, after=after
+        )
     return pages
+
+
+def in_words(check: str) -> str:
+    """Return a check's name; one that is a key of the metrics in words."""
+    group, _, rest = check.partition("/")
+    return f"{group}: {metric_words.describe(check).text}" if rest and " " not in check else check
 
 
 def number(value: Any) -> str:

@@ -1,7 +1,8 @@
-"""Scripted approaches in a home that training never saw: does the model's animal flee as often as the true one?
+"""Scripted approaches in a home that training never saw: does the model's animal flee as often as the true
+one?
 
-Each approach has a twin in which the person stands still, from the same start; and the model is asked once more with
-the person taken out of its perception.
+Each approach has a twin in which the person stands still, from the same start; and the model is asked once
+more with the person taken out of its perception.
 """
 
 from dataclasses import dataclass, replace
@@ -10,22 +11,22 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import arrays
-from pipeline.models.behavior import Sampling
-from pipeline.models.flight import flees
-from pipeline.models.perception import FeatureVolume, world_from_ego
-from pipeline.models.planning import observe
-from pipeline.models.predictors import WINDOWS_AT_ONCE, Ats
-from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, Context
-from pipeline.space import rigid
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.perception import FeatureVolume, world_from_ego
+from pipeline.behavior.planning import observe
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import PAST, Context
+from pipeline.data import npz
+from pipeline.geometry import rigid
+from pipeline.metrics.flight import flees
+from pipeline.rivals.predictors import WINDOWS_AT_ONCE, Ats
 
 TRUE = ("true", "true_standing")
 """names of what the animal itself did, by twin"""
 
 
 @dataclass(frozen=True)
-class Approaches:
+class RecordedApproaches:
     """What animal and person did; twin 0: the person walks up, twin 1: it stands."""
 
     world_from_agent: Float[np.ndarray, "twin approach frame 4 4"]
@@ -34,14 +35,21 @@ class Approaches:
     scene: Scenes
 
 
-def read(folder: Path) -> Approaches:
+def read(folder: Path) -> RecordedApproaches:
     """Read `approaches.npz` and its home. Raises InputError ART-010 when damaged."""
     names = ("world_from_agent", "agent_from_bone", "observer")
-    return Approaches(**arrays.load(folder / "approaches.npz", names), scene=Scenes.of(FeatureVolume.load(folder / "volume.npz")))
+    return RecordedApproaches(
+        **npz.load(folder / "approaches.npz", names),
+        scene=Scenes.of(FeatureVolume.load(folder / "volume.npz")),
+    )
 
 
-def shares(ats: Ats, met: Approaches, count: int, seed: int) -> dict[str, Float[np.ndarray, "approach"]]:
-    """Return per approach the share of ``count`` plans that flee, by what is perceived, and whether the animal fled."""
+def shares(
+    ats: Ats, met: RecordedApproaches, count: int, seed: int
+) -> dict[str, Float[np.ndarray, "approach"]]:
+    """Return per approach the share of ``count`` plans that flee, by what is perceived, and whether the
+    animal fled.
+    """
     ats = replace(ats, volume=met.scene)
     unaware = replace(ats.sampling, observer=False)
     asked = ({"seen": ats.sampling, "unseen": unaware}, {"standing": ats.sampling})
@@ -55,8 +63,12 @@ def shares(ats: Ats, met: Approaches, count: int, seed: int) -> dict[str, Float[
     return found
 
 
-def _fled(ats: Ats, context: Context, samplings: dict[str, Sampling], count: int, seed: int) -> dict[str, Float[np.ndarray, "approach"]]:
-    """Return per approach the share of plans that flee, for several ways of sampling that begin with the same noise."""
+def _fled(
+    ats: Ats, context: Context, samplings: dict[str, PlanSamplingConfig], count: int, seed: int
+) -> dict[str, Float[np.ndarray, "approach"]]:
+    """Return per approach the share of plans that flee, for several ways of sampling that begin with the same
+    noise.
+    """
     rngs = {name: np.random.default_rng(seed) for name in samplings}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in samplings}
     for begin in range(0, len(context), WINDOWS_AT_ONCE):
@@ -67,5 +79,7 @@ def _fled(ats: Ats, context: Context, samplings: dict[str, Sampling], count: int
         for name, sampling in samplings.items():
             course = ats.sampler.course(observation, sampling, rngs[name], count=count)
             path = rigid.apply(frame, course).reshape(len(some), count, -1, 3)
-            parts[name].append(flees(path, np.repeat(now, count, axis=1), np.repeat(person, count, axis=1)).mean(1))
+            parts[name].append(
+                flees(path, np.repeat(now, count, axis=1), np.repeat(person, count, axis=1)).mean(1)
+            )
     return {name: np.concatenate(each) for name, each in parts.items()}

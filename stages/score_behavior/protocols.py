@@ -1,78 +1,93 @@
-"""The two protocols of the paper: end to end, where each level feeds the next (Table 4), and fed with the truth (Table 5)."""
-
-from dataclasses import dataclass
+"""The two protocols of the paper: end to end, where each level feeds the next (Table 4), and fed with the
+truth (Table 5).
+"""
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.behavior import ROOT_CHANNELS, bones_from_channels
-from pipeline.models.perception import world_from_ego
-from pipeline.models.planning import observe
-from pipeline.models.predictors import Ats, Samples
-from pipeline.models.scores import GOAL_SCORES, PLAN_SCORES, SCORES
-from pipeline.models.trajectories import TEST, BehaviorData, Context, Future
-from pipeline.space import rigid
+from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
+from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.planning import observe
+from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
+from pipeline.geometry import rigid
+from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
+from pipeline.rivals.predictors import Ats, Samples
+from stages.score_behavior.config import Config
 
 WINDOWS_AT_ONCE = 32
 
 
-@dataclass(frozen=True)
-class Effort:
-    """How much is sampled; see the stage's configuration."""
-
-    samples: int
-    trials: int
-    stride: int
-    plan_trials: int
-    plan_stride: int
-    seed: int
-
-
-def scores(ats: Ats, data: BehaviorData, family: str, effort: Effort) -> dict[str, np.ndarray]:
+def scores(ats: Ats, data: BehaviorData, family: str, scoring: Config) -> dict[str, np.ndarray]:
     """Return per protocol and score one number per window, averaged over trials, and the windows themselves.
 
-    ``goal_window``, ``plan_window``: recording and first frame of the windows on which goals, and plans, are judged.
-    ``end_to_end/solid``: share of each window's sampled positions inside something solid or outside the room.
+    ``goal_window``, ``plan_window``: recording and first frame of the windows on which goals, and plans, are
+    judged. ``end_to_end/solid``: share of each window's sampled positions inside something solid or outside
+    the room.
     """
-    rng, test = np.random.default_rng(effort.seed), data.indices(TEST)
-    many, few = test[:: effort.stride], test[:: effort.plan_stride]
+    rng, test = np.random.default_rng(scoring.seed), data.indices(TEST)
+    many, few = test[:: scoring.stride], test[:: scoring.plan_stride]
     context, future = data.windows(many)
-    goals = ats.goals(context, effort.samples * effort.trials, rng).goal
-    trials = [Samples(part) for part in np.split(goals, effort.trials, axis=1)]
+    goals = ats.goals(context, scoring.samples * scoring.trials, rng).goal
+    trials = [Samples(part) for part in np.split(goals, scoring.trials, axis=1)]
     found = {f"end_to_end/{name}": [SCORES[name](trial, future) for trial in trials] for name in GOAL_SCORES}
     context, future = data.windows(few)
-    for _ in range(effort.plan_trials):
-        samples = ats.sample(context, effort.samples, rng)
+    if len(few):
+        samples = ats.sample(context, scoring.samples, rng)
         _add(found, "end_to_end", samples, future)
-        found.setdefault("end_to_end/solid", []).append(ats.volume.inside_solid(samples.path, context.video).mean((1, 2)))
+        found.setdefault("end_to_end/solid", []).append(
+            ats.volume.inside_solid(samples.path, context.video).mean((1, 2))
+        )
         if family != "one_stage":  # it has no level that could be fed
-            _add(found, "truth_fed", fed_with_truth(ats, context, future, effort.samples, rng), future)
-    listed = {"goal_window": _listed(data, many), "plan_window": _listed(data, few), "videos": np.array(data.videos, np.str_)}
+            _add(found, "truth_fed", fed_with_truth(ats, context, future, scoring.samples, rng), future)
+    listed = {
+        "goal_window": _listed(data, many),
+        "plan_window": _listed(data, few),
+        "videos": np.array(data.videos, np.str_),
+    }
     true = ats.volume.inside_solid(future.path_world, context.video).mean(1)
-    return {name: np.mean(values, axis=0) for name, values in found.items()} | {"recorded/solid": true} | listed
+    return (
+        {name: np.mean(values, axis=0) for name, values in found.items()} | {"recorded/solid": true} | listed
+    )
 
 
-def fed_with_truth(ats: Ats, context: Context, future: Future, count: int, rng: np.random.Generator) -> Samples:
+def fed_with_truth(
+    ats: Ats, context: Context, future: Future, count: int, rng: np.random.Generator
+) -> Samples:
     """Sample paths to the true goal, and bodies along the true path."""
     parts = [slice(begin, begin + WINDOWS_AT_ONCE) for begin in range(0, len(context), WINDOWS_AT_ONCE)]
-    fed = [_fed(ats, context[part], Future(future.world_from_agent[part], future.agent_from_bone[part]), count, rng) for part in parts]
+    fed = [
+        _fed(
+            ats,
+            context[part],
+            Future(future.world_from_agent[part], future.agent_from_bone[part]),
+            count,
+            rng,
+        )
+        for part in parts
+    ]
     return Samples(*(np.concatenate([getattr(each, name) for each in fed]) for name in vars(fed[0])))
 
 
 def _fed(ats: Ats, context: Context, future: Future, count: int, rng: np.random.Generator) -> Samples:
     frame = world_from_ego(context.world_from_agent[:, -1], ats.ego)
     true = rigid.apply(rigid.inverse(frame), future.path_world)
-    codes = ats.sampler.codes(observe(context, ats.volume, ats.agent_from_bone_rest, ats.ego), ats.sampling, count)
+    codes = ats.sampler.codes(
+        observe(context, ats.volume, ats.agent_from_bone_rest, ats.ego), ats.sampling, count
+    )
     world = np.repeat(frame, count, axis=0)
     paths = ats.sampler.paths(codes, np.repeat(true[:, -1], count, axis=0), ats.sampling, rng)
     bodies = ats.sampler.bodies(codes, np.repeat(true, count, axis=0), ats.sampling, rng)
     rotation = world[:, None, :3, :3] @ rigid.rotation_from_6d(bodies[..., :ROOT_CHANNELS])
     bones = bones_from_channels(bodies[..., ROOT_CHANNELS:], ats.agent_from_bone_rest).astype(np.float32)
     path = rigid.apply(world, paths)
-    return Samples(*(a.reshape(len(context), count, *a.shape[1:]) for a in (path[:, -1], path, rotation, bones)))
+    return Samples(
+        *(a.reshape(len(context), count, *a.shape[1:]) for a in (path[:, -1], path, rotation, bones))
+    )
 
 
-def _add(found: dict[str, list[Float[np.ndarray, "window"]]], protocol: str, samples: Samples, future: Future) -> None:
+def _add(
+    found: dict[str, list[Float[np.ndarray, "window"]]], protocol: str, samples: Samples, future: Future
+) -> None:
     for name in PLAN_SCORES:
         found.setdefault(f"{protocol}/{name}", []).append(SCORES[name](samples, future))
 

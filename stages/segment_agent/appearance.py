@@ -1,8 +1,10 @@
-"""What the animal of one recording looks like: a small network that learns it from the recording's own first masks.
+"""What the animal of one recording looks like: a small network that learns it from the recording's own first
+masks.
 
-First masks rest on geometry and miss an animal that never leaves its place, or leak where depth is poor; such errors
-differ from frame to frame while the animal's looks stay, so the network, too small to learn the errors by heart, keeps
-the looks. `learn` trains one on examples; `Appearance.log_odds` judges a picture of any size.
+First masks rest on geometry and miss an animal that never leaves its place, or leak where depth is poor; such
+errors differ from frame to frame while the animal's appearance stays, so the network, too small to learn the
+errors by heart, keeps the appearance. `learn` trains one on examples; `Appearance.log_odds` judges a picture
+of any size.
 """
 
 import math
@@ -16,6 +18,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from stages.segment_agent.config import LearningConfig
+
 ALIGNED_PX = 16
 """pictures are widened to a multiple of it"""
 GAIN = 4.0
@@ -26,34 +30,22 @@ LIMIT = 8.0
 """largest log-odds of a pixel"""
 
 
-@dataclass(frozen=True)
-class Learning:
-    """How the animal's looks are learnt."""
-
-    examples: int = 150
-    """frames to learn from"""
-    steps: int = 300
-    """training steps"""
-    batch: int = 6
-    """crops per step"""
-    crop_px: int = 144
-    """side of a crop at working resolution, pixels"""
-    rate: float = 5e-3
-    """highest learning rate"""
-    trusting: float = 0.5
-    """share of the steps in which every label counts"""
-    doubt: float = 4.0
-    """log-odds by which the network must contradict a label to ignore it later"""
-    at_animal: float = 0.7
-    """share of the other crops that show the animal"""
-    mined: float = 0.2
-    """share of crops around what was taken for the animal by mistake, once a third of the steps is done"""
-    scaled: float = 0.5
-    """share of crops that show the animal smaller or larger than it was seen"""
-    scales: tuple[float, float] = (0.5, 1.5)
-    """how much smaller and larger"""
-    least_px: int = 60
-    """animal pixels that an example needs"""
+RATE, WEIGHT_DECAY = 5e-3, 1e-3
+"""highest learning rate, and decay of weights, of AdamW"""
+TRUSTING = 0.5
+"""share of the steps in which every label counts"""
+CONTRADICTION = 4.0
+"""log-odds by which the network must contradict a label to ignore it later"""
+AT_ANIMAL = 0.7
+"""share of the other crops that show the animal"""
+MINED = 0.2
+"""share of crops around what was taken for the animal by mistake, once a third of the steps is done"""
+SCALED, SCALES = 0.5, (0.5, 1.5)
+"""share of crops that show the animal smaller or larger than it was seen, and how much"""
+LEAST_PX = 60
+"""animal pixels that an example needs"""
+CONTRAST, BRIGHTNESS = 0.2, 0.15
+"""standard deviations of changed contrast (share) and exposure (of -1..1) of crops"""
 
 
 @dataclass(frozen=True)
@@ -78,7 +70,9 @@ class Appearance(nn.Module):
                 nn.Sequential(_block(third, fourth, 2), _block(fourth, fourth)),
             ]
         )
-        self.up = nn.ModuleList([_block(fourth + third, third), _block(third + second, second), _block(second + first, first)])
+        self.up = nn.ModuleList(
+            [_block(fourth + third, third), _block(third + second, second), _block(second + first, first)]
+        )
         self.out = nn.Sequential(nn.Conv2d(first, 4, 3, 1, 1), nn.PixelShuffle(2))
 
     def forward(self, color: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch height width"]:
@@ -90,11 +84,20 @@ class Appearance(nn.Module):
         deep = levels.pop()
         for up in self.up:
             level = levels.pop()
-            deep = up(torch.cat([F.interpolate(deep, size=level.shape[-2:], mode="bilinear", align_corners=False), level], 1))
+            deep = up(
+                torch.cat(
+                    [F.interpolate(deep, size=level.shape[-2:], mode="bilinear", align_corners=False), level],
+                    1,
+                )
+            )
         return GAIN * self.out(deep)[:, 0]
 
-    def log_odds_within(self, color: UInt8[np.ndarray, "height width 3"], rows: slice, columns: slice) -> Float[np.ndarray, "rows columns"]:
-        """Judge a rectangle of a picture, as `log_odds` of the whole would but for what lies farther than its surroundings."""
+    def log_odds_within(
+        self, color: UInt8[np.ndarray, "height width 3"], rows: slice, columns: slice
+    ) -> Float[np.ndarray, "rows columns"]:
+        """Judge a rectangle of a picture, as `log_odds` of the whole would but for what lies farther than its
+        surroundings.
+        """
         top, left = max(rows.start - SURROUNDINGS_PX, 0), max(columns.start - SURROUNDINGS_PX, 0)
         top, left = top - top % ALIGNED_PX, left - left % ALIGNED_PX
         found = self.log_odds(color[top : rows.stop + SURROUNDINGS_PX, left : columns.stop + SURROUNDINGS_PX])
@@ -109,32 +112,48 @@ class Appearance(nn.Module):
         return found.clamp(-LIMIT, LIMIT).numpy()
 
 
-def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generator) -> Appearance | None:
-    """Train a network on examples; None when none of them shows the animal.
+def learn(
+    examples: Sequence[Example],
+    options: LearningConfig,
+    rng: np.random.Generator,
+    *,
+    room: Sequence[Example] = (),
+    least_px: int = LEAST_PX,
+    scaled: float = SCALED,
+) -> Appearance | None:
+    """Train a network on examples, and on others that show the ``room`` alone; None when none shows the
+    animal.
 
-    Stripes of a carpet may look like a tabby, so twice it looks at half of the examples and learns more from its mistakes.
+    Stripes of a carpet may look like a tabby, so twice it looks at half of the examples and learns more from
+    its mistakes.
     """
-    showing = [example for example in examples if (example.labels == 255).sum() >= options.least_px]
+    showing = [example for example in examples if (example.labels == 255).sum() >= least_px]
     if not showing:
         return None
+    showing += room
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         network = Appearance()
-    optimizer = torch.optim.AdamW(network.parameters(), options.rate, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.rate, total_steps=options.steps)
+    optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=options.steps)
     mistakes = None
     for step in range(options.steps):
         if step in (options.steps // 3, 2 * options.steps // 3):
-            mistakes = [_mistake(network, example, options) for example in showing[::2]]
+            mistakes = [_mistake(network, example) for example in showing[::2]]
         network.train()
         crops = [
-            _crop(*_scaled(*_chosen(showing, mistakes, options, rng), options, rng), options.crop_px, rng) for _ in range(options.batch)
+            _crop(
+                *_scaled(*_chosen(showing, mistakes, options.crop_px, rng), options.crop_px, scaled, rng),
+                options.crop_px,
+                rng,
+            )
+            for _ in range(options.batch)
         ]
         color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
         found = network(color)
         loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
-        contradicted = torch.where(labels == 255, -found, found) > options.doubt
-        counted = (labels != 128) & ~(contradicted & (step > options.trusting * options.steps))
+        contradicted = torch.where(labels == 255, -found, found) > CONTRADICTION
+        counted = (labels != 128) & ~(contradicted & (step > TRUSTING * options.steps))
         weight = counted.float()
         optimizer.zero_grad()
         ((loss * weight).sum() / weight.sum().clamp(min=1)).backward()
@@ -143,53 +162,69 @@ def learn(examples: Sequence[Example], options: Learning, rng: np.random.Generat
     return network.eval()
 
 
-def _mistake(network: Appearance, example: Example, options: Learning) -> UInt8[np.ndarray, "height width"]:
-    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be the animal.
+def _mistake(network: Appearance, example: Example) -> UInt8[np.ndarray, "height width"]:
+    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be the
+    animal.
 
     Nothing where the labelled animal does not look like one: then the label may be the mistake.
     """
     like = network.log_odds(example.color)
-    if (like[example.labels == 255] > 0).mean() < 0.5:
+    if (example.labels == 255).any() and (like[example.labels == 255] > 0).mean() < 0.5:
         return np.zeros(like.shape, np.uint8)
-    return np.where((example.labels == 0) & (like < options.doubt), np.clip(10 * (like + 2), 0, 255), 0).astype(np.uint8)
+    return np.where(
+        (example.labels == 0) & (like < CONTRADICTION), np.clip(10 * (like + 2), 0, 255), 0
+    ).astype(np.uint8)
 
 
 def _chosen(
-    examples: Sequence[Example], mistakes: list[UInt8[np.ndarray, "height width"]] | None, options: Learning, rng: np.random.Generator
+    examples: Sequence[Example],
+    mistakes: list[UInt8[np.ndarray, "height width"]] | None,
+    crop_px: int,
+    rng: np.random.Generator,
 ) -> tuple[Example, tuple[int, int]]:
-    """Choose an example and the middle (row, column) of a crop: a mistake, a place near the animal, or any."""
+    """Choose an example and the middle (row, column) of a crop: a mistake, near the animal, or any."""
     height, width = examples[0].labels.shape
-    if mistakes is not None and rng.random() < options.mined:
+    if mistakes is not None and rng.random() < MINED:
         total = np.array([weight.sum(dtype=np.int64) for weight in mistakes])
         if total.any():
             index = int(rng.choice(len(mistakes), p=total / total.sum()))
             heaped = np.cumsum(mistakes[index], dtype=np.int64)
-            return examples[2 * index], divmod(int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right")), width)
-    example = examples[rng.integers(len(examples))]
-    if rng.random() >= options.at_animal:
+            return examples[2 * index], divmod(
+                int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right")), width
+            )
+    example = examples[int(rng.integers(len(examples)))]
+    if rng.random() >= AT_ANIMAL or not (example.labels == 255).any():
         return example, (int(rng.integers(height)), int(rng.integers(width)))
     inside = np.flatnonzero(example.labels == 255)
     row, column = divmod(int(inside[rng.integers(len(inside))]), width)
-    reach = options.crop_px * 3 // 8
+    reach = crop_px * 3 // 8
     return example, (row + int(rng.integers(-reach, reach)), column + int(rng.integers(-reach, reach)))
 
 
-def _scaled(example: Example, middle: tuple[int, int], options: Learning, rng: np.random.Generator) -> tuple[Example, tuple[int, int]]:
-    """Show an example and the middle of a crop as from nearer or from farther away, now and then: animals walk up and off."""
-    if options.scaled == 0 or rng.random() >= options.scaled:
+def _scaled(
+    example: Example, middle: tuple[int, int], crop_px: int, scaled: float, rng: np.random.Generator
+) -> tuple[Example, tuple[int, int]]:
+    """Show an example and the middle of a crop as from nearer or from farther away, now and then: animals
+    walk up and off.
+    """
+    if scaled == 0 or rng.random() >= scaled:
         return example, middle
-    scale = float(np.exp(rng.uniform(*np.log(options.scales))))
-    reach = math.ceil(options.crop_px / scale)
+    scale = float(np.exp(rng.uniform(*np.log(SCALES))))
+    reach = math.ceil(crop_px / scale)
     top, left = (max(at - reach // 2 - 1, 0) for at in middle)
     part = np.s_[top : top + reach + 2, left : left + reach + 2]
     color, labels = example.color[part], example.labels[part]
     size = tuple(max(1, round(scale * side)) for side in labels.shape[::-1])
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    scaled = Example(cv2.resize(color, size, interpolation=how), cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST))
-    return scaled, (round(scale * (middle[0] - top)), round(scale * (middle[1] - left)))
+    zoomed = Example(
+        cv2.resize(color, size, interpolation=how), cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    )
+    return zoomed, (round(scale * (middle[0] - top)), round(scale * (middle[1] - left)))
 
 
-def _crop(example: Example, middle: tuple[int, int], side: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+def _crop(
+    example: Example, middle: tuple[int, int], side: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
     """Cut a square; flip it, change its exposure and contrast."""
     height, width = example.labels.shape
     top, left = middle[0] - side // 2, middle[1] - side // 2
@@ -200,7 +235,7 @@ def _crop(example: Example, middle: tuple[int, int], side: int, rng: np.random.G
     color, labels = np.pad(color, [*short, (0, 0)], mode="edge"), np.pad(labels, short, constant_values=128)
     if rng.random() < 0.5:
         color, labels = color[:, ::-1], labels[:, ::-1]
-    shown = _normalised(color) * (1 + 0.2 * rng.normal()) + 0.15 * rng.normal()
+    shown = _normalised(color) * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
     return shown.float(), torch.from_numpy(labels.copy())
 
 
@@ -209,4 +244,6 @@ def _normalised(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "3 
 
 
 def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.LeakyReLU(0.1))
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.LeakyReLU(0.1)
+    )

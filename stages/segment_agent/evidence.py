@@ -1,4 +1,5 @@
-"""What the points of a window say about showing the animal: geometry first, colour where a known surface looks otherwise.
+"""What the points of a window say about showing the animal: geometry first, colour where a known surface
+looks otherwise.
 
 `judge_motion` serves sessions; `turnaround` makes the judge of the other recordings.
 """
@@ -11,14 +12,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from stages.segment_agent import free_space, movers
-from stages.segment_agent.free_space import FreeSpace, References, Votes
-from stages.segment_agent.movers import Mover
+from stages.segment_agent.free_space import References, Votes
 from stages.segment_agent.windows import Sphere, Window
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a window's points say: log-odds of showing the animal, how much to trust them, and which are beyond doubt."""
+    """What a window's points say: log-odds of showing the animal, how much to trust them, and which are
+    beyond doubt.
+    """
 
     log_odds: Float[np.ndarray, "height width"]
     certainty: Float[np.ndarray, "height width"]
@@ -28,58 +30,49 @@ class Evidence:
     room: Bool[np.ndarray, "height width"]
 
 
-@dataclass(frozen=True)
-class Weighing:
-    """Log-odds that observations of a session are worth."""
-
-    moving: float = 3.0
-    """a point in space that is free at other times"""
-    room: float = 3.0
-    """a point on a surface that other frames saw"""
-    step_m: float = 0.022
-    """step in front of that surface that speaks neither way"""
-    step_spread_m: float = 0.008
-    """step that is worth one more"""
-    recolored: float = 1.0
-    """each time the noise by which such a surface's colour differs"""
-    distrusted: float = 0.5
-    """certainty of depth of low confidence or at a step; 1 is that of all other depth"""
-    distrusted_behind: float = 0.25
-    """the same where it lies where no animal is: the sensor may have looked past a tail"""
-    distrusted_moving: float = 0.6
-    """the same in space that is free at other times"""
-    few: float = 5.0
-    """references that must have seen a surface to make it half certain: one or two may have seen the animal itself there"""
-
-
+MOVING, ROOM = 3.0, 3.0
+"""log-odds that a point is worth in space that is free at other times; and on a surface that other frames saw
+"""
+STEP_M, STEP_SPREAD_M = 0.022, 0.008
+"""step in front of that surface that speaks neither way, and the step that is worth one more"""
+RECOLORED = 1.0
+"""log-odds for each time the noise by which such a surface's colour differs"""
+DISTRUSTED, DISTRUSTED_BEHIND, DISTRUSTED_MOVING = 0.5, 0.25, 0.6
+"""certainty of depth of low confidence or at a step (1 is that of all other depth): on such a surface, where
+no animal is (the sensor may have looked past a tail), and in space that is free at other times"""
+FEW = 5.0
+"""references that must have seen a surface to make it half certain: one or two may have seen the animal
+itself there"""
 ASKEW_PX = 2
 """how far a texture may lie from where it was, working pixels"""
 
 Judge = Callable[[int, Window, Sphere], Evidence]
 
 
-def judge_motion(references: References, free: FreeSpace, mover: Mover, weighing: Weighing) -> Judge:
+def judge_motion(references: References) -> Judge:
     """Evidence for sessions: free at other times is animal; on a surface that others saw is room.
 
-    On such a surface a step towards the camera or another colour than the others saw there speaks for the animal: paws
-    and tails are too thin for the depth sensor.
+    On such a surface a step towards the camera or another colour than the others saw there speaks for the
+    animal: paws and tails are too thin for the depth sensor.
     """
 
     def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
         known = np.isfinite(window.points_world[..., 0])
         near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
-        votes = free_space.vote(references, np.where(near[..., None], window.points_world, np.nan), free, frame)
-        animal = movers.moving(votes, mover)
+        votes = free_space.vote(references, np.where(near[..., None], window.points_world, np.nan), frame)
+        animal = movers.moving(votes)
         settled = known & ~animal & (votes.occupied > 0)
-        step = np.clip((votes.gap_m - weighing.step_m) / weighing.step_spread_m, -weighing.room, 1)
-        log_odds = np.where(animal, weighing.moving, np.where(settled, step + weighing.recolored * recolored(window, votes, settled), 0.0))
-        elsewhere, seen = known & ~near, votes.occupied / (votes.occupied + weighing.few)
-        doubted = np.where(animal, weighing.distrusted_moving, np.where(settled, weighing.distrusted, weighing.distrusted_behind))
+        step = np.clip((votes.gap_m - STEP_M) / STEP_SPREAD_M, -ROOM, 1)
+        log_odds = np.where(
+            animal, MOVING, np.where(settled, step + RECOLORED * recolored(window, votes, settled), 0.0)
+        )
+        elsewhere, seen = known & ~near, votes.occupied / (votes.occupied + FEW)
+        doubted = np.where(animal, DISTRUSTED_MOVING, np.where(settled, DISTRUSTED, DISTRUSTED_BEHIND))
         certainty = np.where(settled, seen, 1.0) * np.where(window.trusted, 1.0, doubted)
-        log_odds[elsewhere] = -weighing.room
+        log_odds[elsewhere] = -ROOM
         certainty[~(animal | settled | elsewhere)] = 0.05
-        clear = animal & movers.clearly_moving(votes, mover)
-        return Evidence(log_odds, certainty, animal & window.trusted, clear, log_odds <= -0.66 * weighing.room)
+        clear = animal & movers.clearly_moving(votes)
+        return Evidence(log_odds, certainty, animal & window.trusted, clear, log_odds <= -0.66 * ROOM)
 
     return judge
 
@@ -88,18 +81,26 @@ def either(first: Judge, second: Judge) -> Judge:
     """Evidence by the first judge where that speaks for the animal, by the second elsewhere."""
 
     def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
-        told, other = first(frame, window, ball), second(frame, window, ball)
-        own = told.log_odds > 0
-        return Evidence(**{part.name: np.where(own, getattr(told, part.name), getattr(other, part.name)) for part in fields(Evidence)})
+        preferred, other = first(frame, window, ball), second(frame, window, ball)
+        own = preferred.log_odds > 0
+        return Evidence(
+            **{
+                part.name: np.where(own, getattr(preferred, part.name), getattr(other, part.name))
+                for part in fields(Evidence)
+            }
+        )
 
     return judge
 
 
-def recolored(window: Window, votes: Votes, settled: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Return by how many times the noise (0..6) a surface shows another colour than at other times, shadows taken out.
+def recolored(
+    window: Window, votes: Votes, settled: Bool[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width"]:
+    """Return by how many times the noise (0..6) a surface shows another colour than at other times, shadows
+    taken out.
 
-    A shadow or a changed exposure scales all channels alike, and a shadow only darkens. Any colour that the surface had
-    within `ASKEW_PX` is no other one: the edges of a texture never lie quite where they were.
+    A shadow or a changed exposure scales all channels alike, and a shadow only darkens. Any colour that the
+    surface had within `ASKEW_PX` is no other one: the edges of a texture never lie quite where they were.
     """
     if settled.sum() < 50:
         return np.zeros(settled.shape)

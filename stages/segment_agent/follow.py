@@ -1,9 +1,10 @@
 """Masks of a recording without depth, from one box: colour and flow only.
 
-GrabCut cuts the animal out of the hinted frame and a network learns its looks; it is followed both ways from there
-(`_followed`) as what looks like it near where flow carries the last mask. That loses sides of the animal never seen
-before, so the network learns again from the whole recording, where what moves against the background beside the
-followed part counts too, and the animal is followed once more. What moves elsewhere is some other mover.
+GrabCut cuts the animal out of the hinted frame and a network learns its appearance; it is followed both ways
+from there (`_followed`) as what looks like it near where flow carries the last mask. That loses sides of the
+animal never seen before, so the network learns again from the whole recording, where what moves against the
+background beside the followed part counts too, and the animal is followed once more. What moves elsewhere is
+some other mover.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,9 +15,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.files import arrays
-from pipeline.files.clips import Clip
-from stages.segment_agent.appearance import Appearance, Example, Learning, learn
+from pipeline.data.clips import Clip
+from pipeline.data.flow import open_flow
+from stages.segment_agent.appearance import Appearance, Example, learn
+from stages.segment_agent.config import LearningConfig
 from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
 from stages.segment_agent.windows import working_picture, working_size
@@ -26,28 +28,21 @@ SURE = 4.0
 MOTION_GAP = 4
 
 
-@dataclass(frozen=True)
-class Following:
-    """How an animal is followed without depth; pixels are those of the working picture."""
-
-    first_steps: int = 80
-    """training steps on the hinted frame"""
-    steps: int = 160
-    """training steps on the whole recording"""
-    hinted_share: float = 0.17
-    """share of the hinted frame among those examples"""
-    reach_px: int = 12
-    """how far from the carried mask the animal is looked for"""
-    beside_px: int = 25
-    """how far from the followed part something moving belongs to the animal"""
-    halo_px: int = 7
-    """how far flow smears motion beyond the edge of what moves"""
-    carried: float = 2.0
-    """largest log-odds of the carried mask at first; half of it counts when the looks are known better"""
-    moving: float = 4.0
-    """times the typical residual from which on a point moves against the background"""
-    still: float = 2.5
-    """times the typical residual up to which a point does not"""
+FIRST_STEPS, STEPS = 80, 160
+"""training steps on the hinted frame, and on the whole recording"""
+HINTED_SHARE = 0.17
+"""share of the hinted frame among those examples"""
+REACH_PX = 12
+"""how far from the carried mask the animal is looked for, working pixels as all here"""
+BESIDE_PX = 25
+"""how far from the followed part something moving belongs to the animal"""
+HALO_PX = 7
+"""how far flow smears motion beyond the edge of what moves"""
+CARRIED = 2.0
+"""largest log-odds of the carried mask at first; half of it counts when the appearance is known better"""
+MOVING, STILL = 4.0, 2.5
+"""times the typical residual from which on a point moves against the background, and up to which it does not
+"""
 
 
 @dataclass(frozen=True)
@@ -65,7 +60,7 @@ class Footage:
     def to(self, frame: int, other: int) -> Float[np.ndarray, "height width 2"] | None:
         """Read the flow from a frame to another, working pixels; None where none is stored."""
         first, gap = min(frame, other), abs(other - frame)
-        table = arrays.open_lazily(self.flow / f"flow_{gap}_{'fw' if other > frame else 'bw'}.npz", "flow")
+        table = open_flow(self.flow, gap, backward=other < frame)
         if not 0 <= first < len(table):
             return None
         size = working_size(self.clip, self.height_px)
@@ -73,21 +68,27 @@ class Footage:
         return scale * cv2.resize(table[first].astype(np.float32), size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def follow(footage: Footage, hint: Prompt, options: Following, learning: Learning, rng: np.random.Generator) -> Iterator[Mask]:
+def follow(
+    footage: Footage, hint: Prompt, learning: LearningConfig, rng: np.random.Generator
+) -> Iterator[Mask]:
     """Return one mask per frame at colour resolution."""
     count = len(footage.clip)
     hinted = cut_out(footage, hint, rng)
     shown = Example(footage.color(hint.frame), hinted.astype(np.uint8) * 255)
-    network = learn([shown], replace(learning, steps=options.first_steps, least_px=1, scaled=0.0), rng)
-    rough = _followed(footage, hint.frame, hinted, network, options.reach_px, options.carried)
+    network = learn([shown], replace(learning, steps=FIRST_STEPS), rng, least_px=1, scaled=0.0)
+    assert network is not None, "GrabCut leaves at least the hinted box"
+    rough = _followed(footage, hint.frame, hinted, network, REACH_PX, CARRIED)
     chosen = np.unique(np.linspace(0, count - 1, learning.examples).round().astype(int)).tolist()
-    examples = [_example(footage, frame, _unpacked(rough[frame]), options) for frame in chosen if frame != hint.frame]
-    repeated = [shown] * max(1, round(options.hinted_share * len(examples)))
-    network = learn(repeated + examples, replace(learning, steps=options.steps, scaled=0.0), rng)
-    allowed = _allowed(rough, options)
-    found = _followed(footage, hint.frame, hinted, network, options.reach_px + 3, options.carried / 2, allowed)
+    examples = [_example(footage, frame, _unpacked(rough[frame])) for frame in chosen if frame != hint.frame]
+    repeated = [shown] * max(1, round(HINTED_SHARE * len(examples)))
+    network = learn(repeated + examples, replace(learning, steps=STEPS), rng, scaled=0.0)
+    assert network is not None, "the hinted frame shows the animal"
+    allowed = _allowed(rough)
+    found = _followed(footage, hint.frame, hinted, network, REACH_PX + 3, CARRIED / 2, allowed)
     for mask in map(_unpacked, found):
-        labels = cv2.resize(mask.astype(np.uint8) * 255, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR)
+        labels = cv2.resize(
+            mask.astype(np.uint8) * 255, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR
+        )
         yield Mask(np.where(labels > 127, 255, 0).astype(np.uint8), bool(mask.any()), 0.5)
 
 
@@ -107,16 +108,21 @@ def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Bool[np
 
 
 def grab(
-    color: UInt8[np.ndarray, "height width 3"], marks: UInt8[np.ndarray, "height width"], rng: np.random.Generator
+    color: UInt8[np.ndarray, "height width 3"],
+    marks: UInt8[np.ndarray, "height width"],
+    rng: np.random.Generator,
 ) -> Bool[np.ndarray, "height width"]:
     """Cut something out of a picture by GrabCut (Rother et al. 2004); ``marks`` are OpenCV's four."""
     cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
-    found = cv2.grabCut(color, marks.copy(), None, np.zeros((1, 65)), np.zeros((1, 65)), 8, cv2.GC_INIT_WITH_MASK)[0]
+    found = cv2.grabCut(
+        color, marks.copy(), None, np.zeros((1, 65)), np.zeros((1, 65)), 8, cv2.GC_INIT_WITH_MASK
+    )[0]
     return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
 
 
 def residual(footage: Footage, frame: int) -> Float[np.ndarray, "height width"]:
-    """Return how far a point moves against the background, in typical residuals, mean of both directions of time.
+    """Return how far a point moves against the background, in typical residuals, mean of both directions of
+    time.
 
     The background moves as most of the picture does, by a homography.
     """
@@ -135,15 +141,17 @@ def residual(footage: Footage, frame: int) -> Float[np.ndarray, "height width"]:
     return np.mean(parts, axis=0) if parts else np.zeros(working_size(footage.clip, footage.height_px))
 
 
-def _example(footage: Footage, frame: int, rough: Bool[np.ndarray, "height width"], options: Following) -> Example:
-    """Label a frame: what was followed or moves beside it is animal, what is far or still is not, the rest is unknown."""
+def _example(footage: Footage, frame: int, rough: Bool[np.ndarray, "height width"]) -> Example:
+    """Label a frame: what was followed or moves beside it is animal, what is far or still is not, the rest is
+    unknown.
+    """
     moves = residual(footage, frame)
-    beside = _grown(rough, options.beside_px)
-    inner = _grown(~((moves > options.moving) | rough), options.halo_px)
+    beside = _grown(rough, BESIDE_PX)
+    inner = _grown(~((moves > MOVING) | rough), HALO_PX)
     labels = np.full(rough.shape, 128, np.uint8)
-    labels[~beside | ((moves < options.still) & ~rough)] = 0
+    labels[~beside | ((moves < STILL) & ~rough)] = 0
     labels[beside & ~inner] = 255
-    labels[rough & (moves > options.still)] = 255
+    labels[rough & (moves > STILL)] = 255
     return Example(footage.color(frame), labels)
 
 
@@ -167,16 +175,22 @@ def _followed(
             near = np.ones_like(mask) if lost else _grown(prior > 0, reach_px)
             if allowed is not None:
                 near &= allowed(frame)
-            log_odds = network.log_odds(footage.color(frame)) + (0 if lost else np.clip(prior, -carried, carried))
+            log_odds = network.log_odds(footage.color(frame)) + (
+                0 if lost else np.clip(prior, -carried, carried)
+            )
             log_odds[~near] = -SURE
             kept = _kept(log_odds > 0, prior > 0, least_px=0.3 * size if lost else 0.0)
-            before = np.where(kept, np.clip(log_odds, 1, SURE), np.clip(log_odds, -SURE, -1)).astype(np.float32)
+            before = np.where(kept, np.clip(log_odds, 1, SURE), np.clip(log_odds, -SURE, -1)).astype(
+                np.float32
+            )
             size = int(kept.sum()) or size
             found[frame] = _packed(kept)
     return found
 
 
-def _carried(footage: Footage, frame: int, other: int, log_odds: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+def _carried(
+    footage: Footage, frame: int, other: int, log_odds: Float[np.ndarray, "height width"]
+) -> Float[np.ndarray, "height width"]:
     """Carry log-odds of another frame to this one along the flow."""
     moved = footage.to(frame, other)
     columns, rows = (np.arange(side, dtype=np.float32) for side in log_odds.shape[::-1])
@@ -193,7 +207,7 @@ def _carried(footage: Footage, frame: int, other: int, log_odds: Float[np.ndarra
 def _kept(
     inside: Bool[np.ndarray, "height width"], prior: Bool[np.ndarray, "height width"], least_px: float
 ) -> Bool[np.ndarray, "height width"]:
-    """Keep the parts that meet the carried mask; with none carried, the largest part if it is large enough."""
+    """Keep the parts that meet the carried mask; with none carried, the largest one if large enough."""
     count, part, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8))
     if count == 1:
         return inside
@@ -204,18 +218,24 @@ def _kept(
     return ((met > 0.1 * met.max()) & (met > 0))[part]
 
 
-def _allowed(rough: list[bytes], options: Following) -> Callable[[int], Bool[np.ndarray, "height width"]]:
-    """Tell where the animal may be: near the followed part, anywhere where that was lost."""
+def _allowed(rough: list[bytes]) -> Callable[[int], Bool[np.ndarray, "height width"]]:
+    """Return where the animal may be: near the followed part, anywhere where that was lost."""
 
     def allowed(frame: int) -> Bool[np.ndarray, "height width"]:
         followed = _unpacked(rough[frame])
-        return _grown(followed, options.beside_px + 5) if followed.any() else ~followed
+        return _grown(followed, BESIDE_PX + 5) if followed.any() else ~followed
 
     return allowed
 
 
 def _grown(mask: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
-    return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))) > 0
+    return (
+        cv2.dilate(
+            mask.astype(np.uint8),
+            cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1)),
+        )
+        > 0
+    )
 
 
 def _packed(mask: Bool[np.ndarray, "height width"]) -> bytes:

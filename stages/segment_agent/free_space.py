@@ -1,7 +1,8 @@
 """Free space: a point that other frames saw through is not part of the still room.
 
-`References` keeps a fixed number of depth pictures spread over the recording, before and after any frame, so that an
-animal that rests for a while is told by the times when its place was empty. Votes cost O(references) a frame.
+`References` keeps a fixed number of depth pictures spread over the recording, before and after any frame, so
+that an animal that rests for a while is told by the times when its place was empty. Votes cost O(references)
+a frame.
 """
 
 from collections.abc import Callable
@@ -10,29 +11,42 @@ from dataclasses import dataclass, replace
 import cv2
 import numba
 import numpy as np
+import scipy.optimize
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.files.clips import Clip
-from pipeline.space import cameras, rigid
+from pipeline.data.clips import Clip, usable_depth
+from pipeline.geometry import cameras, rigid
+
+MARGIN_M = 0.03
+"""a surface must lie this far, and four standard deviations of the depth noise, behind a point to prove it
+free"""
+ACROSS_M = 0.015
+"""pose error that is tolerated across the line of sight"""
+SIGNIFICANT = 4.0
+"""standard deviations of depth noise that are no chance"""
 
 
 @dataclass(frozen=True)
-class FreeSpace:
-    """How other frames judge a point."""
+class DepthNoise:
+    """How depth pictures of one recording disagree about the same surface: sensor and poses together.
 
-    references: int = 90
-    """depth pictures that vote, spread evenly over the recording"""
-    margin_m: float = 0.05
-    """a surface must lie this far behind a point to prove it free"""
-    margin_share: float = 0.015
-    """the same as a share of the distance, added"""
-    drift_m: float = 0.015
-    """pose error that is tolerated across the line of sight"""
+    Standard deviation in metres = constant_m + quadratic * z^2, z in metres: triangulation errs with the
+    square of z.
+    """
+
+    constant_m: float = 0.005
+    quadratic: float = 0.0025
+
+    def sigma_m(self, z: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        """Return the standard deviation at a distance, metres."""
+        return self.constant_m + self.quadratic * z**2
 
 
 @dataclass(frozen=True)
 class References:
-    """Depth pictures that vote; ``nearest`` is the smallest depth in a neighbourhood, which tolerates drift at edges."""
+    """Depth pictures that vote; ``nearest`` is the smallest depth in a neighbourhood, which tolerates drift
+    at edges.
+    """
 
     camera_from_world: Float[np.ndarray, "reference 4 4"]
     intrinsics: Float[np.ndarray, "reference 3 3"]
@@ -40,11 +54,14 @@ class References:
     nearest: Float[np.ndarray, "reference height width"]
     color: UInt8[np.ndarray, "reference height width 3"]
     frame: Int[np.ndarray, "reference"]
+    noise: DepthNoise
 
 
 @dataclass(frozen=True)
 class Votes:
-    """Per point: references that saw through it, references that saw a surface there, and the mean gap to that surface."""
+    """Per point: references that saw through it, references that saw a surface there, and the mean gap to
+    that surface.
+    """
 
     free: Int[np.ndarray, "*shape"]
     occupied: Int[np.ndarray, "*shape"]
@@ -54,41 +71,115 @@ class Votes:
     """mean colour (0..255) of those surfaces"""
 
 
-def usable_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth without low-confidence pixels and without flying pixels at depth steps (0 = unknown)."""
-    depth = clip.depth(frame)
-    low = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), np.ones((3, 3), np.uint8))
-    high = cv2.dilate(depth, np.ones((3, 3), np.uint8))
-    return np.where((clip.confidence(frame) > 0) & (high - low < 0.25 * depth), depth, 0).astype(np.float32)
+NEAREST_M = 0.1
+"""nothing is measured nearer to a depth camera"""
+NOISE_REACH_M = 0.15
+"""largest difference that may be noise of a surface seen twice, and not another surface"""
 
 
-def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: FreeSpace) -> References:
-    """Read the depth pictures that vote."""
-    frames = np.unique(np.linspace(0, len(clip) - 1, min(options.references, len(clip))).round().astype(int))
-    depth = np.stack([usable_depth(clip, frame) for frame in frames])
+def steady_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
+    """Read usable depth without flying pixels at depth steps (metres, 0 = unknown)."""
+    return usable_depth(clip, frame, keep_steps=False)
+
+
+def inner_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
+    """Read depth away from steps, holes and what the sensor doubts (0 = unknown): there, misalignment proves
+    nothing.
+    """
+    depth = steady_depth(clip, frame)
+    beside = np.ones((2 * (depth.shape[1] // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
+    low, high = cv2.erode(depth, beside), cv2.dilate(depth, beside)
+    return np.where((low > 0) & (high - low < INNER_STEP_SHARE * depth), depth, 0).astype(np.float32)
+
+
+INNER_WIDTH_PX = 320
+"""width of a picture of which one pixel around each is looked at, in wider ones more; narrower ones are
+phones', whose confidence marks steps"""
+INNER_STEP_SHARE = 0.12
+"""share of the distance from which a difference within that window is a step between surfaces"""
+
+
+def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> References:
+    """Read the ``count`` depth pictures that vote."""
+    frames = np.unique(np.linspace(0, len(clip) - 1, min(count, len(clip))).round().astype(int))
+    depth = np.stack([steady_depth(clip, frame) for frame in frames])
     nearest = np.stack(
-        [_nearest(picture, clip.depth_intrinsics[frame, 0, 0], options) for picture, frame in zip(depth, frames, strict=True)]
+        [
+            _nearest(picture, clip.depth_intrinsics[frame, 0, 0])
+            for picture, frame in zip(depth, frames, strict=True)
+        ]
     )
     color = np.stack([soft_color(clip.color(frame), clip.depth_size) for frame in frames])
-    return References(rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames], depth, nearest, color, frames)
+    camera_from_world, pinhole = rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames]
+    noise = measure_noise(depth, camera_from_world, pinhole)
+    return References(camera_from_world, pinhole, depth, nearest, color, frames, noise)
 
 
-def without(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]], free: FreeSpace) -> References:
-    """Forget what references saw where ``hidden`` (at any resolution) says so: there, they no longer know a surface."""
+def measure_noise(
+    depth: Float[np.ndarray, "reference height width"],
+    camera_from_world: Float[np.ndarray, "reference 4 4"],
+    intrinsics: Float[np.ndarray, "reference 3 3"],
+    probes: int = 800,
+) -> DepthNoise:
+    """Measure how far depth pictures err from what their neighbours in time and later ones predict, by range.
+
+    A robust deviation (1.48 times the median) per half metre; least squares with non-negative coefficients.
+    The default where too little overlaps.
+    """
+    ranges, errors = [], []
+    for first, second in _pairs(len(depth)):
+        inner = cv2.erode((depth[first] > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        chosen = np.flatnonzero(inner)[:: max(1, int(inner.sum()) // probes)]
+        rows, columns = np.unravel_index(chosen, inner.shape)
+        pixel = np.stack([columns, rows], axis=1) + 0.5
+        points = cameras.unproject(pixel, intrinsics[first]) * depth[first][rows, columns][:, None]
+        relative = camera_from_world[second] @ rigid.inverse(camera_from_world[first])
+        at, z = cameras.project(rigid.apply(relative, points), intrinsics[second])
+        inside = (z > NEAREST_M) & (at >= 0).all(1) & (at < np.array(inner.shape[::-1])).all(1)
+        at, z = np.asarray(at)[inside].astype(int), np.asarray(z)[inside]
+        measured = depth[second][at[:, 1], at[:, 0]]
+        near = (measured > 0) & (np.abs(measured - z) < NOISE_REACH_M)
+        ranges.append(z[near])
+        errors.append(np.abs(measured - z)[near])
+    z, error = np.concatenate(ranges), np.concatenate(errors)
+    bins = [(z >= low) & (z < low + 0.5) for low in np.arange(0.25, 6, 0.5)]
+    bins = [own for own in bins if own.sum() > 200]
+    if len(bins) < 2:
+        return DepthNoise()
+    middle = np.array([float(np.median(z[own])) for own in bins])
+    sigma = np.array([1.48 * float(np.median(error[own])) for own in bins])
+    (constant, quadratic), _ = scipy.optimize.nnls(np.stack([np.ones_like(middle), middle**2], axis=1), sigma)
+    return DepthNoise(max(float(constant), 0.002), float(quadratic))
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    """Pair pictures with the next one and with one a fifth of the recording later."""
+    later = max(2, count // 5)
+    return [(a, a + gap) for a in range(0, count - 1, 2) for gap in (1, later) if a + gap < count]
+
+
+def without(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]]) -> References:
+    """Forget what references saw where ``hidden`` (at any resolution) says so: there, they no longer know a
+    surface.
+    """
     size = references.depth.shape[1:][::-1]
     depth = references.depth.copy()
     for row, frame in enumerate(references.frame):
-        depth[row][cv2.resize(hidden(int(frame)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0] = 0
-    nearest = [_nearest(picture, k[0, 0], free) for picture, k in zip(depth, references.intrinsics, strict=True)]
+        depth[row][
+            cv2.resize(hidden(int(frame)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        ] = 0
+    nearest = [_nearest(picture, k[0, 0]) for picture, k in zip(depth, references.intrinsics, strict=True)]
     return replace(references, depth=depth, nearest=np.stack(nearest))
 
 
-def soft_color(color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "new_height new_width 3"]:
+def soft_color(
+    color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
+) -> UInt8[np.ndarray, "new_height new_width 3"]:
     """Resize to (height, width) and blur a little, so that colours compare in spite of small pose errors."""
     return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), 1.2)
 
 
-def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], options: FreeSpace, frame: int) -> Votes:
+def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], frame: int) -> Votes:
     """Let all references but the frame itself judge points (world, metres; NaN gets no vote)."""
     known = np.isfinite(points_world[..., 0])
     points = np.ascontiguousarray(points_world[known], np.float32)
@@ -102,8 +193,8 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], op
         references.depth,
         references.nearest,
         references.color,
-        np.float32(options.margin_m),
-        np.float32(options.margin_share),
+        np.float32(MARGIN_M + SIGNIFICANT * references.noise.constant_m),
+        np.float32(SIGNIFICANT * references.noise.quadratic),
     )
     votes = [np.zeros(known.shape + values.shape[1:], values.dtype) for values in judged]
     for whole, values in zip(votes, judged, strict=True):
@@ -111,26 +202,41 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], op
     return Votes(*votes)
 
 
-def _looking_at(references: References, points_world: Float[np.ndarray, "point 3"], probes: int = 96) -> Bool[np.ndarray, "reference"]:
-    """Tell which references have any of some evenly chosen points in their picture, or nearly so."""
+def _looking_at(
+    references: References, points_world: Float[np.ndarray, "point 3"], probes: int = 96
+) -> Bool[np.ndarray, "reference"]:
+    """Return which references have any of some evenly chosen points in their picture, or nearly so."""
     chosen = points_world[:: max(1, len(points_world) // probes)].astype(float)
-    pixel, depth = cameras.project(rigid.apply(references.camera_from_world, chosen[None]), references.intrinsics[:, None])
+    pixel, depth = cameras.project(
+        rigid.apply(references.camera_from_world, chosen[None]), references.intrinsics[:, None]
+    )
     height, width = references.depth.shape[1:]
-    inside = (depth > 0.1) & (np.abs(pixel[..., 0] / width - 0.5) < 0.6) & (np.abs(pixel[..., 1] / height - 0.5) < 0.6)
+    inside = (
+        (depth > 0.1)
+        & (np.abs(pixel[..., 0] / width - 0.5) < 0.6)
+        & (np.abs(pixel[..., 1] / height - 0.5) < 0.6)
+    )
     return inside.any(1)
 
 
-def _nearest(depth: Float[np.ndarray, "height width"], focal_px: float, options: FreeSpace) -> Float[np.ndarray, "height width"]:
-    """Smallest known depth in a window as wide as the tolerated drift at the median distance; 0 where the centre is unknown."""
+def _nearest(depth: Float[np.ndarray, "height width"], focal_px: float) -> Float[np.ndarray, "height width"]:
+    """Smallest depth in a window as wide as the tolerated drift at the median distance; 0 where any of it is
+    unknown.
+
+    Sensors lose thin and glossy things: what is seen beside a hole proves nothing about what stands there.
+    """
     known = depth > 0
     distance = float(np.median(depth[known])) if known.any() else 1.0
-    radius = int(np.clip(round(focal_px * options.drift_m / distance), 1, 4))
-    lowest = cv2.erode(np.where(known, depth, np.inf).astype(np.float32), np.ones((2 * radius + 1, 2 * radius + 1), np.uint8))
-    return np.where(known, lowest, 0).astype(np.float32)
+    radius = int(np.clip(round(focal_px * ACROSS_M / distance), 1, 4))
+    lowest = cv2.erode(
+        np.where(known, depth, np.inf).astype(np.float32), np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    )
+    whole = cv2.erode(known.astype(np.uint8), np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)) > 0
+    return np.where(whole, lowest, 0).astype(np.float32)
 
 
 @numba.njit(cache=True, fastmath=True)
-def _vote(points, voters, camera_from_world, pinhole, depth, nearest, color, margin_m, margin_share):
+def _vote(points, voters, camera_from_world, pinhole, depth, nearest, color, margin_m, margin_quadratic):
     count, (height, width) = len(points), depth.shape[1:]
     free, occupied, gap = np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros(count, np.float32)
     mean = np.zeros((count, 3), np.float32)
@@ -145,7 +251,7 @@ def _vote(points, voters, camera_from_world, pinhole, depth, nearest, color, mar
             v = int(np.floor((m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth_here * k[1] + k[3]))
             if u < 0 or v < 0 or u >= width or v >= height or depth[r, v, u] == 0:
                 continue
-            margin = margin_m + margin_share * depth_here
+            margin = margin_m + margin_quadratic * depth_here * depth_here
             difference = depth[r, v, u] - depth_here
             if nearest[r, v, u] - depth_here > margin:
                 free[i] += 1

@@ -1,18 +1,53 @@
-"""One sharp mask per frame: where the ball is, the judge's evidence and the animal's looks decide together."""
+"""One sharp mask per frame: where the ball is, the judge's evidence and the animal's appearance decide
+together.
+"""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.files.clips import Clip
+from pipeline.data.clips import Clip
 from stages.segment_agent import refine
 from stages.segment_agent.appearance import Appearance
 from stages.segment_agent.evidence import Evidence, Judge
-from stages.segment_agent.refine import Palette, Refinement
+from stages.segment_agent.refine import Edges, Palette
 from stages.segment_agent.windows import Sphere, Window, cut, working_picture, working_size
+
+COLOR_WEIGHT = 0.7
+"""log-odds per unit of the colours' log-ratio"""
+APPEARANCE_WEIGHT = 0.3
+"""weight of the learned appearance's log-odds"""
+APPEARANCE_ALONE, APPEARANCE_AGAINST = 3.0, 4.0
+"""largest log-odds by which it speaks for the animal where geometry knows nothing (elsewhere it does not: the
+edges of geometry are sharper), and against it anywhere"""
+DOUBT = 0.2
+"""log-odds by which a pixel is rather room, beside the learned appearance"""
+SURE = 1.0
+"""log-odds from which on a pixel is surely animal, beside the learned appearance"""
+SMALL_PX, BACKED = 250, 0.7
+"""pixels below which a mask must be well backed, since chance makes small ones, and the share of them that
+must look like the animal or have moved clearly"""
+LEAST_PRESUMED_PX = 25
+"""sure pixels that a frame needs in which the track was lost"""
+PRESENCE_BIAS, PRESENCE_APPEARANCE, PRESENCE_MOVED, PRESENCE_PRESUMED, PRESENCE_LIMIT = (
+    -1.0,
+    1.0,
+    3.0,
+    1.5,
+    4.0,
+)
+"""log-odds that a mask shows the animal: without evidence; per unit of its mean appearance, which is limited;
+where all of it clearly moved; and less where its place is only guessed"""
+LOG_ODDS_LIMIT = 5.0
+"""log-odds beyond which nothing is certain"""
+FOUND_CALIBRATION, MISSED_CALIBRATION = (0.5, 2.5), (-1.0, 0.7)
+"""offset and slope that make log-odds of presence probabilities, found on semi-real sequences: a mask that
+passes is hardly ever wrong, while an animal that is just coming into view is often missed"""
+UNKNOWN = 0.3
+"""certainty below which geometry knows nothing"""
 
 
 @dataclass(frozen=True)
@@ -22,6 +57,9 @@ class Mask:
     labels: UInt8[np.ndarray, "height width"]
     visible: bool
     confidence: float
+    """probability that `visible` is right"""
+    contradicted: float = 0.0
+    """share of the mask that looks like the room or lies on a surface that other frames saw there"""
 
 
 @dataclass(frozen=True)
@@ -32,8 +70,9 @@ class Painter:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     balls: list[Sphere | None]
     judge: Judge
-    options: Refinement
-    looks: Palette | Appearance
+    height_px: int
+    appearance: Palette | Appearance
+    edges: Edges = field(default_factory=Edges)
 
     def masks(self, frames: Iterable[int]) -> Iterator[Mask]:
         """Make one mask per frame, in order, at colour resolution."""
@@ -42,50 +81,78 @@ class Painter:
             labels = mask.labels
             if labels.shape != self.clip.color_size:
                 labels = cv2.resize(labels, self.clip.color_size[::-1], interpolation=cv2.INTER_NEAREST)
-            yield Mask(labels, mask.visible, mask.confidence)
+            yield replace(mask, labels=labels)
 
     def working_mask(self, frame: int) -> Mask:
         """Make one mask at working resolution."""
-        empty = np.zeros(working_size(self.clip, self.options.height_px), np.uint8)
+        empty = np.zeros(working_size(self.clip, self.height_px), np.uint8)
         ball = self.balls[frame]
         if ball is None:
             return Mask(empty, False, 1.0)
-        color = working_picture(self.clip, frame, self.options.height_px)
+        color = working_picture(self.clip, frame, self.height_px)
         window = cut(self.clip, frame, self.world_from_camera[frame], ball, color)
         if window is None:
             return Mask(empty, False, 1.0)
         evidence = self.judge(frame, window, ball)
-        match self.looks:
+        match self.appearance:
             case Palette() as palette:
-                log_odds = evidence.log_odds + self.options.color_weight * palette.ratio(window.color, evidence.room)
-                log_odds = refine.sharpen(log_odds, evidence.certainty, window.color, self.options)
+                like = palette.ratio(window.color, evidence.room)
+                log_odds = evidence.log_odds + COLOR_WEIGHT * like
+                log_odds = refine.sharpen(log_odds, evidence.certainty, window.color, self.edges)
                 sure = evidence.animal
-                labels = refine.label(log_odds, sure, self.options)
+                labels = refine.label(log_odds, sure, self.edges)
             case Appearance() as network:
-                labels, sure = self._by_looks(window, evidence, network.log_odds_within(color, window.rows, window.columns))
-        least = self.options.least_presumed_px if ball.presumed else 1
-        if sure[labels == 255].sum() < least:
+                like = network.log_odds_within(color, window.rows, window.columns)
+                labels, sure = self._by_appearance(window, evidence, like)
+        inside = labels == 255
+        if sure[inside].sum() < (LEAST_PRESUMED_PX if ball.presumed else 1):
             return Mask(empty, False, 0.5)
+        contradicted = float(((like < 0) | evidence.room)[inside].mean())
+        present = self._presence(evidence, like, inside, ball.presumed)
+        if present < 0:  # unknown rather than animal
+            labels = np.where(labels == 255, 128, labels)
         empty[window.rows, window.columns] = labels
-        return Mask(empty, True, float(sure[labels == 255].mean()))
+        offset, slope = FOUND_CALIBRATION if present >= 0 else MISSED_CALIBRATION
+        confidence = 1 / (1 + np.exp(-min(offset + slope * abs(present), LOG_ODDS_LIMIT)))
+        return Mask(empty, present >= 0, float(confidence), contradicted)
 
-    def _by_looks(
+    def _presence(
+        self,
+        evidence: Evidence,
+        like: Float[np.ndarray, "height width"],
+        inside: Bool[np.ndarray, "height width"],
+        presumed: bool,
+    ) -> float:
+        """Return the log-odds that a mask shows the animal at all: by what it looks like, by what moved, by
+        the track.
+        """
+        similarity = float(np.clip(like[inside], -PRESENCE_LIMIT, PRESENCE_LIMIT).mean())
+        moved = float(evidence.clear[inside].mean())
+        return (
+            PRESENCE_BIAS
+            + PRESENCE_APPEARANCE * similarity
+            + PRESENCE_MOVED * moved
+            - PRESENCE_PRESUMED * presumed
+        )
+
+    def _by_appearance(
         self, window: Window, evidence: Evidence, like: Float[np.ndarray, "height width"]
     ) -> tuple[UInt8[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-        """Return labels and what is sure, by evidence and learnt looks.
+        """Return labels and what is sure, by evidence and the learned appearance.
 
-        A small mask must be well backed, since chance makes small ones; and as a small view lies at steps of depth all over,
-        what moves clearly there is sure too if no mask is found without it.
+        A small mask must be well backed, since chance makes small ones; and as a small view lies at steps of
+        depth all over, what moves clearly there is sure too if no mask is found without it.
         """
-        options = self.options
-        known = refine.sharpen(evidence.log_odds, evidence.certainty, window.color, options)
-        most = np.where(evidence.certainty < 0.3, options.looks_alone, options.looks_for)
-        log_odds = known + np.clip(options.looks_weight * like, -options.looks_against, most) - options.doubt
-        strict = (log_odds > options.sure) & (evidence.animal | (like > 0))
-        for sure, enough_px in ((strict, options.small_px), (strict | ((log_odds > options.sure) & evidence.clear), np.inf)):
-            labels = refine.without_strays(refine.label(log_odds, sure, options), like)
+        known = refine.sharpen(evidence.log_odds, evidence.certainty, window.color, self.edges)
+        most = np.where(evidence.certainty < UNKNOWN, APPEARANCE_ALONE, 0.0)
+        log_odds = known + np.clip(APPEARANCE_WEIGHT * like, -APPEARANCE_AGAINST, most) - DOUBT
+        strict = (log_odds > SURE) & (evidence.animal | (like > 0))
+        for sure, enough_px in ((strict, SMALL_PX), (strict | ((log_odds > SURE) & evidence.clear), np.inf)):
+            labels = refine.without_strays(refine.label(log_odds, sure, self.edges), like)
             inside = labels == 255
-            if inside.sum() >= enough_px or (inside.any() and ((like > 0) | evidence.clear)[inside].mean() >= options.backed):
+            if inside.sum() >= enough_px or (
+                inside.any() and ((like > 0) | evidence.clear)[inside].mean() >= BACKED
+            ):
                 return labels, sure
         return np.zeros_like(labels), sure
 
@@ -93,15 +160,13 @@ class Painter:
 def learn_palette(painter: Painter, pictures: int = 30) -> Palette:
     """Learn the animal's colours from frames spread over the recording."""
     palette = Palette()
-    seen = [frame for frame, ball in enumerate(painter.balls) if ball is not None and not ball.presumed]
-    for frame in seen[:: max(1, len(seen) // pictures)]:
-        window = _window(painter, frame)
+    seen = [
+        (frame, ball) for frame, ball in enumerate(painter.balls) if ball is not None and not ball.presumed
+    ]
+    for frame, ball in seen[:: max(1, len(seen) // pictures)]:
+        color = working_picture(painter.clip, frame, painter.height_px)
+        window = cut(painter.clip, frame, painter.world_from_camera[frame], ball, color)
         if window is not None:
-            sure = painter.judge(frame, window, painter.balls[frame]).animal.astype(np.uint8)
+            sure = painter.judge(frame, window, ball).animal.astype(np.uint8)
             palette.learn(window.color[cv2.erode(sure, np.ones((3, 3), np.uint8)) > 0])
     return palette
-
-
-def _window(painter: Painter, frame: int) -> Window | None:
-    color = working_picture(painter.clip, frame, painter.options.height_px)
-    return cut(painter.clip, frame, painter.world_from_camera[frame], painter.balls[frame], color)

@@ -1,4 +1,4 @@
-"""A user's hint where the animal is: one box or one click in one frame, read from `<recording>.prompt.toml`."""
+"""A user's hint where the animal is: a box or a click in one frame, read from `<recording>.prompt.toml`."""
 
 import tomllib
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.files.clips import Clip
-from pipeline.space import cameras, rigid
-from stages.segment_agent.free_space import usable_depth
+from pipeline.core.errors import InputError
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid
+from stages.segment_agent.free_space import steady_depth
 from stages.segment_agent.movers import Hint
 
 FORESHORTENED = 1.5
@@ -26,7 +26,8 @@ class Prompt:
 
 
 def parse(path: Path, clip: Clip) -> Prompt:
-    """Read ``frame`` or ``time_s`` (since the first frame), and ``box = [x0, y0, x1, y1]`` or ``click = [x, y]``.
+    """Read ``frame`` or ``time_s`` (since the first frame), and ``box = [x0, y0, x1, y1]`` or ``click = [x,
+    y]``.
 
     Places are pixels of the stored picture, or shares of it where none is above 1. Raises InputError MSK-001.
     """
@@ -34,27 +35,40 @@ def parse(path: Path, clip: Clip) -> Prompt:
         table = tomllib.loads(path.read_text())
         unknown = table.keys() - {"frame", "time_s", "box", "click"}
         if unknown or ("frame" in table) == ("time_s" in table) or ("box" in table) == ("click" in table):
-            raise ValueError(f"either frame or time_s, either box or click, and nothing else: {', '.join(table)}")
+            raise ValueError(
+                f"either frame or time_s, either box or click, and nothing else: {', '.join(table)}"
+            )
         passed_s = clip.timestamp_s - clip.timestamp_s[0]
-        frame = int(table["frame"]) if "frame" in table else int(np.abs(passed_s - float(table["time_s"])).argmin())
+        frame = (
+            int(table["frame"])
+            if "frame" in table
+            else int(np.abs(passed_s - float(table["time_s"])).argmin())
+        )
         if "time_s" in table and not -0.5 <= float(table["time_s"]) <= passed_s[-1] + 0.5:
             raise ValueError(f"time_s = {table['time_s']} of a recording of {passed_s[-1]:.1f} s")
         box = np.array(table["box"] if "box" in table else table["click"] * 2, float)
         x0, y0, x1, y1 = (box * np.tile(clip.color_size[::-1], 2) if box.max() <= 1 else box).tolist()
-        if not (0 <= frame < len(clip) and 0 <= x0 <= x1 <= clip.color_size[1] and 0 <= y0 <= y1 <= clip.color_size[0]):
+        if not (
+            0 <= frame < len(clip)
+            and 0 <= x0 <= x1 <= clip.color_size[1]
+            and 0 <= y0 <= y1 <= clip.color_size[0]
+        ):
             raise ValueError(f"frame {frame}, box {box.tolist()} is not inside the recording")
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(
             "MSK-001",
             f"not a usable hint: {error}",
             str(path),
-            "give `frame = 12` or `time_s = 1.2`, and `box = [x0, y0, x1, y1]` or `click = [x, y]` in pixels or in shares of the picture",
+            "give `frame = 12` or `time_s = 1.2`, and `box = [x0, y0, x1, y1]` or `click = [x, y]` in pixels "
+            "or in shares of the picture",
         ) from error
     return Prompt(frame, (x0, y0, x1, y1))
 
 
 def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Hint:
-    """Take a prompt to the world; a box tells how far the animal reaches. Raises InputError MSK-002 without depth there."""
+    """Take a prompt to the world; a box gives how far the animal reaches. Raises InputError MSK-002 without
+    depth there.
+    """
     centre = position(prompt, clip, world_from_camera)
     x0, y0, x1, y1 = prompt.box_px
     distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
@@ -62,13 +76,20 @@ def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "fram
     return Hint(prompt.frame, centre, FORESHORTENED * half_m) if half_m > 0.02 else Hint(prompt.frame, centre)
 
 
-def position(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"]:
-    """Return the nearest surface in the middle third of the box, in the world. Raises InputError MSK-002 without depth there."""
+def position(
+    prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]
+) -> Float[np.ndarray, "3"]:
+    """Return the nearest surface in the middle third of the box, in the world. Raises InputError MSK-002
+    without depth there.
+    """
     x0, y0, x1, y1 = prompt.box_px
     scale = np.array([clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]])
-    centre, half = np.array([x0 + x1, y0 + y1]) / 2 * scale, np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2)
+    centre, half = (
+        np.array([x0 + x1, y0 + y1]) / 2 * scale,
+        np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2),
+    )
     low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)
-    depth = usable_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
+    depth = steady_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():
         raise InputError(
             "MSK-002",

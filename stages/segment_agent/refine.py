@@ -1,7 +1,8 @@
 """Turn coarse evidence into a sharp mask: depth evidence, colour, and edges of the picture.
 
-Everything is a log-odds picture of a window around the animal; a guided filter lets the colour picture's edges decide
-where depth is missing. `Palette` learns the animal's colours over the recording, the window's rest gives the room's.
+Everything is a log-odds picture of a window around the animal; a guided filter lets the colour picture's
+edges decide where depth is missing. `Palette` learns the animal's colours over the recording, the window's
+rest gives the room's.
 """
 
 from dataclasses import dataclass
@@ -12,39 +13,17 @@ from jaxtyping import Bool, Float, UInt8
 
 
 @dataclass(frozen=True)
-class Refinement:
-    """How evidence becomes a mask."""
+class Edges:
+    """How sharply evidence becomes a mask."""
 
-    color_weight: float = 0.7
-    """log-odds per unit of the colours' log-ratio"""
-    looks_weight: float = 0.3
-    """weight of the learnt looks' log-odds"""
-    looks_for: float = 0.0
-    """largest log-odds by which the learnt looks speak for the animal where geometry is sure: its edges are sharper"""
-    looks_alone: float = 3.0
-    """the same where geometry knows nothing"""
-    looks_against: float = 4.0
-    """largest log-odds by which they speak against it"""
-    doubt: float = 0.2
-    """log-odds by which a pixel is rather room, beside the learnt looks"""
-    sure: float = 1.0
-    """log-odds from which on a pixel is surely animal, beside the learnt looks"""
     radius_px: int = 1
     """reach of the edge-preserving filter at working resolution"""
-    edge: float = 0.1
-    """colour variance (0..1 squared) below which the filter smooths"""
     unsure: float = 0.5
     """log-odds below which a pixel at the boundary is unknown"""
-    small_px: int = 250
-    """pixels below which a mask must be well backed: chance makes small ones"""
-    backed: float = 0.7
-    """share of such a mask's pixels that must look like the animal or have moved clearly"""
-    least_presumed_px: int = 25
-    """sure pixels that a frame needs in which the track was lost"""
-    height_px: int = 320
-    """working height; larger pictures are worked on at this size"""
 
 
+EDGE = 0.1
+"""colour variance (0..1 squared) below which the filter smooths, as its root"""
 BINS = 12
 
 
@@ -61,31 +40,35 @@ class Palette:
     def ratio(
         self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
-        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks pixels that surely show the room."""
+        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks pixels that surely
+        show the room.
+        """
         if self._counts.sum() < 50 or room.sum() < 50:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)
         np.add.at(counts, _bin(color[room]), 1.0)
         animal, around = _density(self._counts), _density(counts)
         where = _bin(color.reshape(-1, 3))
-        return np.clip(np.log(animal[where] / around[where]), -2, 2).reshape(color.shape[:2]).astype(np.float32)
+        return (
+            np.clip(np.log(animal[where] / around[where]), -2, 2).reshape(color.shape[:2]).astype(np.float32)
+        )
 
 
 def sharpen(
     evidence: Float[np.ndarray, "height width"],
     certainty: Float[np.ndarray, "height width"],
     color: UInt8[np.ndarray, "height width 3"],
-    options: Refinement,
+    edges: Edges,
 ) -> Float[np.ndarray, "height width"]:
     """Spread log-odds along the picture: where certainty is low the neighbours of like colour decide."""
     guide = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32) / 255
     both = np.dstack([evidence * certainty, certainty]).astype(np.float32)
-    filtered = cv2.ximgproc.guidedFilter(guide, both, options.radius_px, options.edge**2)
+    filtered = cv2.ximgproc.guidedFilter(guide, both, edges.radius_px, EDGE**2)
     return filtered[..., 0] / np.maximum(filtered[..., 1], 0.05)
 
 
 def label(
-    log_odds: Float[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"], options: Refinement
+    log_odds: Float[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"], edges: Edges
 ) -> UInt8[np.ndarray, "height width"]:
     """Decide 255 / 0 / 128: parts that hold sure pixels stay, holes close, a weak boundary is unknown."""
     inside = (log_odds > 0).astype(np.uint8)
@@ -97,17 +80,21 @@ def label(
     cross = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     rim = cv2.dilate(inside, cross) != cv2.erode(inside, cross)
     mask = np.where(inside > 0, 255, 0).astype(np.uint8)
-    mask[rim & (np.abs(log_odds) < options.unsure)] = 128
+    mask[rim & (np.abs(log_odds) < edges.unsure)] = 128
     return mask
 
 
-def without_strays(labels: UInt8[np.ndarray, "height width"], like: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
-    """Take away parts, but for the largest, that look rather like the room: rims of furniture that drift makes seem to move."""
+def without_strays(
+    labels: UInt8[np.ndarray, "height width"], like: Float[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width"]:
+    """Take away parts, but for the largest, that look rather like the room: rims of furniture that drift
+    makes seem to move.
+    """
     count, parts, stats, _ = cv2.connectedComponentsWithStats((labels > 0).astype(np.uint8), connectivity=8)
     if count < 3:
         return labels
-    looks = np.bincount(parts.ravel(), like.ravel(), count) / stats[:, cv2.CC_STAT_AREA]
-    stray = looks < 0
+    mean_odds = np.bincount(parts.ravel(), like.ravel(), count) / stats[:, cv2.CC_STAT_AREA]
+    stray = mean_odds < 0
     stray[[0, 1 + stats[1:, cv2.CC_STAT_AREA].argmax()]] = False
     return np.where(stray[parts], 0, labels).astype(np.uint8)
 

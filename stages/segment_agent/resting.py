@@ -1,44 +1,46 @@
-"""Find an animal that rests all session long where a user points at it: nothing but the hint tells it from the room.
+"""Find an animal that rests all session long where a user points at it: nothing but the hint separates it
+from the room.
 
-In the hinted frame GrabCut cuts it out of what lies near the hint and above the ground; its points there fill cells, which
-tell it in other frames. Of sides that were turned away nothing is known; its looks, once learnt, find them.
+In the hinted frame GrabCut cuts it out of what lies near the hint and above the ground; its points there fill
+cells, which show it in other frames. Of sides that were turned away nothing is known; its appearance, once
+learned, finds them.
 """
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.files.clips import Clip
-from pipeline.space import cameras, rigid
+from pipeline.core.errors import InputError
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.evidence import Judge
 from stages.segment_agent.follow import grab
-from stages.segment_agent.free_space import FreeSpace, References
-from stages.segment_agent.movers import Hint, Mover
-from stages.segment_agent.turnaround import Turnaround, find_cluster, judge_standing, surroundings
+from stages.segment_agent.free_space import References
+from stages.segment_agent.movers import Hint
+from stages.segment_agent.turnaround import CLEARANCE_M, find_cluster, judge_standing, surroundings
 from stages.segment_agent.windows import Sphere, cut, working_picture
 
 POINTED_M, SURELY_M = 0.1, 0.05
 """around its place lies what a hint points at; nearer, and above the ground, it surely is the animal"""
 GRABBED_PX = 240
-"""smallest side of a picture to cut out of: in smaller ones GrabCut's cost of an outline outweighs what it encloses"""
+"""smallest side of a picture to cut out of: in smaller ones GrabCut's cost of an outline outweighs what it
+encloses"""
 LEAST_PX = 30
 """pixels of the animal, and of what is not, without which it cannot be cut out"""
 
 
 def rests(
-    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], references: References, free: FreeSpace, mover: Mover, hint: Hint
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], references: References, hint: Hint
 ) -> bool:
-    """Tell whether what a hint points at stays there: few other frames see through it."""
-    depth = free_space.usable_depth(clip, hint.frame)
+    """Return whether what a hint points at stays there: few other frames see through it."""
+    depth = free_space.steady_depth(clip, hint.frame)
     points = cameras.back_project(depth, clip.depth_intrinsics[hint.frame])[depth > 0]
     points = rigid.apply(world_from_camera[hint.frame], points)
     points = points[np.linalg.norm(points - hint.centre_world, axis=1) < POINTED_M]
-    through = movers.moving(free_space.vote(references, points, free, hint.frame), mover)
+    through = movers.moving(free_space.vote(references, points, hint.frame))
     return bool(through.sum() < 0.5 * len(points))
 
 
@@ -46,7 +48,6 @@ def find_resting(
     clip: Clip,
     world_from_camera: Float[np.ndarray, "frame 4 4"],
     hint: Hint,
-    options: Turnaround,
     height_px: int,
     rng: np.random.Generator,
 ) -> tuple[list[Sphere | None], Judge]:
@@ -54,27 +55,33 @@ def find_resting(
 
     Raises InputError MSK-003 when nothing stands out from the ground there.
     """
-    _, ground = surroundings(clip, world_from_camera, options, hint.centre_world)
-    shown = None if ground is None else _cut_out(clip, world_from_camera[hint.frame], hint, ground, height_px, options, rng)
-    if shown is None:
+    _, ground = surroundings(clip, world_from_camera, hint.centre_world)
+    shown = (
+        None
+        if ground is None
+        else _cut_out(clip, world_from_camera[hint.frame], hint, ground, height_px, rng)
+    )
+    if ground is None or shown is None:
         raise InputError(
             "MSK-003",
             "nothing stands out from level ground where the hint points",
             f"{clip.folder}, frame {hint.frame}",
-            "point at the middle of the animal, or put a box around it, in a frame that shows the ground beside it",
+            "point at the middle of the animal, or draw a box, in a frame that shows the ground beside it",
         )
-    cluster = find_cluster(shown, hint.centre_world, replace(options, least_hits=1))
-    return [cluster.ball] * len(clip), judge_standing(cluster, ground, options, whole=False)
+    cluster = find_cluster(shown, hint.centre_world, least_hits=1)
+    return [cluster.ball] * len(clip), judge_standing(cluster, ground, whole=False)
 
 
-def _cut_out(clip, world_from_camera, hint, ground, height_px, options, rng):
-    """Return the points of the animal that the hinted frame shows, in the world; None where there are hardly any."""
+def _cut_out(clip, world_from_camera, hint, ground, height_px, rng):
+    """Return the points of the animal that the hinted frame shows, in the world; None where there are hardly
+    any.
+    """
     color = working_picture(clip, hint.frame, height_px)
     window = cut(clip, hint.frame, world_from_camera, Sphere(hint.centre_world, 2 * hint.reach_m), color)
     if window is None:
         return None
     away_m = np.linalg.norm(window.points_world - hint.centre_world, axis=-1)
-    raised = ground.above(window.points_world) > options.clearance_m
+    raised = ground.above(window.points_world) > CLEARANCE_M
     possible, surely = raised & (away_m < hint.reach_m), raised & (away_m < SURELY_M)
     if not surely.any() or min(possible.sum(), (~possible).sum()) < LEAST_PX:
         return None

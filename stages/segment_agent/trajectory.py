@@ -1,4 +1,4 @@
-"""Where the phone was: its odometry without drift, or motion from depth and flow where a recording has none."""
+"""Where the phone was: odometry without drift, or motion from depth and flow where there is none."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,16 +6,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import arrays
-from pipeline.files.clips import Clip
-from pipeline.space import cameras
-from pipeline.space.align import ransac_rigid
-from pipeline.space.depth_alignment import DepthView, depth_view
-from pipeline.space.straightening import Straightening, chain, level, straighten
-from stages.segment_agent.free_space import usable_depth
+from pipeline.data.clips import Clip
+from pipeline.data.flow import STRIDE_PX, open_flow
+from pipeline.geometry import cameras
+from pipeline.geometry.align import ransac_rigid
+from pipeline.mapping.icp import DepthImage, depth_image
+from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
+from stages.segment_agent.free_space import steady_depth
 
 DEPTH_STRIDE = 3
-FLOW_STRIDE = 4
 
 
 @dataclass(frozen=True)
@@ -27,40 +26,46 @@ class Trajectory:
     residual_m: float
 
 
-def steady(clip: Clip, flow: Path, options: Straightening, rng: np.random.Generator) -> Trajectory:
+def steady(clip: Clip, flow: Path, rng: np.random.Generator) -> Trajectory:
     """Return poses without drift; a recording without odometry is chained from picture to picture first."""
 
-    def view(frame: int) -> DepthView:
-        depth = usable_depth(clip, frame)
-        return depth_view(depth, clip.depth_intrinsics[frame], depth > 0, DEPTH_STRIDE)
+    def view(frame: int) -> DepthImage:
+        depth = steady_depth(clip, frame)
+        return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, DEPTH_STRIDE)
 
     poses = clip.odometry_from_camera
     if poses is None:
-        forward = arrays.open_lazily(flow / "flow_1_fw.npz", "flow")
-        poses = chain(view, lambda frame, _: motion_from_flow(clip, frame, forward[frame], rng), len(clip), options)
-    found = straighten(view, clip.timestamp_s, poses, options)
+        forward = open_flow(flow, 1)
+        poses = chain_alignments(
+            view, lambda frame, _: motion_from_flow(clip, frame, forward[frame], rng), len(clip)
+        )
+    found = correct_drift(view, clip.timestamp_s, poses)
     level_known = clip.odometry_from_camera is not None and clip.gravity_known
-    poses = found.world_from_camera if level_known else level(view, found.world_from_camera)
+    poses = found.world_from_camera if level_known else align_gravity(view, found.world_from_camera)
     return Trajectory(poses, found.edges, found.residual_m)
 
 
 def motion_from_flow(
     clip: Clip, frame: int, flow: Float[np.ndarray, "height width 2"], rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"]:
-    """Return ``first_from_second`` of a frame and the next from where the pixels went and how deep they were."""
+    """Return ``first_from_second`` of a frame and the next from flow and depth."""
     height, width = flow.shape[:2]
-    pixel = cameras.pixel_grid(height, width) * FLOW_STRIDE
+    pixel = cameras.pixel_grid(height, width) * STRIDE_PX
     first = _lift(clip, frame, pixel.reshape(-1, 2))
     second = _lift(clip, frame + 1, (pixel + flow).reshape(-1, 2))
     known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
-    first_from_second, _ = ransac_rigid(second[known], first[known], threshold_m=0.03, iterations=200, rng=rng)
+    first_from_second, _ = ransac_rigid(
+        second[known], first[known], threshold_m=0.03, iterations=200, rng=rng
+    )
     return first_from_second
 
 
 def _lift(clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
     """Back-project colour pixels by the depth there; NaN where it is unknown or the pixel is out of view."""
-    depth = usable_depth(clip, frame)
-    at = np.floor(pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]).astype(int)
+    depth = steady_depth(clip, frame)
+    at = np.floor(
+        pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]
+    ).astype(int)
     inside = ((at >= 0) & (at < [clip.depth_size[1], clip.depth_size[0]])).all(1)
     at = np.where(inside[:, None], at, 0)
     z = np.where(inside, depth[at[:, 1], at[:, 0]], 0)

@@ -1,7 +1,8 @@
-"""Find an animal that keeps still while the phone circles it: what stands on the floor where all cameras look.
+"""Find an animal that keeps still while the phone circles it: what stands on the floor where all cameras
+look.
 
-The optical axes meet near the animal; the level surface beneath that point is its ground; the connected cluster of
-points above that ground nearest to the axes' meeting point is the animal.
+The optical axes meet near the animal; the level surface beneath that point is its ground; the connected
+cluster of points above that ground nearest to the axes' meeting point is the animal.
 """
 
 from collections.abc import Iterable
@@ -11,43 +12,40 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float
 
-from pipeline.errors import InputError
-from pipeline.files.clips import Clip
-from pipeline.space import rigid
-from pipeline.space.depth_alignment import depth_view
-from pipeline.space.ground import Ground, fit_ground
-from pipeline.space.thin_depth import supported
+from pipeline.core.errors import InputError
+from pipeline.data.clips import Clip
+from pipeline.geometry import rigid
+from pipeline.geometry.flying_pixels import supported
+from pipeline.geometry.ground import GroundPlane, fit_ground
+from pipeline.mapping.icp import depth_image
 from stages.segment_agent.evidence import Evidence, Judge
+from stages.segment_agent.refine import Edges
 from stages.segment_agent.windows import Sphere, Window
 
 LEAST_SPREAD = 1e-3
-"""mean squared sine of the angles between optical axes and the line that they all run along; below, they meet nowhere"""
+"""mean squared sine of the angles between optical axes and the line that they all run along; below, they meet
+nowhere"""
 
 
-@dataclass(frozen=True)
-class Turnaround:
-    """How the standing animal is told from its ground and from furniture."""
-
-    pictures: int = 40
-    """frames that the cluster is made of"""
-    reach_m: float = 0.9
-    """farthest part of an animal from the point where the optical axes meet"""
-    voxel_m: float = 0.025
-    """size of the cluster's cells"""
-    clearance_m: float = 0.03
-    """height above the ground from which points surely do not belong to it"""
-    foot_m: float = 0.008
-    """height above the ground from which a point under the body is rather a paw than ground"""
-    least_hits: int = 3
-    """pictures that must have seen a point in a cell"""
-    radius_px: int = 2
-    """reach of the edge-preserving filter: cells are coarser than what motion tells"""
-    unsure: float = 0.4
-    """log-odds below which a pixel at the boundary is unknown"""
-    least_level: int = 200
-    """points of level surface lower than the focus without which there is no ground"""
-    nearest_m: float = 0.25
-    """the optical axes meet at least so far before most cameras"""
+PICTURES = 40
+"""frames that the cluster is made of"""
+REACH_M = 0.9
+"""farthest part of an animal from the point where the optical axes meet"""
+VOXEL_M = 0.025
+"""size of the cluster's cells"""
+CLEARANCE_M = 0.03
+"""height above the ground from which points surely do not belong to it"""
+FOOT_M, FOOT_SPREAD_M = 0.008, 0.004
+"""height above the ground from which a point under the body is rather a paw than ground, and what is worth
+one more"""
+LEAST_HITS = 3
+"""pictures that must have seen a point in a cell"""
+EDGES = Edges(radius_px=2, unsure=0.4)
+"""cells are coarser than evidence of motion"""
+LEAST_LEVEL = 200
+"""points of level surface lower than the focus without which there is no ground"""
+NEAREST_M = 0.25
+"""the optical axes meet at least so far before most cameras"""
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class Cluster:
     voxel_m: float
 
     def holds(self, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
-        """Tell which points lie in the cells; NaN does not."""
+        """Return which points lie in the cells; NaN does not."""
         at = np.floor(np.nan_to_num((points_world - self.origin) / self.voxel_m, nan=-1.0)).astype(int)
         inside = ((at >= 0) & (at < self.cells.shape)).all(-1)
         at = np.clip(at, 0, np.array(self.cells.shape) - 1)
@@ -74,41 +72,46 @@ class Cluster:
 
 
 def find_standing(
-    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"] | None
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], focus: Float[np.ndarray, "3"] | None
 ) -> tuple[list[Sphere | None], Judge]:
     """Locate what stands at the focus; return a ball per frame and the judge of its points. World: +y up.
 
-    Raises InputError MSK-003 when nothing stands there, when there is no ground that it stands on, or no focus.
+    Raises InputError MSK-003 when nothing stands there, when there is no ground that it stands on, or no
+    focus.
     """
 
     def refused(what: str) -> InputError:
-        remedy = "circle the resting animal with the phone pointed at it and the ground in view, or give a hint"
+        remedy = (
+            "circle the resting animal with the phone pointed at it and the ground in view, or give a hint"
+        )
         return InputError("MSK-003", what, str(clip.folder), remedy)
 
     if focus is None:
         raise refused("the cameras do not look at one place from around it")
-    points, ground = surroundings(clip, world_from_camera, options, focus)
+    points, ground = surroundings(clip, world_from_camera, focus)
     if ground is None:
         raise refused("no level ground is seen where the cameras look")
-    cluster = find_cluster(points[ground.above(points) > options.clearance_m], focus, options)
+    cluster = find_cluster(points[ground.above(points) > CLEARANCE_M], focus)
     if not cluster.cells.any():
         raise refused("nothing stands where the cameras look")
-    return [cluster.ball] * len(clip), judge_standing(cluster, ground, options)
+    return [cluster.ball] * len(clip), judge_standing(cluster, ground)
 
 
 def surroundings(
-    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround, focus: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "point 3"], Ground | None]:
-    """Return the points near a focus that frames spread over the recording see, and the ground beneath it, if one is seen."""
-    chosen = np.unique(np.linspace(0, len(clip) - 1, options.pictures).astype(int))
-    points, level = _points_near(clip, world_from_camera, focus, options, chosen)
-    seen = (points[level, 1] < focus[1] + 0.05).sum() >= options.least_level
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], focus: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "point 3"], GroundPlane | None]:
+    """Return the points near a focus that frames spread over the recording see, and the ground beneath it, if
+    one is seen.
+    """
+    chosen = np.unique(np.linspace(0, len(clip) - 1, PICTURES).astype(int))
+    points, level = _points_near(clip, world_from_camera, focus, chosen)
+    seen = (points[level, 1] < focus[1] + 0.05).sum() >= LEAST_LEVEL
     return points, fit_ground(points[level], focus) if seen else None
 
 
-def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"], options: Turnaround) -> Float[np.ndarray, "3"] | None:
-    """Return the point nearest to all optical axes (robust least squares), metres; None where they meet at no place that most
-    cameras look at: they run alongside, or the phone turns on the spot.
+def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"] | None:
+    """Return the point nearest to all optical axes (robust least squares), metres; None where they meet at no
+    place that most cameras look at: they run alongside, or the phone turns on the spot.
     """
     centre, forward = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
@@ -121,44 +124,50 @@ def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"], options: Tu
         distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - centre), axis=1)
         weight = 1 / (1 + (distance / 0.15) ** 2)
     before_m = np.einsum("fi,fi->f", point - centre, forward)
-    return point if np.median(before_m) > options.nearest_m else None
+    return point if np.median(before_m) > NEAREST_M else None
 
 
-def find_cluster(points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], options: Turnaround) -> Cluster:
-    """Gather points into cells and keep the connected group that is large and near the focus, grown by two cells."""
-    reach = options.reach_m + 2 * options.voxel_m
-    origin, count = focus - reach, int(np.ceil(2 * reach / options.voxel_m))
-    at = np.floor((points_world - origin) / options.voxel_m).astype(int)
+def find_cluster(
+    points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], least_hits: int = LEAST_HITS
+) -> Cluster:
+    """Gather points into cells and keep the connected group that is large and near the focus, grown by two
+    cells.
+    """
+    reach = REACH_M + 2 * VOXEL_M
+    origin, count = focus - reach, int(np.ceil(2 * reach / VOXEL_M))
+    at = np.floor((points_world - origin) / VOXEL_M).astype(int)
     at = at[((at >= 0) & (at < count)).all(1)]
     hits = np.bincount(np.ravel_multi_index(at.T, (count,) * 3), minlength=count**3).reshape((count,) * 3)
-    filled = hits >= options.least_hits
+    filled = hits >= least_hits
     around = np.ones((3, 3, 3), bool)
-    group, groups = scipy.ndimage.label(scipy.ndimage.binary_closing(filled, around) | filled, around)
-    centre = origin + (np.argwhere(filled) + 0.5) * options.voxel_m
+    closed = np.array(scipy.ndimage.binary_closing(filled, around)) | filled
+    group = np.zeros(filled.shape, np.int32)
+    groups = scipy.ndimage.label(closed, around, output=group)
+    centre = origin + (np.argwhere(filled) + 0.5) * VOXEL_M
     nearness = np.exp(-((np.linalg.norm(centre - focus, axis=1) / 0.25) ** 2))
     score = np.bincount(group[filled], nearness, minlength=groups + 1)
     own = (group == score.argmax()) & filled
-    return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, options.voxel_m)
+    return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, VOXEL_M)
 
 
 def _points_near(
-    clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, options: Turnaround, frames: Iterable[int]
+    clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, frames: Iterable[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read points within reach of the focus, tails and ears too, and whether they face upward."""
     points, level = [], []
     for frame in frames:
         depth = clip.depth(frame)
         depth = np.where(supported(depth), depth, 0)
-        view = depth_view(depth, clip.depth_intrinsics[frame], depth > 0, 2)
+        view = depth_image(depth, clip.depth_intrinsics[frame], depth > 0, 2)
         world = rigid.apply(world_from_camera[frame], view.points.reshape(-1, 3).astype(float))
         up = (view.normals.reshape(-1, 3) @ world_from_camera[frame, :3, :3].T)[:, 1]
-        near = (view.points.reshape(-1, 3)[:, 2] > 0) & (np.abs(world - focus).max(1) < options.reach_m)
+        near = (view.points.reshape(-1, 3)[:, 2] > 0) & (np.abs(world - focus).max(1) < REACH_M)
         points.append(world[near])
         level.append(up[near] > 0.9)
     return np.concatenate(points), np.concatenate(level)
 
 
-def judge_standing(cluster: Cluster, ground: Ground, options: Turnaround, whole: bool = True) -> Judge:
+def judge_standing(cluster: Cluster, ground: GroundPlane, whole: bool = True) -> Judge:
     """Evidence of a cluster: its cells well above the ground are animal, the rest is room.
 
     If they are not the ``whole`` animal, nothing is known of what stands beside them.
@@ -168,14 +177,14 @@ def judge_standing(cluster: Cluster, ground: Ground, options: Turnaround, whole:
         known = np.isfinite(window.points_world[..., 0])
         held, height = cluster.holds(window.points_world), ground.above(window.points_world)
         beneath = window.points_world.copy()  # feet: cells begin at the clearance, look one up
-        beneath[..., 1] += options.clearance_m
+        beneath[..., 1] += CLEARANCE_M
         held |= cluster.holds(beneath)
-        log_odds = np.where(held, np.clip((height - options.foot_m) / 0.004, -3, 3), -3.0)
+        log_odds = np.where(held, np.clip((height - FOOT_M) / FOOT_SPREAD_M, -3, 3), -3.0)
         log_odds[~known] = 0.0
         certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), 0.05)
         if not whole:
             near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
-            beside = near & ~held & (height > options.clearance_m)
+            beside = near & ~held & (height > CLEARANCE_M)
             log_odds[beside], certainty[beside] = 0.0, 0.05
         sure = window.trusted & (log_odds > 2)
         return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)

@@ -1,4 +1,6 @@
-"""Cut the part of a frame that may show the animal, at working resolution, with its points in the recording's world."""
+"""Cut the part of a frame that may show the animal, at working resolution, with its points in the recording's
+world.
+"""
 
 from dataclasses import dataclass
 
@@ -6,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.files.clips import Clip
-from pipeline.space import cameras, rigid
-from pipeline.space.thin_depth import supported
-from stages.segment_agent.free_space import usable_depth
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid
+from pipeline.geometry.flying_pixels import supported
+from stages.segment_agent.free_space import steady_depth
 
 STEP_M = 0.05
 """difference of neighbouring depths that is a step and not a slope"""
@@ -52,9 +54,16 @@ def working_picture(clip: Clip, frame: int, height_px: int) -> UInt8[np.ndarray,
 
 
 def rectangle(
-    clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, size: tuple[int, int], rim_px: int = 8
+    clip: Clip,
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    ball: Sphere,
+    size: tuple[int, int],
+    rim_px: int = 8,
 ) -> tuple[slice, slice]:
-    """Return the rows and columns of a working picture of (height, width) that show a ball; empty where it is out of view."""
+    """Return the rows and columns of a working picture of (height, width) that show a ball; empty where it is
+    out of view.
+    """
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     centre = rigid.apply(rigid.inverse(world_from_camera), ball.centre_world[None])[0]
     pixel, depth = cameras.project(centre, intrinsics)
@@ -67,7 +76,11 @@ def rectangle(
 
 
 def cut(
-    clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], ball: Sphere, color: UInt8[np.ndarray, "height width 3"]
+    clip: Clip,
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    ball: Sphere,
+    color: UInt8[np.ndarray, "height width 3"],
 ) -> Window | None:
     """Read the rectangle around a ball out of a working picture; None when it is out of view."""
     size = color.shape[:2]
@@ -78,24 +91,33 @@ def cut(
     grid = cameras.pixel_grid(*size)[rows, columns]
     at = np.floor(grid * [clip.depth_size[1] / size[1], clip.depth_size[0] / size[0]]).astype(int)
     z = unblurred(clip.depth(frame))[at[..., 1], at[..., 0]]
-    trusted = usable_depth(clip, frame)[at[..., 1], at[..., 0]] > 0
-    points = rigid.apply(world_from_camera, (cameras.unproject(grid, intrinsics) * z[..., None]).reshape(-1, 3)).reshape(*z.shape, 3)
+    trusted = steady_depth(clip, frame)[at[..., 1], at[..., 0]] > 0
+    points = rigid.apply(
+        world_from_camera, (cameras.unproject(grid, intrinsics) * z[..., None]).reshape(-1, 3)
+    ).reshape(*z.shape, 3)
     points[z == 0] = np.nan
     return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points, trusted)
 
 
 def supported_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth without blur at steps, thin things kept that the sensor doubts but neighbours agree on (0 = unknown)."""
+    """Read depth without blur at steps, thin things kept that the sensor doubts but neighbours agree on (0 =
+    unknown).
+    """
     depth = unblurred(clip.depth(frame))
     return np.where(supported(depth), depth, 0)
 
 
 def unblurred(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Give a depth between two surfaces to the nearer one of both: sensors blur steps, and what floats there is no animal.
+    """Give a depth between two surfaces to the nearer one of both: sensors blur steps, and what floats there
+    is no animal.
 
-    Toggle mapping (Kramer and Bruckner 1975) where the neighbours differ by more than a step; it leaves the step where it is.
+    Toggle mapping (Kramer and Bruckner 1975) where the neighbours differ by more than a step; it leaves the
+    step where it is.
     """
     around = np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around), cv2.dilate(depth, around)
+    low, high = (
+        cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around),
+        cv2.dilate(depth, around),
+    )
     snapped = np.where(depth - low < high - depth, low, high)
     return np.where((depth > 0) & (high - low > STEP_M), snapped, depth)

@@ -1,17 +1,21 @@
-"""Sub-goals for minutes from the behaviour model: one goal after the other, each asked for where the last plan ended."""
+"""Sub-goals for minutes from the behaviour model: one goal after the other, each asked for where the last
+plan ended.
+"""
 
 import numpy as np
 
-from pipeline.models.simulator import Simulator
-from pipeline.models.subgoals import Subgoal
-from pipeline.models.trajectories import RATE_HZ
+from pipeline.behavior.simulator import Simulator
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.longterm.subgoals import Subgoal
 from stages.simulate.observers import Observer
 
 
 def chained_goals(simulator: Simulator, observer: Observer, count: int, seed: int) -> list[Subgoal]:
-    """Return the start and ``count`` goals, a plan's length apart; the simulator must play each plan to its end."""
+    """Return the start and ``count`` goals, a plan's length apart; the simulator must play each plan to its
+    end.
+    """
     chaining = simulator.flock.chaining
-    assert np.isinf(chaining.noticeable) and not chaining.fade_frames, chaining
+    assert np.isinf(chaining.observer_motion_ratio) and not chaining.blend_frames, chaining
     state = simulator.reset(seed)
     frames = simulator.flock.plan_frames
     found = [Subgoal(state.world_from_agent[:3, 3], _heading(state.world_from_agent), 0.0)]

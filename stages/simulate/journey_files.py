@@ -9,16 +9,16 @@ import torch
 from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline import progress
-from pipeline.files import arrays, glb, images
-from pipeline.models import refit
-from pipeline.models.bodies import Body, PosedSurface
-from pipeline.models.contacts import tensors
-from pipeline.models.journeys import Journey
-from pipeline.models.plausibility import Plausibility
-from pipeline.models.short_motions import RATE_HZ, Moving
-from pipeline.space import overview, rigid
-from pipeline.space.meshes import Mesh, RayCaster, render_view
+from pipeline.core import progress
+from pipeline.data import glb, images, npz
+from pipeline.fields import weight_refit
+from pipeline.geometry import rigid, views
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
+from pipeline.longterm.bodies import PosedSurface, SkinnedBody
+from pipeline.longterm.contacts import motion_tensors
+from pipeline.longterm.journeys import Journey
+from pipeline.longterm.plausibility import Plausibility
+from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
 FOCAL = 0.9
 """Focal length of the frames in units of their width."""
@@ -26,9 +26,9 @@ FITTED_POSES = 60
 """Poses of a take that the four weights of its surface are fitted to."""
 
 
-def write_journey(folder: Path, journey: Journey, body: Body) -> None:
+def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
     """Write `take.npz` (30 fps), `take.glb` and `take.json`."""
-    arrays.save(
+    npz.save(
         folder / "take.npz",
         timestamp_s=journey.timestamp_s,
         world_from_agent=journey.moving.world_from_agent,
@@ -37,7 +37,9 @@ def write_journey(folder: Path, journey: Journey, body: Body) -> None:
         arrival_s=journey.arrival_s.astype(np.float64),
     )
     skin = skin_of(body, journey.moving.agent_from_bone)
-    action = glb.Action("take", journey.timestamp_s, journey.moving.world_from_agent, journey.moving.agent_from_bone)
+    action = glb.Action(
+        "take", journey.timestamp_s, journey.moving.world_from_agent, journey.moving.agent_from_bone
+    )
     (folder / "take.glb").write_bytes(glb.skinned(body.mesh, skin, [action]))
     about = {
         "units": "metres, radians, seconds",
@@ -48,16 +50,25 @@ def write_journey(folder: Path, journey: Journey, body: Body) -> None:
         "arrival_s": journey.arrival_s.tolist(),
         "largest_seam_m": journey.largest_seam_m,
     }
-    write_worth(folder, journey.before, journey.after, **about)
+    write_metrics(folder, journey.before, journey.after, **about)
 
 
-def write_worth(folder: Path, before: Plausibility, after: Plausibility, **about: object) -> None:
+def write_metrics(folder: Path, before: Plausibility, after: Plausibility, **about: object) -> None:
     """Write `take.json`: what a take is, and how physical it was before and after it was optimised."""
-    worth = {"before": _finite(before), "after": _finite(after)}
-    (folder / "take.json").write_text(json.dumps({**about, **worth}, indent=1, allow_nan=False) + "\n")
+    metrics = {"before": _finite(before), "after": _finite(after)}
+    (folder / "take.json").write_text(json.dumps({**about, **metrics}, indent=1, allow_nan=False) + "\n")
 
 
-def write_frames(folder: Path, moving: Moving, body: Body, scene: Mesh, *, rate_hz: float, width: int = 480, height: int = 360) -> None:
+def write_frames(
+    folder: Path,
+    moving: BodyMotion,
+    body: SkinnedBody,
+    scene: Mesh,
+    *,
+    rate_hz: float,
+    width: int = 480,
+    height: int = 360,
+) -> None:
     """Write `frames/%06d.jpg`: the scene and the animal, seen by a camera that follows it from above."""
     (folder / "frames").mkdir()
     caster, surface = RayCaster(scene), PosedSurface(body)
@@ -65,16 +76,22 @@ def write_frames(folder: Path, moving: Moving, body: Body, scene: Mesh, *, rate_
     seen = following(moving.world_from_agent[:, :3, 3], np.median(scene.vertices, axis=0))
     chosen = np.arange(0, len(moving), max(1, round(RATE_HZ / rate_hz)))
     for number, frame in enumerate(progress.track(chosen, "frames", total=len(chosen))):
-        posed = surface(*tensors(moving[frame : frame + 1]))[0].numpy()
-        picture = drawn(caster, Mesh(posed, body.mesh.faces, body.mesh.color), seen[frame], intrinsics, height, width)
+        posed = surface(*motion_tensors(moving[frame : frame + 1]))[0].numpy()
+        picture = drawn(
+            caster, Mesh(posed, body.mesh.faces, body.mesh.color), seen[frame], intrinsics, height, width
+        )
         images.write_color(folder / "frames" / f"{number:06d}.jpg", picture)
 
 
-def following(roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "frame 4 4"]:
+def following(
+    roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "frame 4 4"]:
     """Return a camera that looks down at the animal from the side of the room's centre, moving smoothly."""
     target = gaussian_filter1d(roots_world, 12.0, axis=0, mode="nearest")
     away = (centre - target) * [1.0, 0.0, 1.0]
-    away = gaussian_filter1d(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 0.3), 20.0, axis=0, mode="nearest")
+    away = gaussian_filter1d(
+        away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 0.3), 20.0, axis=0, mode="nearest"
+    )
     eyes = target + 1.3 * away + [0.0, 1.4, 0.05]
     up = np.array([0.0, 1.0, 0.0])
     return np.stack([rigid.look_at(eye, at, up) for eye, at in zip(eyes, target, strict=True)])
@@ -88,24 +105,33 @@ def drawn(
     height: int,
     width: int,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the animal in its scene, each pixel by what is nearer; the animal is shaded by how it faces the camera."""
+    """Draw the animal in its scene, each pixel by what is nearer; the animal is shaded by how it faces the
+    camera.
+    """
     back, hits = render_view(scene, world_from_camera, intrinsics, height, width)
     front, touched = render_view(RayCaster(animal), world_from_camera, intrinsics, height, width)
     nearer = (front > 0) & ((back == 0) | (front < back))
     facing = np.abs(touched.interpolate(animal, animal.vertex_normals()) @ world_from_camera[:3, 2])
-    fur = overview.shade(animal, touched) * (0.45 + 0.55 * facing[:, None])
-    picture = overview.shade(scene.mesh, hits).reshape(height, width, 3)
+    fur = views.shade(animal, touched) * (0.45 + 0.55 * facing[:, None])
+    picture = views.shade(scene.mesh, hits).reshape(height, width, 3)
     return np.where(nearer[..., None], fur.reshape(height, width, 3).astype(np.uint8), picture)
 
 
-def skin_of(body: Body, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> glb.Skin:
+def skin_of(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> glb.Skin:
     """Fit four weights a vertex to the surface in the poses that differ most."""
-    rest, some = body.agent_from_bone_rest, agent_from_bone[refit.different_poses(agent_from_bone, FITTED_POSES)]
+    rest, some = (
+        body.agent_from_bone_rest,
+        agent_from_bone[weight_refit.different_poses(agent_from_bone, FITTED_POSES)],
+    )
     still = torch.eye(4).expand(len(some), 4, 4)
     posed = PosedSurface(body)(still, torch.from_numpy(some).float()).double().numpy()
-    four, _ = refit.refit_weights(np.asarray(body.mesh.vertices, np.float64), body.weights, refit.Poses(some @ rigid.inverse(rest), posed))
+    four, _ = weight_refit.refit_weights(
+        np.asarray(body.mesh.vertices, np.float64),
+        body.weights,
+        weight_refit.Poses(some @ rigid.inverse(rest), posed),
+    )
     return glb.Skin(four.joints, four.weights, rest, tuple(f"bone_{bone:02d}" for bone in range(len(rest))))
 
 
-def _finite(worth: Plausibility) -> dict[str, float | None]:
-    return {name: value if np.isfinite(value) else None for name, value in asdict(worth).items()}
+def _finite(metrics: Plausibility) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in asdict(metrics).items()}

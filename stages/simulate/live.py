@@ -1,7 +1,8 @@
-"""The animal live in a browser, computed here: for networks and machines that a page cannot hold (viser, an extra).
+"""The animal live in a browser, computed here: for networks and machines that a page cannot hold (viser, an
+extra).
 
-The server listens on this machine alone. One visitor drags the person about; `run` goes on until it is told to stop,
-or is interrupted, and returns all that happened as a take.
+The server listens on this machine alone. One visitor drags the person about; `run` goes on until it is
+stopped, or is interrupted, and returns all that happened as a take.
 """
 
 import time
@@ -13,19 +14,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.files.glb import Skin
-from pipeline.models.simulator import Simulator, State
-from pipeline.models.trajectories import RATE_HZ
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
+from pipeline.behavior.simulator import Simulator, SimulatorState
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core.errors import InputError
+from pipeline.data.glb import Skin
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
 from stages.simulate.rollout import Take, take_of
 
 _HOST = "127.0.0.1"
 
 
 @dataclass(frozen=True)
-class Look:
+class LiveAppearance:
     """What is shown: the animal's surface and skin (agent frame), the room as binary glTF (world frame)."""
 
     mesh: Mesh
@@ -33,22 +34,37 @@ class Look:
     scene: bytes
 
 
-class Live:
+class LiveView:
     """One animal, one room, one visitor."""
 
-    def __init__(self, simulator: Simulator, look: Look, observer: Float[np.ndarray, "3"], *, seed: int, port: int):
+    def __init__(
+        self,
+        simulator: Simulator,
+        look: LiveAppearance,
+        observer: Float[np.ndarray, "3"],
+        *,
+        seed: int,
+        port: int,
+    ):
         try:
             import viser  # late: an extra
         except ImportError as error:
             raise InputError(
-                "SIM-010", f"the live view needs viser: {error}", "the Python environment", "install it: make extras"
+                "SIM-010",
+                f"the live view needs viser: {error}",
+                "the Python environment",
+                "install it: make extras",
             ) from error
         self.simulator, self.seed = simulator, seed
         self.server = viser.ViserServer(host=_HOST, port=port, verbose=False)
         self.server.scene.set_up_direction("+y")
         self.server.scene.add_glb("/room", look.scene)
         self.person = self.server.scene.add_transform_controls(
-            "/person", scale=0.5, active_axes=(True, False, True), disable_rotations=True, position=tuple(observer)
+            "/person",
+            scale=0.5,
+            active_axes=(True, False, True),
+            disable_rotations=True,
+            position=tuple(observer),
         )
         self.server.scene.add_icosphere("/person/head", 0.12, (47, 111, 159))
         self.goal = self.server.scene.add_icosphere("/goal", 0.06, (200, 114, 43))
@@ -91,13 +107,13 @@ class Live:
         flock, guidance = self.simulator.flock, float(self.interactivity.value)
         if guidance != flock.sampling.guidance:
             flock.sampling = replace(flock.sampling, guidance=guidance)
-            flock.reconsider()
+            flock.invalidate_plans()
         position = np.array(self.person.position, float)
         self.states.append(self.simulator.step(position))
         self.seen.append(position)
         self._show(self.states[-1])
 
-    def _show(self, state: State) -> None:
+    def _show(self, state: SimulatorState) -> None:
         turns = rigid.quaternion_from_rotation(state.agent_from_bone[:, :3, :3].astype(np.float64))
         root = rigid.quaternion_from_rotation(state.world_from_agent[:3, :3])
         with self.server.atomic():
@@ -106,11 +122,15 @@ class Live:
                 handle.position, handle.wxyz = state.agent_from_bone[bone, :3, 3], turns[bone]
             self.goal.position = state.goal_world
 
-    def _add_animal(self, look: Look) -> Any:
+    def _add_animal(self, look: LiveAppearance) -> Any:
         weights = np.zeros((len(look.mesh.vertices), len(look.skin.bone_names)), np.float32)
         np.add.at(weights, (np.arange(len(weights))[:, None], look.skin.joints), look.skin.weights)
         rest = look.skin.agent_from_bone_rest
-        color = (150, 120, 90) if look.mesh.color is None else tuple(int(value) for value in look.mesh.color.mean(0))
+        color = (
+            (150, 120, 90)
+            if look.mesh.color is None
+            else tuple(int(value) for value in look.mesh.color.mean(0))
+        )
         return self.server.scene.add_mesh_skinned(
             "/animal",
             look.mesh.vertices.astype(np.float32),
@@ -124,7 +144,9 @@ class Live:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        self.interactivity = gui.add_slider("interactivity", 0.0, 1.0, 0.05, float(np.clip(self.simulator.flock.sampling.guidance, 0, 1)))
+        self.interactivity = gui.add_slider(
+            "interactivity", 0.0, 1.0, 0.05, float(np.clip(self.simulator.flock.sampling.guidance, 0, 1))
+        )
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
         gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())

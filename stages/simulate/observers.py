@@ -1,39 +1,44 @@
 """Scripted observers for rollouts without a person."""
 
 from collections.abc import Callable
-from typing import Literal, assert_never
+from typing import assert_never
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.models.trajectories import RATE_HZ
+from pipeline.behavior.trajectories import RATE_HZ
+from stages.simulate.config import ObserverScript
 
-Script = Literal["away", "still", "approach", "circle"]
 Observer = Callable[[float, Float[np.ndarray, "3"]], Float[np.ndarray, "3"]]
 """From time in seconds and the animal's position to the observer's position, world metres"""
-AWAY_M = 100.0
-"""From here on nobody perceives an observer: one who was recorded further off is one of whom nothing is known."""
+UNKNOWN_OBSERVER_M = 100.0
+"""From here on nobody perceives an observer: one who was recorded further off is one of whom nothing is
+known."""
 
 
-def scripted(script: Script, *, center: Float[np.ndarray, "3"], speed_m_s: float = 1.0) -> Observer:
-    """Return an observer: far ``away``, ``still`` at the centre, walking up to the animal every 8 s, or circling.
+def scripted(script: ObserverScript, *, center: Float[np.ndarray, "3"], speed_m_s: float = 1.0) -> Observer:
+    """Return an observer: far ``away``, ``still`` at the centre, walking up to the animal every 8 s, or
+    circling.
 
     ``center`` is a point at the height of the phone.
     """
     match script:
         case "away":
-            return lambda time_s, animal: center + np.array([AWAY_M, 0.0, 0.0])
+            return lambda time_s, animal: center + np.array([UNKNOWN_OBSERVER_M, 0.0, 0.0])
         case "still":
             return lambda time_s, animal: center
         case "circle":
-            return lambda time_s, animal: center + 1.2 * np.array([np.cos(time_s * speed_m_s / 1.2), 0.0, np.sin(time_s * speed_m_s / 1.2)])
+            return lambda time_s, animal: (
+                center
+                + 1.2 * np.array([np.cos(time_s * speed_m_s / 1.2), 0.0, np.sin(time_s * speed_m_s / 1.2)])
+            )
         case "approach":
-            return _Walker(center, speed_m_s)
+            return ApproachingObserver(center, speed_m_s)
         case _:
             assert_never(script)
 
 
-class _Walker:
+class ApproachingObserver:
     """Walks up to the animal for 4 s, goes back to the centre for 4 s."""
 
     def __init__(self, center: Float[np.ndarray, "3"], speed_m_s: float):
@@ -48,5 +53,7 @@ class _Walker:
         away = target - self.position
         distance = float(np.linalg.norm(away))
         keep = 0.5 if time_s % 8.0 < 4.0 else 0.0
-        self.position = self.position + away / max(distance, 1e-6) * np.clip(distance - keep, 0.0, self.stride)
+        self.position = self.position + away / max(distance, 1e-6) * np.clip(
+            distance - keep, 0.0, self.stride
+        )
         return self.position

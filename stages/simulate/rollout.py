@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import arrays
-from pipeline.models.simulator import Simulator, State
-from pipeline.models.trajectories import RATE_HZ
-from pipeline.space import rigid
+from pipeline.behavior.simulator import Simulator, SimulatorState
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.data import npz
+from pipeline.geometry import rigid
 from stages.simulate.observers import Observer
 
 
@@ -39,7 +39,7 @@ def rollout(simulator: Simulator, observer: Observer, *, seconds: float, seed: i
     return take_of(states, seen)
 
 
-def take_of(states: list[State], seen: list[Float[np.ndarray, "3"]]) -> Take:
+def take_of(states: list[SimulatorState], seen: list[Float[np.ndarray, "3"]]) -> Take:
     """Gather states and the observer's positions."""
     columns = {
         name: np.array([getattr(state, name) for state in states])
@@ -56,8 +56,10 @@ def take_of(states: list[State], seen: list[Float[np.ndarray, "3"]]) -> Take:
 
 
 def write_take(folder: Path, take: Take) -> None:
-    """Write ``take.npz`` (everything) and ``take.csv`` (a row per frame: position, quaternion, speed, distance)."""
-    arrays.save(folder / "take.npz", **vars(take))
+    """Write ``take.npz`` (everything) and ``take.csv`` (a row per frame: position, quaternion, speed,
+    distance).
+    """
+    npz.save(folder / "take.npz", **vars(take))
     position = take.world_from_agent[:, :3, 3]
     quaternion = rigid.quaternion_from_rotation(take.world_from_agent[:, :3, :3])
     speed = np.linalg.norm(np.gradient(position, 1 / RATE_HZ, axis=0), axis=1)

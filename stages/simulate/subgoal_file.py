@@ -1,12 +1,12 @@
 """Sub-goals as a user writes them: a TOML file of `[[subgoal]]` tables.
 
 [[subgoal]]
-position = [1.2, 0.8]        # x and z on the floor, or x, y, z of the body's centre (on furniture), metres, world
+position = [1.2, 0.8]       # x, z on the floor, or x, y, z of the body's centre (on furniture); metres, world
 heading_deg = 90             # optional: about +y, 0 looks along +z, 90 along +x
 time_s = 12.0                # optional: when to be there; not before the animal can be
 
-A place on the floor without room to turn, by a wall or inside of furniture, or without a way to it, is moved to the nearest that
-has both: `take.json` tells where to.
+A place on the floor without room to turn, by a wall or inside of furniture, or without a path to it, is moved
+to the nearest that has both; `take.json` holds where to.
 """
 
 from collections.abc import Mapping
@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.models.subgoals import Subgoal
+from pipeline.core.errors import InputError
+from pipeline.longterm.subgoals import Subgoal
 
 LONGEST_S = 3600.0
 """Latest time of a sub-goal, seconds."""
 
 
 @dataclass(frozen=True)
-class Written:
+class SubgoalEntry:
     """One `[[subgoal]]`."""
 
     position: tuple[float, ...]
@@ -38,22 +38,40 @@ class Written:
 def tables(table: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
     """Return the `[[subgoal]]` tables of a file. Raises InputError SIM-002."""
     rows = table.get("subgoal")
-    if set(table) != {"subgoal"} or not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
-        raise InputError("SIM-002", "holds no sub-goals", str(path), "write one [[subgoal]] table per sub-goal, nothing else")
+    if (
+        set(table) != {"subgoal"}
+        or not isinstance(rows, list)
+        or not all(isinstance(row, Mapping) for row in rows)
+    ):
+        raise InputError(
+            "SIM-002",
+            "holds no sub-goals",
+            str(path),
+            "write one [[subgoal]] table per sub-goal, nothing else",
+        )
     return rows
 
 
-def subgoals(written: list[Written], path: Path) -> list[Subgoal]:
+def subgoals(written: list[SubgoalEntry], path: Path) -> list[Subgoal]:
     """Check what was written and return it as sub-goals. Raises InputError SIM-002."""
     found, clock = [], 0.0
     for number, each in enumerate(written, 1):
         where = f"{path}: subgoal {number}"
         if len(each.position) not in (2, 3) or not np.isfinite(each.position).all():
-            raise InputError("SIM-002", f"{each.position} is no position", where, "give [x, z] or [x, y, z] in metres")
+            raise InputError(
+                "SIM-002", f"{each.position} is no position", where, "give [x, z] or [x, y, z] in metres"
+            )
         if not np.isfinite(each.heading_deg or 0.0) or not (each.time_s or 0.0) <= LONGEST_S:
-            raise InputError("SIM-002", f"heading_deg or time_s is no number up to {LONGEST_S:g} s", where, "correct it")
+            raise InputError(
+                "SIM-002", f"heading_deg or time_s is no number up to {LONGEST_S:g} s", where, "correct it"
+            )
         if each.time_s is not None and each.time_s < clock:
-            raise InputError("SIM-002", f"time_s {each.time_s:g} is before the sub-goal ahead of it", where, "let times rise")
+            raise InputError(
+                "SIM-002",
+                f"time_s {each.time_s:g} is before the sub-goal ahead of it",
+                where,
+                "let times rise",
+            )
         clock = each.time_s if each.time_s is not None else clock
         x, *middle, z = each.position
         position = np.array([x, middle[0] if middle else np.nan, z])

@@ -6,28 +6,48 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import binary_dilation
 
-from pipeline.models.perception import FeatureVolume
-from pipeline.models.strides import STAYS_M_S
-from pipeline.models.support import marked, ranges
-from pipeline.models.trajectories import FUTURE, PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory, window_starts
+from pipeline.behavior.path_encoding import REST_SPEED_M_S
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.support import height_ranges, mark_supported
+from pipeline.behavior.trajectories import (
+    FUTURE,
+    PAST,
+    RATE_HZ,
+    TEST,
+    TRAIN,
+    BehaviorData,
+    Trajectory,
+    window_starts,
+)
+from stages.slice_behavior.floor import with_filled_floor
 
 
 def slice_windows(
-    trajectories: dict[str, Trajectory], test: frozenset[str], agent_from_bone_rest: np.ndarray, *, stride: int
+    trajectories: dict[str, Trajectory],
+    test: frozenset[str],
+    agent_from_bone_rest: np.ndarray,
+    *,
+    stride: int,
 ) -> BehaviorData:
-    """List the windows of every recording: with ``stride`` in training recordings, every one in test recordings."""
+    """List the windows of every recording: with ``stride`` in training recordings, every one in test
+    recordings.
+    """
     videos = tuple(sorted(trajectories))
     starts = [window_starts(trajectories[v].valid, PAST + FUTURE, 1 if v in test else stride) for v in videos]
     video = np.repeat(np.arange(len(videos)), [len(s) for s in starts]).astype(np.int32)
     tested = np.array([v in test for v in videos])
     split = np.where(tested[video], TEST, TRAIN).astype(np.uint8)
     start = np.concatenate(starts).astype(np.int32)
-    return BehaviorData({v: trajectories[v] for v in videos}, agent_from_bone_rest, video, start, split, videos)
+    return BehaviorData(
+        {v: trajectories[v] for v in videos}, agent_from_bone_rest, video, start, split, videos
+    )
 
 
-def allowed_voxels(volume: FeatureVolume, trajectories: dict[str, Trajectory], *, reach_voxels: int) -> UInt8[np.ndarray, "x y z"]:
-    """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of where it has been; there 2
-    right above something solid.
+def allowed_voxels(
+    volume: FeatureVolume, trajectories: dict[str, Trajectory], *, reach_voxels: int
+) -> UInt8[np.ndarray, "x y z"]:
+    """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of where it has been;
+    there 2 right above something solid, and 3 above floor that nobody recorded and that was filled.
     """
     visited = np.zeros(volume.occupancy.shape, bool)
     for trajectory in trajectories.values():
@@ -35,14 +55,17 @@ def allowed_voxels(volume: FeatureVolume, trajectories: dict[str, Trajectory], *
         visited[tuple(voxel[inside].T)] = True
     if reach_voxels > 0 and visited.any():
         visited = binary_dilation(visited, iterations=reach_voxels)
-    return marked((volume.occupancy == 0) | visited, volume.occupancy)
+    marks = mark_supported((volume.occupancy == 0) | visited, volume.occupancy)
+    return with_filled_floor(marks, volume.occupancy, visited)
 
 
 def standing_heights(pairs: Iterable[tuple[FeatureVolume, Trajectory]]) -> Float[np.ndarray, "2 2"]:
-    """Return how high above what carries it the root is, see `Support.range_m`, of recordings in their scenes."""
+    """Return how high above what carries it the root is, see `Support.range_m`, of recordings in their
+    scenes.
+    """
     seen = []
     for volume, trajectory in pairs:
         root = trajectory.world_from_agent[:, :3, 3]
         speed = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0, prepend=root[:1, [0, 2]]), axis=-1) * RATE_HZ
-        seen.append((volume, root[trajectory.valid], (speed > STAYS_M_S)[trajectory.valid]))
-    return ranges(seen)
+        seen.append((volume, root[trajectory.valid], (speed > REST_SPEED_M_S)[trajectory.valid]))
+    return height_ranges(seen)

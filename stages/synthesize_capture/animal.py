@@ -35,7 +35,13 @@ def _limbs(side: int) -> list[tuple[str, str, tuple, tuple, tuple]]:
         (f"{tag} forearm", f"{tag} upper arm", (f * 1.15, -0.103, 0.075), (f, -0.203, 0.112), (0.025, 0.018)),
         (f"{tag} hand", f"{tag} forearm", (f, -0.203, 0.112), (f, -0.219, 0.14), (0.019, 0.018)),
         (f"{tag} thigh", "pelvis", (h, 0.0, -0.155), (h * 1.25, -0.105, -0.115), (0.058, 0.034)),
-        (f"{tag} shank", f"{tag} thigh", (h * 1.25, -0.105, -0.115), (h * 1.1, -0.148, -0.21), (0.031, 0.018)),
+        (
+            f"{tag} shank",
+            f"{tag} thigh",
+            (h * 1.25, -0.105, -0.115),
+            (h * 1.1, -0.148, -0.21),
+            (0.031, 0.018),
+        ),
         (f"{tag} foot", f"{tag} shank", (h * 1.1, -0.148, -0.21), (h * 1.1, -0.214, -0.178), (0.017, 0.016)),
         (f"{tag} toes", f"{tag} foot", (h * 1.1, -0.214, -0.178), (h * 1.1, -0.22, -0.148), (0.018, 0.017)),
     ]
@@ -65,7 +71,10 @@ def _skeleton() -> tuple[Bone, ...]:
         start = end
     rows += [*_limbs(1), *_limbs(-1)]
     names = [row[0] for row in rows]
-    return tuple(Bone(name, names.index(parent) if parent else -1, head, tail, radius) for name, parent, head, tail, radius in rows)
+    return tuple(
+        Bone(name, names.index(parent) if parent else -1, head, tail, radius)
+        for name, parent, head, tail, radius in rows
+    )
 
 
 BONES = _skeleton()
@@ -102,8 +111,20 @@ def _body_distance(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "p
     parts = [_cone(points, HEADS[k], TAILS[k], *BONES[k].radius) for k in range(len(BONES))]
     sharpness = [0.03] * 6 + [0.012] * 5 + [0.024, 0.012, 0.008, 0.03, 0.014, 0.008, 0.008] * 2
     for side in (-1, 1):
-        ear = _cone(points, np.array([side * 0.030, 0.125, 0.225]), np.array([side * 0.040, 0.168, 0.216]), 0.020, 0.0065)
-        cheek = _cone(points, np.array([side * 0.022, 0.068, 0.262]), np.array([side * 0.014, 0.064, 0.283]), 0.026, 0.018)
+        ear = _cone(
+            points,
+            np.array([side * 0.030, 0.125, 0.225]),
+            np.array([side * 0.040, 0.168, 0.216]),
+            0.020,
+            0.0065,
+        )
+        cheek = _cone(
+            points,
+            np.array([side * 0.022, 0.068, 0.262]),
+            np.array([side * 0.014, 0.064, 0.283]),
+            0.026,
+            0.018,
+        )
         parts += [ear, cheek]
         sharpness += [0.008, 0.012]
     parts.append(_cone(points, np.array([0, -0.025, -0.08]), np.array([0, -0.022, 0.07]), 0.06, 0.064))
@@ -115,15 +136,23 @@ def _body_distance(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "p
     return total
 
 
-def _cone(points: np.ndarray, head: np.ndarray, tail: np.ndarray, head_radius: float, tail_radius: float) -> np.ndarray:
+def _cone(
+    points: np.ndarray, head: np.ndarray, tail: np.ndarray, head_radius: float, tail_radius: float
+) -> np.ndarray:
     axis = tail - head
     along = np.clip((points - head) @ axis / (axis @ axis), 0, 1)
-    return np.linalg.norm(points - head - along[:, None] * axis, axis=-1) - (head_radius + along * (tail_radius - head_radius))
+    return np.linalg.norm(points - head - along[:, None] * axis, axis=-1) - (
+        head_radius + along * (tail_radius - head_radius)
+    )
 
 
-def _skin(vertices: Float[np.ndarray, "vertex 3"]) -> tuple[Int[np.ndarray, "vertex 4"], Float[np.ndarray, "vertex 4"]]:
+def _skin(
+    vertices: Float[np.ndarray, "vertex 3"],
+) -> tuple[Int[np.ndarray, "vertex 4"], Float[np.ndarray, "vertex 4"]]:
     """Weigh bones by a soft minimum of their distances; far limbs of the other side never mix in."""
-    distance = np.stack([_cone(vertices, HEADS[k], TAILS[k], *BONES[k].radius) for k in range(len(BONES))], axis=-1)
+    distance = np.stack(
+        [_cone(vertices, HEADS[k], TAILS[k], *BONES[k].radius) for k in range(len(BONES))], axis=-1
+    )
     score = np.exp(-np.maximum(distance - distance.min(1, keepdims=True), 0) / 0.009)
     for name, sign in (("left", 1), ("right", -1)):
         limb = [index for index, bone in enumerate(BONES) if bone.name.startswith(name)]
@@ -140,7 +169,11 @@ def _coat(vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator) -> 
     ground = np.array([0.36, 0.22, 0.115]) * rng.uniform(0.8, 1.15)
     dark, pale = np.array([0.045, 0.032, 0.026]), np.array([0.72, 0.66, 0.56])
     phase = rng.uniform(0, 2 * np.pi, 6)
-    wobble = 0.9 * np.sin(9 * y / 0.1 + phase[0]) + 0.8 * np.sin(x / 0.022 + phase[1]) + 0.6 * np.sin(z / 0.05 + phase[2])
+    wobble = (
+        0.9 * np.sin(9 * y / 0.1 + phase[0])
+        + 0.8 * np.sin(x / 0.022 + phase[1])
+        + 0.6 * np.sin(z / 0.05 + phase[2])
+    )
     body = np.sin(2 * np.pi * z / 0.052 + wobble)
     tail = np.sin(2 * np.pi * z / 0.045 + phase[3])
     leg = np.sin(2 * np.pi * y / 0.042 + 0.5 * np.sin(z / 0.02 + phase[4]))
@@ -149,8 +182,12 @@ def _coat(vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator) -> 
     blotch = np.clip(np.sin(x / 0.03 + phase[5]) * np.sin(z / 0.06 + phase[0]) * 1.5, 0, 1)
     light_part = np.clip((-y - 0.055) / 0.025, 0, 1) * (y > -0.11) * (np.abs(x) < 0.05)
     light_part = np.maximum(light_part, np.clip((-y - 0.19) / 0.012, 0, 1))
-    light_part = np.maximum(light_part, np.clip((z - 0.262) / 0.015, 0, 1) * np.clip((0.085 - y) / 0.015, 0, 1))
-    light_part = np.maximum(light_part, np.clip((z - 0.13) / 0.03, 0, 1) * np.clip((0.0 - y) / 0.03, 0, 1) * (y > -0.1))
+    light_part = np.maximum(
+        light_part, np.clip((z - 0.262) / 0.015, 0, 1) * np.clip((0.085 - y) / 0.015, 0, 1)
+    )
+    light_part = np.maximum(
+        light_part, np.clip((z - 0.13) / 0.03, 0, 1) * np.clip((0.0 - y) / 0.03, 0, 1) * (y > -0.1)
+    )
     color = ground * (1 - 0.25 * blotch[:, None]) * (1 - stripe[:, None]) + dark * stripe[:, None]
     color = color * (1 - light_part[:, None]) + pale * light_part[:, None]
     face = np.stack([np.abs(x) - 0.024, y - 0.094, z - 0.273], axis=-1)
@@ -160,7 +197,9 @@ def _coat(vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator) -> 
 
 
 def surface(animal: Animal, a_from_bone: Float[np.ndarray, "bone 4 4"]) -> Float[np.ndarray, "vertex 3"]:
-    """Blend the bones' motions linearly and return the vertices in frame a (at rest, bones sit at their heads)."""
+    """Blend the bones' motions linearly and return the vertices in frame a (at rest, bones sit at their
+    heads).
+    """
     a_from_rest = a_from_bone.copy()
     a_from_rest[:, :3, 3] -= np.einsum("bij,bj->bi", a_from_bone[:, :3, :3], HEADS)
     return _blend(animal.vertices, animal.bone, animal.weight, a_from_rest)

@@ -1,7 +1,8 @@
 """Other homes than the one that is filmed: the same kinds of furniture along other walls, in another order.
 
-`furnish_otherwise` draws a home until everything stands free and the animal can reach all of its favourite places.
-Only `lives` needs them: behaviour must be learned in some homes and judged in one that it has never seen.
+`furnish_otherwise` draws a home until everything stands free and the animal can reach all of its favourite
+places. Only `lives` needs them: behaviour must be learned in some homes and judged in one that it has never
+seen.
 """
 
 from dataclasses import dataclass, replace
@@ -12,8 +13,22 @@ from scipy.ndimage import label
 from stages.synthesize_capture import furniture, sheets
 from stages.synthesize_capture.furniture import Piece
 from stages.synthesize_capture.navigation import floor_for
-from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, WINDOW_CORNER, Footprint, Movable, Place, Room, shell
-from stages.synthesize_capture.session import ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M, PERSON_BREADTH_M, PERSON_HEIGHT_M
+from stages.synthesize_capture.room import (
+    DEPTH_M,
+    WIDTH_M,
+    WINDOW_CORNER,
+    Footprint,
+    Movable,
+    Place,
+    Room,
+    shell,
+)
+from stages.synthesize_capture.session import (
+    ANIMAL_BREADTH_M,
+    ANIMAL_HEIGHT_M,
+    PERSON_BREADTH_M,
+    PERSON_HEIGHT_M,
+)
 
 GAP_M = 0.06
 """Between a wall and what stands at it."""
@@ -21,7 +36,10 @@ BREADTH_M = 0.5
 """Free floor wanted between two pieces, so that the animal passes."""
 IN_FRONT_OF_SOFA_M = 1.15
 PLACES: dict[str, tuple[tuple[str, tuple[float, float, float], float, tuple[float, float]], ...]] = {
-    "sofa": (("sofa", (0.35, 0.44, 0.12), 0.0, (0.55, 0.86)), ("sofa corner", (-0.5, 0.44, 0.12), 0.3, (-0.7, 0.86))),
+    "sofa": (
+        ("sofa", (0.35, 0.44, 0.12), 0.0, (0.55, 0.86)),
+        ("sofa corner", (-0.5, 0.44, 0.12), 0.3, (-0.7, 0.86)),
+    ),
     "cat tree": (("cat tree", (-0.06, 0.5, 0.1), -0.6, (-0.1, 0.66)),),
     "shelf": (("shelf", (0.0, 0.0, 0.55), 0.0, (0.0, 0.55)),),
     "bowls": (("bowl", (0.05, 0.0, 0.35), np.pi, (0.05, 0.35)),),
@@ -63,7 +81,9 @@ class Dwelling:
     """Furniture, the rug, the window and, last, the loose things."""
 
     def rearranged(self, rng: np.random.Generator, attempts: int = 500) -> "Dwelling":
-        """Return the home after people moved its loose things, none of them so that it shuts the animal in."""
+        """Return the home after people moved its loose things, none of them so that it shuts the animal
+        in.
+        """
         for _ in range(attempts):
             room = self.room.arranged(rng)
             if _livable(room):
@@ -103,9 +123,16 @@ def _arranged(pieces: dict[str, Piece], rng: np.random.Generator) -> tuple[Stand
         else:
             return None
         if name == "sofa":
-            table = Standing("coffee table", pieces["coffee table"], *new.at(rng.uniform(-0.2, 0.2), IN_FRONT_OF_SOFA_M), new.yaw)
+            table = Standing(
+                "coffee table",
+                pieces["coffee table"],
+                *new.at(rng.uniform(-0.2, 0.2), IN_FRONT_OF_SOFA_M),
+                new.yaw,
+            )
             placed.append(table)
-    rug = Standing("rug", pieces["rug"], rng.uniform(-0.9, 0.9), rng.uniform(-0.5, 0.5), rng.choice([0.0, np.pi / 2]))
+    rug = Standing(
+        "rug", pieces["rug"], rng.uniform(-0.9, 0.9), rng.uniform(-0.5, 0.5), rng.choice([0.0, np.pi / 2])
+    )
     return (*placed, rug)
 
 
@@ -114,12 +141,19 @@ def _at_wall(name: str, piece: Piece, rng: np.random.Generator) -> Standing:
     depth = piece.size[1] / 2 + GAP_M
     along = (WIDTH_M if wall % 2 == 0 else DEPTH_M) / 2 - piece.size[0] / 2 - 0.1
     offset, reach = rng.uniform(-along, along), (DEPTH_M if wall % 2 == 0 else WIDTH_M) / 2 - depth
-    x, z, yaw = ((offset, -reach, 0.0), (-reach, offset, np.pi / 2), (offset, reach, np.pi), (reach, offset, -np.pi / 2))[wall]
+    x, z, yaw = (
+        (offset, -reach, 0.0),
+        (-reach, offset, np.pi / 2),
+        (offset, reach, np.pi),
+        (reach, offset, -np.pi / 2),
+    )[wall]
     return Standing(name, piece, float(x), float(z), float(yaw))
 
 
 def _apart(first: Standing, second: Standing) -> bool:
-    """Tell whether two pieces, which stand along the axes, leave a way between them, or at least touch nowhere."""
+    """Tell whether two pieces, which stand along the axes, leave a way between them, or at least touch
+    nowhere.
+    """
     gap = 0.15 if {"window", "bowls", "plant", "lamp"} & {first.name, second.name} else BREADTH_M
 
     def half(thing: Standing) -> np.ndarray:
@@ -134,8 +168,13 @@ def _home(standing: tuple[Standing, ...], things: list[Piece], rng: np.random.Ge
     fixed = [sheet.moved(sheets.upright(s.x, s.z, s.yaw)) for s in standing for sheet in s.piece.sheets]
     blocks = tuple(s.footprint() for s in standing if s.piece.top > 0.1 and s.name != "window")
     floor = floor_for(list(blocks), breadth_m=0.9, height_m=PERSON_HEIGHT_M).centers()
-    homes = np.column_stack([floor[rng.integers(len(floor), size=len(things))], rng.uniform(-np.pi, np.pi, len(things))])
-    movables = tuple(Movable(tuple(t.sheets), t.size, t.top, tuple(map(float, h))) for t, h in zip(things, homes, strict=True))
+    homes = np.column_stack(
+        [floor[rng.integers(len(floor), size=len(things))], rng.uniform(-np.pi, np.pi, len(things))]
+    )
+    movables = tuple(
+        Movable(tuple(t.sheets), t.size, t.top, tuple(map(float, h)))
+        for t, h in zip(things, homes, strict=True)
+    )
     window = next(s for s in standing if s.name == "window")
     corner = np.array([[window.x, 2.1, window.z], [0, 0, 1.5], [0, -1.2, 0]], float)
     lamp = next(s for s in standing if s.name == "lamp")
@@ -154,11 +193,16 @@ def _places(standing: tuple[Standing, ...]) -> tuple[Place, ...]:
 
 def _loose(room: Room) -> tuple[Standing, ...]:
     pieces = [Piece(list(thing.sheets), thing.size, thing.height) for thing in room.movables]
-    return tuple(Standing("loose", piece, *map(float, spot)) for piece, spot in zip(pieces, room.arrangement, strict=True))
+    return tuple(
+        Standing("loose", piece, *map(float, spot))
+        for piece, spot in zip(pieces, room.arrangement, strict=True)
+    )
 
 
 def _livable(room: Room) -> bool:
-    """Tell whether nearly all free floor hangs together, for animal and person, with all favourite places on it."""
+    """Tell whether nearly all free floor hangs together, for animal and person, with all favourite places on
+    it.
+    """
     for breadth, height in ((ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M), (PERSON_BREADTH_M, PERSON_HEIGHT_M)):
         floor = floor_for(room.footprints(), breadth_m=breadth, height_m=height)
         parts, count = label(floor.free)

@@ -1,4 +1,6 @@
-"""Film a script: render each frame, pass it through the sensor, and keep what is true beside what is recorded."""
+"""Film a script: render each frame, pass it through the sensor, and keep what is true beside what is
+recorded.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.space import cameras, rigid
+from pipeline.geometry import cameras, rigid
 from stages.synthesize_capture import animal, light, raster, sensor, shade
 from stages.synthesize_capture.animal import INDEX, Animal
 from stages.synthesize_capture.script import Script
@@ -66,7 +68,10 @@ class Stage:
         """Film every frame in order."""
         script = self.script
         blur = sensor.motion_blur_px(
-            script.world_from_camera, script.timestamp_s, float(script.intrinsics[0, 0]), script.exposure.shutter_s
+            script.world_from_camera,
+            script.timestamp_s,
+            float(script.intrinsics[0, 0]),
+            script.exposure.shutter_s,
         )
         for index in range(len(script.timestamp_s)):
             yield self._frame(index, blur[index])
@@ -81,10 +86,16 @@ class Stage:
         doubled = np.array([[2 * fx, 0, 2 * cx], [0, 2 * fy, 2 * cy], [0, 0, 1]])
         view = raster.see(rigid.apply(camera_from_world, vertices), faces, doubled, 2 * height, 2 * width)
         coat = self._coat(index, body, camera_from_world)
-        linear = shade.shade(view.face, view.inverse_corners, (fx, fy, cx, cy), self.room, coat, camera_from_world)
+        linear = shade.shade(
+            view.face, view.inverse_corners, (fx, fy, cx, cy), self.room, coat, camera_from_world
+        )
         color = sensor.picture(linear, script.exposure, float(script.gain[index]), blur_px, self._rng)
-        scaled = np.array([fx * columns / width, fy * rows / height, cx * columns / width, cy * rows / height])
-        true_depth = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, scaled, rows, columns)
+        scaled = np.array(
+            [fx * columns / width, fy * rows / height, cx * columns / width, cy * rows / height]
+        )
+        true_depth = raster.depth_through(
+            view.face, view.inverse_depth, view.inverse_corners, scaled, rows, columns
+        )
         depth, confidence = sensor.lidar(true_depth, self._rng)
         samples = _four_sums(view.face >= len(self.room.faces))
         return Frame(color, depth, confidence, true_depth, samples >= 2, body)
@@ -98,7 +109,9 @@ class Stage:
                 np.zeros((0, 4), np.float32),
                 np.zeros((0, 4)),
             )
-        received = light.light_on_body(body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light)
+        received = light.light_on_body(
+            body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light
+        )
         motion = self.script.motion
         camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
         balls = np.zeros((len(SHADOW_BALLS), 4))
@@ -108,14 +121,19 @@ class Stage:
         return shade.Coat(self.creature.faces, self.creature.vertices, received, self.creature.fur, balls)
 
 
-def true_flow(stage: Stage, first: int, second: int, *, stride: int = 4) -> Float[np.ndarray, "rows columns 2"]:
-    """Return flow between two frames of the upright picture, pixels, at the centres of ``stride``-pixel cells.
+def true_flow(
+    stage: Stage, first: int, second: int, *, stride: int = 4
+) -> Float[np.ndarray, "rows columns 2"]:
+    """Return flow between two frames of the upright picture, pixels, at the centres of ``stride``-pixel
+    cells.
 
     NaN where the surface is hidden or out of view in frame ``second``.
     """
     script = stage.script
     upright = cameras.turn_camera(script.world_from_camera[[first, second]], script.quarter_turns)
-    lenses = cameras.turn_intrinsics(matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns)
+    lenses = cameras.turn_intrinsics(
+        matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns
+    )
     height, width = script.color_size if script.quarter_turns % 2 == 0 else script.color_size[::-1]
     here, there = (stage.mesh(stage.animal_world(index)) for index in (first, second))
     cells = (height // stride, width // stride)
@@ -125,13 +143,22 @@ def true_flow(stage: Stage, first: int, second: int, *, stride: int = 4) -> Floa
     share = np.einsum("hwij,hwj->hwi", view.inverse_corners[np.maximum(view.face, 0)], rays)
     share /= np.maximum(share.sum(-1, keepdims=True), 1e-9)
     corners = there[0][there[1][np.maximum(view.face, 0)]]
-    moved = rigid.apply(rigid.inverse(upright[1]), np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3)).reshape(*cells, 3)
+    moved = rigid.apply(
+        rigid.inverse(upright[1]), np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3)
+    ).reshape(*cells, 3)
     pixel, depth = cameras.project(moved, lenses[1])
     flow = (pixel - (cameras.pixel_grid(*cells) * stride)).astype(np.float32)
     inside = (
-        (depth > 0.05) & (pixel[..., 0] >= 0) & (pixel[..., 0] < width) & (pixel[..., 1] >= 0) & (pixel[..., 1] < height) & (view.face >= 0)
+        (depth > 0.05)
+        & (pixel[..., 0] >= 0)
+        & (pixel[..., 0] < width)
+        & (pixel[..., 1] >= 0)
+        & (pixel[..., 1] < height)
+        & (view.face >= 0)
     )
-    nearest = raster.see(rigid.apply(rigid.inverse(upright[1]), there[0]), there[1], lenses[1], height, width).inverse_depth
+    nearest = raster.see(
+        rigid.apply(rigid.inverse(upright[1]), there[0]), there[1], lenses[1], height, width
+    ).inverse_depth
     at = np.clip(np.nan_to_num(pixel), 0, [width - 1, height - 1]).astype(int)
     hidden = depth > 1.0 / np.maximum(nearest[at[..., 1], at[..., 0]], 1e-3) + 0.02 + 0.01 * depth
     flow[~inside | hidden] = np.nan

@@ -33,7 +33,11 @@ def sofa(rng: np.random.Generator) -> Piece:
         parts += sheets.cushion((side * 0.39, 0.36, 0.1), (0.77, 0.14, 0.68), cloth, bulge=0.022)
         parts += sheets.cushion((side * 0.39, 0.62, -0.2), (0.76, 0.38, 0.14), cloth, bulge=0.03)
     pillow = sheets.cushion(
-        (0, 0, 0), (0.38, 0.36, 0.08), texture.fabric(rng, (196, 150, 70), grain=6, stripes_m=0.07), bulge=0.05, skip=""
+        (0, 0, 0),
+        (0.38, 0.36, 0.08),
+        texture.fabric(rng, (196, 150, 70), grain=6, stripes_m=0.07),
+        bulge=0.05,
+        skip="",
     )
     parts += [sheet.moved(sheets.upright(-0.62, -0.07, 0.3, 0.6)) for sheet in pillow]
     return Piece(parts, (1.9, 0.88), 0.8)
@@ -43,7 +47,11 @@ def shelf(rng: np.random.Generator) -> Piece:
     """Make a shelf with five rows of books and a few things between them."""
     timber = texture.wood(rng, (168, 128, 84))
     wide, deep = 1.16, 0.32
-    parts = [sheet for side in (-1, 1) for sheet in sheets.box((side * wide / 2, 0.95, 0), (0.025, 1.9, deep), timber, skip="-y")]
+    parts = [
+        sheet
+        for side in (-1, 1)
+        for sheet in sheets.box((side * wide / 2, 0.95, 0), (0.025, 1.9, deep), timber, skip="-y")
+    ]
     parts += sheets.box((0, 0.95, -deep / 2 + 0.01), (wide, 1.88, 0.012), timber, skip="-z -y +y +x -x")
     for level in range(6):
         parts += sheets.box((0, 0.06 + 0.365 * level, 0), (wide, 0.025, deep), timber, skip="-z +x -x")
@@ -53,7 +61,9 @@ def shelf(rng: np.random.Generator) -> Piece:
         right = min(max(right, left + 0.3), 0.55)
         tall = rng.uniform(0.22, 0.28)
         spines = {"+z": texture.books(rng), "": texture.plain(rng, (190, 180, 160))}
-        parts += sheets.box(((left + right) / 2, bottom + tall / 2, -0.02), (right - left, tall, 0.22), spines, skip="-y -z")
+        parts += sheets.box(
+            ((left + right) / 2, bottom + tall / 2, -0.02), (right - left, tall, 0.22), spines, skip="-y -z"
+        )
     parts += sheets.cylinder(
         (0.5, 0.0725 + 0.365 + 0.08, 0),
         0.05,
@@ -62,7 +72,11 @@ def shelf(rng: np.random.Generator) -> Piece:
         texture.plain(rng, (40, 60, 80)),
         flare=0.7,
     )
-    parts += [sheets.ball((-0.5, 0.0725 + 0.365 * 3 + 0.06, 0.02), 0.06, texture.fabric(rng, (190, 70, 60), grain=10))]
+    parts += [
+        sheets.ball(
+            (-0.5, 0.0725 + 0.365 * 3 + 0.06, 0.02), 0.06, texture.fabric(rng, (190, 70, 60), grain=10)
+        )
+    ]
     return Piece(parts, (1.2, 0.34), 1.9)
 
 
@@ -74,12 +88,16 @@ def media(rng: np.random.Generator) -> Piece:
     parts += [
         sheet
         for k in range(3)
-        for sheet in sheets.box((-0.48 + 0.48 * k, 0.24, 0.208), (0.45, 0.38, 0.016), texture.wood(rng, (140, 108, 80)), skip="-z")
+        for sheet in sheets.box(
+            (-0.48 + 0.48 * k, 0.24, 0.208), (0.45, 0.38, 0.016), texture.wood(rng, (140, 108, 80)), skip="-z"
+        )
     ]
     parts += sheets.box((0, 0.82, -0.08), (1.1, 0.64, 0.05), black, skip="-z")
     parts += sheets.box((0, 0.475, -0.05), (0.4, 0.03, 0.2), black, skip="-z -y")
     parts += sheets.box((0.6, 0.5, 0.04), (0.12, 0.08, 0.18), texture.carton(rng), skip="-y")
-    parts += sheets.cylinder((-0.65, 0.53, 0.03), 0.045, 0.14, texture.poster(rng), texture.plain(rng, (200, 196, 190)))
+    parts += sheets.cylinder(
+        (-0.65, 0.53, 0.03), 0.045, 0.14, texture.poster(rng), texture.plain(rng, (200, 196, 190))
+    )
     return Piece(parts, (1.5, 0.42), 0.9)
 
 
@@ -109,8 +127,15 @@ def coffee_table(rng: np.random.Generator) -> Piece:
         {"+y": texture.poster(rng), "": texture.plain(rng, (230, 230, 226))},
         skip="-y",
     )
-    parts += sheets.box((-0.13, 0.445, 0.0), (0.2, 0.022, 0.14), {"+y": texture.poster(rng), "": texture.books(rng)}, skip="-y")
-    parts += sheets.cylinder((0.23, 0.46, 0.08), 0.038, 0.09, texture.plain(rng, (60, 96, 120)), texture.plain(rng, (70, 44, 26)))
+    parts += sheets.box(
+        (-0.13, 0.445, 0.0),
+        (0.2, 0.022, 0.14),
+        {"+y": texture.poster(rng), "": texture.books(rng)},
+        skip="-y",
+    )
+    parts += sheets.cylinder(
+        (0.23, 0.46, 0.08), 0.038, 0.09, texture.plain(rng, (60, 96, 120)), texture.plain(rng, (70, 44, 26))
+    )
     return Piece(parts, (0.86, 0.46), 0.42, 0.36)
 
 
@@ -149,16 +174,24 @@ def dining_table(rng: np.random.Generator) -> Piece:
 def plant(rng: np.random.Generator) -> Piece:
     """Make a pot plant with long bent leaves."""
     soil = texture.fabric(rng, (64, 48, 36), grain=10)
-    parts = sheets.cylinder((0, 0.17, 0), 0.14, 0.34, texture.plain(rng, (208, 202, 190), clouds=6), soil, flare=1.25)
+    parts = sheets.cylinder(
+        (0, 0.17, 0), 0.14, 0.34, texture.plain(rng, (208, 202, 190), clouds=6), soil, flare=1.25
+    )
     for _ in range(26):
         yaw, reach, rise = rng.uniform(0, 2 * np.pi), rng.uniform(0.12, 0.3), rng.uniform(0.35, 0.95)
         t = np.linspace(0, 1, 5)
         out, across = np.array([np.sin(yaw), 0, np.cos(yaw)]), np.array([np.cos(yaw), 0, -np.sin(yaw)])
-        spine = np.array([0, 0.34, 0]) + t[:, None] * reach * out + (rise * (1.7 * t - 0.75 * t**2))[:, None] * [0, 1, 0]
+        spine = (
+            np.array([0, 0.34, 0])
+            + t[:, None] * reach * out
+            + (rise * (1.7 * t - 0.75 * t**2))[:, None] * [0, 1, 0]
+        )
         half = (0.045 * np.sin(np.pi * np.clip(t * 0.9 + 0.08, 0, 1)))[:, None] * across
         points = np.stack([spine - half, spine + half], axis=1)[::-1]
         green = np.array([62.0, 110, 52]) + rng.uniform(-18, 26, 3)
-        parts.append(Sheet(points.astype(np.float32), texture.plain(rng, tuple(green), grain=5, clouds=10)(0.09, rise)))
+        parts.append(
+            Sheet(points.astype(np.float32), texture.plain(rng, tuple(green), grain=5, clouds=10)(0.09, rise))
+        )
     return Piece(parts, (0.42, 0.42), 1.2)
 
 
@@ -181,8 +214,12 @@ def lamp(rng: np.random.Generator) -> Piece:
 def bowls(rng: np.random.Generator) -> Piece:
     """Make a food and a water bowl, too low to be in anyone's way."""
     blue = texture.plain(rng, (60, 120, 170))
-    parts = sheets.cylinder((-0.11, 0.025, 0), 0.075, 0.05, blue, texture.fabric(rng, (110, 76, 46), grain=14), flare=0.8)
-    parts += sheets.cylinder((0.11, 0.025, 0.02), 0.075, 0.05, blue, texture.plain(rng, (170, 190, 200)), flare=0.8)
+    parts = sheets.cylinder(
+        (-0.11, 0.025, 0), 0.075, 0.05, blue, texture.fabric(rng, (110, 76, 46), grain=14), flare=0.8
+    )
+    parts += sheets.cylinder(
+        (0.11, 0.025, 0.02), 0.075, 0.05, blue, texture.plain(rng, (170, 190, 200)), flare=0.8
+    )
     return Piece(parts, (0.36, 0.15), 0.05)
 
 
@@ -210,7 +247,11 @@ def loose_things(rng: np.random.Generator) -> list[Piece]:
         chair += sheets.box((sx * 0.18, 0.49, -0.19), (0.035, 0.1, 0.03), timber, skip="+y -y")
     crate = sheets.box((0, 0.13, 0), (0.36, 0.26, 0.28), texture.carton(rng), skip="-y")
     parcel = sheets.box((0, 0.09, 0), (0.26, 0.18, 0.2), texture.carton(rng), skip="-y")
-    toy = [sheets.ball((0, 0.045, 0), 0.045, texture.fabric(rng, (220, 90, 50), grain=16, stripes_m=0.07, stripe=40))]
+    toy = [
+        sheets.ball(
+            (0, 0.045, 0), 0.045, texture.fabric(rng, (220, 90, 50), grain=16, stripes_m=0.07, stripe=40)
+        )
+    ]
     cloth = texture.fabric(rng, (140, 70, 80), grain=7, stripes_m=0.1)
     stool = sheets.cylinder((0, 0.2, 0), 0.2, 0.4, cloth, texture.fabric(rng, (150, 80, 90), grain=8))
     return [

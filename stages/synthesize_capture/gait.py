@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 from stages.synthesize_capture.animal import BONES, HEADS, INDEX, STAND_HEIGHT_M, TAILS
 from stages.synthesize_capture.session import AnimalCourse
 
@@ -20,18 +20,20 @@ WALK_OFFSET = np.array([0.75, 0.25, 0.5, 0.0])
 TROT_OFFSET = np.array([0.5, 0.0, 0.0, -0.5])
 SOLE_M = 0.016
 """Height of a foot bone's head above the sole."""
-NEUTRAL = np.array([HEADS[INDEX[name]] for name in FEET]) + np.array([[0, 0, 0.0], [0, 0, 0.0], [0, 0, 0.03], [0, 0, 0.03]])
+NEUTRAL = np.array([HEADS[INDEX[name]] for name in FEET]) + np.array(
+    [[0, 0, 0.0], [0, 0, 0.0], [0, 0, 0.03], [0, 0, 0.03]]
+)
 
 
 @dataclass(frozen=True)
-class Motion:
+class AnimalMotion:
     """The animal's body at some times: root in the world and bones in the agent frame."""
 
     world_from_agent: Float[np.ndarray, "frame 4 4"]
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
 
 
-def poses(course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]) -> Motion:
+def poses(course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]) -> AnimalMotion:
     """Return root and bones at the given times."""
     state = _sampled(course, timestamp_s)
     world_from_agent = _root(state, timestamp_s)
@@ -46,11 +48,15 @@ def poses(course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]) -> Moti
     for index, side in enumerate(("left", "right")):
         _fore_limb(bones, side, feet_agent[:, index])
         _hind_limb(bones, side, feet_agent[:, 2 + index])
-    return Motion(world_from_agent, bones)
+    return AnimalMotion(world_from_agent, bones)
 
 
-def footfalls(course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame foot 3"]:
-    """Return the four feet's world positions (bone heads of hands and toes) from the rhythm of the gait alone."""
+def footfalls(
+    course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]
+) -> Float[np.ndarray, "frame foot 3"]:
+    """Return the four feet's world positions (bone heads of hands and toes) from the rhythm of the gait
+    alone.
+    """
     phase, duty, offset, lift = _rhythm(course)
     placed = np.zeros((len(timestamp_s), 4, 3))
     for foot in range(4):
@@ -67,7 +73,9 @@ def footfalls(course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]) -> 
 
 
 def _rhythm(course: AnimalCourse) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return stride phase, share of the stride on the ground, phase offset per foot and lift of the feet in metres."""
+    """Return stride phase, share of the stride on the ground, phase offset per foot and lift of the feet in
+    metres.
+    """
     step = float(course.timestamp_s[1] - course.timestamp_s[0])
     speed = gaussian_filter1d(np.where(course.airborne > 0.5, 0.0, course.speed()), 0.08 / step)
     turn = gaussian_filter1d(np.abs(np.gradient(course.yaw, step)), 0.08 / step)
@@ -84,15 +92,23 @@ def _rhythm(course: AnimalCourse) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     )
 
 
-def _planted(course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, foot: int) -> Float[np.ndarray, "frame 3"]:
-    """Return where a foot stands in stride ``index``: under its neutral place at the middle of that stance."""
+def _planted(
+    course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, foot: int
+) -> Float[np.ndarray, "frame 3"]:
+    """Return where a foot stands in stride ``index``: under its neutral place at the middle of that
+    stance.
+    """
     rising = cycle + 1e-9 * np.arange(len(cycle))
     when = np.interp(index + half_duty, rising, course.timestamp_s)
     yaw = np.interp(when, course.timestamp_s, course.yaw)
     x, y, z = (np.interp(when, course.timestamp_s, course.position[:, axis]) for axis in range(3))
     side, forward = NEUTRAL[foot, 0], NEUTRAL[foot, 2]
     return np.stack(
-        [x + np.cos(yaw) * side + np.sin(yaw) * forward, y + SOLE_M, z - np.sin(yaw) * side + np.cos(yaw) * forward],
+        [
+            x + np.cos(yaw) * side + np.sin(yaw) * forward,
+            y + SOLE_M,
+            z - np.sin(yaw) * side + np.cos(yaw) * forward,
+        ],
         axis=-1,
     )
 
@@ -116,7 +132,9 @@ def _sampled(course: AnimalCourse, timestamp_s: np.ndarray) -> _State:
     def at(values: np.ndarray, smooth_s: float = 0.0) -> np.ndarray:
         values = values if values.ndim > 1 else values[:, None]
         if smooth_s:
-            values = gaussian_filter1d(values, smooth_s / (course.timestamp_s[1] - course.timestamp_s[0]), axis=0)
+            values = gaussian_filter1d(
+                values, smooth_s / (course.timestamp_s[1] - course.timestamp_s[0]), axis=0
+            )
         columns = [np.interp(timestamp_s, course.timestamp_s, values[:, k]) for k in range(values.shape[1])]
         return np.stack(columns, axis=-1) if len(columns) > 1 else columns[0]
 
@@ -140,17 +158,28 @@ def _sampled(course: AnimalCourse, timestamp_s: np.ndarray) -> _State:
 def _root(state: _State, timestamp_s: np.ndarray) -> Float[np.ndarray, "frame 4 4"]:
     height = STAND_HEIGHT_M - 0.012 - 0.012 * np.clip(state.speed, 0, 1.5) - 0.05 * state.crouch
     stand = 1 - state.sit - state.lie
-    height = height * stand + 0.172 * state.sit + 0.105 * state.lie + 0.006 * np.sin(4 * np.pi * state.phase) * np.clip(state.speed, 0, 1)
+    height = (
+        height * stand
+        + 0.172 * state.sit
+        + 0.105 * state.lie
+        + 0.006 * np.sin(4 * np.pi * state.phase) * np.clip(state.speed, 0, 1)
+    )
     height += 0.0015 * np.sin(2 * np.pi * 0.45 * timestamp_s)
-    pitch = -0.56 * state.sit + 0.03 * np.sin(4 * np.pi * state.phase + 1.0) * np.clip(state.speed - 0.6, 0, 1)
+    pitch = -0.56 * state.sit + 0.03 * np.sin(4 * np.pi * state.phase + 1.0) * np.clip(
+        state.speed - 0.6, 0, 1
+    )
     roll = np.clip(0.05 * state.turn * state.speed, -0.12, 0.12)
     climb = np.gradient(state.position[:, 1], timestamp_s) if len(timestamp_s) > 1 else np.zeros(1)
     pitch = pitch - np.clip(0.35 * climb, -0.6, 0.6) * state.air
     rotation = _turn(1, state.yaw) @ _turn(0, pitch) @ _turn(2, -roll)
-    return rigid.make(rotation, state.position + np.stack([np.zeros_like(height), height, np.zeros_like(height)], axis=-1))
+    return rigid.make(
+        rotation, state.position + np.stack([np.zeros_like(height), height, np.zeros_like(height)], axis=-1)
+    )
 
 
-def _posed_feet(feet_agent: np.ndarray, world_from_agent: np.ndarray, state: _State) -> Float[np.ndarray, "frame foot 3"]:
+def _posed_feet(
+    feet_agent: np.ndarray, world_from_agent: np.ndarray, state: _State
+) -> Float[np.ndarray, "frame foot 3"]:
     """Blend planted feet with those of sitting, lying and flying."""
     level_from_agent = _turn(1, -state.yaw) @ world_from_agent[:, :3, :3]
     ground = state.position[:, 1] - world_from_agent[:, 1, 3] + SOLE_M
@@ -163,7 +192,10 @@ def _posed_feet(feet_agent: np.ndarray, world_from_agent: np.ndarray, state: _St
 
     sitting = on_ground([(0.036, 0.105), (-0.036, 0.105), (0.075, -0.05), (-0.075, -0.05)])
     lying = on_ground([(0.05, 0.19), (-0.05, 0.19), (0.095, -0.08), (-0.095, -0.08)])
-    flying = np.broadcast_to(NEUTRAL + np.array([[0, 0.05, 0.07], [0, 0.05, 0.07], [0, 0.03, -0.09], [0, 0.03, -0.09]]), feet_agent.shape)
+    flying = np.broadcast_to(
+        NEUTRAL + np.array([[0, 0.05, 0.07], [0, 0.05, 0.07], [0, 0.03, -0.09], [0, 0.03, -0.09]]),
+        feet_agent.shape,
+    )
     sit, lie, air = (part[:, None, None] for part in (state.sit, state.lie, state.air))
     return (feet_agent * (1 - sit - lie) + sitting * sit + lying * lie) * (1 - air) + flying * air
 
@@ -200,7 +232,11 @@ def _swing_tail(bones: np.ndarray, state: _State, timestamp_s: np.ndarray) -> No
     base = bones[:, INDEX["pelvis"], :3, :3]
     lift = (0.35 + 0.75 * state.tail) * (1 - rest) - 0.3 * rest + 0.45 * state.sit
     for index in range(5):
-        sway = 0.16 * np.sin(2 * np.pi * (0.55 + 0.25 * np.abs(state.tail)) * timestamp_s - 0.7 * index) * (1 + 0.5 * index)
+        sway = (
+            0.16
+            * np.sin(2 * np.pi * (0.55 + 0.25 * np.abs(state.tail)) * timestamp_s - 0.7 * index)
+            * (1 + 0.5 * index)
+        )
         curl = 0.38 * rest * (index > 0)
         bend = (0.75 if index == 0 else 0.22) * lift
         base = base @ _turn(1, sway * (1 - 0.7 * rest) + curl) @ _turn(0, bend)
@@ -230,7 +266,9 @@ def _hind_limb(bones: np.ndarray, side: str, foot: Float[np.ndarray, "frame 3"])
     bones[:, INDEX[toes], :3, 3] = foot
 
 
-def _two_bones(bones: np.ndarray, first: str, second: str, start: np.ndarray, end: np.ndarray, *, pole: np.ndarray) -> None:
+def _two_bones(
+    bones: np.ndarray, first: str, second: str, start: np.ndarray, end: np.ndarray, *, pole: np.ndarray
+) -> None:
     """Place two bones between two points by the law of cosines, the middle joint towards ``pole``."""
     a, b = _length(first), _length(second)
     axis = end - start
@@ -273,7 +311,9 @@ def _mostly_level(bones: np.ndarray, parent: str) -> np.ndarray:
 
 def _joint(bones: np.ndarray, name: str, parent: str) -> Float[np.ndarray, "frame 3"]:
     index, above = INDEX[name], INDEX[parent]
-    return bones[:, above, :3, 3] + np.einsum("fij,j->fi", bones[:, above, :3, :3], HEADS[index] - HEADS[above])
+    return bones[:, above, :3, 3] + np.einsum(
+        "fij,j->fi", bones[:, above, :3, :3], HEADS[index] - HEADS[above]
+    )
 
 
 def _hang(bones: np.ndarray, name: str, parent: str, rotation: np.ndarray) -> None:

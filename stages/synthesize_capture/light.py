@@ -1,4 +1,5 @@
-"""Light the room once per recording: daylight through the window, a lamp, and the soft light between surfaces.
+"""Light the room once per recording: daylight through the window, a lamp, and the soft light between
+surfaces.
 
 `Light` is one session's light; `lit_sheets` multiplies each sheet's picture by a smooth light map that is
 found by casting rays at a coarse grid of points (Lambertian surfaces, one bounce approximated by a constant).
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.space.meshes import Mesh, RayCaster
+from pipeline.geometry.meshes import Mesh, RayCaster
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.sheets import Sheet, triangles
 
@@ -34,21 +35,33 @@ class Light:
 
 
 def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
-    """Draw a light: by day the window rules, in the evening the lamp, at sunset one low red sun and hardly anything else."""
+    """Draw a light: by day the window rules, in the evening the lamp, at sunset one low red sun and hardly
+    anything else.
+    """
     warm, cool = np.array([1.0, 0.82, 0.6]), np.array([0.9, 0.98, 1.08])
     if hour == "evening":
         window, lamp, ambient = 0.10 * cool, rng.uniform(0.75, 0.95) * warm, 0.16 * np.array([1.0, 0.9, 0.78])
     else:
-        window, lamp = rng.uniform(1.3, 2.2) * (cool + rng.uniform(-0.06, 0.06, 3)), rng.uniform(0.0, 0.25) * warm
+        window, lamp = (
+            rng.uniform(1.3, 2.2) * (cool + rng.uniform(-0.06, 0.06, 3)),
+            rng.uniform(0.0, 0.25) * warm,
+        )
         ambient = rng.uniform(0.42, 0.55) * (1.0 + rng.uniform(-0.05, 0.05, 3))
     sun = np.array([1.0, rng.uniform(0.3, 0.7), rng.uniform(-0.8, 0.8)])
     if hour == "sunset":  # as many draws as by day, so that life goes on as it would have
         red = np.array([1.3, 0.7, 0.4])
-        window, lamp, ambient, sun[1:] = 3.0 * window * red, 0.0 * warm, 0.4 * ambient * red, sun[1:] * (0.2, 1.5)
+        window, lamp, ambient, sun[1:] = (
+            3.0 * window * red,
+            0.0 * warm,
+            0.4 * ambient * red,
+            sun[1:] * (0.2, 1.5),
+        )
     return Light(window, lamp, ambient, sun / np.linalg.norm(sun))
 
 
-def lit_sheets(room: Room, light: Light, rng: np.random.Generator) -> list[UInt8[np.ndarray, "height width 3"]]:
+def lit_sheets(
+    room: Room, light: Light, rng: np.random.Generator
+) -> list[UInt8[np.ndarray, "height width 3"]]:
     """Return each sheet's picture in that light, as square roots of linear radiance (255 = 2.0)."""
     sheets = room.sheets()
     vertices, faces, _, _ = triangles(sheets)
@@ -66,7 +79,9 @@ def lit_sheets(room: Room, light: Light, rng: np.random.Generator) -> list[UInt8
     return lit
 
 
-def _lit_picture(sheet: Sheet, cells: Float[np.ndarray, "row column 3"], light: Light) -> UInt8[np.ndarray, "height width 3"]:
+def _lit_picture(
+    sheet: Sheet, cells: Float[np.ndarray, "row column 3"], light: Light
+) -> UInt8[np.ndarray, "height width 3"]:
     height, width, _ = sheet.picture.shape
     albedo = (np.arange(256, dtype=np.float32) / 255) ** 2.2
     if sheet.glow > 0:
@@ -93,11 +108,18 @@ def _light_grid(sheet: Sheet) -> tuple[np.ndarray, np.ndarray]:
 def _bilinear(grid: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     i, j = np.clip(row.astype(int), 0, grid.shape[0] - 2), np.clip(column.astype(int), 0, grid.shape[1] - 2)
     s, t = (row - i)[..., None], (column - j)[..., None]
-    return (1 - s) * ((1 - t) * grid[i, j] + t * grid[i, j + 1]) + s * ((1 - t) * grid[i + 1, j] + t * grid[i + 1, j + 1])
+    return (1 - s) * ((1 - t) * grid[i, j] + t * grid[i, j + 1]) + s * (
+        (1 - t) * grid[i + 1, j] + t * grid[i + 1, j + 1]
+    )
 
 
 def _irradiance(
-    points: np.ndarray, normals: np.ndarray, room: Room, light: Light, caster: RayCaster, rng: np.random.Generator
+    points: np.ndarray,
+    normals: np.ndarray,
+    room: Room,
+    light: Light,
+    caster: RayCaster,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "point 3"]:
     total = np.zeros((len(points), 3))
     openness = np.zeros(len(points))
@@ -111,19 +133,30 @@ def _irradiance(
     for i in range(2):
         for j in range(3):
             jitter = rng.uniform(-0.12, 0.12, 2)
-            sample = corner + (j + 0.5 + jitter[0]) / 3 * right + (i + 0.5 + jitter[1]) / 2 * down - np.array([0.06, 0, 0])
+            sample = (
+                corner
+                + (j + 0.5 + jitter[0]) / 3 * right
+                + (i + 0.5 + jitter[1]) / 2 * down
+                - np.array([0.06, 0, 0])
+            )
             area = np.linalg.norm(right) * np.linalg.norm(down) / 6
             total += (
-                _from_source(points, normals, sample, caster, facing=np.array([-1.0, 0, 0]), toward=light.toward_sun)[:, None]
+                _from_source(
+                    points, normals, sample, caster, facing=np.array([-1.0, 0, 0]), toward=light.toward_sun
+                )[:, None]
                 * light.window
                 * area
             )
     for shift in ((0.0, 0.22, 0.0), (0.0, -0.2, 0.0)):
-        total += _from_source(points, normals, np.asarray(room.lamp) + shift, caster)[:, None] * light.lamp * 0.6
+        total += (
+            _from_source(points, normals, np.asarray(room.lamp) + shift, caster)[:, None] * light.lamp * 0.6
+        )
     return total
 
 
-def _from_source(points, normals, source, caster: RayCaster, *, facing=None, toward=None) -> Float[np.ndarray, "point"]:
+def _from_source(
+    points, normals, source, caster: RayCaster, *, facing=None, toward=None
+) -> Float[np.ndarray, "point"]:
     """Return form factors of a small source; a window faces one way and shines strongest along ``toward``."""
     away = source - points
     distance = np.linalg.norm(away, axis=-1)
@@ -148,7 +181,10 @@ def _around(normals: np.ndarray, sine_cosine: np.ndarray, turn: np.ndarray) -> n
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     second = np.cross(normals, first)
-    return sine_cosine[0] * (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second) + sine_cosine[1] * normals
+    return (
+        sine_cosine[0] * (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second)
+        + sine_cosine[1] * normals
+    )
 
 
 def light_on_body(
@@ -159,7 +195,10 @@ def light_on_body(
     total = (0.35 + 0.6 * up) * light.ambient
     corner, right, down = room.window
     sources = (
-        (corner + 0.5 * right + 0.5 * down, light.window * np.linalg.norm(right) * np.linalg.norm(down) / np.pi),
+        (
+            corner + 0.5 * right + 0.5 * down,
+            light.window * np.linalg.norm(right) * np.linalg.norm(down) / np.pi,
+        ),
         (np.asarray(room.lamp), light.lamp * 1.2),
     )
     for source, strength in sources:

@@ -40,16 +40,26 @@ class Floor:
         centers = self.centers()
         return centers[np.argmin(((centers - point) ** 2).sum(-1))]
 
-    def route(self, start: Ground, goal: Ground, *, avoid: Ground | None = None, avoid_m: float = 1.0) -> Float[np.ndarray, "waypoint 2"]:
-        """Return a shortest way that keeps off ``avoid``; blocked cells are crossed only when there is no other."""
+    def route(
+        self, start: Ground, goal: Ground, *, avoid: Ground | None = None, avoid_m: float = 1.0
+    ) -> Float[np.ndarray, "waypoint 2"]:
+        """Return a shortest way that keeps off ``avoid``; blocked cells are crossed only when there is no
+        other.
+        """
         cost = np.where(self.free, 1.0, 60.0)
         if avoid is not None:
             x = (np.arange(self.free.shape[0]) + 0.5) * CELL_M - WIDTH_M / 2 - avoid[0]
             z = (np.arange(self.free.shape[1]) + 0.5) * CELL_M - DEPTH_M / 2 - avoid[1]
             cost = cost * (1 + 8 * np.exp(-(x[:, None] ** 2 + z[None, :] ** 2) / (0.5 * avoid_m) ** 2))
-        cells, _ = route_through_array(cost, self.cell(start), self.cell(goal), fully_connected=True, geometric=True)
+        cells, _ = route_through_array(
+            cost, self.cell(start), self.cell(goal), fully_connected=True, geometric=True
+        )
         way = (np.array(cells) + 0.5) * CELL_M - [WIDTH_M / 2, DEPTH_M / 2]
-        return np.concatenate([way[1:-1], np.asarray(goal, float)[None]]) if len(way) > 1 else np.asarray(goal, float)[None]
+        return (
+            np.concatenate([way[1:-1], np.asarray(goal, float)[None]])
+            if len(way) > 1
+            else np.asarray(goal, float)[None]
+        )
 
 
 def floor_for(footprints: list[Footprint], *, breadth_m: float, height_m: float) -> Floor:
@@ -64,7 +74,12 @@ def floor_for(footprints: list[Footprint], *, breadth_m: float, height_m: float)
             continue
         cosine, sine = np.cos(block.yaw), np.sin(block.yaw)
         away = grid - np.asarray(block.center)
-        local = np.abs(np.stack([cosine * away[..., 0] - sine * away[..., 1], sine * away[..., 0] + cosine * away[..., 1]], axis=-1))
+        local = np.abs(
+            np.stack(
+                [cosine * away[..., 0] - sine * away[..., 1], sine * away[..., 0] + cosine * away[..., 1]],
+                axis=-1,
+            )
+        )
         outside = np.maximum(local - np.asarray(block.size) / 2, 0)
         free &= np.linalg.norm(outside, axis=-1) >= reach
     return Floor(free)
@@ -93,14 +108,18 @@ class Walker:
 
     def step(self, seconds: float, desired_speed: float, *, face: float | None = None) -> None:
         """Move on, heading along the way or, if given, towards the angle ``face`` (a person who films)."""
-        while len(self.way) and np.linalg.norm(self.way[0] - self.position) < (0.22 if len(self.way) > 1 else 0.05 + 0.06 * self.speed):
+        while len(self.way) and np.linalg.norm(self.way[0] - self.position) < (
+            0.22 if len(self.way) > 1 else 0.05 + 0.06 * self.speed
+        ):
             self.way = self.way[1:]
         target_speed, heading = 0.0, self.yaw
         if len(self.way):
             toward = self.way[0] - self.position
             heading = float(np.arctan2(toward[0], toward[1]))
             left = np.linalg.norm(self.way[-1] - self.position)
-            target_speed = min(desired_speed, np.sqrt(2 * 0.8 * self.acceleration * max(left - 0.03, 0.0)) + 0.08)
+            target_speed = min(
+                desired_speed, np.sqrt(2 * 0.8 * self.acceleration * max(left - 0.03, 0.0)) + 0.08
+            )
         error = _wrapped((heading if face is None else face) - self.yaw)
         self.yaw += float(np.clip(error, -self.turn_rate * seconds, self.turn_rate * seconds))
         if face is None:
@@ -115,9 +134,9 @@ class Walker:
             self._slide(ahead)
 
     def _slide(self, ahead: Ground) -> None:
-        for kept in (np.array([ahead[0], self.position[1]]), np.array([self.position[0], ahead[1]])):
-            if self.floor.is_free(kept):
-                self.position = kept
+        for along_axis in (np.array([ahead[0], self.position[1]]), np.array([self.position[0], ahead[1]])):
+            if self.floor.is_free(along_axis):
+                self.position = along_axis
                 return
         self.speed *= 0.5
 

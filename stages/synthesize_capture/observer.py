@@ -1,8 +1,9 @@
 """The person with the phone: follows the animal, walks up to it, stands, steps back, strolls.
 
-A small random state machine. Who films comes up every 8 to 10 s so that what the animal does about people can be learnt
-from minutes of video, mostly from where the animal came to; who lives there leaves it alone for longer, goes off again,
-and comes up from across the room. Positions (x, z) on the floor in metres, yaw about +y.
+A small random state machine. Who films comes up every 8 to 10 s so that what the animal does about people can
+be learnt from minutes of video, mostly from where the animal came to; who lives there leaves it alone for
+longer, goes off again, and comes up from across the room. Positions (x, z) on the floor in metres, yaw about
++y.
 """
 
 from dataclasses import dataclass
@@ -17,14 +18,14 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Habits:
+class ObserverStyle:
     """How a person moves; ranges are drawn from evenly, times in seconds, paces in m/s."""
 
     watch_s: Range = (7.0, 9.0)
     approach_s: Range = (2.0, 3.0)
-    approach_pace: Range = (0.9, 1.2)
+    approach_m_s: Range = (0.9, 1.2)
     retreat_s: Range = (1.4, 2.2)
-    retreat_pace: Range = (0.6, 0.85)
+    retreat_m_s: Range = (0.6, 0.85)
     far_m: float = 2.7
     """from farther off the animal is not walked up to, but strolled to a film's distance first"""
     stays: float = 0.8
@@ -33,13 +34,13 @@ class Habits:
     """probability to walk up after standing, rather than to stroll"""
 
 
-FILMING = Habits()
-AT_HOME = Habits(
+FILMING = ObserverStyle()
+AT_HOME = ObserverStyle(
     watch_s=(4.0, 20.0),
     approach_s=(4.0, 6.0),
-    approach_pace=(0.8, 1.3),
+    approach_m_s=(0.8, 1.3),
     retreat_s=(2.0, 4.0),
-    retreat_pace=(0.7, 1.1),
+    retreat_m_s=(0.7, 1.1),
     far_m=4.0,
     stays=0.1,
     comes_up=0.95,
@@ -49,10 +50,12 @@ AT_HOME = Habits(
 class Observer:
     """A person who films; `step` moves it once, `looks_at` is what the phone points to."""
 
-    def __init__(self, floor: Floor, position: Ground, rng: np.random.Generator, habits: Habits = FILMING):
+    def __init__(
+        self, floor: Floor, position: Ground, rng: np.random.Generator, style: ObserverStyle = FILMING
+    ):
         self.walker = Walker(floor, floor.nearest(position), 0.0, turn_rate=2.6, acceleration=2.2)
-        self.rng, self.habits = rng, habits
-        self.mode, self.left_s, self.pace, self.since_plan_s = "watch", rng.uniform(1.0, 2.0), 0.0, 0.0
+        self.rng, self.style = rng, style
+        self.mode, self.left_s, self.speed_m_s, self.since_plan_s = "watch", rng.uniform(1.0, 2.0), 0.0, 0.0
         self.velocity = np.zeros(2)
         self.looks_at: Float[np.ndarray, 3] | None = None
         self._last: np.ndarray | None = None
@@ -74,41 +77,48 @@ class Observer:
         if self.left_s <= 0:
             self._choose(ground)
         toward = ground - self.walker.position
-        self.walker.step(seconds, self.pace, face=float(np.arctan2(toward[0], toward[1])))
+        self.walker.step(seconds, self.speed_m_s, face=float(np.arctan2(toward[0], toward[1])))
         self.velocity = (self.walker.position - before) / seconds
         self._last = animal
         self._look(seconds, animal)
 
     def _choose(self, animal: Ground) -> None:
         """Take up the next mode."""
-        habits = self.habits
+        style = self.style
         self.walker.stop()
-        self.pace = 0.0
+        self.speed_m_s = 0.0
         after = {
             "approach": ("watch", "retreat"),
             "watch": ("approach", "stroll"),
             "retreat": ("watch", "approach"),
             "stroll": ("approach", "watch"),
         }
-        chance = {"approach": habits.stays, "watch": habits.comes_up, "retreat": 1.0, "stroll": 0.2}[self.mode]
-        far = self.mode != "stroll" and np.linalg.norm(self.walker.position - animal) > habits.far_m
+        chance = {"approach": style.stays, "watch": style.comes_up, "retreat": 1.0, "stroll": 0.2}[self.mode]
+        far = self.mode != "stroll" and np.linalg.norm(self.walker.position - animal) > style.far_m
         self.mode = "stroll" if far else after[self.mode][0 if self.rng.random() < chance else 1]
         match self.mode:
             case "watch":
-                self.left_s = self.rng.uniform(*habits.watch_s)
+                self.left_s = self.rng.uniform(*style.watch_s)
             case "approach":
-                self.left_s, self.pace = self.rng.uniform(*habits.approach_s), self.rng.uniform(*habits.approach_pace)
+                self.left_s, self.speed_m_s = (
+                    self.rng.uniform(*style.approach_s),
+                    self.rng.uniform(*style.approach_m_s),
+                )
                 self._plan_approach(animal)
             case "retreat":
-                self.left_s, self.pace = self.rng.uniform(*habits.retreat_s), self.rng.uniform(*habits.retreat_pace)
+                self.left_s, self.speed_m_s = (
+                    self.rng.uniform(*style.retreat_s),
+                    self.rng.uniform(*style.retreat_m_s),
+                )
                 self._go_by(
                     animal,
                     lambda center: (
-                        0.9 * np.linalg.norm(center - animal, axis=-1) - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1)
+                        0.9 * np.linalg.norm(center - animal, axis=-1)
+                        - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1)
                     ),
                 )
             case "stroll":
-                self.left_s, self.pace = self.rng.uniform(2.4, 3.8), self.rng.uniform(0.5, 0.8)
+                self.left_s, self.speed_m_s = self.rng.uniform(2.4, 3.8), self.rng.uniform(0.5, 0.8)
                 from_animal = self.walker.position - animal
                 angle = np.arctan2(from_animal[0], from_animal[1]) + self.rng.normal(0, 0.5)
                 self.walker.go(animal + 2.1 * np.array([np.sin(angle), np.cos(angle)]), avoid=animal)
@@ -124,15 +134,18 @@ class Observer:
     def _look(self, seconds: float, animal: Float[np.ndarray, "3"]) -> None:
         """Follow the animal with a lag; sometimes glance elsewhere for a moment."""
         target = animal + np.array([0.0, 0.12, 0.0])
-        if self._glance is None and self.rng.random() < 0.02 * seconds * (3.0 if self.mode == "stroll" else 1.0):
+        if self._glance is None and self.rng.random() < 0.02 * seconds * (
+            3.0 if self.mode == "stroll" else 1.0
+        ):
             self._glance = (
                 self.rng.uniform(0.5, 1.0),
-                target + np.array([self.rng.uniform(-1, 1), self.rng.uniform(0, 0.6), self.rng.uniform(-1, 1)]),
+                target
+                + np.array([self.rng.uniform(-1, 1), self.rng.uniform(0, 0.6), self.rng.uniform(-1, 1)]),
             )
         if self._glance is not None:
-            left, aside = self._glance
-            target = aside
-            self._glance = (left - seconds, aside) if left > seconds else None
+            left, sideways = self._glance
+            target = sideways
+            self._glance = (left - seconds, sideways) if left > seconds else None
         if self.looks_at is None:
             self.looks_at = target.copy()
         self.looks_at = self.looks_at + (target - self.looks_at) * (1 - np.exp(-seconds / REACTION_S))

@@ -25,7 +25,7 @@ REASONS: tuple[Reason, ...] = ("own", "flee", "approach")
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenPerson:
     """The person as the animal sees it: position and velocity on the floor."""
 
     position: Ground
@@ -46,12 +46,14 @@ class Policy:
 
     def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
         self.rng, self.places = rng, places
-        self.walker = Walker(floor, floor.nearest(position), rng.uniform(-np.pi, np.pi), turn_rate=4.0, acceleration=3.0)
+        self.walker = Walker(
+            floor, floor.nearest(position), rng.uniform(-np.pi, np.pi), turn_rate=4.0, acceleration=3.0
+        )
         self.height = 0.0
         self.place: Place | None = None
         self.perch: Place | None = None
         self.reason: Reason = "own"
-        self.pace, self.rest_s, self.calm_s, self.fear_s = 0.0, 0.6, 0.0, 0.0
+        self.speed_m_s, self.rest_s, self.calm_s, self.fear_s = 0.0, 0.6, 0.0, 0.0
         self.posture = np.zeros(3)
         self.wanted = np.zeros(3)
         self.leap: Leap | None = None
@@ -63,7 +65,7 @@ class Policy:
         """Where it stands: x, height of the ground under it, z."""
         return np.array([self.walker.position[0], self.height, self.walker.position[1]])
 
-    def step(self, seconds: float, seen: Seen) -> None:
+    def step(self, seconds: float, seen: SeenPerson) -> None:
         """Decide, then move on by one step."""
         self._feel(seconds, seen)
         if self.leap is not None:
@@ -76,15 +78,17 @@ class Policy:
                 self.perch = None
             else:
                 self.walker.turn_rate = (7.5 if self.reason == "flee" else 4.0) if moving else 2.2
-                self.walker.step(seconds, self.pace, face=None if moving else self._faces(seen))
+                self.walker.step(seconds, self.speed_m_s, face=None if moving else self._faces(seen))
                 if moving and self.walker.arrived():
                     self._arrive()
         rate = 1 - np.exp(-seconds / 0.22)
         standing = self.walker.speed > 0.12 or self.leap is not None
-        self.posture += rate * (np.where(standing, np.array([0, 0, self.wanted[2]]), self.wanted) - self.posture)
+        self.posture += rate * (
+            np.where(standing, np.array([0, 0, self.wanted[2]]), self.wanted) - self.posture
+        )
         self._look(seconds, seen)
 
-    def _feel(self, seconds: float, seen: Seen) -> None:
+    def _feel(self, seconds: float, seen: SeenPerson) -> None:
         """Follow how long the person has been calm and how threatening it is."""
         away = self.walker.position - seen.position
         distance = float(np.linalg.norm(away))
@@ -96,10 +100,12 @@ class Policy:
     def _threatened(self) -> bool:
         near = 0.95 if self.height > 0.1 else 1.25
         return (
-            (self.distance < near and self.closing > 0.25) or self.distance < 0.55 or (self.distance < near + 0.75 and self.closing > 0.65)
+            (self.distance < near and self.closing > 0.25)
+            or self.distance < 0.55
+            or (self.distance < near + 0.75 and self.closing > 0.65)
         )
 
-    def _decide(self, seconds: float, seen: Seen) -> None:
+    def _decide(self, seconds: float, seen: SeenPerson) -> None:
         if self._threatened() and self.fear_s <= 0:
             self._flee(seen)
             return
@@ -107,13 +113,18 @@ class Policy:
             return
         self.rest_s -= seconds
         rested = self.reason == "own" or self.rest_s <= 0
-        willing = self.reason != "approach" and rested and 1.35 < self.distance < NOTICE_M + 0.5 and self.calm_s > 0.9
+        willing = (
+            self.reason != "approach"
+            and rested
+            and 1.35 < self.distance < NOTICE_M + 0.5
+            and self.calm_s > 0.9
+        )
         if willing and self.rng.random() < 1.8 * seconds:
             self._approach(seen)
         elif self.rest_s <= -2.5 and self.rng.random() < 0.5 * seconds:
             self._visit()
 
-    def _flee(self, seen: Seen) -> None:
+    def _flee(self, seen: SeenPerson) -> None:
         """Run to a free spot straight away from the person, about two metres off, not past it."""
         centers = self.walker.floor.centers()
         off = centers - self.walker.position
@@ -122,8 +133,13 @@ class Policy:
         away = away / max(float(np.linalg.norm(away)), 1e-6)
         straight = (off @ away) / np.maximum(length, 1e-6)
         clear = np.minimum(np.linalg.norm(centers - seen.position, axis=-1), 3.0)
-        score = 0.5 * clear + 3.0 * straight - 1.6 * np.abs(length - FLIGHT_M) + self.rng.gumbel(0, 0.02, len(centers))
-        self.reason, self.fear_s, self.pace = "flee", 0.9, self.rng.uniform(1.7, 2.3)
+        score = (
+            0.5 * clear
+            + 3.0 * straight
+            - 1.6 * np.abs(length - FLIGHT_M)
+            + self.rng.gumbel(0, 0.02, len(centers))
+        )
+        self.reason, self.fear_s, self.speed_m_s = "flee", 0.9, self.rng.uniform(1.7, 2.3)
         self._leave()
         goal = centers[np.argmax(score)]
         self.place = self._refuge(goal, seen)
@@ -131,20 +147,24 @@ class Policy:
         self.wanted = np.array([0.0, 0.0, 0.7])
         self.rest_s = self.rng.uniform(1.4, 2.0)
 
-    def _refuge(self, goal: Ground, seen: Seen) -> Place | None:
+    def _refuge(self, goal: Ground, seen: SeenPerson) -> Place | None:
         """Return a high place close to where it runs, not on the person's side."""
         for place in self.places:
             entry = np.asarray(place.entry)
-            if place.position[1] > 0.1 and np.linalg.norm(entry - goal) < 0.8 and np.linalg.norm(entry - seen.position) > 1.3:
+            if (
+                place.position[1] > 0.1
+                and np.linalg.norm(entry - goal) < 0.8
+                and np.linalg.norm(entry - seen.position) > 1.3
+            ):
                 return place
         return None
 
-    def _approach(self, seen: Seen) -> None:
+    def _approach(self, seen: SeenPerson) -> None:
         """Walk up to about a metre from the person, a little to one side."""
         from_person = self.walker.position - seen.position
         angle = np.arctan2(from_person[0], from_person[1]) + self.rng.normal(0, 0.15)
         goal = seen.position + self.rng.uniform(0.9, 1.05) * np.array([np.sin(angle), np.cos(angle)])
-        self.reason, self.pace = "approach", self.rng.uniform(0.6, 0.9)
+        self.reason, self.speed_m_s = "approach", self.rng.uniform(0.6, 0.9)
         self._leave()
         self.walker.go(goal)
         self.wanted = np.zeros(3)
@@ -152,9 +172,13 @@ class Policy:
 
     def _visit(self) -> None:
         """Go to a favourite place, or just somewhere."""
-        weight = np.array([0.5 if self.perch is not None and place is self.perch else 1.0 for place in self.places])
-        weight *= np.exp(-0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places]))
-        self.reason, self.pace = "own", self.rng.choice([0.5, 0.7, 0.9, 1.3], p=[0.2, 0.4, 0.25, 0.15])
+        weight = np.array(
+            [0.5 if self.perch is not None and place is self.perch else 1.0 for place in self.places]
+        )
+        weight *= np.exp(
+            -0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places])
+        )
+        self.reason, self.speed_m_s = "own", self.rng.choice([0.5, 0.7, 0.9, 1.3], p=[0.2, 0.4, 0.25, 0.15])
         self._leave()
         if self.rng.random() < 0.75:
             self.place = self.places[self.rng.choice(len(self.places), p=weight / weight.sum())]
@@ -176,14 +200,18 @@ class Policy:
             self._jump(np.asarray(self.place.position, float))
         sit, lie = {"flee": (0.15, 0.0), "approach": (0.65, 0.1), "own": (0.4, 0.25)}[self.reason]
         draw = self.rng.random()
-        self.wanted = np.array([float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0])
+        self.wanted = np.array(
+            [float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0]
+        )
 
     def _jump(self, end: Float[np.ndarray, "3"]) -> None:
         self.leap = Leap(self.position, end)
         self.walker.speed = 0.0
 
-    def _faces(self, seen: Seen) -> float | None:
-        """Return where it turns to while it rests: out from a perch, towards a person that it minds, or nowhere."""
+    def _faces(self, seen: SeenPerson) -> float | None:
+        """Return where it turns to while it rests: out from a perch, towards a person that it minds, or
+        nowhere.
+        """
         if self.perch is not None:
             return self.perch.yaw
         if self.reason == "own" or self.distance > NOTICE_M or self.posture[:2].max() > 0.3:
@@ -197,14 +225,16 @@ class Policy:
         share = min(leap.elapsed_s / JUMP_S, 1.0)
         course = share * share * (3 - 2 * share)
         self.walker.position = (leap.start + course * (leap.end - leap.start))[[0, 2]]
-        self.height = float(leap.start[1] + course * (leap.end[1] - leap.start[1]) + 4 * 0.16 * share * (1 - share))
+        self.height = float(
+            leap.start[1] + course * (leap.end[1] - leap.start[1]) + 4 * 0.16 * share * (1 - share)
+        )
         toward = (leap.end - leap.start)[[0, 2]]
         error = (np.arctan2(toward[0], toward[1]) - self.walker.yaw + np.pi) % (2 * np.pi) - np.pi
         self.walker.yaw += float(np.clip(error, -9 * seconds, 9 * seconds))
         if share >= 1.0:
             self.height, self.leap = float(leap.end[1]), None
 
-    def _look(self, seconds: float, seen: Seen) -> None:
+    def _look(self, seconds: float, seen: SeenPerson) -> None:
         """Turn the gaze: at the person when it matters, else ahead or around."""
         self._gaze_s -= seconds
         ahead = self.position + np.array([np.sin(self.walker.yaw), 0.22, np.cos(self.walker.yaw)])
@@ -214,6 +244,8 @@ class Policy:
             self._gaze_s = self.rng.uniform(0.6, 2.2)
             watch = self.distance < NOTICE_M and self.rng.random() < (0.8 if self.reason != "own" else 0.4)
             person = np.array([seen.position[0], 1.2, seen.position[1]])
-            around = ahead + np.array([self.rng.uniform(-1, 1), self.rng.uniform(-0.2, 0.3), self.rng.uniform(-1, 1)])
+            around = ahead + np.array(
+                [self.rng.uniform(-1, 1), self.rng.uniform(-0.2, 0.3), self.rng.uniform(-1, 1)]
+            )
             self._gaze_goal = person if watch else around
         self.gaze = self.gaze + (self._gaze_goal - self.gaze) * (1 - np.exp(-seconds / 0.18))

@@ -10,24 +10,26 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline import processes, progress
-from pipeline.files import meshes
-from pipeline.space.meshes import Mesh
+from pipeline.core import processes, progress
+from pipeline.data import ply
+from pipeline.geometry.meshes import Mesh
 from stages.synthesize_capture import record3d, sheets
 from stages.synthesize_capture.animal import BONES, Animal
 from stages.synthesize_capture.film import Stage
 from stages.synthesize_capture.record3d import Header
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.script import Script
-from stages.synthesize_capture.truth import Truth, write_flow
+from stages.synthesize_capture.truth import TruthWriter, write_flow
 
 FLOW_PAIRS = 40
 THUMBNAILS = 6
 
 
 @dataclass(frozen=True)
-class Made:
-    """What is worth knowing about a finished recording: some frames (colour, animal outlined, depth) and shares."""
+class FilmedRecording:
+    """What is worth knowing about a finished recording: some frames (colour, animal outlined, depth) and
+    shares.
+    """
 
     name: str
     frames: int
@@ -37,7 +39,9 @@ class Made:
     depths: np.ndarray
 
 
-def produce(scripts: list[Script], creature: Animal, recordings: Path, truth: Path, *, workers: int) -> list[Made]:
+def produce(
+    scripts: list[Script], creature: Animal, recordings: Path, truth: Path, *, workers: int
+) -> list[FilmedRecording]:
     """Make everything, longest recordings first; return in the order of the scripts."""
     order = sorted(range(len(scripts)), key=lambda index: -len(scripts[index].timestamp_s))
     jobs = [(scripts[index], creature, recordings, truth) for index in order]
@@ -49,10 +53,10 @@ def produce(scripts: list[Script], creature: Animal, recordings: Path, truth: Pa
     return [made[index] for index in range(len(scripts))]
 
 
-def record(script: Script, creature: Animal, recordings: Path, truth_folder: Path) -> Made:
+def record(script: Script, creature: Animal, recordings: Path, truth_folder: Path) -> FilmedRecording:
     """Film one script into a `.r3d` file and its truth."""
     stage = Stage(script, creature)
-    truth = Truth(script, keep_depth=script.name == "heldout")
+    truth = TruthWriter(script, keep_depth=script.name == "heldout")
     chosen = set(np.linspace(0, len(script.timestamp_s) - 1, THUMBNAILS).astype(int).tolist())
     thumbnails, outlines, depths = [], [], []
     with record3d.Writer(recordings / f"{script.name}.r3d") as writer:
@@ -67,7 +71,7 @@ def record(script: Script, creature: Animal, recordings: Path, truth_folder: Pat
     truth.write(truth_folder)
     if script.session is not None:
         write_flow(stage, truth_folder, pairs=FLOW_PAIRS)
-    return Made(
+    return FilmedRecording(
         script.name,
         len(script.timestamp_s),
         float(truth.visible().mean()),
@@ -78,13 +82,15 @@ def record(script: Script, creature: Animal, recordings: Path, truth_folder: Pat
 
 
 def write_world(room: Room, creature: Animal, seed: int, folder: Path) -> None:
-    """Write the true room (as in the walk-through, world of the truth), the animal at rest (agent frame), and names."""
+    """Write the true room (as in the walk-through, world of the truth), the animal at rest (agent frame), and
+    names.
+    """
     about = {"seed": seed, "up": [0, 1, 0], "bones": [bone.name for bone in BONES]}
     (folder / "world.json").write_text(json.dumps(about, indent=1) + "\n")
     vertices, faces, coordinates, _owner = sheets.triangles(room.sheets())
-    meshes.write_ply(folder / "scene.ply", Mesh(vertices, faces, _room_colors(room, coordinates)))
+    ply.write_ply(folder / "scene.ply", Mesh(vertices, faces, _room_colors(room, coordinates)))
     color = (np.clip(creature.fur[:, :3], 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
-    meshes.write_ply(folder / "agent.ply", Mesh(creature.vertices, creature.faces, color))
+    ply.write_ply(folder / "agent.ply", Mesh(creature.vertices, creature.faces, color))
 
 
 def _room_colors(room: Room, coordinates: np.ndarray) -> UInt8[np.ndarray, "vertex 3"]:

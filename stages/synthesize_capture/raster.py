@@ -1,8 +1,9 @@
 """See surfaces through a pinhole camera: scan-convert triangles without clipping.
 
-For a triangle with corners M = [v0 v1 v2] in camera axes, the barycentric coordinates of the ray d = (x, y, 1)
-divided by its depth are M^-1 d, and their sum is 1 / depth (Olano and Greer 1997). Each is linear along a
-row of pixels, so a row's span follows from three inequalities; triangles that pass behind the camera need no clipping.
+For a triangle with corners M = [v0 v1 v2] in camera axes, the barycentric coordinates of the ray d = (x, y,
+1) divided by its depth are M^-1 d, and their sum is 1 / depth (Olano and Greer 1997). Each is linear along a
+row of pixels, so a row's span follows from three inequalities; triangles that pass behind the camera need no
+clipping.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ NEAR_M = 0.03
 
 
 @dataclass(frozen=True)
-class View:
+class RasterView:
     """What a camera sees: nearest face per sample (-1 none), 1 / depth, and M^-1 per face."""
 
     face: Int[np.ndarray, "height width"]
@@ -29,14 +30,21 @@ def see(
     intrinsics: Float[np.ndarray, "3 3"],
     height: int,
     width: int,
-) -> View:
+) -> RasterView:
     """Find the nearest face through each pixel centre; both sides of a face are seen."""
     face = np.full((height, width), -1, np.int32)
     inverse_depth = np.zeros((height, width), np.float32)
     inverse_corners = np.zeros((len(faces), 3, 3), np.float64)
     focal_center = np.array([intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]])
-    _scan(np.ascontiguousarray(points_camera, np.float64), faces, focal_center, inverse_corners, face, inverse_depth)
-    return View(face, inverse_depth, inverse_corners)
+    _scan(
+        np.ascontiguousarray(points_camera, np.float64),
+        faces,
+        focal_center,
+        inverse_corners,
+        face,
+        inverse_depth,
+    )
+    return RasterView(face, inverse_depth, inverse_corners)
 
 
 @njit(cache=True, error_model="numpy")
@@ -97,7 +105,9 @@ def _invert(a, b, c, out):
 
 @njit(cache=True, error_model="numpy")
 def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height, width):
-    """Return exact z-depth ``[height width]`` (0 = nothing) at the pixel centres of the view in another size."""
+    """Return exact z-depth ``[height width]`` (0 = nothing) at the pixel centres of the view in another
+    size.
+    """
     depth = np.zeros((height, width), np.float32)
     fx, fy, cx, cy = focal_center
     rows, columns = face_of.shape
@@ -109,7 +119,11 @@ def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height,
                 x, y = (j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy
                 total = 0.0
                 for k in range(3):
-                    total += inverse_corners[face, k, 0] * x + inverse_corners[face, k, 1] * y + inverse_corners[face, k, 2]
+                    total += (
+                        inverse_corners[face, k, 0] * x
+                        + inverse_corners[face, k, 1] * y
+                        + inverse_corners[face, k, 2]
+                    )
                 near = inverse_depth[row, column]
                 depth[i, j] = 1.0 / min(max(total, 0.97 * near), 1.03 * near)
     return depth

@@ -15,7 +15,7 @@ import lzfse
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.space import cameras, rigid
+from pipeline.geometry import cameras, rigid
 
 _ZIP_TIME = (2024, 6, 1, 12, 0, 0)
 
@@ -74,18 +74,26 @@ class Writer:
         confidence: UInt8[np.ndarray, "rows columns"],
     ) -> None:
         """Append one frame: RGB, depth in metres (float32), confidence 0 to 2."""
-        done, jpeg = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
+        done, jpeg = cv2.imencode(
+            ".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]
+        )
         assert done, "JPEG encoding failed"
         self._member(f"rgbd/{self._count}.jpg", jpeg.tobytes())
-        self._member(f"rgbd/{self._count}.depth", lzfse.compress(np.ascontiguousarray(depth, "<f4").tobytes()))
-        self._member(f"rgbd/{self._count}.conf", lzfse.compress(np.ascontiguousarray(confidence, np.uint8).tobytes()))
+        self._member(
+            f"rgbd/{self._count}.depth", lzfse.compress(np.ascontiguousarray(depth, "<f4").tobytes())
+        )
+        self._member(
+            f"rgbd/{self._count}.conf", lzfse.compress(np.ascontiguousarray(confidence, np.uint8).tobytes())
+        )
         if self._count == 0:
             self._member("icon", jpeg.tobytes())
         self._count += 1
 
     def finish(self, header: Header) -> None:
         """Write the metadata, after the frames."""
-        assert len(header.timestamp_s) == self._count, f"{self._count} frames, {len(header.timestamp_s)} timestamps"
+        assert len(header.timestamp_s) == self._count, (
+            f"{self._count} frames, {len(header.timestamp_s)} timestamps"
+        )
         self._member("metadata", json.dumps(header.metadata()).encode())
 
     def _member(self, name: str, data: bytes) -> None:

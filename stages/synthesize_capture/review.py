@@ -1,4 +1,6 @@
-"""Judge the made world: does the animal move, does it answer people, is it seen; and draw it for the report."""
+"""Judge the made world: does the animal move, does it answer people, is it seen; and draw it for the
+report.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline import qa
-from pipeline.qa import Check, Picture
+from pipeline.data import qa
+from pipeline.data.qa import Check, Picture
 from stages.synthesize_capture.policy import REASONS
-from stages.synthesize_capture.produce import Made
+from stages.synthesize_capture.produce import FilmedRecording
 from stages.synthesize_capture.room import DEPTH_M, WIDTH_M
 from stages.synthesize_capture.script import MOVING_M_S, Script
 from stages.synthesize_capture.session import STEP_S, SessionTrajectories
@@ -37,36 +39,64 @@ def manner(sessions: list[SessionTrajectories]) -> Manner:
     for lived in sessions:
         speed = lived.animal.speed()
         reach = round(WINDOW_S / STEP_S)
-        moving += [float(speed[start : start + reach].mean() > MOVING_M_S) for start in range(0, max(len(speed) - reach, 1), 6)]
+        moving += [
+            float(speed[start : start + reach].mean() > MOVING_M_S)
+            for start in range(0, max(len(speed) - reach, 1), 6)
+        ]
         flee = _begins(lived.reason == REASONS.index("flee"))
-        ran += [bool(flee[max(start - 15, 0) : start + 30].any()) for start in np.flatnonzero(_begins(_pressed(lived)))]
+        ran += [
+            bool(flee[max(start - 15, 0) : start + 30].any())
+            for start in np.flatnonzero(_begins(_pressed(lived)))
+        ]
         away = ~_pressed(lived) & (_distance(lived) > 1.6)
-        alone += [bool(flee[start : start + 30].any()) for start in range(0, len(flee), 30) if away[max(start - 20, 0) : start + 30].all()]
+        alone += [
+            bool(flee[start : start + 30].any())
+            for start in range(0, len(flee), 30)
+            if away[max(start - 20, 0) : start + 30].all()
+        ]
     return Manner(_mean(moving), _mean(ran), _mean(alone))
 
 
-def report_quality(folder: Path, scripts: list[Script], made: list[Made]) -> None:
+def report_quality(folder: Path, scripts: list[Script], made: list[FilmedRecording]) -> None:
     """Write the stage's checks and pictures into the artifact in the making."""
     shown = manner([part.session for part in scripts if part.session is not None])
     visible = _mean([part.visible_share for part in made if part.outlines.any()])
     qa.write(
         folder,
-        good="a lived-in room under changing light, and a cat that walks, sits and runs from whoever comes close",
+        good=(
+            "a lived-in room under changing light, and a cat that walks, "
+            "sits and runs from whoever comes close"
+        ),
         bad="an animal that never moves or is never in the picture",
         checks=[
             Check("windows in which the animal moves", shown.moving_windows, "share", 0.5, 0.4, "higher"),
-            Check("quick approaches that it runs from", shown.flees_when_approached, "share", 0.6, None, "higher"),
+            Check(
+                "quick approaches that it runs from",
+                shown.flees_when_approached,
+                "share",
+                0.6,
+                None,
+                "higher",
+            ),
             Check("seconds left alone in which it runs", shown.flees_when_left_alone, "share", 0.1, None),
             Check("frames that show the animal", visible, "share", 0.7, 0.5, "higher"),
         ],
         pictures=[
-            Picture("contact_sheet", contact_sheet(made), "Every recording, the animal's true outline, stored depth"),
-            Picture("birds_eye", birds_eye(scripts), "From above: the phone (blue), the animal (orange), its flights (red)"),
+            Picture(
+                "contact_sheet",
+                contact_sheet(made),
+                "Every recording, the animal's true outline, stored depth",
+            ),
+            Picture(
+                "birds_eye",
+                birds_eye(scripts),
+                "From above: the phone (blue), the animal (orange), its flights (red)",
+            ),
         ],
     )
 
 
-def contact_sheet(made: list[Made]) -> UInt8[np.ndarray, "height width 3"]:
+def contact_sheet(made: list[FilmedRecording]) -> UInt8[np.ndarray, "height width 3"]:
     """Show frames of every recording, one a row: the animal's true outline in magenta, then stored depth."""
     rows = []
     for recording in made:
@@ -76,7 +106,9 @@ def contact_sheet(made: list[Made]) -> UInt8[np.ndarray, "height width 3"]:
             picture[cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0] = (255, 0, 255)
             pictures.append(picture)
         for depth in recording.depths[1::3]:
-            turbo = cv2.applyColorMap(np.clip(depth * 50, 0, 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+            turbo = cv2.applyColorMap(np.clip(depth * 50, 0, 255).astype(np.uint8), cv2.COLORMAP_TURBO)[
+                ..., ::-1
+            ]
             turbo[depth <= 0] = 0
             pictures.append(cv2.resize(turbo, color.shape[1::-1], interpolation=cv2.INTER_NEAREST))
         rows.append(np.hstack(pictures))
@@ -95,8 +127,12 @@ def _from_above(script: Script) -> UInt8[np.ndarray, "height width 3"]:
         corners = cv2.boxPoints(((0, 0), block.size, 0.0))
         cosine, sine = np.cos(block.yaw), np.sin(block.yaw)
         turned = corners @ np.array([[cosine, -sine], [sine, cosine]]) + np.asarray(block.center)
-        cv2.fillConvexPoly(canvas, _pixels(turned), (205, 205, 200) if block.bottom == 0 else (228, 226, 220), cv2.LINE_AA)
-    cv2.polylines(canvas, [_pixels(script.world_from_camera[:, [0, 2], 3])], False, (60, 110, 220), 2, cv2.LINE_AA)
+        cv2.fillConvexPoly(
+            canvas, _pixels(turned), (205, 205, 200) if block.bottom == 0 else (228, 226, 220), cv2.LINE_AA
+        )
+    cv2.polylines(
+        canvas, [_pixels(script.world_from_camera[:, [0, 2], 3])], False, (60, 110, 220), 2, cv2.LINE_AA
+    )
     for pose in script.world_from_camera[::15]:
         start = pose[[0, 2], 3]
         cv2.arrowedLine(

@@ -1,9 +1,9 @@
 """The home: one furnished living room as sheets, footprints, favourite places and lights.
 
-`furnish` builds it from a generator: walls with faint plaster, a repeating plank floor, and strong
-features only where homes have them. `Room.arranged` puts the movable things somewhere else for another session.
-Frame: the world of the truth, +y up, floor at y = 0, metres; x along the long side, z along the short one.
-The pieces of `furniture.py` stand about their own origins with their backs to -z; `furnish` puts them up.
+`furnish` builds it from a generator: walls with faint plaster, a repeating plank floor, and strong features
+only where homes have them. `Room.arranged` puts the movable things somewhere else for another session. Frame:
+the world of the truth, +y up, floor at y = 0, metres; x along the long side, z along the short one. The
+pieces of `furniture.py` stand about their own origins with their backs to -z; `furnish` puts them up.
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +32,9 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Place:
-    """A place the animal likes: where it stands, which way it looks, the spot on the floor from which it jumps up."""
+    """A place the animal likes: where it stands, which way it looks, the spot on the floor from which it
+    jumps up.
+    """
 
     name: str
     position: tuple[float, float, float]
@@ -83,7 +85,9 @@ class Room:
         return [*self.standing, *moved]
 
     def arranged(self, rng: np.random.Generator) -> "Room":
-        """Return the room after people moved its loose things: each is shifted and turned, some a good way."""
+        """Return the room after people moved its loose things: each is shifted and turned, some a good
+        way.
+        """
         arrangement = np.array([thing.home for thing in self.movables], float)
         far = rng.random(len(arrangement)) < 0.6
         reach = np.where(far, 0.45, 0.08)[:, None]
@@ -95,7 +99,9 @@ class Room:
 
 
 def furnish(rng: np.random.Generator) -> Room:
-    """Build the room with its usual arrangement; colours, prints and small offsets come from the generator."""
+    """Build the room with its usual arrangement; colours, prints and small offsets come from the
+    generator.
+    """
     x, z = WIDTH_M / 2, DEPTH_M / 2
     stands = {
         "sofa": (-0.75, -z + 0.5, 0.0),
@@ -114,17 +120,22 @@ def furnish(rng: np.random.Generator) -> Room:
     }
     pieces = {name: furniture.MAKERS[name](rng) for name in stands}
     fixed = shell(rng)
-    fixed += [sheet.moved(sheets.upright(*stands[name])) for name, piece in pieces.items() for sheet in piece.sheets]
+    fixed += [
+        sheet.moved(sheets.upright(*stands[name])) for name, piece in pieces.items() for sheet in piece.sheets
+    ]
     standing = tuple(
         Footprint((px, pz), pieces[name].size, yaw, pieces[name].bottom, pieces[name].top)
         for name, (px, pz, yaw) in stands.items()
         if pieces[name].top > 0.1
     )
     movables = tuple(
-        Movable(tuple(piece.sheets), piece.size, piece.top, home) for piece, home in zip(furniture.loose_things(rng), _HOMES, strict=True)
+        Movable(tuple(piece.sheets), piece.size, piece.top, home)
+        for piece, home in zip(furniture.loose_things(rng), _HOMES, strict=True)
     )
     lamp = (stands["lamp"][0], 1.62, stands["lamp"][1])
-    return Room(tuple(fixed), movables, np.array(_HOMES, float), standing, _places(stands), WINDOW_CORNER, lamp)
+    return Room(
+        tuple(fixed), movables, np.array(_HOMES, float), standing, _places(stands), WINDOW_CORNER, lamp
+    )
 
 
 _HOMES = (
@@ -168,7 +179,9 @@ def _shell(rng: np.random.Generator) -> list[Sheet]:
         sheets.flat((-x, y, z), (0, 0, -2 * z), (0, -y, 0), strong),
         sheets.flat((x, y, -z), (0, 0, 2 * z), (0, -y, 0), plaster),
         sheets.flat((-x, 0, -z), (2 * x, 0, 0), (0, 0, 2 * z), texture.planks(rng, (158, 122, 86))),
-        sheets.flat((-x, y, z), (2 * x, 0, 0), (0, 0, -2 * z), texture.plain(rng, (226, 224, 218), clouds=1.5)),
+        sheets.flat(
+            (-x, y, z), (2 * x, 0, 0), (0, 0, -2 * z), texture.plain(rng, (226, 224, 218), clouds=1.5)
+        ),
     ]
     skirting = texture.plain(rng, (224, 220, 210))
     board = [
@@ -188,7 +201,12 @@ def _shell(rng: np.random.Generator) -> list[Sheet]:
     panels = [
         sheet
         for y0 in (0.55, 1.45)
-        for sheet in sheets.box((1.0, y0, z - 0.042), (0.56, 0.7, 0.014), texture.wood(rng, (186, 172, 150), contrast=3), skip="+z")
+        for sheet in sheets.box(
+            (1.0, y0, z - 0.042),
+            (0.56, 0.7, 0.014),
+            texture.wood(rng, (186, 172, 150), contrast=3),
+            skip="+z",
+        )
     ]
     return [*walls, *board, *leaf, *around, *handle, *panels]
 
@@ -205,7 +223,12 @@ def _window(rng: np.random.Generator) -> list[Sheet]:
     radiator = [
         sheet
         for k in range(12)
-        for sheet in sheets.box((x - 0.07, 0.42, -0.55 + 0.1 * k), (0.09, 0.6, 0.07), texture.plain(rng, (220, 220, 214)), skip="+x -y")
+        for sheet in sheets.box(
+            (x - 0.07, 0.42, -0.55 + 0.1 * k),
+            (0.09, 0.6, 0.07),
+            texture.plain(rng, (220, 220, 214)),
+            skip="+x -y",
+        )
     ]
     pot = sheets.cylinder(
         (x - 0.1, 0.97, 0.45),

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.space import cameras, rigid
+from pipeline.geometry import cameras, rigid
 from stages.synthesize_capture import camera_motion, dwellings, gait, light, sensor, session
-from stages.synthesize_capture.gait import Motion
+from stages.synthesize_capture.config import Config
+from stages.synthesize_capture.gait import AnimalMotion
 from stages.synthesize_capture.light import Hour, Light
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.sensor import Exposure
@@ -19,25 +20,18 @@ from stages.synthesize_capture.session import AnimalCourse, SessionTrajectories
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Which recordings to make; see the stage's Config for units."""
+class PhoneFormat:
+    """What the phone stores; a LiDAR phone's depth, and its colour small enough to render on two cores."""
 
-    seed: int
-    session_count: int
-    session_s: float
-    test_session_s: float
-    walkthrough_s: float
-    turnaround_s: float
-    heldout_of: int
-    record_fps: float
-    dim_session: int
-    sideways_session: int
-    harsh_session: int
-    foreign_sessions: int
-    color_height: int
-    color_width: int
-    depth_height: int
-    depth_width: int
+    fps: float = 15.0
+    """Frames per second."""
+    color_size: tuple[int, int] = (320, 240)
+    """Height and width of the stored portrait canvas, pixels."""
+    depth_size: tuple[int, int] = (256, 192)
+    """Height and width of the stored depth, pixels."""
+
+
+PHONE = PhoneFormat()
 
 
 @dataclass(frozen=True)
@@ -57,7 +51,7 @@ class Script:
     """fx, fy, cx, cy in stored colour pixels."""
     odometry_from_camera: Float[np.ndarray, "frame 4 4"]
     gain: Float[np.ndarray, "frame"]
-    motion: Motion | None
+    motion: AnimalMotion | None
     moving: np.ndarray
     quarter_turns: int
     """Clockwise turns that make the stored picture upright."""
@@ -71,37 +65,50 @@ MOVING_M_S = 0.15
 """Above this speed over ground the animal counts as moving."""
 
 
-def scripts(plan: Plan, room: Room) -> list[Script]:
+def scripts(config: Config, room: Room, phone: PhoneFormat = PHONE) -> list[Script]:
     """Write all scripts: walk-through, turnaround, sessions, and the second phone of one session."""
-    streams = iter(np.random.default_rng([plan.seed, 1]).spawn(4 * plan.session_count + 16 + plan.foreign_sessions))
+    streams = iter(
+        np.random.default_rng([config.seed, 1]).spawn(4 * config.session_count + 16 + config.foreign_sessions)
+    )
     day = light.light_of_session(next(streams), "day")
     rng = next(streams)
     out = [
         _script(
-            plan,
+            phone,
             rng,
             "walkthrough",
             room,
             day,
-            camera_motion.walkthrough(room, rng, plan.walkthrough_s),
-            plan.walkthrough_s,
+            camera_motion.walkthrough(room, rng, config.walkthrough_s),
+            config.walkthrough_s,
         )
     ]
     rng = next(streams)
-    course = session.standing_course(room, rng, plan.turnaround_s)
-    out.append(_script(plan, rng, "turnaround", room, day, camera_motion.turnaround(course, rng), plan.turnaround_s, course=course))
-    for number in range(1, plan.session_count + 1):
+    course = session.standing_course(room, rng, config.turnaround_s)
+    out.append(
+        _script(
+            phone,
+            rng,
+            "turnaround",
+            room,
+            day,
+            camera_motion.turnaround(course, rng),
+            config.turnaround_s,
+            course=course,
+        )
+    )
+    for number in range(1, config.session_count + 1):
         rng = next(streams)
-        seconds = plan.test_session_s if number == plan.session_count else plan.session_s
+        seconds = config.test_session_s if number == config.session_count else config.session_s
         arranged = room.arranged(rng)
-        hour: Hour = {plan.dim_session: "evening", plan.harsh_session: "sunset"}.get(number, "day")
+        hour: Hour = {config.dim_session: "evening", config.harsh_session: "sunset"}.get(number, "day")
         lit = light.light_of_session(rng, hour)
         lived = session.simulate_session(arranged, rng, seconds)
         path = camera_motion.filming(lived, rng)
-        turns = 1 if number == plan.sideways_session else 0
+        turns = 1 if number == config.sideways_session else 0
         out.append(
             _script(
-                plan,
+                phone,
                 rng,
                 f"session-{number}",
                 arranged,
@@ -115,24 +122,36 @@ def scripts(plan: Plan, room: Room) -> list[Script]:
             )
         )
         rng = next(streams)
-        if number == plan.heldout_of:
+        if number == config.heldout_of:
             path = camera_motion.bystanding(lived, arranged, rng)
-            out.append(_script(plan, rng, "heldout", arranged, lit, path, seconds, course=lived.animal, hour=hour))
-    return [*out, *_foreign(plan, streams)]
+            out.append(
+                _script(phone, rng, "heldout", arranged, lit, path, seconds, course=lived.animal, hour=hour)
+            )
+    return [*out, *_foreign(config, phone, streams)]
 
 
-def _foreign(plan: Plan, streams: Iterator[np.random.Generator]) -> Iterator[Script]:
+def _foreign(config: Config, phone: PhoneFormat, streams: Iterator[np.random.Generator]) -> Iterator[Script]:
     """Write the sessions of other homes; those of this one are the same with and without them."""
-    for number in range(plan.session_count + 1, plan.session_count + plan.foreign_sessions + 1):
+    for number in range(config.session_count + 1, config.session_count + config.foreign_sessions + 1):
         rng = next(streams)
         home = dwellings.filmed_elsewhere(rng)
-        lived = session.simulate_session(home, rng, plan.session_s)
+        lived = session.simulate_session(home, rng, config.session_s)
         lit, path = light.light_of_session(rng, "day"), camera_motion.filming(lived, rng)
-        yield _script(plan, rng, f"session-{number}", home, lit, path, plan.session_s, course=lived.animal, lived=lived)
+        yield _script(
+            phone,
+            rng,
+            f"session-{number}",
+            home,
+            lit,
+            path,
+            config.session_s,
+            course=lived.animal,
+            lived=lived,
+        )
 
 
 def _script(
-    plan: Plan,
+    phone: PhoneFormat,
     rng: np.random.Generator,
     name: str,
     room: Room,
@@ -145,7 +164,7 @@ def _script(
     hour: Hour = "day",
     turns: int = 0,
 ) -> Script:
-    timestamp_s = sensor.timestamps(rng, duration_s, plan.record_fps)
+    timestamp_s = sensor.timestamps(rng, duration_s, phone.fps)
     upright = rigid.interpolate(np.arange(len(path)) * session.STEP_S, path, timestamp_s)
     stored = cameras.turn_camera(upright, -turns)
     exposure = sensor.exposure_of_recording(rng, hour)
@@ -160,14 +179,14 @@ def _script(
         exposure=exposure,
         timestamp_s=timestamp_s,
         world_from_camera=stored,
-        intrinsics=sensor.lens(rng, timestamp_s, plan.color_width, plan.color_height),
+        intrinsics=sensor.lens(rng, timestamp_s, phone.color_size[1], phone.color_size[0]),
         odometry_from_camera=sensor.odometry(rng, timestamp_s, stored),
         gain=sensor.gains(rng, timestamp_s, exposure),
         motion=None if course is None else gait.poses(course, timestamp_s),
         moving=moving,
         quarter_turns=turns,
-        color_size=(plan.color_height, plan.color_width),
-        depth_size=(plan.depth_height, plan.depth_width),
-        fps=plan.record_fps,
+        color_size=phone.color_size,
+        depth_size=phone.depth_size,
+        fps=phone.fps,
         session=lived,
     )

@@ -1,4 +1,5 @@
-"""What the phone makes of light, distance and motion: timestamps, lens, picture, LiDAR depth, drifting odometry.
+"""What the phone makes of light, distance and motion: timestamps, lens, picture, LiDAR depth, drifting
+odometry.
 
 Each function turns truth into what a Record3D phone would store; none of them knows about files.
 """
@@ -10,16 +11,20 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 from stages.synthesize_capture.light import Hour
 
 DEPTH_REACH_M = 5.0
-_TONE = (np.clip(1.06 * (1 - np.exp(-1.9 * np.linspace(0, 2.5, 4096))), 0, 1) ** (1 / 2.2) * 255).astype(np.float32)
+_TONE = (np.clip(1.06 * (1 - np.exp(-1.9 * np.linspace(0, 2.5, 4096))), 0, 1) ** (1 / 2.2) * 255).astype(
+    np.float32
+)
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """How one recording is exposed: gain on linear light and its slow wander, white balance, noise at unit signal."""
+    """How one recording is exposed: gain on linear light and its slow wander, white balance, noise at unit
+    signal.
+    """
 
     gain: float
     gain_wander: float
@@ -29,7 +34,9 @@ class Exposure:
 
 
 def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
-    """Draw an exposure; the evening is lifted by gain, stays darker, noisier and more blurred, the sunset is overexposed."""
+    """Draw an exposure; the evening is lifted by gain, stays darker, noisier and more blurred, the sunset is
+    overexposed.
+    """
     balance = 1.0 + rng.uniform(-0.07, 0.07, 3)
     balance[1] = 1.0
     if hour == "sunset":
@@ -40,7 +47,9 @@ def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
 
 
 def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float[np.ndarray, "frame"]:
-    """Return recorded times from 0: nominal rate, a millisecond of jitter, now and then one to three frames lost."""
+    """Return recorded times from 0: nominal rate, a millisecond of jitter, now and then one to three frames
+    lost.
+    """
     times = np.arange(int(duration_s * fps + 1e-6) + 1) / fps
     times[1:] += np.clip(rng.normal(0, 0.0012, len(times) - 1), -0.004, 0.004)
     keep = np.ones(len(times), bool)
@@ -50,17 +59,23 @@ def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float
     return times[keep]
 
 
-def lens(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], width: int, height: int) -> Float[np.ndarray, "frame 4"]:
+def lens(
+    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], width: int, height: int
+) -> Float[np.ndarray, "frame 4"]:
     """Return fx, fy, cx, cy per frame: about 54 by 68 degrees, with a stabiliser and a focus that wander."""
     focal = 235.0 / 240.0 * width * rng.uniform(0.985, 1.015)
     center = np.array([width, height]) / 2 + rng.normal(0, 0.004 * width, 2)
     wander = [_slow(rng, timestamp_s, 1.2) for _ in range(3)]
     fx = focal * (1 + 0.0012 * wander[0])
-    return np.stack([fx, fx, center[0] + 0.0022 * width * wander[1], center[1] + 0.0022 * width * wander[2]], axis=-1)
+    return np.stack(
+        [fx, fx, center[0] + 0.0022 * width * wander[1], center[1] + 0.0022 * width * wander[2]], axis=-1
+    )
 
 
 def odometry(
-    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], world_from_camera: Float[np.ndarray, "frame 4 4"]
+    rng: np.random.Generator,
+    timestamp_s: Float[np.ndarray, "frame"],
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Return the phone's own poses: gravity-aligned, a new origin and heading, drifting.
 
@@ -96,7 +111,9 @@ def picture(
     """Expose linear light: motion blur along ``blur_px``, vignette, photon and read noise, tone curve."""
     image = _smeared(linear, blur_px)
     height, width, _ = image.shape
-    image = image * (exposure.gain * gain * exposure.white_balance).astype(np.float32) * _vignette(height, width)
+    image = (
+        image * (exposure.gain * gain * exposure.white_balance).astype(np.float32) * _vignette(height, width)
+    )
     noise = rng.standard_normal(image.shape, dtype=np.float32)
     image += exposure.noise * np.sqrt(0.02 + image) * noise
     return _TONE[np.clip(image * (4095 / 2.5), 0, 4095).astype(np.uint16)].astype(np.uint8)
@@ -107,8 +124,8 @@ def lidar(
 ) -> tuple[Float[np.ndarray, "height width"], UInt8[np.ndarray, "height width"]]:
     """Return LiDAR-like depth (metres, float32; 0 or NaN unknown) and confidence 0 low, 1 medium, 2 high.
 
-    Range noise of half a per cent plus 4 mm with a spatial grain, outlines that wander by a pixel and smear into
-    mixed pixels, holes along some edges, nothing past 5 m.
+    Range noise of half a per cent plus 4 mm with a spatial grain, outlines that wander by a pixel and smear
+    into mixed pixels, holes along some edges, nothing past 5 m.
     """
     height, width = depth.shape
     bend = cv2.resize(
@@ -117,15 +134,21 @@ def lidar(
         interpolation=cv2.INTER_LINEAR,
     )
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    seen = cv2.remap(depth, x + 0.7 * bend[..., 0], y + 0.7 * bend[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.remap(
+        depth,
+        x + 0.7 * bend[..., 0],
+        y + 0.7 * bend[..., 1],
+        cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     mixed = cv2.blur(seen, (3, 3))
     jump = cv2.morphologyEx(seen, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     edge = jump > 0.05 + 0.03 * seen
     seen = np.where(edge & (bend[..., 0] > 0.1), mixed, seen)
     grain = cv2.GaussianBlur(rng.standard_normal((height, width), dtype=np.float32), (0, 0), 1.6) * 5.6
-    measured = seen + (0.005 * seen + 0.004) * (0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)).astype(
-        np.float32
-    )
+    measured = seen + (0.005 * seen + 0.004) * (
+        0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)
+    ).astype(np.float32)
     slope = jump / np.maximum(seen, 0.3)
     confidence = np.where(slope > 0.09, 0, np.where((slope > 0.035) | (seen > 3.8), 1, 2)).astype(np.uint8)
     confidence = cv2.erode(confidence, np.ones((3, 3), np.uint8))
@@ -143,14 +166,20 @@ def motion_blur_px(
     focal_px: float,
     shutter_s: float,
 ) -> Float[np.ndarray, "frame 2"]:
-    """Return how far (x, y) the picture's centre moves while the shutter is open, from the camera's turning."""
-    turn = rigid.vector_from_rotation(np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3])
+    """Return how far (x, y) the picture's centre moves while the shutter is open, from the camera's
+    turning.
+    """
+    turn = rigid.vector_from_rotation(
+        np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
+    )
     rate = turn / np.diff(timestamp_s)[:, None]
     rate = np.concatenate([rate, rate[-1:]])
     return np.stack([-rate[:, 1], rate[:, 0]], axis=-1) * focal_px * shutter_s
 
 
-def gains(rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], exposure: Exposure) -> Float[np.ndarray, "frame"]:
+def gains(
+    rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], exposure: Exposure
+) -> Float[np.ndarray, "frame"]:
     """Return the automatic exposure's slow wander, around 1."""
     return np.exp(exposure.gain_wander * _slow(rng, timestamp_s, 2.5))
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from stages.synthesize_capture.navigation import floor_for
-from stages.synthesize_capture.observer import FILMING, Habits, Observer
-from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, Seen
+from stages.synthesize_capture.observer import FILMING, Observer, ObserverStyle
+from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, SeenPerson
 from stages.synthesize_capture.room import Room
 
 STEP_S = 1.0 / 30.0
@@ -52,23 +52,29 @@ class SessionTrajectories:
     """Index into `policy.REASONS`."""
 
 
-def simulate_session(room: Room, rng: np.random.Generator, duration_s: float, habits: Habits = FILMING) -> SessionTrajectories:
+def simulate_session(
+    room: Room, rng: np.random.Generator, duration_s: float, style: ObserverStyle = FILMING
+) -> SessionTrajectories:
     """Simulate one session in a room; the same generator state gives the same session."""
     animal_floor = floor_for(room.footprints(), breadth_m=ANIMAL_BREADTH_M, height_m=ANIMAL_HEIGHT_M)
     person_floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
     start = person_floor.centers()[rng.integers(person_floor.free.sum())]
     centers = animal_floor.centers()
-    begin = centers[np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))]
+    begin = centers[
+        np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))
+    ]
     animal = Policy(animal_floor, room.places, begin, rng)
-    observer = Observer(person_floor, start, rng, habits)
-    past: deque[Seen] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
+    observer = Observer(person_floor, start, rng, style)
+    past: deque[SeenPerson] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
     count = int(np.ceil(duration_s / STEP_S)) + 2
     rows: list[tuple] = []
     for _ in range(count):
         observer.step(STEP_S, animal.position)
-        past.append(Seen(observer.walker.position.copy(), observer.velocity.copy()))
+        past.append(SeenPerson(observer.walker.position.copy(), observer.velocity.copy()))
         animal.step(STEP_S, past[0])
-        mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (1.0 - 0.6 * animal.posture[:2].sum())
+        mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (
+            1.0 - 0.6 * animal.posture[:2].sum()
+        )
         rows.append(
             (
                 animal.position,
@@ -84,7 +90,9 @@ def simulate_session(room: Room, rng: np.random.Generator, duration_s: float, ha
         )
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     timestamp_s = np.arange(count) * STEP_S
-    course = AnimalCourse(timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5])
+    course = AnimalCourse(
+        timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5]
+    )
     return SessionTrajectories(course, columns[6], columns[7], columns[8])
 
 
@@ -104,4 +112,6 @@ def standing_course(room: Room, rng: np.random.Generator, duration_s: float) -> 
         current = goal if current is None else current + (goal - current) * (1 - np.exp(-STEP_S / 0.3))
         gaze[index] = current
     still = np.zeros(count)
-    return AnimalCourse(np.arange(count) * STEP_S, position, yaw, np.zeros((count, 3)), still, gaze, still + 0.1)
+    return AnimalCourse(
+        np.arange(count) * STEP_S, position, yaw, np.zeros((count, 3)), still, gaze, still + 0.1
+    )

@@ -1,7 +1,9 @@
-"""Turn what the camera sees into light: lit pictures through mip maps, fur on the animal, a soft shadow under it.
+"""Turn what the camera sees into light: lit pictures through mip maps, fur on the animal, a soft shadow under
+it.
 
 `Backdrop` holds a recording's lit room as one mesh with an atlas of mip maps; `shade` makes a linear RGB
-image from a view at twice the image's size: pixels whose four samples agree are shaded once, edges four times.
+image from a view at twice the image's size: pixels whose four samples agree are shaded once, edges four
+times.
 """
 
 from dataclasses import dataclass
@@ -44,7 +46,9 @@ def backdrop(sheets: list[Sheet], lit: list[UInt8[np.ndarray, "height width 3"]]
             levels[index, level] = start, height, width
             parts.append(picture.reshape(-1))
             start += picture.size
-            picture = cv2.resize(picture, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
+            picture = cv2.resize(
+                picture, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA
+            )
     density = np.array(
         [picture.shape[1] / max(sheet.size_m()[1], 1e-3) for sheet, picture in zip(sheets, lit, strict=True)],
         np.float32,
@@ -52,7 +56,16 @@ def backdrop(sheets: list[Sheet], lit: list[UInt8[np.ndarray, "height width 3"]]
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    return Backdrop(vertices, faces, coordinates[faces], owner, normal.astype(np.float32), np.concatenate(parts), levels, density)
+    return Backdrop(
+        vertices,
+        faces,
+        coordinates[faces],
+        owner,
+        normal.astype(np.float32),
+        np.concatenate(parts),
+        levels,
+        density,
+    )
 
 
 @dataclass(frozen=True)
@@ -70,9 +83,15 @@ class Coat:
 
 
 def shade(
-    view_face, inverse_corners, focal_center, room: Backdrop, coat: Coat, camera_from_world: Float[np.ndarray, "4 4"]
+    view_face,
+    inverse_corners,
+    focal_center,
+    room: Backdrop,
+    coat: Coat,
+    camera_from_world: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "height width 3"]:
-    """Return linear RGB of a view whose samples are twice as dense; ``focal_center`` = fx fy cx cy of the image.
+    """Return linear RGB of a view whose samples are twice as dense; ``focal_center`` = fx fy cx cy of the
+    image.
 
     Faces from ``len(room.faces)`` on are the animal's.
     """
@@ -146,7 +165,23 @@ def _shade(
                 if face >= room_faces:
                     _fur(coat_faces[face - room_faces], a, b, c, rest, light, pattern, z / fx, pixel)
                 else:
-                    _sample(face, a, b, c, x, y, z, fx, surface[face], corners, atlas, levels, density, normals, pixel)
+                    _sample(
+                        face,
+                        a,
+                        b,
+                        c,
+                        x,
+                        y,
+                        z,
+                        fx,
+                        surface[face],
+                        corners,
+                        atlas,
+                        levels,
+                        density,
+                        normals,
+                        pixel,
+                    )
                     if bounds[0] <= i < bounds[1] and bounds[2] <= j < bounds[3]:
                         dark = _shadow(x * z, y * z, z, normals[face], shadow)
                         for channel in range(3):
@@ -176,8 +211,12 @@ def _sample(face, a, b, c, x, y, z, fx, sheet, corners, atlas, levels, density, 
         j1, i1 = min(j0 + 1, columns - 1), min(i0 + 1, rows - 1)
         s, t = p - j0, q - i0
         for channel in range(3):
-            upper = (1 - s) * atlas[start + (i0 * columns + j0) * 3 + channel] + s * atlas[start + (i0 * columns + j1) * 3 + channel]
-            lower = (1 - s) * atlas[start + (i1 * columns + j0) * 3 + channel] + s * atlas[start + (i1 * columns + j1) * 3 + channel]
+            upper = (1 - s) * atlas[start + (i0 * columns + j0) * 3 + channel] + s * atlas[
+                start + (i0 * columns + j1) * 3 + channel
+            ]
+            lower = (1 - s) * atlas[start + (i1 * columns + j0) * 3 + channel] + s * atlas[
+                start + (i1 * columns + j1) * 3 + channel
+            ]
             pixel[channel] += weight * ((1 - t) * upper + t * lower)
     for channel in range(3):
         root = pixel[channel] / 255.0
@@ -194,9 +233,17 @@ def _fur(corner, a, b, c, rest, light, pattern, footprint, pixel):
     y = a * rest[corner[0], 1] + b * rest[corner[1], 1] + c * rest[corner[2], 1]
     z = a * rest[corner[0], 2] + b * rest[corner[1], 2] + c * rest[corner[2], 2]
     strength = a * pattern[corner[0], 3] + b * pattern[corner[1], 3] + c * pattern[corner[2], 3]
-    fine = strength * min(1.0, 0.004 / max(footprint, 1e-4)) * (_grain(x, y, z, 90.0) * 0.8 + _grain(x, y, z, 230.0) * 0.5)
+    fine = (
+        strength
+        * min(1.0, 0.004 / max(footprint, 1e-4))
+        * (_grain(x, y, z, 90.0) * 0.8 + _grain(x, y, z, 230.0) * 0.5)
+    )
     for channel in range(3):
-        base = a * pattern[corner[0], channel] + b * pattern[corner[1], channel] + c * pattern[corner[2], channel]
+        base = (
+            a * pattern[corner[0], channel]
+            + b * pattern[corner[1], channel]
+            + c * pattern[corner[2], channel]
+        )
         shine = a * light[corner[0], channel] + b * light[corner[1], channel] + c * light[corner[2], channel]
         pixel[channel] = max(base * (1.0 + fine), 0.004) * shine
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 
 Paint = Callable[[float, float], UInt8[np.ndarray, "height width 3"]]
 """Draws the picture of a sheet of the given width and height in metres (sRGB albedo)."""
@@ -56,7 +56,9 @@ def flat(corner, right, down, paint: Paint, *, glow: float = 0.0, cells: tuple[i
 
 
 def box(center, size, paint: Paint | dict[str, Paint], *, skip: str = "") -> list[Sheet]:
-    """Make an upright box; ``paint`` may name faces (``+x`` ... ``-z``) apart ("" = the rest); ``skip`` omits faces."""
+    """Make an upright box; ``paint`` may name faces (``+x`` ... ``-z``) apart ("" = the rest); ``skip`` omits
+    faces.
+    """
     center, half = np.asarray(center, float), np.asarray(size, float) / 2
     sheets = []
     for name, normal in (
@@ -72,7 +74,9 @@ def box(center, size, paint: Paint | dict[str, Paint], *, skip: str = "") -> lis
         normal = np.array(normal, float)
         up = np.array([0.0, 1.0, 0.0]) if normal[1] == 0 else np.array([0.0, 0.0, -normal[1]])
         right = np.cross(up, normal)
-        corner = center + half * normal + np.abs(half @ np.abs(up)) * up - np.abs(half @ np.abs(right)) * right
+        corner = (
+            center + half * normal + np.abs(half @ np.abs(up)) * up - np.abs(half @ np.abs(right)) * right
+        )
         chosen = paint.get(name, paint[""]) if isinstance(paint, dict) else paint
         sheets.append(flat(corner, 2 * (half @ np.abs(right)) * right, -2 * (half @ np.abs(up)) * up, chosen))
     return sheets
@@ -94,7 +98,9 @@ def cushion(center, size, paint: Paint, *, bulge: float, skip: str = "-y") -> li
     return soft
 
 
-def cylinder(center, radius: float, height: float, side: Paint, top: Paint, *, flare: float = 1.0, segments: int = 16) -> list[Sheet]:
+def cylinder(
+    center, radius: float, height: float, side: Paint, top: Paint, *, flare: float = 1.0, segments: int = 16
+) -> list[Sheet]:
     """Make a standing cylinder whose top radius is ``flare`` times the bottom one, with a lid."""
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
@@ -109,7 +115,9 @@ def cylinder(center, radius: float, height: float, side: Paint, top: Paint, *, f
 
 
 def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: int) -> Sheet:
-    """Make a hanging cloth from its top left corner along ``right``, in ``folds`` waves of ``depth`` metres."""
+    """Make a hanging cloth from its top left corner along ``right``, in ``folds`` waves of ``depth``
+    metres.
+    """
     corner, right = np.asarray(corner, float), np.asarray(right, float)
     u = np.linspace(0, 1, folds * 4 + 1)
     out = np.cross(right, [0, 1.0, 0]) / np.linalg.norm(right)
@@ -120,9 +128,16 @@ def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: 
 
 def ball(center, radius: float, paint: Paint, *, squash: float = 1.0, rings: int = 7) -> Sheet:
     """Make a ball, its height scaled by ``squash``."""
-    polar, angle = np.meshgrid(np.linspace(0.02, np.pi - 0.02, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij")
-    unit = np.stack([np.sin(polar) * np.sin(angle), squash * np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1)
-    return Sheet((np.asarray(center, float) + radius * unit).astype(np.float32), paint(2 * np.pi * radius, np.pi * radius))
+    polar, angle = np.meshgrid(
+        np.linspace(0.02, np.pi - 0.02, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij"
+    )
+    unit = np.stack(
+        [np.sin(polar) * np.sin(angle), squash * np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1
+    )
+    return Sheet(
+        (np.asarray(center, float) + radius * unit).astype(np.float32),
+        paint(2 * np.pi * radius, np.pi * radius),
+    )
 
 
 def triangles(
@@ -130,7 +145,8 @@ def triangles(
 ) -> tuple[Float[np.ndarray, "vertex 3"], np.ndarray, Float[np.ndarray, "vertex 2"], np.ndarray]:
     """Join sheets to one mesh.
 
-    Returns vertices, faces (counter-clockwise from the front), picture coordinates in [0, 1], and each face's sheet.
+    Returns vertices, faces (counter-clockwise from the front), picture coordinates in [0, 1], and each face's
+    sheet.
     """
     vertices, faces, coordinates, owner, start = [], [], [], [], 0
     for index, sheet in enumerate(sheets):
@@ -145,4 +161,9 @@ def triangles(
         start += rows * columns
     joined = (np.concatenate(part) for part in (vertices, faces, coordinates, owner))
     vertices, faces, coordinates, owner = joined
-    return vertices.astype(np.float32), faces.astype(np.int32), coordinates.astype(np.float32), owner.astype(np.int32)
+    return (
+        vertices.astype(np.float32),
+        faces.astype(np.int32),
+        coordinates.astype(np.float32),
+        owner.astype(np.int32),
+    )

@@ -16,24 +16,45 @@ PRINT_TEXEL_M = 0.003
 Color = tuple[float, float, float]
 
 
-def plain(rng: np.random.Generator, color: Color, *, grain: float = 1.5, clouds: float = 2.5, texel_m: float = TEXEL_M) -> Paint:
-    """Paint plaster or lacquer: one colour with faint grain and broad clouds (deviations in grey levels of 255)."""
+def plain(
+    rng: np.random.Generator,
+    color: Color,
+    *,
+    grain: float = 1.5,
+    clouds: float = 2.5,
+    texel_m: float = TEXEL_M,
+) -> Paint:
+    """Paint plaster or lacquer: one colour with faint grain and broad clouds (deviations in grey levels of
+    255).
+    """
 
     def paint(width_m: float, height_m: float) -> np.ndarray:
         size = _size(width_m, height_m, texel_m)
         field = (
-            grain * _noise(rng, size, 0.0) + 0.8 * grain * _noise(rng, size, 0.02 / texel_m) + clouds * _noise(rng, size, 0.25 / texel_m)
+            grain * _noise(rng, size, 0.0)
+            + 0.8 * grain * _noise(rng, size, 0.02 / texel_m)
+            + clouds * _noise(rng, size, 0.25 / texel_m)
         )
         return _bytes(np.asarray(color) + field[..., None])
 
     return paint
 
 
-def planks(rng: np.random.Generator, color: Color, *, plank_m: tuple[float, float] = (0.9, 0.15), along_u: bool = True) -> Paint:
+def planks(
+    rng: np.random.Generator,
+    color: Color,
+    *,
+    plank_m: tuple[float, float] = (0.9, 0.15),
+    along_u: bool = True,
+) -> Paint:
     """Paint a floor of planks: the same printed board again and again, with hardly visible differences."""
     length, breadth = (max(4, round(part / TEXEL_M)) for part in plank_m)
-    streak = cv2.GaussianBlur(rng.standard_normal((breadth, length)).astype(np.float32), (0, 0), sigmaX=14, sigmaY=0.7)
-    knots = cv2.GaussianBlur(rng.standard_normal((breadth, length)).astype(np.float32), (0, 0), sigmaX=6, sigmaY=3)
+    streak = cv2.GaussianBlur(
+        rng.standard_normal((breadth, length)).astype(np.float32), (0, 0), sigmaX=14, sigmaY=0.7
+    )
+    knots = cv2.GaussianBlur(
+        rng.standard_normal((breadth, length)).astype(np.float32), (0, 0), sigmaX=6, sigmaY=3
+    )
     board = 6 * streak / streak.std() + 4 * knots / knots.std()
     board[:1] -= 34
     board[:, :1] -= 30
@@ -43,10 +64,17 @@ def planks(rng: np.random.Generator, color: Color, *, plank_m: tuple[float, floa
         rows, columns = size if along_u else size[::-1]
         count = rows // breadth + 2
         grey = np.concatenate(
-            [np.roll(np.tile(board, (1, columns // length + 2)), (row % 3) * length // 3, axis=1)[:, :columns] for row in range(count)]
+            [
+                np.roll(np.tile(board, (1, columns // length + 2)), (row % 3) * length // 3, axis=1)[
+                    :, :columns
+                ]
+                for row in range(count)
+            ]
         )
         grey = grey[:rows] + 2.0 * _noise(rng, (rows, columns), 40)
-        return _bytes(np.asarray(color) + (grey if along_u else grey.T)[..., None] * np.array([1.0, 0.92, 0.8]))
+        return _bytes(
+            np.asarray(color) + (grey if along_u else grey.T)[..., None] * np.array([1.0, 0.92, 0.8])
+        )
 
     return paint
 
@@ -57,21 +85,37 @@ def wood(rng: np.random.Generator, color: Color, *, contrast: float = 6.0) -> Pa
     def paint(width_m: float, height_m: float) -> np.ndarray:
         size = _size(width_m, height_m, TEXEL_M)
         along, across = (22.0, 0.8) if width_m >= height_m else (0.8, 22.0)
-        streak = cv2.GaussianBlur(rng.standard_normal(size).astype(np.float32), (0, 0), sigmaX=along, sigmaY=across)
+        streak = cv2.GaussianBlur(
+            rng.standard_normal(size).astype(np.float32), (0, 0), sigmaX=along, sigmaY=across
+        )
         field = contrast * streak / max(float(streak.std()), 1e-6) + 0.3 * contrast * _noise(rng, size, 12)
         return _bytes(np.asarray(color) + field[..., None] * np.array([1.0, 0.9, 0.75]))
 
     return paint
 
 
-def fabric(rng: np.random.Generator, color: Color, *, grain: float = 7.0, stripes_m: float = 0.0, stripe: float = 18.0) -> Paint:
+def fabric(
+    rng: np.random.Generator,
+    color: Color,
+    *,
+    grain: float = 7.0,
+    stripes_m: float = 0.0,
+    stripe: float = 18.0,
+) -> Paint:
     """Paint cloth: a woven grain, soft wear and, if ``stripes_m`` > 0, regular vertical stripes."""
 
     def paint(width_m: float, height_m: float) -> np.ndarray:
         size = _size(width_m, height_m, TEXEL_M)
-        field = grain * 0.6 * _noise(rng, size, 0.0) + 0.5 * grain * _noise(rng, size, 3.0) + 0.6 * grain * _noise(rng, size, 20.0)
+        field = (
+            grain * 0.6 * _noise(rng, size, 0.0)
+            + 0.5 * grain * _noise(rng, size, 3.0)
+            + 0.6 * grain * _noise(rng, size, 20.0)
+        )
         if stripes_m:
-            field = field + stripe * np.sign(np.sin(2 * np.pi * np.arange(size[1]) * TEXEL_M / stripes_m))[None, :]
+            field = (
+                field
+                + stripe * np.sign(np.sin(2 * np.pi * np.arange(size[1]) * TEXEL_M / stripes_m))[None, :]
+            )
         return _bytes(np.asarray(color) + field[..., None])
 
     return paint
@@ -148,9 +192,20 @@ def rug(rng: np.random.Generator) -> Paint:
             for column in range(int(0.26 / PRINT_TEXEL_M), columns - step // 2, step):
                 for radius, color in ((0.42, palette[3]), (0.3, palette[1]), (0.16, palette[2])):
                     reach = int(radius * step)
-                    diamond = np.array([[column, row - reach], [column + reach, row], [column, row + reach], [column - reach, row]])
+                    diamond = np.array(
+                        [
+                            [column, row - reach],
+                            [column + reach, row],
+                            [column, row + reach],
+                            [column - reach, row],
+                        ]
+                    )
                     cv2.fillConvexPoly(picture, diamond, tuple(int(c) for c in color))
-        return _bytes(picture + 9 * _noise(rng, (rows, columns), 0.8)[..., None] + 7 * _noise(rng, (rows, columns), 25)[..., None])
+        return _bytes(
+            picture
+            + 9 * _noise(rng, (rows, columns), 0.8)[..., None]
+            + 7 * _noise(rng, (rows, columns), 25)[..., None]
+        )
 
     return paint
 
@@ -197,23 +252,31 @@ def _size(width_m: float, height_m: float, texel_m: float) -> tuple[int, int]:
     return max(4, round(height_m / texel_m)), max(4, round(width_m / texel_m))
 
 
-def _noise(rng: np.random.Generator, size: tuple[int, int], blur_texels: float) -> Float[np.ndarray, "height width"]:
+def _noise(
+    rng: np.random.Generator, size: tuple[int, int], blur_texels: float
+) -> Float[np.ndarray, "height width"]:
     """Return smooth noise of unit deviation whose grain is about ``blur_texels``."""
     if blur_texels <= 0:
         return rng.standard_normal(size, dtype=np.float32)
     step = max(1, int(blur_texels))
     coarse = rng.standard_normal((size[0] // step + 3, size[1] // step + 3), dtype=np.float32)
-    smooth = cv2.resize(cv2.GaussianBlur(coarse, (0, 0), 0.8), None, fx=step, fy=step, interpolation=cv2.INTER_CUBIC)
+    smooth = cv2.resize(
+        cv2.GaussianBlur(coarse, (0, 0), 0.8), None, fx=step, fy=step, interpolation=cv2.INTER_CUBIC
+    )
     field = smooth[: size[0], : size[1]]
     return field / max(float(smooth.std()), 1e-6)
 
 
 def _palette(rng: np.random.Generator, count: int) -> UInt8[np.ndarray, "color 3"]:
-    hsv = np.stack([rng.integers(0, 180, count), rng.integers(60, 200, count), rng.integers(50, 235, count)], axis=-1).astype(np.uint8)
+    hsv = np.stack(
+        [rng.integers(0, 180, count), rng.integers(60, 200, count), rng.integers(50, 235, count)], axis=-1
+    ).astype(np.uint8)
     return cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
 
 
-def _shapes(rng: np.random.Generator, picture: np.ndarray, palette: np.ndarray, *, count: int, reach: float) -> None:
+def _shapes(
+    rng: np.random.Generator, picture: np.ndarray, palette: np.ndarray, *, count: int, reach: float
+) -> None:
     rows, columns, _ = picture.shape
     for _ in range(count):
         color = tuple(int(value) for value in palette[rng.integers(len(palette))])
@@ -222,7 +285,11 @@ def _shapes(rng: np.random.Generator, picture: np.ndarray, palette: np.ndarray, 
         if rng.random() < 0.5:
             cv2.circle(picture, center, radius, color, -1)
         else:
-            cv2.fillPoly(picture, [np.asarray(center) + rng.integers(-radius, radius + 1, (4, 2)).astype(np.int32)], color)
+            cv2.fillPoly(
+                picture,
+                [np.asarray(center) + rng.integers(-radius, radius + 1, (4, 2)).astype(np.int32)],
+                color,
+            )
 
 
 def _lettering(rng: np.random.Generator, picture: np.ndarray, ink: np.ndarray, *, top: int) -> None:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
-from pipeline.files import arrays
-from pipeline.space import cameras
+from pipeline.data import npz
+from pipeline.geometry import cameras
 from stages.synthesize_capture.film import Frame, Stage, matrices, true_flow
 from stages.synthesize_capture.script import Script
 
@@ -19,7 +20,7 @@ FLOW_GAP_S = 0.1
 
 
 @dataclass
-class Truth:
+class TruthWriter:
     """Collects one recording's truth frame by frame, then writes it."""
 
     script: Script
@@ -38,7 +39,7 @@ class Truth:
             root = self.script.motion.world_from_agent[index, :3, 3]
             self.vertices.append((frame.vertices_world - root).astype(np.float16))
 
-    def visible(self) -> np.ndarray:
+    def visible(self) -> Bool[np.ndarray, "frame"]:
         """Return in which frames the animal can be seen."""
         return np.array([mask.mean() > VISIBLE_SHARE for mask in self.masks])
 
@@ -48,7 +49,9 @@ class Truth:
         contents = {
             "timestamp_s": script.timestamp_s,
             "world_from_camera": cameras.turn_camera(script.world_from_camera, script.quarter_turns),
-            "intrinsics": cameras.turn_intrinsics(matrices(script.intrinsics), script.color_size, script.quarter_turns),
+            "intrinsics": cameras.turn_intrinsics(
+                matrices(script.intrinsics), script.color_size, script.quarter_turns
+            ),
             "agent_visible": self.visible(),
             "moving": script.moving,
         }
@@ -57,17 +60,19 @@ class Truth:
             contents["agent_from_bone"] = script.motion.agent_from_bone.astype(np.float32)
             contents["agent_vertices_world"] = np.stack(self.vertices)
             masks = np.stack(self.masks)
-            arrays.save(
+            npz.save(
                 folder / f"{name}.masks.npz",
                 compress=True,
                 packed=np.packbits(masks, axis=-1),
                 shape=np.array(masks.shape, np.int64),
             )
-        arrays.save(folder / f"{name}.npz", **contents)
+        npz.save(folder / f"{name}.npz", **contents)
         if self.keep_depth:
-            stored = cameras.scale_intrinsics(matrices(script.intrinsics), script.color_size, script.depth_size)
+            stored = cameras.scale_intrinsics(
+                matrices(script.intrinsics), script.color_size, script.depth_size
+            )
             depth_intrinsics = cameras.turn_intrinsics(stored, script.depth_size, script.quarter_turns)
-            arrays.save(
+            npz.save(
                 folder / f"{name}.depth.npz",
                 compress=True,
                 depth=np.stack(self.depth),
@@ -78,10 +83,12 @@ class Truth:
 def write_flow(stage: Stage, folder: Path, *, pairs: int) -> None:
     """Write the true flow of some pairs of frames about a tenth of a second apart."""
     times = stage.script.timestamp_s
-    first = np.unique(np.linspace(0, np.searchsorted(times, times[-1] - FLOW_GAP_S) - 1, pairs).astype(np.int64))
+    first = np.unique(
+        np.linspace(0, np.searchsorted(times, times[-1] - FLOW_GAP_S) - 1, pairs).astype(np.int64)
+    )
     second = [int(np.argmin(np.abs(times - times[index] - FLOW_GAP_S))) for index in first]
     flow = np.stack([true_flow(stage, int(a), b) for a, b in zip(first, second, strict=True)])
-    arrays.save(
+    npz.save(
         folder / f"{stage.script.name}.flow.npz",
         compress=True,
         frame_index=first,

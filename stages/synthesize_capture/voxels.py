@@ -1,12 +1,13 @@
 """A home as a feature volume, straight from its geometry: what `lives` gives in place of a reconstruction.
 
-Each kind of thing has a code of its own, a unit vector that is the same in every home, as pictures' features would be.
+Each kind of thing has a code of its own, a unit vector that is the same in every home, as pictures' features
+would be.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.models.perception import FeatureVolume
+from pipeline.behavior.perception import FeatureVolume
 from stages.synthesize_capture.dwellings import Dwelling, Standing
 from stages.synthesize_capture.room import DEPTH_M, WIDTH_M
 from stages.synthesize_capture.sheets import Sheet, upright
@@ -16,7 +17,8 @@ MARGIN_M = 0.2
 HEIGHT_M = 1.6
 CHANNELS = 16
 KINDS = (
-    "floor", "wall", "window", "rug", "sofa", "shelf", "media", "cat tree", "coffee table", "dining table", "plant", "lamp",
+    "floor", "wall", "window", "rug", "sofa", "shelf", "media", "cat tree", "coffee table", "dining table",
+    "plant", "lamp",
     "bowls", "loose",
 )  # fmt: skip
 CODES = np.linalg.qr(np.random.default_rng(5).standard_normal((CHANNELS, CHANNELS)))[0][: len(KINDS)]
@@ -28,29 +30,41 @@ HEADROOM_M = 0.5
 def volume_of(home: Dwelling) -> FeatureVolume:
     """Voxelise floor, walls, surfaces and what they enclose."""
     origin = np.array([-WIDTH_M / 2 - MARGIN_M, -MARGIN_M, -DEPTH_M / 2 - MARGIN_M])
-    shape = tuple(np.ceil((np.array([WIDTH_M, HEIGHT_M, DEPTH_M]) + 2 * MARGIN_M) / VOXEL_M - 1e-9).astype(int))
+    shape = tuple(
+        np.ceil((np.array([WIDTH_M, HEIGHT_M, DEPTH_M]) + 2 * MARGIN_M) / VOXEL_M - 1e-9).astype(int)
+    )
     centres = origin + (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) + 0.5) * VOXEL_M
     kind = np.full(shape, -1)
-    kind[(np.abs(centres[..., 0]) > WIDTH_M / 2) | (np.abs(centres[..., 2]) > DEPTH_M / 2)] = KINDS.index("wall")
+    kind[(np.abs(centres[..., 0]) > WIDTH_M / 2) | (np.abs(centres[..., 2]) > DEPTH_M / 2)] = KINDS.index(
+        "wall"
+    )
     kind[centres[..., 1] < 0] = KINDS.index("floor")
     for thing in home.standing:
         kind[_taken(thing, centres, origin)] = KINDS.index(thing.name)
     for place in home.room.places:
         if place.position[1] > 0.1:
             near = np.hypot(centres[..., 0] - place.position[0], centres[..., 2] - place.position[2]) < 0.3
-            level = (centres[..., 1] > place.position[1] + 0.05) & (centres[..., 1] < place.position[1] + HEADROOM_M)
+            level = (centres[..., 1] > place.position[1] + 0.05) & (
+                centres[..., 1] < place.position[1] + HEADROOM_M
+            )
             kind[near & level] = -1
     codes = np.concatenate([CODES, np.zeros((1, CHANNELS))])
     features = np.moveaxis(codes[kind], -1, 0).astype(np.float16)
     return FeatureVolume(features, (kind >= 0).astype(np.uint8), origin, VOXEL_M)
 
 
-def _taken(thing: Standing, centres: Float[np.ndarray, "x y z 3"], origin: Float[np.ndarray, "3"]) -> np.ndarray:
-    """Return the voxels of a thing: its surfaces above its clearance, and in its block all below the topmost surface."""
+def _taken(
+    thing: Standing, centres: Float[np.ndarray, "x y z 3"], origin: Float[np.ndarray, "3"]
+) -> np.ndarray:
+    """Return the voxels of a thing: its surfaces above its clearance, and in its block all below the topmost
+    surface.
+    """
     cosine, sine = np.cos(thing.yaw), np.sin(thing.yaw)
     away_x, away_z = centres[..., 0] - thing.x, centres[..., 2] - thing.z
     size = np.array(thing.piece.size) / 2
-    block = (np.abs(cosine * away_x - sine * away_z) < size[0]) & (np.abs(sine * away_x + cosine * away_z) < size[1])
+    block = (np.abs(cosine * away_x - sine * away_z) < size[0]) & (
+        np.abs(sine * away_x + cosine * away_z) < size[1]
+    )
     if thing.name == "rug":  # colours the floor
         return block & (np.abs(centres[..., 1] + VOXEL_M / 2) < VOXEL_M / 2)
     if thing.name == "window":  # radiator and curtains hang on the wall

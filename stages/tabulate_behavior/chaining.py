@@ -1,63 +1,94 @@
-"""Plans chained for minutes beside the observer of a test recording: does the animal stay, and move as it does?"""
+"""Plans chained for minutes beside the observer of a test recording: does the animal stay, and move as it
+does?
+"""
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import ks_2samp
 
-from pipeline.models.predictors import Ats
-from pipeline.models.scenes import Scenes
-from pipeline.models.simulator import Chaining, Flock
-from pipeline.models.trajectories import PAST, RATE_HZ, TEST, BehaviorData
+from pipeline.behavior.config import ReplanningConfig
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, BehaviorData
+from pipeline.rivals.predictors import Ats
 
 REST_M_S = 0.05
 """speed below which an animal rests: it breathes, and reconstructions err by more"""
-RARELY = 0.999
+UPRIGHT_QUANTILE = 0.999
 """share of recorded time in which an animal is nearer to upright than what counts as tilted"""
 
 
-def figures(ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds: float, seed: int) -> dict[str, float]:
+def figures(
+    ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds: float, seed: int
+) -> dict[str, float]:
     """Return the share of time inside something solid or outside, and Kolmogorov-Smirnov distances of speeds.
 
-    Truth against truth compares each test recording (each half, if there is one) with the others. ``moving`` counts all
-    speeds of an animal that rests as one. ``tilted`` is the share of time further from upright than recorded animals mostly are.
+    Truth against truth compares each test recording (each half, if there is one) with the others. ``moving``
+    counts all speeds of an animal that rests as one. ``tilted`` is the share of time further from upright
+    than recorded animals mostly are.
     """
     rng, test = np.random.default_rng(seed), data.indices(TEST)
-    chosen = test[(np.arange(count) * len(test)) // count + rng.integers(max(len(test) // count, 1), size=count)]
+    chosen = test[
+        (np.arange(count) * len(test)) // count + rng.integers(max(len(test) // count, 1), size=count)
+    ]
     poses = rollouts(ats, data, scenes, chosen, seconds, rng)
     lived, tilt = poses[..., :3, 3], _tilts(poses)
     solid = scenes.inside_solid(lived, data.video[chosen]).mean(1)
     recorded = [data.trajectories[data.videos[video]] for video in np.unique(data.video[test])]
     true = [_speeds(t.world_from_agent[:, :3, 3])[t.valid[1:] & t.valid[:-1]] for t in recorded]
-    tilted = np.quantile(np.concatenate([_tilts(t.world_from_agent[t.valid]) for t in recorded]), RARELY)
+    tilted = np.quantile(
+        np.concatenate([_tilts(t.world_from_agent[t.valid]) for t in recorded]), UPRIGHT_QUANTILE
+    )
     speeds, whole = [_speeds(life) for life in lived], np.concatenate(true)
     return {
         "behavior/ats/chain_rollouts": float(count),
         "behavior/ats/chain_seconds": float(seconds),
         "behavior/ats/chain_solid_share": float(np.mean(solid)),
         "behavior/ats/chain_solid_share_worst": float(np.max(solid)),
-        "behavior/ats/chain_speed_ks": float(np.mean([_apart(each, whole) for each in speeds])),
-        "behavior/ats/chain_speed_ks_pooled": _apart(np.concatenate(speeds), whole),
-        "behavior/ats/chain_moving_speed_ks": float(np.mean([_apart(each, whole, REST_M_S) for each in speeds])),
-        "behavior/ats/chain_moving_speed_ks_pooled": _apart(np.concatenate(speeds), whole, REST_M_S),
+        "behavior/ats/chain_speed_ks": float(np.mean([_ks_distance(each, whole) for each in speeds])),
+        "behavior/ats/chain_speed_ks_pooled": _ks_distance(np.concatenate(speeds), whole),
+        "behavior/ats/chain_moving_speed_ks": float(
+            np.mean([_ks_distance(each, whole, REST_M_S) for each in speeds])
+        ),
+        "behavior/ats/chain_moving_speed_ks_pooled": _ks_distance(np.concatenate(speeds), whole, REST_M_S),
         "behavior/ats/chain_tilted_share": float(np.mean(tilt > tilted)),
         "behavior/ats/chain_rest_share": float(np.mean(np.concatenate(speeds) < REST_M_S)),
-        "behavior/true/chain_speed_ks": _among(true),
-        "behavior/true/chain_moving_speed_ks": _among(true, REST_M_S),
+        "behavior/true/chain_speed_ks": _ks_among_recordings(true),
+        "behavior/true/chain_moving_speed_ks": _ks_among_recordings(true, REST_M_S),
         "behavior/true/chain_rest_share": float(np.mean(whole < REST_M_S)),
     }
 
 
 def rollouts(
-    ats: Ats, data: BehaviorData, scenes: Scenes, window: Int[np.ndarray, "life"], seconds: float, rng: np.random.Generator
+    ats: Ats,
+    data: BehaviorData,
+    scenes: Scenes,
+    window: Int[np.ndarray, "life"],
+    seconds: float,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "life frame 4 4"]:
-    """Let the model go on from some windows, in their homes, with their observers walking as recorded, over and over."""
-    flock = Flock(ats.sampler, scenes, data.agent_from_bone_rest, ats.ego, sampling=ats.sampling, chaining=Chaining())
+    """Let the model go on from some windows, in their homes, with their observers walking as recorded, over
+    and over.
+    """
+    flock = AnimalBatch(
+        ats.sampler,
+        scenes,
+        data.agent_from_bone_rest,
+        ats.ego,
+        sampling=ats.sampling,
+        chaining=ReplanningConfig(),
+    )
     context, _ = data.windows(window)
-    walks = [data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]]
+    walks = [
+        data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]
+    ]
     flock.begin(context, rng)
     root = [context.world_from_agent[:, -1]]
     for step in range(round(seconds * RATE_HZ)):
-        seen = [walk[(start + PAST + step) % len(walk)] for walk, start in zip(walks, data.start[window], strict=True)]
+        seen = [
+            walk[(start + PAST + step) % len(walk)]
+            for walk, start in zip(walks, data.start[window], strict=True)
+        ]
         root.append(flock.step(np.array(seen)).root[:, 0])
     return np.stack(root, axis=1)
 
@@ -71,11 +102,16 @@ def _speeds(path: Float[np.ndarray, "frame 3"]) -> Float[np.ndarray, "step"]:
     return np.linalg.norm(np.diff(path, axis=0), axis=-1) * RATE_HZ
 
 
-def _apart(mine: Float[np.ndarray, "step"], others: Float[np.ndarray, "other"], least: float = 0.0) -> float:
+def _ks_distance(
+    mine: Float[np.ndarray, "step"], others: Float[np.ndarray, "other"], least: float = 0.0
+) -> float:
     return float(ks_2samp(np.maximum(mine, least), np.maximum(others, least)).statistic)
 
 
-def _among(recorded: list[Float[np.ndarray, "step"]], least: float = 0.0) -> float:
+def _ks_among_recordings(recorded: list[Float[np.ndarray, "step"]], least: float = 0.0) -> float:
     parts = recorded if len(recorded) > 1 else np.array_split(recorded[0], 2)
-    others = [np.concatenate([part for other, part in enumerate(parts) if other != mine]) for mine in range(len(parts))]
-    return float(np.mean([_apart(part, rest, least) for part, rest in zip(parts, others, strict=True)]))
+    others = [
+        np.concatenate([part for other, part in enumerate(parts) if other != mine])
+        for mine in range(len(parts))
+    ]
+    return float(np.mean([_ks_distance(part, rest, least) for part, rest in zip(parts, others, strict=True)]))

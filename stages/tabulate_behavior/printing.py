@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from pipeline.models.intervals import told
+from pipeline.metrics.intervals import formatted_interval
 
 END_TO_END = (
     ("goal_minde_m", "goal [m]"),
@@ -17,7 +17,11 @@ TRUTH_FED = (
     ("truth_fed_orientation_minade_rad", "orientation [rad]"),
     ("truth_fed_joints_minade_rad", "joints [rad]"),
 )
-FLIGHT = (("flees_seen", "person walks up"), ("flees_unseen", "person not perceived"), ("flees_standing", "person stands"))
+FLIGHT = (
+    ("flees_seen", "person walks up"),
+    ("flees_unseen", "person not perceived"),
+    ("flees_standing", "person stands"),
+)
 
 
 def tables(figures: Mapping[str, float | None], methods: tuple[str, ...]) -> str:
@@ -27,18 +31,28 @@ def tables(figures: Mapping[str, float | None], methods: tuple[str, ...]) -> str
         table("Table 5: fed with the true goal, and the true path", TRUTH_FED, figures, methods),
     ]
     if "behavior/ats/flees_true" in figures:
-        true = f"(the animal itself: {figures['behavior/ats/flees_true']:.1%}, standing {figures['behavior/ats/flees_true_standing']:.1%})"
-        parts.append(table(f"Share of approaches from which the animal flees {true}", FLIGHT, figures, methods))
+        walking, standing = (figures[f"behavior/ats/flees_true{end}"] for end in ("", "_standing"))
+        true = f"(the animal itself: {walking:.1%}, standing {standing:.1%})"
+        parts.append(
+            table(f"Share of approaches from which the animal flees {true}", FLIGHT, figures, methods)
+        )
     return "\n\n".join(parts)
 
 
-def table(title: str, columns: tuple[tuple[str, str], ...], figures: Mapping[str, float | None], methods: tuple[str, ...]) -> str:
+def table(
+    title: str,
+    columns: tuple[tuple[str, str], ...],
+    figures: Mapping[str, float | None],
+    methods: tuple[str, ...],
+) -> str:
     """Return one table; methods that have none of its figures are left out."""
     rows = [["method", *(head for _, head in columns)]]
     for method in methods:
-        cells = [told(figures, f"behavior/{method}/{name}", ".3f") for name, _ in columns]
+        cells = [formatted_interval(figures, f"behavior/{method}/{name}", ".3f") for name, _ in columns]
         if any(text != "-" for text in cells):
             rows.append([method, *cells])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = [
+        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
     return "\n".join([title, *lines])

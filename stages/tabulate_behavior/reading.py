@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.files import arrays
+from pipeline.data import npz
 
 
 @dataclass(frozen=True)
-class Scores:
+class MethodScores:
     """The scores of one method."""
 
     goal_window: Int[np.ndarray, "window 2"]
@@ -29,19 +29,27 @@ class Scores:
         return self.goal_window if name.split("/")[1].startswith("goal") else self.plan_window
 
 
-def stacked(folders: Sequence[Path]) -> Scores:
+def stacked(folders: Sequence[Path]) -> MethodScores:
     """Read the trials of one method, which differ in their seed. Raises InputError ART-010 when damaged."""
-    read = [arrays.load(folder / "scores.npz") for folder in folders]
-    told = [name for name in read[0] if "/" in name]
-    return Scores(read[0]["goal_window"], read[0]["plan_window"], {name: np.stack([each[name] for each in read]) for name in told})
+    read = [npz.load(folder / "scores.npz") for folder in folders]
+    names = [name for name in read[0] if "/" in name]
+    return MethodScores(
+        read[0]["goal_window"],
+        read[0]["plan_window"],
+        {name: np.stack([each[name] for each in read]) for name in names},
+    )
 
 
 def curves(folders: Sequence[Path]) -> dict[str, Float[np.ndarray, "seed step"]]:
     """Read the losses of every step of the trials of one method."""
-    read = [arrays.load(folder / "losses.npz") for folder in folders]
+    read = [npz.load(folder / "losses.npz") for folder in folders]
     return {name.removeprefix("loss/"): np.stack([each[name] for each in read]) for name in read[0]}
 
 
-def windows(found: Mapping[str, Scores]) -> dict[str, Int[np.ndarray, "window 2"]]:
+def windows(found: Mapping[str, MethodScores]) -> dict[str, Int[np.ndarray, "window 2"]]:
     """Return the exact windows of every method."""
-    return {f"{method}/{kind}": getattr(scores, kind) for method, scores in found.items() for kind in ("goal_window", "plan_window")}
+    return {
+        f"{method}/{kind}": getattr(scores, kind)
+        for method, scores in found.items()
+        for kind in ("goal_window", "plan_window")
+    }

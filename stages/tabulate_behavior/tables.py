@@ -5,50 +5,74 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.intervals import Interval, episodes
-from pipeline.models.trajectories import FUTURE, PAST
-from stages.tabulate_behavior.reading import Scores
+from pipeline.behavior.trajectories import FUTURE, PAST
+from pipeline.metrics.intervals import Interval, episodes
+from stages.tabulate_behavior.reading import MethodScores
 
-PLAIN = "end_to_end"
+UNPREFIXED = "end_to_end"
 """Its figures carry no prefix: they are those of Table 4."""
 CONTRASTS = (
     ("flees_seen_minus_true", "flees/seen", "flees/true"),
     ("flees_seen_minus_unseen", "flees/seen", "flees/unseen"),
-    ("solid_minus_recorded", f"{PLAIN}/solid", "recorded/solid"),
+    ("solid_minus_recorded", f"{UNPREFIXED}/solid", "recorded/solid"),
 )
 """Figure, and the two scores whose difference it is, approach by approach or window by window."""
 
+RESAMPLES = 2000
+"""Bootstrap resamples: bounds of 95 % intervals vary by about 1 % of their width."""
 
-def figures(found: Mapping[str, Scores], ours: str, *, draws: int, seed: int) -> dict[str, float | None]:
-    """Return all figures with their intervals, and those of the differences to ours where windows are the same."""
+
+def figures(
+    found: Mapping[str, MethodScores], ours: str, *, seed: int, draws: int = RESAMPLES
+) -> dict[str, float | None]:
+    """Return all figures with their intervals, and those of the differences to ours where windows are the
+    same.
+    """
     table: dict[str, float | None] = {}
     for method, scores in found.items():
         for name, values in scores.values.items():
             window = scores.windows_of(name)
-            table |= interval(values, window, draws, seed).named(f"behavior/{method}/{_figure(name)}")
+            table |= interval(values, window, draws, seed).as_figures(f"behavior/{method}/{_figure(name)}")
             rival = found[ours].values.get(name)
             if method != ours and rival is not None and np.array_equal(window, found[ours].windows_of(name)):
-                both = min(len(rival), len(values)) if min(len(rival), len(values)) > 1 else max(len(rival), len(values))
-                less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(values[:both], (both, values.shape[1]))
-                table |= interval(less, window, draws, seed).named(f"behavior/{ours}_minus_{method}/{_figure(name)}")
+                both = (
+                    min(len(rival), len(values))
+                    if min(len(rival), len(values)) > 1
+                    else max(len(rival), len(values))
+                )
+                less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(
+                    values[:both], (both, values.shape[1])
+                )
+                table |= interval(less, window, draws, seed).as_figures(
+                    f"behavior/{ours}_minus_{method}/{_figure(name)}"
+                )
         _contrast(table, method, scores, draws, seed)
         table[f"behavior/{method}/seeds"] = len(next(iter(scores.values.values())))
     return table
 
 
-def _contrast(table: dict[str, float | None], method: str, scores: Scores, draws: int, seed: int) -> None:
-    """Put what the bars ask of one method alone: flight against the animal's own and without the observer, and control."""
+def _contrast(
+    table: dict[str, float | None], method: str, scores: MethodScores, draws: int, seed: int
+) -> None:
+    """Put what the bars ask of one method alone: flight against the animal's own and without the observer,
+    and control.
+    """
     for name, first, second in CONTRASTS:
         if first in scores.values and second in scores.values:
             less = scores.values[first] - scores.values[second]
-            table |= interval(less, scores.windows_of(first), draws, seed).named(f"behavior/{method}/{name}")
-    fed, alone = (scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", PLAIN))
+            table |= interval(less, scores.windows_of(first), draws, seed).as_figures(
+                f"behavior/{method}/{name}"
+            )
+    fed, alone = (scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", UNPREFIXED))
     if fed is not None and alone is not None:
         table[f"behavior/{method}/path_minade_truth_fed_share"] = float(fed.mean() / alone.mean())
 
 
-def interval(values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], draws: int, seed: int) -> Interval:
-    """Resample seeds and episodes of 6.4 s, both with replacement, and return the mean with percentiles 2.5 and 97.5.
+def interval(
+    values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], draws: int, seed: int
+) -> Interval:
+    """Resample seeds and episodes of 6.4 s, both with replacement, and return the mean with percentiles 2.5
+    and 97.5.
 
     The bounds of one episode alone are NaN.
     """
@@ -67,7 +91,9 @@ def interval(values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "
 
 
 def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]]) -> dict[str, float]:
-    """Return by how much of itself each loss still fell from its last but one tenth to its last: near 0 is a plateau."""
+    """Return by how much of itself each loss still fell from its last but one tenth to its last: near 0 is a
+    plateau.
+    """
     table = {}
     for method, terms in curves.items():
         for name, loss in terms.items():
@@ -80,4 +106,4 @@ def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]])
 
 
 def _figure(name: str) -> str:
-    return name.removeprefix(f"{PLAIN}/").replace("/", "_")
+    return name.removeprefix(f"{UNPREFIXED}/").replace("/", "_")

@@ -2,39 +2,69 @@
 
 import numpy as np
 
-from pipeline.models.predictors import ConstantVelocity, LocationPrior, Samples, StandStill
-from pipeline.models.scores import GOAL_SCORES, PLAN_SCORES, SCORES
-from pipeline.models.trajectories import TRAIN, BehaviorData
-from stages.tabulate_behavior.reading import Scores
+from pipeline.behavior.trajectories import TRAIN, BehaviorData
+from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
+from pipeline.rivals.predictors import ConstantVelocity, LocationPrior, Samples, StandStill
+from stages.tabulate_behavior.reading import MethodScores
 
 RIVALS = {"location_prior": LocationPrior, "stand_still": StandStill, "constant_velocity": ConstantVelocity}
 
+SAMPLES = 16
+"""Samples per window (K), as many as `score_behavior` draws."""
+FIT_STRIDE = 4
+"""Every how many training windows the rivals are fitted to; neighbours are alike."""
+WINDOWS_AT_ONCE = 64
+"""Bounds the memory of sampled bones."""
 
-def scores(data: BehaviorData, like: Scores, *, samples: int, trials: int, seed: int) -> dict[str, Scores]:
+
+def scores(
+    data: BehaviorData, like: MethodScores, *, trials: int, seed: int, samples: int = SAMPLES
+) -> dict[str, MethodScores]:
     """Fit each rival to the training windows and score it on the windows of ``like``."""
-    context, future = data.windows(data.indices(TRAIN)[::4])
-    return {name: _scores(rival.fit(context, future), data, like, samples, trials, seed) for name, rival in RIVALS.items()}
+    context, future = data.windows(data.indices(TRAIN)[::FIT_STRIDE])
+    return {
+        name: _scores(rival.fit(context, future), data, like, samples, trials, seed)
+        for name, rival in RIVALS.items()
+    }
 
 
 def _scores(
-    method: LocationPrior | StandStill | ConstantVelocity, data: BehaviorData, like: Scores, samples: int, trials: int, seed: int
-) -> Scores:
+    method: LocationPrior | StandStill | ConstantVelocity,
+    data: BehaviorData,
+    like: MethodScores,
+    samples: int,
+    trials: int,
+    seed: int,
+) -> MethodScores:
     rng, found = np.random.default_rng(seed), {}
     for windows, names in ((like.goal_window, GOAL_SCORES), (like.plan_window, PLAN_SCORES)):
         parts = []
-        for some in np.array_split(_numbers(data, windows), max(len(windows) // 64, 1)):
+        for some in np.array_split(_numbers(data, windows), max(len(windows) // WINDOWS_AT_ONCE, 1)):
             context, future = data.windows(some)
-            drawn = [method.sample(context, samples, rng) for _ in range(trials if names == GOAL_SCORES else 1)]
-            parts.append({name: np.mean([SCORES[name](each, future) for each in drawn], axis=0) for name in names if _told(drawn[0], name)})
-        found |= {f"end_to_end/{name}": np.concatenate([part[name] for part in parts])[None] for name in parts[0]}
-    return Scores(like.goal_window, like.plan_window, found)
+            drawn = [
+                method.sample(context, samples, rng) for _ in range(trials if names == GOAL_SCORES else 1)
+            ]
+            parts.append(
+                {
+                    name: np.mean([SCORES[name](each, future) for each in drawn], axis=0)
+                    for name in names
+                    if _predicts(drawn[0], name)
+                }
+            )
+        found |= {
+            f"end_to_end/{name}": np.concatenate([part[name] for part in parts])[None] for name in parts[0]
+        }
+    return MethodScores(like.goal_window, like.plan_window, found)
 
 
-def _told(samples: Samples, name: str) -> bool:
+def _predicts(samples: Samples, name: str) -> bool:
     return name in GOAL_SCORES or samples.path is not None
 
 
 def _numbers(data: BehaviorData, windows: np.ndarray) -> np.ndarray:
     """Return the numbers of windows in the data's list."""
-    where = {(int(video), int(start)): number for number, (video, start) in enumerate(zip(data.video, data.start, strict=True))}
+    where = {
+        (int(video), int(start)): number
+        for number, (video, start) in enumerate(zip(data.video, data.start, strict=True))
+    }
     return np.array([where[int(video), int(start)] for video, start in windows])

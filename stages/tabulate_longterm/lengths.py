@@ -4,35 +4,43 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.models.bodies import PosedSurface
-from pipeline.models.contacts import tensors
-from pipeline.models.journeys import World, travel
-from pipeline.models.motion_optimization import Settings
-from pipeline.models.short_motions import RATE_HZ
-from pipeline.models.subgoals import preferred
+from pipeline.longterm.bodies import PosedSurface
+from pipeline.longterm.config import MotionOptimizationConfig
+from pipeline.longterm.contacts import motion_tensors
+from pipeline.longterm.journeys import LongTermWorld, travel
+from pipeline.longterm.short_motions import RATE_HZ
+from pipeline.longterm.subgoals import sample_visited_subgoals
 
 
 @dataclass(frozen=True)
-class Length:
+class LongMotionLength:
     """A long motion to make."""
 
     seconds: float
     subgoals: int
 
 
-def figures(world: World, been: np.ndarray, length: Length, settings: Settings, seed: int) -> dict[str, float | None]:
+def figures(
+    world: LongTermWorld,
+    been: np.ndarray,
+    length: LongMotionLength,
+    settings: MotionOptimizationConfig,
+    seed: int,
+) -> dict[str, float | None]:
     """Travel through preferred places for minutes and measure what the bars ask for.
 
     Sub-goals are due at even times, so that the animal rests at those that it reaches early.
     """
     rng = np.random.default_rng(seed)
-    drawn = preferred(been, length.subgoals + 1, rng)
-    timed = [replace(goal, time_s=length.seconds * number / length.subgoals) for number, goal in enumerate(drawn)]
+    drawn = sample_visited_subgoals(been, length.subgoals + 1, rng)
+    timed = [
+        replace(goal, time_s=length.seconds * number / length.subgoals) for number, goal in enumerate(drawn)
+    ]
     made = travel(world, timed, settings, rng)
     low, high = world.scene.surface.points.min(0), world.scene.surface.points.max(0)
-    surface, outside = PosedSurface(world.body, world.body.spread(200)), 0.0
+    surface, outside = PosedSurface(world.body, world.body.sample_vertices(200)), 0.0
     for start in range(0, len(made.moving), 300):
-        points = surface(*tensors(made.moving[start : start + 300])).numpy()
+        points = surface(*motion_tensors(made.moving[start : start + 300])).numpy()
         beyond = np.maximum(np.maximum(low - points, points - high), 0)[..., [0, 2]]
         outside = max(outside, float(beyond.max()))
     there = made.moving.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]
@@ -50,4 +58,6 @@ def figures(world: World, been: np.ndarray, length: Length, settings: Settings, 
         "slide_before_m_s": made.before.slide_m_s,
         "subgoal_error_m": float(reached.max()),
     }
-    return {f"longterm_minutes/{name}": value if np.isfinite(value) else None for name, value in found.items()}
+    return {
+        f"longterm_minutes/{name}": value if np.isfinite(value) else None for name, value in found.items()
+    }

@@ -8,66 +8,76 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.models.ablated_motion import Ablated
-from pipeline.models.clip_channels import Clips, decode_clip, encode_places
-from pipeline.models.longterm import ROOT
-from pipeline.models.longterm_examples import Lives
-from pipeline.models.motion_synthesis import LongTerm
+from pipeline.longterm.clip_channels import Clips, decode_clip, encode_places
+from pipeline.longterm.examples import MotionDataset
+from pipeline.longterm.motion_synthesis import LongTerm
+from pipeline.longterm.networks import ROOT_CHANNELS
+from pipeline.rivals.longterm_networks import AblatedNetworks
 
 Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """From clips, of which only first and last frames and the scene may be looked at, to all frames"""
-OPTIMISED = ("ours", "base", "route_cvae", "nearest")
+OPTIMIZED = ("ours", "base", "route_cvae", "nearest")
 """Methods that are also judged after the optimisation."""
-SEEING = {"ours": "ours_no_scene", "route_t_pose": "route_t_pose_no_scene", "base": "base_no_scene"}
+WITHOUT_SCENE = {"ours": "ours_no_scene", "route_t_pose": "route_t_pose_no_scene", "base": "base_no_scene"}
 """Methods that see the scene, and the same that do not; the routes of `route_tr_pose` are those of ours."""
-BEYOND = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {blind: seeing for seeing, blind in SEEING.items()}
-"""Methods whose errors beyond another's are told clip by clip, with intervals."""
+COMPARED_WITH = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {
+    blind: sees_scene for sees_scene, blind in WITHOUT_SCENE.items()
+}
+"""Methods whose errors beyond another's are reported clip by clip, with intervals."""
 
 
 @dataclass(frozen=True)
-class Models:
+class ComparedModels:
     """All that was trained on one source of motion."""
 
     ours: LongTerm
-    ablated: dict[str, Ablated]
+    ablated: dict[str, AblatedNetworks]
     bank: Clips
     """the short motions that were learned from, without scene points"""
 
 
-def methods(models: Models, lives: Lives, seed: int) -> dict[str, Method]:
+def methods(models: ComparedModels, dataset: MotionDataset, seed: int) -> dict[str, Method]:
     """Return every method by its name in the tables."""
 
-    def by(net: LongTerm | Ablated) -> Method:
+    def by(net: LongTerm | AblatedNetworks) -> Method:
         return lambda clips: net.between(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
 
     trained = {"ours": by(models.ours)} | {name: by(net) for name, net in models.ablated.items()}
     return trained | {
-        "route_cvae": lambda clips: route_cvae(models.ours, clips, lives, np.random.default_rng(seed)),
+        "route_cvae": lambda clips: route_cvae(models.ours, clips, dataset, np.random.default_rng(seed)),
         "nearest": lambda clips: nearest(models.bank, clips),
     }
 
 
-def route_cvae(model: LongTerm, clips: Clips, lives: Lives, rng: np.random.Generator) -> Float[Tensor, "clip frame channel"]:
+def route_cvae(
+    model: LongTerm, clips: Clips, dataset: MotionDataset, rng: np.random.Generator
+) -> Float[Tensor, "clip frame channel"]:
     """Follow RouteNet's route with a body of the CVAE in every frame, one z per clip (Route + CVAE)."""
     with torch.no_grad():
         route = model.route(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
         made = []
         for index in range(len(clips)):
-            roots = decode_clip(_with_pose(route[index], model), clips.world_from_clip[index], model.poses).world_from_agent
-            places = encode_places(roots, np.full(len(roots), clips.scene[index]), lives.scenes, model.sizes.points, rng)
-            shape = torch.from_numpy(lives.body.shape).float().expand(len(roots), -1)
+            roots = decode_clip(
+                _with_pose(route[index], model), clips.world_from_clip[index], model.poses
+            ).world_from_agent
+            places = encode_places(
+                roots, np.full(len(roots), clips.scene[index]), dataset.scenes, model.sizes.points, rng
+            )
+            shape = torch.from_numpy(dataset.body.shape).float().expand(len(roots), -1)
             z = torch.from_numpy(rng.standard_normal(model.sizes.latent)).float().expand(len(roots), -1)
             drawn = model.static.decode(z, model.static.given(places.place, shape, places.points))
-            made.append(torch.cat([route[index], drawn[:, ROOT:]], dim=-1))
+            made.append(torch.cat([route[index], drawn[:, ROOT_CHANNELS:]], dim=-1))
     return torch.stack(made)
 
 
 def nearest(bank: Clips, clips: Clips) -> Float[Tensor, "clip frame channel"]:
-    """Take from the memory bank the short motion whose ends are most alike, laid where the clip is (after HSNMS)."""
+    """Take from the memory bank the short motion whose ends are most alike, laid where the clip is (after
+    HSNMS).
+    """
 
     def ends(some: Clips) -> Float[Tensor, "clip channel"]:
         both = some.channels[:, [0, -1]]
-        return torch.cat([both[..., :ROOT], 0.1 * both[..., ROOT:]], dim=-1).flatten(1)
+        return torch.cat([both[..., :ROOT_CHANNELS], 0.1 * both[..., ROOT_CHANNELS:]], dim=-1).flatten(1)
 
     return bank.channels[torch.cdist(ends(clips), ends(bank)).argmin(1)]
 

@@ -5,51 +5,54 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.models import ablated_motion, simulated_lives
-from pipeline.models.longterm_examples import Cutting, Lives, cut, encoded, reconstructed
-from pipeline.models.motion_synthesis import LongTerm
-from pipeline.models.trajectories import TRAIN, BehaviorData
-from stages.tabulate_longterm.methods import Models
+from pipeline.behavior.trajectories import TRAIN, BehaviorData
+from pipeline.longterm import simulated_lives
+from pipeline.longterm.examples import MotionDataset, encode_selection, reconstructed_dataset, select_clips
+from pipeline.longterm.motion_synthesis import LongTerm
+from pipeline.rivals import longterm_networks
+from stages.tabulate_longterm.methods import ComparedModels
 
 
 @dataclass(frozen=True)
-class Source:
+class MotionSource:
     """Motion that was learned from and motion that was not, and what was learned."""
 
-    train: Lives
-    held_out: Lives
+    train: MotionDataset
+    held_out: MotionDataset
     split: tuple[str, ...]
     """per held-out stretch: held_out, unseen or test"""
-    models: Models
+    models: ComparedModels
     data: BehaviorData | None = None
 
 
-def simulated(world: Path, study: Path) -> Source:
+def simulated(world: Path, study: Path) -> MotionSource:
     """Read simulated motion and what was learned from it."""
-    lives, split = simulated_lives.load(world)
+    dataset, split = simulated_lives.load(world)
     learned, rest = np.flatnonzero(np.array(split) == "train"), np.flatnonzero(np.array(split) != "train")
-    train = lives.some(learned)
-    return Source(train, lives.some(rest), tuple(split[index] for index in rest), _models(study, train))
+    train = dataset.subset(learned)
+    return MotionSource(
+        train, dataset.subset(rest), tuple(split[index] for index in rest), _models(study, train)
+    )
 
 
-def recorded(reconstruction: Path, behavior_data: Path, ablations: Path) -> Source:
+def recorded(reconstruction: Path, behavior_data: Path, ablations: Path) -> MotionSource:
     """Read reconstructed motion and what was learned from it."""
     data = BehaviorData.load(behavior_data)
-    lives, video_of = reconstructed(reconstruction, data)
+    dataset, video_of = reconstructed_dataset(reconstruction, data)
     learns = {data.videos[video] for video in np.unique(data.video[data.split == TRAIN])}
-    train = lives.some([index for index, video in enumerate(video_of) if video in learns])
+    train = dataset.subset([index for index, video in enumerate(video_of) if video in learns])
     rest = [index for index, video in enumerate(video_of) if video not in learns]
-    held_out = lives.some(rest) if rest else Lives(lives.body, (), (), lives.scenes)
-    return Source(train, held_out, ("test",) * len(rest), _models(ablations, train), data)
+    held_out = dataset.subset(rest) if rest else MotionDataset(dataset.body, (), (), dataset.scenes)
+    return MotionSource(train, held_out, ("test",) * len(rest), _models(ablations, train), data)
 
 
-def _models(folder: Path, train: Lives) -> Models:
+def _models(folder: Path, train: MotionDataset) -> ComparedModels:
     ours = LongTerm.load(folder)
     ablated = {
-        name: ablated_motion.load(folder / "ablations" / f"{name}.safetensors", kind, ours.sizes)
-        for name, kind in ablated_motion.KINDS.items()
+        name: longterm_networks.load(folder / "ablations" / f"{name}.safetensors", kind, ours.sizes)
+        for name, kind in longterm_networks.ABLATIONS.items()
         if (folder / "ablations" / f"{name}.safetensors").is_file()
     }
     rng = np.random.default_rng(0)
-    bank = encoded(train, cut(train, Cutting(resting=0.0), rng), ours.poses, 0, rng)
-    return Models(ours, ablated, bank)
+    bank = encode_selection(train, select_clips(train, rng, resting=0.0), ours.poses, 0, rng)
+    return ComparedModels(ours, ablated, bank)

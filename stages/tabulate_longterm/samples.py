@@ -1,38 +1,43 @@
-"""Samples of the behaviour model before and after they are made physical: penetration, sliding feet, goal and path errors."""
+"""Samples of the behaviour model before and after they are made physical: penetration, sliding feet, goal and
+path errors.
+"""
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline import progress
-from pipeline.models.behavior import ROOT_CHANNELS, Sampling, bones_from_channels
-from pipeline.models.intervals import bootstrapped, episodes, names_of
-from pipeline.models.journeys import World, physical
-from pipeline.models.motion_optimization import Settings
-from pipeline.models.perception import Ego, world_from_ego
-from pipeline.models.planning import Sampler, observe
-from pipeline.models.scenes import Scenes
-from pipeline.models.short_motions import Moving
-from pipeline.models.trajectories import FUTURE, RATE_HZ, BehaviorData
+from pipeline.behavior.config import Ego, PlanSamplingConfig
+from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
+from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.planning import Sampler, observe
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import FUTURE, RATE_HZ, BehaviorData
+from pipeline.core import progress
+from pipeline.longterm.config import MotionOptimizationConfig
+from pipeline.longterm.journeys import LongTermWorld, refine_at_rate
+from pipeline.longterm.short_motions import BodyMotion
+from pipeline.metrics.intervals import bootstrapped, episodes, names_of
 
 NAMES = ("penetration", "slide", "goal_error", "path_error")
 UNITS = ("m", "m_s", "m", "m")
 
 
 def figures(
-    world: World,
+    world: LongTermWorld,
     sampler: Sampler,
     data: BehaviorData,
     scenes: Scenes,
     ego: Ego,
     windows: Int[np.ndarray, "window"],
-    settings: Settings,
+    settings: MotionOptimizationConfig,
     *,
     draws: int,
     seed: int,
 ) -> dict[str, float | None]:
-    """Draw one plan per window, make it physical, and compare penetration, sliding feet and distances from the truth.
+    """Draw one plan per window, make it physical, and compare penetration, sliding feet and distances from
+    the truth.
 
-    `<name>_before_<unit>`, `<name>_<unit>` and `<name>_more_<unit>`, the second less the first, with intervals over episodes.
+    `<name>_before_<unit>`, `<name>_<unit>` and `<name>_more_<unit>`, the second less the first, with
+    intervals over episodes.
     """
     both = rows(world, sampler, data, scenes, ego, windows, settings, seed)
     episode = episodes(data.start[windows], data.video[windows], FUTURE)
@@ -42,32 +47,41 @@ def figures(
         for ending, values in (("_before", before), ("", after), ("_more", after - before)):
             key, known = f"longterm_samples/{name}{ending}_{unit}", np.isfinite(values)
             groups = np.unique(episode[known], return_inverse=True)[1]
-            told = bootstrapped(values[known], groups, draws, np.random.default_rng(seed)).named(key) if known.any() else None
-            found |= told or dict.fromkeys(names_of(key))
+            interval = (
+                bootstrapped(values[known], groups, draws, np.random.default_rng(seed)).as_figures(key)
+                if known.any()
+                else None
+            )
+            found |= interval or dict.fromkeys(names_of(key))
     return found
 
 
 def rows(
-    world: World,
+    world: LongTermWorld,
     sampler: Sampler,
     data: BehaviorData,
     scenes: Scenes,
     ego: Ego,
     windows: Int[np.ndarray, "window"],
-    settings: Settings,
+    settings: MotionOptimizationConfig,
     seed: int,
 ) -> Float[np.ndarray, "window 2 4"]:
     """Return `NAMES` of each window's plan before and after."""
     context, future = data.windows(windows)
     observation = observe(context, scenes, data.agent_from_bone_rest, ego)
-    plan = sampler.plan(observation, Sampling(), np.random.default_rng(seed))
+    plan = sampler.plan(observation, PlanSamplingConfig(), np.random.default_rng(seed))
     roots = plan.world_from_agent(world_from_ego(context.world_from_agent[:, -1], ego))
     bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], data.agent_from_bone_rest)
     count = min(roots.shape[1], future.path_world.shape[1])
     time_s, found = np.arange(count) / RATE_HZ, []
     plans = zip(roots[:, :count], bones[:, :count], future.path_world[:, :count], strict=True)
     for root, bone, truth in progress.track(plans, "samples", total=len(roots)):
-        done, *worth = physical(world, time_s, Moving(root, bone), settings)
+        done, *worth = refine_at_rate(world, time_s, BodyMotion(root, bone), settings)
         off = [np.linalg.norm(each[:, :3, 3] - truth, axis=1) for each in (root, done.world_from_agent)]
-        found.append([[each.penetration_m, each.slide_m_s, away[-1], away.mean()] for each, away in zip(worth, off, strict=True)])
+        found.append(
+            [
+                [each.penetration_m, each.slide_m_s, away[-1], away.mean()]
+                for each, away in zip(worth, off, strict=True)
+            ]
+        )
     return np.array(found)

@@ -7,28 +7,30 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.models.behavior import channels_from_bones
-from pipeline.models.bodies import PoseSpace
-from pipeline.models.clip_channels import Clips, decode_clip
-from pipeline.models.contacts import tensors
-from pipeline.models.longterm_examples import Lives
-from pipeline.models.motion_optimization import Settings, optimise
-from pipeline.models.motion_synthesis import LongTerm
-from pipeline.models.plausibility import Judge, seams
-from pipeline.models.short_motions import STEPS, Moving, joined
+from pipeline.behavior.model import channels_from_bones
+from pipeline.longterm.bodies import PoseSpace
+from pipeline.longterm.clip_channels import Clips, decode_clip
+from pipeline.longterm.config import MotionOptimizationConfig
+from pipeline.longterm.contacts import motion_tensors
+from pipeline.longterm.examples import MotionDataset
+from pipeline.longterm.motion_optimization import optimize_motion
+from pipeline.longterm.motion_synthesis import LongTerm
+from pipeline.longterm.plausibility import PlausibilityMeter, seams
+from pipeline.longterm.short_motions import STEPS, BodyMotion, concatenate_motions
 
 METRICS = (
     "translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm",
     "end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share", "seam_share", "seam_worst_mm",
     "non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "least_slide_m_s",
 )  # fmt: skip
-"""translation, orientation, pose: L1 x 100 of root position (m), of its rotation's first two columns, of the bones' channels
-(rad, m). MPJPE: origins of the bones. MPVPE: all vertices. Neighbour v2v, between one short motion and the next, three ways.
-End v2v, the paper's words: distance of the first and last mesh from the given ones. Neighbour v2v, the paper's figures, which for
-true motion are not nothing: distance from the given ends to the meshes one frame further in. Seam: how much further the
-vertices move at the frame where two short motions join than in the frames beside it, their mean and the worst of them.
-Share: of the body's length. Slide: median speed of standing feet in that clip; planted: share of frames in which any foot
-stands; least slide: speed of the foot that moves least."""
+"""translation, orientation, pose: L1 x 100 of root position (m), of its rotation's first two columns, of the
+bones' channels (rad, m). MPJPE: origins of the bones. MPVPE: all vertices. Neighbour v2v, between one short
+motion and the next, three ways. End v2v, the paper's words: distance of the first and last mesh from the
+given ones. Neighbour v2v, the paper's figures, which for true motion are not nothing: distance from the given
+ends to the meshes one frame further in. Seam: how much further the vertices move at the frame where two short
+motions join than in the frames beside it, their mean and the worst of them. Share: of the body's length.
+Slide: median speed of standing feet in that clip; planted: share of frames in which any foot stands; least
+slide: speed of the foot that moves least."""
 MEDIANS = ("slide_m_s", "least_slide_m_s")
 """Metrics of which the tables give the median over clips, not the mean."""
 
@@ -40,28 +42,32 @@ ENDS, NEXT_TO_ENDS = np.array([0, -1]), np.array([1, -2])
 class Reference:
     """Everything that motions of one clip are measured against."""
 
-    truth: Moving
+    truth: BodyMotion
     """as it was recorded"""
-    judge: Judge
+    judge: PlausibilityMeter
 
     @cached_property
     def mesh(self) -> Float[Tensor, "frame vertex 3"]:
         """The true body."""
-        return self.judge.surface(*tensors(self.truth))
+        return self.judge.surface(*motion_tensors(self.truth))
 
 
-def score(made: Moving, reference: Reference, poses: PoseSpace, seam_m: Float[np.ndarray, "vertex"]) -> Float[np.ndarray, "metric"]:
+def score(
+    made: BodyMotion, reference: Reference, poses: PoseSpace, seam_m: Float[np.ndarray, "vertex"]
+) -> Float[np.ndarray, "metric"]:
     """Measure one short motion; the feet that stand are those of the made motion itself."""
     body, truth = reference.judge.body, reference.truth
     stance = reference.judge.stance(made)
     worth = reference.judge.plausibility(made, stance)
-    mesh = reference.judge.surface(*tensors(made))
+    mesh = reference.judge.surface(*motion_tensors(made))
     apart = (mesh - reference.mesh).norm(dim=-1)
     beside = float((mesh[NEXT_TO_ENDS] - reference.mesh[ENDS]).norm(dim=-1).mean())
     turn = np.abs(made.world_from_agent - truth.world_from_agent)[:, :3, :2].mean()
     joints = [each.world_from_agent[:, None] @ each.agent_from_bone for each in (made, truth)]
     rest = poses.rest.double().numpy()
-    pose = np.abs(channels_from_bones(made.agent_from_bone, rest) - channels_from_bones(truth.agent_from_bone, rest)).mean()
+    pose = np.abs(
+        channels_from_bones(made.agent_from_bone, rest) - channels_from_bones(truth.agent_from_bone, rest)
+    ).mean()
     return np.array(
         [
             100 * np.abs(made.world_from_agent - truth.world_from_agent)[:, :3, 3].mean(),
@@ -85,11 +91,17 @@ def score(made: Moving, reference: Reference, poses: PoseSpace, seam_m: Float[np
 
 
 def scores(
-    channels: Float[Tensor, "clip frame channel"], clips: Clips, references: list[Reference], model: LongTerm, settings: Settings | None
+    channels: Float[Tensor, "clip frame channel"],
+    clips: Clips,
+    references: list[Reference],
+    model: LongTerm,
+    settings: MotionOptimizationConfig | None,
 ) -> Float[np.ndarray, "clip metric"]:
-    """Measure the motions of one method on all clips, two of which always follow each other, and the seams between those.
+    """Measure the motions of one method on all clips, two of which always follow each other, and the seams
+    between those.
 
-    Where ``settings`` are given both are optimised as one motion, all but the given bodies at its ends and in its middle.
+    Where ``settings`` are given both are optimised as one motion, all but the given bodies at its ends and in
+    its middle.
     """
     made = [
         decode_clip(each, frame, model.poses, reference.truth[ENDS].agent_from_bone)
@@ -99,22 +111,30 @@ def scores(
 
 
 def scored(
-    motions: list[Moving], references: list[Reference], model: LongTerm, settings: Settings | None = None
+    motions: list[BodyMotion],
+    references: list[Reference],
+    model: LongTerm,
+    settings: MotionOptimizationConfig | None = None,
 ) -> Float[np.ndarray, "clip metric"]:
     """Measure motions that follow each other two by two."""
     rows = []
     for start in range(0, len(motions), 2):
-        both, judge = joined(motions[start : start + 2]), references[start].judge
+        both, judge = concatenate_motions(motions[start : start + 2]), references[start].judge
         if settings is not None:
             held = np.arange(len(both)) % STEPS == 0
-            both = optimise(both, model.physique(judge.body), judge.scene, settings, held=held)
+            both = optimize_motion(both, model.contact_body(judge.body), judge.scene, settings, held=held)
         seam = seams(judge.body, both, STEPS, vertices=None)[0]
         halves = both[: STEPS + 1], both[STEPS:]
-        rows += [score(half, known, model.poses, seam) for half, known in zip(halves, references[start : start + 2], strict=True)]
+        rows += [
+            score(half, known, model.poses, seam)
+            for half, known in zip(halves, references[start : start + 2], strict=True)
+        ]
     return np.array(rows).reshape(-1, len(METRICS))
 
 
-def references(parts: list[Moving], scene: np.ndarray, lives: Lives, model: LongTerm) -> list[Reference]:
+def references(
+    parts: list[BodyMotion], scene: np.ndarray, dataset: MotionDataset, model: LongTerm
+) -> list[Reference]:
     """Pair true short motions with what judges them."""
-    judges = [Judge(lives.body, model.contacts, each.distance) for each in lives.scenes]
+    judges = [PlausibilityMeter(dataset.body, model.contacts, each.distance) for each in dataset.scenes]
     return [Reference(part, judges[index]) for part, index in zip(parts, scene, strict=True)]

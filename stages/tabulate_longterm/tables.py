@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.intervals import bootstrapped, names_of, told
+from pipeline.metrics.intervals import bootstrapped, formatted_interval, names_of
 from stages.tabulate_longterm.scores import MEDIANS, METRICS
 
 TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
@@ -14,9 +14,15 @@ TABLE_4 = ("end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share", "seam_sha
 
 
 def figures(
-    rows: Mapping[str, Float[np.ndarray, "clip metric"]], episode: Int[np.ndarray, "clip"], prefix: str, *, draws: int, seed: int
+    rows: Mapping[str, Float[np.ndarray, "clip metric"]],
+    episode: Int[np.ndarray, "clip"],
+    prefix: str,
+    *,
+    draws: int,
+    seed: int,
 ) -> dict[str, float | None]:
-    """Return mean (of `MEDIANS` the median) and 95 % interval, drawn over episodes, of every metric of every method.
+    """Return mean (of `MEDIANS` the median) and 95 % interval, drawn over episodes, of every metric of every
+    method.
 
     None where it cannot be measured.
     """
@@ -28,7 +34,9 @@ def figures(
                 found |= dict.fromkeys(names_of(name))
                 continue
             groups = np.unique(episode[: len(column)][known], return_inverse=True)[1]
-            found |= bootstrapped(column[known], groups, draws, np.random.default_rng(seed), median=metric in MEDIANS).named(name)
+            found |= bootstrapped(
+                column[known], groups, draws, np.random.default_rng(seed), median=metric in MEDIANS
+            ).as_figures(name)
     return found
 
 
@@ -42,21 +50,40 @@ def text(found: Mapping[str, float | None]) -> str:
         ("longterm_recorded", "reconstructed motion, test recording"),
         ("longterm_recorded_blocked", "reconstructed motion, something in the way"),
     ):
-        methods = dict.fromkeys(name.split("/")[1] for name in found if name.startswith(f"{prefix}/") and name.count("/") == 2)
+        methods = dict.fromkeys(
+            name.split("/")[1] for name in found if name.startswith(f"{prefix}/") and name.count("/") == 2
+        )
         for number, columns in ((1, TABLE_1), (2, TABLE_2), (4, TABLE_4)):
             if methods:
                 parts.append(_table(f"Table {number}: {title}", prefix, list(methods), columns, found))
     others = [name for name in found if name.split("/")[0] in ("longterm_minutes", "longterm_samples")]
     if others:
         parts.append(
-            "\n".join(["Minutes of motion, and samples of the behaviour model", *(f"{name}  {told(found, name)}" for name in others)])
+            "\n".join(
+                [
+                    "Minutes of motion, and samples of the behaviour model",
+                    *(f"{name}  {formatted_interval(found, name)}" for name in others),
+                ]
+            )
         )
     return "\n\n".join(parts)
 
 
-def _table(title: str, prefix: str, methods: list[str], columns: tuple[str, ...], found: Mapping[str, float | None]) -> str:
+def _table(
+    title: str, prefix: str, methods: list[str], columns: tuple[str, ...], found: Mapping[str, float | None]
+) -> str:
     rows = [["method", *columns]]
     for method in methods:
-        rows.append([method, *(told(found, f"{prefix}/{method}/{column}") for column in columns)])
+        rows.append(
+            [method, *(formatted_interval(found, f"{prefix}/{method}/{column}") for column in columns)]
+        )
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join([title, *("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)])
+    return "\n".join(
+        [
+            title,
+            *(
+                "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+                for row in rows
+            ),
+        ]
+    )

@@ -1,9 +1,11 @@
 """Training windows as tensors in the ego frame, and the augmented batches drawn from them.
 
-Augmentation rotates the ego frame about its up axis, mirrors left and right (bones are hidden then, since nobody knows
-which bone mirrors which), shifts the observer and blurs what is remembered: five minutes of video must go a long way.
+Augmentation rotates the ego frame about its up axis, mirrors left and right (bones are hidden then, since
+nobody knows which bone mirrors which), shifts the observer and blurs what is remembered: five minutes of
+video must go a long way.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,57 +14,35 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import convolve1d
 from torch import Tensor
 
-from pipeline.models.behavior import Architecture, Scaling, channels_from_bones
-from pipeline.models.perception import FeatureVolume, Minds, grid_points_ego, world_from_ego
-from pipeline.models.scenes import Scenes
-from pipeline.models.strides import GOAL_POWER, powered, strides_from_path
-from pipeline.models.trajectories import PAST, RATE_HZ, BehaviorData
-from pipeline.space import rigid, rigid_torch
+from pipeline.behavior.model import Architecture, Scaling, channels_from_bones
+from pipeline.behavior.path_encoding import (
+    GOAL_LENGTH_POWER,
+    velocity_channels_from_path,
+    with_powered_length,
+)
+from pipeline.behavior.perception import FeatureVolume, PerceptionEnsemble, grid_points_ego, world_from_ego
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import PAST, RATE_HZ, BehaviorData
+from pipeline.geometry import rigid, rigid_torch
+from stages.train_behavior.config import AugmentationConfig
 
-NEAR_M, COMING_M_S = 2.4, 0.4
+YAW_JITTER_RAD = 0.3
+"""largest rotation of samples that are not turned by any angle"""
+OBSERVER_SHIFT_M = 0.05
+"""standard deviation of a shift of the observer's whole past: how far reconstructed cameras are off"""
+POSTURE_TILT_RAD, POSTURE_BEND = 0.15, 0.3
+"""standard deviations of a posture's offset: tilt of the root; bones, in their own standard deviations"""
+APPROACH_DISTANCE_M, APPROACH_SPEED_M_S = 2.4, 0.4
 """distance and pace of an observer that comes up"""
-BIN_M, AS_OFTEN = 0.2, 8
-"""distances that approaches are told apart by, and how often a window may count so that rare distances are asked as often"""
-ENOUGH = 8192
-"""Windows that tell means and spreads."""
+BIN_M, MAX_REPEATS = 0.2, 8
+"""bins of distance of approaches, and how often a window may count so that rare distances are
+asked as often"""
+MAX_STATISTICS_WINDOWS = 8192
+"""Windows that means and standard deviations are computed from."""
 
 
 @dataclass(frozen=True)
-class Augmentation:
-    """How far training samples stray from the recorded ones."""
-
-    turn: float = 0.5
-    """probability of turning the ego frame about its up axis by any angle"""
-    yaw_rad: float = 0.3
-    """largest turn of the other samples, either way"""
-    mirror: float = 0.5
-    """probability of mirroring left and right"""
-    observer_m: float = 0.05
-    """standard deviation of a shift of the observer's whole past"""
-    past: float = 0.3
-    """standard deviation of noise on the remembered motion, in its own standard deviations"""
-    lapse: float = 0.5
-    """probability that the posture that is remembered is off, as sampled ones are: else what is off stays and adds up"""
-    lapse_rad: float = 0.15
-    """standard deviation of the tilt of the root's posture then"""
-    lapse_bones: float = 0.3
-    """standard deviation of that of its bones, in their own standard deviations"""
-    hide_bones: float = 0.5
-    """probability that a sample's remembered bones are hidden"""
-    approached: float = 0.1
-    """share of samples drawn from windows that begin with a person coming up, from near and from far alike, which are few and
-    matter; what follows is as likely in them as ever"""
-    approached_paths: float = 0.1
-    """the same while path and body learn apart from goals"""
-
-    @property
-    def largest_turn_rad(self) -> float:
-        """Return how far the ego frame may be turned, either way."""
-        return torch.pi if self.turn > 0 else self.yaw_rad
-
-
-@dataclass(frozen=True)
-class Tracks:
+class EgoTracks:
     """What animal and observer do in some windows, each in its own ego frame."""
 
     root: Float[Tensor, "window 64 3"]
@@ -71,7 +51,7 @@ class Tracks:
 
 
 @dataclass(frozen=True)
-class Windows:
+class TrainingWindows:
     """All training windows: every frame once, and which frames each window holds."""
 
     world_from_agent: Float[Tensor, "frame 4 4"]
@@ -87,16 +67,16 @@ class Windows:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def tracks(self, index: Int[Tensor, "some"]) -> Tracks:
+    def tracks(self, index: Int[Tensor, "some"]) -> EgoTracks:
         """Express some windows in the ego frames of their current times."""
         ego_from_world = rigid_torch.inverse(self.world_from_ego[index])
         ego_from_agent = ego_from_world[:, None] @ self.world_from_agent[self.frame[index]]
         observer = rigid_torch.apply(ego_from_world, self.observer_world[self.frame[index, :PAST]])
-        return Tracks(ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], observer)
+        return EgoTracks(ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], observer)
 
 
 @dataclass(frozen=True)
-class Statistics:
+class WindowStatistics:
     """Means and spreads of the training windows."""
 
     scaling: Scaling
@@ -107,30 +87,30 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class Batch:
+class TrainingBatch:
     """One augmented batch: inputs of perception, and clean targets in scaled units."""
 
     scene: Float[Tensor, "batch channel x y z"]
     observer_past: Float[Tensor, "batch frame*3"]
     past: Float[Tensor, "batch frame*channel"]
     held: Float[Tensor, "batch frame channel"]
-    """root and bones of the frames that tell pace and posture, as they were"""
+    """root and bones of the frames that give velocity and posture, as they were"""
     bones_keep: Float[Tensor, "batch"]
     mirrored: Bool[Tensor, "batch"]
-    chosen: Bool[Tensor, "batch"]
-    """drawn for their observer, who is always perceived then: without, they would tell wrong odds"""
+    oversampled: Bool[Tensor, "batch"]
+    """drawn for their observer, who is always perceived then: without, the odds would be wrong"""
     goal: Float[Tensor, "batch 3"]
     track: Float[Tensor, "batch 3 56"]
-    """where the animal is in each frame, told as a goal is"""
+    """where the animal is in each frame, encoded as a goal is"""
     path: Float[Tensor, "batch 4 56"]
     """its strides"""
     places: Float[Tensor, "batch 3 56"]
-    """the path as a body is told it"""
+    """the path as it conditions a body"""
     body: Float[Tensor, "batch channel 56"]
 
-    def to(self, device: torch.device) -> "Batch":
+    def to(self, device: torch.device) -> "TrainingBatch":
         """Return the batch on a device."""
-        return Batch(*(value.to(device) for value in vars(self).values()))
+        return TrainingBatch(*(value.to(device) for value in vars(self).values()))
 
 
 class SceneSampler:
@@ -148,19 +128,31 @@ class SceneSampler:
         self.points = torch.from_numpy(grid_points_ego(stride).astype(np.float32)).to(device)
         first = np.cumsum([0, *(len(part) for part in flat[:-1])])
         self.first = torch.from_numpy(first).to(device)
-        self.origin = torch.from_numpy(np.stack([volume.origin for volume in volumes]).astype(np.float32)).to(device)
+        self.origin = torch.from_numpy(np.stack([volume.origin for volume in volumes]).astype(np.float32)).to(
+            device
+        )
         self.shape = torch.tensor([volume.occupancy.shape for volume in volumes], device=device)
         self.voxel_m = torch.tensor([volume.voxel_m for volume in volumes], device=device)
 
     def __call__(
-        self, world_from_ego: Float[Tensor, "batch 4 4"], side: Float[Tensor, "batch"], scene: Int[Tensor, "batch"]
+        self,
+        world_from_ego: Float[Tensor, "batch 4 4"],
+        side: Float[Tensor, "batch"],
+        scene: Int[Tensor, "batch"],
     ) -> Float[Tensor, "batch channel x y z"]:
         """Sample the grid in the volumes ``scene``; ``side`` is -1 where left and right are exchanged."""
-        points = self.points.flatten(0, 2) * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
+        points = (
+            self.points.flatten(0, 2)
+            * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
+        )
         away = rigid_torch.apply(world_from_ego, points) - self.origin[scene][:, None]
         index, shape = (away / self.voxel_m[scene][:, None, None]).floor().long(), self.shape[scene][:, None]
         inside = ((index >= 0) & (index < shape)).all(-1)
-        row = (index[..., 0] * shape[..., 1] + index[..., 1]) * shape[..., 2] + index[..., 2] + self.first[scene][:, None]
+        row = (
+            (index[..., 0] * shape[..., 1] + index[..., 1]) * shape[..., 2]
+            + index[..., 2]
+            + self.first[scene][:, None]
+        )
         features = self.features[torch.where(inside, row, len(self.features) - 1)]
         return features.transpose(1, 2).unflatten(2, self.points.shape[:3])
 
@@ -174,58 +166,80 @@ def _smoothed(volume: FeatureVolume, stride: int) -> Float[np.ndarray, "x y z ch
     return np.moveaxis(features, 0, -1)
 
 
-def windows_from_data(data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture, scenes: Scenes) -> Windows:
-    """Put the frames of all recordings in one row and tell where in it each window lies."""
+def windows_from_data(
+    data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture, scenes: Scenes
+) -> TrainingWindows:
+    """Put the frames of all recordings in one row and index each window in it."""
     tracks = [data.trajectories[video] for video in data.videos]
     agent = np.concatenate([track.world_from_agent for track in tracks])
     observer = np.concatenate([track.world_from_camera[:, :3, 3] for track in tracks])
-    bones = np.concatenate([channels_from_bones(track.agent_from_bone, data.agent_from_bone_rest) for track in tracks])
+    bones = np.concatenate(
+        [channels_from_bones(track.agent_from_bone, data.agent_from_bone_rest) for track in tracks]
+    )
     first = np.cumsum([0, *(len(track.timestamp_s) for track in tracks[:-1])])
     rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(PAST + data.future)
     frame = world_from_ego(agent[rows[:, PAST - 1]], architecture.ego)
     number = scenes.number(data.video[index], len(index))
     tables = (torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, bones, frame))
     met = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST]])
-    met = met[:0] if architecture.blind_to == "observer" else met
-    return Windows(*tables, torch.from_numpy(rows), torch.from_numpy(number), torch.from_numpy(met))
+    met = met[:0] if architecture.ablated_input == "observer" else met
+    return TrainingWindows(*tables, torch.from_numpy(rows), torch.from_numpy(number), torch.from_numpy(met))
 
 
-def approached(agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray, "window 8 3"]) -> Int[np.ndarray, "some"]:
-    """Return the windows in which the observer, at most `NEAR_M` from the animal, comes up at `COMING_M_S` or more.
+def approached(
+    agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray, "window 8 3"]
+) -> Int[np.ndarray, "some"]:
+    """Return the windows in which the observer, at most `APPROACH_DISTANCE_M` from the animal, comes up at
+    `APPROACH_SPEED_M_S` or more.
 
-    Those at distances that are rare are named several times: an animal learns no rule from what it is hardly asked.
+    Those at distances that are rare are named several times: an animal learns no rule from what it is hardly
+    asked.
     """
     away = (agent[:, None] - observer)[..., [0, 2]]
     distance = np.linalg.norm(away[:, -1], axis=-1)
     walked = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (RATE_HZ / (PAST - 1))
-    met = np.flatnonzero((distance < NEAR_M) & ((walked * away[:, -1]).sum(-1) > COMING_M_S * distance))
+    met = np.flatnonzero(
+        (distance < APPROACH_DISTANCE_M) & ((walked * away[:, -1]).sum(-1) > APPROACH_SPEED_M_S * distance)
+    )
     each = (distance[met] / BIN_M).astype(int)
     most = np.bincount(each).max(initial=0)
     parts = [met[each == number] for number in np.unique(each)]
-    return np.concatenate([met[:0], *(np.resize(part, min(most, AS_OFTEN * len(part))) for part in parts)])
+    return np.concatenate([met[:0], *(np.resize(part, min(most, MAX_REPEATS * len(part))) for part in parts)])
 
 
-def statistics_from_windows(windows: Windows, turn_rad: float, *, per_frame: bool = False) -> Statistics:
-    """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past to at most 8,192 windows.
+def largest_turn_rad(augmentation: AugmentationConfig) -> float:
+    """Return how far the ego frame may be rotated about its up axis, either way, radians."""
+    return math.pi if augmentation.turn > 0 else 0.0
 
-    Strides are scaled in all frames alike or, with ``per_frame``, in each on its own, as the released code scales. The root's
-    rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is remembered of a body is scaled
-    as the body is.
+
+def statistics_from_windows(
+    windows: TrainingWindows, turn_rad: float, *, per_frame: bool = False
+) -> WindowStatistics:
+    """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past to at most 8,192
+    windows.
+
+    Strides are scaled in all frames alike or, with ``per_frame``, in each on its own, as the released code
+    scales. The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way.
+    What is remembered of a body is scaled as the body is.
     """
-    some = torch.arange(0, len(windows), -(-len(windows) // ENOUGH))
+    some = torch.arange(0, len(windows), -(-len(windows) // MAX_STATISTICS_WINDOWS))
     tracks, rows = windows.tracks(some), windows.frame[some]
     future = tracks.root[:, PAST:].double().numpy()
     level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(0.02)
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
     whole = body_statistics(tracks.rotation[:, PAST:], windows.bones[rows[:, PAST:].unique()], turn_rad)
-    strides = strides_from_path(tracks.root[:, PAST:], tracks.root[:, PAST - 1])[..., :3].double().numpy()
+    strides = (
+        velocity_channels_from_path(tracks.root[:, PAST:], tracks.root[:, PAST - 1])[..., :3].double().numpy()
+    )
     each = np.swapaxes(strides, 0, 1) if per_frame else strides.reshape(1, -1, 3)
     stride_std = np.array([[*_spread(frame), 1.0] for frame in each])
-    scaling = Scaling(_spread(powered(future[:, -1], GOAL_POWER)), stride_std, path_std, *whole)
+    scaling = Scaling(
+        _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER)), stride_std, path_std, *whole
+    )
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
     position = tracks.root[:, :PAST].std().clip(0.05).expand(3)
-    return Statistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
+    return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 
 def _spread(way: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
@@ -246,37 +260,45 @@ def body_statistics(
     return np.concatenate([root.mean(0), posed.mean(0)]), np.maximum(std, floor)
 
 
-def body_channels(rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch c"]:
+def body_channels(
+    rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]
+) -> Float[Tensor, "*batch c"]:
     """Put the root's rotation (6) before the bones."""
     return torch.cat([rigid_torch.rotation_to_6d(rotation), bones], dim=-1)
 
 
-def lapsed(
+def with_posture_noise(
     rotation: Float[Tensor, "batch 8 3 3"],
     bones: Float[Tensor, "batch 8 channel"],
-    statistics: Statistics,
-    augmentation: Augmentation,
+    statistics: WindowStatistics,
+    augmentation: AugmentationConfig,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "batch 8 3 3"], Float[Tensor, "batch 8 channel"]]:
     """Tilt the roots and bend the bones of some samples, in all frames alike."""
     size, channels = len(bones), bones.shape[-1]
-    some = (torch.rand(size, 1, generator=generator) < augmentation.lapse).float()
-    tilt = torch.randn(size, 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0]) * augmentation.lapse_rad * some
-    bend = torch.randn(size, channels, generator=generator) * statistics.past_std[-channels:] * augmentation.lapse_bones * some
+    some = (torch.rand(size, 1, generator=generator) < augmentation.posture_offset).float()
+    tilt = torch.randn(size, 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0]) * POSTURE_TILT_RAD * some
+    bend = (
+        torch.randn(size, channels, generator=generator)
+        * statistics.past_std[-channels:]
+        * POSTURE_BEND
+        * some
+    )
     return rigid_torch.so3_exp(tilt)[:, None] @ rotation, bones + bend[:, None]
 
 
 def draw_batch(
-    windows: Windows,
+    windows: TrainingWindows,
     scene: SceneSampler,
-    statistics: Statistics,
-    augmentation: Augmentation,
+    statistics: WindowStatistics,
+    augmentation: AugmentationConfig,
     size: int,
     generator: torch.Generator,
     *,
     bodies: bool = True,
-) -> Batch:
-    """Draw windows with replacement and augment each on its own, on the CPU; the batch lands where the scene lies.
+) -> TrainingBatch:
+    """Draw windows with replacement and augment each on its own, on the CPU; the batch lands where the scene
+    lies.
 
     Without ``bodies``, which take the longest, those have no frames.
     """
@@ -290,7 +312,9 @@ def draw_batch(
     often = torch.randint(max(len(windows.approached), 1), (size,), generator=generator)
     index[chosen] = windows.approached[often[chosen]]
     side = 1.0 - 2.0 * (uniform(size) < augmentation.mirror).float()
-    reach = torch.where(uniform(size) < augmentation.turn, torch.pi, augmentation.yaw_rad)
+    reach = torch.where(
+        uniform(size) < augmentation.turn, torch.pi, min(largest_turn_rad(augmentation), YAW_JITTER_RAD)
+    )
     yaw = (uniform(size) * 2 - 1) * reach
     turn = rigid_torch.so3_exp(torch.stack([torch.zeros(size), yaw, torch.zeros(size)], dim=-1))
     flip = torch.diag_embed(torch.stack([side, torch.ones(size), torch.ones(size)], dim=-1))
@@ -298,19 +322,30 @@ def draw_batch(
     tracks = windows.tracks(index)
     root = tracks.root @ new_from_old.mT
     rotation = new_from_old[:, None] @ tracks.rotation @ flip[:, None]
-    shift = torch.randn(size, 1, 3, generator=generator) * augmentation.observer_m
+    shift = torch.randn(size, 1, 3, generator=generator) * (
+        OBSERVER_SHIFT_M if augmentation.past > 0 else 0.0
+    )
     observer = (tracks.observer + shift) @ new_from_old.mT
     frames = windows.frame[index]
-    remembered = body_channels(*lapsed(rotation[:, :PAST], windows.bones[frames[:, :PAST]], statistics, augmentation, generator))
+    remembered = body_channels(
+        *with_posture_noise(
+            rotation[:, :PAST], windows.bones[frames[:, :PAST]], statistics, augmentation, generator
+        )
+    )
     past = torch.cat([root[:, :PAST], remembered], dim=-1)
-    held = past[:, -Minds.HELD_FRAMES :]
+    held = past[:, -PerceptionEnsemble.POSTURE_FRAMES :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
-    body = body_channels(rotation[:, posed], windows.bones[frames[:, posed]]) - torch.from_numpy(scaling.body_mean).float()
+    body = (
+        body_channels(rotation[:, posed], windows.bones[frames[:, posed]])
+        - torch.from_numpy(scaling.body_mean).float()
+    )
     device, future = scene.points.device, root[:, PAST:]
-    track = powered(future, GOAL_POWER) / torch.from_numpy(scaling.goal_std).float()
-    strides = strides_from_path(future, root[:, PAST - 1]) / torch.from_numpy(scaling.stride_std).float()
-    return Batch(
+    track = with_powered_length(future, GOAL_LENGTH_POWER) / torch.from_numpy(scaling.goal_std).float()
+    strides = (
+        velocity_channels_from_path(future, root[:, PAST - 1]) / torch.from_numpy(scaling.stride_std).float()
+    )
+    return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
         observer.flatten(1),
         past.flatten(1),

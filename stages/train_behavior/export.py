@@ -1,4 +1,6 @@
-"""The trained model as files: ONNX networks, weights, the sampler's contract, one golden plan to test samplers with."""
+"""The trained model as files: ONNX networks, weights, the sampler's contract, one golden plan to test
+samplers with.
+"""
 
 import json
 import logging
@@ -12,18 +14,24 @@ import onnxruntime
 import torch
 from safetensors.torch import save_file
 
-from pipeline.models.behavior import Architecture, BehaviorNets, Sampling, Scaling, contract
-from pipeline.models.diffusion import Schedule
-from pipeline.models.perception import GRID_SHAPE
-from pipeline.models.planning import Observation, Sampler, TorchNetworks
-from pipeline.models.strides import STRIDE
-from pipeline.models.trajectories import PAST
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contract
+from pipeline.behavior.path_encoding import PATH_CHANNELS
+from pipeline.behavior.perception import GRID_SHAPE
+from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
+from pipeline.behavior.trajectories import PAST
 
 NETWORKS = ("perception", "goal", "path", "body")
 
 
 def write_model(
-    folder: Path, nets: BehaviorNets, architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: np.ndarray
+    folder: Path,
+    nets: BehaviorNets,
+    architecture: Architecture,
+    scaling: Scaling,
+    schedule: Schedule,
+    rest: np.ndarray,
 ) -> float:
     """Write everything a sampler needs. Return the largest difference between ONNX and torch."""
     write_contract(folder, nets, architecture, scaling, schedule, rest)
@@ -31,10 +39,18 @@ def write_model(
 
 
 def write_contract(
-    folder: Path, nets: BehaviorNets, architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: np.ndarray
+    folder: Path,
+    nets: BehaviorNets,
+    architecture: Architecture,
+    scaling: Scaling,
+    schedule: Schedule,
+    rest: np.ndarray,
 ) -> None:
     """Write weights, `behavior.json` and, of the model that other samplers know, `golden.json`."""
-    save_file({name: value.contiguous() for name, value in nets.state_dict().items()}, folder / "behavior.safetensors")
+    save_file(
+        {name: value.contiguous() for name, value in nets.state_dict().items()},
+        folder / "behavior.safetensors",
+    )
     document = contract(architecture, scaling, schedule, rest)
     (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
     if architecture.family == "diffusion":
@@ -46,10 +62,15 @@ def write_networks(folder: Path, nets: BehaviorNets, architecture: Architecture)
     """Write the four ONNX files. Return the largest difference between ONNX and torch."""
     for name in NETWORKS:
         export_network(getattr(nets, name), folder / f"{name}.onnx", *signature(name, architecture))
-    return max(difference(getattr(nets, name), folder / f"{name}.onnx", signature(name, architecture)[0]) for name in NETWORKS)
+    return max(
+        difference(getattr(nets, name), folder / f"{name}.onnx", signature(name, architecture)[0])
+        for name in NETWORKS
+    )
 
 
-def export_network(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]], output: str) -> None:
+def export_network(
+    module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]], output: str
+) -> None:
     """Write one network as ONNX with a free batch dimension; the same weights always give the same bytes."""
     batch = torch.export.Dim("batch", min=1, max=4096)
     example = tuple(torch.zeros(2, *shape) for shape in inputs.values())
@@ -82,7 +103,7 @@ def export_network(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[
 
 def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], str]:
     """Return the inputs of a network (name and shape without batch) and the name of its output."""
-    step: dict[str, tuple[int, ...]] = {"t": (), "condition": (a.condition,)}
+    step: dict[str, tuple[int, ...]] = {"t": (), "condition": (a.condition_length,)}
     match name:
         case "perception":
             grid = {
@@ -94,30 +115,48 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
         case "goal":
             return {"x": (3,)} | step, "epsilon"
         case "path":
-            return {"x": (STRIDE, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
+            return {"x": (PATH_CHANNELS, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
         case _:
-            return {"x": (a.body_channels, a.future)} | step | {"control": (3, a.future), "keep": (1,)}, "epsilon"
+            return {"x": (a.body_channels, a.future)} | step | {
+                "control": (3, a.future),
+                "keep": (1,),
+            }, "epsilon"
 
 
 def golden_observation(a: Architecture) -> Observation:
     """Return the fixed input of the golden plan; every number follows from its index."""
 
     def wave(*shape: int, amplitude: float, frequency: float) -> np.ndarray:
-        return (amplitude * np.sin(frequency * np.arange(np.prod(shape), dtype=np.float64))).reshape(1, *shape).astype(np.float32)
+        return (
+            (amplitude * np.sin(frequency * np.arange(np.prod(shape), dtype=np.float64)))
+            .reshape(1, *shape)
+            .astype(np.float32)
+        )
 
-    observer = np.stack([np.linspace(0.5, 0.2, PAST), np.full(PAST, 1.2), np.linspace(1.8, 1.1, PAST)], axis=-1).reshape(1, -1)
+    observer = np.stack(
+        [np.linspace(0.5, 0.2, PAST), np.full(PAST, 1.2), np.linspace(1.8, 1.1, PAST)], axis=-1
+    ).reshape(1, -1)
     scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
-    return Observation(scene, observer.astype(np.float32), wave(PAST * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1))
+    return Observation(
+        scene, observer.astype(np.float32), wave(PAST * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
+    )
 
 
 def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
     """Sample one plan by DDIM and note its input, its noise and its result."""
     observation = golden_observation(architecture)
-    sampling = Sampling(method="ddim", goal_steps=10, sequence_steps=10, path_draws=1)
+    sampling = PlanSamplingConfig(method="ddim", goal_steps=10, sequence_steps=10, max_path_draws=1)
     noise = np.random.default_rng(0)
-    shapes = {"goal": (1, 3), "path": (1, STRIDE, architecture.future), "body": (1, architecture.body_channels, architecture.future)}
+    shapes = {
+        "goal": (1, 3),
+        "path": (1, PATH_CHANNELS, architecture.future),
+        "body": (1, architecture.body_channels, architecture.future),
+    }
     drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}
-    plans = {f"guidance_{s:g}": sampler.plan(observation, replace(sampling, guidance=s), np.random.default_rng(0)) for s in (1.0, 0.5)}
+    plans = {
+        f"guidance_{s:g}": sampler.plan(observation, replace(sampling, guidance=s), np.random.default_rng(0))
+        for s in (1.0, 0.5)
+    }
     return {
         "input": {
             "scene_grid": "scene_grid.flat[i] = 0.25 sin(0.01 i)",
@@ -131,7 +170,10 @@ def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
             "sequence_steps": sampling.sequence_steps,
         },
         "noise": {name: _plain(value) for name, value in drawn.items()},
-        "plans": {name: {level: _plain(value) for level, value in vars(plan).items()} for name, plan in plans.items()},
+        "plans": {
+            name: {level: _plain(value) for level, value in vars(plan).items()}
+            for name, plan in plans.items()
+        },
     }
 
 

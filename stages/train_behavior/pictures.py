@@ -4,40 +4,44 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.figure import Figure
 
-from pipeline import figures
-from pipeline.fit import FitRecord
-from pipeline.models.behavior import Sampling
-from pipeline.models.perception import FeatureVolume
-from pipeline.models.planning import Observation, Sampler
-from pipeline.models.scenes import Scenes
-from pipeline.qa import Check, Picture
-from pipeline.space import rigid
-from stages.train_behavior.reactions import SIDES, Moments, Reactions, approach
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.planning import Observation, Sampler
+from pipeline.behavior.scenes import Scenes
+from pipeline.core.training import FitRecord
+from pipeline.data import plots
+from pipeline.data.qa import Check, Picture
+from pipeline.geometry import rigid
+from stages.train_behavior.reactions import SIDES, Reactions, SampledMoments, approach
 
-FAN = 64
-SHOWN = 4
-REACH_M = 3.0
+FAN_GOALS = 64
+SHOWN_WINDOWS = 4
+WINDOW_HALF_M = 3.0
 
 
-def pictures(sampler: Sampler, moments: Moments, scenes: Scenes, record: FitRecord, *, seed: int) -> list[Picture]:
+def pictures(
+    sampler: Sampler, moments: SampledMoments, scenes: Scenes, record: FitRecord, *, seed: int
+) -> list[Picture]:
     """Draw a few training windows, sampled under different conditions."""
-    chosen = np.linspace(0, len(moments.observation) - 1, SHOWN + 2).astype(int)[1:-1]
-    rooms, frame = [_Room(scenes.volumes[number]) for number in moments.scene[chosen]], moments.world_from_ego[chosen]
+    chosen = np.linspace(0, len(moments.observation) - 1, SHOWN_WINDOWS + 2).astype(int)[1:-1]
+    rooms, frame = (
+        [RoomMap(scenes.volumes[number]) for number in moments.scene[chosen]],
+        moments.world_from_ego[chosen],
+    )
     some = moments.observation[chosen]
     removed = {
-        "all": Sampling(),
-        "no observer": Sampling(observer=False),
-        "no scene": Sampling(scene=False),
-        "no past": Sampling(past=False),
+        "all": PlanSamplingConfig(),
+        "no observer": PlanSamplingConfig(observer=False),
+        "no scene": PlanSamplingConfig(scene=False),
+        "no past": PlanSamplingConfig(past=False),
     }
-    strength = {f"interactivity {s:g}": Sampling(guidance=s) for s in (0.0, 0.5, 1.0)}
+    strength = {f"interactivity {s:g}": PlanSamplingConfig(guidance=s) for s in (0.0, 0.5, 1.0)}
     with_scene = {name: removed[name] for name in ("all", "no scene")}
     close = replace(some, observer_past=np.tile(approach(SIDES[0], 0.8, 1.0), (len(chosen), 1)))
     captions = {
-        "goals": "Sampled goals (orange) at training moments, with conditions removed; animal blue, observer green.",
-        "guidance": "The same moments with an observer who walks up from ahead; same noise at each interactivity.",
+        "goals": "Sampled goals (orange) with conditions removed; animal blue, observer green.",
+        "guidance": "The same with an observer who walks up from ahead; same noise at each interactivity.",
         "paths": "Sampled paths with and without the scene.",
         "losses": "Squared error of the predicted noise, smoothed.",
     }
@@ -45,7 +49,7 @@ def pictures(sampler: Sampler, moments: Moments, scenes: Scenes, record: FitReco
         "goals": fans(rooms, sampler, some, frame, removed, seed),
         "guidance": fans(rooms, sampler, close, frame, strength, seed),
         "paths": fans(rooms, sampler, some, frame, with_scene, seed, paths=True),
-        "losses": losses(record),
+        "losses": plots.loss_curves({"training": record.terms}),
     }
     return [Picture(name, image, captions[name]) for name, image in images.items()]
 
@@ -55,10 +59,22 @@ def checks(record: FitRecord, reactions: Reactions, onnx_difference: float) -> l
     learned = {name: values[np.isfinite(values)] for name, values in record.terms.items()}
     last = {name: float(values[-max(len(values) // 10, 1) :].mean()) for name, values in learned.items()}
     return [
-        *(Check(f"{name}: squared error of the noise, last tenth", value, "", 0.9) for name, value in last.items()),
+        *(
+            Check(f"{name}: squared error of the noise, last tenth", value, "", 0.9)
+            for name, value in last.items()
+        ),
         Check("goals move away from an approaching observer", reactions.away_m, "m", 0.1, None, "higher"),
-        Check("share of approaches that drive goals away", reactions.away_share, "share", 0.6, None, "higher"),
-        Check("goals after an approach from one side against the other", reactions.reversal_m, "m", 0.2, None, "higher"),
+        Check(
+            "share of approaches that drive goals away", reactions.away_share, "share", 0.6, None, "higher"
+        ),
+        Check(
+            "goals after an approach from one side against the other",
+            reactions.reversal_m,
+            "m",
+            0.2,
+            None,
+            "higher",
+        ),
         Check("shift by a far observer against none", reactions.far_m, "m", 0.01, 0.1),
         Check("shift by a far observer against a farther one", reactions.farther_m, "m", 0.01, 0.1),
         Check("ONNX against torch, largest difference", onnx_difference, "", 1e-4, 1e-2),
@@ -66,53 +82,43 @@ def checks(record: FitRecord, reactions: Reactions, onnx_difference: float) -> l
     ]
 
 
-def losses(record: FitRecord) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the loss terms."""
-    figure = Figure(figsize=(7, 3), dpi=80, layout="constrained")
-    axis = figure.subplots()
-    for name, values in record.terms.items():
-        width = max(len(values) // 50, 1)
-        smooth = np.convolve(values, np.ones(width) / width, "valid")
-        axis.plot(np.arange(len(smooth)) + width, smooth, label=name)
-    axis.set(xlabel="step", ylabel="squared error", yscale="log")
-    axis.legend()
-    return figures.pixels(figure)
-
-
 def fans(
-    rooms: "list[_Room]",
+    rooms: "list[RoomMap]",
     sampler: Sampler,
     observation: Observation,
     frame: Float[np.ndarray, "window 4 4"],
-    samplings: dict[str, Sampling],
+    samplings: dict[str, PlanSamplingConfig],
     seed: int,
     *,
     paths: bool = False,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw one row per way of sampling, one column per window."""
-    figure = Figure(figsize=(2.6 * len(frame), 2.3 * len(samplings)), dpi=80, layout="constrained")
-    grid = figure.subplots(len(samplings), len(frame), squeeze=False)
-    count = 12 if paths else FAN
+    size = (2.6 * len(frame), 2.3 * len(samplings))
+    figure, grid = plots.panels(len(samplings), len(frame), width_in=size[0], height_in=size[1])
+    count = 12 if paths else FAN_GOALS
     for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
         rng, codes = np.random.default_rng(seed), sampler.codes(observation, sampling, count)
         goals = sampler.goals(codes, sampling, rng)
-        lines = sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3) if paths else None
+        lines = (
+            sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3) if paths else None
+        )
         goals = goals.reshape(len(frame), count, 3)
         for column, axis in enumerate(row):
-            rooms[column].window(axis, frame[column], observation.observer_past[column].reshape(-1, 3), goals[column])
+            rooms[column].window(
+                axis, frame[column], observation.observer_past[column].reshape(-1, 3), goals[column]
+            )
             if lines is not None:
                 rooms[column].lines(axis, frame[column], lines[column])
         row[0].set_ylabel(name)
-    return figures.pixels(figure)
+    return plots.pixels(figure)
 
 
-class _Room:
+class RoomMap:
     """The room from above, to draw on."""
 
     def __init__(self, volume: FeatureVolume):
         self.solid = (volume.occupancy[:, min(3, volume.occupancy.shape[1] - 1) :] == 1).mean(1)
-        self.low = volume.origin[[0, 2]]
-        self.high = self.low + np.array(self.solid.shape) * volume.voxel_m
+        self.low, self.voxel_m = volume.origin[[0, 2]], volume.voxel_m
 
     def window(
         self,
@@ -121,19 +127,31 @@ class _Room:
         observer: Float[np.ndarray, "frame 3"],
         goals: Float[np.ndarray, "sample 3"],
     ) -> None:
-        extent = (self.low[0], self.high[0], self.high[1], self.low[1])
-        axis.imshow(self.solid.T, cmap="Greys", extent=extent, vmax=1.2)
+        plots.floor_plan(axis, self.solid, self.low, self.voxel_m)
         goal, seen = rigid.apply(frame, goals), rigid.apply(frame, observer)
-        axis.scatter(goal[:, 0], goal[:, 2], s=5, color="#dd8452", alpha=0.7)
-        axis.plot(seen[:, 0], seen[:, 2], color="#55a868", linewidth=2)
-        axis.scatter(*seen[-1, [0, 2]], color="#55a868", s=25)
-        axis.quiver(*frame[[0, 2], 3], *(frame[[0, 2], 2] * [1, 1]), angles="xy", color="#3b6ea5", scale=8, width=0.02)
+        axis.scatter(goal[:, 0], goal[:, 2], s=5, color=plots.ORANGE, alpha=0.7)
+        axis.plot(seen[:, 0], seen[:, 2], color=plots.GREEN, linewidth=2)
+        axis.scatter(*seen[-1, [0, 2]], color=plots.GREEN, s=25)
+        axis.quiver(
+            *frame[[0, 2], 3],
+            *(frame[[0, 2], 2] * [1, 1]),
+            angles="xy",
+            color=plots.BLUE,
+            scale=8,
+            width=0.02,
+        )
         axis.set(xticks=[], yticks=[])
         if self.solid.size > 1:
-            axis.set(xlim=extent[:2], ylim=extent[2:])
+            high = self.low + np.array(self.solid.shape) * self.voxel_m
+            axis.set(xlim=(self.low[0], high[0]), ylim=(high[1], self.low[1]))
         else:  # nothing is known of the scene
-            axis.set(xlim=frame[0, 3] + [-REACH_M, REACH_M], ylim=frame[2, 3] + [REACH_M, -REACH_M])
+            axis.set(
+                xlim=frame[0, 3] + [-WINDOW_HALF_M, WINDOW_HALF_M],
+                ylim=frame[2, 3] + [WINDOW_HALF_M, -WINDOW_HALF_M],
+            )
 
-    def lines(self, axis, frame: Float[np.ndarray, "4 4"], paths: Float[np.ndarray, "sample frame 3"]) -> None:
+    def lines(
+        self, axis, frame: Float[np.ndarray, "4 4"], paths: Float[np.ndarray, "sample frame 3"]
+    ) -> None:
         for path in rigid.apply(frame, paths):
-            axis.plot(path[:, 0], path[:, 2], color="#c44e52", linewidth=0.8, alpha=0.7)
+            axis.plot(path[:, 0], path[:, 2], color=plots.RED, linewidth=0.8, alpha=0.7)

@@ -1,7 +1,8 @@
-"""Does the animal mind the observer? The same sampled noise under observers that come close, are far, or absent.
+"""Does the animal mind the observer? The same sampled noise under observers that come close, are far, or
+absent.
 
-The observer walks up to the animal from one side, from the other side, stands beyond the radius of perception, and is
-dropped; everything else, scene, past and noise, is the same.
+The observer walks up to the animal from one side, from the other side, stands beyond the radius of
+perception, and is dropped; everything else, scene, past and noise, is the same.
 """
 
 from dataclasses import dataclass, replace
@@ -9,11 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.models.behavior import Architecture, Sampling
-from pipeline.models.perception import world_from_ego
-from pipeline.models.planning import Observation, Sampler, observe
-from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.model import Architecture
+from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.planning import Observation, Sampler, observe
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData
 
 SAMPLES = 16
 SIDES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -37,7 +39,7 @@ class Reactions:
 
 
 @dataclass(frozen=True)
-class Moments:
+class SampledMoments:
     """Some training windows, evenly spread, at which the model is looked at."""
 
     observation: Observation
@@ -46,16 +48,22 @@ class Moments:
     """number of each window's feature volume"""
 
 
-def moments(data: BehaviorData, scenes: Scenes, architecture: Architecture, count: int = 24) -> Moments:
+def moments(
+    data: BehaviorData, scenes: Scenes, architecture: Architecture, count: int = 24
+) -> SampledMoments:
     """Choose training windows and encode what the animal perceives in them."""
     train = data.indices(TRAIN)
     context, _ = data.windows(train[np.linspace(0, len(train) - 1, min(count, len(train))).astype(int)])
     observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)
     number = scenes.number(context.video, len(context))
-    return Moments(observation, world_from_ego(context.world_from_agent[:, -1], architecture.ego), number)
+    return SampledMoments(
+        observation, world_from_ego(context.world_from_agent[:, -1], architecture.ego), number
+    )
 
 
-def approach(side: Float[np.ndarray, "3"], distance_m: float, speed_m_s: float) -> Float[np.ndarray, "frame*3"]:
+def approach(
+    side: Float[np.ndarray, "3"], distance_m: float, speed_m_s: float
+) -> Float[np.ndarray, "frame*3"]:
     """Return an observer's past in the ego frame: walking up from ``side``, now ``distance_m`` away."""
     before_s = np.arange(PAST - 1, -1, -1)[:, None] / RATE_HZ
     return ((distance_m + speed_m_s * before_s) * side + [0.0, 1.0, 0.0]).ravel().astype(np.float32)
@@ -71,9 +79,11 @@ def measure(
     speed_m_s: float = 1.0,
 ) -> Reactions:
     """Sample goals of some windows under scripted observers, always with the same noise."""
-    sampling = Sampling(clear=False)
+    sampling = PlanSamplingConfig(avoid_solid=False)
 
-    def mean_goals(observer: Float[np.ndarray, "frame*3"], sampling: Sampling) -> Float[np.ndarray, "window 3"]:
+    def mean_goals(
+        observer: Float[np.ndarray, "frame*3"], sampling: PlanSamplingConfig
+    ) -> Float[np.ndarray, "window 3"]:
         seen = replace(observation, observer_past=np.tile(observer, (len(observation), 1)))
         goals = sampler.goals(sampler.codes(seen, sampling, SAMPLES), sampling, np.random.default_rng(seed))
         return goals.reshape(len(observation), SAMPLES, 3).mean(1)

@@ -1,88 +1,141 @@
-"""Train the kinds of localizers that are networks, on the views that the bank would hold."""
+"""Train the kinds of localizers that are networks, on the views that the bank would hold or on fresh ones."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
-from pipeline.fit import fit
-from pipeline.models.pose_regressor import PoseNet, on_grid, pose_loss
-from pipeline.models.scene_coordinates import CoordinateNet, coordinate_loss
-from pipeline.models.sight import Target
-from stages.train_localizer.describing import Described
+from pipeline.core.training import fit
+from pipeline.localization.patches import Patches, PcaBasis, Target
+from pipeline.localization.pose_regressor import PoseRegressor, on_grid, pose_loss
+from pipeline.localization.scene_coordinates import SceneCoordinateNet, coordinate_loss
+from stages.train_localizer.config import NetworkConfig
+from stages.train_localizer.describing import DescribedViews
 
+PATCH_DROPOUT = 0.15
+"""Share of a view's patches that are hidden in each step, as occluders do."""
+UNCERTAINTY_WEIGHT = 0.1
+"""Weight of the likelihood of the predicted error against the error itself."""
+WEIGHT_DECAY, CLIP_NORM = 1e-4, 5.0
+"""AdamW's decay and the largest norm of a gradient."""
+WARM_UP_SHARE, LEAST_RATE = 0.02, 0.01
+"""Share of the steps over which the learning rate rises, and what remains of it at the end."""
 
-@dataclass(frozen=True)
-class NetOptions:
-    """Size and training of the networks."""
-
-    steps: int = 2500
-    """Steps of AdamW."""
-    rate: float = 2e-3
-    """Learning rate at the start; it falls to nothing along a cosine."""
-    patches: int = 2048
-    """Coordinates: patches a step."""
-    views: int = 64
-    """Regression: views a step."""
-    coordinate_width: int = 384
-    """Coordinates: hidden units ..."""
-    coordinate_layers: int = 4
-    """... and hidden layers."""
-    pose_width: int = 32
-    """Regression: channels of the first of four stages; the paper's ResNet-18 has 64."""
+DrawPatches = Callable[[np.random.Generator], tuple[Patches, np.ndarray]]
+"""Draws a fresh view: its patches and ``map_from_camera``."""
 
 
-def train_coordinates(described: Described, options: NetOptions, seed: int) -> CoordinateNet:
+def train_coordinates(described: DescribedViews, config: NetworkConfig, seed: int) -> SceneCoordinateNet:
     """Train a scene-coordinate network on all patches."""
     torch.manual_seed(seed)
-    net = CoordinateNet(described.descriptors.shape[1], options.coordinate_width, options.coordinate_layers)
+    net = SceneCoordinateNet(
+        described.descriptors.shape[1], config.coordinate_width, config.coordinate_layers
+    )
     descriptors, points = torch.from_numpy(described.descriptors), torch.from_numpy(described.points_map)
-    _measure(net, points)
+    _set_extent(net, points)
 
     def loss(_: int, generator: torch.Generator):
-        chosen = torch.randint(len(descriptors), (options.patches,), generator=generator)
-        return coordinate_loss(*net(descriptors[chosen]), points[chosen]).mean()
+        chosen = torch.randint(len(descriptors), (config.batch_patches,), generator=generator)
+        predicted, log_m = net(descriptors[chosen])
+        return coordinate_loss(predicted, log_m, points[chosen]).mean()
 
-    return _train(net, loss, options, seed)
-
-
-def train_regressor(described: Described, target: Target, options: NetOptions, seed: int) -> PoseNet:
-    """Train the paper's regressor: scene views tell the camera's place, agent views the place of what they show."""
-    torch.manual_seed(seed)
-    net = PoseNet(described.descriptors.shape[1], options.pose_width)
-    parts = np.split(described.descriptors, np.cumsum(described.counts)[:-1])
-    grids = torch.from_numpy(np.stack([on_grid(part, patches.cell) for part, patches in zip(parts, described.patches, strict=True)]))
-    rotation, place = (torch.from_numpy(value.astype(np.float32)) for value in _answers(described, target))
-    _measure(net, place)
-
-    def loss(_: int, generator: torch.Generator):
-        chosen = torch.randint(len(grids), (options.views,), generator=generator)
-        shown = grids[chosen] * (torch.rand(len(chosen), 1, *grids.shape[2:], generator=generator) > 0.15)
-        error, surprise = pose_loss(*net(shown), rotation[chosen], place[chosen])
-        return {"error": error.mean(), "surprise": 0.1 * surprise.mean()}
-
-    return _train(net, loss, options, seed)
+    return _train(net, loss, config, seed)
 
 
-def _answers(described: Described, target: Target) -> tuple[Float[np.ndarray, "view 3 3"], Float[np.ndarray, "view 3"]]:
-    poses = described.map_from_camera[described.view]
+@dataclass
+class PoseSamples:
+    """A ring of views for the regressor; with fresh views each step replaces the oldest ones."""
+
+    grids: Float[Tensor, "view axis row column"]
+    rotation: Float[Tensor, "view 3 3"]
+    position: Float[Tensor, "view 3"]
+    oldest: int = 0
+
+    def replace(self, basis: PcaBasis, draw: DrawPatches, target: Target, rng: np.random.Generator) -> None:
+        """Draw a view and put it in place of the oldest."""
+        patches, map_from_camera = draw(rng)
+        grid = on_grid(basis.project(patches.descriptors), patches.cell)
+        self.grids[self.oldest] = torch.from_numpy(grid)
+        self.rotation[self.oldest] = torch.from_numpy(map_from_camera[:3, :3].astype(np.float32))
+        position = anchor_position(patches, map_from_camera, target)
+        self.position[self.oldest] = torch.from_numpy(position.astype(np.float32))
+        self.oldest = (self.oldest + 1) % len(self.grids)
+
+
+def anchor_position(
+    patches: Patches, map_from_camera: Float[np.ndarray, "4 4"], target: Target
+) -> Float[np.ndarray, "3"]:
+    """Return the position in the map that a regressor predicts: the camera's, or the middle of what an agent
+    view shows."""
     if target == "scene":
-        return poses[:, :3, :3], poses[:, :3, 3]
-    middle = np.stack([np.median(patches.points_camera, axis=0) for patches in described.patches])
-    return poses[:, :3, :3], np.einsum("vij,vj->vi", poses[:, :3, :3], middle) + poses[:, :3, 3]
+        return map_from_camera[:3, 3]
+    return map_from_camera[:3, :3] @ np.median(patches.points_camera, axis=0) + map_from_camera[:3, 3]
 
 
-def _measure(net, points):
-    """Tell a network where the map lies and how large it is."""
+def train_regressor(
+    described: DescribedViews,
+    target: Target,
+    config: NetworkConfig,
+    seed: int,
+    draw: DrawPatches | None = None,
+) -> PoseRegressor:
+    """Train the paper's regressor (Eq. 5) on the described views, or on views that ``draw`` renders on the
+    fly."""
+    torch.manual_seed(seed)
+    net = PoseRegressor(described.descriptors.shape[1], config.pose_width)
+    samples = _samples(described, target)
+    _set_extent(net, samples.position)
+
+    def loss(step: int, generator: torch.Generator):
+        if draw is not None:
+            rng = np.random.default_rng((seed, step))
+            for _ in range(config.fresh_views):
+                samples.replace(described.basis, draw, target, rng)
+        chosen = torch.randint(len(samples.grids), (config.batch_views,), generator=generator)
+        grids = samples.grids[chosen]
+        visible = torch.rand(len(chosen), 1, *grids.shape[2:], generator=generator) > PATCH_DROPOUT
+        rotation, position, log_error = net(grids * visible)
+        error, likelihood = pose_loss(
+            rotation, position, log_error, samples.rotation[chosen], samples.position[chosen]
+        )
+        return {"error": error.mean(), "uncertainty": UNCERTAINTY_WEIGHT * likelihood.mean()}
+
+    return _train(net, loss, config, seed)
+
+
+def _samples(described: DescribedViews, target: Target) -> PoseSamples:
+    parts = np.split(described.descriptors, np.cumsum(described.counts)[:-1])
+    poses = described.map_from_camera[described.view]
+    grids = [on_grid(part, each.cell) for part, each in zip(parts, described.patches, strict=True)]
+    position = [
+        anchor_position(each, pose, target) for each, pose in zip(described.patches, poses, strict=True)
+    ]
+    rotation = poses[:, :3, :3].astype(np.float32)
+    return PoseSamples(
+        torch.from_numpy(np.stack(grids)),
+        torch.from_numpy(rotation),
+        torch.from_numpy(np.stack(position).astype(np.float32)),
+    )
+
+
+def _set_extent(net, points):
+    """Give a network the middle and size of the map, so that its outputs are of order one."""
     net.middle.copy_(points.mean(0))
     net.extent.copy_(points.std(0).norm())
 
 
-def _train(net, loss, options, seed):
-    optimizer = torch.optim.AdamW(net.parameters(), options.rate, weight_decay=1e-4)
+def _train(net, loss, config, seed):
+    optimizer = torch.optim.AdamW(net.parameters(), config.rate, weight_decay=WEIGHT_DECAY)
+
+    def schedule(done: float) -> float:
+        warm_up = min(1.0, done / WARM_UP_SHARE + WARM_UP_SHARE)
+        return warm_up * (LEAST_RATE + (1 - LEAST_RATE) * (0.5 + 0.5 * np.cos(np.pi * done)))
+
     fit(
-        modules={"net": net}, optimizer=optimizer, loss=loss, steps=options.steps, seed=seed, label="localizer", clip_norm=5.0,
-        schedule=lambda done: min(1.0, 50 * done + 0.02) * (0.01 + 0.99 * (0.5 + 0.5 * np.cos(np.pi * done))),
+        modules={"net": net}, optimizer=optimizer, loss=loss, steps=config.steps, seed=seed,
+        label="localizer", clip_norm=CLIP_NORM, schedule=schedule,
     )  # fmt: skip
     return net.eval()

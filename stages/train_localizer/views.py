@@ -1,54 +1,51 @@
-"""Random views of a template: where cameras stand, what they would see, and how light and noise disturb it.
+"""Random views of a template: camera poses, renderings, and their augmentation by light, blur and noise.
 
-`scene_camera` and `agent_camera` draw poses, `photograph` renders one with noise; all draw from one generator.
+`scene_camera` and `agent_camera` draw poses, `render` draws an augmented view; all draw from one generator.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
+from kornia.enhance import adjust_gamma
+from kornia.filters import gaussian_blur2d
 
-from pipeline.space import cameras, rigid
-from pipeline.space.meshes import RayCaster, render_view
-from pipeline.space.surface import depth_noise
+from pipeline.geometry import cameras, rigid
+from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.mapping.depth_scans import depth_noise
 
 UP = np.array([0.0, 1.0, 0.0])
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """Where random cameras stand and how their pictures are disturbed."""
-
-    near_share: float = 0.5
-    """Share of scene cameras drawn near the walk-through's, the rest anywhere in the room."""
-    near_m: float = 0.35
-    """Spread of those around the walk-through's cameras, metres."""
-    height_m: tuple[float, float] = (0.5, 1.9)
-    """Heights above the floor of cameras drawn anywhere, metres."""
-    pitch_deg: tuple[float, float] = (-55.0, 15.0)
-    """Scene cameras look between these angles, degrees above the horizon."""
-    roll_deg: float = 12.0
-    """Standard deviation of roll, degrees."""
-    distance_m: tuple[float, float] = (0.7, 3.5)
-    """Distances of agent cameras, metres."""
-    elevation_deg: tuple[float, float] = (-10.0, 70.0)
-    """Agent cameras stand between these elevations, degrees."""
-    gain: float = 0.3
-    """Largest relative change of brightness."""
-    gamma: float = 0.25
-    """Largest relative change of gamma."""
-    blur_px: float = 1.0
-    """Largest Gaussian blur, pixels."""
-    noise: float = 0.015
-    """Standard deviation of pixel noise, share of full scale."""
-    occluded: float = 0.4
-    """Share of scene views with a blob in front, as the animal would be."""
+NEAR_SHARE, NEAR_M, NEAR_YAW_RAD, NEAR_PITCH_RAD = 0.5, 0.35, 0.6, 0.2
+"""Share of scene cameras drawn near the walk-through's, and standard deviations of their offset, metres and
+radians."""
+ROOM_MARGIN_M, HEIGHT_M = 0.8, (0.5, 1.9)
+"""The other cameras: margin around the walk-through's path, and heights above the floor, metres."""
+ROLL_DEG = 12.0
+"""Standard deviation of roll, degrees."""
+ELEVATION_DEG, AIM_M = (-10.0, 70.0), 0.03
+"""Agent cameras: elevations (degrees), and standard deviation of the point they look at (metres)."""
+GAIN, WHITE_BALANCE, GAMMA = 0.3, 0.04, 0.25
+"""Largest relative change of brightness, standard deviation of each channel's, largest relative change of
+gamma."""
+BLUR_PX, LEAST_BLUR_PX, PIXEL_NOISE = 1.0, 0.3, 0.015
+"""Largest and least Gaussian blur, pixels, and standard deviation of pixel noise, share of full scale."""
+OCCLUDED_SHARE, OCCLUDER_DEPTH = 0.4, 0.8
+"""Share of scene queries with an occluder in front, as the animal would be, and its depth over what it
+hides."""
+LEAST_SEEN, NEAREST_M, NEAREST_QUANTILE, LEAST_FRONT = 0.6, 0.35, 0.05, 0.95
+"""A plausible view: share of its pixels with surface, this quantile of its depth beyond this many metres, and
+share of surface seen from its front."""
+FRONT_RAYS = 16
+"""Rays along the picture's height that test the last."""
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """One rendered view, disturbed as a phone would."""
+class RenderedView:
+    """One rendered view, augmented; depth in metres, 0 = nothing; intrinsics in pixels."""
 
     map_from_camera: Float[np.ndarray, "4 4"]
     intrinsics: Float[np.ndarray, "3 3"]
@@ -58,84 +55,101 @@ class Photograph:
 
 
 def scene_camera(
-    walk: Float[np.ndarray, "frame 4 4"], floor_m: float, options: ViewOptions, rng: np.random.Generator
+    walk: Float[np.ndarray, "frame 4 4"],
+    floor_m: float,
+    pitch_deg: tuple[float, float],
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "4 4"]:
     """Draw a camera: near one of the walk-through's, or anywhere within reach of where it went."""
-    roll = np.deg2rad(rng.normal(0, options.roll_deg))
+    roll = np.deg2rad(rng.normal(0, ROLL_DEG))
     near = walk[rng.integers(len(walk))]
-    if rng.random() < options.near_share:
-        turn = rigid.exp(np.concatenate([[rng.normal(0, 0.2), 0, roll], np.zeros(3)]))
-        yaw = rigid.rotation_from_vector(UP * rng.normal(0, 0.6))
-        return rigid.make(yaw @ near[:3, :3] @ turn[:3, :3], near[:3, 3] + rng.normal(0, options.near_m, 3))
-    low, high = walk[:, :3, 3].min(0) - 0.8, walk[:, :3, 3].max(0) + 0.8
+    if rng.random() < NEAR_SHARE:
+        turn = rigid.exp(np.concatenate([[rng.normal(0, NEAR_PITCH_RAD), 0, roll], np.zeros(3)]))
+        yaw = rigid.rotation_from_vector(UP * rng.normal(0, NEAR_YAW_RAD))
+        return rigid.make(yaw @ near[:3, :3] @ turn[:3, :3], near[:3, 3] + rng.normal(0, NEAR_M, 3))
+    low, high = walk[:, :3, 3].min(0) - ROOM_MARGIN_M, walk[:, :3, 3].max(0) + ROOM_MARGIN_M
     eye = rng.uniform(low, high)
-    eye[1] = floor_m + rng.uniform(*options.height_m)
-    yaw, pitch = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(*options.pitch_deg))
+    eye[1] = floor_m + rng.uniform(*HEIGHT_M)
+    yaw, pitch = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(*pitch_deg))
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
     return rigid.look_at(eye, eye + forward, UP) @ rigid.exp(np.array([0, 0, roll, 0, 0, 0]))
 
 
-def agent_camera(centre: Float[np.ndarray, "3"], options: ViewOptions, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+def agent_camera(
+    centre: Float[np.ndarray, "3"], distance_m: tuple[float, float], rng: np.random.Generator
+) -> Float[np.ndarray, "4 4"]:
     """Draw a camera that looks at the agent from any azimuth."""
     azimuth = rng.uniform(-np.pi, np.pi)
-    elevation = np.arcsin(rng.uniform(*np.sin(np.deg2rad(options.elevation_deg))))
-    direction = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    eye = centre + direction * rng.uniform(*options.distance_m)
-    roll = np.deg2rad(rng.normal(0, options.roll_deg))
-    return rigid.look_at(eye, centre + rng.normal(0, 0.03, 3), UP) @ rigid.exp(np.array([0, 0, roll, 0, 0, 0]))
+    elevation = np.arcsin(rng.uniform(*np.sin(np.deg2rad(ELEVATION_DEG))))
+    direction = np.array(
+        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
+    )
+    eye = centre + direction * rng.uniform(*distance_m)
+    roll = np.deg2rad(rng.normal(0, ROLL_DEG))
+    return rigid.look_at(eye, centre + rng.normal(0, AIM_M, 3), UP) @ rigid.exp(
+        np.array([0, 0, roll, 0, 0, 0])
+    )
 
 
-def photograph(
+def render(
     caster: RayCaster,
     map_from_camera: Float[np.ndarray, "4 4"],
     intrinsics: Float[np.ndarray, "3 3"],
     size: tuple[int, int],
-    options: ViewOptions,
     rng: np.random.Generator,
-) -> Photograph:
-    """Render a view and disturb its colour; depth stays exact (see `with_depth_noise`)."""
+) -> RenderedView:
+    """Render a view (pixels, size = height, width) and augment its colour; depth stays exact (see
+    `with_depth_noise`)."""
     depth, hits = render_view(caster, map_from_camera, intrinsics, *size)
     seen = depth > 0
+    assert caster.mesh.color is not None, "templates have colours"
     color = hits.interpolate(caster.mesh, caster.mesh.color).reshape(*size, 3)
     color[~seen] = color[seen].mean(0) if seen.any() else 128
-    return Photograph(map_from_camera, intrinsics, disturb(color, options, rng), depth, seen)
+    return RenderedView(map_from_camera, intrinsics, augment(color, rng), depth, seen)
 
 
-def disturb(
-    color: Float[np.ndarray, "height width 3"], options: ViewOptions, rng: np.random.Generator
+def augment(
+    color: Float[np.ndarray, "height width 3"], rng: np.random.Generator
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Change exposure, white balance and gamma, blur a little, add noise."""
-    picture = cv2.GaussianBlur(color.astype(np.float32) / 255, (0, 0), max(0.3, rng.uniform(0, options.blur_px)))
-    gain = 1 + rng.uniform(-options.gain, options.gain) + rng.normal(0, 0.04, 3)
-    picture = np.clip(picture, 1e-4, 1) ** (1 + rng.uniform(-options.gamma, options.gamma)) * gain
-    picture = picture + rng.normal(0, options.noise, picture.shape)
-    return np.clip(np.round(picture * 255), 0, 255).astype(np.uint8)
+    """Change exposure, white balance and gamma, blur a little and add noise; colours 0..255."""
+    sigma = max(LEAST_BLUR_PX, rng.uniform(0, BLUR_PX))
+    kernel = round(8 * sigma + 1) | 1  # four standard deviations on either side
+    gain = 1 + rng.uniform(-GAIN, GAIN) + rng.normal(0, WHITE_BALANCE, 3)
+    gamma = 1 + rng.uniform(-GAMMA, GAMMA)
+    picture = torch.from_numpy(color.astype(np.float32) / 255).permute(2, 0, 1)[None]
+    picture = adjust_gamma(gaussian_blur2d(picture, kernel, (sigma, sigma)), gamma)
+    noisy = picture[0].permute(1, 2, 0).numpy() * gain + rng.normal(0, PIXEL_NOISE, color.shape)
+    return np.clip(np.round(noisy * 255), 0, 255).astype(np.uint8)
 
 
-def plausible(view: Photograph, caster: RayCaster) -> bool:
-    """Tell whether a person could have taken this scene view: mostly seen surface, from its front, nothing too near."""
-    if view.seen.mean() < 0.6 or np.quantile(view.depth[view.seen], 0.05) < 0.35:
+def plausible(view: RenderedView, caster: RayCaster) -> bool:
+    """Return whether a person could have taken this scene view: mostly surface, from its front, nothing too
+    near."""
+    if view.seen.mean() < LEAST_SEEN or np.quantile(view.depth[view.seen], NEAREST_QUANTILE) < NEAREST_M:
         return False
-    grid = view.depth.shape[0] // 16
-    directions = cameras.ray_directions(view.intrinsics, *view.depth.shape)[::grid, ::grid].reshape(-1, 3) @ view.map_from_camera[:3, :3].T
+    grid = view.depth.shape[0] // FRONT_RAYS
+    directions = (
+        cameras.ray_directions(view.intrinsics, *view.depth.shape)[::grid, ::grid].reshape(-1, 3)
+        @ view.map_from_camera[:3, :3].T
+    )
     face = caster.cast(view.map_from_camera[:3, 3], directions).face
     corner = caster.mesh.vertices[caster.mesh.faces[face[face >= 0]]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    return bool((np.einsum("ri,ri->r", normal, directions[face >= 0]) < 0).mean() > 0.95)
+    return bool((np.einsum("ri,ri->r", normal, directions[face >= 0]) < 0).mean() > LEAST_FRONT)
 
 
-def occlude(view: Photograph, rng: np.random.Generator) -> Photograph:
-    """Put a blob of one colour in front, nearer than what it hides."""
+def occlude(view: RenderedView, rng: np.random.Generator) -> RenderedView:
+    """Put an ellipse of one colour in front, nearer than what it hides."""
     height, width = view.depth.shape
     centre = (int(rng.integers(width // 5, width * 4 // 5)), int(rng.integers(height // 3, height)))
     axes = (int(rng.integers(width // 12, width // 4)), int(rng.integers(width // 14, width // 7)))
     shape = np.zeros(view.depth.shape, np.uint8)
     cv2.ellipse(shape, centre, axes, float(rng.uniform(-30, 30)), 0, 360, 1, -1)
     color = np.where(shape[..., None] > 0, rng.integers(0, 255, 3).astype(np.uint8), view.color)
-    return Photograph(view.map_from_camera, view.intrinsics, color, np.where(shape > 0, view.depth * 0.8, view.depth), view.seen)
+    return replace(view, color=color, depth=np.where(shape > 0, view.depth * OCCLUDER_DEPTH, view.depth))
 
 
-def with_depth_noise(view: Photograph, rng: np.random.Generator) -> Photograph:
-    """Add the noise that phone depth has."""
+def with_depth_noise(view: RenderedView, rng: np.random.Generator) -> RenderedView:
+    """Add the noise of phone depth."""
     noisy = np.where(view.seen, view.depth + rng.normal(0, 1, view.depth.shape) * depth_noise(view.depth), 0)
-    return Photograph(view.map_from_camera, view.intrinsics, view.color, noisy.astype(np.float32), view.seen)
+    return replace(view, depth=noisy.astype(np.float32))

@@ -1,81 +1,107 @@
 """From motion to a model: what the body touches, its pose space, and all networks in their order."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from pipeline.errors import InputError
-from pipeline.fit import FitRecord
-from pipeline.models import ablated_motion
-from pipeline.models.ablated_motion import Ablated
-from pipeline.models.clip_channels import Clips
-from pipeline.models.contacts import find_contacts
-from pipeline.models.longterm import PointNet, PoseNet, RouteNet, StaticBody
-from pipeline.models.longterm_examples import Lives, bodies, cut, encoded, fitted_poses
-from pipeline.models.motion_synthesis import LongTerm, habits_of
+from pipeline.core.errors import InputError
+from pipeline.core.training import FitRecord
+from pipeline.longterm.clip_channels import Clips
+from pipeline.longterm.config import LongTermSizes
+from pipeline.longterm.contacts import find_contact_vertices
+from pipeline.longterm.examples import (
+    MotionDataset,
+    encode_selection,
+    fit_pose_space,
+    sample_static_bodies,
+    select_clips,
+)
+from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
+from pipeline.longterm.networks import PointNet, PoseNet, RouteNet, StaticBody
+from pipeline.rivals import longterm_networks
+from pipeline.rivals.longterm_networks import AblatedNetworks
 from stages.train_longterm import training
-from stages.train_longterm.training import Trainer
+from stages.train_longterm.config import Config
+from stages.train_longterm.training import LongTermLossWeights, NetworkTrainer
+
+Network = TypeVar("Network", bound=nn.Module)
+DEFAULT_SIZES = LongTermSizes()
+"""Sizes that every build uses; tests take smaller ones."""
 
 
 @dataclass(frozen=True)
-class Learned:
+class TrainedLongTerm:
     """A trained model, how training went, and the networks that the tables compare with."""
 
     model: LongTerm
     records: dict[str, FitRecord]
-    ablated: dict[str, Ablated] = field(default_factory=dict)
+    ablated: dict[str, AblatedNetworks] = field(default_factory=dict)
 
 
-def learn(lives: Lives, settings: Any, *, resume: Path | None = None) -> Learned:
-    """Train everything on some motion; ``settings`` are the stage's."""
-    rng = np.random.default_rng(settings.seed)
-    settings = replace(settings, sizes=replace(settings.sizes, shape=len(lives.body.shape)))
-    poses = fitted_poses(lives.stretches, lives.body.agent_from_bone_rest, settings.sizes.pose)
-    contacts = find_contacts(lives.body, list(lives.stretches), lives.distances)
-    clips = encoded(lives, cut(lives, settings.cutting, rng), poses, settings.sizes.points, rng)
-    stills = bodies(lives, settings.cutting, poses, settings.sizes.points, rng)
-    trainer = Trainer(poses, settings.weights, settings.seed, resume)
-    nets = {
-        "static": fresh(lambda: StaticBody(settings.sizes), settings),
-        "route": fresh(lambda: RouteNet(settings.sizes, seeing=settings.scene), settings),
-        "pose": fresh(lambda: PoseNet(settings.sizes, seeing=settings.scene), settings),
-    }
+def train_networks(
+    dataset: MotionDataset,
+    config: Config,
+    *,
+    sizes: LongTermSizes = DEFAULT_SIZES,
+    resume: Path | None = None,
+) -> TrainedLongTerm:
+    """Train the static bodies, RouteNet, PoseNet and the ablations that ``config`` names on some motion."""
+    rng = np.random.default_rng(config.seed)
+    sizes = replace(sizes, shape=len(dataset.body.shape))
+    poses = fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, sizes.pose)
+    contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
+    chosen = select_clips(dataset, rng, stride=config.clip_stride)
+    clips = encode_selection(dataset, chosen, poses, sizes.points, rng)
+    stills = sample_static_bodies(dataset, poses, sizes.points, rng, most=config.most_bodies)
+    trainer = NetworkTrainer(poses, LongTermLossWeights(), config.seed, resume)
+    static = initialized(lambda: StaticBody(sizes), config)
+    route = initialized(lambda: RouteNet(sizes, sees_scene=config.scene), config)
+    pose = initialized(lambda: PoseNet(sizes, sees_scene=config.scene), config)
     records = {
-        "static": training.fit_body(nets["static"], stills, lives, contacts, trainer, settings.body),
-        "route": training.fit_route(nets["route"], clips, trainer, settings.route),
-        "pose": training.fit_pose(nets["pose"], training.true_routes(clips), clips, trainer, settings.pose),
+        "static": training.fit_body(static, stills, dataset, contacts, trainer, config.body),
+        "route": training.fit_route(route, clips, trainer, config.route),
+        "pose": training.fit_pose(pose, training.smoothed_true_routes(clips), clips, trainer, config.pose),
     }
-    scenes = [lives.scenes[index] for index in lives.scene_of]
-    model = LongTerm(settings.sizes, poses, contacts, habits_of(list(lives.stretches), scenes), **nets)
-    return Learned(model, records, learn_ablations(clips, trainer, settings, nets["route"]))
+    scenes = [dataset.scenes[index] for index in dataset.scene_of]
+    prior = measure_motion_prior(list(dataset.stretches), scenes)
+    model = LongTerm(sizes, poses, contacts, prior, static, route, pose)
+    return TrainedLongTerm(model, records, train_ablations(clips, trainer, config, sizes, route))
 
 
-def learn_ablations(clips: Clips, trainer: Trainer, settings: Any, route: RouteNet) -> dict[str, Ablated]:
-    """Train those networks of Table 1 that are asked for and not part of the model; routes of the same kind are shared."""
-    routes, trained = {(True, True, False): route} if settings.scene else {}, {}
-    wanted = {"none": (), "rivals": ablated_motion.RIVALS, "all": tuple(ablated_motion.KINDS)}[settings.ablations]
-    for name, kind in ((name, ablated_motion.KINDS[name]) for name in wanted):
-        made = fresh(lambda kind=kind: ablated_motion.build(kind, settings.sizes), settings)
+def train_ablations(
+    clips: Clips, trainer: NetworkTrainer, config: Config, sizes: LongTermSizes, route: RouteNet
+) -> dict[str, AblatedNetworks]:
+    """Train the networks of Table 1 that are asked for and not part of the model; equal routes are shared."""
+    routes, trained = {(True, True, False): route} if config.scene else {}, {}
+    names = {"none": (), "rivals": longterm_networks.RIVALS, "all": tuple(longterm_networks.ABLATIONS)}
+    for name in names[config.ablations]:
+        spec = longterm_networks.ABLATIONS[name]
+        made = initialized(lambda spec=spec: longterm_networks.build(spec, sizes), config)
         if made.base is not None:
-            training.fit_base(made.base, clips, trainer, settings.pose, name)
+            training.fit_base(made.base, clips, trainer, config.pose, name)
         else:
-            key = (kind.seeing, kind.route_turns, kind.paper)
+            key = (spec.sees_scene, spec.route_turns, spec.paper)
             if key not in routes:
-                training.fit_route(made.route, clips, trainer, settings.route, f"{name}_route")
+                training.fit_route(made.route, clips, trainer, config.route, f"{name}_route")
                 routes[key] = made.route
             made.route.load_state_dict(routes[key].state_dict())
-            along = training.made_routes(made.route, clips) if kind.paper else training.true_routes(clips)
-            training.fit_pose(made.pose, along, clips, trainer, settings.pose, f"{name}_pose")
+            along = (
+                training.predicted_routes(made.route, clips)
+                if spec.paper
+                else training.smoothed_true_routes(clips)
+            )
+            training.fit_pose(made.pose, along, clips, trainer, config.pose, f"{name}_pose")
         trained[name] = made.eval()
     return trained
 
 
-def write_ablations(folder: Path, learned: Learned) -> None:
+def write_ablations(folder: Path, learned: TrainedLongTerm) -> None:
     """Write `ablations/<name>.safetensors` where there are any."""
     if learned.ablated:
         (folder / "ablations").mkdir()
@@ -83,22 +109,29 @@ def write_ablations(folder: Path, learned: Learned) -> None:
             made.save(folder / "ablations" / f"{name}.safetensors")
 
 
-def fresh(make: Any, settings: Any) -> nn.Module:
+def initialized(make: Callable[[], Network], config: Config) -> Network:
     """Build a network from the seed, its PointNets from given weights if there are any."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
+        torch.manual_seed(config.seed)
         net = make()
-    if settings.point_net is not None:
+    if config.point_net is not None:
         for part in net.modules():
-            if isinstance(part, PointNet) and part.seeing:
-                _start(part, Path(settings.point_net))
+            if isinstance(part, PointNet) and part.sees_scene:
+                _load_point_net(part, Path(config.point_net))
     return net
 
 
-def _start(part: PointNet, path: Path) -> None:
+def _load_point_net(part: PointNet, path: Path) -> None:
     if not path.is_file():
-        raise InputError("LTM-002", "the weights of PointNet are not there", str(path), "give an existing safetensors file, or none")
+        raise InputError(
+            "LTM-002",
+            "the weights of PointNet are not there",
+            str(path),
+            "give an existing safetensors file, or none",
+        )
     try:
         part.load_state_dict(load_file(path))
     except (RuntimeError, ValueError) as error:
-        raise InputError("LTM-002", f"these weights do not fit: {error}", str(path), "they must have the widths of `sizes`") from error
+        raise InputError(
+            "LTM-002", f"these weights do not fit: {error}", str(path), "they must have the widths of `sizes`"
+        ) from error

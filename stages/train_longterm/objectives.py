@@ -1,24 +1,36 @@
-"""The losses of long-term motion: L1 on what is predicted (Eqs. 3, 4), and what a static body owes to the scene."""
+"""The losses of long-term motion: L1 on what is predicted (Eqs. 3, 4), and what a static body owes to the
+scene.
+"""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.models.bodies import PosedSurface, PoseSpace
-from pipeline.models.contacts import Contacts
-from pipeline.models.longterm import ROOT
-from pipeline.models.motion_optimization import collision_error, contact_error
-from pipeline.space import rigid_torch
-from pipeline.space.signed_distance import SignedDistance
+from pipeline.geometry import rigid_torch
+from pipeline.geometry.signed_distance import SignedDistance
+from pipeline.longterm.bodies import PosedSurface, PoseSpace
+from pipeline.longterm.contacts import ContactVertices
+from pipeline.longterm.motion_optimization import collision_error, contact_error
+from pipeline.longterm.networks import ROOT_CHANNELS
 
 
-def route_error(made: Float[Tensor, "batch frame 9"], truth: Float[Tensor, "batch frame 9"]) -> tuple[Tensor, Tensor]:
+def route_error(
+    made: Float[Tensor, "batch frame 9"], truth: Float[Tensor, "batch frame 9"]
+) -> tuple[Tensor, Tensor]:
     """Return the mean L1 distance of t (metres) and of r."""
-    return (made[..., :3] - truth[..., :3]).abs().mean(), (made[..., 3:ROOT] - truth[..., 3:ROOT]).abs().mean()
+    return (made[..., :3] - truth[..., :3]).abs().mean(), (
+        made[..., 3:ROOT_CHANNELS] - truth[..., 3:ROOT_CHANNELS]
+    ).abs().mean()
 
 
-def pose_error(made: Float[Tensor, "*batch pose"], truth: Float[Tensor, "*batch pose"], lever: Float[Tensor, "pose channel"]) -> Tensor:
-    """Return the mean L1 distance between the bones' channels that p stands for, metres (radians at a lever of 0.1 m)."""
+def pose_error(
+    made: Float[Tensor, "*batch pose"],
+    truth: Float[Tensor, "*batch pose"],
+    lever: Float[Tensor, "pose channel"],
+) -> Tensor:
+    """Return the mean L1 distance between the bones' channels that p stands for, metres (radians at a lever
+    of 0.1 m).
+    """
     return ((made - truth) @ lever).abs().mean()
 
 
@@ -28,23 +40,34 @@ def lever_of(poses: PoseSpace, lever_m: float = 0.1) -> Float[Tensor, "pose chan
     return poses.basis * scale
 
 
-def divergence(mean: Float[Tensor, "batch latent"], log_variance: Float[Tensor, "batch latent"]) -> Tensor:
-    """Return the mean KL divergence of N(mean, variance) from the standard normal distribution, per number of z."""
+def kl_divergence(mean: Float[Tensor, "batch latent"], log_variance: Float[Tensor, "batch latent"]) -> Tensor:
+    """Return the mean KL divergence of N(mean, variance) from the standard normal distribution, per number of
+    z.
+    """
     return 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).mean()
 
 
 def posed(
-    body: Float[Tensor, "batch channel"], world_from_place: Float[Tensor, "batch 4 4"], poses: PoseSpace, surface: PosedSurface
+    body: Float[Tensor, "batch channel"],
+    world_from_place: Float[Tensor, "batch 4 4"],
+    poses: PoseSpace,
+    surface: PosedSurface,
 ) -> Float[Tensor, "batch vertex 3"]:
     """Return the vertices of bodies in the world."""
-    place_from_agent = rigid_torch.make(rigid_torch.rotation_from_6d(body[:, 3:ROOT]), body[:, :3])
-    return surface(world_from_place @ place_from_agent, poses.bones(poses.decode(body[:, ROOT:])))
+    place_from_agent = rigid_torch.make(rigid_torch.rotation_from_6d(body[:, 3:ROOT_CHANNELS]), body[:, :3])
+    return surface(world_from_place @ place_from_agent, poses.bones(poses.decode(body[:, ROOT_CHANNELS:])))
 
 
 def scene_errors(
-    vertices: Float[Tensor, "batch vertex 3"], scene: Int[Tensor, "batch"], scenes: list[SignedDistance], contacts: Contacts, count: int
+    vertices: Float[Tensor, "batch vertex 3"],
+    scene: Int[Tensor, "batch"],
+    scenes: list[SignedDistance],
+    contacts: ContactVertices,
+    count: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return mean collision and contact error; the last vertices, from ``count`` on, are the contact vertices."""
+    """Return mean collision and contact error; the last vertices, from ``count`` on, are the contact
+    vertices.
+    """
     distance = torch.zeros(vertices.shape[:2])
     for index, each in enumerate(scenes):
         rows = torch.nonzero(scene == index)[:, 0]

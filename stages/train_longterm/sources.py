@@ -5,59 +5,75 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import InputError
-from pipeline.files import arrays, meshes
-from pipeline.models import simulated_lives
-from pipeline.models.longterm_examples import Lives, reconstructed
-from pipeline.models.short_motions import resampled
-from pipeline.models.smplx_bodies import motion_from_parameters, smplx_body
-from pipeline.models.surroundings import Surroundings
-from pipeline.models.trajectories import TRAIN, BehaviorData
+from pipeline.behavior.trajectories import TRAIN, BehaviorData
+from pipeline.core.errors import InputError
+from pipeline.data import npz, ply
+from pipeline.longterm import simulated_lives
+from pipeline.longterm.examples import MotionDataset, reconstructed_dataset
+from pipeline.longterm.short_motions import resample_motion
+from pipeline.longterm.smplx_bodies import motion_from_parameters, smplx_body
+from pipeline.longterm.surroundings import MotionScene
 
 
 @dataclass(frozen=True)
-class Parted:
+class DatasetSplit:
     """Motion to learn from and motion held out; the latter may be nothing."""
 
-    train: Lives
-    held_out: Lives | None
+    train: MotionDataset
+    held_out: MotionDataset | None
 
 
-def recorded(reconstruction: Path, behavior_data: Path) -> Parted:
-    """Read reconstructed sessions, those of the behaviour test held out. Raises LTM-001 where there is too little motion."""
+def recorded(reconstruction: Path, behavior_data: Path) -> DatasetSplit:
+    """Read reconstructed sessions, those of the behaviour test held out. Raises LTM-001 where there is too
+    little motion.
+    """
     data = BehaviorData.load(behavior_data)
-    lives, video_of = reconstructed(reconstruction, data)
+    dataset, video_of = reconstructed_dataset(reconstruction, data)
     learns = {data.videos[video] for video in np.unique(data.video[data.split == TRAIN])}
     train = [index for index, video in enumerate(video_of) if video in learns]
     if not train:
         remedy = "record longer sessions in which the animal stays in view"
-        raise InputError("LTM-001", "no two seconds of uninterrupted motion to learn from", str(behavior_data), remedy)
+        raise InputError(
+            "LTM-001", "no two seconds of uninterrupted motion to learn from", str(behavior_data), remedy
+        )
     rest = [index for index, video in enumerate(video_of) if video not in learns]
-    return Parted(lives.some(train), lives.some(rest) if rest else None)
+    return DatasetSplit(dataset.subset(train), dataset.subset(rest) if rest else None)
 
 
-def simulated(folder: Path) -> Parted:
+def simulated(folder: Path) -> DatasetSplit:
     """Read simulated motion; homes and sessions that are not for training are held out."""
-    lives, split = simulated_lives.load(folder)
+    dataset, split = simulated_lives.load(folder)
     held = np.flatnonzero(np.array(split) != "train")
-    return Parted(lives.some(np.flatnonzero(np.array(split) == "train")), lives.some(held) if len(held) else None)
+    return DatasetSplit(
+        dataset.subset(np.flatnonzero(np.array(split) == "train")),
+        dataset.subset(held) if len(held) else None,
+    )
 
 
-def people(model: Path, folder: Path) -> Parted:
+def people(model: Path, folder: Path) -> DatasetSplit:
     """Read recorded SMPL-X motion: `scene.ply` and `*.npz` of one person, the last in name order held out.
 
-    Each holds `timestamp_s`, `transl`, `global_orient`, `body_pose` (rotation vectors, world +y up, metres) and `betas`.
-    Raises InputError LTM-001 where there is none, LTM-003 and LTM-004 where SMPL-X is not there.
+    Each holds `timestamp_s`, `transl`, `global_orient`, `body_pose` (rotation vectors, world +y up, metres)
+    and `betas`. Raises InputError LTM-001 where there is none, LTM-003 and LTM-004 where SMPL-X is not there.
     """
     files = sorted(folder.glob("*.npz"))
     if not files:
-        raise InputError("LTM-001", "no SMPL-X motion to learn from", str(folder), "put *.npz and scene.ply there")
-    loaded = [arrays.load(file, ("timestamp_s", "transl", "global_orient", "body_pose", "betas")) for file in files]
+        raise InputError(
+            "LTM-001", "no SMPL-X motion to learn from", str(folder), "put *.npz and scene.ply there"
+        )
+    loaded = [
+        npz.load(file, ("timestamp_s", "transl", "global_orient", "body_pose", "betas")) for file in files
+    ]
     person = smplx_body(model, loaded[0]["betas"])
-    moved = [motion_from_parameters(person, each["transl"], each["global_orient"], each["body_pose"]) for each in loaded]
-    motions = tuple(resampled(each["timestamp_s"], motion) for each, motion in zip(loaded, moved, strict=True))
+    moved = [
+        motion_from_parameters(person, each["transl"], each["global_orient"], each["body_pose"])
+        for each in loaded
+    ]
+    motions = tuple(
+        resample_motion(each["timestamp_s"], motion) for each, motion in zip(loaded, moved, strict=True)
+    )
     roots = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
-    scene = Surroundings.for_motion(meshes.read_ply(folder / "scene.ply"), roots, reach_m=1.5)
-    lives = Lives(person.body, motions, (0,) * len(motions), (scene,))
+    scene = MotionScene.for_motion(ply.read_ply(folder / "scene.ply"), roots, reach_m=1.5)
+    dataset = MotionDataset(person.body, motions, (0,) * len(motions), (scene,))
     last = len(motions) - 1
-    return Parted(lives.some(list(range(max(last, 1)))), lives.some([last]) if last else None)
+    return DatasetSplit(dataset.subset(list(range(max(last, 1)))), dataset.subset([last]) if last else None)

@@ -1,4 +1,4 @@
-"""Fit the networks of long-term motion one after the other: static bodies, routes, then poses along routes that are held."""
+"""Fit the networks of long-term motion in turn: static bodies, routes, then poses along fixed routes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,29 +10,33 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor, nn
 
-from pipeline.fit import FitRecord, fit
-from pipeline.models.bodies import PosedSurface, PoseSpace
-from pipeline.models.clip_channels import Clips
-from pipeline.models.contacts import Contacts
-from pipeline.models.longterm import ROOT, BaseNet, PoseNet, RouteNet, StaticBody, rotations_of
-from pipeline.models.longterm_examples import Bodies, Lives
+from pipeline.core.training import FitRecord, fit
+from pipeline.longterm.bodies import PosedSurface, PoseSpace
+from pipeline.longterm.clip_channels import Clips
+from pipeline.longterm.config import LongTermOptimizerConfig
+from pipeline.longterm.contacts import ContactVertices
+from pipeline.longterm.examples import MotionDataset, StaticBodies
+from pipeline.longterm.networks import ROOT_CHANNELS, BaseNet, PoseNet, RouteNet, StaticBody, orthonormalized
 from stages.train_longterm import objectives
 
+GRADIENT_NORM = 1.0
+"""Gradients longer than this are clipped to it."""
+SAVE_EVERY = 200
+"""Steps between checkpoints: a minute at most is lost when training is stopped."""
+SMOOTH_FRAMES = 4.0
+"""Deviation of the Gaussian that makes true routes as smooth as predicted ones, frames of 30 fps."""
+CHUNK = 256
+"""Clips at a time where nothing is trained."""
+BODY_VERTICES = 150
+"""Vertices of the surface that the CVAE's losses look at."""
+LEAST_RATE = 1e-3
+"""Share of the peak learning rate at both ends."""
+WARMUP = 0.03
+"""Share of the training in which the learning rate rises."""
+
 
 @dataclass(frozen=True)
-class Pace:
-    """Length and speed of one network's training."""
-
-    steps: int = 500
-    """steps of Adam"""
-    batch: int = 48
-    """examples a step"""
-    rate: float = 2e-3
-    """peak learning rate; falls to nothing along a cosine (the paper: 1e-3, and five to twenty times the steps)"""
-
-
-@dataclass(frozen=True)
-class Weights:
+class LongTermLossWeights:
     """What the terms of the losses weigh."""
 
     translation: float = 1.0
@@ -52,37 +56,59 @@ class Weights:
 
 
 def cosine(progress: float) -> float:
-    """Return the factor on the learning rate."""
-    return min(1.0, (progress + 1e-3) / 0.03) * 0.5 * (1 + np.cos(np.pi * min(progress, 1.0))) + 1e-3
+    """Return the factor on the learning rate: a linear warm-up, then a cosine; never quite 0."""
+    warm = min(1.0, (progress + LEAST_RATE) / WARMUP)
+    return warm * 0.5 * (1 + np.cos(np.pi * min(progress, 1.0))) + LEAST_RATE
 
 
 @dataclass(frozen=True)
-class Trainer:
+class NetworkTrainer:
     """What all trainings share."""
 
     poses: PoseSpace
-    weights: Weights
+    weights: LongTermLossWeights
     seed: int
     resume: Path | None = None
     device: str = "cpu"
 
-    def fitted(self, name: str, net: nn.Module, pace: Pace, loss: Callable[[Tensor], dict[str, Tensor]], examples: int) -> FitRecord:
+    def fitted(
+        self,
+        name: str,
+        net: nn.Module,
+        optimizer_config: LongTermOptimizerConfig,
+        loss: Callable[[Tensor], dict[str, Tensor]],
+        examples: int,
+    ) -> FitRecord:
         """Fit one network in place to random batches of examples."""
-        optimizer = torch.optim.Adam(net.parameters(), lr=pace.rate)
+        optimizer = torch.optim.Adam(net.parameters(), lr=optimizer_config.rate)
 
         def step_loss(step: int, generator: torch.Generator) -> dict[str, Tensor]:
-            return loss(torch.randint(examples, (pace.batch,), generator=generator))
+            return loss(torch.randint(examples, (optimizer_config.batch,), generator=generator))
 
         folder = self.resume / name if self.resume else None
         record = fit(
-            modules={"net": net}, optimizer=optimizer, loss=step_loss, steps=pace.steps, seed=self.seed,
-            resume=folder, save_every=200, schedule=cosine, label=name, clip_norm=1.0,
-        )  # fmt: skip
+            modules={"net": net},
+            optimizer=optimizer,
+            loss=step_loss,
+            steps=optimizer_config.steps,
+            seed=self.seed,
+            resume=folder,
+            save_every=SAVE_EVERY,
+            schedule=cosine,
+            label=name,
+            clip_norm=GRADIENT_NORM,
+        )
         net.eval()
         return record
 
 
-def fit_route(net: RouteNet, clips: Clips, trainer: Trainer, pace: Pace, name: str = "route") -> FitRecord:
+def fit_route(
+    net: RouteNet,
+    clips: Clips,
+    trainer: NetworkTrainer,
+    optimizer_config: LongTermOptimizerConfig,
+    name: str = "route",
+) -> FitRecord:
     """Fit a RouteNet (Eq. 3), its draft alike."""
     w = trainer.weights
 
@@ -90,82 +116,129 @@ def fit_route(net: RouteNet, clips: Clips, trainer: Trainer, pace: Pace, name: s
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
         shift, turn = map(sum, zip(*(objectives.route_error(each, truth) for each in made), strict=True))
-        return {"translation": w.translation * shift} | ({"rotation": w.rotation * turn} if net.turns else {})
+        return {"translation": w.translation * shift} | (
+            {"rotation": w.rotation * turn} if net.predicts_rotation else {}
+        )
 
-    return trainer.fitted(name, net, pace, loss, len(clips))
+    return trainer.fitted(name, net, optimizer_config, loss, len(clips))
 
 
-def made_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:
+def predicted_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:
     """Return the routes that a RouteNet makes, which the paper's PoseNet learns along."""
     with torch.no_grad():
-        ends, batches = clips.channels[:, [0, -1]], torch.arange(len(clips)).split(256)
+        ends, batches = clips.channels[:, [0, -1]], torch.arange(len(clips)).split(CHUNK)
         return torch.cat([net(ends[rows, 0], ends[rows, 1], clips.seen[rows]) for rows in batches])
 
 
-def true_routes(clips: Clips, smooth_frames: float = 4.0) -> Float[Tensor, "clip frame 9"]:
-    """Return the true routes, as smooth as made ones: along routes that are off, poses that fit none of them would be learned."""
-    route = clips.channels[..., :ROOT]
-    even = torch.from_numpy(gaussian_filter1d(route.numpy(), smooth_frames, axis=1, mode="nearest"))
-    return rotations_of(torch.cat([route[:, :1], even[:, 1:-1], route[:, -1:]], dim=1))
+def smoothed_true_routes(clips: Clips) -> Float[Tensor, "clip frame 9"]:
+    """Return the true routes, as smooth as predicted ones: along routes that are off, poses that fit none
+    would be learned.
+    """
+    route = clips.channels[..., :ROOT_CHANNELS]
+    even = torch.from_numpy(gaussian_filter1d(route.numpy(), SMOOTH_FRAMES, axis=1, mode="nearest"))
+    return orthonormalized(torch.cat([route[:, :1], even[:, 1:-1], route[:, -1:]], dim=1))
 
 
 def fit_pose(
-    net: PoseNet, routes: Float[Tensor, "clip frame 9"], clips: Clips, trainer: Trainer, pace: Pace, name: str = "pose"
+    net: PoseNet,
+    routes: Float[Tensor, "clip frame 9"],
+    clips: Clips,
+    trainer: NetworkTrainer,
+    optimizer_config: LongTermOptimizerConfig,
+    name: str = "pose",
 ) -> FitRecord:
     """Fit a PoseNet along routes that are held (Eq. 4)."""
     w, lever = trainer.weights, objectives.lever_of(trainer.poses)
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
-        made = net(truth[:, 0, ROOT:], truth[:, -1, ROOT:], routes[index], clips.seen.points[index])
-        terms = {"pose": w.pose * objectives.pose_error(made[..., ROOT:], truth[..., ROOT:], lever)}
-        return terms | ({"rotation": w.rotation * objectives.route_error(made[..., :ROOT], truth[..., :ROOT])[1]} if net.turns else {})
+        made = net(
+            truth[:, 0, ROOT_CHANNELS:], truth[:, -1, ROOT_CHANNELS:], routes[index], clips.seen.points[index]
+        )
+        terms = {
+            "pose": w.pose
+            * objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
+        }
+        return terms | (
+            {
+                "rotation": w.rotation
+                * objectives.route_error(made[..., :ROOT_CHANNELS], truth[..., :ROOT_CHANNELS])[1]
+            }
+            if net.predicts_rotation
+            else {}
+        )
 
-    return trainer.fitted(name, net, pace, loss, len(clips))
+    return trainer.fitted(name, net, optimizer_config, loss, len(clips))
 
 
-def fit_base(net: BaseNet, clips: Clips, trainer: Trainer, pace: Pace, name: str = "base") -> FitRecord:
+def fit_base(
+    net: BaseNet,
+    clips: Clips,
+    trainer: NetworkTrainer,
+    optimizer_config: LongTermOptimizerConfig,
+    name: str = "base",
+) -> FitRecord:
     """Fit a BaseNet, its draft alike."""
     w, lever = trainer.weights, objectives.lever_of(trainer.poses)
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
-        shift, turn = map(sum, zip(*(objectives.route_error(each[..., :ROOT], truth[..., :ROOT]) for each in made), strict=True))
-        pose = sum(objectives.pose_error(each[..., ROOT:], truth[..., ROOT:], lever) for each in made)
+        shift, turn = map(
+            sum,
+            zip(
+                *(
+                    objectives.route_error(each[..., :ROOT_CHANNELS], truth[..., :ROOT_CHANNELS])
+                    for each in made
+                ),
+                strict=True,
+            ),
+        )
+        pose = sum(
+            objectives.pose_error(each[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
+            for each in made
+        )
         return {"translation": w.translation * shift, "rotation": w.rotation * turn, "pose": w.pose * pose}
 
-    return trainer.fitted(name, net, pace, loss, len(clips))
+    return trainer.fitted(name, net, optimizer_config, loss, len(clips))
 
 
 def fit_body(
-    net: StaticBody, bodies: Bodies, lives: Lives, contacts: Contacts, trainer: Trainer, pace: Pace, vertices: int = 150, name: str = "body"
+    net: StaticBody,
+    bodies: StaticBodies,
+    dataset: MotionDataset,
+    contacts: ContactVertices,
+    trainer: NetworkTrainer,
+    optimizer_config: LongTermOptimizerConfig,
 ) -> FitRecord:
     """Fit the CVAE: reconstruction, KL divergence, contact and collision (Sec. 3.2)."""
     w, poses, lever = trainer.weights, trainer.poses, objectives.lever_of(trainer.poses)
-    chosen = lives.body.spread(vertices)
-    surface = PosedSurface(lives.body, np.concatenate([chosen, contacts.vertices]))
+    chosen = dataset.body.sample_vertices(BODY_VERTICES)
+    surface = PosedSurface(dataset.body, np.concatenate([chosen, contacts.vertices]))
     frames = torch.from_numpy(bodies.places.world_from_place).float()
-    scene, distances = torch.from_numpy(bodies.scene), [each.distance for each in lives.scenes]
-    shape = torch.from_numpy(lives.body.shape).float()[None]
+    scene, distances = torch.from_numpy(bodies.scene), [each.distance for each in dataset.scenes]
+    shape = torch.from_numpy(dataset.body.shape).float()[None]
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = bodies.truth[index]
-        given = net.given(bodies.places.place[index], shape.expand(len(index), -1), bodies.places.points[index])
+        given = net.given(
+            bodies.places.place[index], shape.expand(len(index), -1), bodies.places.points[index]
+        )
         mean, log_variance = net.encode(truth, given)
         made = net.decode(mean + torch.randn_like(mean) * (log_variance / 2).exp(), given)
         mesh = objectives.posed(made, frames[index], poses, surface)
         with torch.no_grad():
             true_mesh = objectives.posed(truth, frames[index], poses, surface)
-        shift, turn = objectives.route_error(made[..., :ROOT], truth[..., :ROOT])
+        shift, turn = objectives.route_error(made[..., :ROOT_CHANNELS], truth[..., :ROOT_CHANNELS])
         collision, contact = objectives.scene_errors(mesh, scene[index], distances, contacts, len(chosen))
         return {
             "root": w.translation * shift + w.rotation * turn,
-            "pose": w.pose * objectives.pose_error(made[..., ROOT:], truth[..., ROOT:], lever),
+            "pose": w.pose
+            * objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever),
             "vertices": w.vertices * (mesh - true_mesh).norm(dim=-1).mean(),
-            "divergence": w.divergence * objectives.divergence(mean, log_variance),
+            "divergence": w.divergence * objectives.kl_divergence(mean, log_variance),
             "collision": w.collision * collision,
             "contact": w.contact * contact,
         }
 
-    return trainer.fitted(name, net, pace, loss, len(bodies.scene))
+    return trainer.fitted("body", net, optimizer_config, loss, len(bodies.scene))

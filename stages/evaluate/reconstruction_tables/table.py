@@ -1,21 +1,26 @@
 """Measure several reconstructions from the same held-out phone, and compare them picture by picture."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.models.intervals import bootstrapped, episodes
-from pipeline.qa import Check
-from pipeline.videos import Video
+from pipeline.core import devices
+from pipeline.core.videos import Video
+from pipeline.data.qa import Check
+from pipeline.metrics.intervals import bootstrapped, episodes
+from pipeline.metrics.metrics import Metrics, formatted
 from stages.evaluate import heldout, reading, reconstruction, surfaces
-from stages.evaluate.figures import Figures, told
-from stages.evaluate.heldout import PARTS, View
+from stages.evaluate.heldout import PARTS, HeldoutView
 from stages.evaluate.reading import Reconstructed
 
-PAPER = {"ours": (0.708, 0.695, 0.703), "totalrecon": (0.099, 0.647, 0.053), "totalrecon_single": (0.533, 0.685, 0.518)}
+PAPER = {
+    "ours": (0.708, 0.695, 0.703),
+    "totalrecon": (0.099, 0.647, 0.053),
+    "totalrecon_single": (0.533, 0.685, 0.518),
+}
 """DepthAcc of all, agent and scene on the paper's own cat (Table 3)"""
 NAMES = {
     "ours": "ours",
@@ -28,35 +33,39 @@ NAMES = {
 }
 COLUMNS = {"depth_acc": "DepthAcc@0.1m", "psnr": "PSNR, dB", "ssim": "SSIM"}
 NO_TRUTH = "what the held-out phone truly saw is not known for this capture"
+EPISODE_FRAMES = 3
+"""Rendered frames that are resampled together: neighbours look alike."""
+BOOTSTRAP_DRAWS = 2000
 
 
-@dataclass(frozen=True)
-class Effort:
-    """How much is looked at, and how intervals are drawn."""
-
-    heldout_frames: int = 24
-    """Frames of each held-out phone that are drawn"""
-    episode_frames: int = 3
-    """Drawn frames that are resampled together"""
-    bootstrap_draws: int = 2000
-    """Resamples of the intervals"""
-
-
-def figures(
-    folders: Mapping[str, Path], places: Reconstructed, videos: Sequence[Video], effort: Effort, rng: np.random.Generator, device: str
-) -> Figures:
-    """Return ``<variant>/<figure>`` of every variant, and what its DepthAcc lacks against ours, with intervals."""
-    found = Figures()
+def metrics(
+    folders: Mapping[str, Path],
+    places: Reconstructed,
+    videos: Sequence[Video],
+    heldout_frames: int,
+    rng: np.random.Generator,
+    device: devices.Device,
+) -> Metrics:
+    """Return ``<variant>/<figure>`` of every variant, and what its DepthAcc lacks against ours, with
+    intervals.
+    """
+    found = Metrics()
     if places.truth is None:
-        found.skip([f"{variant}/{kind}_{part}" for variant in folders for kind in COLUMNS for part in PARTS], NO_TRUTH)
+        found.skip(
+            [f"{variant}/{kind}_{part}" for variant in folders for kind in COLUMNS for part in PARTS],
+            NO_TRUTH,
+        )
         return found
     known = reading.recorded(places, tuple(videos))
-    of_role = {role: [each for each in known if each.video.role == role] for role in ("walkthrough", "turnaround", "session", "heldout")}
+    of_role = {
+        role: [each for each in known if each.video.role == role]
+        for role in ("walkthrough", "turnaround", "session", "heldout")
+    }
     frames = reading.frames_of_truth(places, of_role["walkthrough"][0], of_role["turnaround"][0])
     filmed = {phone.video.synchronized_with for phone in of_role["heldout"]}
     sessions = [each for each in of_role["session"] if each.video.id in filmed]
     shots = [
-        (phone.video.synchronized_with, reconstruction.shots_of(places, phone, frames, effort.heldout_frames))
+        (phone.video.synchronized_with, reconstruction.shots_of(places, phone, frames, heldout_frames))
         for phone in of_role["heldout"]
         if phone.video.synchronized_with
     ]
@@ -65,30 +74,32 @@ def figures(
         here = replace(places, reconstruction=folder)
         motions = {each.video.id: reading.read_motion(folder, each.video.id) for each in sessions}
         views = [
-            view for session, seen in shots for view in reconstruction.drawn_by_fields(here, session, motions.get(session), seen, device)
+            view
+            for session, seen in shots
+            for view in reconstruction.drawn_by_fields(here, session, motions.get(session), seen, device)
         ]
-        one = Figures()
-        one.add(heldout.view_figures(views) if views else _nothing())
+        one = Metrics()
+        one.add(heldout.view_metrics(views) if views else _nothing())
         one.add(reconstruction.agent_roots(sessions, motions, frames))
         followed = reconstruction.track_distances(here, sessions, motions, of_role["turnaround"][0], frames)
-        one.add(surfaces.track_figures(followed))
+        one.add(surfaces.track_metrics(followed))
         found.add_as(variant, one, "reconstruction")
         right[variant] = np.array([_depth_acc(view) for view in views])
         if views:
             found.pictures[variant] = heldout.side_by_side(views)
     for variant in folders:
         if variant != "ours" and len(right["ours"]):
-            _compare(found, variant, right["ours"] - right[variant], effort, rng)
+            _compare(found, variant, right["ours"] - right[variant], rng)
     return found
 
 
-def _nothing() -> Figures:
-    found = Figures()
+def _nothing() -> Metrics:
+    found = Metrics()
     found.skip([name for name in heldout.NAMES if name.startswith("reconstruction/")], heldout.UNSEEN)
     return found
 
 
-def _depth_acc(view: View) -> list[float]:
+def _depth_acc(view: HeldoutView) -> list[float]:
     """Return the share of right depth of one picture: all, agent, scene; NaN for what is not in it."""
     known = (view.true.depth > 0) & (view.true.depth <= heldout.RANGE_M)
     right = heldout.depth_is_right(view)
@@ -96,31 +107,48 @@ def _depth_acc(view: View) -> list[float]:
     return [float(right[part].mean()) if part.any() else np.nan for part in parts]
 
 
-def _compare(found: Figures, variant: str, lacking: Float[np.ndarray, "view part"], effort: Effort, rng: np.random.Generator) -> None:
-    """Put the mean difference of pictures to ours with its 95 % interval; neighbouring pictures are drawn again together."""
+def _compare(
+    found: Metrics, variant: str, lacking: Float[np.ndarray, "view part"], rng: np.random.Generator
+) -> None:
+    """Put the mean difference of pictures to ours with its 95 % interval; neighbouring pictures are drawn
+    again together.
+    """
     for column, part in enumerate(PARTS):
         seen = np.flatnonzero(np.isfinite(lacking[:, column]))
         if not len(seen):
             continue
-        episode = episodes(seen, np.zeros(len(seen), int), effort.episode_frames)
-        interval = bootstrapped(lacking[seen, column], episode, effort.bootstrap_draws, rng)
+        episode = episodes(seen, np.zeros(len(seen), int), EPISODE_FRAMES)
+        interval = bootstrapped(lacking[seen, column], episode, BOOTSTRAP_DRAWS, rng)
         found.put_mean(f"{variant}/depth_acc_{part}_less_than_ours", interval)
 
 
 def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
-    """Lay the figures out as Table 3, the paper's beside ours."""
-    lines = ["Table 3: seen by the held-out phone (all / agent / scene); roots and followed points in the sessions it filmed too"]
+    """Lay the metrics out as Table 3, the paper's beside ours."""
+    lines = [
+        (
+            "Table 3: seen by the held-out phone (all / agent / scene); roots and "
+            "followed points in the sessions it filmed too"
+        )
+    ]
     head = f"{'':34}" + "".join(f"{name:>24}" for name in COLUMNS.values())
     lines.append(head + f"{'all, less than ours':>28}{'root, m / deg':>18}{'tracks, m':>18}{'paper':>24}")
     for variant in variants:
         row = f"{NAMES.get(variant, variant):34}"
         for kind in COLUMNS:
             form = ".1f" if kind == "psnr" else ".3f"
-            row += f"{' / '.join(told(values.get(f'{variant}/{kind}_{part}'), form) for part in PARTS):>24}"
-        lacking = [told(values.get(f"{variant}/depth_acc_all_less_than_ours{end}")) for end in ("", "_ci95_low", "_ci95_high")]
+            row += (
+                f"{' / '.join(formatted(values.get(f'{variant}/{kind}_{part}'), form) for part in PARTS):>24}"
+            )
+        lacking = [
+            formatted(values.get(f"{variant}/depth_acc_all_less_than_ours{end}"))
+            for end in ("", "_ci95_low", "_ci95_high")
+        ]
         row += f"{'' if variant == 'ours' else f'{lacking[0]} [{lacking[1]}, {lacking[2]}]':>28}"
-        root = told(values.get(f"{variant}/agent_root_m_median")), told(values.get(f"{variant}/agent_root_deg_median"), ".1f")
-        tracks = (told(values.get(f"{variant}/agent_track_m_{which}")) for which in ("median", "p90"))
+        root = (
+            formatted(values.get(f"{variant}/agent_root_m_median")),
+            formatted(values.get(f"{variant}/agent_root_deg_median"), ".1f"),
+        )
+        tracks = (formatted(values.get(f"{variant}/agent_track_m_{which}")) for which in ("median", "p90"))
         row += f"{' / '.join(root):>18}{' / '.join(tracks):>18}"
         lines.append(row + f"{' / '.join(f'{value:g}' for value in PAPER.get(variant, ())):>24}")
     lines.append(
@@ -130,7 +158,7 @@ def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def pictures(found: Figures) -> dict[str, tuple[UInt8[np.ndarray, "height width 3"], str]]:
+def pictures(found: Metrics) -> dict[str, tuple[UInt8[np.ndarray, "height width 3"], str]]:
     """Return the drawn views of every variant with a caption."""
     return {
         variant: (image, f"{NAMES.get(variant, variant)}: truth, drawn, true depth, drawn depth")
@@ -140,9 +168,15 @@ def pictures(found: Figures) -> dict[str, tuple[UInt8[np.ndarray, "height width 
 
 def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:
     """Judge whether ours is ahead of each rival over all pixels."""
-    found = [Check("DepthAcc of all pixels, ours", values.get("ours/depth_acc_all"), "share", 0.85, 0.7, "higher")]
+    found = [
+        Check("DepthAcc of all pixels, ours", values.get("ours/depth_acc_all"), "share", 0.85, 0.7, "higher")
+    ]
     for variant in variants:
         if variant != "ours":
             name = f"DepthAcc that is lacking: {NAMES.get(variant, variant)}"
-            found.append(Check(name, values.get(f"{variant}/depth_acc_all_less_than_ours"), "share", 0.0, None, "higher"))
+            found.append(
+                Check(
+                    name, values.get(f"{variant}/depth_acc_all_less_than_ours"), "share", 0.0, None, "higher"
+                )
+            )
     return found

@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import arrays
-from pipeline.models.intervals import bootstrapped, episodes
-from pipeline.qa import Check
-from pipeline.videos import Video
+from pipeline.core.videos import Video
+from pipeline.data.clips import FRAMES
+from pipeline.data.poses import RegisteredPoses
+from pipeline.data.qa import Check
+from pipeline.data.templates import SceneCameras
+from pipeline.metrics.intervals import bootstrapped, episodes
+from pipeline.metrics.metrics import Metrics, formatted, median
+from pipeline.metrics.pose_errors import PoseErrors, constant_between, joined, pose_errors
 from stages.evaluate import registration
-from stages.evaluate.alignment import PoseErrors, constant_between, joined, pose_errors
-from stages.evaluate.figures import Figures, median, told
-from stages.evaluate.reading import read_registration
-from stages.evaluate.truth import Truth
+from stages.evaluate.truth import RecordingTruth
 
 PAPER = {"ours": (6.35, 0.41), "no_localizer": (37.59, 0.83), "no_feature_metric": (22.47, 1.30)}
 """Rotation (degrees) and translation (metres) on the paper's own cat videos (Table 1)"""
@@ -26,6 +27,9 @@ NAMES = {
     "no_odometry": "without odometry",
     "regression_only": "regression only",
 }
+EPISODE_S = 5.0
+"""Intervals resample stretches of this length together: poses of neighbouring frames err alike."""
+BOOTSTRAP_DRAWS = 2000
 MOST_DEG, MOST_M = 180.0, 10.0
 """A frame without a pose counts as this wrong where errors are averaged"""
 UNITS = {"rotation_deg": "degrees", "translation_m": "meters"}
@@ -48,31 +52,42 @@ class _Session:
     timestamp_s: Float[np.ndarray, "frame"]
 
 
-def figures(
+def metrics(
     folders: Mapping[str, Path],
     frames: Mapping[str, Path],
     videos: Sequence[Video],
     scene_template: Path,
     truth: Path | None,
     resampling: Resampling,
-) -> Figures:
+) -> Metrics:
     """Return ``<variant>/<figure>`` of every variant, and what each changes against ours, with intervals."""
-    found = Figures()
+    found = Metrics()
     if truth is None:
-        names = [f"{variant}/{unit}_{which}" for variant in folders for unit in UNITS for which in ("median", "p95")]
+        names = [
+            f"{variant}/{unit}_{which}"
+            for variant in folders
+            for unit in UNITS
+            for which in ("median", "p95")
+        ]
         found.skip(names, "the true poses of this capture are not known")
         return found
     sessions = _sessions(frames, videos, scene_template, truth)
     errors: dict[str, list[PoseErrors]] = {}
     for variant, folder in folders.items():
-        poses = {session.id: read_registration(folder, session.id) for session in sessions}
-        errors[variant] = [pose_errors(_cameras(poses[session.id], session), session.camera) for session in sessions]
+        poses = {session.id: RegisteredPoses.open(folder / session.id) for session in sessions}
+        errors[variant] = [
+            pose_errors(_cameras(poses[session.id], session), session.camera) for session in sessions
+        ]
         confidence = {session.id: _confidence(poses[session.id], session) for session in sessions}
         named = {session.id: error for session, error in zip(sessions, errors[variant], strict=True)}
-        one = registration.camera_figures(named, confidence, sum(table is not None for table in poses.values()))
+        one = registration.camera_metrics(
+            named, confidence, sum(table is not None for table in poses.values())
+        )
         for id, error in named.items():
             for unit in UNITS:
-                found.put(f"{variant}/{id}/{unit}_median", median(getattr(error, UNITS[unit])), registration.REFUSED)
+                found.put(
+                    f"{variant}/{id}/{unit}_median", median(getattr(error, UNITS[unit])), registration.REFUSED
+                )
         found.add_as(variant, one, "registration")
     for variant in folders:
         if variant != "ours":
@@ -82,22 +97,33 @@ def figures(
 
 def _compare(found, variant, sessions, errors, resampling):
     """Put the paired mean differences to ours with 95 % intervals, over all sessions and over each."""
-    chosen = {variant: list(range(len(sessions)))} | {f"{variant}/{session.id}": [index] for index, session in enumerate(sessions)}
+    chosen = {variant: list(range(len(sessions)))} | {
+        f"{variant}/{session.id}": [index] for index, session in enumerate(sessions)
+    }
     for name, part in chosen.items():
-        start = np.concatenate([(sessions[index].timestamp_s / resampling.episode_s).astype(int) for index in part])
+        start = np.concatenate(
+            [(sessions[index].timestamp_s / resampling.episode_s).astype(int) for index in part]
+        )
         video = np.repeat(part, [len(sessions[index].timestamp_s) for index in part])
         both = [joined([errors[which][index] for index in part]) for which in (variant, "ours")]
         for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
             theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
-            interval = bootstrapped(theirs - ours, episodes(start, video, 1), resampling.draws, resampling.rng)
+            interval = bootstrapped(
+                theirs - ours, episodes(start, video, 1), resampling.draws, resampling.rng
+            )
             found.put_mean(f"{name}/{unit}_more_than_ours", interval)
 
 
 def _sessions(frames, videos, scene_template, truth) -> list[_Session]:
-    cameras = arrays.load(scene_template / "cameras.npz", ("world_from_camera", "registered"))
-    ours = np.where(cameras["registered"][:, None, None], cameras["world_from_camera"], np.nan)
-    tables = {id: arrays.load(folder / "frames.npz", ("source_index", "timestamp_s")) for id, folder in frames.items()}
-    true = {video.id: Truth.open(truth, Path(video.file).stem, tables[video.id]["source_index"]) for video in videos if video.id in tables}
+    ours = SceneCameras.open(scene_template).world_from_registered
+    tables = {
+        id: FRAMES.load(folder / "frames.npz", "source_index", "timestamp_s") for id, folder in frames.items()
+    }
+    true = {
+        video.id: RecordingTruth.open(truth, Path(video.file).stem, tables[video.id]["source_index"])
+        for video in videos
+        if video.id in tables
+    }
     walk = next(video.id for video in videos if video.role == "walkthrough")
     world = constant_between(ours, true[walk].world_from_camera)
     chosen = [video.id for video in videos if video.role == "session"]
@@ -105,41 +131,66 @@ def _sessions(frames, videos, scene_template, truth) -> list[_Session]:
 
 
 def _cameras(poses, session):
-    return poses["world_from_camera"] if poses else np.full((len(session.camera), 4, 4), np.nan)
+    return poses.world_from_camera if poses else np.full((len(session.camera), 4, 4), np.nan)
 
 
 def _confidence(poses, session):
-    return poses["confidence"] if poses else np.zeros(len(session.camera))
+    return poses.confidence if poses else np.zeros(len(session.camera))
 
 
 def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
-    """Lay the figures out as Table 1, the paper's beside ours."""
+    """Lay the metrics out as Table 1, the paper's beside ours."""
     lines = [
-        "Table 1: camera registration, all frames of all sessions (median; 95th percentile; mean difference to ours with 95 % interval)",
+        (
+            "Table 1: camera registration, all frames of all sessions (median; 95th "
+            "percentile; mean difference to ours with 95 % interval)"
+        ),
         f"{'':34}{'rotation, deg':>20}{'translation, m':>20}{'videos':>9}{'to ours, deg':>28}{'paper':>16}",
     ]
     for variant in variants:
-        pairs = ["; ".join(told(values.get(f"{variant}/{unit}_{which}")) for which in ("median", "p95")) for unit in UNITS]
-        videos = "/".join(told(values.get(f"{variant}/videos_{which}"), "g") for which in ("registered", "total"))
-        against = "" if variant == "ours" else _interval(values, f"{variant}/rotation_deg_more_than_ours", ".3f")
+        pairs = [
+            "; ".join(formatted(values.get(f"{variant}/{unit}_{which}")) for which in ("median", "p95"))
+            for unit in UNITS
+        ]
+        videos = "/".join(
+            formatted(values.get(f"{variant}/videos_{which}"), "g") for which in ("registered", "total")
+        )
+        against = (
+            "" if variant == "ours" else _interval(values, f"{variant}/rotation_deg_more_than_ours", ".3f")
+        )
         paper = "{:g} / {:g}".format(*PAPER[variant]) if variant in PAPER else ""
-        lines.append(f"{NAMES.get(variant, variant):34}{pairs[0]:>20}{pairs[1]:>20}{videos:>9}{against:>28}{paper:>16}")
+        lines.append(
+            f"{NAMES.get(variant, variant):34}{pairs[0]:>20}{pairs[1]:>20}{videos:>9}{against:>28}{paper:>16}"
+        )
     sessions = sorted({name.split("/")[1] for name in values if name.count("/") == 2})
-    lines += ["", f"{'per session: median deg':34}" + "".join(f"{id:>26}" for id in sessions)] if sessions else []
+    lines += (
+        ["", f"{'per session: median deg':34}" + "".join(f"{id:>26}" for id in sessions)] if sessions else []
+    )
     for variant in variants if sessions else ():
-        row = "".join(f"{told(values.get(f'{variant}/{id}/rotation_deg_median')):>26}" for id in sessions)
+        row = "".join(
+            f"{formatted(values.get(f'{variant}/{id}/rotation_deg_median')):>26}" for id in sessions
+        )
         lines.append(f"{NAMES.get(variant, variant):34}{row}")
     lines += ["", "per session: mean difference to ours, mm"] if sessions else []
     for variant in [each for each in variants if each != "ours"] if sessions else ():
-        row = "".join(f"{_interval(values, f'{variant}/{id}/translation_m_more_than_ours', '.1f', 1000):>26}" for id in sessions)
+        row = "".join(
+            f"{_interval(values, f'{variant}/{id}/translation_m_more_than_ours', '.1f', 1000):>26}"
+            for id in sessions
+        )
         lines.append(f"{NAMES.get(variant, variant):34}{row}")
-    lines.append("paper: its own cat videos, degrees / metres; '-': more than half (a twentieth) of the frames has no pose.")
+    lines.append(
+        "paper: its own cat videos, degrees / metres; '-': more than half "
+        "(a twentieth) of the frames has no pose."
+    )
     return "\n".join(lines) + "\n"
 
 
 def _interval(values: Mapping[str, float | None], name: str, form: str, scale: float = 1.0) -> str:
-    mean, low, high = (None if values.get(name + end) is None else scale * values[name + end] for end in ("", "_ci95_low", "_ci95_high"))
-    return f"{told(mean, form)} [{told(low, form)}, {told(high, form)}]"
+    mean, low, high = (
+        None if values.get(name + end) is None else scale * values[name + end]
+        for end in ("", "_ci95_low", "_ci95_high")
+    )
+    return f"{formatted(mean, form)} [{formatted(low, form)}, {formatted(high, form)}]"
 
 
 def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:

@@ -1,51 +1,42 @@
-"""Grounding DINO finds the animal by its name in some frames, SAM 2 follows it from the most certain one to both ends.
+"""Grounding DINO finds the animal by its name in some frames, SAM 2 follows it from the most certain one to
+both ends.
 
-A user's hint takes the place of the detector. Masks are made as they are asked for; those before the first frame are
-kept compressed, so that memory hardly grows with the recording.
+A user's hint takes the place of the detector. Masks are made as they are asked for; those before the first
+frame are kept compressed, so that memory hardly grows with the recording.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import InputError
-from pipeline.files.clips import Clip
+from pipeline.core.errors import InputError
+from pipeline.data.clips import Clip
+from stages.segment_agent.config import FoundationConfig
 from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
 
 if TYPE_CHECKING:
-    from pipeline.models.grounding_dino import GroundingDino
-    from pipeline.models.sam2 import Sam2
+    from pipeline.backends.grounding_dino import GroundingDino
+    from pipeline.backends.sam2 import Sam2
 
 
-@dataclass(frozen=True)
-class Foundation:
-    """Which models, and what they look for."""
-
-    detector: str = ""
-    """Folder of a Grounding DINO checkpoint; not needed where a prompt points at the animal."""
-    tracker: str = ""
-    """Folder of a SAM 2 checkpoint."""
-    description: str = "a cat."
-    """What the animal is called."""
-    threshold: float = 0.3
-    """Score from which a detection counts, 0..1."""
-    looked_at: int = 16
-    """Frames in which it is looked for."""
-    unsure: float = 1.0
-    """Log-odds on both sides of even within which a pixel is unknown."""
+LOOKED_AT = 16
+"""frames in which the animal is looked for"""
+UNSURE = 1.0
+"""log-odds on both sides of even within which a pixel is unknown"""
 
 
-def segment(clip: Clip, hint: Prompt | None, options: Foundation, device: str) -> Iterator[Mask]:
-    """Return one mask per frame, in order. Raises MSK-004 where the animal is not found, MOD-001..003 without models."""
-    from pipeline.models.grounding_dino import GroundingDino
-    from pipeline.models.sam2 import Sam2
+def segment(clip: Clip, hint: Prompt | None, options: FoundationConfig, device: str) -> Iterator[Mask]:
+    """Return one mask per frame, in order. Raises MSK-004 where the animal is not found, MOD-001..003 without
+    models.
+    """
+    from pipeline.backends.grounding_dino import GroundingDino
+    from pipeline.backends.sam2 import Sam2
 
     tracker = Sam2(options.tracker, device)
     if hint is None:
@@ -55,16 +46,18 @@ def segment(clip: Clip, hint: Prompt | None, options: Foundation, device: str) -
     return _follow(clip, tracker, frame, box_px, options)
 
 
-def _find(clip: Clip, detector: GroundingDino, options: Foundation) -> tuple[int, Float[np.ndarray, 4]]:
+def _find(clip: Clip, detector: GroundingDino, options: FoundationConfig) -> tuple[int, Float[np.ndarray, 4]]:
     """Return the frame and box of the most certain detection."""
     best: tuple[float, int, np.ndarray] | None = None
-    for frame in np.unique(np.linspace(0, len(clip) - 1, options.looked_at).round().astype(int)).tolist():
+    for frame in np.unique(np.linspace(0, len(clip) - 1, LOOKED_AT).round().astype(int)).tolist():
         found = detector.find(clip.color(frame), options.description, options.threshold)
         if len(found.score) and (best is None or found.score[0] > best[0]):
             best = (float(found.score[0]), frame, found.boxes_px[0])
     if best is None:
-        what = f"{options.description!r} was found in none of {options.looked_at} frames"
-        raise InputError("MSK-004", what, str(clip.folder), "describe the animal otherwise, or point at it with a prompt")
+        what = f"{options.description!r} was found in none of {LOOKED_AT} frames"
+        raise InputError(
+            "MSK-004", what, str(clip.folder), "describe the animal otherwise, or point at it with a prompt"
+        )
     return best[1], best[2]
 
 
@@ -76,16 +69,18 @@ def widened(hint: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[n
     return np.concatenate([np.maximum(low, 0), np.minimum(high, size[::-1])])
 
 
-def _follow(clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, 4], options: Foundation) -> Iterator[Mask]:
+def _follow(
+    clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, 4], options: FoundationConfig
+) -> Iterator[Mask]:
     before: list[tuple[bytes, bool, float]] = []
     for log_odds, presence in tracker.track(clip.color, range(start, -1, -1), box_px):
-        mask = labelled(log_odds, presence, options.unsure)
+        mask = labelled(log_odds, presence, UNSURE)
         before.append((cv2.imencode(".png", mask.labels)[1].tobytes(), mask.visible, mask.confidence))
     while len(before) > 1:
         png, visible, confidence = before.pop()
         yield Mask(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), visible, confidence)
     for log_odds, presence in tracker.track(clip.color, range(start, len(clip)), box_px):
-        yield labelled(log_odds, presence, options.unsure)
+        yield labelled(log_odds, presence, UNSURE)
 
 
 def labelled(log_odds: Float[np.ndarray, "height width"], presence: float, unsure: float) -> Mask:

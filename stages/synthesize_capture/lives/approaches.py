@@ -1,6 +1,8 @@
-"""Scripted approaches: a person stands, then walks up to the animal; in a twin of each the person goes on standing.
+"""Scripted approaches: a person stands, then walks up to the animal; in a twin of each the person goes on
+standing.
 
-What the animal's true policy does in either case is what a behaviour model should do when it is shown the same 0.8 s.
+What the animal's true policy does in either case is what a behaviour model should do when it is shown the
+same 0.8 s.
 """
 
 import copy
@@ -11,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import arrays
-from pipeline.models.perception import FeatureVolume
-from pipeline.models.trajectories import FUTURE, PAST
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.trajectories import FUTURE, PAST
+from pipeline.data import npz
 from stages.synthesize_capture import gait
 from stages.synthesize_capture.dwellings import Dwelling
 from stages.synthesize_capture.lives.lives import RATE_HZ
 from stages.synthesize_capture.navigation import floor_for
 from stages.synthesize_capture.observer import Observer
-from stages.synthesize_capture.policy import DELAY_S, Policy, Seen
+from stages.synthesize_capture.policy import DELAY_S, Policy, SeenPerson
 from stages.synthesize_capture.session import (
     ANIMAL_BREADTH_M,
     ANIMAL_HEIGHT_M,
@@ -41,7 +43,7 @@ EYE_M = 1.35
 
 
 @dataclass(frozen=True)
-class Approaches:
+class ScriptedApproaches:
     """Windows of approaches and, one for one, of their twins; the current frame is the last of the past."""
 
     world_from_agent: Float[np.ndarray, "twin approach frame 4 4"]
@@ -51,7 +53,7 @@ class Approaches:
     volume: FeatureVolume
 
 
-def scripted(home: Dwelling, rng: np.random.Generator, count: int) -> Approaches:
+def scripted(home: Dwelling, rng: np.random.Generator, count: int) -> ScriptedApproaches:
     """Play ``count`` approaches and their twins, each from a place and a mood of its own."""
     home = home.rearranged(rng)
     footprints = home.room.footprints()
@@ -68,49 +70,73 @@ def scripted(home: Dwelling, rng: np.random.Generator, count: int) -> Approaches
         person = Observer(floor, near[rng.integers(len(near))], rng.spawn(1)[0])
         windows.append(_pair(animal, person, rng.uniform(0.9, 1.2)))
     columns = [np.stack([[pair[twin][part] for pair in windows] for twin in (0, 1)]) for part in range(3)]
-    return Approaches(*columns, volume_of(home))
+    return ScriptedApproaches(*columns, volume_of(home))
 
 
-def _pair(animal: Policy, person: Observer, pace: float) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Play one approach and its twin from the same start; the animal's own choices fall alike until it notices."""
+def _pair(animal: Policy, person: Observer, speed_m_s: float) -> tuple[tuple[np.ndarray, ...], ...]:
+    """Play one approach and its twin from the same start; the animal's own choices fall alike until it
+    notices.
+    """
     twins = []
     for walks in (True, False):
-        rows, seen = _played(copy.deepcopy(animal), copy.deepcopy(person), pace if walks else None)
+        rows, seen = _played(copy.deepcopy(animal), copy.deepcopy(person), speed_m_s if walks else None)
         now = CALM_S + WALKED_S
         timestamp_s = now + np.arange(1 - PAST, FUTURE + 1) / RATE_HZ
         motion = gait.poses(rows, timestamp_s)
         sample = np.round(timestamp_s[:PAST] / STEP_S).astype(int)
-        twins.append((motion.world_from_agent, motion.agent_from_bone[:PAST].astype(np.float32), seen[sample]))
+        twins.append(
+            (motion.world_from_agent, motion.agent_from_bone[:PAST].astype(np.float32), seen[sample])
+        )
     return tuple(twins)
 
 
-def _played(animal: Policy, person: Observer, pace: float | None) -> tuple[AnimalCourse, Float[np.ndarray, "sample 3"]]:
+def _played(
+    animal: Policy, person: Observer, speed_m_s: float | None
+) -> tuple[AnimalCourse, Float[np.ndarray, "sample 3"]]:
     """Let both live; the person stands, and after a while walks up at ``pace``, if given."""
-    past: deque[Seen] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
+    past: deque[SeenPerson] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
     person.mode, person.left_s = "watch", np.inf
     rows, seen = [], []
     for step in range(int(np.ceil((CALM_S + WALKED_S + FUTURE / RATE_HZ + 0.5) / STEP_S))):
-        if pace is not None and step == round(CALM_S / STEP_S):
-            person.mode, person.pace, person.left_s, person.since_plan_s = "approach", pace, 4.0, np.inf
+        if speed_m_s is not None and step == round(CALM_S / STEP_S):
+            person.mode, person.speed_m_s, person.left_s, person.since_plan_s = (
+                "approach",
+                speed_m_s,
+                4.0,
+                np.inf,
+            )
         if person.mode != "approach":
             person.left_s = np.inf
         person.step(STEP_S, animal.position)
-        past.append(Seen(person.walker.position.copy(), person.velocity.copy()))
+        past.append(SeenPerson(person.walker.position.copy(), person.velocity.copy()))
         animal.step(STEP_S, past[0])
-        mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (1.0 - 0.6 * animal.posture[:2].sum())
-        rows.append((animal.position, animal.walker.yaw, animal.posture.copy(), float(animal.leap is not None), animal.gaze.copy(), mood))
+        mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (
+            1.0 - 0.6 * animal.posture[:2].sum()
+        )
+        rows.append(
+            (
+                animal.position,
+                animal.walker.yaw,
+                animal.posture.copy(),
+                float(animal.leap is not None),
+                animal.gaze.copy(),
+                mood,
+            )
+        )
         seen.append([person.walker.position[0], EYE_M, person.walker.position[1]])
     position, yaw, posture, air, gaze, tail = (np.array(column) for column in zip(*rows, strict=True))
-    return AnimalCourse(np.arange(len(rows)) * STEP_S, position, np.unwrap(yaw), posture, air, gaze, tail), np.array(seen)
+    return AnimalCourse(
+        np.arange(len(rows)) * STEP_S, position, np.unwrap(yaw), posture, air, gaze, tail
+    ), np.array(seen)
 
 
-def write(folder: Path, met: Approaches) -> None:
+def write(folder: Path, met: ScriptedApproaches) -> None:
     """Write `approaches.npz` and the home's `volume.npz`."""
-    arrays.save(
+    npz.save(
         folder / "approaches.npz",
         compress=True,
         world_from_agent=met.world_from_agent,
         agent_from_bone=met.agent_from_bone,
         observer=met.observer,
     )
-    arrays.save(folder / "volume.npz", compress=True, **vars(met.volume))
+    npz.save(folder / "volume.npz", compress=True, **vars(met.volume))

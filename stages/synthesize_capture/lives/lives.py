@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import arrays
-from pipeline.models.perception import FeatureVolume
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.data import npz
 from stages.synthesize_capture import camera_motion, gait, session
 from stages.synthesize_capture.animal import BONES, HEADS
 from stages.synthesize_capture.dwellings import Dwelling
@@ -20,7 +20,7 @@ APART_S = 5.0
 
 
 @dataclass(frozen=True)
-class Life:
+class SimulatedLife:
     """What animal and person did in a home."""
 
     timestamp_s: Float[np.ndarray, "frame"]
@@ -32,21 +32,30 @@ class Life:
     """Index into `policy.REASONS`, per frame."""
 
 
-def lived(home: Dwelling, rng: np.random.Generator, duration_s: float, takes: int = 1) -> Life:
-    """Let animal and a person who lives there be together for a while, in several takes, each begun anew from anywhere."""
+def lived(home: Dwelling, rng: np.random.Generator, duration_s: float, takes: int = 1) -> SimulatedLife:
+    """Let animal and a person who lives there be together for a while, in several takes, each begun anew from
+    anywhere.
+    """
     played = [_take(home, rng, duration_s / takes) for _ in range(takes)]
     begun_s = np.arange(takes) * (duration_s / takes + APART_S)
     time, agent, bones, camera, reason = (np.concatenate(column) for column in zip(*played, strict=True))
-    return Life(time + np.repeat(begun_s, [len(part[0]) for part in played]), agent, bones, camera, volume_of(home), reason)
+    return SimulatedLife(
+        time + np.repeat(begun_s, [len(part[0]) for part in played]),
+        agent,
+        bones,
+        camera,
+        volume_of(home),
+        reason,
+    )
 
 
 def _take(home: Dwelling, rng: np.random.Generator, duration_s: float) -> tuple[np.ndarray, ...]:
-    told = session.simulate_session(home.room, rng, duration_s, AT_HOME)
+    lived_session = session.simulate_session(home.room, rng, duration_s, AT_HOME)
     timestamp_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     sample = np.round(timestamp_s / session.STEP_S).astype(int)
-    motion = gait.poses(told.animal, timestamp_s)
-    camera = camera_motion.filming(told, rng)[sample]
-    return timestamp_s, motion.world_from_agent, motion.agent_from_bone, camera, told.reason[sample]
+    motion = gait.poses(lived_session.animal, timestamp_s)
+    camera = camera_motion.filming(lived_session, rng)[sample]
+    return timestamp_s, motion.world_from_agent, motion.agent_from_bone, camera, lived_session.reason[sample]
 
 
 def rest() -> Float[np.ndarray, "bone 4 4"]:
@@ -56,10 +65,10 @@ def rest() -> Float[np.ndarray, "bone 4 4"]:
     return bones
 
 
-def write(path: Path, life: Life) -> None:
+def write(path: Path, life: SimulatedLife) -> None:
     """Write a recording that `read_trajectories` takes."""
     volume = {f"volume/{name}": value for name, value in vars(life.volume).items()}
-    arrays.save(
+    npz.save(
         path,
         compress=True,
         timestamp_s=life.timestamp_s,

@@ -19,36 +19,61 @@ export function api(simulator) {
         milliseconds: simulator.milliseconds,
         aim: simulator.stops.next,
         stops: simulator.stops.left,
-        route: simulator.route && { points: simulator.route.points, done: simulator.route.done, length: simulator.route.length },
-        replay: simulator.replaying && { name: simulator.replaying.name, tick: simulator.replayTick, place: [...simulator.clips.frame(simulator.replaying, simulator.replayTick).slice(0, 3)] },
+        route: simulator.route && {
+          points: simulator.route.points,
+          done: simulator.route.done,
+          length: simulator.route.length,
+        },
+        replay: simulator.replaying && {
+          name: simulator.replaying.name,
+          tick: simulator.replayTick,
+          place: [...simulator.clips.frame(simulator.replaying, simulator.replayTick).slice(0, 3)],
+        },
         take_s: simulator.take.seconds,
         software: room.software,
-        marks_s: Object.fromEntries(performance.getEntriesByType('mark').map((mark) => [mark.name, mark.startTime / 1000])),
+        marks_s: Object.fromEntries(
+          performance.getEntriesByType('mark').map((mark) => [mark.name, mark.startTime / 1000]),
+        ),
         pixelRatio: room.renderer.getPixelRatio(),
         settings: { ...simulator.state },
       };
     },
-    // observer: its last places on the floor, [[x, z], ...], oldest first (or one place where it stands still).
+    // observer: its last places on the floor, [[x, z], ...], oldest first (or one place where it stands
+    // still).
     sampleGoals: async ({ observer: seen, seed = 0, K = 16, steps = 10, ...rest }) => {
       const places = typeof seen?.[0] === 'number' ? [seen] : seen;
       const count = simulator.contract.behavior.past_frames;
-      const walked = places && Array.from({ length: count }, (_, i) => places[Math.max(0, places.length - count + i)]);
+      const walked =
+        places && Array.from({ length: count }, (_, i) => places[Math.max(0, places.length - count + i)]);
       const changes = walked ? { observer: walked.map((place) => observer.pose(place)) } : {};
-      const answer = await planner.goals(simulator.question({ ...changes, seed, samples: K, steps, aim: null, path: null, ...rest }));
+      const answer = await planner.goals(
+        simulator.question({ ...changes, seed, samples: K, steps, aim: null, path: null, ...rest }),
+      );
       return answer.goals;
     },
     plan: (changes = {}) => planner.plan(simulator.question({ seed: 0, ...changes })),
     golden: (golden) => planner.golden(golden),
-    pause: () => { if (simulator.playing) simulator.play(); },
-    play: () => { if (!simulator.playing) simulator.play(); },
+    pause: () => {
+      if (simulator.playing) simulator.play();
+    },
+    play: () => {
+      if (!simulator.playing) simulator.play();
+    },
     reset: () => simulator.reset(),
     visit: (points) => simulator.visit(points),
-    moveObserver: (place) => { observer.place = [...place]; observer.target = null; simulator.taken = true; },
+    moveObserver: (place) => {
+      observer.place = [...place];
+      observer.target = null;
+      simulator.taken = true;
+    },
     // A point of the world, or a mesh's place, in pixels of the window.
     screen: (point) => {
       room.orbit.update();
       room.camera.updateMatrixWorld();
-      const spot = room.orbit.target.clone().set(...point).project(room.camera);
+      const spot = room.orbit.target
+        .clone()
+        .set(...point)
+        .project(room.camera);
       return [((spot.x + 1) / 2) * innerWidth, ((1 - spot.y) / 2) * innerHeight];
     },
     frames: () => simulator.frames ?? 0,

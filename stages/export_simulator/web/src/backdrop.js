@@ -1,5 +1,5 @@
-// The room as a still: drawn once per view, colours and depth, and laid beneath everything else in every frame.
-// Where a processor draws, this is most of the work saved while the view rests.
+// The room as a still: drawn once per view, colours and depth, and laid beneath everything else in every
+// frame. Where a processor draws, this is most of the work saved while the view rests.
 
 import * as THREE from 'three';
 
@@ -8,11 +8,22 @@ export const BACKDROP_LAYER = 1;
 export class Backdrop {
   constructor(renderer) {
     this.renderer = renderer;
-    this.still = new THREE.WebGLRenderTarget(1, 1, { type: THREE.HalfFloatType, depthTexture: new THREE.DepthTexture(1, 1, THREE.UnsignedIntType) });
+    this.still = new THREE.WebGLRenderTarget(1, 1, {
+      type: THREE.HalfFloatType,
+      depthTexture: new THREE.DepthTexture(1, 1, THREE.UnsignedIntType),
+    });
     const material = new THREE.ShaderMaterial({
       uniforms: { color: { value: this.still.texture }, depth: { value: this.still.depthTexture } },
-      vertexShader: 'varying vec2 place; void main() { place = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }',
-      fragmentShader: 'uniform sampler2D color; uniform sampler2D depth; varying vec2 place; void main() { gl_FragColor = texture2D(color, place); gl_FragDepth = texture2D(depth, place).r;\n#include <colorspace_fragment>\n}',
+      vertexShader:
+        'varying vec2 place; void main() { place = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }',
+      fragmentShader: `
+        uniform sampler2D color, depth;
+        varying vec2 place;
+        void main() {
+          gl_FragColor = texture2D(color, place);
+          gl_FragDepth = texture2D(depth, place).r;
+          #include <colorspace_fragment>
+        }`,
       depthFunc: THREE.AlwaysDepth,
     });
     this.sheet = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), material);
@@ -21,9 +32,10 @@ export class Backdrop {
     this.eye = new THREE.Camera();
   }
 
-  render(scene, camera) {
+  // more: numbers that also decide how the room looks.
+  render(scene, camera, more) {
     const { renderer } = this;
-    this.refresh(scene, camera);
+    this.refresh(scene, camera, more);
     camera.layers.set(0);
     renderer.render(this.scene, this.eye);
     renderer.autoClear = false;
@@ -32,10 +44,12 @@ export class Backdrop {
     camera.layers.enable(BACKDROP_LAYER);
   }
 
-  refresh(scene, camera) {
+  refresh(scene, camera, more) {
     const size = this.renderer.getDrawingBufferSize(new THREE.Vector2());
     camera.updateMatrixWorld();
-    const key = [...size, ...camera.matrixWorld.elements, ...camera.projectionMatrix.elements].map((value) => value.toFixed(4)).join();
+    const key = [...size, ...camera.matrixWorld.elements, ...camera.projectionMatrix.elements, ...more]
+      .map((value) => value.toFixed(4))
+      .join();
     if (key === this.key) return;
     this.key = key;
     this.still.setSize(size.x, size.y);

@@ -1,5 +1,5 @@
-// Recorded sessions at 10 Hz: where a simulation may begin, what a real animal did, where the person stood. And takes
-// of `stages.simulate` that the visitor has opened.
+// Recorded sessions at 10 Hz: where a simulation may begin, what a real animal did, where the person stood.
+// And takes of `stages.simulate` that the visitor has opened.
 
 import { ROW, lookAt, turnFromMatrix } from './rigid.js';
 import { uniforms } from './noise.js';
@@ -29,7 +29,8 @@ export class Clips {
     return this.row(clip.start + (tick % clip.count)).subarray(this.width - ROW);
   }
 
-  // Append a take (arrays of its `take.npz`), every tenth of a second of it. Throws where it is not this animal's.
+  // Append a take (arrays of its `take.npz`), every tenth of a second of it. Throws where it is not this
+  // animal's.
   add(name, { timestamp_s: time, world_from_agent: root, agent_from_bone: bone, observer_world: seen }) {
     const bones = this.width / ROW - 2;
     if (!time || !root || !bone) throw new Error('it lacks timestamp_s, world_from_agent or agent_from_bone');
@@ -39,14 +40,25 @@ export class Clips {
     values.set(this.values);
     const [x, z] = this.observer.start_m;
     for (let tick = 0, frame = 0; tick < count; tick++) {
-      while (frame + 1 < time.values.length && time.values[frame + 1] - time.values[0] < tick / RATE_HZ + 1e-3) frame++;
+      while (
+        frame + 1 < time.values.length &&
+        time.values[frame + 1] - time.values[0] < tick / RATE_HZ + 1e-3
+      )
+        frame++;
       const place = row(root.values, frame);
-      const eye = seen ? Array.from(seen.values.subarray(3 * frame, 3 * frame + 3)) : [x, this.floor + this.observer.eye_height_m, z];
-      const rows = [place, ...Array.from({ length: bones }, (_, k) => row(bone.values, frame * bones + k)), lookAt(eye, place.slice(0, 3))];
+      const eye = seen
+        ? Array.from(seen.values.subarray(3 * frame, 3 * frame + 3))
+        : [x, this.floor + this.observer.eye_height_m, z];
+      const rows = [
+        place,
+        ...Array.from({ length: bones }, (_, k) => row(bone.values, frame * bones + k)),
+        lookAt(eye, place.slice(0, 3)),
+      ];
       values.set(rows.flat(), this.values.length + tick * this.width);
     }
     let unique = name;
-    for (let number = 2; this.list.some((clip) => clip.name === unique); number++) unique = `${name} ${number}`;
+    for (let number = 2; this.list.some((clip) => clip.name === unique); number++)
+      unique = `${name} ${number}`;
     const clip = { name: unique, start: this.values.length / this.width, count, opened: true };
     this.values = values;
     this.list.push(clip);
@@ -54,7 +66,8 @@ export class Clips {
   }
 
   each(visit) {
-    for (const clip of this.list) for (let tick = 0; tick < clip.count; tick++) visit(this.frame(clip, tick), this.camera(clip, tick));
+    for (const clip of this.list)
+      for (let tick = 0; tick < clip.count; tick++) visit(this.frame(clip, tick), this.camera(clip, tick));
   }
 
   // The first `count` frames of a clip.
@@ -68,7 +81,9 @@ export class Clips {
     const draw = uniforms(seed + 1);
     const clip = this.list[Math.floor(draw() * this.recorded)];
     const last = count - 1 + Math.floor(draw() * Math.max(1, clip.count - count));
-    const frames = Array.from({ length: count }, (_, i) => this.frame(clip, Math.max(0, last - count + 1 + i)));
+    const frames = Array.from({ length: count }, (_, i) =>
+      this.frame(clip, Math.max(0, last - count + 1 + i)),
+    );
     return { frames, observer: this.camera(clip, last) };
   }
 }

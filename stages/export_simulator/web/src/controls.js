@@ -1,15 +1,33 @@
-// Hands on the scene: keys walk the observer and turn the view, a drag on the figure carries it, a click on the floor
-// is a goal, one more with the pins (or with shift), a stroke with the pen (or with shift) is a path.
-// Keys that mean something to the part of the panel that has the focus stay its own.
+// Hands on the scene: keys walk the observer and turn the view, a drag on the figure carries it, a click on
+// floor or furniture is a goal, one more with the pins (or with shift), a stroke with the pen (or with shift)
+// is a path. Keys that mean something to the part of the panel that has the focus stay its own.
 
-const KEYS = { w: [0, 1], arrowup: [0, 1], s: [0, -1], arrowdown: [0, -1], a: [-1, 0], arrowleft: [-1, 0], d: [1, 0], arrowright: [1, 0] };
+const KEYS = {
+  w: [0, 1],
+  arrowup: [0, 1],
+  s: [0, -1],
+  arrowdown: [0, -1],
+  a: [-1, 0],
+  arrowleft: [-1, 0],
+  d: [1, 0],
+  arrowright: [1, 0],
+};
 const TURNS = { q: [-1, 0], e: [1, 0], '+': [0, -1], '=': [0, -1], '-': [0, 1] };
 const CLICK_PX = 6;
 const STROKE_M = 0.03;
 
 export class Controls {
   constructor(room, observer, on) {
-    Object.assign(this, { room, observer, on, down: new Map(), press: null, dragging: false, tool: null, stroke: null });
+    Object.assign(this, {
+      room,
+      observer,
+      on,
+      down: new Map(),
+      press: null,
+      dragging: false,
+      tool: null,
+      stroke: null,
+    });
     addEventListener('keydown', (event) => this.key(event));
     addEventListener('keyup', (event) => this.down.delete(event.code));
     addEventListener('blur', () => this.down.clear());
@@ -31,11 +49,15 @@ export class Controls {
 
   // The sum of what the keys that are down mean.
   held(meanings) {
-    return [...this.down.values()].reduce(([x, y], key) => [x + (meanings[key]?.[0] ?? 0), y + (meanings[key]?.[1] ?? 0)], [0, 0]);
+    return [...this.down.values()].reduce(
+      ([x, y], key) => [x + (meanings[key]?.[0] ?? 0), y + (meanings[key]?.[1] ?? 0)],
+      [0, 0],
+    );
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return this.down.clear(); // some systems never tell when a chord's keys go up
+    // some systems report no keyup for a chord's keys
+    if (event.ctrlKey || event.metaKey || event.altKey) return this.down.clear();
     const key = event.key.toLowerCase();
     if (belongs(key, event.target)) return;
     if (key in KEYS || key in TURNS) {
@@ -46,13 +68,16 @@ export class Controls {
       event.preventDefault();
     } else if (key === 'r') this.on.reset();
     else if (key === 'h') this.on.how();
-    else if (key === 'c') this.on.aim([...this.observer.place]);
+    else if (key === 'c') this.on.call();
     else if (key === 'p' || key === 'g') this.on.hold(key === 'p' ? 'pen' : 'pins');
     else if (key === 'escape' && this.tool) this.on.hold(null);
   }
 
   overObserver(event) {
-    return this.observer.figure.visible && this.room.aim(event).intersectObject(this.observer.figure, true).length > 0;
+    return (
+      this.observer.figure.visible &&
+      this.room.aim(event).intersectObject(this.observer.figure, true).length > 0
+    );
   }
 
   start(event) {
@@ -83,7 +108,8 @@ export class Controls {
 
   move(event) {
     if (!event.isPrimary) return;
-    if (this.press && Math.hypot(event.clientX - this.press.x, event.clientY - this.press.y) > CLICK_PX) this.press.moved = true;
+    if (this.press && Math.hypot(event.clientX - this.press.x, event.clientY - this.press.y) > CLICK_PX)
+      this.press.moved = true;
     if (this.stroke) this.draw(event);
     else if (this.dragging) {
       const point = this.room.floorPoint(event);
@@ -102,8 +128,8 @@ export class Controls {
     const click = press && !press.moved && !dragging && event.button === 0;
     if (stroke && !(click && event.shiftKey)) this.on.drawn(stroke);
     else if (click) {
-      const point = this.room.floorPoint(event);
-      if (point) this.on.aim(point, event.shiftKey || this.tool === 'pins');
+      const surface = this.room.surfacePoint(event);
+      if (surface) this.on.aim(surface, event.shiftKey || this.tool === 'pins');
     }
   }
 }

@@ -8,7 +8,9 @@ export class Film {
   }
 
   static get possible() {
-    return typeof MediaRecorder === 'function' && typeof HTMLCanvasElement.prototype.captureStream === 'function';
+    return (
+      typeof MediaRecorder === 'function' && typeof HTMLCanvasElement.prototype.captureStream === 'function'
+    );
   }
 
   get running() {
@@ -18,8 +20,13 @@ export class Film {
   start() {
     const mimeType = KINDS.find((kind) => MediaRecorder.isTypeSupported(kind));
     this.pieces = [];
-    this.recorder = new MediaRecorder(this.canvas.captureStream(30), { mimeType, videoBitsPerSecond: 6_000_000 });
-    this.recorder.ondataavailable = ({ data }) => { if (data.size) this.pieces.push(data); };
+    this.recorder = new MediaRecorder(this.canvas.captureStream(30), {
+      mimeType,
+      videoBitsPerSecond: 6_000_000,
+    });
+    this.recorder.ondataavailable = ({ data }) => {
+      if (data.size) this.pieces.push(data);
+    };
     this.recorder.start(1000);
   }
 

@@ -5,7 +5,8 @@ import { ROW } from './rigid.js';
 const FLOAT = 5126;
 const [JSON_CHUNK, BIN_CHUNK, MAGIC] = [0x4e4f534a, 0x004e4942, 0x46546c67];
 
-// model: bytes of a GLB; times: seconds; frames: root and joints as rows. Returns the bytes of the animated one.
+// model: bytes of a GLB; times: seconds; frames: root and joints as rows. Returns the bytes of the animated
+// one.
 export function animated(model, name, times, frames) {
   const { json, bin } = opened(model);
   const skin = json.skins[0];
@@ -16,7 +17,13 @@ export function animated(model, name, times, frames) {
     const bytes = new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
     json.bufferViews.push({ buffer: 0, byteOffset: length, byteLength: bytes.byteLength });
     const width = { SCALAR: 1, VEC3: 3, VEC4: 4 }[type];
-    json.accessors.push({ bufferView: json.bufferViews.length - 1, componentType: FLOAT, count: values.length / width, type, ...bounds });
+    json.accessors.push({
+      bufferView: json.bufferViews.length - 1,
+      componentType: FLOAT,
+      count: values.length / width,
+      type,
+      ...bounds,
+    });
     parts.push(bytes);
     length += bytes.byteLength;
     return json.accessors.length - 1;
@@ -25,10 +32,17 @@ export function animated(model, name, times, frames) {
   const animation = { name, channels: [], samplers: [] };
   [root, ...skin.joints].forEach((node, index) => {
     const rows = frames.map((frame) => frame.subarray(index * ROW, (index + 1) * ROW));
-    const tracks = { translation: [rows.flatMap((row) => [...row.subarray(0, 3)]), 'VEC3'], rotation: [withoutFlips(rows), 'VEC4'] };
+    const tracks = {
+      translation: [rows.flatMap((row) => [...row.subarray(0, 3)]), 'VEC3'],
+      rotation: [withoutFlips(rows), 'VEC4'],
+    };
     for (const [path, [values, type]] of Object.entries(tracks)) {
       animation.channels.push({ sampler: animation.samplers.length, target: { node, path } });
-      animation.samplers.push({ input, output: store(Float32Array.from(values), type), interpolation: 'LINEAR' });
+      animation.samplers.push({
+        input,
+        output: store(Float32Array.from(values), type),
+        interpolation: 'LINEAR',
+      });
     }
   });
   json.animations = [animation];
@@ -41,7 +55,8 @@ function withoutFlips(rows) {
   let last = null;
   return rows.flatMap((row) => {
     let q = [row[4], row[5], row[6], row[3]];
-    const norm = Math.hypot(...q) * (last && q.reduce((sum, value, i) => sum + value * last[i], 0) < 0 ? -1 : 1);
+    const norm =
+      Math.hypot(...q) * (last && q.reduce((sum, value, i) => sum + value * last[i], 0) < 0 ? -1 : 1);
     q = q.map((value) => value / norm);
     last = q;
     return q;

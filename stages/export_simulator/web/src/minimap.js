@@ -1,8 +1,7 @@
-// The room from above, turned as the view of the whole room is: a faint picture, where animal and observer have been,
-// where they are and what comes next.
+// The room from above, turned as the view of the whole room is: a faint picture, where animal and observer
+// have been, where they are and what comes next.
 
 const CELLS = 72;
-const PAPER = [0xf5, 0xf2, 0xec]; // what the view draws where nothing is
 const COLORS = { animal: [200, 114, 43], observer: [47, 111, 159] };
 
 export class Minimap {
@@ -38,7 +37,9 @@ export class Minimap {
     let furthest = 0;
     for (let i = 0; i < side * side; i++) {
       if (isPaper(pixels, i)) continue;
-      const [x, z] = [i % side, side - 1 - Math.floor(i / side)].map((place) => ((place + 0.5) / side - 0.5) * 2 * half);
+      const [x, z] = [i % side, side - 1 - Math.floor(i / side)].map(
+        (place) => ((place + 0.5) / side - 0.5) * 2 * half,
+      );
       furthest = Math.max(furthest, ...this.turned(x, z).map(Math.abs));
     }
     return furthest || half;
@@ -57,9 +58,10 @@ export class Minimap {
     this.stale = true;
   }
 
-  draw({ animal, observer, goals, chosen, path, recorded, wishes }) {
+  draw({ animal, observer, goals, chosen, path, recorded, commands }) {
     const { pen, size } = this;
-    if (this.stale) for (const who of ['observer', 'animal']) paintHeat(this.layers[who], this.heat[who], COLORS[who]);
+    if (this.stale)
+      for (const who of ['observer', 'animal']) paintHeat(this.layers[who], this.heat[who], COLORS[who]);
     this.stale = false;
     pen.clearRect(0, 0, size, size);
     pen.globalAlpha = 0.55;
@@ -68,8 +70,9 @@ export class Minimap {
     pen.imageSmoothingEnabled = true;
     for (const who of ['observer', 'animal']) pen.drawImage(this.layers[who], 0, 0, size, size);
     if (path) this.line(path);
-    for (const [i, goal] of (goals ?? []).entries()) this.dot(goal[0], goal[2], i === chosen ? 5 : 3, i === chosen ? 1 : 0.45);
-    for (const wish of wishes) this.cross(wish);
+    for (const [i, goal] of (goals ?? []).entries())
+      this.dot(goal[0], goal[2], i === chosen ? 5 : 3, i === chosen ? 1 : 0.45);
+    for (const wish of commands) this.cross(wish);
     if (recorded) this.dot(recorded[0], recorded[2], 7, 0.9, '#6d675e');
     this.wedge(animal, '#c8722b', false);
     this.wedge(observer, '#2f6f9f', true);
@@ -101,7 +104,10 @@ export class Minimap {
     pen.strokeStyle = '#2d2b28';
     pen.lineWidth = 2.5;
     pen.beginPath();
-    for (const side of [-1, 1]) { pen.moveTo(px - 6, py - 6 * side); pen.lineTo(px + 6, py + 6 * side); }
+    for (const side of [-1, 1]) {
+      pen.moveTo(px - 6, py - 6 * side);
+      pen.lineTo(px + 6, py + 6 * side);
+    }
     pen.stroke();
   }
 
@@ -116,21 +122,32 @@ export class Minimap {
     pen.strokeStyle = '#fff';
     pen.lineWidth = 2.5;
     pen.beginPath();
-    if (triangle) { pen.moveTo(0, -13); pen.lineTo(9, 10); pen.lineTo(-9, 10); pen.closePath(); } else { pen.arc(0, 0, 8, 0, 7); pen.moveTo(-5, -6); pen.lineTo(0, -15); pen.lineTo(5, -6); }
+    if (triangle) {
+      pen.moveTo(0, -13);
+      pen.lineTo(9, 10);
+      pen.lineTo(-9, 10);
+      pen.closePath();
+    } else {
+      pen.arc(0, 0, 8, 0, 7);
+      pen.moveTo(-5, -6);
+      pen.lineTo(0, -15);
+      pen.lineTo(5, -6);
+    }
     pen.stroke();
     pen.fill();
     pen.restore();
   }
 }
 
-const isPaper = (pixels, i) => PAPER.every((value, channel) => Math.abs(pixels[4 * i + channel] - value) < 5);
+const isPaper = (pixels, i) => pixels[4 * i + 3] === 0;
 
 function backdrop({ pixels }, size, share, turn) {
   const side = Math.sqrt(pixels.length / 4);
   const raw = document.createElement('canvas');
   raw.width = raw.height = side;
   const image = new ImageData(side, side);
-  for (let row = 0; row < side; row++) image.data.set(pixels.subarray((side - 1 - row) * side * 4, (side - row) * side * 4), row * side * 4);
+  for (let row = 0; row < side; row++)
+    image.data.set(pixels.subarray((side - 1 - row) * side * 4, (side - row) * side * 4), row * side * 4);
   for (let i = 0; i < side * side; i++) if (isPaper(image.data, i)) image.data[4 * i + 3] = 0;
   raw.getContext('2d').putImageData(image, 0, 0);
   const canvas = document.createElement('canvas');

@@ -12,5 +12,9 @@ export function uniforms(seed) {
 
 export function normals(seed) {
   const draw = uniforms(seed);
-  return (count) => Float32Array.from({ length: count }, () => Math.sqrt(-2 * Math.log(1 - draw())) * Math.cos(2 * Math.PI * draw()));
+  return (count) =>
+    Float32Array.from(
+      { length: count },
+      () => Math.sqrt(-2 * Math.log(1 - draw())) * Math.cos(2 * Math.PI * draw()),
+    );
 }

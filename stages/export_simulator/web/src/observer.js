@@ -5,6 +5,9 @@ import { lookAt } from './rigid.js';
 
 export const WALK_M_S = 1.1;
 const DRAG_M_S = 2.5;
+const WALL_M = 0.15; // kept from the edges of the room
+const APART_M = 0.36; // kept from the animal: nobody walks through anybody
+const HISTORY_TICKS = 16;
 
 export class Observer {
   constructor(contract, color = 0x2f6f9f) {
@@ -33,29 +36,44 @@ export class Observer {
       const share = Math.min(1, (DRAG_M_S * seconds) / (Math.hypot(x, z) || 1));
       [dx, dz] = [x * share, z * share];
     }
+    if (dx || dz) this.place = this.apart([this.place[0] + dx, this.place[1] + dz]);
     const [low, high] = this.bounds;
-    this.place = [
-      Math.min(high[0] - 0.15, Math.max(low[0] + 0.15, this.place[0] + dx)),
-      Math.min(high[2] - 0.15, Math.max(low[2] + 0.15, this.place[1] + dz)),
-    ];
+    this.place = [0, 1].map((axis) =>
+      Math.min(high[2 * axis] - WALL_M, Math.max(low[2 * axis] + WALL_M, this.place[axis])),
+    );
     this.figure.position.set(this.place[0], this.floor, this.place[1]);
     this.figure.rotation.y = Math.atan2(this.animal[0] - this.place[0], this.animal[2] - this.place[1]);
     return Math.hypot(dx, dz) > 1e-5;
   }
 
+  // A step that would lead into the animal ends beside it; who stands there already may step back.
+  apart([x, z]) {
+    const gap = (place) => Math.hypot(place[0] - this.animal[0], place[1] - this.animal[2]);
+    const reach = Math.min(APART_M, gap(this.place));
+    const distance = gap([x, z]);
+    if (distance >= reach || distance < 1e-6) return distance < 1e-6 ? this.place : [x, z];
+    return [
+      this.animal[0] + ((x - this.animal[0]) * reach) / distance,
+      this.animal[2] + ((z - this.animal[2]) * reach) / distance,
+    ];
+  }
+
   // The phone's pose: at eye height, looking at the animal.
   pose(place = this.place) {
-    return lookAt([place[0], this.floor + this.eye, place[1]], [this.animal[0], this.animal[1], this.animal[2]]);
+    return lookAt(
+      [place[0], this.floor + this.eye, place[1]],
+      [this.animal[0], this.animal[1], this.animal[2]],
+    );
   }
 
   tick() {
     this.history.push(this.pose());
-    if (this.history.length > 16) this.history.shift();
+    if (this.history.length > HISTORY_TICKS) this.history.shift();
   }
 
   // Forget the walk: stand here as if for a while.
   settle() {
-    this.history = Array.from({ length: 16 }, () => this.pose());
+    this.history = Array.from({ length: HISTORY_TICKS }, () => this.pose());
     this.step(0, [0, 0], 0);
   }
 }
@@ -65,16 +83,43 @@ function person(eye, color) {
   const group = new THREE.Group();
   const cloth = new THREE.MeshLambertMaterial({ color, transparent: true, opacity: 0.8 });
   const tall = eye - 0.2;
-  const profile = [[0, 0], [0.19, 0], [0.195, 0.02], [0.16, 0.3 * tall], [0.115, 0.62 * tall], [0.1, 0.84 * tall], [0.115, 0.9 * tall], [0.1, 0.96 * tall], [0, tall]];
+  const profile = [
+    [0, 0],
+    [0.19, 0],
+    [0.195, 0.02],
+    [0.16, 0.3 * tall],
+    [0.115, 0.62 * tall],
+    [0.1, 0.84 * tall],
+    [0.115, 0.9 * tall],
+    [0.1, 0.96 * tall],
+    [0, tall],
+  ];
   const curve = new THREE.SplineCurve(profile.slice(2).map(([r, y]) => new THREE.Vector2(r, y)));
   const outline = [new THREE.Vector2(0.001, 0), new THREE.Vector2(0.19, 0), ...curve.getPoints(28)];
   const body = new THREE.Mesh(new THREE.LatheGeometry(outline, 32), cloth);
   const head = new THREE.Mesh(new THREE.SphereGeometry(0.115, 28, 20), cloth);
   head.position.y = eye - 0.06;
-  const phone = new THREE.Mesh(new THREE.BoxGeometry(0.075, 0.15, 0.012), new THREE.MeshLambertMaterial({ color: 0x2d2b28 }));
+  const phone = new THREE.Mesh(
+    new THREE.BoxGeometry(0.075, 0.15, 0.012),
+    new THREE.MeshLambertMaterial({ color: 0x2d2b28 }),
+  );
   phone.position.set(0, eye - 0.16, 0.24);
-  const ring = new THREE.Mesh(new THREE.RingGeometry(0.25, 0.275, 48).rotateX(-Math.PI / 2), new THREE.MeshBasicMaterial({ color, transparent: true, opacity: 0.55 }));
+  // A face towards the front, where the phone is.
+  const dark = new THREE.MeshLambertMaterial({ color: 0x2d2b28 });
+  const features = [
+    [-0.042, 0.02, 0.102, 0.016],
+    [0.042, 0.02, 0.102, 0.016],
+    [0, -0.012, 0.118, 0.02],
+  ].map(([x, y, z, size], i) => {
+    const feature = new THREE.Mesh(new THREE.SphereGeometry(size, 12, 10), i < 2 ? dark : cloth);
+    feature.position.set(x, eye - 0.06 + y, z);
+    return feature;
+  });
+  const ring = new THREE.Mesh(
+    new THREE.RingGeometry(0.25, 0.275, 48).rotateX(-Math.PI / 2),
+    new THREE.MeshBasicMaterial({ color, transparent: true, opacity: 0.55 }),
+  );
   ring.position.y = 0.015;
-  group.add(body, head, phone, ring);
+  group.add(body, head, phone, ring, ...features);
   return group;
 }

@@ -1,4 +1,4 @@
-// What the animal has in mind, drawn on the floor: the fan of sampled goals, the chosen goal, the path ribbon.
+// The plan, drawn on the floor: the fan of sampled goals, the chosen goal, the path ribbon.
 
 import * as THREE from 'three';
 
@@ -21,14 +21,17 @@ export class Overlays {
       new THREE.MeshBasicMaterial({ color: 0xc8722b, transparent: true, opacity: 0.95, depthWrite: false }),
     );
     this.fan = new THREE.LineSegments(
-      new THREE.BufferGeometry().setAttribute('position', new THREE.BufferAttribute(new Float32Array(MAX_GOALS * 6), 3)),
+      new THREE.BufferGeometry().setAttribute(
+        'position',
+        new THREE.BufferAttribute(new Float32Array(MAX_GOALS * 6), 3),
+      ),
       new THREE.LineBasicMaterial({ color: 0xc8722b, transparent: true, opacity: 0.3, depthWrite: false }),
     );
     this.fan.frustumCulled = false;
     this.ribbon = ribbon();
     this.route = ribbon(0xc8722b);
-    this.wishes = new THREE.Group();
-    for (const node of [this.goals, this.chosen, this.fan, this.ribbon, this.route, this.wishes]) {
+    this.commands = new THREE.Group();
+    for (const node of [this.goals, this.chosen, this.fan, this.ribbon, this.route, this.commands]) {
       node.renderOrder = 3;
       node.visible = false;
       scene.add(node);
@@ -42,7 +45,10 @@ export class Overlays {
     const count = Math.min(MAX_GOALS, plan.goals.length);
     const matrix = new THREE.Matrix4();
     for (let i = 0; i < count; i++) {
-      this.goals.setMatrixAt(i, matrix.makeTranslation(plan.goals[i][0], this.ground(plan.goals[i]), plan.goals[i][2]));
+      this.goals.setMatrixAt(
+        i,
+        matrix.makeTranslation(plan.goals[i][0], this.ground(plan.goals[i]), plan.goals[i][2]),
+      );
     }
     this.goals.count = count;
     this.goals.instanceMatrix.needsUpdate = true;
@@ -52,19 +58,24 @@ export class Overlays {
     this.refresh();
   }
 
-  // A path that the visitor draws or has drawn, [[x, z], ...] or null; and goals, [[x, z], ...].
+  // A path that the visitor draws or has drawn, [[x, z], ...] or null; and goals, [[x, z, up], ...].
   ask(route, goals = []) {
     const height = this.floor + LIFT_M;
     this.route.visible = Boolean(route && route.length > 1);
     if (this.route.visible) {
       const every = Math.ceil(route.length / 250);
-      fillRibbon(this.route, route.filter((_, i) => i % every === 0 || i === route.length - 1).map(([x, z]) => [x, this.floor, z]), () => height + 0.003, 0);
+      fillRibbon(
+        this.route,
+        route.filter((_, i) => i % every === 0 || i === route.length - 1).map(([x, z]) => [x, this.floor, z]),
+        () => height + 0.003,
+        0,
+      );
     }
-    while (this.wishes.children.length < goals.length) this.wishes.add(wish());
-    this.wishes.visible = goals.length > 0;
-    this.wishes.children.forEach((node, i) => {
+    while (this.commands.children.length < goals.length) this.commands.add(commandMarker());
+    this.commands.visible = goals.length > 0;
+    this.commands.children.forEach((node, i) => {
       node.visible = i < goals.length;
-      if (node.visible) node.position.set(goals[i][0], height + 0.004, goals[i][1]);
+      if (node.visible) node.position.set(goals[i][0], height + 0.004 + (goals[i][2] ?? 0), goals[i][1]);
     });
   }
 
@@ -96,18 +107,34 @@ function ribbon(color = 0x4c8067) {
   const index = [];
   for (let i = 0; i < 255; i++) index.push(2 * i, 2 * i + 1, 2 * i + 2, 2 * i + 1, 2 * i + 3, 2 * i + 2);
   geometry.setIndex(index);
-  const mesh = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ vertexColors: true, transparent: true, depthWrite: false, side: THREE.DoubleSide }));
+  const mesh = new THREE.Mesh(
+    geometry,
+    new THREE.MeshBasicMaterial({
+      vertexColors: true,
+      transparent: true,
+      depthWrite: false,
+      side: THREE.DoubleSide,
+    }),
+  );
   mesh.frustumCulled = false;
   mesh.userData.tint = new THREE.Color(color);
   return mesh;
 }
 
 // The visitor's goal: a flat cross in a ring.
-function wish() {
-  const material = new THREE.MeshBasicMaterial({ color: 0x2d2b28, transparent: true, opacity: 0.9, depthWrite: false });
+function commandMarker() {
+  const material = new THREE.MeshBasicMaterial({
+    color: 0x2d2b28,
+    transparent: true,
+    opacity: 0.9,
+    depthWrite: false,
+  });
   const group = new THREE.Group();
   group.add(new THREE.Mesh(new THREE.RingGeometry(0.15, 0.17, 40).rotateX(-Math.PI / 2), material));
-  for (const angle of [Math.PI / 4, -Math.PI / 4]) group.add(new THREE.Mesh(new THREE.PlaneGeometry(0.2, 0.024).rotateX(-Math.PI / 2).rotateY(angle), material));
+  for (const angle of [Math.PI / 4, -Math.PI / 4])
+    group.add(
+      new THREE.Mesh(new THREE.PlaneGeometry(0.2, 0.024).rotateX(-Math.PI / 2).rotateY(angle), material),
+    );
   return group;
 }
 
@@ -117,7 +144,8 @@ function fillRibbon(mesh, path, ground, fade = 0.7) {
   const count = Math.min(256, path.length);
   let [sideX, sideZ] = [0, 0];
   for (let i = 0; i < count; i++) {
-    const before = path[Math.max(0, i - 2)], after = path[Math.min(count - 1, i + 2)];
+    const before = path[Math.max(0, i - 2)],
+      after = path[Math.min(count - 1, i + 2)];
     const [dx, dz] = [after[0] - before[0], after[2] - before[2]];
     const length = Math.hypot(dx, dz);
     if (length > 1e-3) [sideX, sideZ] = [(-dz / length) * 0.028, (dx / length) * 0.028];

@@ -3,13 +3,16 @@
 import { SPEEDS } from './state.js';
 
 const at = (id) => document.getElementById(id);
-const HOW = at('help').innerHTML;
+const touch = matchMedia('(pointer: coarse)').matches;
+const HOW = at(touch ? 'help-touch' : 'help-mouse').innerHTML;
+at('help').innerHTML = HOW;
+const HELP_MS = 12000; // the help stays this long at first
 const TOOLS = {
   pen: 'Draw on the floor with one stroke; it walks there.',
   pins: 'Click one place after the other; it visits them in this order.',
 };
 
-export function buildPanel(state, clips, on) {
+export function buildPanel(state, { clips, controls }, on) {
   const sync = [];
   const change = (key, value) => {
     state[key] = value;
@@ -17,7 +20,9 @@ export function buildPanel(state, clips, on) {
     on.change(key);
   };
 
-  at('interactivity').addEventListener('input', (event) => change('interactivity', Number(event.target.value)));
+  at('interactivity').addEventListener('input', (event) =>
+    change('interactivity', Number(event.target.value)),
+  );
   sync.push(() => {
     at('interactivity').value = state.interactivity;
     at('interactivity-value').textContent = state.interactivity.toFixed(2);
@@ -27,25 +32,35 @@ export function buildPanel(state, clips, on) {
   for (const box of document.querySelectorAll('[data-layer]')) toggle(box, box.dataset.layer);
   function toggle(box, key) {
     box.addEventListener('change', () => change(key, box.checked ? 1 : 0));
-    sync.push(() => { box.checked = Boolean(state[key]); });
+    sync.push(() => {
+      box.checked = Boolean(state[key]);
+    });
   }
 
-  choices('samples', [1, 4, 16]);
-  choices('steps', [10, 50]);
+  Object.assign(at('interactivity'), { min: controls.interactivity.least, max: controls.interactivity.most });
+  choices('samples', controls.samples.choices);
+  choices('steps', controls.steps.choices);
   function choices(key, values) {
     for (const value of values) {
-      const button = Object.assign(document.createElement('button'), { textContent: value, title: `${value} ${key}` });
+      const button = Object.assign(document.createElement('button'), {
+        textContent: value,
+        title: `${value} ${key}`,
+      });
       button.addEventListener('click', () => change(key, value));
       at(key).append(button);
       sync.push(() => button.setAttribute('aria-pressed', state[key] === value));
     }
   }
 
-  at('seed').addEventListener('change', (event) => change('seed', Math.min(999999, Math.max(0, Math.round(Number(event.target.value) || 0)))));
+  at('seed').addEventListener('change', (event) =>
+    change('seed', Math.min(999999, Math.max(0, Math.round(Number(event.target.value) || 0)))),
+  );
   at('seed-next').addEventListener('click', () => change('seed', (state.seed + 1) % 1000000));
-  sync.push(() => { at('seed').value = state.seed; });
+  sync.push(() => {
+    at('seed').value = state.seed;
+  });
 
-  for (const clip of clips) addClip(clip.name);
+  for (const clip of clips) addClip(clip);
   at('open').addEventListener('click', () => at('open-file').click());
   at('open-file').addEventListener('change', (event) => {
     if (event.target.files.length) on.open(event.target.files[0]);
@@ -57,7 +72,9 @@ export function buildPanel(state, clips, on) {
     if (event.dataTransfer.files.length) on.open(event.dataTransfer.files[0]);
   });
   at('replay').addEventListener('change', (event) => change('replay', event.target.value));
-  sync.push(() => { at('replay').value = state.replay; });
+  sync.push(() => {
+    at('replay').value = state.replay;
+  });
 
   for (const button of document.querySelectorAll('[data-view]')) {
     button.addEventListener('click', () => change('view', button.dataset.view));
@@ -70,26 +87,33 @@ export function buildPanel(state, clips, on) {
   at('reset').addEventListener('click', on.reset);
   at('free').addEventListener('click', on.free);
   at('how').addEventListener('click', howTo);
-  at('slow').addEventListener('click', () => change('speed', SPEEDS.find((speed) => speed !== state.speed)));
+  at('call').addEventListener('click', on.call);
+  at('slow').addEventListener('click', () =>
+    change(
+      'speed',
+      SPEEDS.find((speed) => speed !== state.speed),
+    ),
+  );
   sync.push(() => at('slow').setAttribute('aria-pressed', state.speed !== 1));
 
-  const fold = () => at('panel-toggle').setAttribute('aria-expanded', !at('panel').classList.toggle('closed'));
+  const fold = () =>
+    at('panel-toggle').setAttribute('aria-expanded', !at('panel').classList.toggle('closed'));
   at('panel-toggle').addEventListener('click', fold);
-  if (matchMedia('(max-width: 720px), (max-height: 520px)').matches) fold();  // as in style.css
+  if (matchMedia('(max-width: 720px), (max-height: 620px)').matches) fold(); // as in style.css
   sync.forEach((update) => update());
   return { refresh: () => sync.forEach((update) => update()) };
 }
 
-export function addClip(name) {
-  at('replay').append(Object.assign(document.createElement('option'), { value: name, textContent: name }));
+export function addClip({ name, label = name }) {
+  at('replay').append(Object.assign(document.createElement('option'), { value: name, textContent: label }));
 }
 
 export function showPlaying(playing) {
   at('play').textContent = playing ? 'pause' : 'go on';
 }
 
-// Whether there is a wish that can be taken back, and how many goals a journey has that can be kept.
-export function showWishes(any, goals) {
+// Whether there is a command that can be taken back, and how many goals a journey has that can be kept.
+export function showCommands(any, goals) {
   at('free').hidden = !any;
   at('toml').hidden = goals === 0;
 }
@@ -110,6 +134,7 @@ export function showFilm(running, possible) {
 export function help(text, seconds = 0) {
   at('help').classList.toggle('gone', !text);
   if (text) at('help').textContent = text;
+  at('help').classList.toggle('asked', Boolean(text));
   clearTimeout(help.timer);
   if (seconds) help.timer = setTimeout(() => at('help').classList.add('gone'), 1000 * seconds);
 }
@@ -117,7 +142,7 @@ export function help(text, seconds = 0) {
 // How to use the page: shown at first for a while, then when it is asked for.
 export function howTo() {
   const box = at('help');
-  const shown = box.innerHTML === HOW && !box.classList.contains('gone') && getComputedStyle(box).display !== 'none';
+  const shown = box.classList.contains('asked') && box.innerHTML === HOW && !box.classList.contains('gone');
   clearTimeout(help.timer);
   box.innerHTML = HOW;
   box.classList.add('asked');
@@ -129,8 +154,14 @@ export async function copyLink() {
     await navigator.clipboard.writeText(location.href);
     help('The address of this behaviour is copied.', 4);
   } catch {
-    help('The address of this behaviour stands in the browser\'s address line.', 6);
+    help("The address of this behaviour stands in the browser's address line.", 6);
   }
+}
+
+// What a visitor should know of this scene, beneath the name.
+export function warn(text) {
+  at('warning').textContent = text;
+  at('warning').hidden = false;
 }
 
 export function status(text) {
@@ -144,7 +175,7 @@ export function progress(share, text) {
 
 export function ready() {
   at('splash').classList.add('gone');
-  help.timer = setTimeout(() => at('help').classList.add('gone'), 12000);
+  help.timer = setTimeout(() => at('help').classList.add('gone'), HELP_MS);
 }
 
 export { sorry } from './sorry.js';

@@ -1,4 +1,4 @@
-// The main thread's side of the mind: starts the worker and asks it questions.
+// The main thread's side of the planner: starts the worker and sends it requests.
 
 import * as assets from './assets.js';
 
@@ -17,10 +17,17 @@ export class Planner {
     planner.worker.onerror = (event) => planner.broke(new Error(event.message));
     const wasm = await assets.bytes('ort.wasm');
     onProgress(0.15);
-    const models = Object.fromEntries(await Promise.all(MODELS.map(async (name) => [name, await assets.bytes(name)])));
+    const models = Object.fromEntries(
+      await Promise.all(MODELS.map(async (name) => [name, await assets.bytes(name)])),
+    );
     onProgress(0.3);
     const [volume, allowed] = [await assets.bytes('volume'), await assets.bytes('allowed')];
-    await planner.ask('load', { contract, wasm, models, volume, allowed }, [wasm.buffer, volume.buffer, ...Object.values(models).map((model) => model.buffer)]);
+    planner.allowed = allowed;
+    await planner.ask('load', { contract, wasm, models, volume, allowed }, [
+      wasm.buffer,
+      volume.buffer,
+      ...Object.values(models).map((model) => model.buffer),
+    ]);
     return planner;
   }
 

@@ -1,4 +1,5 @@
-// Rigid motions as rows of seven numbers: place x y z (metres), quaternion w x y z. Named a_from_b, as everywhere here.
+// Rigid motions as rows of seven numbers: place x y z (metres), quaternion w x y z. Named a_from_b, as
+// everywhere here.
 
 export const ROW = 7;
 
@@ -13,7 +14,9 @@ export function multiply(p, q) {
 
 export function rotate(q, v) {
   const [w, x, y, z] = q;
-  const tx = 2 * (y * v[2] - z * v[1]), ty = 2 * (z * v[0] - x * v[2]), tz = 2 * (x * v[1] - y * v[0]);
+  const tx = 2 * (y * v[2] - z * v[1]),
+    ty = 2 * (z * v[0] - x * v[2]),
+    tz = 2 * (x * v[1] - y * v[0]);
   return [v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx];
 }
 
@@ -23,7 +26,12 @@ export const turn = (row) => [row[3], row[4], row[5], row[6]];
 
 export function compose(aFromB, bFromC) {
   const moved = rotate(turn(aFromB), place(bFromC));
-  return [aFromB[0] + moved[0], aFromB[1] + moved[1], aFromB[2] + moved[2], ...multiply(turn(aFromB), turn(bFromC))];
+  return [
+    aFromB[0] + moved[0],
+    aFromB[1] + moved[1],
+    aFromB[2] + moved[2],
+    ...multiply(turn(aFromB), turn(bFromC)),
+  ];
 }
 
 export function inverse(aFromB) {
@@ -40,9 +48,15 @@ export function apply(aFromB, point) {
 // Rotation matrix, row-major nine numbers.
 export function matrixFromTurn([w, x, y, z]) {
   return [
-    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    1 - 2 * (y * y + z * z),
+    2 * (x * y - w * z),
+    2 * (x * z + w * y),
+    2 * (x * y + w * z),
+    1 - 2 * (x * x + z * z),
+    2 * (y * z - w * x),
+    2 * (x * z - w * y),
+    2 * (y * z + w * x),
+    1 - 2 * (x * x + y * y),
   ];
 }
 
@@ -51,13 +65,19 @@ export function turnFromMatrix(m) {
   const q = [0, 0, 0, 0];
   if (trace > 0) {
     const s = 2 * Math.sqrt(trace + 1);
-    q[0] = s / 4; q[1] = (m[7] - m[5]) / s; q[2] = (m[2] - m[6]) / s; q[3] = (m[3] - m[1]) / s;
+    q[0] = s / 4;
+    q[1] = (m[7] - m[5]) / s;
+    q[2] = (m[2] - m[6]) / s;
+    q[3] = (m[3] - m[1]) / s;
   } else {
     const i = m[0] >= m[4] && m[0] >= m[8] ? 0 : m[4] >= m[8] ? 1 : 2;
-    const j = (i + 1) % 3, k = (i + 2) % 3;
+    const j = (i + 1) % 3,
+      k = (i + 2) % 3;
     const s = 2 * Math.sqrt(1 + m[4 * i] - m[4 * j] - m[4 * k]);
     q[0] = (m[3 * k + j] - m[3 * j + k]) / s;
-    q[1 + i] = s / 4; q[1 + j] = (m[3 * j + i] + m[3 * i + j]) / s; q[1 + k] = (m[3 * k + i] + m[3 * i + k]) / s;
+    q[1 + i] = s / 4;
+    q[1 + j] = (m[3 * j + i] + m[3 * i + j]) / s;
+    q[1 + k] = (m[3 * k + i] + m[3 * i + k]) / s;
   }
   const sign = q[0] < 0 ? -1 : 1;
   return q.map((value) => value * sign);

@@ -1,36 +1,75 @@
-// The stage: renderer, camera, light, and the room as Gaussian splats or, where drawing is done in software, as a mesh.
+// The stage: renderer, camera, light, and the room as Gaussian splats or, where drawing is done in software,
+// as a mesh.
 
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';
-import { SparkRenderer, SplatEdit, SplatEditRgbaBlendMode, SplatEditSdf, SplatEditSdfType, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
+import {
+  SparkRenderer,
+  SplatEdit,
+  SplatEditRgbaBlendMode,
+  SplatEditSdf,
+  SplatEditSdfType,
+  SplatFileType,
+  SplatMesh,
+} from '@sparkjsdev/spark';
 import { BACKDROP_LAYER, Backdrop } from './backdrop.js';
+import { Cutaway } from './cutaway.js';
 import { Steadiness } from './steadiness.js';
 
 const HEADROOM_M = 1.9; // what hangs higher above the floor is cut away, so that one can look in
-const PIXELS = { software: [0.75, 0.3, 75], graphics: [2, 0.6, 28] }; // drawn per pixel of the screen, most and least; wanted ms a frame
+// drawn per pixel of the screen, most and least; wanted ms a frame
+const PIXELS = { software: [0.75, 0.3, 75], graphics: [2, 0.6, 28] };
 const WALL_M = 0.35; // a wall's thickness, with what leans on it
 
 const FOG_M = 0.5; // Gaussians nearer to the eye are hidden
 const FURTHEST_M = 14; // how far away the view may go
 const FURTHEST = 4; // and in widths of the room: from there an upright phone shows it from wall to wall
 const CLOSE_M = 1.7; // how far away the view stays that follows the animal
-const CORNERS = [[1, 1], [-1, 1], [1, -1], [-1, -1]]; // towards +x and +z, from which the room is looked into
+const CLOSER = 0.88; // the first view on a screen that is wide, in widths of the room
+const TOWARDS_ANIMAL = 0.4; // how far from the room's middle to the animal that view looks
+const RAISED_M = 0.12; // what is hit higher above the floor is furniture
+const AZIMUTHS = 16; // directions tried from which the animal is to be seen closely
+const CORNERS = [
+  [1, 1],
+  [-1, 1],
+  [1, -1],
+  [-1, -1],
+]; // towards +x and +z, from which the room is looked into
 
-export const parseModel = (bytes) => new Promise((done, fail) => {
-  new GLTFLoader().parse(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength), '', done, fail);
-});
+export const parseModel = (bytes) =>
+  new Promise((done, fail) => {
+    new GLTFLoader().parse(
+      bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength),
+      '',
+      done,
+      fail,
+    );
+  });
 
 export class Room {
   constructor(canvas, contract) {
     this.canvas = canvas;
     this.contract = contract;
     this.software = drawsInSoftware();
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.software, powerPreference: 'high-performance' });
-    this.renderer.setClearColor(0xf5f2ec);
+    this.renderer = new THREE.WebGLRenderer({
+      canvas,
+      antialias: !this.software,
+      powerPreference: 'high-performance',
+    });
+    this.renderer.setClearColor(paperColor());
+    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => {
+      this.renderer.setClearColor(paperColor());
+      if (this.backdrop) this.backdrop.key = '';
+    });
     this.renderer.localClippingEnabled = true;
     const [most, least, wanted] = PIXELS[this.software ? 'software' : 'graphics'];
-    this.steadiness = new Steadiness(this.software ? most : Math.min(most, devicePixelRatio), least, wanted, (ratio) => this.renderer.setPixelRatio(ratio));
+    this.steadiness = new Steadiness(
+      this.software ? most : Math.min(most, devicePixelRatio),
+      least,
+      wanted,
+      (ratio) => this.renderer.setPixelRatio(ratio),
+    );
     this.renderer.setPixelRatio(this.steadiness.ratio);
     this.scene = new THREE.Scene();
     if (this.software) this.backdrop = new Backdrop(this.renderer);
@@ -42,8 +81,15 @@ export class Room {
     const furthest = Math.max(FURTHEST_M, FURTHEST * this.span);
     this.camera = new THREE.PerspectiveCamera(40, 1, 0.05, 5 * furthest);
     this.orbit = new OrbitControls(this.camera, canvas);
-    Object.assign(this.orbit, { enableDamping: true, dampingFactor: 0.08, maxPolarAngle: 1.5, minDistance: 0.6, maxDistance: furthest });
+    Object.assign(this.orbit, {
+      enableDamping: true,
+      dampingFactor: 0.08,
+      maxPolarAngle: 1.5,
+      minDistance: 0.6,
+      maxDistance: furthest,
+    });
     this.ray = new THREE.Raycaster();
+    this.cutaway = new Cutaway(contract.scene.floor_m);
     this.frameRoom();
     addEventListener('resize', () => this.resize());
     this.resize();
@@ -58,9 +104,16 @@ export class Room {
   // Look into the room from the corner that shows the animal, if one does.
   frameRoom(animal) {
     const [low, high] = this.contract.scene.bounds_m;
-    const middle = new THREE.Vector3((low[0] + high[0]) / 2, this.contract.scene.floor_m + 0.25, (low[2] + high[2]) / 2);
-    const away = this.span * (innerWidth < 720 ? 1.75 : 1);
-    const from = ([x, z]) => middle.clone().add(new THREE.Vector3(0.62 * x, 0.98, 0.86 * z).multiplyScalar(away));
+    const middle = new THREE.Vector3(
+      (low[0] + high[0]) / 2,
+      this.contract.scene.floor_m + 0.25,
+      (low[2] + high[2]) / 2,
+    );
+    const narrow = innerWidth < 720;
+    if (animal && !narrow) middle.lerp(new THREE.Vector3(animal[0], middle.y, animal[2]), TOWARDS_ANIMAL);
+    const away = this.span * (narrow ? 1.75 : CLOSER);
+    const from = ([x, z]) =>
+      middle.clone().add(new THREE.Vector3(0.62 * x, 0.98, 0.86 * z).multiplyScalar(away));
     if (animal) this.corner = CORNERS.find((corner) => this.sees(from(corner), new THREE.Vector3(...animal)));
     this.orbit.target.copy(middle);
     this.camera.position.copy(from(this.corner ?? CORNERS[0]));
@@ -72,7 +125,9 @@ export class Room {
     const ray = new THREE.Raycaster(eye, point.clone().sub(eye).normalize(), 0, eye.distanceTo(point) - 0.1);
     ray.layers.enableAll();
     this.mesh.updateWorldMatrix(true, false);
-    return ray.intersectObject(this.mesh).every((hit) => hit.point.y > this.contract.scene.floor_m + HEADROOM_M);
+    return ray
+      .intersectObject(this.mesh)
+      .every((hit) => hit.point.y > this.contract.scene.floor_m + HEADROOM_M);
   }
 
   async addMesh(bytes) {
@@ -80,7 +135,12 @@ export class Room {
     const above = new THREE.Plane(new THREE.Vector3(0, -1, 0), this.contract.scene.floor_m + HEADROOM_M);
     model.scene.traverse((node) => {
       if (!node.isMesh) return;
-      node.material = new THREE.MeshBasicMaterial({ vertexColors: true, side: THREE.FrontSide, clippingPlanes: [above] });
+      node.material = new THREE.MeshBasicMaterial({
+        vertexColors: true,
+        side: THREE.FrontSide,
+        clippingPlanes: [above],
+      });
+      this.cutaway.patch(node.material);
       this.mesh = node;
       if (this.backdrop) node.layers.set(BACKDROP_LAYER);
     });
@@ -93,12 +153,25 @@ export class Room {
     const edit = new SplatEdit({ rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY, sdfs: [this.shell] });
     // What floats right before the eye is fog, whatever it is made of.
     this.near = new SplatEditSdf({ type: SplatEditSdfType.SPHERE, opacity: 0, radius: FOG_M });
-    const clear = new SplatEdit({ rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY, softEdge: 0.1, sdfs: [this.near] });
+    const clear = new SplatEdit({
+      rgbaBlendMode: SplatEditRgbaBlendMode.MULTIPLY,
+      softEdge: 0.1,
+      sdfs: [this.near],
+    });
     splats.add(edit, this.shell, clear, this.near);
+    this.cutaway.edit(splats);
     await splats.initialized;
     this.scene.add(new SparkRenderer({ renderer: this.renderer }), splats);
     this.splats = splats;
-    if (this.mesh) this.mesh.visible = false;
+    // The mesh goes on hiding what is behind it, unseen: splats leave no depth.
+    Object.assign(this.mesh.material, {
+      colorWrite: false,
+      transparent: true,
+      polygonOffset: true,
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 4,
+    });
+    this.mesh.renderOrder = 0.5;
   }
 
   // Splats have no back: hide the walls between the camera and the room, and what hangs high.
@@ -106,7 +179,10 @@ export class Room {
     const [low, high] = this.contract.scene.bounds_m.map((corner) => [...corner]);
     high[1] = this.contract.scene.floor_m + HEADROOM_M;
     low[1] -= 1;
-    for (const [axis, name] of [[0, 'x'], [2, 'z']]) {
+    for (const [axis, name] of [
+      [0, 'x'],
+      [2, 'z'],
+    ]) {
       const outside = this.camera.position[name];
       low[axis] += outside < low[axis] ? WALL_M : -1;
       high[axis] -= outside > high[axis] ? WALL_M : -1;
@@ -126,10 +202,28 @@ export class Room {
     this.orbit.target.set(...animal);
     if (view === 'you') this.camera.position.set(...eye);
     else {
-      const away = this.camera.position.clone().sub(this.orbit.target).setY(0).normalize();
-      this.camera.position.copy(this.orbit.target).addScaledVector(away, CLOSE_M).setY(animal[1] + 0.55 * CLOSE_M);
+      this.camera.position.copy(this.closeTo(animal));
     }
     this.orbit.update();
+  }
+
+  // Where an eye sees the animal closely, as near as can be to where it is now.
+  closeTo(animal) {
+    const away = this.camera.position.clone().sub(this.orbit.target).setY(0).normalize();
+    const from = (turns) =>
+      away
+        .clone()
+        .applyAxisAngle(this.camera.up, turns * 2 * Math.PI)
+        .multiplyScalar(CLOSE_M)
+        .setY(0.55 * CLOSE_M)
+        .add(this.orbit.target);
+    const tried = Array.from({ length: AZIMUTHS }, (_, i) =>
+      from(((i % 2 ? 1 : -1) * Math.ceil(i / 2)) / AZIMUTHS),
+    );
+    const [low, high] = this.contract.scene.bounds_m;
+    const inside = (eye) => eye.x > low[0] && eye.x < high[0] && eye.z > low[2] && eye.z < high[2];
+    const open = tried.filter((eye) => this.sees(eye, new THREE.Vector3(...animal)));
+    return open.find(inside) ?? open[0] ?? tried[0];
   }
 
   // Turn about what is looked at (radians) or come closer (a factor).
@@ -146,13 +240,15 @@ export class Room {
       this.camera.position.set(...eye);
       return this.orbit.target.set(...point);
     }
-    if (this.backdrop && this.view !== 'animal') return; // the whole room is in view, and a still view is cheap to draw
+    // the whole room is in view, and a still view is cheap to draw
+    if (this.backdrop && this.view !== 'animal') return;
     const { target } = this.orbit;
     const [dx, dz] = [point[0] - target.x, point[2] - target.z];
     const distance = Math.hypot(dx, dz);
     const slack = this.view === 'animal' ? 0.12 : 0.9;
     if (distance < slack) return;
-    const share = ((distance - slack) / distance) * Math.min(1, (this.view === 'animal' ? 2.5 : 0.5) * seconds);
+    const share =
+      ((distance - slack) / distance) * Math.min(1, (this.view === 'animal' ? 2.5 : 0.5) * seconds);
     for (const spot of [target, this.camera.position]) {
       spot.x += dx * share;
       spot.z += dz * share;
@@ -169,17 +265,25 @@ export class Room {
     eye.lookAt(eye.position.x, 0, eye.position.z);
     eye.layers.enable(BACKDROP_LAYER);
     const target = new THREE.WebGLRenderTarget(size, size, { colorSpace: THREE.SRGBColorSpace });
-    const hidden = this.scene.children.filter((child) => child.visible && !child.isLight && !child.getObjectById(this.mesh.id));
-    const shown = this.mesh.visible;
-    hidden.forEach((child) => { child.visible = false; });
+    const hidden = this.scene.children.filter(
+      (child) => child.visible && !child.isLight && !child.getObjectById(this.mesh.id),
+    );
+    const [shown, paper] = [this.mesh.visible, this.renderer.getClearColor(new THREE.Color())];
+    this.renderer.setClearColor(paper, 0);
+    hidden.forEach((child) => {
+      child.visible = false;
+    });
     this.mesh.visible = true;
     this.renderer.setRenderTarget(target);
-    this.renderer.render(this.scene, eye);
+    this.cutaway.without(() => this.renderer.render(this.scene, eye));
     const pixels = new Uint8Array(size * size * 4);
     this.renderer.readRenderTargetPixels(target, 0, 0, size, size, pixels);
     this.renderer.setRenderTarget(null);
+    this.renderer.setClearColor(paper, 1);
     target.dispose();
-    hidden.forEach((child) => { child.visible = true; });
+    hidden.forEach((child) => {
+      child.visible = true;
+    });
     this.mesh.visible = shown;
     return { pixels, center: [eye.position.x, eye.position.z], half };
   }
@@ -195,7 +299,10 @@ export class Room {
   }
 
   aim(event) {
-    const pointer = new THREE.Vector2((event.clientX / innerWidth) * 2 - 1, 1 - (event.clientY / innerHeight) * 2);
+    const pointer = new THREE.Vector2(
+      (event.clientX / innerWidth) * 2 - 1,
+      1 - (event.clientY / innerHeight) * 2,
+    );
     this.ray.setFromCamera(pointer, this.camera);
     return this.ray;
   }
@@ -209,6 +316,39 @@ export class Room {
     return inside ? [point.x, point.z] : null;
   }
 
+  // What a click shows: {place: [x, z], up}, up being the height above the floor of the furniture that is
+  // hit, or 0; null outside the room.
+  surfacePoint(event) {
+    const floor = this.floorPoint(event);
+    if (!this.mesh) return floor && { place: floor, up: 0 };
+    const ray = this.aim(event);
+    ray.layers.enableAll();
+    this.mesh.updateWorldMatrix(true, false);
+    const { floor_m: floorHeight } = this.contract.scene;
+    const hit = ray
+      .intersectObject(this.mesh)
+      .find(({ point }) => point.y < floorHeight + HEADROOM_M && !this.cutaway.covers(point));
+    if (!hit || hit.point.y < floorHeight + RAISED_M) return floor && { place: floor, up: 0 };
+    return { place: [hit.point.x, hit.point.z], up: hit.point.y - floorHeight };
+  }
+
+  // The height of the mesh beneath a point, or null.
+  surfaceBelow(point) {
+    const ray = new THREE.Raycaster(new THREE.Vector3(...point), new THREE.Vector3(0, -1, 0));
+    ray.layers.enableAll();
+    return ray.intersectObject(this.mesh)[0]?.point.y ?? null;
+  }
+
+  // Cut away what hides the animal.
+  reveal(animal) {
+    const point = new THREE.Vector3(...animal);
+    this.cutaway.follow(
+      this.camera.position,
+      point,
+      this.backdrop && (() => !this.sees(this.camera.position, point)),
+    );
+  }
+
   // The compass direction of the view on the floor, radians from +z towards +x.
   heading() {
     const forward = this.camera.getWorldDirection(new THREE.Vector3());
@@ -217,12 +357,16 @@ export class Room {
 
   render() {
     if (this.splats) this.openShell();
-    if (this.near && this.near.position.distanceTo(this.camera.position) > 0.05) this.near.position.copy(this.camera.position);
+    if (this.near && this.near.position.distanceTo(this.camera.position) > 0.05)
+      this.near.position.copy(this.camera.position);
     this.orbit.update();
-    if (this.backdrop && !this.splats) this.backdrop.render(this.scene, this.camera);
+    if (this.backdrop && !this.splats) this.backdrop.render(this.scene, this.camera, this.cutaway.key);
     else this.renderer.render(this.scene, this.camera);
   }
 }
+
+const paperColor = () =>
+  new THREE.Color(getComputedStyle(document.documentElement).getPropertyValue('--paper').trim());
 
 function drawsInSoftware() {
   const gl = document.createElement('canvas').getContext('webgl2');

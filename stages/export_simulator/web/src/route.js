@@ -2,7 +2,7 @@
 
 const SPACING_M = 0.05;
 const TICK_S = 0.1;
-const PICKUP_M_S2 = 1.5; // how quickly the walker gains speed
+const ACCELERATION_M_S2 = 1.5; // how quickly the walker gains speed
 const AHEAD_M = 0.8; // how far beyond what is done the walker may be found
 export const ARRIVED_M = 0.12;
 
@@ -22,7 +22,9 @@ export class Route {
     const place = Math.min(this.points.length - 1, Math.max(0, along / SPACING_M));
     const index = Math.min(this.points.length - 2, Math.floor(place));
     const share = place - index;
-    return [0, 1].map((axis) => this.points[index][axis] * (1 - share) + this.points[index + 1][axis] * share);
+    return [0, 1].map(
+      (axis) => this.points[index][axis] * (1 - share) + this.points[index + 1][axis] * share,
+    );
   }
 
   // Note how far the walker at [x, z] has come; it never goes back.
@@ -34,7 +36,8 @@ export class Route {
       const distance = Math.hypot(x - here[0], z - here[1]);
       if (distance < nearest - 1e-9) [nearest, this.done] = [distance, along];
     }
-    if (Math.hypot(...this.at(this.length).map((value, axis) => value - here[axis])) < ARRIVED_M) this.done = Math.max(this.done, Math.min(this.length, this.done + AHEAD_M));
+    if (Math.hypot(...this.at(this.length).map((value, axis) => value - here[axis])) < ARRIVED_M)
+      this.done = Math.max(this.done, Math.min(this.length, this.done + AHEAD_M));
   }
 
   // Places at the next ticks for a walker at root [x, y, z] with a speed now (m/s) and a pace to reach;
@@ -43,11 +46,15 @@ export class Route {
     const start = this.at(this.done);
     let along = this.done;
     return Array.from({ length: count }, (_, i) => {
-      speed = Math.min(pace, speed + PICKUP_M_S2 * TICK_S);
+      speed = Math.min(pace, speed + ACCELERATION_M_S2 * TICK_S);
       along = Math.min(this.length, along + speed * TICK_S);
       const beside = Math.max(0, 1 - (i + 1) / 10) ** 2;
       const [x, z] = this.at(along);
-      return [x + beside * (root[0] - start[0]), standing + beside * (root[1] - standing), z + beside * (root[2] - start[1])];
+      return [
+        x + beside * (root[0] - start[0]),
+        standing + beside * (root[1] - standing),
+        z + beside * (root[2] - start[1]),
+      ];
     });
   }
 

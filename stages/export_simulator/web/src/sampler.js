@@ -1,18 +1,27 @@
-// From what is perceived to a plan: goal, then path, then body. Counterpart of Sampler in pipeline/models/planning.py.
+// From what is perceived to a plan: goal, then path, then body. Counterpart of Sampler in
+// pipeline/behavior/planning.py.
 
+import { aroundPerson } from './avoidance.js';
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
-import { bent, distance, goalFrom, led, pathFrom, scaledGoal } from './strides.js';
+import { stridesAlong, distance, goalFrom, snappedToGoal, pathFrom, scaledGoal } from './strides.js';
 
 const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
 const SOONEST = 6; // frames that a visitor's goal leaves at least
-const FURTHEST = 2; // a clicked goal further away than this, in deviations of learned goals, is approached in legs
+// a clicked goal further away than this, in deviations of learned goals, is approached in legs
+const FURTHEST = 2;
 
 export class Sampler {
   // networks: name -> async (feeds: {name: [values, shape]}) -> Float32Array
   constructor(contract, networks, senses) {
-    Object.assign(this, { contract: contract.behavior, heights: contract.agent.root_height_m, pace: contract.agent.pace_m_s, networks, senses });
+    Object.assign(this, {
+      contract: contract.behavior,
+      heights: contract.agent.root_height_m,
+      pace: contract.agent.pace_m_s,
+      networks,
+      senses,
+    });
     this.frames = this.contract.future_frames;
     this.stride = this.contract.strides.numbers;
     this.channels = this.contract.scaling.body_mean.length;
@@ -20,98 +29,136 @@ export class Sampler {
 
   // The code with everything that is kept, and the one without the observer.
   async codes(observation, keep, interactivity) {
-    const perceive = (observer) => this.networks.perception({
-      scene_grid: [observation.sceneGrid, [1, this.contract.architecture.scene_channels, ...this.contract.grid.shape]],
-      observer_past: [observation.observerPast, [1, observation.observerPast.length]],
-      past: [observation.past, [1, observation.past.length]],
-      keep: [Float32Array.of(keep.scene, observer, keep.past), [1, 3]],
-    });
+    const perceive = (observer) =>
+      this.networks.perception({
+        scene_grid: [
+          observation.sceneGrid,
+          [1, this.contract.architecture.scene_channels, ...this.contract.grid.shape],
+        ],
+        observer_past: [observation.observerPast, [1, observation.observerPast.length]],
+        past: [observation.past, [1, observation.past.length]],
+        keep: [Float32Array.of(keep.scene, observer, keep.past), [1, 3]],
+      });
     const full = await perceive(keep.observer);
     const last = observation.past.length / this.contract.past_frames;
     const start = Array.from(observation.past.slice(-last).slice(0, 3));
-    return { full, start, blind: interactivity === 1 ? full : await perceive(0) };
+    return { full, start, withoutObserver: interactivity === 1 ? full : await perceive(0) };
   }
 
   // Scaled goals, `count` of them, three numbers each.
   goals(codes, count, { noise, steps, interactivity, method, draw, frame }) {
-    const denoise = (code) => (x, t) => this.networks.goal({ x: [x, [count, 3]], ...this.step(count, t, code) });
-    return this.run(denoise(codes.full), denoise(codes.blind), noise, { method, count: steps, draw, interactivity, correct: frame && ((clean) => this.goalsCleared(frame, clean)) });
+    const denoise = (code) => (x, t) =>
+      this.networks.goal({ x: [x, [count, 3]], ...this.step(count, t, code) });
+    return this.run(denoise(codes.full), denoise(codes.withoutObserver), noise, {
+      method,
+      count: steps,
+      draw,
+      interactivity,
+      correct: frame && ((clean) => this.goalsCleared(frame, clean)),
+    });
   }
 
-  // Scaled paths [3, frames] towards scaled goals, and others for those that do not get there although the goal is all
-  // that guidance tells.
+  // Scaled paths [3, frames] towards scaled goals, and others for those that miss it although guidance
+  // follows the goal alone.
   async paths(codes, goals, { draw, draws, ...options }) {
     const { keepGoal = 1, commanded = false, interactivity } = options;
     const paths = await this.pathsOnce(codes, goals, options);
     const length = 3 * this.frames;
     for (let i = 1; i < draws && (commanded || (keepGoal && interactivity >= 1)); i++) {
-      const off = this.missed(paths, goals, codes.start);
+      const off = this.goalErrors(paths, goals, codes.start);
       const again = [...off.keys()].filter((index) => off[index] > 1);
       if (!again.length) break;
-      const targets = Float32Array.from(again.flatMap((index) => Array.from(goals.subarray(3 * index, 3 * index + 3))));
-      const others = await this.pathsOnce(codes, targets, { ...options, noise: draw(this.stride * this.frames * again.length) });
-      const closer = this.missed(others, targets, codes.start);
+      const targets = Float32Array.from(
+        again.flatMap((index) => Array.from(goals.subarray(3 * index, 3 * index + 3))),
+      );
+      const others = await this.pathsOnce(codes, targets, {
+        ...options,
+        noise: draw(this.stride * this.frames * again.length),
+      });
+      const closer = this.goalErrors(others, targets, codes.start);
       again.forEach((index, other) => {
-        if (closer[other] < off[index]) paths.set(others.subarray(other * length, (other + 1) * length), index * length);
+        if (closer[other] < off[index])
+          paths.set(others.subarray(other * length, (other + 1) * length), index * length);
       });
     }
     return paths;
   }
 
   // How far from their goals paths end, in parts of what still counts as there: more than 1 does not.
-  missed(paths, goals, start) {
+  goalErrors(paths, goals, start) {
     const { reach_m: least, reach } = this.contract.strides;
     const length = 3 * this.frames;
     return Array.from({ length: goals.length / 3 }, (_, i) => {
-      const [goal, end] = [this.goal(goals, i), this.positions(paths.subarray(i * length, (i + 1) * length)).at(-1)];
+      const [goal, end] = [
+        this.goal(goals, i),
+        this.positions(paths.subarray(i * length, (i + 1) * length)).at(-1),
+      ];
       return distance(end, goal) / Math.max(least, reach * distance(goal, start));
     });
   }
 
-  // A scaled path towards each scaled goal. The reference of the guidance sees neither observer nor goal, but a goal that
-  // the visitor has set is not taken away.
+  // A scaled path towards each scaled goal. The reference of the guidance sees neither observer nor goal, but
+  // a goal that the visitor has set is not taken away.
   async pathsOnce(codes, goals, { noise, steps, interactivity, frame, keepGoal = 1, commanded = false }) {
     const count = goals.length / 3;
-    const denoise = (code, keep) => (x, t) => this.networks.path({
-      x: [x, [count, this.stride, this.frames]], ...this.step(count, t, code),
-      control: [goals, [count, 3]], keep: [new Float32Array(count).fill(keep), [count, 1]],
-    });
+    const denoise = (code, keep) => (x, t) =>
+      this.networks.path({
+        x: [x, [count, this.stride, this.frames]],
+        ...this.step(count, t, code),
+        control: [goals, [count, 3]],
+        keep: [new Float32Array(count).fill(keep), [count, 1]],
+      });
     const correct = frame && ((clean) => this.pathsCleared(frame, codes.start, clean));
-    const drawn = await this.run(denoise(codes.full, keepGoal), denoise(codes.blind, commanded ? 1 : 0), noise, { method: 'ddim', count: steps, interactivity, correct });
+    const drawn = await this.run(
+      denoise(codes.full, keepGoal),
+      denoise(codes.withoutObserver, commanded ? 1 : 0),
+      noise,
+      { method: 'ddim', count: steps, interactivity, correct },
+    );
     const pull = commanded ? 1 : keepGoal * Math.min(interactivity, 1);
-    return this.ledPaths(drawn, goals, codes.start, pull);
+    return this.snappedPaths(drawn, goals, codes.start, pull);
   }
 
   // Scaled goals, moved to where the animal may rest, on what carries it.
   goalsCleared(frame, scaled) {
     const egoFromWorld = inverse(frame);
-    return Float32Array.from(this.goalsInWorld(frame, scaled).flatMap((goal) => {
-      const [x, y, z] = this.senses.cleared(goal);
-      return Array.from(this.scaled(apply(egoFromWorld, [x, this.senses.carried([x, y, z], false), z])));
-    }));
+    return Float32Array.from(
+      this.goalsInWorld(frame, scaled).flatMap((goal) => {
+        const [x, y, z] = this.senses.cleared(goal);
+        return Array.from(
+          this.scaled(apply(egoFromWorld, [x, this.senses.support.carried([x, y, z], false), z])),
+        );
+      }),
+    );
   }
 
-  // Scaled strides, bent to where the animal may be.
+  // Scaled strides, stridesAlong to where the animal may be.
   pathsCleared(frame, start, scaled) {
-    const { contract: { scaling, strides: told, rate_hz: rate }, frames } = this;
+    const {
+      contract: { scaling, strides: encoding, rate_hz: rate },
+      frames,
+    } = this;
     const [egoFromWorld, length] = [inverse(frame), this.stride * frames];
     const out = new Float32Array(scaled.length);
     for (let at = 0; at < scaled.length; at += length) {
       const mine = scaled.subarray(at, at + length);
-      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, told);
+      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, encoding);
       const moved = path.map((place) => apply(egoFromWorld, this.senses.cleared(apply(frame, place))));
-      out.set(bent(mine, frames, scaling.stride_std, start, moved, rate, told), at);
+      out.set(stridesAlong(mine, frames, scaling.stride_std, start, moved, rate, encoding), at);
     }
     return out;
   }
 
-  // Scaled places [3, frames] that scaled strides lead to, bent towards scaled goals.
-  ledPaths(drawn, goals, start, pull) {
-    const { contract: { scaling, strides: told, rate_hz: rate }, frames } = this;
+  // Scaled places [3, frames] that scaled strides lead to, stridesAlong towards scaled goals.
+  snappedPaths(drawn, goals, start, pull) {
+    const {
+      contract: { scaling, strides: encoding, rate_hz: rate },
+      frames,
+    } = this;
     const each = Array.from({ length: goals.length / 3 }, (_, i) => {
       const mine = drawn.subarray(i * this.stride * frames, (i + 1) * this.stride * frames);
-      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, told);
-      return this.scaledPath(led(path, start, this.goal(goals, i), pull));
+      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, encoding);
+      return this.scaledPath(snappedToGoal(path, start, this.goal(goals, i), pull));
     });
     return Float32Array.from(each.flat());
   }
@@ -125,19 +172,28 @@ export class Sampler {
     return scaledGoal(goal, this.contract.scaling.goal_std, this.contract.strides);
   }
 
-  // Places as a body is told them.
+  // Places as a body is encoding them.
   scaledPath(places) {
-    const { path_std: spread } = this.contract.scaling;
-    return [0, 1, 2].flatMap((axis) => places.map((place, i) => place[axis] / spread[axis][i]));
+    const { path_std: deviation } = this.contract.scaling;
+    return [0, 1, 2].flatMap((axis) => places.map((place, i) => place[axis] / deviation[axis][i]));
   }
 
-  // A scaled body [channels, frames] along a scaled path, drawn from fainter noise than goals and paths are, and no other.
+  // A scaled body [channels, frames] along a scaled path, drawn from fainter noise than goals and paths are,
+  // and no other.
   body(codes, path, { noise, steps, interactivity }) {
-    const denoise = (code) => (x, t) => this.networks.body({
-      x: [x, [1, this.channels, this.frames]], ...this.step(1, t, code), control: [path, [1, 3, this.frames]], keep: [Float32Array.of(1), [1, 1]],
-    });
+    const denoise = (code) => (x, t) =>
+      this.networks.body({
+        x: [x, [1, this.channels, this.frames]],
+        ...this.step(1, t, code),
+        control: [path, [1, 3, this.frames]],
+        keep: [Float32Array.of(1), [1, 1]],
+      });
     const faint = noise.map((value) => value * this.contract.sampling.body_spread);
-    return this.run(denoise(codes.full), denoise(codes.blind), faint, { method: 'ddim', count: steps, interactivity });
+    return this.run(denoise(codes.full), denoise(codes.withoutObserver), faint, {
+      method: 'ddim',
+      count: steps,
+      interactivity,
+    });
   }
 
   step(count, t, code) {
@@ -146,24 +202,37 @@ export class Sampler {
     return { t: [new Float32Array(count).fill(t), [count]], condition: [condition, [count, code.length]] };
   }
 
-  run(full, blind, noise, { interactivity, ...options }) {
-    return sample(guided(full, blind, interactivity), noise, this.contract.schedule, options);
+  run(full, withoutObserver, noise, { interactivity, ...options }) {
+    return sample(guided(full, withoutObserver, interactivity), noise, this.contract.schedule, options);
   }
 
   // Goals alone, in the world.
   async sampleGoals(question) {
     const { frame, ...observation } = this.senses.observe(question.past, question.observer);
     const codes = await this.codes(observation, question.keep, question.interactivity);
-    return { goals: this.goalsInWorld(frame, await this.dreamt(codes, question.samples, this.drawing(frame, question))) };
+    return {
+      goals: this.goalsInWorld(
+        frame,
+        await this.sampledGoals(codes, question.samples, this.drawing(frame, question)),
+      ),
+    };
   }
 
   // How a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived.
-  drawing(frame, { seed, steps, interactivity, keep }) {
-    return { method: this.contract.sampling.method, draw: normals(seed), steps, interactivity, frame: keep.scene ? frame : null };
+  drawing(frame, { seed, steps, interactivity, keep, observer }) {
+    const [x, , z] = observer.at(-1);
+    return {
+      method: this.contract.sampling.method,
+      draw: normals(seed),
+      steps,
+      interactivity,
+      frame: keep.scene ? frame : null,
+      person: [x, z],
+    };
   }
 
   // Scaled goals that it thinks of by itself.
-  dreamt(codes, samples, options) {
+  sampledGoals(codes, samples, options) {
     const steps = Math.max(options.steps, this.contract.sampling.goal_steps);
     return this.goals(codes, samples, { ...options, noise: options.draw(3 * samples), steps });
   }
@@ -172,31 +241,50 @@ export class Sampler {
     return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, this.goal(scaled, i)));
   }
 
-  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, path}. `cleared` is where a plan
-  // ends that goes all the way to the aim: as near to it as the animal may be.
+  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, raised, path}.
+  // `cleared` is where a plan ends that goes all the way to the aim: as near to it as the animal may be.
   async plan(question) {
     const observation = this.senses.observe(question.past, question.observer);
     const { frame } = observation;
     const options = this.drawing(frame, question);
     const whole = await this.codes(observation, question.keep, question.interactivity);
     if (question.path) return this.followed(frame, whole, question.path, options);
-    // sampled bones walk less distinctly than recorded ones do: told of them, the animal would stop
+    // sampled bones walk less distinctly than recorded ones do: encoding of them, the animal would stop
     const bare = this.senses.boneless(observation, this.contract.scaling.body_mean);
     const codes = await this.codes(bare, question.keep, question.interactivity);
     const commanded = Boolean(question.aim);
-    const leg = commanded && this.leg(frame, question.aim);
-    const scaled = commanded ? leg.scaled : await this.dreamt(codes, question.samples, options);
+    const leg = commanded && this.leg(frame, question.aim, question.raised);
+    const scaled = commanded ? leg.scaled : await this.sampledGoals(codes, question.samples, options);
     const keepGoal = commanded ? 1 : question.keep.goal;
     const goals = this.goalsInWorld(frame, scaled);
-    const tried = commanded ? Array(Math.min(CANDIDATES, question.samples)).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
-    const targets = Float32Array.from(tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))));
+    const tried = commanded
+      ? Array(Math.min(CANDIDATES, question.samples)).fill(0)
+      : this.insideFirst(goals).slice(0, CANDIDATES);
+    const targets = Float32Array.from(
+      tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))),
+    );
     const paths = await this.paths(codes, targets, {
-      ...options, keepGoal, commanded, draws: this.contract.sampling.path_draws, noise: options.draw(this.stride * this.frames * tried.length),
+      ...options,
+      keepGoal,
+      commanded,
+      draws: this.contract.sampling.path_draws,
+      noise: options.draw(this.stride * this.frames * tried.length),
     });
-    if (commanded) for (let i = 0; i < tried.length; i++) this.meet(paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)), scaled);
+    if (commanded)
+      for (let i = 0; i < tried.length; i++)
+        this.bendToGoal(
+          paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)),
+          scaled,
+          question.raised,
+        );
     const best = this.firstInside(frame, paths);
-    const path = this.kept(frame, codes.start, this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))), options);
-    const lived = await this.embodied(frame, whole, path, options);
+    const path = this.constrained(
+      frame,
+      codes.start,
+      this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))),
+      options,
+    );
+    const lived = await this.withBody(frame, whole, path, options);
     return { goals, chosen: tried[best], ...lived, cleared: leg.last ? lived.path.at(-1) : null };
   }
 
@@ -206,17 +294,21 @@ export class Sampler {
     return goals.map((_, i) => i).sort((a, b) => inside[b] - inside[a] || a - b);
   }
 
-  // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the animal's pace
-  // would be, and stays.
-  meet(path, goal) {
-    const { path_std: spread } = this.contract.scaling;
+  // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the
+  // animal's pace would be, and stays.
+  bendToGoal(path, goal, raised) {
+    const { path_std: deviation } = this.contract.scaling;
     const target = this.goal(goal);
-    const arrival = Math.min(this.frames - 1, Math.max(SOONEST, Math.ceil((Math.hypot(target[0], target[2]) / this.pace) * this.contract.rate_hz)));
-    for (const axis of [0, 2]) {
-      const missing = target[axis] - path[axis * this.frames + arrival] * spread[axis][arrival];
+    const arrival = Math.min(
+      this.frames - 1,
+      Math.max(SOONEST, Math.ceil((Math.hypot(target[0], target[2]) / this.pace) * this.contract.rate_hz)),
+    );
+    for (const axis of raised ? [0, 1, 2] : [0, 2]) {
+      const missing = target[axis] - path[axis * this.frames + arrival] * deviation[axis][arrival];
       for (let i = 0; i < this.frames; i++) {
-        const place = path[axis * this.frames + i] * spread[axis][i] + missing * ((i + 1) / (arrival + 1)) ** 1.2;
-        path[axis * this.frames + i] = (i < arrival ? place : target[axis]) / spread[axis][i];
+        const place =
+          path[axis * this.frames + i] * deviation[axis][i] + missing * ((i + 1) / (arrival + 1)) ** 1.2;
+        path[axis * this.frames + i] = (i < arrival ? place : target[axis]) / deviation[axis][i];
       }
     }
   }
@@ -224,27 +316,42 @@ export class Sampler {
   // A plan along places that the visitor has drawn, points of the world, one a frame.
   async followed(frame, codes, places, options) {
     const egoFromWorld = inverse(frame);
-    const path = this.kept(frame, codes.start, places.map((place) => apply(egoFromWorld, place)), options);
-    return { goals: [places.at(-1)], chosen: 0, ...(await this.embodied(frame, codes, path, options)) };
+    const path = this.constrained(
+      frame,
+      codes.start,
+      places.map((place) => apply(egoFromWorld, place)),
+      options,
+    );
+    return { goals: [places.at(-1)], chosen: 0, ...(await this.withBody(frame, codes, path, options)) };
   }
 
-  // Places of the ego frame as a scaled path where the animal may be, on what carries it; as they are where it does not
-  // perceive the scene.
-  kept(frame, start, places, { frame: cleared }) {
-    if (!cleared) return Float32Array.from(this.scaledPath(places));
+  // Places of the ego frame as a scaled path that is possible: where the animal may be (unless it does not
+  // perceive the scene), around the person's body, on what carries it.
+  constrained(frame, start, places, { frame: perceived, person }) {
     const egoFromWorld = inverse(frame);
-    const moved = places.map((place) => this.senses.cleared(apply(frame, place)));
-    const world = this.senses.trodden(moved, apply(frame, start), this.contract.strides.stays_m_s / this.contract.rate_hz);
+    const [from, clear] = [apply(frame, start), (place) => (perceived ? this.senses.cleared(place) : place)];
+    const around = aroundPerson(
+      places.map((place) => clear(apply(frame, place))),
+      from,
+      person,
+      clear,
+    );
+    const world = perceived
+      ? this.senses.support.follow(around, from, this.contract.strides.stays_m_s / this.contract.rate_hz)
+      : around;
     return Float32Array.from(this.scaledPath(world.map((place) => apply(egoFromWorld, place))));
   }
 
   // The body along a scaled path, and both in the world.
-  async embodied(frame, codes, path, options) {
-    const body = await this.body(codes, path, { ...options, noise: options.draw(this.channels * this.frames) });
+  async withBody(frame, codes, path, options) {
+    const body = await this.body(codes, path, {
+      ...options,
+      noise: options.draw(this.channels * this.frames),
+    });
     const { positions, bodies } = this.unscaled(path, body);
     return {
       path: positions.map((position) => apply(frame, position)),
-      frames: positions.map((position, i) => this.grounded(this.senses.rows(frame, position, bodies[i]))),
+      frames: positions.map((position, i) => this.clampHeight(this.senses.rows(frame, position, bodies[i]))),
     };
   }
 
@@ -259,16 +366,17 @@ export class Sampler {
   }
 
   // Over many plans small errors of height add up: keep the root between the heights that recordings know.
-  grounded(rows) {
+  clampHeight(rows) {
     const [low, high] = this.heights;
     rows[1] = Math.min(high, Math.max(low, rows[1]));
     return rows;
   }
 
-  // The visitor's goal in scaled units, not further than the animal goes in one plan; and whether it is there then.
-  leg(frame, aim) {
-    const [x, , z] = apply(inverse(frame), aim);
-    const whole = this.scaled([x, 0, z]);
+  // The visitor's goal in scaled units, not further than the animal goes in one plan; and whether it is there
+  // then.
+  leg(frame, aim, raised) {
+    const [x, y, z] = apply(inverse(frame), aim);
+    const whole = this.scaled([x, raised ? y : 0, z]);
     const share = Math.min(1, FURTHEST / Math.max(1e-6, Math.hypot(...whole)));
     return { scaled: Float32Array.from(whole, (value) => value * share), last: share === 1 };
   }
@@ -279,19 +387,24 @@ export class Sampler {
     const each = Array.from({ length: this.frames }, (_, i) => i);
     return {
       positions: this.positions(path),
-      bodies: each.map((i) => mean.map((center, channel) => body[channel * this.frames + i] * deviation[channel] + center)),
+      bodies: each.map((i) =>
+        mean.map((center, channel) => body[channel * this.frames + i] * deviation[channel] + center),
+      ),
     };
   }
 
   positions(path) {
-    const spread = this.contract.scaling.path_std;
-    return Array.from({ length: this.frames }, (_, i) => [0, 1, 2].map((axis) => path[axis * this.frames + i] * spread[axis][i]));
+    const deviation = this.contract.scaling.path_std;
+    return Array.from({ length: this.frames }, (_, i) =>
+      [0, 1, 2].map((axis) => path[axis * this.frames + i] * deviation[axis][i]),
+    );
   }
 
   // The fixed plan that Python wrote down, sampled again from the same input and noise.
   async golden(golden) {
     const { architecture, grid, past_frames: count } = this.contract;
-    const wave = (length, amplitude, frequency) => Float32Array.from({ length }, (_, i) => amplitude * Math.sin(frequency * i));
+    const wave = (length, amplitude, frequency) =>
+      Float32Array.from({ length }, (_, i) => amplitude * Math.sin(frequency * i));
     const observation = {
       sceneGrid: wave(architecture.scene_channels * grid.shape.reduce((a, b) => a * b), 0.25, 0.01),
       past: wave(count * (9 + 6 * architecture.bones), 0.1, 0.1),
@@ -303,9 +416,21 @@ export class Sampler {
     for (const name of Object.keys(golden.plans)) {
       const options = { method: golden.sampling.method, interactivity: Number(name.split('_')[1]) };
       const codes = await this.codes(observation, { scene, observer, past }, options.interactivity);
-      const goal = await this.goals(codes, 1, { ...options, steps: golden.sampling.goal_steps, noise: noise('goal') });
-      const path = await this.paths(codes, goal, { ...options, steps: golden.sampling.sequence_steps, noise: noise('path') });
-      const body = await this.body(codes, path, { ...options, steps: golden.sampling.sequence_steps, noise: noise('body') });
+      const goal = await this.goals(codes, 1, {
+        ...options,
+        steps: golden.sampling.goal_steps,
+        noise: noise('goal'),
+      });
+      const path = await this.paths(codes, goal, {
+        ...options,
+        steps: golden.sampling.sequence_steps,
+        noise: noise('path'),
+      });
+      const body = await this.body(codes, path, {
+        ...options,
+        steps: golden.sampling.sequence_steps,
+        noise: noise('body'),
+      });
       const { positions, bodies } = this.unscaled(path, body);
       plans[name] = { goal: this.goal(goal), path: positions, body: bodies };
     }

@@ -1,8 +1,23 @@
 // What the animal perceives, in its ego frame: the scene on a grid, the observer's and its own last frames.
-// The counterpart of pipeline/models/perception.py and behavior.py; both are held together by a golden plan.
+// The counterpart of pipeline/behavior/perception.py and behavior.py; both are held together by a golden
+// plan.
 
 import { nearestAllowed } from './clearing.js';
-import { ROW, apply, compose, conjugate, inverse, matrixFromTurn, multiply, place, rotate, turn, turnFromMatrix, turnFromVector } from './rigid.js';
+import { Support } from './support.js';
+import {
+  ROW,
+  apply,
+  compose,
+  conjugate,
+  inverse,
+  matrixFromTurn,
+  multiply,
+  place,
+  rotate,
+  turn,
+  turnFromMatrix,
+  turnFromVector,
+} from './rigid.js';
 
 const UPRIGHT = 0.2;
 const ROOT_CHANNELS = 6;
@@ -17,6 +32,7 @@ export class Senses {
     this.volume = { ...contract.volume, values: halfTable(volume) };
     this.allowed = allowed;
     this.nearest = nearestAllowed(allowed, contract.volume.shape.slice(1));
+    this.support = new Support(this.volume, allowed);
     this.rest = behavior.agent_from_bone_rest.map(rowFromMatrix);
   }
 
@@ -36,7 +52,8 @@ export class Senses {
   boneless(observation, mean) {
     const past = Float32Array.from(observation.past);
     const length = 3 + mean.length;
-    for (let at = 0; at < past.length; at += length) past.set(mean.slice(ROOT_CHANNELS), at + 3 + ROOT_CHANNELS);
+    for (let at = 0; at < past.length; at += length)
+      past.set(mean.slice(ROOT_CHANNELS), at + 3 + ROOT_CHANNELS);
     return { ...observation, past };
   }
 
@@ -46,7 +63,8 @@ export class Senses {
     if (this.ego === 'full') return root;
     const head = rotate(turn(root), [0, 0, 1]);
     let forward = head;
-    if (Math.hypot(head[0], head[2]) < UPRIGHT) forward = rotate(turn(root), [0, 1, 0]).map((value) => -Math.sign(head[1]) * value);
+    if (Math.hypot(head[0], head[2]) < UPRIGHT)
+      forward = rotate(turn(root), [0, 1, 0]).map((value) => -Math.sign(head[1]) * value);
     const yaw = Math.atan2(forward[0], forward[2]);
     return [...place(root), Math.cos(yaw / 2), 0, Math.sin(yaw / 2), 0];
   }
@@ -54,34 +72,55 @@ export class Senses {
   // Nearest voxels on the ego grid; zero outside the volume.
   around(frame) {
     const [nx, ny, nz] = this.grid.shape;
-    const { shape: [channels, vx, vy, vz], origin, voxel_m: voxel, values } = this.volume;
+    const {
+      shape: [channels, vx, vy, vz],
+      origin,
+      voxel_m: voxel,
+      values,
+    } = this.volume;
     const m = matrixFromTurn(turn(frame)).map((value) => value * (this.grid.cell_m / voxel));
     const base = [0, 1, 2].map((axis) => (frame[axis] - origin[axis]) / voxel);
     const out = new Float32Array(channels * nx * ny * nz);
     let cell = 0;
-    for (let i = 0; i < nx; i++) for (let j = 0; j < ny; j++) for (let k = 0; k < nz; k++, cell++) {
-      const [x, y, z] = [i + 0.5 - nx / 2, j + 0.5 - ny / 2, k + 0.5 - nz / 2];
-      const a = Math.floor(base[0] + m[0] * x + m[1] * y + m[2] * z);
-      const b = Math.floor(base[1] + m[3] * x + m[4] * y + m[5] * z);
-      const c = Math.floor(base[2] + m[6] * x + m[7] * y + m[8] * z);
-      if (a < 0 || b < 0 || c < 0 || a >= vx || b >= vy || c >= vz) continue;
-      const at = (a * vy + b) * vz + c;
-      for (let channel = 0; channel < channels; channel++) out[channel * nx * ny * nz + cell] = values[channel * vx * vy * vz + at];
-    }
+    for (let i = 0; i < nx; i++)
+      for (let j = 0; j < ny; j++)
+        for (let k = 0; k < nz; k++, cell++) {
+          const [x, y, z] = [i + 0.5 - nx / 2, j + 0.5 - ny / 2, k + 0.5 - nz / 2];
+          const a = Math.floor(base[0] + m[0] * x + m[1] * y + m[2] * z);
+          const b = Math.floor(base[1] + m[3] * x + m[4] * y + m[5] * z);
+          const c = Math.floor(base[2] + m[6] * x + m[7] * y + m[8] * z);
+          if (a < 0 || b < 0 || c < 0 || a >= vx || b >= vy || c >= vz) continue;
+          const at = (a * vy + b) * vz + c;
+          for (let channel = 0; channel < channels; channel++)
+            out[channel * nx * ny * nz + cell] = values[channel * vx * vy * vz + at];
+        }
     return out;
   }
 
   // Whether the root may be at a point of the world; nowhere outside the volume.
   allows(point) {
-    const { shape: [, vx, vy, vz], origin, voxel_m: voxel } = this.volume;
+    const {
+      shape: [, vx, vy, vz],
+      origin,
+      voxel_m: voxel,
+    } = this.volume;
     const [a, b, c] = [0, 1, 2].map((axis) => Math.floor((point[axis] - origin[axis]) / voxel));
-    return a >= 0 && b >= 0 && c >= 0 && a < vx && b < vy && c < vz && this.allowed[(a * vy + b) * vz + c] > 0;
+    return (
+      a >= 0 && b >= 0 && c >= 0 && a < vx && b < vy && c < vz && this.allowed[(a * vy + b) * vz + c] > 0
+    );
   }
 
-  // A point of the world, moved to the nearest voxel where the root may be; the point itself where it may be there, or nowhere.
+  // A point of the world, moved to the nearest voxel where the root may be; the point itself where it may be
+  // there, or nowhere.
   cleared(point) {
-    const { shape: [, vx, vy, vz], origin, voxel_m: voxel } = this.volume;
-    const clamped = [vx, vy, vz].map((count, axis) => Math.min(count - 1, Math.max(0, Math.floor((point[axis] - origin[axis]) / voxel))));
+    const {
+      shape: [, vx, vy, vz],
+      origin,
+      voxel_m: voxel,
+    } = this.volume;
+    const clamped = [vx, vy, vz].map((count, axis) =>
+      Math.min(count - 1, Math.max(0, Math.floor((point[axis] - origin[axis]) / voxel))),
+    );
     const target = this.nearest[(clamped[0] * vy + clamped[1]) * vz + clamped[2]];
     if (target < 0 || this.allows(point)) return point;
     return [Math.floor(target / (vy * vz)), Math.floor(target / vz) % vy, target % vz].map((index, axis) => {
@@ -90,43 +129,17 @@ export class Senses {
     });
   }
 
-  // The height, nearest to a point's, at which what carries the animal bears its root; the point's own where nothing is
-  // known to. Counterpart of pipeline/models/support.py.
-  carried(point, moves) {
-    const { shape: [, vx, vy, vz], origin, voxel_m: voxel, support } = this.volume;
-    const [a, c] = [0, 2].map((axis) => Math.floor((point[axis] - origin[axis]) / voxel));
-    if (!support || a < 0 || c < 0 || a >= vx || c >= vz) return point[1];
-    const [low, high] = support.range_m[moves ? 1 : 0];
-    let nearest = Infinity;
-    for (let b = 0; b < vy; b++) {
-      if (this.allowed[(a * vy + b) * vz + c] !== support.mark) continue;
-      const top = origin[1] + b * voxel;
-      const height = Math.min(top + high, Math.max(top + low, point[1]));
-      if (Math.abs(height - point[1]) < Math.abs(nearest - point[1])) nearest = height;
-    }
-    return Number.isFinite(nearest) ? nearest : point[1];
-  }
-
-  // A path of the world, which begins a frame after `start`, on what carries the animal; steps become jumps.
-  trodden(path, start, fastest) {
-    const { support } = this.volume;
-    if (!support) return path;
-    const heights = path.map((place, i) => {
-      const before = i ? path[i - 1] : start;
-      return this.carried(place, Math.hypot(place[0] - before[0], place[2] - before[2]) > fastest);
-    });
-    const reach = (support.flight.length - 1) / 2;
-    const padded = [...Array(reach).fill(start[1]), ...heights, ...Array(reach).fill(heights.at(-1))];
-    const flown = heights.map((_, i) => support.flight.reduce((sum, share, k) => sum + share * padded[i + k], 0));
-    return path.map(([x, , z], i) => [x, Math.max(heights[i], flown[i]), z]);
-  }
-
   pastChannels(egoFromWorld, rows) {
     const root = compose(egoFromWorld, Array.from(rows.slice(0, ROW)));
     const channels = [...place(root), ...sixFromTurn(turn(root))];
     this.rest.forEach((rest, bone) => {
       const row = Array.from(rows.slice((bone + 1) * ROW, (bone + 2) * ROW));
-      channels.push(...vectorFromTurn(multiply(turn(row), conjugate(turn(rest)))), row[0] - rest[0], row[1] - rest[1], row[2] - rest[2]);
+      channels.push(
+        ...vectorFromTurn(multiply(turn(row), conjugate(turn(rest)))),
+        row[0] - rest[0],
+        row[1] - rest[1],
+        row[2] - rest[2],
+      );
     });
     return channels;
   }
@@ -145,7 +158,12 @@ export class Senses {
 }
 
 function rowFromMatrix(m) {
-  return [m[0][3], m[1][3], m[2][3], ...turnFromMatrix([...m[0].slice(0, 3), ...m[1].slice(0, 3), ...m[2].slice(0, 3)])];
+  return [
+    m[0][3],
+    m[1][3],
+    m[2][3],
+    ...turnFromMatrix([...m[0].slice(0, 3), ...m[1].slice(0, 3), ...m[2].slice(0, 3)]),
+  ];
 }
 
 // First two columns of the rotation.
@@ -176,7 +194,9 @@ function vectorFromTurn([w, x, y, z]) {
 function halfTable(bytes) {
   const halves = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 2);
   return Float32Array.from(halves, (half) => {
-    const sign = half & 0x8000 ? -1 : 1, exponent = (half >> 10) & 31, fraction = half & 1023;
+    const sign = half & 0x8000 ? -1 : 1,
+      exponent = (half >> 10) & 31,
+      fraction = half & 1023;
     if (exponent === 0) return sign * fraction * 2 ** -24;
     return exponent === 31 ? 0 : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
   });

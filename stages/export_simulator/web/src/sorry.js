@@ -4,5 +4,11 @@ export function sorry(text, remedy) {
   document.getElementById('splash').classList.remove('gone');
   const card = document.querySelector('#splash .card');
   card.classList.add('sorry');
-  card.replaceChildren(...[['h1', 'Not here, sadly'], ['p', text], ['p', remedy]].map(([tag, content]) => Object.assign(document.createElement(tag), { textContent: content })));
+  card.replaceChildren(
+    ...[
+      ['h1', 'Not here, sadly'],
+      ['p', text],
+      ['p', remedy],
+    ].map(([tag, content]) => Object.assign(document.createElement(tag), { textContent: content })),
+  );
 }

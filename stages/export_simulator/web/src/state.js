@@ -1,32 +1,65 @@
 // The settings of the page, mirrored in the address after '#', so that a behaviour can be linked.
 
-const DEFAULTS = {
-  interactivity: 1, scene: 1, observer: 1, past: 1, goal: 1,
-  samples: 4, steps: 10, seed: 0, replay: '', speed: 1,
-  aim: '', route: '', at: '', view: 'room', goals: 1, path: 1,
-};
-
 export const SPEEDS = [1, 0.3]; // seconds of the animal's life a second
 export const VIEWS = ['room', 'animal', 'you'];
+const LARGEST_SEED = 999999;
+const SWITCHES = ['scene', 'observer', 'past', 'goal', 'goals', 'path', 'outline'];
 
-export function readState() {
-  const state = { ...DEFAULTS };
-  for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
-    if (!(key in DEFAULTS)) continue;
-    if (typeof DEFAULTS[key] === 'string') state[key] = value;
-    else if (Number.isFinite(Number(value))) state[key] = Number(value);
-  }
-  state.interactivity = Math.min(1, Math.max(0, state.interactivity));
-  state.samples = [1, 4, 16].includes(state.samples) ? state.samples : DEFAULTS.samples;
-  state.steps = [10, 50].includes(state.steps) ? state.steps : DEFAULTS.steps;
-  state.speed = SPEEDS.includes(state.speed) ? state.speed : DEFAULTS.speed;
-  state.view = VIEWS.includes(state.view) ? state.view : DEFAULTS.view;
-  state.seed = Math.min(999999, Math.max(0, Math.round(state.seed)));
-  return state;
+// Every setting with its default; those of the behaviour model come with the contract.
+export function defaults({ controls: { interactivity, samples, steps } }) {
+  return {
+    interactivity: interactivity.default,
+    scene: 1,
+    observer: 1,
+    past: 1,
+    goal: 1,
+    samples: samples.default,
+    steps: steps.default,
+    seed: 0,
+    replay: '',
+    speed: 1,
+    aim: '',
+    route: '',
+    at: '',
+    view: 'room',
+    goals: 1,
+    path: 1,
+    outline: 0,
+  };
 }
 
-export function writeState(state) {
-  const changed = Object.entries(state).filter(([key, value]) => key in DEFAULTS && value !== DEFAULTS[key]);
+// The settings of an address, and what of it was ignored: {state, ignored: ['key=value', ...]}.
+export function readState(contract, clips, hash = location.hash) {
+  const state = defaults(contract);
+  const { interactivity, samples, steps } = contract.controls;
+  const number = (least, most) => (text) =>
+    text !== '' && Number(text) >= least && Number(text) <= most ? Number(text) : null;
+  const among = (values) => (text) => values.find((value) => String(value) === text) ?? null;
+  const read = {
+    interactivity: number(interactivity.least, interactivity.most),
+    samples: among(samples.choices),
+    steps: among(steps.choices),
+    seed: (text) => (/^\d+$/.test(text) ? number(0, LARGEST_SEED)(text) : null),
+    speed: among(SPEEDS),
+    view: among(VIEWS),
+    replay: (text) => (clips.some((clip) => clip.name === text) ? text : null),
+    aim: (text) => (readPlaces(text).length ? text : null),
+    route: (text) => (readPlaces(text).length ? text : null),
+    at: (text) => (readPoint(text) ? text : null),
+    ...Object.fromEntries(SWITCHES.map((key) => [key, among([0, 1])])),
+  };
+  const ignored = [];
+  for (const [key, text] of new URLSearchParams(hash.slice(1))) {
+    const value = read[key]?.(text) ?? null;
+    if (value === null) ignored.push(`${key}=${text}`);
+    else state[key] = value;
+  }
+  return { state, ignored };
+}
+
+export function writeState(state, contract) {
+  const usual = defaults(contract);
+  const changed = Object.entries(state).filter(([key, value]) => key in usual && value !== usual[key]);
   const hash = new URLSearchParams(changed.map(([key, value]) => [key, String(value)])).toString();
   history.replaceState(null, '', hash ? `#${hash}` : location.pathname + location.search);
 }
@@ -37,8 +70,8 @@ export function readPlaces(text) {
   return points.every(Boolean) ? points : [];
 }
 
-// 'x,z' in metres to two numbers, or null.
+// 'x,z' in metres, or 'x,z,up' for what is above the floor, to numbers; or null.
 export function readPoint(text) {
   const point = text.split(',').map(Number);
-  return text && point.length === 2 && point.every(Number.isFinite) ? point : null;
+  return text && (point.length === 2 || point.length === 3) && point.every(Number.isFinite) ? point : null;
 }

@@ -6,16 +6,17 @@ import { rotate } from './rigid.js';
 const ARRIVED_M = 0.25;
 
 export class Stops {
-  // points: [[x, z], ...] on the floor, metres; from: the root's row where the journey begins.
-  constructor(points = [], from = null) {
-    Object.assign(this, { points, from, reached: 0, nearest: new Map() });
+  // points: [[x, z], ...] on the floor, or [x, z, up] above it, metres; from: the root's row where the
+  // journey begins; rootAt: a point to the height of the root there.
+  constructor(points = [], from = null, rootAt = null) {
+    Object.assign(this, { points, from, rootAt, reached: 0, nearest: new Map() });
   }
 
   get left() {
     return this.points.slice(this.reached);
   }
 
-  // Where to go now, [x, z], or null.
+  // Where to go now, [x, z] or [x, z, up], or null.
   get next() {
     return this.points[this.reached] ?? null;
   }
@@ -38,13 +39,22 @@ export class Stops {
     return Boolean(near);
   }
 
+  // A goal as the file has it: on the floor without a height, on furniture with the root's.
+  position(point) {
+    return point[2] ? [point[0], this.rootAt(point), point[1]] : point.slice(0, 2);
+  }
+
   // The whole journey, with where it begins: metres, world frame; 0 degrees looks along +z, 90 along +x.
   get toml() {
     const [x, y, z, ...turn] = this.from;
     const nose = rotate(turn, [0, 0, 1]);
     const heading = (Math.atan2(nose[0], nose[2]) * 180) / Math.PI;
-    const begin = `# where it stood\n[[subgoal]]\nposition = [${[x, y, z].map(metres).join(', ')}]\nheading_deg = ${heading.toFixed(1)}\n`;
-    const stops = this.points.map((point) => `[[subgoal]]\nposition = [${point.map(metres).join(', ')}]\n`);
+    const begin =
+      `# where it stood\n[[subgoal]]\nposition = [${[x, y, z].map(metres).join(', ')}]\n` +
+      `heading_deg = ${heading.toFixed(1)}\n`;
+    const stops = this.points.map(
+      (point) => `[[subgoal]]\nposition = [${this.position(point).map(metres).join(', ')}]\n`,
+    );
     return new Blob([[begin, ...stops].join('\n')], { type: 'application/toml' });
   }
 }

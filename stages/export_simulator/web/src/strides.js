@@ -1,5 +1,5 @@
-// Goals and paths as the numbers that are diffused. Counterpart of pipeline/models/strides.py, whose powers and breath
-// come with the contract: {numbers, root_power, goal_power, breath, faint_m2}.
+// Goals and paths as the numbers that are diffused. Counterpart of pipeline/behavior/strides.py, whose powers
+// and breath come with the contract: {numbers, root_power, goal_power, breath, faint_m2}.
 
 // The same direction, the length raised to a power.
 function powered(way, power, faint) {
@@ -8,42 +8,55 @@ function powered(way, power, faint) {
 }
 
 // Goals in metres as they are diffused, and back.
-export const scaledGoal = (goal, deviation, told) => powered(goal, told.goal_power, told.faint_m2).map((value, axis) => value / deviation[axis]);
-export const goalFrom = (scaled, deviation, told) => (
-  powered(Array.from(scaled, (value, axis) => value * deviation[axis]), 1 / told.goal_power, told.faint_m2)
-);
+export const scaledGoal = (goal, deviation, encoding) =>
+  powered(goal, encoding.goal_power, encoding.faint_m2).map((value, axis) => value / deviation[axis]);
+export const goalFrom = (scaled, deviation, encoding) =>
+  powered(
+    Array.from(scaled, (value, axis) => value * deviation[axis]),
+    1 / encoding.goal_power,
+    encoding.faint_m2,
+  );
 
 // The places that scaled strides [numbers, frames] lead to, one after another, from `start` on.
-export function pathFrom(scaled, frames, deviation, start, rate, told) {
+export function pathFrom(scaled, frames, deviation, start, rate, encoding) {
   let place = start;
   return Array.from({ length: frames }, (_, i) => {
     const spread = deviation[i] ?? deviation[0]; // of each frame on its own, or of all alike
-    const stays = scaled[3 * frames + i] > 0 ? 1 : told.breath;
+    const stays = scaled[3 * frames + i] > 0 ? 1 : encoding.breath;
     const root = [0, 1, 2].map((axis) => scaled[axis * frames + i] * spread[axis] * stays);
-    place = powered(root, 1 / told.root_power, told.faint_m2).map((value, axis) => place[axis] + value / rate);
+    place = powered(root, 1 / encoding.root_power, encoding.faint_m2).map(
+      (value, axis) => place[axis] + value / rate,
+    );
     return place;
   });
 }
 
 // Scaled strides [numbers, frames] that lead along another path, as far as they move.
-export function bent(scaled, frames, deviation, start, path, rate, told) {
+export function stridesAlong(scaled, frames, deviation, start, path, rate, encoding) {
   const out = Float32Array.from(scaled);
   path.forEach((place, i) => {
     const [spread, before] = [deviation[i] ?? deviation[0], i ? path[i - 1] : start];
-    const root = powered(place.map((value, axis) => (value - before[axis]) * rate), told.root_power, told.faint_m2);
-    const stays = scaled[3 * frames + i] > 0 ? 1 : told.breath;
+    const root = powered(
+      place.map((value, axis) => (value - before[axis]) * rate),
+      encoding.root_power,
+      encoding.faint_m2,
+    );
+    const stays = scaled[3 * frames + i] > 0 ? 1 : encoding.breath;
     for (const axis of [0, 1, 2]) out[axis * frames + i] = root[axis] / stays / spread[axis];
   });
   return out;
 }
 
-// Bend a path so that it ends at its goal (pull 1), where it likes (0), or between; no stride by more than its length.
-export function led(path, start, goal, pull) {
+// Bend a path so that it ends at its goal (pull 1), where it likes (0), or between; no stride by more than
+// its length.
+export function snappedToGoal(path, start, goal, pull) {
   let way = 0;
   const gone = path.map((place, i) => (way += distance(place, i ? path[i - 1] : start)));
   const missing = goal.map((value, axis) => value - path.at(-1)[axis]);
   const longest = Math.max(Math.hypot(...missing), way, Number.EPSILON);
-  return path.map((place, i) => place.map((value, axis) => value + (missing[axis] * pull * gone[i]) / longest));
+  return path.map((place, i) =>
+    place.map((value, axis) => value + (missing[axis] * pull * gone[i]) / longest),
+  );
 }
 
 export const distance = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);

@@ -1,4 +1,4 @@
-// Words beside what is drawn, so that nothing is told by colour alone.
+// Words beside what is drawn, so that nothing depends on colour alone.
 
 export class Tags {
   constructor(camera) {
@@ -8,7 +8,10 @@ export class Tags {
 
   label(name) {
     if (this.labels[name]) return this.labels[name];
-    this.labels[name] = Object.assign(document.createElement('span'), { className: `tag ${name}`, hidden: true });
+    this.labels[name] = Object.assign(document.createElement('span'), {
+      className: `tag ${name}`,
+      hidden: true,
+    });
     document.body.append(this.labels[name]);
     return this.labels[name];
   }
@@ -22,6 +25,7 @@ export class Tags {
     if (label.textContent !== text) label.textContent = text;
     point.project(this.camera);
     label.hidden = point.z > 1 || Math.abs(point.x) > 1.1 || Math.abs(point.y) > 1.1;
-    label.style.transform = `translate(-50%, -100%) translate(${(((point.x + 1) / 2) * innerWidth).toFixed(1)}px, ${(((1 - point.y) / 2) * innerHeight).toFixed(1)}px)`;
+    const [x, y] = [((point.x + 1) / 2) * innerWidth, ((1 - point.y) / 2) * innerHeight];
+    label.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
   }
 }

@@ -1,5 +1,5 @@
-// The animal's motion as one line in time: what was shown, the plan being followed, and the cross-fade into the next.
-// Ticks are 10 Hz frames; a frame holds the root's row and then one row per bone.
+// The animal's motion as one line in time: what was shown, the plan being followed, and the cross-fade into
+// the next. Ticks are 10 Hz frames; a frame holds the root's row and then one row per bone.
 
 import { ROW, blend } from './rigid.js';
 

@@ -15,9 +15,17 @@ const answers = {
     const networks = {};
     const names = Object.keys(models);
     for (const [i, name] of names.entries()) {
-      const session = await ort.InferenceSession.create(models[name], { executionProviders: ['wasm'], graphOptimizationLevel: 'all' });
+      const session = await ort.InferenceSession.create(models[name], {
+        executionProviders: ['wasm'],
+        graphOptimizationLevel: 'all',
+      });
       networks[name] = async (feeds) => {
-        const tensors = Object.fromEntries(Object.entries(feeds).map(([key, [values, shape]]) => [key, new ort.Tensor('float32', values, shape)]));
+        const tensors = Object.fromEntries(
+          Object.entries(feeds).map(([key, [values, shape]]) => [
+            key,
+            new ort.Tensor('float32', values, shape),
+          ]),
+        );
         return (await session.run(tensors))[session.outputNames[0]].data;
       };
       report((i + 1) / names.length);

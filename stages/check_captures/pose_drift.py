@@ -1,0 +1,42 @@
+"""How far device poses drift: depth of frames that see the same place long after each other, compared."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.geometry import rigid
+from pipeline.recordings.conventions import DepthPicture, compare
+from stages.check_captures.sampling import SampledFrame
+
+LATER_S = 5.0
+MIN_OVERLAP = 0.3
+MOST_PAIRS = 60
+
+
+def drift_m(shots: Sequence[SampledFrame]) -> float:
+    """Return the median disagreement of depth between frames at least 5 s apart, metres.
+
+    NaN where none overlap.
+    """
+    if len(shots) < 2 or shots[0].odometry_from_camera is None:
+        return np.nan
+    pairs = [
+        (first, second)
+        for i, first in enumerate(shots)
+        for second in shots[i + 1 :]
+        if second.timestamp_s - first.timestamp_s >= LATER_S and _looks_alike(first, second)
+    ]
+    found = []
+    for first, second in pairs[:: max(1, len(pairs) // MOST_PAIRS)]:
+        second_from_first = rigid.inverse(second.odometry_from_camera) @ first.odometry_from_camera
+        views = (DepthPicture(shot.depth, shot.depth_intrinsics) for shot in (first, second))
+        residual_m, overlap, _ = compare(*views, second_from_first)
+        if overlap > MIN_OVERLAP:
+            found.append(residual_m)
+    return float(np.median(found)) if found else np.nan
+
+
+def _looks_alike(first: SampledFrame, second: SampledFrame) -> bool:
+    """Tell whether two cameras look into about the same direction from about the same place."""
+    relative = rigid.inverse(first.odometry_from_camera) @ second.odometry_from_camera
+    return relative[2, 2] > 0.8 and float(np.linalg.norm(relative[:3, 3])) < 1.5

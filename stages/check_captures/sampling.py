@@ -1,0 +1,168 @@
+"""Sample a recording: a few dozen upright frames spread over it, and what can be measured without any
+map.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.recordings import extraction
+from pipeline.recordings.extraction import ExtractionPlan
+from pipeline.recordings.recording import Recording, damaged
+
+DEPTH_SIDE_PX = 192
+"""longer side of the sampled depth"""
+BLURRED_SHARE = 0.4
+"""share of the recording's median sharpness below which a picture is blurred"""
+BLURRED = 4.0
+"""sharpness below which a picture is blurred whatever the others are like"""
+
+
+@dataclass(frozen=True)
+class SampledFrame:
+    """One sampled frame, upright."""
+
+    timestamp_s: float
+    gray: UInt8[np.ndarray, "height width"]
+    intrinsics: Float[np.ndarray, "3 3"]
+    depth: Float[np.ndarray, "height width"]
+    """metres, 0 = unknown"""
+    depth_intrinsics: Float[np.ndarray, "3 3"]
+    odometry_from_camera: Float[np.ndarray, "4 4"] | None
+    sharpness: float
+    brightness: float
+    beyond: float
+    """share of the depth that is known but beyond the sensor's range"""
+
+
+@dataclass(frozen=True)
+class RecordingSample:
+    """A sample of a recording."""
+
+    recording: Recording
+    plan: ExtractionPlan | None
+    """None for a recording without depth"""
+    shots: Sequence[SampledFrame]
+    damaged: float
+    """share of the sample (0..1) that cannot be decoded"""
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first to the last frame."""
+        return float(self.recording.timestamp_s[-1] - self.recording.timestamp_s[0])
+
+    @property
+    def rate_hz(self) -> float:
+        """Typical frames per second."""
+        steps = np.diff(self.recording.timestamp_s)
+        return float(1 / np.median(steps)) if len(steps) else 0.0
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Longest time between two recorded frames."""
+        return float(np.diff(self.recording.timestamp_s).max(initial=0.0))
+
+    @property
+    def dark(self) -> float:
+        """Share of dark pictures, 0..1."""
+        return float(np.mean([shot.brightness < extraction.DARK for shot in self.shots]))
+
+    @property
+    def blurred(self) -> float:
+        """Share of blurred pictures, 0..1: for their recording, or for any."""
+        sharpness = np.array([shot.sharpness for shot in self.shots])
+        return float((sharpness < max(BLURRED_SHARE * float(np.median(sharpness)), BLURRED)).mean())
+
+    @property
+    def depth_valid(self) -> float:
+        """Share of known depth, 0..1; 0 without depth."""
+        return float(np.mean([(shot.depth > 0).mean() if shot.depth.size else 0.0 for shot in self.shots]))
+
+    @property
+    def depth_m(self) -> float:
+        """Typical depth, metres; NaN where none is known."""
+        known = np.concatenate([shot.depth[shot.depth > 0] for shot in self.shots] or [np.zeros(0)])
+        return float(np.median(known)) if len(known) else np.nan
+
+    @property
+    def beyond(self) -> float:
+        """Share of depth beyond the sensor's range, 0..1."""
+        return float(np.mean([shot.beyond for shot in self.shots]))
+
+
+def sample(recording: Recording, count: int, *, max_depth_m: float) -> RecordingSample:
+    """Read about ``count`` frames spread over a recording; `InputError` where it cannot be used at all."""
+    if recording.depth_size is None:
+        return _look_at_pictures(recording, count)
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=640)
+    rows = np.unique(np.linspace(0, len(plan.chosen) - 1, count).round().astype(int))
+    odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[rows]
+    sample = replace(
+        plan,
+        chosen=plan.chosen[rows],
+        timestamp_s=plan.timestamp_s[rows],
+        intrinsics=plan.intrinsics[rows],
+        depth_intrinsics=plan.depth_intrinsics[rows],
+        odometry_from_camera=odometry,
+    )
+    shots = []
+    for position, frame in enumerate(
+        extraction.frames(recording, sample, max_depth_m=max_depth_m, jpeg_quality=50)
+    ):
+        if frame is not None:
+            raw = recording.read_depth(int(recording.index[sample.chosen[position]]))
+            beyond = float((np.isfinite(raw) & (raw >= max_depth_m)).mean())
+            shots.append(_shot(sample, position, frame, beyond))
+    _refuse_empty(recording, shots)
+    return RecordingSample(recording, plan, shots, 1 - len(shots) / len(rows))
+
+
+def _shot(plan: ExtractionPlan, row: int, frame: extraction.ExtractedFrame, beyond: float) -> SampledFrame:
+    step = max(1, max(frame.depth.shape) // DEPTH_SIDE_PX)
+    depth = frame.depth[step // 2 :: step, step // 2 :: step]
+    intrinsics = plan.depth_intrinsics[row].copy()
+    intrinsics[:2, 2] -= step // 2 + 0.5
+    intrinsics[:2] /= step
+    intrinsics[:2, 2] += 0.5
+    return SampledFrame(
+        timestamp_s=float(plan.timestamp_s[row]),
+        gray=cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY),
+        intrinsics=plan.intrinsics[row],
+        depth=depth,
+        depth_intrinsics=intrinsics,
+        odometry_from_camera=None if plan.odometry_from_camera is None else plan.odometry_from_camera[row],
+        sharpness=frame.sharpness,
+        brightness=frame.brightness,
+        beyond=beyond,
+    )
+
+
+def _look_at_pictures(recording: Recording, count: int) -> RecordingSample:
+    rows = np.unique(np.linspace(0, len(recording.index) - 1, count).round().astype(int))
+    nothing, shots = np.zeros((0, 0), np.float32), []
+    for row in rows:
+        color = recording.read_color(int(recording.index[row]))
+        if color is not None:
+            gray, statistics = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), extraction.picture_statistics(color)
+            shots.append(
+                SampledFrame(
+                    float(recording.timestamp_s[row]),
+                    gray,
+                    np.eye(3),
+                    nothing,
+                    np.eye(3),
+                    None,
+                    *statistics,
+                    0.0,
+                )
+            )
+    _refuse_empty(recording, shots)
+    return RecordingSample(recording, None, shots, 1 - len(shots) / len(rows))
+
+
+def _refuse_empty(recording: Recording, shots: Sequence[SampledFrame]) -> None:
+    if not shots:
+        raise damaged(recording.where, "none of the sampled pictures can be decoded")

@@ -1,0 +1,220 @@
+"""Ask every subject for its metrics, one after the other."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import BehaviorData
+from pipeline.core import devices, progress
+from pipeline.core.videos import Video
+from pipeline.data import flow, plots
+from pipeline.data.clips import Masks
+from pipeline.data.poses import RegisteredPoses
+from pipeline.data.templates import SceneCameras
+from pipeline.localization import localizer as localizers
+from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.pose_errors import PoseErrors, joined, pose_errors
+from pipeline.rivals.predictors import Ats
+from stages.evaluate import (
+    behavior,
+    clicked,
+    heldout,
+    localizing,
+    perception,
+    physical,
+    reading,
+    real_phone,
+    reconstruction,
+    registration,
+    speed,
+)
+from stages.evaluate.config import Config
+from stages.evaluate.reading import BuildFolders, RecordingWithTruth, TruthAlignment
+from stages.evaluate.reliability import reliability_metrics
+from stages.evaluate.truth import read_flow
+
+MAP_FRAMES = 60
+"""Walk-through frames that the localizer's rivals may use: one in eight of a minute."""
+NO_TRUTH = "the true poses of this capture are not known"
+NEED_TRUTH = (
+    *clicked.NAMES, "localizer/rotation_deg_median", "localizer/translation_m_median", "masks/iou_mean",
+    "masks/iou_resting", "flow/epe_px_mean",
+)  # fmt: skip
+
+
+def evaluate(
+    folders: BuildFolders, videos: Sequence[Video], config: Config, device: devices.Device
+) -> Metrics:
+    """Return all metrics of a build."""
+    metrics, rng = Metrics(), np.random.default_rng(config.seed)
+    if folders.truth is None:
+        sessions = [video for video in videos if video.role == "session"]
+        placed = sum((folders.registration / video.id / "poses.npz").exists() for video in sessions)
+        metrics.put("registration/videos_registered", placed)
+        metrics.put("registration/videos_total", len(sessions))
+        metrics.skip(NEED_TRUTH + reconstruction.NAMES, NO_TRUTH)
+        metrics.add(_against_clicks(folders, tuple(videos), config, device))
+    else:
+        metrics.add(_against_truth(folders, videos, config, rng, device))
+    progress.log("evaluate: behaviour")
+    data = BehaviorData.load(folders.behavior_data)
+    ours = _predictor(folders, data, device)
+    metrics.add(behavior.behavior_metrics(data, ours, config))
+    progress.log("evaluate: penetration and foot slide")
+    metrics.add(physical.physical_metrics(data, ours, folders.reconstruction, seed=config.seed))
+    metrics.add(
+        speed.plan_metrics(data, _predictor(folders, data, "cpu"), config.seed, measure=config.time_plans)
+    )
+    return metrics
+
+
+def _against_clicks(
+    folders: BuildFolders, videos: tuple[Video, ...], config: Config, device: devices.Device
+) -> Metrics:
+    """Measure a real capture: registration by clicks, held-out views by the phone itself, placed by clicks or
+    registration.
+    """
+    metrics, cameras = Metrics(), {}
+    if folders.clicks is None:
+        metrics.skip(clicked.NAMES + clicked.OWN_NAMES, clicked.NO_CLICKS)
+    else:
+        progress.log("evaluate: clicks")
+        cameras = clicked.cameras_from_clicks(folders.clicks, folders, videos)
+        metrics.add(clicked.clicked_metrics(cameras, folders, videos))
+    seen, sources = [], []
+    for video in (video for video in videos if video.role == "heldout" and video.synchronized_with):
+        placed = real_phone.cameras_of(folders, video, cameras.get(video.id))
+        sources.append(placed[1] if placed else real_phone.UNPLACED)
+        seen.append(
+            (
+                video.synchronized_with,
+                real_phone.shots(folders, video, placed[0], config.heldout_frames) if placed else [],
+            )
+        )
+    if sources:
+        progress.log("evaluate: held-out phone")
+        metrics.add(reconstruction.held_out_metrics(folders, seen, device, config.lpips_weights))
+        nowhere = all(where == real_phone.UNPLACED for where in sources)
+        metrics.skip(
+            *(
+                (heldout.NAMES, real_phone.UNPLACED)
+                if nowhere
+                else (real_phone.PARTS_WITHOUT_MASKS, real_phone.NO_MASKS)
+            )
+        )
+        metrics.skip(["reconstruction/heldout_cameras"], f"from {'; '.join(sources)}")
+    return metrics
+
+
+def _against_truth(
+    folders: BuildFolders, videos: Sequence, config: Config, rng: np.random.Generator, device: devices.Device
+) -> Metrics:
+    metrics, known = Metrics(), reading.recorded(folders, tuple(videos))
+    role = {
+        name: [each for each in known if each.video.role == name]
+        for name in ("walkthrough", "turnaround", "session", "heldout")
+    }
+    walkthrough, turnaround = role["walkthrough"][0], role["turnaround"][0]
+    frames = reading.frames_of_truth(folders, walkthrough, turnaround)
+    sessions = role["session"]
+    for label, part in (
+        ("registration", lambda: _registration(folders, sessions, frames)),
+        ("single frames", lambda: _single_frames(folders, walkthrough, sessions, frames, config)),
+        ("masks and flow", lambda: _perception(folders, sessions, turnaround)),
+        ("reconstruction", lambda: reconstruction.reconstruction_metrics(
+            folders, known, frames, config, rng, device)),
+    ):  # fmt: skip
+        progress.log(f"evaluate: {label}")
+        metrics.add(part())
+    return metrics
+
+
+def _registration(
+    folders: BuildFolders, sessions: Sequence[RecordingWithTruth], frames: TruthAlignment
+) -> Metrics:
+    cameras, roots, confidence, root_confidence, registered = {}, [], {}, [], 0
+    for each in sessions:
+        poses = RegisteredPoses.open(folders.registration / each.video.id)
+        registered += poses is not None
+        ours = poses or RegisteredPoses.unknown(each.clip.timestamp_s)
+        cameras[each.video.id] = pose_errors(ours.world_from_camera, frames.cameras(each.truth))
+        confidence[each.video.id] = ours.confidence
+        root = pose_errors(ours.world_from_agent, frames.roots(each.truth))
+        roots.append(root[each.truth.agent_visible])
+        root_confidence.append(np.nan_to_num(ours.agent_confidence)[each.truth.agent_visible])
+    metrics = registration.camera_metrics(cameras, confidence, registered)
+    metrics.add(registration.root_metrics("registration", roots))
+    right = registration.is_right(joined(roots), registration.GOOD_ROOT)
+    certain = np.concatenate(root_confidence) if root_confidence else np.zeros(0)
+    metrics.add(reliability_metrics("registration/agent", certain, right))
+    return metrics
+
+
+def _single_frames(
+    folders: BuildFolders,
+    walkthrough: RecordingWithTruth,
+    sessions: Sequence[RecordingWithTruth],
+    frames: TruthAlignment,
+    config: Config,
+) -> Metrics:
+    """Place single frames by our localizer and by its rivals."""
+    cameras = SceneCameras.open(folders.scene_template)
+    mapped = np.flatnonzero(cameras.registered)
+    mapped = mapped[plots.sample(len(mapped), MAP_FRAMES)]
+    ours = localizers.load(folders.scene_localizer)
+    sift = localizing.sift_map(walkthrough.clip, cameras.world_from_camera, mapped)
+    pictures = localizing.gallery(walkthrough.clip, cameras.world_from_camera, mapped)
+    errors: dict[str, list[PoseErrors]] = {
+        name: [] for name in ("localizer/", "localizer/sift_only_", "localizer/retrieval_only_")
+    }
+    probabilities = []
+    for each in sessions:
+        chosen = plots.sample(len(each.clip), config.localizer_frames).tolist()
+        masks = Masks.open(folders.masks[each.video.id])
+        hidden = [masks[frame] > 0 for frame in chosen]
+        answers, probability = localizing.placed_by_localizer(ours, each.clip, chosen, hidden)
+        probabilities.append(probability)
+        placed = {
+            "localizer/": answers,
+            "localizer/sift_only_": localizing.placed_by_sift(sift, each.clip, chosen),
+            "localizer/retrieval_only_": localizing.placed_by_retrieval(pictures, each.clip, chosen),
+        }
+        for name, found in placed.items():
+            errors[name].append(pose_errors(found, frames.cameras(each.truth)[chosen]))
+    metrics = Metrics()
+    for name, parts in errors.items():
+        metrics.add(localizing.metrics_of(name, joined(parts)))
+    right = registration.is_right(joined(errors["localizer/"]))
+    metrics.add(
+        reliability_metrics(
+            "localizer", np.concatenate(probabilities) if probabilities else np.zeros(0), right
+        )
+    )
+    return metrics
+
+
+def _perception(
+    folders: BuildFolders, sessions: Sequence[RecordingWithTruth], turnaround: RecordingWithTruth
+) -> Metrics:
+    seen = {
+        each.video.id: perception.overlaps(Masks.open(folders.masks[each.video.id]), each.truth)
+        for each in (*sessions, turnaround)
+    }
+    pairs = []
+    for each in sessions:
+        true = read_flow(folders.truth, each.name, each.source_index)
+        if true is not None:
+            forward = flow.open_flow(folders.flow[each.video.id], 1)
+            pairs += perception.flow_pairs(forward, true, each.truth.masks)
+    metrics = perception.mask_metrics([seen[each.video.id] for each in sessions], seen[turnaround.video.id])
+    metrics.add(perception.flow_metrics(pairs))
+    return metrics
+
+
+def _predictor(folders: BuildFolders, data: BehaviorData, device: devices.Device) -> Ats:
+    """Open the behaviour model as a predictor on its own windows."""
+    return Ats.load(
+        folders.behavior, Scenes.load(folders.behavior_data, data.videos), PlanSamplingConfig(), device=device
+    )

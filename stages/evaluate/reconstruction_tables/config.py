@@ -1,0 +1,13 @@
+"""Settings of the reconstruction tables."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Config:
+    """How much is measured."""
+
+    heldout_frames: int = 24
+    """Frames of each held-out phone that are rendered."""
+    seed: int = 0
+    """Of the resampling."""

@@ -1,0 +1,23 @@
+"""Settings of `stages.export`."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Format = Literal["glb", "splats", "usd", "bvh", "mjcf", "tables", "movement", "nwb", "nerfstudio", "colmap"]
+Influences = Literal["4", "8"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is written."""
+
+    format: Format = "glb"
+    """one of the formats above"""
+    rate_hz: float = 30.0
+    """keys of animations, per second"""
+    influences: Influences = "4"
+    """bones that move a vertex in glb and usd: four, which every player blends, or eight, with a smaller loss
+    """
+    pictures_per_video: int = 150
+    """frames of each recording for nerfstudio and colmap, evenly spread; only these two formats hold pictures
+    """

@@ -1,0 +1,75 @@
+"""The stage: one recording -> upright frames with metric depth, intrinsics and odometry, and the quality
+page.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.core import progress
+from pipeline.core.videos import Video
+from pipeline.recordings import extraction, formats
+from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan
+from pipeline.recordings.formats import open_recording
+from pipeline.recordings.recording import Recording
+from stages.extract_frames import photogrammetry, writing
+from stages.extract_frames.config import Config
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the stage reads."""
+
+    recording: Path
+    """File or folder as the recording app exported it."""
+    captures: Path | None = None
+    """Folder of all recordings, where a walk-through without depth looks for metric scale."""
+
+
+def run(
+    inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = (), video: Video | None = None
+) -> None:
+    """Extract one recording into `out`. Raises InputError CAP-001..022, MAP-004 for what cannot be used."""
+    recording = open_recording(inputs.recording)
+    if recording.depth_size is None and (video is None or video.role == "walkthrough"):
+        sources = _scale_sources(inputs.captures, video, videos)
+        with tempfile.TemporaryDirectory() as workspace:
+            mapped = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
+        plan, frames, summary = mapped.plan, mapped.frames, mapped.summary
+    else:
+        plan, frames, summary = _measured(recording, config)
+    progress.log(summary)
+    total = len(plan.chosen)
+    tracked = progress.track(frames, "frames", total=total)
+    written = writing.write_frames(
+        out, tracked, total=total, min_depth_valid=config.min_depth_valid, where=recording.where
+    )
+    writing.write_table(out, recording, plan, written)
+    writing.write_mesh(out, recording, plan)
+    writing.report_quality(out, plan, written, rate_hz=config.rate_hz)
+
+
+def _measured(
+    recording: Recording, config: Config
+) -> tuple[ExtractionPlan, Iterator[ExtractedFrame | None], str]:
+    """Return plan, frames and a sentence of a recording with depth."""
+    plan = extraction.understand(
+        recording, rate_hz=config.rate_hz, max_depth_m=config.max_depth_m, max_side_px=config.max_side_px
+    )
+    frames = extraction.frames(
+        recording, plan, max_depth_m=config.max_depth_m, jpeg_quality=config.jpeg_quality
+    )
+    return plan, frames, extraction.summary(recording, plan)
+
+
+def _scale_sources(
+    folder: Path | None, video: Video | None, videos: tuple[Video, ...]
+) -> dict[str, Recording]:
+    """Open the recordings whose depth may supply metric scale to one without, by id."""
+    if video is None or folder is None:
+        return {}
+    return {
+        other.id: open_recording(folder / other.file)
+        for other in formats.scale_sources(folder, video, videos)
+    }

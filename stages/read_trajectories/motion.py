@@ -1,0 +1,53 @@
+"""One recording's motion, whatever it was read from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.behavior.perception import FeatureVolume
+
+ABSENT_OBSERVER_M = 1000.0
+"""Where an observer stands of whom nothing is known: beyond every radius of perception."""
+CLIP_GAP_S = 5.0
+"""Between two clips of one recording, so that no window spans them."""
+
+
+@dataclass(frozen=True)
+class MeasuredMotion:
+    """Poses of agent and observer at the recording's own times, and the scene around them."""
+
+    timestamp_s: Float[np.ndarray, "frame"]
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    volume: FeatureVolume
+
+    def arrays(self) -> dict[str, Float[np.ndarray, "..."] | Bool[np.ndarray, "frame"]]:
+        """Return the arrays of a ``motion.npz``."""
+        known = np.isfinite(self.world_from_agent).all((1, 2))
+        return {
+            "timestamp_s": self.timestamp_s.astype("f8"),
+            "world_from_camera": self.world_from_camera.astype("f8"),
+            "world_from_agent": self.world_from_agent.astype("f8"),
+            "agent_from_bone": self.agent_from_bone.astype("f4"),
+            "confidence": known.astype("f4"),
+            "agent_visible": known,
+        }
+
+
+def absent_observer(frames: int) -> Float[np.ndarray, "frame 4 4"]:
+    """Return an observer who is not there."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = ABSENT_OBSERVER_M
+    return poses
+
+
+def concatenated_times(times: list[Float[np.ndarray, "frame"]]) -> Float[np.ndarray, "frame"]:
+    """Put clips on one clock, in order, far enough apart."""
+    placed, begin = [], 0.0
+    for time in times:
+        placed.append(time - time[0] + begin)
+        begin = placed[-1][-1] + CLIP_GAP_S
+    return np.concatenate(placed)

@@ -1,0 +1,78 @@
+"""The stage: registered recordings and templates -> fields, motion, surfaces, feature volume."""
+
+from pathlib import Path
+
+from pipeline.core import devices, distributed, progress
+from pipeline.core.videos import Video
+from pipeline.fields.fields import Reconstruction
+from stages.reconstruct import assemble, fuse, optimise, pictures, reading, results, writing
+from stages.reconstruct.config import Config
+from stages.reconstruct.reading import Inputs
+
+__all__ = ["Inputs", "run"]
+
+
+def run(
+    inputs: Inputs,
+    config: Config,
+    out: Path,
+    *,
+    device: devices.Device = "cpu",
+    threads: int = 1,
+    resume: Path | None = None,
+    videos: tuple[Video, ...] = (),
+) -> None:
+    """Reconstruct one agent's recordings into `out`; of several processes the first writes."""
+    distributed.join(device)
+    workers = max(1, threads // distributed.size())
+    registered = _read(inputs, config, videos, resume, workers)
+    fused = None
+    if config.scene_geometry == "fused":
+        fused = fuse.fuse_depth(registered, config.fusion, resume, workers)
+    rendered = config.supervision == "rendered"
+    problem = assemble.build(
+        registered,
+        reading.read_template(inputs.agent_template),
+        config.fields,
+        config.seed,
+        device,
+        fused,
+        resume,
+        reading.read_floor(inputs.scene_template),
+        rendered,
+    )
+    rays = problem.store
+    progress.log(f"reconstruct: {len(problem.video)} frames, {len(rays.scene)} + {len(rays.agent)} rays")
+    plan = optimise.OptimizationPlan(
+        config.steps, config.weights, config.batches, config.rates, config.seed, resume, workers, rendered
+    )
+    records = optimise.optimise(problem, plan)
+    if not distributed.leave():
+        return
+    reconstruction = Reconstruction(
+        problem.scene, problem.agent, problem.body, assemble.scene_ids(registered)
+    )
+    motions = results.motions(problem, registered, config.certain_gap_s)
+    sessions = {video.id: motions[video.id] for video in registered if video.camera_free}
+    writing.write(out, problem, reconstruction, motions, sessions)
+    pictures.report_quality(out, reconstruction, sessions, inputs.frames, inputs.masks, records)
+
+
+def _read(
+    inputs: Inputs, config: Config, videos: tuple[Video, ...], scratch: Path | None, workers: int
+) -> list[assemble.RegisteredVideo]:
+    """Read the recordings that are reconstructed together."""
+    by_role = {video.role: video.id for video in videos}
+    only = None
+    if config.sessions == "filmed_twice":
+        only = [video.synchronized_with for video in videos if video.role == "heldout"]
+    return reading.read_videos(
+        inputs,
+        by_role["walkthrough"],
+        by_role["turnaround"],
+        config.sampling,
+        config.seed,
+        only,
+        scratch,
+        workers,
+    )

@@ -1,0 +1,292 @@
+"""Fit the animal's canonical surface to the depth inside its mask: many headings at once, rigidly and
+upright.
+
+`observe` lifts the masked depth to the world, `fit_coarse` and `fit_fine` run a robust point-to-plane fit
+from every initial pose in one batch, `cost` scores a pose.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid, subsampling
+from pipeline.geometry.meshes import Mesh, RayCaster
+
+UP = np.array([0.0, 1.0, 0.0])
+
+
+POINTS, MODEL_POINTS = 220, 700
+"""Depth points per frame and vertices of the template that are used; more fit no better."""
+COARSE_ROUNDS, FIRST_REACH_M, REACH_M = 5, 0.18, 0.07
+"""Gauss-Newton steps from every initial pose, and width of the robust weight at first and at the end, metres:
+legs and tail move, the trunk decides."""
+TILT_SIGMA_RAD, UPRIGHT_SIGMA_RAD = float(np.deg2rad(15.0)), 1e-4
+"""Standard deviation of the root's tilt against upright where it may lean, and where it may not, radians."""
+STAND_POINTS, STAND_REACH_M, STAND_COST_M = 40.0, 0.12, 0.012
+"""Standing on the surface below counts as so many depth points, with a robust weight of this width (animals
+jump and lie down), and floating or sinking by more costs this much, metres."""
+COLOR_WEIGHT_M, OUTSIDE_WEIGHT_M, TRUNCATION = 0.06, 0.05, 1.5
+"""Cost of a full-scale colour difference and of a template wholly outside the mask, metres; distances are
+truncated at so many reaches."""
+POINT_SHARE = 0.15
+"""Weight of the point-to-point term against point-to-plane, so that nothing slides away."""
+PRIOR_POINTS, POINT_SIGMA_M, DAMPING = 20, 0.03, 1e-6
+"""Points that the prior of upright counts as, their noise (metres), and damping of a step."""
+LEAST_POINTS, LEAST_ERODED_PX, NEAREST_M = 25, 60, 0.1
+"""Depth points without which there is no observation, pixels that the eroded mask must keep, least depth
+(metres)."""
+RADIUS, FULL_VIEW, DEPTH_SHARE = 0.75, 0.3, 0.1
+"""In body lengths: radius around the median that points must lie in, silhouette area in full view (squared),
+and distance from the seen side to the middle."""
+STANDING_STEP = 8
+"""One point in so many measures the surface below."""
+BEHIND_M = 0.05
+"""Depth looks past the template when it is farther by this, metres."""
+
+
+@dataclass(frozen=True)
+class AgentModel:
+    """The template, subsampled: points, normals and colours in the agent frame, with a search tree."""
+
+    points_agent: Float[np.ndarray, "point 3"]
+    normals_agent: Float[np.ndarray, "point 3"]
+    color: Float[np.ndarray, "point 3"]
+    """0..1"""
+    tree: KDTree
+    length_m: float
+    """Horizontal length."""
+    stand_m: float
+    """Height of the root above the paws."""
+
+
+@dataclass(frozen=True)
+class StandingSurface:
+    """What animals stand on: the scene's surface, and the floor where it has holes."""
+
+    caster: RayCaster
+    floor_m: float
+
+    def below(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
+        """Return the height of the first surface under each point, the floor's where there is none."""
+        hits = self.caster.cast(points_world, np.broadcast_to([0.0, -1.0, 0.0], points_world.shape))
+        return np.where(hits.face >= 0, points_world[:, 1] - hits.distance, self.floor_m)
+
+
+@dataclass(frozen=True)
+class AgentObservation:
+    """What one frame shows of the animal; metres, colours 0..1."""
+
+    frame: int
+    points_world: Float[np.ndarray, "point 3"]
+    color: Float[np.ndarray, "point 3"]
+    mask: Bool[np.ndarray, "height width"]
+    depth: Float[np.ndarray, "depth_height depth_width"]
+    world_from_camera: Float[np.ndarray, "4 4"]
+    intrinsics: Float[np.ndarray, "3 3"]
+    standing_m: float
+    """Height at which the root would be if the animal stood on what lies below it; NaN where nothing does."""
+    share: float
+    """Visible area over the area that the body would fill at this distance; 1 is in full view."""
+
+
+def make_model(mesh: Mesh, rng: np.random.Generator) -> AgentModel:
+    """Subsample the template evenly by area."""
+    normals = mesh.vertex_normals()
+    area = mesh.face_areas()
+    weight = np.bincount(mesh.faces.ravel(), np.repeat(area, 3), len(mesh.vertices))
+    chosen = np.sort(
+        rng.choice(
+            len(mesh.vertices), min(MODEL_POINTS, (weight > 0).sum()), replace=False, p=weight / weight.sum()
+        )
+    )
+    points = mesh.vertices[chosen].astype(float)
+    color = np.full((len(chosen), 3), 0.5) if mesh.color is None else mesh.color[chosen] / 255.0
+    extent = np.ptp(points[:, [0, 2]], axis=0)
+    return AgentModel(
+        points,
+        normals[chosen],
+        color,
+        KDTree(points),
+        float(extent.max()),
+        float(-np.quantile(points[:, 1], 0.01)),
+    )
+
+
+def observe(
+    clip: Clip,
+    mask: UInt8[np.ndarray, "height width"],
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    model: AgentModel,
+    standing: StandingSurface,
+) -> AgentObservation | None:
+    """Lift the masked depth to the world, without the mask's rim and without what lies far from the rest;
+    None if too little is left.
+    """
+    inside = mask == 255
+    depth = clip.depth(frame)
+    small = cv2.resize(inside.astype(np.uint8), depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    eroded = cv2.erode(small, np.ones((3, 3), np.uint8))
+    chosen = np.flatnonzero(
+        ((eroded if eroded.sum() > LEAST_ERODED_PX else small) > 0)
+        & (depth > NEAREST_M)
+        & (clip.confidence(frame) >= 1)
+    )
+    if len(chosen) < LEAST_POINTS:
+        return None
+    points = cameras.back_project(depth, clip.depth_intrinsics[frame]).reshape(-1, 3)[chosen]
+    near = np.linalg.norm(points - np.median(points, axis=0), axis=1) < RADIUS * model.length_m
+    if near.sum() < LEAST_POINTS:
+        return None
+    points = points[near]
+    points = points[subsampling.evenly(len(points), POINTS)]
+    pixel, z = cameras.project(points, clip.intrinsics[frame])
+    limit = np.array(mask.shape[::-1]) - 1
+    column, row = np.clip(pixel.astype(int), 0, limit).T
+    full_px = FULL_VIEW * model.length_m**2 * (clip.intrinsics[frame, 0, 0] / np.median(z)) ** 2
+    points_world = rigid.apply(world_from_camera, points)
+    inner = points_world[::STANDING_STEP] + _behind(points_world, world_from_camera[:3, 3], model)
+    return AgentObservation(
+        frame=frame,
+        points_world=points_world,
+        color=clip.color(frame)[row, column] / 255.0,
+        mask=inside,
+        depth=depth,
+        world_from_camera=world_from_camera,
+        intrinsics=clip.intrinsics[frame],
+        standing_m=float(np.median(standing.below(inner))) + model.stand_m,
+        share=float(min(1.0, inside.sum() / full_px)),
+    )
+
+
+def initial_poses(
+    observation: AgentObservation, model: AgentModel, headings: int
+) -> Float[np.ndarray, "pose 4 4"]:
+    """Return upright poses at even headings, a little behind the middle of what was seen."""
+    yaw = 2 * np.pi * np.arange(headings) / headings
+    rotation = rigid.rotation_from_yaw(yaw)
+    middle = np.median(observation.points_world, axis=0)
+    middle = middle + _behind(observation.points_world, observation.world_from_camera[:3, 3], model)
+    return rigid.make(rotation, middle - rotation @ np.median(model.points_agent, axis=0))
+
+
+def _behind(points_world, eye, model):
+    """Return the horizontal step from the seen side of the body to its middle."""
+    away = (np.median(points_world, axis=0) - eye) * (1, 0, 1)
+    return DEPTH_SHARE * model.length_m * away / max(np.linalg.norm(away), 1e-6)
+
+
+def fit_coarse(
+    observation: AgentObservation, model: AgentModel, world_from_agent: Float[np.ndarray, "pose 4 4"]
+) -> Float[np.ndarray, "pose 4 4"]:
+    """Fit upright from every pose, the robust weight narrowing from wide."""
+    reach = np.geomspace(FIRST_REACH_M, REACH_M, COARSE_ROUNDS)
+    return _fit(observation, model, world_from_agent, reach, UPRIGHT_SIGMA_RAD)
+
+
+def fit_fine(
+    observation: AgentObservation,
+    model: AgentModel,
+    world_from_agent: Float[np.ndarray, "pose 4 4"],
+    *,
+    rounds: int,
+    tilt: bool,
+) -> Float[np.ndarray, "pose 4 4"]:
+    """Fit to convergence; with ``tilt`` the root may lean."""
+    reach = np.full(rounds, REACH_M)
+    return _fit(observation, model, world_from_agent, reach, TILT_SIGMA_RAD if tilt else UPRIGHT_SIGMA_RAD)
+
+
+def _fit(observation, model, world_from_agent, reaches, prior):
+    """Step robustly, point to plane, with a little point to point so that nothing slides away."""
+    placed = np.array(world_from_agent, float)
+    for reach in reaches:
+        local = rigid.apply(rigid.inverse(placed), observation.points_world[None])
+        distance, nearest = model.tree.query(local)
+        target, normal = model.points_agent[nearest], model.normals_agent[nearest]
+        weight = (reach**2 / (reach**2 + distance**2)) ** 2
+        gradient, curvature = _normal_equations(local, target, normal, weight)
+        curvature, gradient = _keep_upright(placed, curvature, gradient, prior)
+        if np.isfinite(observation.standing_m):
+            curvature, gradient = _keep_standing(placed, curvature, gradient, observation.standing_m)
+        placed = placed @ rigid.exp(np.linalg.solve(curvature, -gradient[..., None])[..., 0])
+    return placed
+
+
+def _normal_equations(local, target, normal, weight):
+    """Sum plane and point terms over the points; the twist moves the body, so it moves points the other
+    way."""
+    gap = local - target
+    curvature, gradient = np.zeros((6, 6)), np.zeros(6)
+    for direction, share in [(normal, 1.0)] + [
+        (np.broadcast_to(axis, gap.shape), POINT_SHARE) for axis in np.eye(3)
+    ]:
+        jacobian = -np.concatenate([np.cross(local, direction), direction], axis=-1)
+        residual = (gap * direction).sum(-1)
+        scaled = jacobian * (share * weight)[..., None]
+        curvature = curvature + np.swapaxes(scaled, -1, -2) @ jacobian
+        gradient = gradient + (scaled * residual[..., None]).sum(-2)
+    return gradient, curvature
+
+
+def _keep_upright(placed, curvature, gradient, prior_rad):
+    """Add the prior that the body's up is the world's: its tilt about the body's x and z axes is small."""
+    up_agent = np.einsum("sji,j->si", placed[:, :3, :3], UP)
+    strength = PRIOR_POINTS * (POINT_SIGMA_M / prior_rad) ** 2
+    tilt = np.cross(UP, up_agent)
+    for axis in (0, 2):
+        curvature[:, axis, axis] += strength
+        gradient[:, axis] -= strength * tilt[:, axis]
+    curvature[:, range(6), range(6)] += DAMPING
+    return curvature, gradient
+
+
+def _keep_standing(placed, curvature, gradient, standing_m):
+    """Add the prior that the animal stands on what lies below it; robust, since it jumps and lies down."""
+    height = placed[:, 1, 3] - standing_m
+    weight = STAND_POINTS * (STAND_REACH_M**2 / (STAND_REACH_M**2 + height**2)) ** 2
+    direction = placed[:, 1, :3]
+    curvature[:, 3:, 3:] += weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
+    gradient[:, 3:] += (weight * height)[:, None] * direction
+    return curvature, gradient
+
+
+def cost(
+    observation: AgentObservation, model: AgentModel, world_from_agent: Float[np.ndarray, "pose 4 4"]
+) -> Float[np.ndarray, "pose"]:
+    """Return the cost of each pose, metres: truncated distance of points, colour difference, template outside
+    the mask."""
+    local = rigid.apply(rigid.inverse(world_from_agent), observation.points_world[None])
+    distance, nearest = model.tree.query(local)
+    seen, expected = observation.color - observation.color.mean(0), model.color[nearest]
+    shade = np.abs(seen - (expected - expected.mean(1, keepdims=True))).mean((1, 2))
+    geometry = np.minimum(distance, TRUNCATION * REACH_M).mean(1)
+    height = np.nan_to_num(world_from_agent[:, 1, 3] - observation.standing_m)
+    lifted = height**2 / (height**2 + STAND_REACH_M**2)
+    geometry = geometry + STAND_COST_M * lifted
+    return (
+        geometry + COLOR_WEIGHT_M * shade + OUTSIDE_WEIGHT_M * _outside(observation, model, world_from_agent)
+    )
+
+
+def _outside(observation, model, world_from_agent):
+    """Return the share of the camera-facing template that lies outside the mask while depth looks past it."""
+    camera_from_agent = rigid.inverse(observation.world_from_camera) @ world_from_agent
+    points = rigid.apply(camera_from_agent, model.points_agent[None])
+    normals = model.normals_agent @ np.swapaxes(camera_from_agent[:, :3, :3], 1, 2)
+    facing = (normals * points).sum(-1) < 0
+    pixel, z = cameras.project(points, observation.intrinsics)
+    height, width = observation.mask.shape
+    inside = (pixel >= 0).all(-1) & (pixel[..., 0] < width) & (pixel[..., 1] < height) & (z > NEAREST_M)
+    column, row = (
+        np.clip(pixel[..., 0], 0, width - 1).astype(int),
+        np.clip(pixel[..., 1], 0, height - 1).astype(int),
+    )
+    scale = np.array(observation.depth.shape) / (height, width)
+    behind = observation.depth[(row * scale[0]).astype(int), (column * scale[1]).astype(int)] > z + BEHIND_M
+    wrong = facing & inside & ~observation.mask[row, column] & behind
+    return wrong.sum(1) / np.maximum(facing.sum(1), 1)

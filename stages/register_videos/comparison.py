@@ -1,0 +1,64 @@
+"""A recorded picture beside the template rendered from its pose, at half size."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.data.clips import Clip, Masks
+from pipeline.geometry import cameras
+from pipeline.geometry.meshes import RayCaster, render_view
+
+BLUR_PX = 9.0
+"""Neighbourhood of the local contrast normalization, standard deviation in half-size pixels."""
+LEAST_VARIANCE = 9.0
+"""Variance of grey values below which a neighbourhood is noise."""
+GREY, CONTRAST = 128, 48
+"""Grey value of the local mean, and grey values per standard deviation."""
+LEAST_SHARE = 1e-3
+"""Added to the share of known pixels in a neighbourhood."""
+
+
+@dataclass(frozen=True)
+class RenderedComparison:
+    """One frame at half the size of its picture."""
+
+    intrinsics: Float[np.ndarray, "3 3"]
+    depth: Float[np.ndarray, "height width"]
+    """Of the template, metres, 0 = none."""
+    rendered: Float[np.ndarray, "height width 3"]
+    recorded: UInt8[np.ndarray, "height width 3"]
+    known: Bool[np.ndarray, "height width"]
+    """Where there is template and surely no animal."""
+
+
+def compare(
+    clip: Clip, masks: Masks, caster: RayCaster, frame: int, world_from_camera: Float[np.ndarray, "4 4"]
+) -> RenderedComparison:
+    """Render the template from the pose of a frame."""
+    size = (clip.color_size[0] // 2, clip.color_size[1] // 2)
+    intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
+    depth, hits = render_view(caster, world_from_camera, intrinsics, *size)
+    assert caster.mesh.color is not None, "templates have colours"
+    rendered = hits.interpolate(caster.mesh, caster.mesh.color).reshape(*size, 3)
+    recorded = cv2.resize(clip.color(frame), size[::-1], interpolation=cv2.INTER_AREA)
+    free = cv2.resize((masks[frame] == 0).astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    return RenderedComparison(intrinsics, depth, rendered, recorded, (depth > 0) & free)
+
+
+def local_contrast_normalization(
+    color: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width"]:
+    """Remove differences of light: grey minus its local mean over its local deviation (Jarrett et al.
+    2009)."""
+    gray = cv2.cvtColor(color.astype(np.float32), cv2.COLOR_RGB2GRAY)
+    weight = known.astype(np.float32)
+    share = _blur(weight) + LEAST_SHARE
+    mean = _blur(gray * weight) / share
+    deviation = np.sqrt(np.maximum(_blur((gray - mean) ** 2 * weight) / share, LEAST_VARIANCE))
+    return np.clip(GREY + CONTRAST * (gray - mean) / deviation * weight, 0, 255).astype(np.uint8)
+
+
+def _blur(picture):
+    return cv2.GaussianBlur(picture, (0, 0), BLUR_PX)

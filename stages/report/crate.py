@@ -1,0 +1,113 @@
+"""The build as a research object (RO-Crate 1.1): recordings, settings, versions, keys, contents, metrics,
+times.
+
+`describe` writes what `make reproduce` reads. Times and the machine are in the records beside the artifacts,
+where the runner leaves them; they vary between runs.
+"""
+
+import json
+import os
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.videos import Video
+from stages.report.collect import read_manifest
+
+FILE = "ro-crate-metadata.json"
+BUILTIN = "synthetic_capture"
+"""Stands beside the other artifacts where a build has no recordings of a user's."""
+Entity = dict[str, Any]
+
+
+def describe(
+    name: str,
+    folders: Mapping[str, Mapping[str | None, Path]],
+    videos: Sequence[Video],
+    metrics: Mapping[str, float | None],
+    *,
+    safe: bool = False,
+    times: bool = True,
+) -> Entity:
+    """Return the content of `ro-crate-metadata.json`; `safe` leaves out names of files, which may reveal
+    people.
+    """
+    recordings = [_recording(video, safe) for video in videos]
+    artifacts = list(_artifacts(folders, times))
+    root = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"Report of {name}",
+        "hasPart": [{"@id": file} for file in ("index.html", "methods.md", "references.bib")],
+        "mentions": [{"@id": entity["@id"]} for entity in (*recordings, *artifacts)],
+        "variableMeasured": [_property(key, value) for key, value in sorted(metrics.items())],
+    }
+    if times:
+        root["locationCreated"] = _machine()
+    about = {
+        "@id": FILE,
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
+        "about": {"@id": "./"},
+    }
+    graph = [about, root, *recordings, *artifacts]
+    return {"@context": "https://w3id.org/ro/crate/1.1/context", "@graph": graph}
+
+
+def _recording(video: Video, safe: bool) -> Entity:
+    return {
+        "@id": f"#recording/{video.id}",
+        "@type": "CreativeWork",
+        "name": video.id if safe else video.file,
+        "additionalProperty": [
+            _property("role", video.role),
+            _property("split", video.split),
+            _property("sha256", video.sha256),
+        ],
+    }
+
+
+def _artifacts(folders: Mapping[str, Mapping[str | None, Path]], times: bool) -> Iterator[Entity]:
+    first = next(iter(folders["registration"].values()))
+    for artifact, each in {BUILTIN: {None: first.with_name(BUILTIN)}, **folders}.items():
+        for video, folder in each.items():
+            manifest = read_manifest(folder)
+            if manifest is not None:
+                base = folder.parent if video is None else folder.parent.parent
+                named = artifact if video is None else f"{artifact}.{video}"
+                yield _artifact(
+                    named.replace(".", "/", 1), manifest, base / "records" / f"{named}.json", times
+                )
+
+
+def _artifact(name: str, manifest: Mapping[str, Any], record: Path, times: bool) -> Entity:
+    properties = {key: manifest[key] for key in ("key", "content", "stage")}
+    properties |= {key: json.dumps(manifest[key], sort_keys=True) for key in ("config", "versions", "inputs")}
+    if times and record.exists():
+        known = json.loads(record.read_bytes())
+        properties |= {
+            key: known.get(key) for key in ("seconds", "peak_memory_mb", "threads", "commit", "finished")
+        }
+    return {
+        "@id": f"#artifact/{name}",
+        "@type": "Dataset",
+        "name": name,
+        "additionalProperty": [_property(key, value) for key, value in properties.items()],
+    }
+
+
+def _property(name: str, value: str | float | None) -> Entity:
+    return {"@type": "PropertyValue", "name": name, "value": value}
+
+
+def _machine() -> Entity:
+    return {
+        "@type": "Place",
+        "name": "machine",
+        "additionalProperty": [
+            _property("system", platform.system()),
+            _property("architecture", platform.machine()),
+            _property("cores", os.cpu_count()),
+        ],
+    }

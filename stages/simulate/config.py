@@ -1,0 +1,48 @@
+"""Settings of a take."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+ObserverScript = Literal["away", "still", "approach", "circle"]
+"""What a scripted observer does."""
+SubgoalSource = Literal["none", "visited", "behavior"]
+"""Where sub-goals come from that no file gives."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is simulated, for how long, and how plans are drawn."""
+
+    seconds: float = 30.0
+    """Length of a take of the behaviour model."""
+    observer: ObserverScript = "approach"
+    """What the observer does."""
+    observer_speed_m_s: float = 1.0
+    """Walking speed of the observer, m/s."""
+    guidance: float = 1.0
+    """Scale of classifier-free guidance: the interactivity."""
+    without: tuple[Literal["scene", "observer", "past", "goal"], ...] = ()
+    """Conditions that plans are drawn without."""
+    goal_steps: int = 50
+    """Denoising steps of goals."""
+    sequence_steps: int = 10
+    """Denoising steps of paths and bodies."""
+    places: SubgoalSource = "none"
+    """Sub-goals that no file gives: sampled from where the animal has been, or the behaviour model's goals
+    one after the other; none: a take of the behaviour model."""
+    place_count: int = 20
+    """How many of them."""
+    optimise: bool = True
+    """Make the motion physically plausible; a take of the behaviour model only where `--longterm` and
+    `--reconstruction` are given."""
+    recording: str | None = None
+    """Take the reconstructed motion of this session, its longest stretch, instead."""
+    pictures_per_s: float = 10.0
+    """Pictures per second of long-term motion; 0: none."""
+    seed: int = 0
+    """Seed of the beginning and of all noise."""
+    serve: bool = False
+    """Show the animal live, on this machine alone, until interrupted; needs `--simulator` and viser (`make
+    extras`)."""
+    port: int = 8080
+    """Where it is shown."""

@@ -1,0 +1,17 @@
+"""Settings of slicing."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Config:
+    """Which motion is trusted, and how densely it is cut into windows."""
+
+    min_confidence: float = 0.3
+    """Frames whose motion has less confidence (0..1) count as missing."""
+    max_gap_s: float = 0.6
+    """Longest gap in seconds that is interpolated."""
+    smooth_s: float = 0.08
+    """Standard deviation in seconds of the smoothing of the agent's root; 0 for none."""
+    stride: int = 1
+    """Frames between starts of training windows."""

@@ -1,0 +1,63 @@
+"""The stage: reconstructed motion, or tables of motion -> trajectories, windows and scenes."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from pipeline.behavior.trajectories import TRAIN
+from pipeline.core import progress
+from pipeline.core.errors import InputError
+from pipeline.core.videos import Video
+from pipeline.data import qa
+from stages.slice_behavior import pictures, reading, writing
+from stages.slice_behavior.config import Config
+from stages.slice_behavior.gridding import trajectory_from_motion
+from stages.slice_behavior.windows import slice_windows
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the stage reads: one of both."""
+
+    reconstruction: Path | None = None
+    """Motion of all sessions in one scene."""
+    trajectories: Mapping[str, Path] | None = None
+    """Tables of motion, a folder per recording."""
+
+
+def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> None:
+    """Slice all sessions. Raises ART-004 without recordings, BEH-001 without a training window."""
+    sessions = {video.id: video for video in videos if video.role == "session"}
+    if not sessions:
+        raise InputError(
+            "ART-004", "which recordings?", "slice_behavior", "give --videos build/<agent>/plan/videos.json"
+        )
+    if inputs.trajectories is not None:
+        source = reading.read_tables(inputs.trajectories)
+    elif inputs.reconstruction is not None:
+        source = reading.read_reconstruction(inputs.reconstruction, list(sessions))
+    else:
+        raise InputError("ART-003", "no motion was given", "slice_behavior", "give --reconstruction")
+    gaps = asdict(config)
+    stride = gaps.pop("stride")
+    trajectories = {id: trajectory_from_motion(motion, **gaps) for id, motion in source.motions.items()}
+    test = frozenset(id for id in trajectories if sessions[id].split == "test")
+    data = slice_windows(trajectories, test, source.agent_from_bone_rest, stride=stride)
+    training = len(data.indices(TRAIN))
+    if not training:
+        remedy = (
+            "record longer sessions in which the animal stays in view, lower min_confidence, "
+            "or raise max_gap_s where rows are further apart"
+        )
+        raise InputError("BEH-001", "no 6.4 s of uninterrupted motion to learn from", source.where, remedy)
+    progress.log(f"{training} training windows, {len(data.start) - training} test windows")
+    data.save(out)
+    training_tracks = {id: trajectory for id, trajectory in trajectories.items() if id not in test}
+    writing.write_volumes(out, source.volumes, training_tracks, tuple(source.motions))
+    qa.write(
+        out,
+        good="hundreds of windows, an animal that covers the room, and an observer at many distances",
+        bad="long invalid stretches, or an animal that never moves",
+        checks=pictures.checks(data),
+        pictures=pictures.pictures(data, source.volumes[0], test),
+    )

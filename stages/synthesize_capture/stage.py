@@ -1,0 +1,29 @@
+"""The stage: a seed -> Record3D recordings and, apart from them, the truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core import progress
+from stages.synthesize_capture import animal, produce, review, room, script
+from stages.synthesize_capture.config import Config
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The stage reads nothing."""
+
+
+def run(inputs: Inputs, config: Config, out: Path, *, threads: int = 1) -> None:
+    """Build the world, write every recording's script, film them, and keep the truth apart."""
+    home = room.furnish(np.random.default_rng([config.seed, 0]))
+    creature = animal.grow(np.random.default_rng([config.seed, 2]))
+    scripts = script.scripts(config, home)
+    progress.log(f"world: {len(scripts)} recordings, {sum(len(part.timestamp_s) for part in scripts)} frames")
+    recordings, truth = out / "recordings", out / "truth"
+    recordings.mkdir()
+    truth.mkdir()
+    made = produce.produce(scripts, creature, recordings, truth, workers=threads)
+    produce.write_world(home, creature, config.seed, truth)
+    review.report_quality(out, scripts, made)

@@ -1,0 +1,38 @@
+"""The stage: trajectories and scenes -> a trained behaviour model, as files."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import TRAIN, BehaviorData, frames_from_seconds
+from pipeline.core import devices, progress
+from stages.train_behavior import outcome
+from stages.train_behavior.config import Config
+from stages.train_behavior.refusals import check_settings
+from stages.train_behavior.training import train
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the stage reads."""
+
+    behavior_data: Path
+    """Trajectories, windows and scenes."""
+
+
+def run(
+    inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", resume: Path | None = None
+) -> None:
+    """Train, export and judge the model. Raises BEH-001, BEH-003, REC-002, ART-010."""
+    data = BehaviorData.load(inputs.behavior_data).with_horizon(frames_from_seconds(config.horizon_s))
+    scenes = Scenes.load(inputs.behavior_data, data.videos)
+    architecture, schedule = outcome.architecture_for(config, data, scenes), Schedule(course=config.schedule)
+    check_settings(config, data, architecture, str(inputs.behavior_data))
+    progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
+    fitted = train(
+        data, scenes, architecture, schedule, config.training, seed=config.seed, resume=resume, device=device
+    )
+    outcome.write_trained(out, fitted, architecture, schedule, data.agent_from_bone_rest)
+    if config.export:
+        outcome.write_exported(out, fitted, architecture, schedule, data, scenes, seed=config.seed)

@@ -1,0 +1,75 @@
+"""Settings of the localizers of the scene and of the agent."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Views of the room."""
+
+    views: int = 500
+    """Rendered views that are learned."""
+    held_out: int = 80
+    """Further views that measure the error and calibrate the uncertainty."""
+    frames: int = 60
+    """Frames of the walk-through that join them."""
+    focal_px: float = 120.0
+    """Focal length that pictures are resized to, pixels."""
+    pitch_deg: tuple[float, float] = (-55.0, 15.0)
+    """Rendered cameras look between these angles, degrees above the horizon."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Views of the animal."""
+
+    views: int = 250
+    """Rendered views that are learned."""
+    held_out: int = 60
+    """Further views that measure the error and calibrate the uncertainty."""
+    distance_m: tuple[float, float] = (0.7, 3.5)
+    """Distances of rendered cameras, metres."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Size and training of the kinds that are networks."""
+
+    steps: int = 2500
+    """Steps of AdamW."""
+    rate: float = 2e-3
+    """Learning rate at the start; it falls to a hundredth along a cosine."""
+    coordinate_width: int = 384
+    """Coordinates: hidden units ..."""
+    coordinate_layers: int = 4
+    """... and hidden layers."""
+    batch_patches: int = 2048
+    """Coordinates: patches per step."""
+    pose_width: int = 32
+    """Regression: channels of the first of four stages; 64 is the paper's ResNet-18."""
+    batch_views: int = 64
+    """Regression: views per step."""
+    fresh_views: int = 0
+    """Regression: views rendered anew in every step, each replacing the oldest one; 0 learns from a fixed
+    set."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Which localizer is trained, and how."""
+
+    target: Literal["scene", "agent"] = "scene"
+    """What is localized against: the room or the animal."""
+    kind: Literal["bank", "coordinates", "regression"] = "bank"
+    """bank: nearest neighbours among patches of rendered views; coordinates: a network regresses each patch's
+    point of the map; regression: a network regresses the pose, as in the paper.
+    """
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    """Views of the room."""
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    """Views of the animal."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """The kinds that are networks."""
+    seed: int = 0
+    """Seed of views, noise and RANSAC."""

@@ -1,0 +1,75 @@
+"""From a template to its localizer's files."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from pipeline.backends.descriptors import Describer
+from pipeline.core.devices import Device
+from pipeline.core.errors import InputError
+from pipeline.data import ply, qa
+from pipeline.data.clips import Clip
+from pipeline.data.templates import SceneCameras
+from pipeline.localization import localizer as localizers
+from stages.train_localizer import pictures, training
+from stages.train_localizer.config import Config
+
+Given = TypeVar("Given")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Folders of finished artifacts; which template is needed depends on the target."""
+
+    feature_basis: Path | None = None
+    """Names the descriptor of all features; without it patches are described by DAISY."""
+    scene_template: Path | None = None
+    """Target scene."""
+    frames: Mapping[str, Path] | None = None
+    """Target scene: the walk-through that its template was built from, by recording."""
+    agent_template: Path | None = None
+    """Target agent."""
+
+
+def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") -> localizers.Localizer:
+    """Train, measure and write the localizer. Raises InputError MAP-006 where the map fills hardly any
+    view."""
+    rng = np.random.default_rng(config.seed)
+    describer = Describer() if inputs.feature_basis is None else Describer.load(inputs.feature_basis)
+    match config.target:
+        case "scene":
+            views = _scene_views(inputs, config, rng)
+        case "agent":
+            mesh = ply.read_ply(_needed(inputs.agent_template, "agent_template") / "agent.ply")
+            views = training.agent_views(mesh, config.agent, rng)
+    localizer, held = training.train(views, config, describer, device, rng)
+    localizers.save(out, localizer, pictures.report(held, config.target))
+    qa.write(
+        out,
+        good="held-out renders are localized within a degree or two, wrong poses get low probabilities",
+        bad="the histogram has its weight on the right, or confident poses are wrong",
+        checks=pictures.checks(held, config.target),
+        pictures=pictures.pictures(held, localizer, config.target),
+    )  # fmt: skip
+    return localizer
+
+
+def _scene_views(inputs: Inputs, config: Config, rng: np.random.Generator) -> training.TrainingViews:
+    template = _needed(inputs.scene_template, "scene_template")
+    clip = Clip.open(next(iter(_needed(inputs.frames, "frames").values())))
+    walk = SceneCameras.open(template).world_from_camera
+    floor_m = json.loads((template / "world.json").read_text())["floor"]
+    return training.scene_views(ply.read_ply(template / "mesh.ply"), walk, floor_m, clip, config.scene, rng)
+
+
+def _needed(value: Given | None, name: str) -> Given:
+    """Return an input that the target needs. Raises InputError ART-001."""
+    if value is None:
+        raise InputError(
+            "ART-001", "is not given, but the target needs it", name, f"pass --{name.replace('_', '-')}"
+        )
+    return value

@@ -1,0 +1,54 @@
+"""Train long-term motion from recorded or simulated motion."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.core import progress
+from pipeline.data import qa
+from pipeline.longterm.short_motions import RATE_HZ
+from stages.train_longterm import learning, pictures, sources
+from stages.train_longterm.config import Config
+from stages.train_longterm.learning import TrainedLongTerm
+
+SECONDS_PER_MINUTE = 60
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Artifacts to learn from: simulated motion, or a reconstruction with its behaviour data."""
+
+    reconstruction: Path | None = None
+    behavior_data: Path | None = None
+    longterm_world: Path | None = None
+
+
+def run(inputs: Inputs, config: Config, out: Path, *, resume: Path | None = None) -> TrainedLongTerm:
+    """Train every network and write `longterm.safetensors`, `longterm.json` and `ablations/` into ``out``.
+
+    Raises InputError LTM-001 to LTM-004 where motion, weights or SMPL-X are missing.
+    """
+    split = _read(inputs, config)
+    frames = sum(map(len, split.train.stretches))
+    minutes = frames / RATE_HZ / SECONDS_PER_MINUTE
+    progress.log(f"{len(split.train.stretches)} stretches of motion, {minutes:.1f} min at {RATE_HZ} fps")
+    trained = learning.train_networks(split.train, config, resume=resume)
+    report = pictures.evaluate_held_out(trained, split, config.seed)
+    trained.model.save(out)
+    learning.write_ablations(out, trained)
+    qa.write(
+        out,
+        good="routes that turn where the animal's do, bodies that stand on what is beneath them",
+        bad="routes through furniture, bodies in the air or in the ground",
+        checks=report.checks,
+        pictures=report.pictures,
+    )
+    return trained
+
+
+def _read(inputs: Inputs, config: Config) -> sources.DatasetSplit:
+    if config.smplx_model is not None:
+        return sources.people(Path(config.smplx_model), Path(config.smplx_motions or ""))
+    if inputs.longterm_world is not None:
+        return sources.simulated(inputs.longterm_world)
+    assert inputs.reconstruction is not None and inputs.behavior_data is not None, "nothing to learn from"
+    return sources.recorded(inputs.reconstruction, inputs.behavior_data)
