@@ -1,10 +1,12 @@
-"""What reconstruction costs behaviour: one model trained on reconstructed motion and one on the true motion of the same sessions.
+"""What reconstruction costs behaviour: one model trained on reconstructed motion and one on the true motion
+of the same sessions.
 
     python -m benchmarks.behavior_gap cat --seeds 3
 
-Needs a finished `behavior_data` of the built-in capture. Recordings, split, scene and training are the same; each model
-is judged on its own kind of motion of the test session, for true bones and reconstructed ones are not the same bones.
-The true world is brought into ours by one rigid motion, fitted on the walk-through's cameras alone.
+Needs a finished `behavior_data` of the built-in capture. Recordings, split, scene and training are the same;
+each model is judged on its own kind of motion of the test session, for true bones and reconstructed ones are
+not the same bones. The true world is brought into ours by one rigid motion, fitted on the walk-through's
+cameras alone.
 """
 
 import argparse
@@ -16,30 +18,36 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from pipeline import config
-from pipeline.files import arrays
-from pipeline.models.behavior import Sampling
-from pipeline.models.planning import TorchNetworks
-from pipeline.models.predictors import Ats
-from pipeline.models.rivals import sampler_of
-from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import TEST, BehaviorData
-from stages.evaluate.alignment import constant_between
-from stages.score_behavior.protocols import Effort, scores
-from stages.slice_behavior.gridding import Motion, trajectory_from_motion
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.planning import TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import TEST, BehaviorData
+from pipeline.core import config
+from pipeline.data import npz
+from pipeline.data.clips import read_source_index
+from pipeline.data.templates import SceneCameras
+from pipeline.metrics.pose_errors import constant_between
+from pipeline.rivals.predictors import Ats
+from pipeline.rivals.samplers import sampler_of
+from stages.score_behavior.config import Config as ScoringConfig
+from stages.score_behavior.protocols import scores
+from stages.slice_behavior.gridding import ReconstructedMotion, trajectory_from_motion
 from stages.slice_behavior.windows import slice_windows
-from stages.train_behavior.__main__ import Config
+from stages.train_behavior.config import Config
 from stages.train_behavior.outcome import architecture_for
 from stages.train_behavior.training import train
 
 
 def ours_from_truth(build: Path, walkthrough: str) -> Float[np.ndarray, "4 4"]:
     """Return the rigid motion from the true world to ours."""
-    cameras = arrays.load(build / "scene_template/cameras.npz", ("world_from_camera", "registered"))
-    source = arrays.load(build / "frames" / walkthrough / "frames.npz", ("source_index",))["source_index"]
-    true = arrays.load(build / "synthetic_capture/truth/walkthrough.npz", ("world_from_camera",))["world_from_camera"][source]
-    kept = cameras["registered"]
-    return constant_between(cameras["world_from_camera"][kept], true[kept])
+    cameras = SceneCameras.open(build / "scene_template")
+    source = read_source_index(build / "frames" / walkthrough)
+    true = npz.load(build / "synthetic_capture/truth/walkthrough.npz", ("world_from_camera",))[
+        "world_from_camera"
+    ][source]
+    kept = cameras.registered
+    return constant_between(cameras.world_from_camera[kept], true[kept])
 
 
 def true_data(build: Path, ours: BehaviorData, videos: list[dict]) -> BehaviorData:
@@ -48,30 +56,41 @@ def true_data(build: Path, ours: BehaviorData, videos: list[dict]) -> BehaviorDa
     world_from_true = ours_from_truth(build, walkthrough)
     trajectories = {}
     for video in (video for video in videos if video["id"] in ours.videos):
-        table = arrays.load(build / "synthetic_capture/truth" / f"{Path(video['file']).stem}.npz")
+        table = npz.load(build / "synthetic_capture/truth" / f"{Path(video['file']).stem}.npz")
         agent, camera = (world_from_true @ table[name] for name in ("world_from_agent", "world_from_camera"))
-        motion = Motion(
-            table["timestamp_s"], camera, agent, table["agent_from_bone"].astype(float), np.ones(len(agent)), np.ones(len(agent), bool)
+        motion = ReconstructedMotion(
+            table["timestamp_s"],
+            camera,
+            agent,
+            table["agent_from_bone"].astype(float),
+            np.ones(len(agent)),
+            np.ones(len(agent), bool),
         )
         known = trajectory_from_motion(motion, min_confidence=0.0, max_gap_s=0.6, smooth_s=0.0)
         mine = ours.trajectories[video["id"]]
         shared = np.isclose(known.timestamp_s[:, None], mine.timestamp_s[mine.valid], atol=0.02).any(1)
         trajectories[video["id"]] = replace(known, valid=known.valid & shared)
     rest = np.tile(np.eye(4, dtype=np.float32), (table["agent_from_bone"].shape[1], 1, 1))
-    rest[:, :3, 3] = np.median(np.concatenate([t.agent_from_bone[..., :3, 3] for t in trajectories.values()]), axis=0)
+    rest[:, :3, 3] = np.median(
+        np.concatenate([t.agent_from_bone[..., :3, 3] for t in trajectories.values()]), axis=0
+    )
     test = frozenset(video["id"] for video in videos if video["split"] == "test")
     return slice_windows(trajectories, test, rest, stride=1)
 
 
 def trained(data: BehaviorData, scenes: Scenes, settings: Config) -> Ats:
     """Train a model on the data."""
-    architecture = architecture_for(vars(settings), data, scenes)
-    fitted = train(data, scenes, architecture, settings.schedule, settings.training, seed=settings.seed)
-    sampler = sampler_of(architecture, TorchNetworks(fitted.nets), settings.schedule, fitted.scaling)
-    return Ats(sampler, scenes, data.agent_from_bone_rest, architecture.ego, Sampling())
+    architecture = architecture_for(settings, data, scenes)
+    fitted = train(
+        data, scenes, architecture, Schedule(course=settings.schedule), settings.training, seed=settings.seed
+    )
+    sampler = sampler_of(
+        architecture, TorchNetworks(fitted.nets), Schedule(course=settings.schedule), fitted.scaling
+    )
+    return Ats(sampler, scenes, data.agent_from_bone_rest, architecture.ego, PlanSamplingConfig())
 
 
-def judged(data: BehaviorData, scenes: Scenes, settings: Config, effort: Effort) -> dict[str, float]:
+def judged(data: BehaviorData, scenes: Scenes, settings: Config, effort: ScoringConfig) -> dict[str, float]:
     """Train on the data and return the mean scores on its test windows."""
     found = scores(trained(data, scenes, settings), data, settings.family, effort)
     return {name: float(value.mean()) for name, value in found.items() if "/" in name}
@@ -79,11 +98,15 @@ def judged(data: BehaviorData, scenes: Scenes, settings: Config, effort: Effort)
 
 def main() -> None:
     """Train and print both, seed by seed, and their ratio."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent")
     parser.add_argument("--build", type=Path, default=Path("build"))
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--settings", type=Path, help="table of train_behavior, JSON or TOML (default: its defaults)")
+    parser.add_argument(
+        "--settings", type=Path, help="table of train_behavior, JSON or TOML (default: its defaults)"
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
     build = given.build / given.agent
@@ -97,12 +120,18 @@ def main() -> None:
     found: dict[str, list[dict[str, float]]] = {name: [] for name in pairs}
     for seed in range(given.seeds):
         for name, data in pairs.items():
-            effort = Effort(samples=16, trials=4, stride=2, plan_trials=1, plan_stride=8, seed=0)
+            effort = ScoringConfig(samples=16, trials=4, stride=2, plan_stride=8, seed=0)
             found[name].append(judged(data, scenes, replace(settings, seed=seed), effort))
-            print(f"seed {seed}, {name}: goal minDE {found[name][-1]['end_to_end/goal_minde_m']:.3f} m", flush=True)
+            print(
+                f"seed {seed}, {name}: goal minDE {found[name][-1]['end_to_end/goal_minde_m']:.3f} m",
+                flush=True,
+            )
     for score in found["true"][0]:
         ours, true = (float(np.mean([each[score] for each in found[name]])) for name in pairs)
-        print(f"{score:40s} reconstructed {ours:.3f}  true {true:.3f}" + (f"  ratio {ours / true:.2f}" if true else ""))
+        print(
+            f"{score:40s} reconstructed {ours:.3f}  true {true:.3f}"
+            + (f"  ratio {ours / true:.2f}" if true else "")
+        )
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
     python -m benchmarks.behavior_once benchmark --settings table.toml --picture once.png
 
-Needs a finished `behavior_data` with test recordings. Models learn from the same recordings: one is shown a single visit
-to something high, with the jump on to it and off it, one no such visit, one all of them. Each is asked for plans
-where the animal of the test recordings jumped off, and where it stayed.
+Needs a finished `behavior_data` with test recordings. Models learn from the same recordings: one is shown a
+single visit to something high, with the jump on to it and off it, one no such visit, one all of them. Each is
+asked for plans where the animal of the test recordings jumped off, and where it stayed.
 """
 
 import argparse
@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 
 from benchmarks.behavior_gap import trained
-from pipeline import config, figures
-from pipeline.files import images
-from pipeline.models.predictors import Ats
-from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory
+from pipeline.core import config
+from pipeline.data import images, plots
+from pipeline.rivals.predictors import Ats
 from stages.slice_behavior.windows import slice_windows
-from stages.train_behavior.__main__ import Config
+from stages.train_behavior.config import Config
 
 HIGH_M = 0.25
 """a root this much higher than usual is on top of something"""
@@ -56,7 +56,9 @@ class Moments:
 
 def usual_height(data: BehaviorData) -> float:
     """Return the median height of the root."""
-    return float(np.median(np.concatenate([t.world_from_agent[t.valid, 1, 3] for t in data.trajectories.values()])))
+    return float(
+        np.median(np.concatenate([t.world_from_agent[t.valid, 1, 3] for t in data.trajectories.values()]))
+    )
 
 
 def high_frames(trajectory: Trajectory, usual_m: float) -> Bool[np.ndarray, "frame"]:
@@ -65,7 +67,9 @@ def high_frames(trajectory: Trajectory, usual_m: float) -> Bool[np.ndarray, "fra
 
 
 def visits(data: BehaviorData, split: int, usual_m: float) -> list[Visit]:
-    """Return the stays of a split's recordings that were seen from the jump on to something to the jump off it."""
+    """Return the stays of a split's recordings that were seen from the jump on to something to the jump off
+    it.
+    """
     found = []
     for number in np.unique(data.video[data.indices(split)]):
         name = data.videos[number]
@@ -73,7 +77,10 @@ def visits(data: BehaviorData, split: int, usual_m: float) -> list[Visit]:
         edges = np.diff(high.astype(int), prepend=0, append=0)
         for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
             frames = slice(begin - JUMP_FRAMES, end + JUMP_FRAMES)
-            if frames.start >= 0 and data.trajectories[name].valid[frames].sum() == frames.stop - frames.start:
+            if (
+                frames.start >= 0
+                and data.trajectories[name].valid[frames].sum() == frames.stop - frames.start
+            ):
                 found.append(Visit(name, frames))
     return found
 
@@ -87,20 +94,33 @@ def shown(data: BehaviorData, kept: list[Visit], usual_m: float) -> BehaviorData
         for visit in kept:
             if visit.video == name:
                 hidden[visit.frames] = False
-        trajectories[name] = trajectory if name in test else replace(trajectory, valid=trajectory.valid & ~hidden)
+        trajectories[name] = (
+            trajectory if name in test else replace(trajectory, valid=trajectory.valid & ~hidden)
+        )
     return slice_windows(trajectories, test, data.agent_from_bone_rest, stride=1)
 
 
 def moments(data: BehaviorData, usual_m: float, stride: int) -> Moments:
     """Choose windows of the test recordings that begin on top of something, every ``stride``-th."""
     index = data.indices(TEST)
-    high = {number: high_frames(data.trajectories[data.videos[number]], usual_m) for number in np.unique(data.video[index])}
+    high = {
+        number: high_frames(data.trajectories[data.videos[number]], usual_m)
+        for number in np.unique(data.video[index])
+    }
 
     def at(frame: int) -> Bool[np.ndarray, "window"]:
-        return np.array([high[video][start + frame] for video, start in zip(data.video[index], data.start[index], strict=True)])
+        return np.array(
+            [
+                high[video][start + frame]
+                for video, start in zip(data.video[index], data.start[index], strict=True)
+            ]
+        )
 
     begins, length = at(PAST - 1), PAST + data.future
-    off, stays = index[begins & ~at(length - 1)], index[begins & np.all([at(frame) for frame in range(PAST, length)], axis=0)]
+    off, stays = (
+        index[begins & ~at(length - 1)],
+        index[begins & np.all([at(frame) for frame in range(PAST, length)], axis=0)],
+    )
     jumps = {
         (video, start + PAST + int(np.argmin(high[video][start + PAST : start + length])))
         for video, start in zip(data.video[off], data.start[off], strict=True)
@@ -108,7 +128,9 @@ def moments(data: BehaviorData, usual_m: float, stride: int) -> Moments:
     return Moments(off[::stride], stays[::stride], len(jumps))
 
 
-def paths(ats: Ats, data: BehaviorData, index: Int[np.ndarray, "window"]) -> Float[np.ndarray, "window sample frame 3"]:
+def paths(
+    ats: Ats, data: BehaviorData, index: Int[np.ndarray, "window"]
+) -> Float[np.ndarray, "window sample frame 3"]:
     """Sample paths of some windows, in the world."""
     return ats.sample(data.windows(index)[0], SAMPLES, np.random.default_rng(0)).path
 
@@ -124,14 +146,20 @@ def counted(ats: Ats, data: BehaviorData, met: Moments, usual_m: float) -> dict[
         "jump off where the animal does": float(down.mean()),
         "windows where some plan does": float(down.any(1).mean()),
         "jump off where the animal stays": float((stays[:, :, -1, 1] < usual_m + HIGH_M).mean()),
-        "height after it, off the usual [m]": float(np.abs(landing[:, 1] - usual_m).mean()) if len(landing) else np.nan,
-        "land in something solid": float(ats.scenes.inside_solid(landing, data.video[met.off[window]]).mean()) if len(landing) else np.nan,
+        "height after it, off the usual [m]": float(np.abs(landing[:, 1] - usual_m).mean())
+        if len(landing)
+        else np.nan,
+        "land in something solid": float(ats.scenes.inside_solid(landing, data.video[met.off[window]]).mean())
+        if len(landing)
+        else np.nan,
         "landings of a window spread by [m]": float(np.mean(spread)) if spread else np.nan,
     }
 
 
 def picture(models: dict[str, Ats], data: BehaviorData, met: Moments, usual_m: float):
-    """Draw some windows in which the animal jumps off: height over time, one row per model, what the animal does in black."""
+    """Draw some windows in which the animal jumps off: height over time, one row per model, what the animal
+    does in black.
+    """
     index = met.off[np.linspace(0, len(met.off) - 1, SHOWN + 2).astype(int)[1:-1]]
     _, future = data.windows(index)
     figure = Figure(figsize=(2.6 * SHOWN, 2.0 * len(models)), dpi=90, layout="constrained")
@@ -144,16 +172,22 @@ def picture(models: dict[str, Ats], data: BehaviorData, met: Moments, usual_m: f
         row[0].set_ylabel(f"{name}\nheight [m]")
     for axis in grid[-1]:
         axis.set_xlabel("s")
-    return figures.pixels(figure)
+    return plots.pixels(figure)
 
 
 def main() -> None:
     """Train the models, print what they do, and draw some of it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent")
     parser.add_argument("--build", type=Path, default=Path("build"))
-    parser.add_argument("--settings", type=Path, help="table of train_behavior, JSON or TOML (default: its defaults)")
-    parser.add_argument("--visits", type=int, default=1, help="so many single visits, each for a model of its own")
+    parser.add_argument(
+        "--settings", type=Path, help="table of train_behavior, JSON or TOML (default: its defaults)"
+    )
+    parser.add_argument(
+        "--visits", type=int, default=1, help="so many single visits, each for a model of its own"
+    )
     parser.add_argument("--stride", type=int, default=10, help="every so many windows are asked")
     parser.add_argument("--picture", type=Path, help="where to draw some of it")
     given = parser.parse_args()
@@ -164,7 +198,9 @@ def main() -> None:
     settings = config.load(Config, given.settings) if given.settings else Config()
     learned, met = visits(data, TRAIN, usual_m), moments(data, usual_m, given.stride)
     chosen = np.linspace(0, len(learned) - 1, given.visits + 2).astype(int)[1:-1]
-    print(f"{len(learned)} visits to learn from; asked in {len(met.off)} windows of {met.jumps} jumps off, {len(met.stays)} of stays")
+    print(
+        f"{len(learned)} visits to learn from; asked in {len(met.off)} windows of {met.jumps} jumps off, {len(met.stays)} of stays"
+    )
     models = {}
     single = {f"once, in {learned[number].video}": [learned[number]] for number in chosen}
     for name, kept in {**single, "never": [], "all": learned}.items():

@@ -2,10 +2,11 @@
 
     python -m benchmarks.behavior_training cat
 
-Needs a finished `behavior_data`. Perception and goals learn first and alone, as the recipe has it; here that part is
-trained anew for a share of its steps at a time, each with its own schedule, and judged on the test windows. Time is CPU
-time of one thread (on a GPU wall-clock time) of the training whole, scaling of the windows included, reading not.
-The paper's 3-D scene encoder (`[train_behavior] scene = "volume"`) takes a few steps beside ours, for its pace.
+Needs a finished `behavior_data`. Perception and goals learn first and alone, as the recipe has it; here that
+part is trained anew for a share of its steps at a time, each with its own schedule, and judged on the test
+windows. Time is CPU time of one thread (on a GPU wall-clock time) of the training whole, scaling of the
+windows included, reading not. The paper's 3-D scene encoder (`[train_behavior] scene = "volume"`) takes a few
+steps beside ours, for its pace.
 """
 
 import argparse
@@ -16,22 +17,24 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline import config
-from pipeline.models.behavior import Sampling
-from pipeline.models.planning import Sampler, TorchNetworks
-from pipeline.models.predictors import Ats
-from pipeline.models.scenes import Scenes
-from pipeline.models.scores import SCORES
-from pipeline.models.trajectories import TEST, BehaviorData
-from stages.train_behavior.__main__ import Config
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import TEST, BehaviorData
+from pipeline.core import config
+from pipeline.metrics.scores import SCORES
+from pipeline.rivals.predictors import Ats
+from stages.train_behavior.config import Config
 from stages.train_behavior.outcome import architecture_for
-from stages.train_behavior.training import Fitted, train
+from stages.train_behavior.training import TrainedBehavior, train
 
 SHARES = (0.125, 0.25, 0.5, 1.0)
 ENOUGH = 1.1
 SAMPLES = 16
 PACED = {"ours": ("pillars", 10, 50), "3-D scene encoder": ("volume", 1, 3)}
-"""scene encoder, and two lengths of training, whose difference is free of what it costs before its first step"""
+"""scene encoder, and two lengths of training, whose difference is free of what it costs before its first
+step"""
 
 
 @dataclass(frozen=True)
@@ -49,20 +52,30 @@ class Ground:
         torch.cuda.synchronize()
         return time.perf_counter()
 
-    def trained(self, settings: Config, steps: int, goal_steps: int) -> tuple[float, Fitted]:
+    def trained(self, settings: Config, steps: int, goal_steps: int) -> tuple[float, TrainedBehavior]:
         """Return the seconds of a training, and the model."""
         pace = replace(settings.training.optimization, steps=steps, goal_steps=goal_steps)
-        architecture, begin = architecture_for(vars(settings), self.data, self.scenes), self.clock()
+        architecture, begin = architecture_for(settings, self.data, self.scenes), self.clock()
         training = replace(settings.training, optimization=pace)
-        fitted = train(self.data, self.scenes, architecture, settings.schedule, training, seed=settings.seed, device=self.device)
+        fitted = train(
+            self.data,
+            self.scenes,
+            architecture,
+            Schedule(course=settings.schedule),
+            training,
+            seed=settings.seed,
+            device=self.device,
+        )
         return self.clock() - begin, fitted
 
 
-def goal_minde_m(ground: Ground, settings: Config, fitted: Fitted) -> float:
+def goal_minde_m(ground: Ground, settings: Config, fitted: TrainedBehavior) -> float:
     """Return the mean distance of the best of 16 goals from the true one on every second test window."""
-    architecture = architecture_for(vars(settings), ground.data, ground.scenes)
-    sampler = Sampler(TorchNetworks(fitted.nets.cpu()), settings.schedule, fitted.scaling)
-    ats = Ats(sampler, ground.scenes, ground.data.agent_from_bone_rest, architecture.ego, Sampling())
+    architecture = architecture_for(settings, ground.data, ground.scenes)
+    sampler = Sampler(TorchNetworks(fitted.nets.cpu()), Schedule(course=settings.schedule), fitted.scaling)
+    ats = Ats(
+        sampler, ground.scenes, ground.data.agent_from_bone_rest, architecture.ego, PlanSamplingConfig()
+    )
     context, future = ground.data.windows(ground.data.indices(TEST)[::2])
     return float(SCORES["goal_minde_m"](ats.goals(context, SAMPLES, np.random.default_rng(0)), future).mean())
 
@@ -76,7 +89,9 @@ def pace(ground: Ground, settings: Config, short: int, long: int) -> tuple[float
 
 def main() -> None:
     """Train, judge and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent")
     parser.add_argument("--build", type=Path, default=Path("build"))
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")

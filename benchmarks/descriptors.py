@@ -1,11 +1,13 @@
-"""Compare dense descriptors that need no downloaded weights: how many cells find their true partner in another view?
+"""Compare dense descriptors that need no downloaded weights: how many cells find their true partner in
+another view?
 
     python -m benchmarks.descriptors build/cat --rgbd 7scenes/kitchen --pairs 24
 
-Pairs of views see the same things from 5 to 45 degrees apart: of a folder of RGB-D frames with poses (7-Scenes), as they
-are and with the second one relit, and of different sessions of a finished build, whose light differs. A cell's partner
-is told by depth and poses; it is found when the likest of all cells of the other picture lies within a cell of it. Each
-descriptor is asked raw and through the 16 channels that everything downstream uses.
+Pairs of views see the same things from 5 to 45 degrees apart: of a folder of RGB-D frames with poses
+(7-Scenes), as they are and with the second one relit, and of different sessions of a finished build, whose
+light differs. A cell's partner is told by depth and poses; it is found when the likest of all cells of the
+other picture lies within a cell of it. Each descriptor is asked raw and through the 16 channels that
+everything downstream uses.
 """
 
 import argparse
@@ -21,10 +23,10 @@ import scipy.ndimage
 import torch
 from jaxtyping import Float, UInt8
 
-from pipeline.files import arrays
-from pipeline.files.clips import Clip
-from pipeline.models import features
-from pipeline.space import cameras, rigid
+from pipeline.backends import daisy
+from pipeline.data import npz
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid
 
 STRIDE_PX = 8
 WINDOW_PX = 36
@@ -70,9 +72,15 @@ def of_build(build: Path, per_session: int) -> list[list[View]]:
     sessions = []
     for path in sorted(build.glob("registration/*/poses.npz")):
         clip = Clip.open(build / "frames" / path.parent.name)
-        poses = arrays.load(path, ("world_from_camera",))["world_from_camera"]
+        poses = npz.load(path, ("world_from_camera",))["world_from_camera"]
         chosen = np.linspace(0, len(clip) - 1, per_session).astype(int).tolist()
-        sessions.append([View(clip.color(i), clip.depth(i), clip.intrinsics[i], poses[i]) for i in chosen if np.isfinite(poses[i]).all()])
+        sessions.append(
+            [
+                View(clip.color(i), clip.depth(i), clip.intrinsics[i], poses[i])
+                for i in chosen
+                if np.isfinite(poses[i]).all()
+            ]
+        )
     return sessions
 
 
@@ -96,20 +104,26 @@ class Pair:
 
 def paired(first: View, second: View) -> Pair | None:
     """Find true partners; None where the views turn too little or too far or share too little."""
-    turned = np.degrees(rigid.rotation_angle(first.world_from_camera[:3, :3], second.world_from_camera[:3, :3]))
+    turned = np.degrees(
+        rigid.rotation_angle(first.world_from_camera[:3, :3], second.world_from_camera[:3, :3])
+    )
     if not 5 < turned < 45:
         return None
     rows, columns = (side // STRIDE_PX for side in first.color.shape[:2])
     pixel = ((cameras.pixel_grid(rows, columns)) * STRIDE_PX).reshape(-1, 2)
     z = first.depth_at(pixel)
     world = rigid.apply(first.world_from_camera, cameras.unproject(pixel, first.intrinsics) * z[:, None])
-    target, distance = cameras.project(rigid.apply(rigid.inverse(second.world_from_camera), world), second.intrinsics)
+    target, distance = cameras.project(
+        rigid.apply(rigid.inverse(second.world_from_camera), world), second.intrinsics
+    )
     seen = (z > 0) & (distance > 0.1)
     seen &= np.abs(second.depth_at(np.where(seen[:, None], target, -1)) - distance) < SURFACE_M
     return Pair(first, second, np.flatnonzero(seen), target[seen]) if seen.sum() >= LEAST_CELLS else None
 
 
-def drawn(candidates: Callable[[np.random.Generator], tuple[View, View]], count: int, tries: int = 2000) -> list[Pair]:
+def drawn(
+    candidates: Callable[[np.random.Generator], tuple[View, View]], count: int, tries: int = 2000
+) -> list[Pair]:
     """Draw pairs until there are enough."""
     rng, found = np.random.default_rng(0), []
     for _ in range(tries):
@@ -121,28 +135,36 @@ def drawn(candidates: Callable[[np.random.Generator], tuple[View, View]], count:
     return found
 
 
-def dense_sift(color: UInt8[np.ndarray, "height width 3"], stride_px: int) -> Float[np.ndarray, "rows columns channel"]:
+def dense_sift(
+    color: UInt8[np.ndarray, "height width 3"], stride_px: int
+) -> Float[np.ndarray, "rows columns channel"]:
     """Upright SIFT (Lowe 2004) at every cell, square-rooted (Arandjelovic and Zisserman 2012)."""
     gray, points, shape = _prepared(color, stride_px, WINDOW_PX / 6)
     raw = cv2.SIFT.create().compute(gray, points)[1]
     return np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-6)).reshape(*shape, -1)
 
 
-def dense_vgg(color: UInt8[np.ndarray, "height width 3"], stride_px: int) -> Float[np.ndarray, "rows columns channel"]:
+def dense_vgg(
+    color: UInt8[np.ndarray, "height width 3"], stride_px: int
+) -> Float[np.ndarray, "rows columns channel"]:
     """Convexly learnt descriptors (Simonyan et al. 2014), whose tables are part of opencv-contrib."""
     gray, points, shape = _prepared(color, stride_px, WINDOW_PX / 6.25)
     raw = cv2.xfeatures2d.VGG.create().compute(gray, points)[1]
     return _unit(raw).reshape(*shape, -1)
 
 
-def dense_kernels(color: UInt8[np.ndarray, "height width 3"], stride_px: int, patch: int = 32) -> Float[np.ndarray, "rows columns channel"]:
+def dense_kernels(
+    color: UInt8[np.ndarray, "height width 3"], stride_px: int, patch: int = 32
+) -> Float[np.ndarray, "rows columns channel"]:
     """Multiple kernel descriptors (Mukundan et al. 2019) of kornia, without its learnt whitening."""
     from kornia.feature import MKDDescriptor
 
     gray, points, shape = _prepared(color, stride_px, WINDOW_PX)
     offset = ((np.arange(patch) + 0.5) / patch - 0.5) * WINDOW_PX
     at = np.array([point.pt for point in points], np.float32)
-    x, y = np.broadcast_arrays(at[:, :1, None] + offset[None, None, :], at[:, 1:, None] + offset[None, :, None])
+    x, y = np.broadcast_arrays(
+        at[:, :1, None] + offset[None, None, :], at[:, 1:, None] + offset[None, :, None]
+    )
     patches = scipy.ndimage.map_coordinates(gray.astype(np.float32), [y, x], order=1)
     with torch.inference_mode():
         network = MKDDescriptor(patch_size=patch, kernel_type="concat", whitening=None)
@@ -150,39 +172,66 @@ def dense_kernels(color: UInt8[np.ndarray, "height width 3"], stride_px: int, pa
     return _unit(np.nan_to_num(raw)).reshape(*shape, -1)
 
 
-DESCRIPTORS: dict[str, Describe] = {"daisy": features.describe, "sift": dense_sift, "vgg": dense_vgg, "kernels": dense_kernels}
+DESCRIPTORS: dict[str, Describe] = {
+    "daisy": daisy.describe,
+    "sift": dense_sift,
+    "vgg": dense_vgg,
+    "kernels": dense_kernels,
+}
 
 
 def compared(sets: dict[str, list[Pair]], describe: Describe) -> Iterator[tuple[str, float, float]]:
-    """Yield (set, share found raw, share found with 16 channels); the basis is fitted to all pictures of all sets."""
-    views = {id(view): view for pairs in sets.values() for pair in pairs for view in (pair.first, pair.second)}
+    """Yield (set, share found raw, share found with 16 channels); the basis is fitted to all pictures of all
+    sets.
+    """
+    views = {
+        id(view): view for pairs in sets.values() for pair in pairs for view in (pair.first, pair.second)
+    }
     raw = {key: describe(view.color, STRIDE_PX) for key, view in views.items()}
-    basis = features.fit_basis(np.concatenate([d.reshape(-1, d.shape[-1])[::4] for d in raw.values()]), whitening=0.5)
+    basis = daisy.fit_basis(
+        np.concatenate([d.reshape(-1, d.shape[-1])[::4] for d in raw.values()]), whitening=0.5
+    )
     for name, pairs in sets.items():
         shares = [
-            np.mean([_found(pair, project(raw[id(pair.first)]), project(raw[id(pair.second)])) for pair in pairs])
+            np.mean(
+                [_found(pair, project(raw[id(pair.first)]), project(raw[id(pair.second)])) for pair in pairs]
+            )
             for project in (lambda d: d, basis.project)
         ]
         yield name, float(shares[0]), float(shares[1])
 
 
-def _found(pair: Pair, first: Float[np.ndarray, "rows columns channel"], second: Float[np.ndarray, "rows columns channel"]) -> float:
+def _found(
+    pair: Pair,
+    first: Float[np.ndarray, "rows columns channel"],
+    second: Float[np.ndarray, "rows columns channel"],
+) -> float:
     """Return the share of cells whose likest cell is within one of their partner."""
-    likest = (first.reshape(-1, first.shape[-1])[pair.cell] @ second.reshape(-1, second.shape[-1]).T).argmax(1)
+    likest = (first.reshape(-1, first.shape[-1])[pair.cell] @ second.reshape(-1, second.shape[-1]).T).argmax(
+        1
+    )
     row, column = np.divmod(likest, second.shape[1])
     found_px = (np.stack([column, row], -1) + 0.5) * STRIDE_PX
     return float((np.abs(found_px - pair.partner_px).max(-1) < 1.5 * STRIDE_PX).mean())
 
 
-def _prepared(color: np.ndarray, stride_px: int, size: float) -> tuple[np.ndarray, list[cv2.KeyPoint], tuple[int, int]]:
-    """Return the reduced picture, mirrored beyond its edges, with a key point per cell, and the grid's shape."""
+def _prepared(
+    color: np.ndarray, stride_px: int, size: float
+) -> tuple[np.ndarray, list[cv2.KeyPoint], tuple[int, int]]:
+    """Return the reduced picture, mirrored beyond its edges, with a key point per cell, and the grid's
+    shape.
+    """
     gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, features.WORKING_SIDE_PX / max(gray.shape))
+    scale = min(1.0, daisy.WORKING_SIDE_PX / max(gray.shape))
     gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
     rows, columns = (side // stride_px for side in color.shape[:2])
-    gray = cv2.copyMakeBorder(gray, *4 * (features.MARGIN_PX,), cv2.BORDER_REFLECT_101)
-    y, x = ((np.arange(count) + 0.5) * stride_px * scale - 0.5 + features.MARGIN_PX for count in (rows, columns))
-    return gray, [cv2.KeyPoint(float(column), float(row), size, 0.0) for row in y for column in x], (rows, columns)
+    gray = cv2.copyMakeBorder(gray, *4 * (daisy.MARGIN_PX,), cv2.BORDER_REFLECT_101)
+    y, x = ((np.arange(count) + 0.5) * stride_px * scale - 0.5 + daisy.MARGIN_PX for count in (rows, columns))
+    return (
+        gray,
+        [cv2.KeyPoint(float(column), float(row), size, 0.0) for row in y for column in x],
+        (rows, columns),
+    )
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -191,7 +240,9 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     """Print one line per descriptor and set."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("build", type=Path, help="a build with a finished registration")
     parser.add_argument("--rgbd", type=Path, help="a folder of frames of the 7-Scenes kind")
     parser.add_argument("--pairs", type=int, default=24, help="pairs of views per set")
@@ -200,19 +251,32 @@ def main() -> None:
     sessions, sets = of_build(given.build, 12), {}
     if given.rgbd:
         views = of_rgbd(given.rgbd)
-        sets["rgbd"] = drawn(lambda rng: tuple(views[i] for i in rng.choice(len(views), 2, replace=False)), given.pairs)
+        sets["rgbd"] = drawn(
+            lambda rng: tuple(views[i] for i in rng.choice(len(views), 2, replace=False)), given.pairs
+        )
         sets["rgbd, relit"] = [replace(pair, second=relit(pair.second)) for pair in sets["rgbd"]]
 
     def of_two_sessions(rng: np.random.Generator) -> tuple[View, View]:
         one, other = rng.choice(len(sessions), 2, replace=False)
-        return sessions[one][rng.integers(len(sessions[one]))], sessions[other][rng.integers(len(sessions[other]))]
+        return sessions[one][rng.integers(len(sessions[one]))], sessions[other][
+            rng.integers(len(sessions[other]))
+        ]
 
     sets["between sessions"] = drawn(of_two_sessions, given.pairs)
     for name, describe in ((name, DESCRIPTORS[name]) for name in given.descriptors):
         begin = time.process_time()
         shares = {part: [round(raw, 3), round(reduced, 3)] for part, raw, reduced in compared(sets, describe)}
         counts = {part: len(pairs) for part, pairs in sets.items()}
-        print(json.dumps({"descriptor": name, "raw, 16 channels": shares, "pairs": counts, "cpu_s": round(time.process_time() - begin, 1)}))
+        print(
+            json.dumps(
+                {
+                    "descriptor": name,
+                    "raw, 16 channels": shares,
+                    "pairs": counts,
+                    "cpu_s": round(time.process_time() - begin, 1),
+                }
+            )
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Compare the kinds of localizers in one run: error against seconds of training, on clean and on spoilt queries.
+"""Compare the kinds of localizers in one run: error against seconds of training, on clean and on spoilt
+queries.
 
     python -m benchmarks.localizers cat
 
-All kinds learn the same rendered views of the scene's template and are asked the same fresh renders: as they are, at low
-contrast, blurred, dark; and frames of the sessions, whose poses the registration tells. Seconds are CPU seconds of one
-process; rendering and describing views is told apart, since every kind needs it. Needs a finished registration.
+All kinds learn the same rendered views of the scene's template and localize the same fresh renders: as they
+are, at low contrast, blurred, dark; and frames of the sessions, whose poses are the registration's. Seconds
+are CPU seconds of one process; rendering and describing views is reported apart, since every kind needs it.
+Needs a finished registration.
 """
 
 import argparse
@@ -20,12 +22,14 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from pipeline.files import arrays, meshes
-from pipeline.files.clips import Clip, Masks
-from pipeline.models import localizer as model
+from pipeline.backends.descriptors import Describer
+from pipeline.data import npz, ply
+from pipeline.data.clips import Clip, Masks
+from pipeline.data.templates import SceneCameras
+from pipeline.localization import localizer as model
 from stages.train_localizer import describing, training
-from stages.train_localizer.networks import NetOptions
-from stages.train_localizer.views import Photograph
+from stages.train_localizer.config import Config, NetworkConfig, SceneConfig
+from stages.train_localizer.views import RenderedView
 
 NEAR = (5.0, 0.2)
 """degrees and metres within which an answer is near"""
@@ -65,19 +69,28 @@ def spoilt(picture: UInt8[np.ndarray, "height width 3"], how: str) -> UInt8[np.n
 QUERIES = ("clean", "low contrast", "blurred", "dark")
 
 
-def told(localizer: model.Localizer, queries: list[Photograph], how: str) -> tuple[float, float, float]:
-    """Return the median rotation (degrees) and translation (metres) and the share near the truth; silence counts as wrong."""
+def errors_of_renders(
+    localizer: model.Localizer, queries: list[RenderedView], how: str
+) -> tuple[float, float, float]:
+    """Return the median rotation (degrees) and translation (metres) and the share near the truth; silence
+    counts as wrong.
+    """
     spoilt_queries = iter([replace(query, color=spoilt(query.color, how)) for query in queries])
     held = describing.hold_out(localizer, lambda: next(spoilt_queries), len(queries))
     return _summary(held.rotation_deg, held.translation_m)
 
 
-def told_of_sessions(localizer: model.Localizer, build: Path, per_session: int) -> tuple[float, float, float]:
+def errors_of_sessions(
+    localizer: model.Localizer, build: Path, per_session: int
+) -> tuple[float, float, float]:
     """Return the same over frames of the sessions, against the poses that the registration gave them."""
     rotation, translation = [], []
     for path in sorted(build.glob("registration/*/poses.npz")):
-        clip, masks = Clip.open(build / "frames" / path.parent.name), Masks.open(build / "masks" / path.parent.name)
-        poses = arrays.load(path, ("world_from_camera",))["world_from_camera"]
+        clip, masks = (
+            Clip.open(build / "frames" / path.parent.name),
+            Masks.open(build / "masks" / path.parent.name),
+        )
+        poses = npz.load(path, ("world_from_camera",))["world_from_camera"]
         for frame in np.linspace(0, len(clip) - 1, per_session).astype(int):
             camera = (clip.depth_intrinsics[frame], clip.intrinsics[frame])
             answers = localizer.localize(clip.color(frame), clip.depth(frame), *camera, masks[frame] == 0)
@@ -89,32 +102,42 @@ def told_of_sessions(localizer: model.Localizer, build: Path, per_session: int) 
 
 def _summary(rotation, translation):
     rotation, translation = np.nan_to_num(rotation, nan=180.0), np.nan_to_num(translation, nan=10.0)
-    return float(np.median(rotation)), float(np.median(translation)), float(((rotation <= NEAR[0]) & (translation <= NEAR[1])).mean())
+    return (
+        float(np.median(rotation)),
+        float(np.median(translation)),
+        float(((rotation <= NEAR[0]) & (translation <= NEAR[1])).mean()),
+    )
 
 
 def rows(build: Path, queries: int, per_session: int, settings: tuple[Setting, ...]) -> Iterator[str]:
-    """Train and ask; yield the lines of a Markdown table as they become known."""
+    """Train and localize; yield the lines of a Markdown table as they become known."""
     template = build / "scene_template"
     clip = Clip.open(build / "frames" / _walkthrough(build))
-    walk = arrays.load(template / "cameras.npz", ("world_from_camera",))["world_from_camera"]
+    walk = SceneCameras.open(template).world_from_camera
     floor_m = json.loads((template / "world.json").read_text())["floor"]
-    options = training.Options(views=max(setting.views for setting in settings), held_out=40)
+    scene = SceneConfig(views=max(setting.views for setting in settings), held_out=40)
     shown, seconds = timed(
-        lambda: training.show_scene(meshes.read_ply(template / "mesh.ply"), walk, floor_m, clip, options, np.random.default_rng(0))
+        lambda: training.scene_views(
+            ply.read_ply(template / "mesh.ply"), walk, floor_m, clip, scene, np.random.default_rng(0)
+        )
     )
-    per_view = seconds / options.views
-    asked = [shown.draw_query() for _ in range(queries)]
+    per_view = seconds / scene.views
+    rng = np.random.default_rng(2)
+    queries_drawn = [shown.draw_query(rng) for _ in range(queries)]
     yield f"{1000 * per_view:.0f} ms to render a view; {queries} fresh renders, {per_session} frames of each session; deg / m / near"
     yield f"| kind | views | steps | s to learn | s / query | {' | '.join(QUERIES)} | sessions |"
     yield "|---" * (6 + len(QUERIES)) + "|"
     for setting in settings:
-        some = replace(shown, pictures=shown.pictures[: setting.views] + shown.pictures[options.views :])
-        rng, net = np.random.default_rng(1), NetOptions(steps=setting.steps)
+        some = replace(shown, pictures=shown.pictures[: setting.views] + shown.pictures[scene.views :])
+        rng = np.random.default_rng(1)
+        config = Config(kind=setting.kind, network=NetworkConfig(steps=setting.steps))
         (localizer, _), learning = timed(
-            lambda s=setting, n=net, p=some, r=rng: training.train(p, replace(options, net=n), s.kind, "scene", r)
+            lambda c=config, p=some, r=rng: training.train(p, c, Describer(), "cpu", r)
         )
-        answers, asking = timed(lambda m=localizer: [told(m, asked, how) for how in QUERIES])
-        cells = [*answers, told_of_sessions(localizer, build, per_session)]
+        answers, asking = timed(
+            lambda m=localizer: [errors_of_renders(m, queries_drawn, how) for how in QUERIES]
+        )
+        cells = [*answers, errors_of_sessions(localizer, build, per_session)]
         per_query = asking / len(QUERIES) / queries
         figures = " | ".join(f"{deg:.2f} / {metres:.3f} / {near:.2f}" for deg, metres, near in cells)
         yield f"| {setting.kind} | {setting.views} | {setting.steps or ''} | {learning:.0f} | {per_query:.3f} | {figures} |"
@@ -133,17 +156,29 @@ def timed(work: Callable):
 
 def main() -> None:
     """Print the table of one agent's build."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent", help="whose build, for example cat")
     parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
-    parser.add_argument("--queries", type=int, default=60, help="fresh renders that are asked")
-    parser.add_argument("--frames", type=int, default=12, help="frames of each session that are asked")
-    parser.add_argument("--most-steps", type=int, default=8000, help="networks that learn for longer are left out")
-    parser.add_argument("--kinds", nargs="+", default=list(get_args(model.Kind)), choices=get_args(model.Kind), help="kinds compared")
+    parser.add_argument("--queries", type=int, default=60, help="fresh renders that are localized")
+    parser.add_argument("--frames", type=int, default=12, help="frames of each session that are localized")
+    parser.add_argument(
+        "--most-steps", type=int, default=8000, help="networks that learn for longer are left out"
+    )
+    parser.add_argument(
+        "--kinds",
+        nargs="+",
+        default=list(get_args(model.Kind)),
+        choices=get_args(model.Kind),
+        help="kinds compared",
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    settings = tuple(setting for setting in SETTINGS if setting.steps <= given.most_steps and setting.kind in given.kinds)
+    settings = tuple(
+        setting for setting in SETTINGS if setting.steps <= given.most_steps and setting.kind in given.kinds
+    )
     for line in rows(given.build / given.agent, given.queries, given.frames, settings):
         print(line, flush=True)
 

@@ -1,9 +1,10 @@
-"""Does the cost of masks stay linear, and their memory bounded? Repeat one session's frames and segment each length.
+"""Does the cost of masks stay linear, and their memory bounded? Repeat one session's frames and segment each
+length.
 
     python -m benchmarks.masks_scale cat --frames 200 800
 
-A session of a build with frames is walked forth and back as often as needed. Seconds are CPU seconds of one process; peak
-memory is the process's own, each length in a process of its own.
+A session of a build with frames is walked forth and back as often as needed. Seconds are CPU seconds of one
+process; peak memory is the process's own, each length in a process of its own.
 """
 
 import argparse
@@ -18,8 +19,9 @@ import numpy as np
 import torch
 
 from benchmarks.registration_scale import There, forth_and_back
-from pipeline.files.clips import Clip
-from stages.segment_agent.masks import Options, segment
+from pipeline.data.clips import Clip
+from stages.segment_agent.config import Config
+from stages.segment_agent.masks import segment
 
 
 def measure(build: Path, video: str, frames: int) -> tuple[float, float, float]:
@@ -29,7 +31,12 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, float]:
     clip = Clip.open(build / "frames" / video)
     start = time.process_time()
     masks, _ = segment(
-        There(clip, forth_and_back(len(clip), frames)), build / "flow" / video, "session", None, Options(), np.random.default_rng(0)
+        There(clip, forth_and_back(len(clip), frames)),
+        build / "flow" / video,
+        "session",
+        None,
+        Config(),
+        np.random.default_rng(0),
     )
     seen = np.mean([mask.visible for mask in masks])
     return time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, float(seen)
@@ -37,7 +44,9 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, float]:
 
 def main() -> None:
     """Print the table of one session of an agent's build."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent", help="whose build, for example cat")
     parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
     parser.add_argument("--frames", type=int, nargs="+", default=[200, 800, 3200], help="lengths")
@@ -49,7 +58,9 @@ def main() -> None:
     for frames in given.frames:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             seconds, peak_mb, seen = pool.apply(measure, (build, video, frames))
-        print(f"| {frames} | {seconds:.0f} | {seconds / frames:.3f} | {peak_mb:.0f} | {seen:.2f} |", flush=True)
+        print(
+            f"| {frames} | {seconds:.0f} | {seconds / frames:.3f} | {peak_mb:.0f} | {seen:.2f} |", flush=True
+        )
 
 
 if __name__ == "__main__":

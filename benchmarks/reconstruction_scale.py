@@ -1,11 +1,13 @@
-"""Does a step of the reconstruction cost the same however many videos there are, and what does a frame cost in memory?
+"""Does a step of the reconstruction cost the same however many videos there are, and what does a frame cost
+in memory?
 
     python -m benchmarks.reconstruction_scale cat --sessions 1 2 4
 
-The first sessions of a finished build are taken, with walk-through and turnaround; each number of them in a process of
-its own. Milliseconds are CPU time of one thread per step, forward, backward and update, the median of ``--steps``.
-What is measured (rays and thumbnails) lies in mapped files; ``memory`` is what cannot be dropped (anonymous pages), less
-what the programs took before they read a frame, when the steps are done: per frame, poses, bones and their optimiser's state.
+The first sessions of a finished build are taken, with walk-through and turnaround; each number of them in a
+process of its own. Milliseconds are CPU time of one thread per step, forward, backward and update, the median
+of ``--steps``. What is measured (rays and thumbnails) lies in mapped files; ``memory`` is what cannot be
+dropped (anonymous pages), less what the programs took before they read a frame, when the steps are done: per
+frame, poses, bones and their optimiser's state.
 """
 
 import argparse
@@ -19,13 +21,17 @@ import numpy as np
 import torch
 
 from stages.reconstruct import assemble, fuse, optimise, reading
-from stages.reconstruct.assemble import Shapes
-from stages.reconstruct.fuse import Fusion
+from stages.reconstruct.config import (
+    FieldSizes,
+    LearningRates,
+    LossWeights,
+    PixelSampling,
+    RayBatches,
+    SceneFusion,
+)
 from stages.reconstruct.joint import JointLoss
 from stages.reconstruct.problem import Problem
-from stages.reconstruct.rays import Sampling
 from stages.reconstruct.scene import SceneLoss
-from stages.reconstruct.settings import Batches, Rates, Weights
 
 KINDS = ("frames", "masks", "flow", "features")
 
@@ -33,15 +39,19 @@ KINDS = ("frames", "masks", "flow", "features")
 def opened(build: Path, sessions: int) -> Problem:
     """Return the problem of the first so many sessions."""
     videos = json.loads((build / "plan" / "videos.json").read_text())
-    of_role = {role: [video["id"] for video in videos if video["role"] == role] for role in ("walkthrough", "turnaround", "session")}
+    of_role = {
+        role: [video["id"] for video in videos if video["role"] == role]
+        for role in ("walkthrough", "turnaround", "session")
+    }
     walkthrough, turnaround = of_role["walkthrough"][0], of_role["turnaround"][0]
     ids = [walkthrough, turnaround, *of_role["session"][:sessions]]
     found = {kind: {id: build / kind / id for id in ids if (build / kind / id).exists()} for kind in KINDS}
-    folders = reading.Folders(**found, **{name: build / name for name in ("registration", "scene_template", "agent_template")})
-    read = reading.read_videos(folders, walkthrough, turnaround, Sampling(scene_per_frame=256, agent_per_frame=160), 0)
-    shapes = Shapes()
-    fused = fuse.ground(read, shapes.scene_margin_m, Fusion(every=50))
-    return assemble.build(read, reading.read_template(folders.agent_template), shapes, 0, "cpu", fused)
+    folders = reading.Inputs(
+        **found, **{name: build / name for name in ("registration", "scene_template", "agent_template")}
+    )
+    read = reading.read_videos(folders, walkthrough, turnaround, PixelSampling(), 0)
+    fused = fuse.fuse_depth(read, SceneFusion())
+    return assemble.build(read, reading.read_template(folders.agent_template), FieldSizes(), 0, "cpu", fused)
 
 
 def stored_bytes(problem: Problem) -> int:
@@ -74,13 +84,15 @@ def measure(build: Path, sessions: int, steps: int) -> dict[str, float]:
     torch.set_num_threads(1)
     before_mb = anonymous_mb()
     problem = opened(build, sessions)
-    weights, batches, rates = Weights(), Batches(), Rates()
+    weights, batches, rates = LossWeights(), RayBatches(), LearningRates()
     scene = optimise.field_groups(problem.scene, rates)
     return {
         "sessions": sessions,
         "frames": len(problem.video),
         "scene_step_ms": step_ms(problem, SceneLoss(problem, weights, batches, steps), scene, steps),
-        "joint_step_ms": step_ms(problem, JointLoss(problem, weights, batches, steps), optimise.joint_groups(problem, rates), steps),
+        "joint_step_ms": step_ms(
+            problem, JointLoss(problem, weights, batches, steps), optimise.joint_groups(problem, rates), steps
+        ),
         "on_disk_kb_per_frame": stored_bytes(problem) / 1000 / len(problem.video),
         "memory_mb": anonymous_mb() - before_mb,
     }
@@ -88,7 +100,9 @@ def measure(build: Path, sessions: int, steps: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent")
     parser.add_argument("--sessions", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--steps", type=int, default=20)

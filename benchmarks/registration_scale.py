@@ -1,9 +1,10 @@
-"""Does the cost of a registration stay linear? Repeat one session's frames and time the registration of each length.
+"""Does the cost of a registration stay linear? Repeat one session's frames and time the registration of each
+length.
 
     python -m benchmarks.registration_scale cat --frames 200 600 1800 5000
 
-A session of a finished build is walked forth and back as often as needed, so that motions stay real. Seconds are CPU
-seconds of one process; peak memory is the process's own, each length in a process of its own.
+A session of a finished build is walked forth and back as often as needed, so that motions stay real. Seconds
+are CPU seconds of one process; peak memory is the process's own, each length in a process of its own.
 """
 
 import argparse
@@ -18,10 +19,11 @@ import cv2
 import numpy as np
 from jaxtyping import Int
 
-from pipeline.files import meshes
-from pipeline.files.clips import Clip, Masks
-from pipeline.models import localizer
+from pipeline.data import ply
+from pipeline.data.clips import Clip, Masks
+from pipeline.localization import localizer
 from stages.register_videos import registration
+from stages.register_videos.config import Config
 
 
 @dataclass(frozen=True)
@@ -85,20 +87,24 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, bool]:
     clip, masks = Clip.open(build / "frames" / video), Masks.open(build / "masks" / video)
     order = forth_and_back(len(clip), frames)
     maps = registration.Maps(
-        meshes.read_ply(build / "scene_template" / "mesh.ply"),
-        meshes.read_ply(build / "agent_template" / "agent.ply"),
+        ply.read_ply(build / "scene_template" / "mesh.ply"),
+        ply.read_ply(build / "agent_template" / "agent.ply"),
         localizer.load(build / "scene_localizer"),
         localizer.load(build / "agent_localizer"),
     )
     start = time.process_time()
-    found = registration.register(There(clip, order), ThereMasks(masks, order), maps, registration.Options(), np.random.default_rng(0))
+    found = registration.register(
+        There(clip, order), ThereMasks(masks, order), maps, Config(), np.random.default_rng(0)
+    )
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return time.process_time() - start, peak_mb, isinstance(found, registration.Registered)
 
 
 def main() -> None:
     """Print the table of one session of an agent's build."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent", help="whose build, for example cat")
     parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
     parser.add_argument("--frames", type=int, nargs="+", default=[200, 600, 1800, 5000], help="lengths")
@@ -110,7 +116,10 @@ def main() -> None:
     for frames in given.frames:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             seconds, peak_mb, registered = pool.apply(measure, (build, video, frames))
-        print(f"| {frames} | {seconds:.0f} | {seconds / frames:.3f} | {peak_mb:.0f} | {'yes' if registered else 'no'} |", flush=True)
+        print(
+            f"| {frames} | {seconds:.0f} | {seconds / frames:.3f} | {peak_mb:.0f} | {'yes' if registered else 'no'} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""Tell what a build cost: seconds, seconds per frame and peak memory of every stage, from the records beside its artifacts.
+"""Tell what a build cost: seconds, seconds per frame and peak memory of every stage, from the records beside
+its artifacts.
 
     python -m benchmarks.stages cat
 
-Times are wall seconds of the job on the machine that ran it, other jobs beside it included; compare builds made alike.
+Times are wall seconds of the job on the machine that ran it, other jobs beside it included; compare builds
+made alike.
 """
 
 import argparse
@@ -49,7 +51,9 @@ def table(found: list[Cost]) -> str:
     lines = ["| artifact | jobs | seconds | frames | s / frame | peak MB |", "|---|---|---|---|---|---|"]
     for cost in found:
         per_frame = f"{cost.seconds / cost.frames:.3f}" if cost.frames else ""
-        lines.append(f"| {cost.artifact} | {cost.jobs} | {cost.seconds:.0f} | {cost.frames or ''} | {per_frame} | {cost.peak_memory_mb} |")
+        lines.append(
+            f"| {cost.artifact} | {cost.jobs} | {cost.seconds:.0f} | {cost.frames or ''} | {per_frame} | {cost.peak_memory_mb} |"
+        )
     whole = sum(cost.seconds for cost in found)
     lines.append(
         f"| all, one after another | {sum(cost.jobs for cost in found)} | {whole:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |"
@@ -59,7 +63,9 @@ def table(found: list[Cost]) -> str:
 
 def main() -> None:
     """Print the table of one agent's build."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("agent", help="whose build, for example cat")
     parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
     given = parser.parse_args()

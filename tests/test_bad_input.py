@@ -20,7 +20,9 @@ def house(tmp_path_factory):
     """A working copy with recordings of its own: one good walk-through under several names."""
     folder = tmp_path_factory.mktemp("house")
     for name in ("pipeline", "stages"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
+        shutil.copytree(
+            ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules")
+        )
     (folder / "agents").mkdir()
     (folder / "agents" / "luna.toml").touch()
     captures = folder / "captures" / "luna"
@@ -35,7 +37,9 @@ def run(house, *module):
 
 
 def tree(house):
-    files = (path for path in house.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    """Every file but caches, and what a failed job reports about itself: its log and its exit code."""
+    apart = {"__pycache__", "logs", "failures"}
+    files = (path for path in house.rglob("*") if path.is_file() and not apart & set(path.parts))
     return {path.relative_to(house).as_posix(): path.read_bytes() for path in files}
 
 
@@ -46,7 +50,10 @@ def truncated(good: Path, bad: Path) -> None:
 def bomb(good: Path, bad: Path) -> None:
     """A depth picture that unpacks to a gigabyte."""
     shutil.copy(good, bad)
-    with zipfile.ZipFile(bad, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("rgbd/9999.depth", "w") as member:
+    with (
+        zipfile.ZipFile(bad, "a", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("rgbd/9999.depth", "w") as member,
+    ):
         for _ in range(1 << 8):
             member.write(bytes(1 << 20))
 
@@ -68,13 +75,16 @@ def no_recording(good: Path, bad: Path) -> None:
     bad.write_bytes(zlib.compress(good.read_bytes()))
 
 
-@pytest.mark.parametrize(("spoil", "code"), [(truncated, "CAP-001"), (no_recording, "CAP-001"), (bomb, "CAP-002"), (face_id, "CAP-005")])
+@pytest.mark.parametrize(
+    ("spoil", "code"),
+    [(truncated, "CAP-001"), (no_recording, "CAP-001"), (bomb, "CAP-002"), (face_id, "CAP-005")],
+)
 def test_a_bad_recording(house, spoil, code):
     captures = house / "captures" / "luna"
     spoil(captures / "walkthrough.r3d", captures / "session.r3d")
-    assert run(house, "pipeline.plan", "plan", "luna").returncode == 0
+    assert run(house, "pipeline.workflow.plan", "plan", "luna").returncode == 0
     before = tree(house)
-    refused = run(house, "pipeline.run", "luna", "frames.v002")
+    refused = run(house, "pipeline.workflow.run", "luna", "frames.v002")
     assert refused.returncode == 2, refused.stderr
     errors = [line for line in refused.stderr.splitlines() if "error:" in line]
     assert len(errors) == 1, refused.stderr
@@ -86,6 +96,6 @@ def test_a_bad_recording(house, spoil, code):
 
 def test_a_good_one(house):
     shutil.copy(house / "captures/luna/walkthrough.r3d", house / "captures/luna/session.r3d")
-    assert run(house, "pipeline.plan", "plan", "luna").returncode == 0
-    made = run(house, "pipeline.run", "luna", "frames.v000")
+    assert run(house, "pipeline.workflow.plan", "plan", "luna").returncode == 0
+    made = run(house, "pipeline.workflow.run", "luna", "frames.v000")
     assert made.returncode == 0, made.stderr

@@ -1,5 +1,9 @@
-"""`data_layout.md` promises what the stages write: every artifact, every file, every array's key, axes and dtype."""
+"""`data_layout.md` promises what the stages write.
 
+Every artifact, every file, every array's key, axes and dtype.
+"""
+
+import importlib
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -8,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import dag
+from pipeline.data.schema import FileSchema
+from pipeline.workflow import dag
 
 ROOT = Path(__file__).parent.parent
 OF_EVERY_ARTIFACT = re.compile(r"manifest\.json|\.ok|qa\.json|qa/.*")
@@ -24,6 +29,8 @@ class Row:
     """Paths inside the artifact."""
     text: str
     """What the row says of them."""
+    files: str
+    """Their names as written."""
 
     @property
     def arrays(self) -> list[tuple[str, int, str, bool]]:
@@ -31,7 +38,10 @@ class Row:
         if "packed" in self.text:
             return []
         some_lack_it = "has no animal" in self.text
-        return [(name, len(axes.split()), dtype, bool(absent) or some_lack_it) for name, axes, dtype, absent in KEY.findall(self.text)]
+        return [
+            (name, len(axes.split()), dtype, bool(absent) or some_lack_it)
+            for name, axes, dtype, absent in KEY.findall(self.text)
+        ]
 
 
 def pattern_of(text: str) -> re.Pattern[str]:
@@ -55,10 +65,11 @@ def promised() -> dict[str, list[Row]]:
         for files, text in cells:
             for name in names:
                 told = [t for t in re.findall(r"`([^`]+)`", files) if "." in t or t.endswith("/")]
-                mine = [t.removeprefix(f"{name}/").removeprefix("<id>/" if dag.NODES[name].roles or dag.NODES[name].trials == "each" else "") for t in told
-                        if not (t.split("/")[0] in names and t.split("/")[0] != name)]  # fmt: skip
+                several = dag.NODES[name].roles or dag.NODES[name].trials == "each"
+                own = [t for t in told if not (t.split("/")[0] in names and t.split("/")[0] != name)]
+                mine = [t.removeprefix(f"{name}/").removeprefix("<id>/" if several else "") for t in own]
                 if mine:
-                    found[name].append(Row(tuple(map(pattern_of, mine)), text))
+                    found[name].append(Row(tuple(map(pattern_of, mine)), text, files))
     return found
 
 
@@ -66,6 +77,23 @@ def test_every_artifact_is_told():
     assert list(promised()) == sorted(dag.NODES, key=list(promised()).index)
     text = (ROOT / "data_layout.md").read_text()
     assert [node.stage for node in dag.FLOW if f"`{node.stage}`" not in text] == []
+
+
+SCHEMAS = [
+    value
+    for module in sorted(Path(ROOT, "pipeline", "data").glob("*.py"))
+    for value in vars(importlib.import_module(f"pipeline.data.{module.stem}")).values()
+    if isinstance(value, FileSchema)
+]
+
+
+@pytest.mark.parametrize("schema", {each.file: each for each in SCHEMAS}.values(), ids=lambda each: each.file)
+def test_schemas_are_promised(schema):
+    """Readers and writers in `pipeline.data` hold what the page says: key, axes and dtype."""
+    artifact, name = schema.file.split("/")
+    (row,) = [row for row in promised()[artifact] if f"{name}`" in row.files]
+    said = {key: (axes, dtype) for key, axes, dtype, _ in KEY.findall(row.text)}
+    assert said == {key: (" ".join(each.axes), each.dtype) for key, each in schema.arrays.items()}
 
 
 def folders(build: Path, name: str) -> list[Path]:
@@ -79,17 +107,21 @@ def files(folder: Path) -> list[str]:
 
 
 @pytest.mark.toy
-@pytest.mark.parametrize("name", [node.artifact for node in dag.nodes_of("recordings") if not node.aside])
+@pytest.mark.parametrize("name", [node.artifact for node in dag.nodes_of("recordings") if not node.on_demand])
 def test_files_are_as_promised(toy, name):
     written = {file for folder in folders(toy, name) for file in files(folder)}
     patterns = [pattern for row in promised()[name] for pattern in row.patterns]
-    assert [file for file in sorted(written) if not any(p.fullmatch(file) for p in patterns)] == [], "written, not promised"
-    needed = [p for row in promised()[name] for p in row.patterns if not any(word in row.text for word in OPTIONAL)]
+    assert [file for file in sorted(written) if not any(p.fullmatch(file) for p in patterns)] == [], (
+        "written, not promised"
+    )
+    needed = [
+        p for row in promised()[name] for p in row.patterns if not any(word in row.text for word in OPTIONAL)
+    ]
     assert [p.pattern for p in needed if not any(map(p.fullmatch, written))] == [], "promised, not written"
 
 
 @pytest.mark.toy
-@pytest.mark.parametrize("name", [node.artifact for node in dag.nodes_of("recordings") if not node.aside])
+@pytest.mark.parametrize("name", [node.artifact for node in dag.nodes_of("recordings") if not node.on_demand])
 def test_arrays_are_as_promised(toy, name):
     for row in promised()[name]:
         for folder in folders(toy, name):

@@ -1,4 +1,6 @@
-"""The guides tell the truth: every command in them exists, with its options; every link and picture leads somewhere."""
+"""The guides tell the truth: every command in them exists, with its options; every link and picture leads
+somewhere.
+"""
 
 import re
 import shlex
@@ -9,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import dag
+from pipeline.workflow import dag
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -24,7 +26,11 @@ def commands() -> list[tuple[str, str]]:
     for page in PAGES:
         for block in BLOCK.findall(page.read_text()):
             lines = (line.partition("#")[0].strip() for line in block.splitlines())
-            found += [(page.name, line) for line in lines if line.split(" ")[0] in ("make", "python", "snakemake", ".venv/bin/python")]
+            found += [
+                (page.name, line)
+                for line in lines
+                if line.split(" ")[0] in ("make", "python", "snakemake", ".venv/bin/python")
+            ]
     return found
 
 
@@ -43,11 +49,13 @@ def check_make(words: list[str]) -> None:
             continue
         if "=" in word:
             name, value = word.split("=")
-            assert f"$({name})" in makefile or f"$(or $({name})" in makefile or f"$(if $({name})" in makefile, word
+            assert (
+                f"$({name})" in makefile or f"$(or $({name})" in makefile or f"$(if $({name})" in makefile
+            ), word
             if name == "VARIANT":
                 assert (ROOT / f"agents/variants/{value}.toml").exists(), word
             if name == "FORMAT":
-                assert f'"{value}"' in (ROOT / "stages/export/__main__.py").read_text(), word
+                assert f'"{value}"' in (ROOT / "stages/export/config.py").read_text(), word
             continue
         agent, *rest = word.split(".")
         assert word in TARGETS or agent in AGENTS, word
@@ -62,7 +70,7 @@ def test_every_command_exists(page: str, line: str) -> None:
         case "make":
             check_make(words)
         case "snakemake":
-            assert (ROOT / "Snakefile").exists() and (ROOT / "profiles/local/config.yaml").exists()
+            assert (ROOT / "Snakefile").exists() and (ROOT / "profiles/default/config.yaml").exists()
         case _:
             assert words[0] == "-m", line
             if words[1] == "http.server":
@@ -70,15 +78,17 @@ def test_every_command_exists(page: str, line: str) -> None:
             elif words[1].startswith("benchmarks"):
                 assert (ROOT / (words[1].replace(".", "/") + ".py")).exists(), line
             else:
-                assert {word for word in words[2:] if word.startswith("--")} <= set(re.findall(r"--[a-z-]+", help_of(words[1]))), line
+                assert {word for word in words[2:] if word.startswith("--")} <= set(
+                    re.findall(r"--[a-z-]+", help_of(words[1]))
+                ), line
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_link_leads_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
         assert target.startswith("http") or (page.parent / target).exists(), target
-    for key in re.findall(r"`(layout|scene_splats|scene_faces|fitted_poses)", page.read_text()):
-        assert key in (ROOT / "stages/export_simulator/__main__.py").read_text(), key
+    for key in re.findall(r"`(layout|scene_splats|scene_faces)", page.read_text()):
+        assert key in (ROOT / "stages/export_simulator/config.py").read_text(), key
 
 
 def test_pictures_are_small() -> None:

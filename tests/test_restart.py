@@ -1,4 +1,6 @@
-"""Kill the toy's build twenty times while stages write, without the truth on disk: the artifacts are the same bytes."""
+"""Kill the toy's build twenty times while stages write, without the truth on disk: the artifacts are the same
+bytes.
+"""
 
 import contextlib
 import os
@@ -12,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import artifact, dag
-from tests.pipeline import checkout
+from pipeline.workflow import artifact, dag
+from tests.pipeline.workflow import checkout
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.toy
@@ -24,7 +26,7 @@ KILLS = {
 }  # fmt: skip
 """How often a build is killed while an artifact is written, or while its training writes checkpoints."""
 TRAININGS = ("reconstruction", "splats", "behavior")
-BUILT = [node.artifact for node in dag.nodes_of("recordings") if not node.aside]
+BUILT = [node.artifact for node in dag.nodes_of("recordings") if not node.on_demand]
 """What `make toy` makes."""
 LIMIT_S = 3600
 """For the next artifact to begin to be written; a hang ends the test."""
@@ -35,7 +37,9 @@ def copy(toy, tmp_path_factory) -> Path:
     """A working copy that has the toy's recordings, and no truth."""
     folder = tmp_path_factory.mktemp("restart")
     for name in ("pipeline", "stages", "agents", "envs"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
+        shutil.copytree(
+            ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules")
+        )
     shutil.copy(ROOT / "Makefile", folder)
     (folder / ".venv").symlink_to(ROOT / ".venv")
     shutil.copytree(toy / "synthetic_capture", folder / "build/toy/synthetic_capture")
@@ -47,7 +51,9 @@ def begin(folder: Path) -> subprocess.Popen[bytes]:
     """Build what stands before `evaluation`, in a process group of its own."""
     goals = [f"toy.{name}" for name in BUILT if name not in ("evaluation", "report")]
     with (folder / "build.log").open("ab") as log:
-        return subprocess.Popen(["make", "-j2", *goals], cwd=folder, start_new_session=True, stdout=log, stderr=log)
+        return subprocess.Popen(
+            ["make", "-j2", *goals], cwd=folder, start_new_session=True, stdout=log, stderr=log
+        )
 
 
 def being_written(folder: Path, name: str) -> Iterator[Path]:
@@ -64,7 +70,8 @@ def being_written(folder: Path, name: str) -> Iterator[Path]:
 def kill_while_writing(folder: Path, names: list[str], choice: random.Random) -> tuple[str, str]:
     """Build until one of `names` is being written, then SIGKILL the group; return which, and what was there.
 
-    A kill a moment after the last write does not count; where a build ends before one counts, they are made again.
+    A kill a moment after the last write does not count; where a build ends before one counts, they are made
+    again.
     """
     end = time.monotonic() + LIMIT_S
     while time.monotonic() < end:
@@ -73,7 +80,12 @@ def kill_while_writing(folder: Path, names: list[str], choice: random.Random) ->
         build = begin(folder)
         while build.poll() is None and not new and time.monotonic() < end:
             time.sleep(0.002)
-            new = [(name, path) for name in names for path in being_written(folder, name) if path not in left_over]
+            new = [
+                (name, path)
+                for name in names
+                for path in being_written(folder, name)
+                if path not in left_over
+            ]
         if new:
             time.sleep(choice.uniform(0, 0.3 if new[0][0] in TRAININGS else 0.02))
         with contextlib.suppress(ProcessLookupError):
@@ -114,7 +126,10 @@ def rebuilt(copy, toy, pytestconfig) -> Path:
         left[name] -= 1
         count = sum(KILLS.values()) - sum(left.values())
         with shown():
-            print(f"kill {count:2} during {name}, beside {there}; {len(complete(copy))} artifacts complete", flush=True)
+            print(
+                f"kill {count:2} during {name}, beside {there}; {len(complete(copy))} artifacts complete",
+                flush=True,
+            )
     assert begin(copy).wait() == 0, (copy / "build.log").read_text()[-3000:]
     return copy
 
@@ -122,7 +137,11 @@ def rebuilt(copy, toy, pytestconfig) -> Path:
 def test_trainings_went_on_from_their_checkpoints(rebuilt):
     log = (rebuilt / "build.log").read_text()
     for name in TRAININGS:
-        steps = [int(line.rsplit(" ", 1)[1]) for line in log.splitlines() if line.startswith(f"[{name}] resumed at step")]
+        steps = [
+            int(line.rsplit(" ", 1)[1])
+            for line in log.splitlines()
+            if line.startswith(f"[{name}] resumed at step")
+        ]
         assert any(step > 0 for step in steps), f"{name} began again"
 
 
@@ -131,9 +150,13 @@ def test_the_artifacts_are_those_of_an_undisturbed_build_with_truth(rebuilt, toy
     assert not (rebuilt / "build/toy/synthetic_capture/truth").exists()
     done = complete(rebuilt)
     assert {name.split("/")[0] for name in done} == set(BUILT) - {"synthetic_capture", "evaluation", "report"}
-    assert [name for name, manifest in done.items() if manifest.files != artifact.opened(toy / name, name).files] == []
+    assert [
+        name for name, manifest in done.items() if manifest.files != artifact.opened(toy / name, name).files
+    ] == []
     for name in done:
-        assert (rebuilt / "build/toy" / name / artifact.MANIFEST).read_bytes() == (toy / name / artifact.MANIFEST).read_bytes()
+        assert (rebuilt / "build/toy" / name / artifact.MANIFEST).read_bytes() == (
+            toy / name / artifact.MANIFEST
+        ).read_bytes()
 
 
 def test_nothing_is_left_over(rebuilt):

@@ -1,4 +1,6 @@
-"""The whole way through with the toy: every artifact stands, the figures reach their bars, nothing runs twice."""
+"""The whole way through with the toy: every artifact stands, the figures reach their bars, nothing runs
+twice.
+"""
 
 import json
 import subprocess
@@ -6,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import artifact, dag
+from pipeline.workflow import artifact, dag
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.toy
@@ -27,11 +29,13 @@ def metrics(toy):
 @pytest.fixture(scope="module")
 def jobs(toy):
     """What `make toy` makes; tables stand aside."""
-    return [job for job in json.loads((toy / "plan" / "dag.json").read_text()) if not job["aside"]]
+    return [job for job in json.loads((toy / "plan" / "dag.json").read_text()) if not job["on_demand"]]
 
 
 def test_every_artifact_is_complete(jobs):
-    assert {job["artifact"] for job in jobs} == {node.artifact for node in dag.nodes_of("recordings") if not node.aside}
+    assert {job["artifact"] for job in jobs} == {
+        node.artifact for node in dag.nodes_of("recordings") if not node.on_demand
+    }
     for job in jobs:
         manifest = artifact.opened(ROOT / job["out"], job["id"])
         assert manifest.files == artifact.digests(ROOT / job["out"]), job["id"]

@@ -1,4 +1,6 @@
-"""Fifty frames of a real kitchen (7-Scenes): the first half a walk-through, the second a session, both without odometry."""
+"""Fifty frames of a real kitchen (7-Scenes): the first half a walk-through, the second a session, both
+without odometry.
+"""
 
 import os
 import shutil
@@ -10,8 +12,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from pipeline.files import arrays, images
-from pipeline.files.clips import Clip
+from pipeline.data import images, npz
+from pipeline.data.clips import Clip
 
 REAL = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata"))
 SCENE = REAL / "7scenes_AB50"
@@ -39,11 +41,15 @@ def _half(folder, numbers):
         (folder / name).mkdir(parents=True)
     for index, number in enumerate(numbers):
         shutil.copy(SCENE / f"frame-{number:06d}.color.jpg", folder / "color" / f"{index:06d}.jpg")
-        depth = cv2.imread(str(SCENE / f"frame-{number:06d}.depth.png"), cv2.IMREAD_UNCHANGED) / np.float32(1000)
-        images.write_depth(folder / "depth" / f"{index:06d}.exr", np.where(depth < 10, depth, 0).astype(np.float32))
+        depth = cv2.imread(str(SCENE / f"frame-{number:06d}.depth.png"), cv2.IMREAD_UNCHANGED) / np.float32(
+            1000
+        )
+        images.write_depth(
+            folder / "depth" / f"{index:06d}.exr", np.where(depth < 10, depth, 0).astype(np.float32)
+        )
         images.write_gray(folder / "confidence" / f"{index:06d}.png", np.full(depth.shape, 2, np.uint8))
     told = np.repeat(np.loadtxt(SCENE / "camera-intrinsics.txt")[None], len(numbers), axis=0)
-    arrays.save(
+    npz.save(
         folder / "frames.npz",
         timestamp_s=(np.array(numbers) - numbers[0]) / RATE_HZ,
         intrinsics=told,

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.files import arrays, images
-from pipeline.files.clips import Clip
-from stages.estimate_flow.__main__ import Config as FlowConfig
-from stages.estimate_flow.estimation import STRIDE_PX, Estimator, Search, flows
-from stages.segment_agent.follow import Following, Footage, follow
-from stages.segment_agent.masks import Options
+from pipeline.data import images, npz
+from pipeline.data.clips import Clip
+from stages.estimate_flow.config import Config as FlowConfig
+from stages.estimate_flow.estimation import STRIDE_PX, Estimator, flows
+from stages.segment_agent.config import Config
+from stages.segment_agent.follow import Footage, follow
 from stages.segment_agent.prompt import Prompt
 
 DOG = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata")) / "davis_dog"
@@ -33,23 +33,31 @@ def dog(tmp_path_factory):
         (folder / "color" / f"{frame:06d}.jpg").write_bytes((DOG / "rgb" / f"{frame:05d}.jpg").read_bytes())
     images.write_depth(folder / "depth" / "000000.exr", np.zeros((60, 107)))
     eye = np.tile(np.eye(3), (FRAMES, 1, 1))
-    table = dict(timestamp_s=np.arange(FRAMES) / 24, intrinsics=eye, depth_intrinsics=eye, quality=np.ones(FRAMES, np.float32))
-    arrays.save(folder / "frames.npz", gravity_known=np.array(False), **table)
-    clip, settings = Clip.open(folder), FlowConfig()
-    estimator = Estimator(
-        clip.color_size,
-        Search(settings.working_side_px, settings.patch_stride_px, settings.iterations),
-        tolerance_px=settings.tolerance_px,
+    table = dict(
+        timestamp_s=np.arange(FRAMES) / 24,
+        intrinsics=eye,
+        depth_intrinsics=eye,
+        quality=np.ones(FRAMES, np.float32),
     )
+    npz.save(folder / "frames.npz", gravity_known=np.array(False), **table)
+    clip = Clip.open(folder)
+    estimator = Estimator(clip.color_size, FlowConfig().working_side_px)
     gray = [estimator.reduce(clip.color(frame)) for frame in range(FRAMES)]
     found = {(gap, way): [] for gap in (1, 2, 4) for way in ("fw", "bw")}
     for gap, *both in flows(gray.__getitem__, FRAMES, (1, 2, 4), estimator):
         for way, part in zip(("fw", "bw"), both, strict=True):
             found[gap, way].append(part)
     for (gap, way), parts in found.items():
-        flow, confidence = (np.stack([getattr(part, name) for part in parts]) for name in ("flow", "confidence"))
-        arrays.save(folder / f"flow_{gap}_{way}.npz", flow=flow, confidence=confidence)
-    masks = np.stack([cv2.imread(str(DOG / "mask" / f"{frame:05d}.png"), cv2.IMREAD_GRAYSCALE) > 127 for frame in range(FRAMES)])
+        flow, confidence = (
+            np.stack([getattr(part, name) for part in parts]) for name in ("flow", "confidence")
+        )
+        npz.save(folder / f"flow_{gap}_{way}.npz", flow=flow, confidence=confidence)
+    masks = np.stack(
+        [
+            cv2.imread(str(DOG / "mask" / f"{frame:05d}.png"), cv2.IMREAD_GRAYSCALE) > 127
+            for frame in range(FRAMES)
+        ]
+    )
     return folder, clip, masks, found
 
 
@@ -57,9 +65,12 @@ def test_masks_from_one_box(dog):
     folder, clip, truth, _ = dog
     rows, columns = np.nonzero(truth[0])
     hint = Prompt(0, (columns.min(), rows.min(), columns.max() + 1.0, rows.max() + 1.0))
-    footage = Footage(clip, folder, Options().refinement.height_px)
-    found = list(follow(footage, hint, Following(), Options().learning, np.random.default_rng(0)))
-    iou = [((m.labels == 255) & t).sum() / ((m.labels == 255) | t).sum() for m, t in zip(found, truth, strict=True)]
+    footage = Footage(clip, folder, Config().height_px)
+    found = list(follow(footage, hint, Config().learning, np.random.default_rng(0)))
+    iou = [
+        ((m.labels == 255) & t).sum() / ((m.labels == 255) | t).sum()
+        for m, t in zip(found, truth, strict=True)
+    ]
     print(f"DAVIS dog: mean IoU {np.mean(iou):.3f}, worst {np.min(iou):.3f}")
     assert np.mean(iou) >= 0.70
 
@@ -97,10 +108,15 @@ def test_flow_is_not_below_opencv(dog):
 
     def chained(step):
         def move(first, second):
-            whole, pixel = np.zeros((*size, 2), np.float32), np.stack(np.meshgrid(*map(np.arange, size[::-1])), -1).astype(np.float32)
+            whole, pixel = (
+                np.zeros((*size, 2), np.float32),
+                np.stack(np.meshgrid(*map(np.arange, size[::-1])), -1).astype(np.float32),
+            )
             for frame in range(first, second):
                 at = pixel + whole
-                whole = whole + cv2.remap(step(frame), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                whole = whole + cv2.remap(
+                    step(frame), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                )
             return whole
 
         return move
@@ -126,7 +142,11 @@ def test_flow_is_not_below_opencv(dog):
     known = sorted(joints)
     pairs = list(zip(known[:-1:2], known[1::2], strict=False))
     hits = {name: _joint_hits(move, joints, masks, pairs) for name, move in rivals.items()}
-    print("DAVIS dog: PCK@0.2", {name: round(value, 3) for name, value in hits.items()}, f"{len(pairs)} pairs, stride {STRIDE_PX}")
+    print(
+        "DAVIS dog: PCK@0.2",
+        {name: round(value, 3) for name, value in hits.items()},
+        f"{len(pairs)} pairs, stride {STRIDE_PX}",
+    )
     warps = {name: warped_iou(move) for name, move in rivals.items()}
     print("DAVIS dog: 5-frame mask-warp IoU", {name: round(value, 3) for name, value in warps.items()})
     assert warps["ours"] > warps["zero"] + 0.1

@@ -1,4 +1,6 @@
-"""A real kitchen from its colours alone: path, lens and depth of a walk against what a depth camera measured."""
+"""A real kitchen from its colours alone: path, lens and depth of a walk against what a depth camera
+measured.
+"""
 
 from dataclasses import dataclass
 
@@ -7,11 +9,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipeline.files.clips import Clip
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras
 from pipeline.recordings import extraction, upright
 from pipeline.recordings.formats import open_recording
-from pipeline.space import cameras
 from stages.extract_frames import photogrammetry, writing
+from stages.extract_frames.config import Config
 from tests.pipeline.recordings import made_formats
 from tests.real.seven_scenes import SCENE, Half, halves
 
@@ -36,15 +39,16 @@ class Walk:
 def walk(tmp_path_factory) -> Walk:
     folder = tmp_path_factory.mktemp("kitchen")
     truth, _ = halves(folder)
-    made_formats.write_movie(folder / "walk.mp4", [truth.clip.color(i) for i in range(len(truth.clip))], rate=2)
+    made_formats.write_movie(
+        folder / "walk.mp4", [truth.clip.color(i) for i in range(len(truth.clip))], rate=2
+    )
     recording = open_recording(folder / "walk.mp4")
     cv2.setNumThreads(1)
-    mapped = photogrammetry.map_pictures(
-        recording, {}, photogrammetry.PhotogrammetryOptions(), rate_hz=10.0, max_side_px=640, max_depth_m=6.0, jpeg_quality=95,
-        workspace=tmp_path_factory.mktemp("workspace"),
-    )  # fmt: skip
+    mapped = photogrammetry.map_pictures(recording, {}, Config(), tmp_path_factory.mktemp("workspace"))
     out = tmp_path_factory.mktemp("frames")
-    written = writing.write_frames(out, mapped.frames, total=len(mapped.plan.chosen), min_depth_valid=0.2, where="walk")
+    written = writing.write_frames(
+        out, mapped.frames, total=len(mapped.plan.chosen), min_depth_valid=0.2, where="walk"
+    )
     writing.write_table(out, recording, mapped.plan, written)
     clip, kept = Clip.open(out), mapped.plan.chosen[written.kept]
     centres, true = clip.odometry_from_camera[:, :3, 3], truth.world_from_camera[kept][:, :3, 3]
@@ -72,7 +76,9 @@ def test_depth_agrees_with_the_depth_camera(walk: Walk):
         ratio.append(depth[both] / measured[both])
         covered.append(both.sum() / (measured > 0).sum())
     off = np.abs(np.concatenate(ratio) - 1)
-    assert np.median(off) <= 0.08, "scale by 25 cameras of half a walk included; 0.062 measured, 0.021 over the whole walk"
+    assert np.median(off) <= 0.08, (
+        "scale by 25 cameras of half a walk included; 0.062 measured, 0.021 over the whole walk"
+    )
     assert np.mean(covered) >= 0.5
 
 
@@ -82,13 +88,18 @@ def test_a_kitchen_stored_sideways_is_turned_upright(turns):
     if not SCENE.exists():
         pytest.skip(f"no real kitchen at {SCENE} (set ATS_REALDATA)")
     recording = open_recording(SCENE)
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
     assert plan.quarter_turns == 0
     stored = cameras.turn_camera(plan.odometry_from_camera, turns)
     views = []
     for row in np.linspace(0, len(plan.chosen) - 1, 12).round().astype(int):
         depth = extraction.stored_depth(recording, int(recording.index[plan.chosen[row]]), 6.0)
-        views.append((cameras.turn_image(depth, turns), cameras.turn_intrinsics(plan.depth_intrinsics[row], depth.shape, turns)))
+        views.append(
+            (
+                cameras.turn_image(depth, turns),
+                cameras.turn_intrinsics(plan.depth_intrinsics[row], depth.shape, turns),
+            )
+        )
     assert upright.quarter_turns_from_room(stored, views) == -turns % 4
     up, gravity = upright.up_from_room(stored, views), np.loadtxt(SCENE / "gravity-direction.txt")
     assert np.degrees(np.arccos(np.clip(up @ -gravity, -1, 1))) < 3.0

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
+from pipeline.core.errors import InputError
+from pipeline.geometry import cameras, rigid
 from pipeline.recordings import conventions, extraction, stray_scanner, upright
 from pipeline.recordings.formats import format_of, open_recording
 from pipeline.recordings.recording import pose_from_matrix
-from pipeline.space import cameras, rigid
 
 REAL = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata"))
 LIMIT_M = 0.015
@@ -39,10 +39,12 @@ def test_seven_scenes_pass_the_self_check():
     path = _sample("7scenes_AB50")
     assert format_of(path).name == "7-Scenes RGB-D"
     recording = open_recording(path)
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
     assert len(plan.chosen) == 50
-    assert plan.self_check.verdict == "documented"
-    assert plan.self_check.residual_m < 2 * LIMIT_M  # a first Kinect, whose own truth is good to some centimetres
+    assert plan.pose_check.verdict == "documented"
+    assert (
+        plan.pose_check.residual_m < 2 * LIMIT_M
+    )  # a first Kinect, whose own truth is good to some centimetres
     assert not plan.gravity_known
 
 
@@ -51,8 +53,8 @@ def test_turned_seven_scenes_are_found_out(turn):
     recording = open_recording(_sample("7scenes_AB50"))
     turned = cameras.turn_camera(conventions.odometry_from_pose(recording.pose, conventions.OPENCV), turn)
     recording = dataclasses.replace(recording, pose=pose_from_matrix(turned))
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
-    assert plan.self_check.convention.quarter_turns == turn
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
+    assert plan.pose_check.convention.quarter_turns == turn
 
 
 def test_stray_odometry_is_read():
@@ -70,9 +72,9 @@ def test_stray_odometry_is_read():
 
 def test_exr_export_passes_the_self_check():
     recording = open_recording(_sample("record3d_exr12"))
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
-    assert plan.self_check.verdict == "documented"
-    assert plan.self_check.residual_m < LIMIT_M
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
+    assert plan.pose_check.verdict == "documented"
+    assert plan.pose_check.residual_m < LIMIT_M
     assert plan.gravity_known
     assert plan.quarter_turns == 0
     frames = list(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=95))
@@ -97,7 +99,7 @@ def test_turned_readings_are_refuted_by_real_depth(turn):
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
 
     def view(frame):
-        return conventions.DepthView(recording.read_depth(int(recording.index[frame])), intrinsics[frame])
+        return conventions.DepthPicture(recording.read_depth(int(recording.index[frame])), intrinsics[frame])
 
     check = conventions.check_poses(pose, recording.timestamp_s, view)
     assert check.verdict == "other"

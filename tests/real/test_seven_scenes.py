@@ -1,4 +1,6 @@
-"""A real kitchen: a template from one half of a walk, single frames of the other half on it, without odometry."""
+"""A real kitchen: a template from one half of a walk, single frames of the other half on it, without
+odometry.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,15 +10,15 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from pipeline.models import localizer as model
+from pipeline.backends.descriptors import Describer
+from pipeline.data.clips import Clip
+from pipeline.localization import localizer as model
+from pipeline.metrics.pose_errors import PoseErrors, constant_between, pose_errors
 from stages.build_scene_template import template
-from stages.build_scene_template.anchor import AnchorOptions
-from stages.build_scene_template.fuse import FuseOptions
-from stages.build_scene_template.refine import RefineOptions
-from stages.build_scene_template.sfm import SfmOptions
+from stages.build_scene_template.config import Config as TemplateConfig
 from stages.evaluate import localizing
-from stages.evaluate.alignment import PoseErrors, constant_between, pose_errors
 from stages.train_localizer import training
+from stages.train_localizer.config import Config, SceneConfig
 from tests.real.seven_scenes import Half, halves
 
 FRAMES = range(25)
@@ -28,7 +30,7 @@ NEAR = (7.0, 0.15)
 class Kitchen:
     """The template of the first half and the second half beside it."""
 
-    made: template.Template
+    made: template.SceneTemplate
     walk: Half
     session: Half
     truth: Float[np.ndarray, "frame 4 4"]
@@ -42,15 +44,18 @@ def kitchen(tmp_path_factory) -> Kitchen:
     made, _ = template.build(
         walk.clip,
         np.zeros((len(walk.clip), 4, 4, 2), np.float16),
-        structure=SfmOptions(),
-        believe=AnchorOptions(),
-        weights=RefineOptions(),
-        fusion=FuseOptions(),
-        workspace=Path(tmp_path_factory.mktemp("workspace")),
-        seed=0,
+        TemplateConfig(),
+        Path(tmp_path_factory.mktemp("workspace")),
     )
     world = constant_between(made.world_from_camera, walk.world_from_camera)
     return Kitchen(made, walk, session, world @ session.world_from_camera)
+
+
+def _trained(
+    made: template.SceneTemplate, walk: Clip, config: Config, rng: np.random.Generator
+) -> model.Localizer:
+    shown = training.scene_views(made.mesh, made.world_from_camera, made.floor_m, walk, config.scene, rng)
+    return training.train(shown, config, Describer(), "cpu", rng)[0]
 
 
 def _near(errors: PoseErrors) -> float:
@@ -58,7 +63,10 @@ def _near(errors: PoseErrors) -> float:
 
 
 def test_template_is_metric_without_odometry(kitchen: Kitchen):
-    truth = constant_between(kitchen.made.world_from_camera, kitchen.walk.world_from_camera) @ kitchen.walk.world_from_camera
+    truth = (
+        constant_between(kitchen.made.world_from_camera, kitchen.walk.world_from_camera)
+        @ kitchen.walk.world_from_camera
+    )
     errors = pose_errors(kitchen.made.world_from_camera, truth)
     assert np.sqrt((errors.meters**2).mean()) <= 0.08
     assert len(kitchen.made.start.registered) == len(kitchen.walk.clip)
@@ -66,8 +74,7 @@ def test_template_is_metric_without_odometry(kitchen: Kitchen):
 
 def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitchen):
     made, walk, clip = kitchen.made, kitchen.walk.clip, kitchen.session.clip
-    options = training.Options(held_out=40)
-    localizer, _ = training.train_scene(made.mesh, made.world_from_camera, made.floor_m, walk, options, np.random.default_rng(0))
+    localizer = _trained(made, walk, Config(scene=SceneConfig(held_out=40)), np.random.default_rng(0))
     hide = [np.zeros(clip.color_size, bool)] * len(clip)
     ours = pose_errors(localizing.placed_by_localizer(localizer, clip, FRAMES, hide)[0], kitchen.truth)
     points = localizing.sift_map(walk, made.world_from_camera, FRAMES)
@@ -83,12 +90,12 @@ def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitc
 def test_doubtful_answers_are_told_from_good_ones(kitchen: Kitchen):
     """A frame of noise finds no believable place in the kitchen."""
     made, rng = kitchen.made, np.random.default_rng(0)
-    options = training.Options(views=60, held_out=40, frames=25)
-    localizer, _ = training.train_scene(made.mesh, made.world_from_camera, made.floor_m, kitchen.walk.clip, options, rng)
+    config = Config(scene=SceneConfig(views=60, held_out=40, frames=25))
+    localizer = _trained(made, kitchen.walk.clip, config, rng)
     clip = kitchen.session.clip
     noise = rng.integers(0, 255, (*clip.color_size, 3)).astype(np.uint8)
     blurred = cv2.GaussianBlur(noise, (0, 0), 5)
     answers = localizer.localize(blurred, clip.depth(0), clip.depth_intrinsics[0], clip.intrinsics[0])
     right = localizer.localize(clip.color(0), clip.depth(0), clip.depth_intrinsics[0], clip.intrinsics[0])
-    assert isinstance(right[0], model.Hypothesis)
+    assert isinstance(right[0], model.PoseHypothesis)
     assert not answers or answers[0].probability < 0.5 * right[0].probability

@@ -1,4 +1,6 @@
-"""A small rendered recording with truth: a furnished box room and a blocky animal, written as a frames artifact."""
+"""A small rendered recording with truth: a furnished box room and a blocky animal, written as a frames
+artifact.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,14 +8,18 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from pipeline.files import arrays, images
-from pipeline.space import cameras, rigid
-from pipeline.space.meshes import Mesh, RayCaster
+from pipeline.data import images, npz
+from pipeline.geometry import cameras, rigid
+from pipeline.geometry.meshes import Mesh, RayCaster
 
 COLOR_SIZE, DEPTH_SIZE = (120, 90), (120, 90)
 INTRINSICS = np.array([[84.0, 0, 45], [0, 84.0, 60], [0, 0, 1]])
 UP = np.array([0.0, 1.0, 0.0])
-ROOM_COLOR, ANIMAL_COLOR, OTHER_COLOR = np.array([120, 130, 150]), np.array([190, 120, 50]), np.array([60, 160, 80])
+ROOM_COLOR, ANIMAL_COLOR, OTHER_COLOR = (
+    np.array([120, 130, 150]),
+    np.array([190, 120, 50]),
+    np.array([60, 160, 80]),
+)
 
 
 def box(size, at) -> trimesh.Trimesh:
@@ -33,8 +39,14 @@ def room() -> trimesh.Trimesh:
 
 
 def animal() -> trimesh.Trimesh:
-    """Body, head, tail and four legs as overlapping boxes; root in the body, +y up, head towards +z, paws at -0.22."""
-    parts = [box((0.14, 0.15, 0.4), (0, 0, 0)), box((0.12, 0.13, 0.14), (0, 0.12, 0.24)), box((0.03, 0.03, 0.2), (0, 0.06, -0.28))]
+    """Body, head, tail and four legs as overlapping boxes; root in the body, +y up, head towards +z, paws at
+    -0.22.
+    """
+    parts = [
+        box((0.14, 0.15, 0.4), (0, 0, 0)),
+        box((0.12, 0.13, 0.14), (0, 0.12, 0.24)),
+        box((0.03, 0.03, 0.2), (0, 0.06, -0.28)),
+    ]
     parts += [box((0.05, 0.2, 0.05), (x, -0.12, z)) for x in (-0.05, 0.05) for z in (-0.16, 0.16)]
     return trimesh.util.concatenate(parts)
 
@@ -56,31 +68,44 @@ def record(
     seed: int = 0,
     world_from_other: np.ndarray | None = None,
 ) -> Recording:
-    """Render a frames artifact into ``folder``; a pose of NaN leaves the animal out, or the other one, which is green."""
+    """Render a frames artifact into ``folder``; a pose of NaN leaves the animal out, or the other one, which
+    is green.
+    """
     rng = np.random.default_rng(seed)
     still, body = room(), animal()
     others = np.full_like(world_from_agent, np.nan) if world_from_other is None else world_from_other
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir(parents=True)
     masks = []
-    for frame, (camera, agent, other) in enumerate(zip(world_from_camera, world_from_agent, others, strict=True)):
+    for frame, (camera, agent, other) in enumerate(
+        zip(world_from_camera, world_from_agent, others, strict=True)
+    ):
         movers = [(pose, kind) for pose, kind in ((agent, 1), (other, 2)) if not np.isnan(pose).any()]
         mesh = trimesh.util.concatenate([still, *(body.copy().apply_transform(pose) for pose, _ in movers)])
-        kinds = np.repeat([0, *(kind for _, kind in movers), 0], [len(still.faces), *[len(body.faces)] * len(movers), 1])
+        kinds = np.repeat(
+            [0, *(kind for _, kind in movers), 0], [len(still.faces), *[len(body.faces)] * len(movers), 1]
+        )
         directions = cameras.ray_directions(INTRINSICS, *COLOR_SIZE).reshape(-1, 3) @ camera[:3, :3].T
-        hits = RayCaster(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces))).cast(camera[:3, 3], directions)
+        hits = RayCaster(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces))).cast(
+            camera[:3, 3], directions
+        )
         kind = kinds[hits.face]
         points = camera[:3, 3] + directions * hits.distance[:, None]
         check = np.where(np.floor(points / 0.17 + 0.013).astype(int).sum(1) % 2, 25, -25)[:, None]
-        color = np.choose(kind[:, None], [ROOM_COLOR + check, ANIMAL_COLOR, OTHER_COLOR]) + rng.normal(0, 4, (len(points), 3))
+        color = np.choose(kind[:, None], [ROOM_COLOR + check, ANIMAL_COLOR, OTHER_COLOR]) + rng.normal(
+            0, 4, (len(points), 3)
+        )
         depth = hits.distance + rng.normal(0, 0.005, len(points))
-        images.write_color(folder / "color" / f"{frame:06d}.jpg", np.clip(color, 0, 255).astype(np.uint8).reshape(*COLOR_SIZE, 3))
+        images.write_color(
+            folder / "color" / f"{frame:06d}.jpg",
+            np.clip(color, 0, 255).astype(np.uint8).reshape(*COLOR_SIZE, 3),
+        )
         images.write_depth(folder / "depth" / f"{frame:06d}.exr", depth.reshape(DEPTH_SIZE))
         images.write_gray(folder / "confidence" / f"{frame:06d}.png", np.full(DEPTH_SIZE, 2, np.uint8))
         masks.append((kind == 1).reshape(COLOR_SIZE))
     count = len(world_from_camera)
     table = {"odometry_from_camera": odometry} if odometry is not None else {}
-    arrays.save(
+    npz.save(
         folder / "frames.npz",
         timestamp_s=np.arange(count) * 0.1,
         intrinsics=np.repeat(INTRINSICS[None], count, 0),
@@ -107,18 +132,26 @@ def turnaround(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     """Camera and agent poses of a full circle around the standing animal."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     middle = np.array([0.1, 0.2, -0.1])
-    eyes = middle + np.stack([0.95 * np.cos(angles), 0.55 + 0.1 * np.sin(2 * angles), 0.95 * np.sin(angles)], axis=1)
+    eyes = middle + np.stack(
+        [0.95 * np.cos(angles), 0.55 + 0.1 * np.sin(2 * angles), 0.95 * np.sin(angles)], axis=1
+    )
     poses = np.stack([rigid.look_at(eye, middle, UP) for eye in eyes])
     agent = rigid.exp(np.array([0, 0.6, 0, 0.1, 0.22, -0.1]))
     return poses, np.repeat(agent[None], count, 0)
 
 
 def session(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """The animal walks, rests for the middle half, walks on, and is away in the last frames; the phone sways and follows."""
+    """The animal walks, rests for the middle half, walks on, and is away in the last frames; the phone sways
+    and follows.
+    """
     time = np.linspace(0, 1, count)
     along = np.interp(time, [0, 0.25, 0.75, 0.95], [-0.7, 0.0, 0.0, 0.7])
     agent = np.stack([rigid.exp(np.array([0, np.pi / 2, 0, x, 0.22, -0.2])) for x in along])
     agent[-3:] = np.nan
-    eyes = np.stack([0.3 * np.sin(3 * time), 1.1 + 0.05 * np.cos(9 * time), 1.3 + 0.1 * np.sin(5 * time)], axis=1)
-    poses = np.stack([rigid.look_at(eye, np.array([0.4 * x, 0.2, -0.2]), UP) for eye, x in zip(eyes, along, strict=True)])
+    eyes = np.stack(
+        [0.3 * np.sin(3 * time), 1.1 + 0.05 * np.cos(9 * time), 1.3 + 0.1 * np.sin(5 * time)], axis=1
+    )
+    poses = np.stack(
+        [rigid.look_at(eye, np.array([0.4 * x, 0.2, -0.2]), UP) for eye, x in zip(eyes, along, strict=True)]
+    )
     return poses, agent

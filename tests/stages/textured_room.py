@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from pipeline.files import images
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh, RayCaster, render_view
+from pipeline.data import images
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 
 SIZE = (160, 120)
 INTRINSICS = np.array([[118.0, 0, 60], [0, 118.0, 80], [0, 0, 1]])
@@ -16,10 +16,16 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 def textured_room(seed: int = 0, edge_m: float = 0.04) -> Mesh:
-    """3 x 2.2 x 2.6 m, floor at 0, three boxes; each vertex has a colour of smooth noise at several scales."""
+    """3 x 2.2 x 2.6 m, floor at 0, three boxes; each vertex has a colour of smooth noise at several
+    scales.
+    """
     walls = trimesh.creation.box((3.0, 2.2, 2.6), rigid.make(np.eye(3), np.array([0, 1.1, 0.0])))
     walls.invert()
-    boxes = [((0.6, 0.5, 0.9), (1.1, 0.25, 0.6)), ((0.4, 1.1, 0.4), (-1.2, 0.55, -0.9)), ((0.8, 0.35, 0.4), (-0.9, 0.17, 0.9))]
+    boxes = [
+        ((0.6, 0.5, 0.9), (1.1, 0.25, 0.6)),
+        ((0.4, 1.1, 0.4), (-1.2, 0.55, -0.9)),
+        ((0.8, 0.35, 0.4), (-0.9, 0.17, 0.9)),
+    ]
     parts = [walls, *(trimesh.creation.box(size, rigid.make(np.eye(3), np.array(at))) for size, at in boxes)]
     whole = trimesh.util.concatenate(parts)
     vertices, faces = trimesh.remesh.subdivide_to_size(whole.vertices, whole.faces, edge_m, max_iter=12)
@@ -88,7 +94,10 @@ class MemoryClip:
             depth, hits = render_view(self.caster, self.truth[frame], INTRINSICS, *SIZE)
             color = hits.interpolate(self.caster.mesh, self.caster.mesh.color).reshape(*SIZE, 3)
             noise = np.random.default_rng(frame).normal(0, self.noise_m, SIZE)
-            self.cache[frame] = color.round().astype(np.uint8), np.where(depth > 0, depth + noise, 0).astype(np.float32)
+            self.cache[frame] = (
+                color.round().astype(np.uint8),
+                np.where(depth > 0, depth + noise, 0).astype(np.float32),
+            )
         return self.cache[frame]
 
     def color(self, frame: int) -> np.ndarray:
@@ -121,7 +130,11 @@ def drifting(truth: np.ndarray, seed: int, *, deg: float = 0.1, m: float = 0.004
     """Return odometry with its own origin and heading whose steps err at random."""
     rng = np.random.default_rng(seed)
     start = rigid.make(rigid.rotation_from_vector(UP * rng.uniform(-3, 3)), rng.uniform(-1, 1, 3))
-    steps = rigid.inverse(truth[:-1]) @ truth[1:] @ rigid.exp(rng.normal(0, 1, (len(truth) - 1, 6)) * ([np.deg2rad(deg)] * 3 + [m] * 3))
+    steps = (
+        rigid.inverse(truth[:-1])
+        @ truth[1:]
+        @ rigid.exp(rng.normal(0, 1, (len(truth) - 1, 6)) * ([np.deg2rad(deg)] * 3 + [m] * 3))
+    )
     odometry = [start @ truth[0]]
     for step in steps:
         odometry.append(odometry[-1] @ step)

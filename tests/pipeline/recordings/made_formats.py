@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import trimesh
 
-from pipeline.files import images
-from pipeline.space import cameras
+from pipeline.data import images
+from pipeline.geometry import cameras
 from tests.stages.extract_frames.made_recordings import Made, write_zip
 
 START_S = 65575.6
@@ -35,7 +35,9 @@ def put(folder: Path, members: dict[str, bytes | str]) -> Path:
 def write_movie(path: Path, pictures: list[np.ndarray], *, rate: int = 60, key_every: int = 8) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=rate, options={"crf": "4", "preset": "ultrafast", "g": str(key_every)})
+        stream = container.add_stream(
+            "libx264", rate=rate, options={"crf": "4", "preset": "ultrafast", "g": str(key_every)}
+        )
         stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv444p"
         stream.time_base = Fraction(1, rate)
         for number, picture in enumerate(pictures):
@@ -51,7 +53,10 @@ def stored_cameras(made: Made) -> np.ndarray:
 
 
 def quaternion_poses(made: Made) -> np.ndarray:
-    """[frame 7] qx qy qz qw x y z with OpenCV axes; the sign of every second quaternion is flipped, as apps do."""
+    """[frame 7] qx qy qz qw x y z with OpenCV axes.
+
+    The sign of every second quaternion is flipped, as apps do.
+    """
     from pipeline.recordings.recording import pose_from_matrix
 
     pose = pose_from_matrix(stored_cameras(made))
@@ -75,7 +80,10 @@ def stray(folder: Path, made: Made, columns: int = 15) -> Path:
         cells = [START_S + made.timestamp_s[i], f"{i:06d}", *pose[4:], *pose[:4]]
         cells = cells[2:] if columns == 7 else cells + ([fx, fy, cx, cy, "", ""] if columns == 15 else [])
         rows.append(", ".join(map(str, cells)))
-    members = {"odometry.csv": "\n".join(rows), "camera_matrix.csv": f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0"}
+    members = {
+        "odometry.csv": "\n".join(rows),
+        "camera_matrix.csv": f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0",
+    }
     for i in frames:
         members[f"depth/{i:06d}.png"] = png(millimeters(made.depth(i)))
         members[f"confidence/{i:06d}.png"] = png(np.full(made.depth(i).shape, 1, np.uint8))
@@ -101,7 +109,9 @@ def polycam(folder: Path, made: Made, corrected: bool = False) -> Path:
 def polycam_mesh(folder: Path, mesh: trimesh.Trimesh, aligned_from_world: np.ndarray) -> None:
     """Add the app's own mesh as it stores it: turned to its own axes, and the turn beside it."""
     (folder / "raw.glb").write_bytes(mesh.copy().apply_transform(aligned_from_world).export(file_type="glb"))
-    (folder / "mesh_info.json").write_text(json.dumps({"alignmentTransform": aligned_from_world.T.ravel().tolist()}))
+    (folder / "mesh_info.json").write_text(
+        json.dumps({"alignmentTransform": aligned_from_world.T.ravel().tolist()})
+    )
 
 
 def nerfcapture(folder: Path, made: Made, reach_m: float = 8.0) -> Path:
@@ -111,9 +121,13 @@ def nerfcapture(folder: Path, made: Made, reach_m: float = 8.0) -> Path:
     for i, camera in enumerate(cameras.opencv_from_opengl(stored_cameras(made))):
         size = made.color(i).shape[1::-1]
         members[f"rgb/{i}.png"] = png(made.color(i)[..., ::-1])
-        members[f"depth/{i}.png"] = png(cv2.resize(millimeters(made.depth(i), 1 / scale), size, interpolation=cv2.INTER_NEAREST))
+        members[f"depth/{i}.png"] = png(
+            cv2.resize(millimeters(made.depth(i), 1 / scale), size, interpolation=cv2.INTER_NEAREST)
+        )
         names = dict(file_path=f"rgb/{i}.png", depth_path=f"depth/{i}.png")
-        frames.append(names | dict(transform_matrix=camera.tolist(), timestamp=float(made.timestamp_s[i]), cx=cx, cy=cy))
+        frames.append(
+            names | dict(transform_matrix=camera.tolist(), timestamp=float(made.timestamp_s[i]), cx=cx, cy=cy)
+        )
     table = dict(fl_x=fl_x, fl_y=fl_y, integer_depth_scale=scale, frames=frames[::-1])
     return put(folder, members | {"transforms.json": json.dumps(table)})
 
@@ -134,19 +148,31 @@ def tum(folder: Path, made: Made, poses: bool = True, per_meter: float = 5000) -
         members[f"rgb/{time:.6f}.png"] = png(made.color(i)[..., ::-1])
         members[f"depth/{time + 0.004:.6f}.png"] = png(millimeters(made.depth(i), per_meter))
     members["rgb.txt"] = "# colour\n" + "\n".join(f"{time:.6f} rgb/{time:.6f}.png" for time in times)
-    members["depth.txt"] = "# depth\n" + "\n".join(f"{time + 0.004:.6f} depth/{time + 0.004:.6f}.png" for time in times)
-    lines = [" ".join(map(str, [t + 0.002, *p[4:], *p[:4]])) for t, p in zip(times, quaternion_poses(made), strict=True)]
-    return put(folder, members | ({"groundtruth.txt": "# time tx ty tz qx qy qz qw\n" + "\n".join(lines)} if poses else {}))
+    members["depth.txt"] = "# depth\n" + "\n".join(
+        f"{time + 0.004:.6f} depth/{time + 0.004:.6f}.png" for time in times
+    )
+    lines = [
+        " ".join(map(str, [t + 0.002, *p[4:], *p[:4]]))
+        for t, p in zip(times, quaternion_poses(made), strict=True)
+    ]
+    return put(
+        folder,
+        members | ({"groundtruth.txt": "# time tx ty tz qx qy qz qw\n" + "\n".join(lines)} if poses else {}),
+    )
 
 
 def seven_scenes(folder: Path, made: Made, poses: bool = True) -> Path:
-    members: dict[str, bytes | str] = {"camera-intrinsics.txt": "\n".join(" ".join(map(str, row)) for row in made.intrinsics)}
+    members: dict[str, bytes | str] = {
+        "camera-intrinsics.txt": "\n".join(" ".join(map(str, row)) for row in made.intrinsics)
+    }
     for i, camera in enumerate(stored_cameras(made)):
         number = round(30 * made.timestamp_s[i])
         members[f"frame-{number:06d}.color.png"] = png(made.color(i)[..., ::-1])
         members[f"frame-{number:06d}.depth.png"] = png(millimeters(made.depth(i)))
         if poses:
-            members[f"frame-{number:06d}.pose.txt"] = "\n".join("\t".join(f"{x:.9e}" for x in row) for row in camera)
+            members[f"frame-{number:06d}.pose.txt"] = "\n".join(
+                "\t".join(f"{x:.9e}" for x in row) for row in camera
+            )
     return put(folder, members)
 
 

@@ -1,4 +1,7 @@
-"""One walk, written in every format, comes back the same: upright, metric, with its poses, whatever the app stores."""
+"""One walk, written in every format, comes back the same.
+
+Upright, metric, with its poses, whatever the app stores.
+"""
 
 import json
 import struct
@@ -7,12 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.errors import InputError
-from pipeline.files import images
+from pipeline.core.errors import InputError
+from pipeline.data import images
+from pipeline.geometry import rigid
 from pipeline.recordings import extraction, stray_scanner, tum
 from pipeline.recordings.formats import format_of, open_recording
 from pipeline.recordings.movies import Movie
-from pipeline.space import rigid
 from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import Made, walk, write_zip
 
@@ -32,7 +35,7 @@ CASES = {
 
 def _understand(path):
     recording = open_recording(path)
-    return recording, extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, pairs=6, max_side_px=640)
+    return recording, extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
 
 
 def _frames(recording, plan):
@@ -46,7 +49,7 @@ def test_a_walk_comes_back(tmp_path, name):
     path = write(tmp_path / "walkthrough", made)
     assert format_of(path).name == name
     recording, plan = _understand(path)
-    assert plan.self_check.verdict == "documented", plan.self_check
+    assert plan.pose_check.verdict == "documented", plan.pose_check
     assert (turns + plan.quarter_turns) % 4 == 0
     assert plan.gravity_known == (turns == LANDSCAPE)
     np.testing.assert_allclose(plan.timestamp_s, made.timestamp_s[plan.chosen], atol=1e-3)
@@ -64,18 +67,30 @@ def test_a_walk_comes_back(tmp_path, name):
 def test_poses_may_be_missing(tmp_path, write):
     _, plan = _understand(write(tmp_path / "a", walk(8), poses=False))
     assert plan.odometry_from_camera is None
-    assert plan.self_check.reason == "the recording has no device poses"
+    assert plan.pose_check.reason == "the recording has no device poses"
     assert len(plan.chosen) >= 5
 
 
 TIMES, POSES = (np.arange(12) / RATE_HZ).tolist(), walk(12, rate_hz=RATE_HZ).poses().tolist()
 MENDED = {
     "no intrinsics of frames": ({"perFrameIntrinsicCoeffs": []}, 12, None),
-    "few intrinsics of frames": ({"perFrameIntrinsicCoeffs": [[51, 53, 25, 31]] * 9}, 12, "3 of 12 frames have no intrinsics"),
+    "few intrinsics of frames": (
+        {"perFrameIntrinsicCoeffs": [[51, 53, 25, 31]] * 9},
+        12,
+        "3 of 12 frames have no intrinsics",
+    ),
     "no times": ({"frameTimestamps": []}, 12, None),
     "few times": ({"frameTimestamps": TIMES[:10]}, 10, "2 of 12 frames are left out"),
-    "a time twice": ({"frameTimestamps": [*TIMES[:10], TIMES[9], TIMES[11]]}, 11, "1 of 12 frames are left out"),
-    "a time that is none": ({"frameTimestamps": [*TIMES[:10], None, TIMES[11]]}, 11, "1 of 12 frames are left out"),
+    "a time twice": (
+        {"frameTimestamps": [*TIMES[:10], TIMES[9], TIMES[11]]},
+        11,
+        "1 of 12 frames are left out",
+    ),
+    "a time that is none": (
+        {"frameTimestamps": [*TIMES[:10], None, TIMES[11]]},
+        11,
+        "1 of 12 frames are left out",
+    ),
     "few poses": ({"poses": POSES[:10]}, 12, "2 of 12 frames have no device pose"),
     "another camera": ({"cameraType": 2}, 12, "camera type 2 is not known"),
 }
@@ -89,12 +104,19 @@ def test_rows_that_record3d_left_out_cost_no_more_than_themselves(tmp_path, name
     recording = open_recording(made.write(tmp_path / "a.r3d"))
     assert len(recording.index) == len(recording.pose) == len(recording.intrinsics) == frames
     assert (np.diff(recording.timestamp_s) > 0).all()
-    assert [each.startswith(remark) for each in recording.remarks] == [True] if remark else not recording.remarks
+    assert (
+        [each.startswith(remark) for each in recording.remarks] == [True] if remark else not recording.remarks
+    )
 
 
 def test_the_first_frames_intrinsics_stand_in_for_missing_ones(tmp_path):
     made = walk(6)
-    made.metadata["perFrameIntrinsicCoeffs"] = [[51, 53, 25, 31], [0, 0, 0, 0], [51, None, 25, 31], [51, 53, 25, 31]]
+    made.metadata["perFrameIntrinsicCoeffs"] = [
+        [51, 53, 25, 31],
+        [0, 0, 0, 0],
+        [51, None, 25, 31],
+        [51, 53, 25, 31],
+    ]
     recording = open_recording(made.write(tmp_path / "a.r3d"))
     assert recording.intrinsics[:, 0, 0].tolist() == [51, 50, 50, 51, 50, 50]
 
@@ -120,8 +142,14 @@ def test_frames_without_depth_shift_nothing(tmp_path):
 
 
 def test_times_of_a_real_odometry_are_its_own():
-    text = "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, distortion_center_x, distortion_center_y\n"
-    text += "5.0, 000000, 0, 0, 0, 0, 0, 0, 1, 1597.8, 1597.8, 955.3, 717.7, , \n5.05, 000003, 0, 0, 0, 0, 0, 0, 1, 1604.2, 1604.2, 955.5, 717.8, , "
+    text = (
+        "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, "
+        "distortion_center_x, distortion_center_y\n"
+    )
+    text += (
+        "5.0, 000000, 0, 0, 0, 0, 0, 0, 1, 1597.8, 1597.8, 955.3, 717.7, , \n5.05, 000003, "
+        "0, 0, 0, 0, 0, 0, 1, 1604.2, 1604.2, 955.5, 717.8, , "
+    )
     rows = stray_scanner.read_odometry(text, "a")
     assert rows.frame.tolist() == [0, 3]
     assert rows.coefficients[:, 0].tolist() == [1597.8, 1604.2]
@@ -139,7 +167,7 @@ def test_lost_tracking_leaves_frames_out_or_all_poses(tmp_path):
         file.unlink()
     _, plan = _understand(path)
     assert plan.odometry_from_camera is None
-    assert "50 % of the frames have no device pose" in plan.self_check.reason
+    assert "50 % of the frames have no device pose" in plan.pose_check.reason
 
 
 def test_corrected_polycam_pictures_win_and_their_borders_are_no_depth(tmp_path):
@@ -154,7 +182,9 @@ def test_corrected_polycam_pictures_win_and_their_borders_are_no_depth(tmp_path)
             picture[:, :16] = 0
             return picture
 
-    made_formats.polycam(path, Bordered(dark.world_from_camera, dark.timestamp_s, quarter_turns=LANDSCAPE), corrected=True)
+    made_formats.polycam(
+        path, Bordered(dark.world_from_camera, dark.timestamp_s, quarter_turns=LANDSCAPE), corrected=True
+    )
     depth = open_recording(path).read_depth(1_600_000_000)
     assert (depth[:, :7] == 0).all()
     assert (depth[:, 9:] > 0).all()
@@ -211,7 +241,9 @@ def test_a_video_knows_its_damage(tmp_path):
     movie = Movie(tmp_path / "a.mp4")
     assert len(movie) == 40
     right = [
-        picture is not None and np.abs(picture.astype(int) - made.color(i)).mean() < 4 for i in range(40) for picture in [movie.read(i)]
+        picture is not None and np.abs(picture.astype(int) - made.color(i)).mean() < 4
+        for i in range(40)
+        for picture in [movie.read(i)]
     ]
     assert right[0] and right[39]
     assert 20 < sum(right) < 40
@@ -259,7 +291,9 @@ def _intrinsics_of_another_size(path, made):
 def _constant_rows(path, made):
     made_formats.stray(path, made)
     for file in (path / "depth").iterdir():
-        file.write_bytes(made_formats.png(np.repeat(np.arange(32, dtype=np.uint16)[:, None] + 900, 24, axis=1)))
+        file.write_bytes(
+            made_formats.png(np.repeat(np.arange(32, dtype=np.uint16)[:, None] + 900, 24, axis=1))
+        )
     return path
 
 
@@ -327,7 +361,9 @@ def test_what_cannot_be_used_is_refused_with_a_remedy(tmp_path, code):
     assert refused.value.remedy
 
 
-@pytest.mark.parametrize(("color", "depth"), [((1920, 1440), (256, 192)), ((1080, 1920), (144, 256)), ((768, 1366), (27, 48))])
+@pytest.mark.parametrize(
+    ("color", "depth"), [((1920, 1440), (256, 192)), ((1080, 1920), (144, 256)), ((768, 1366), (27, 48))]
+)
 def test_pictures_and_depth_of_one_shape_may_be_rounded(color, depth):
     extraction._refuse_other_shape(color, depth, "a")
     with pytest.raises(InputError, match=f"CAP-008.*depth of {depth[0]} x {depth[1]}"):
@@ -337,7 +373,9 @@ def test_pictures_and_depth_of_one_shape_may_be_rounded(color, depth):
 def test_up_may_be_any_axis():
     turned = extraction._y_up_from((0.0, 0.0, 1.0))
     np.testing.assert_allclose(turned[:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(extraction._y_up_from((0.0, -1.0, 0.0))[:3, :3] @ [0, -1, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        extraction._y_up_from((0.0, -1.0, 0.0))[:3, :3] @ [0, -1, 0], [0, 1, 0], atol=1e-12
+    )
     assert rigid.rotation_angle(np.eye(3), extraction._y_up_from((0.0, 1.0, 0.0))[:3, :3]) < 1e-12
 
 
@@ -350,7 +388,9 @@ def test_the_rotation_tag_of_a_video_makes_it_upright(tmp_path, turns):
     recording, plan = _understand(path)
     assert recording.quarter_turns == plan.quarter_turns == turns
     np.testing.assert_allclose(plan.intrinsics[0], upright.intrinsics, atol=1e-6)
-    np.testing.assert_allclose(plan.odometry_from_camera[0], upright.world_from_camera[plan.chosen[0]], atol=1e-5)
+    np.testing.assert_allclose(
+        plan.odometry_from_camera[0], upright.world_from_camera[plan.chosen[0]], atol=1e-5
+    )
     frame = _frames(recording, plan)[2]
     assert np.abs(frame.color.astype(int) - upright.color(plan.chosen[2])).mean() < 4
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.recordings.selection import choose_frames
+from pipeline.recordings.extraction import choose_frames
 
 
 @settings(max_examples=60, deadline=None)

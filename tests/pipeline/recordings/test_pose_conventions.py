@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.geometry import cameras, rigid
+from pipeline.geometry.meshes import RayCaster
 from pipeline.recordings import conventions, upright
-from pipeline.space import cameras, rigid
-from pipeline.space.meshes import RayCaster
 from tests.stages import textured_room
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
@@ -17,7 +17,7 @@ def _check(made, pose, size=1.0):
 
     def view(frame):
         noisy = size * made.depth(frame) + rng.normal(0, 0.003, DEPTH_SIZE)
-        return conventions.DepthView(noisy, intrinsics)
+        return conventions.DepthPicture(noisy, intrinsics)
 
     return conventions.check_poses(pose, made.timestamp_s, view)
 
@@ -48,13 +48,18 @@ def test_documented_convention_is_kept():
     assert check.residual_m < 0.025  # a 24 x 32 picture steps 30 mm per pixel along a wall
 
 
-@pytest.mark.parametrize("changes", [{"axes": "opencv"}, {"direction": "world_to_camera"}, {"quarter_turns": 1}])
+@pytest.mark.parametrize(
+    "changes", [{"axes": "opencv"}, {"direction": "world_to_camera"}, {"quarter_turns": 1}]
+)
 def test_another_convention_is_found(changes):
     made = walk(60)
     convention = conventions.Convention(**changes)
     check = _check(made, _stored(made, convention))
     assert check.verdict == "other"
-    relative = [rigid.inverse(poses[0]) @ poses[-1] for poses in (made.world_from_camera, _read(made, convention, check))]
+    relative = [
+        rigid.inverse(poses[0]) @ poses[-1]
+        for poses in (made.world_from_camera, _read(made, convention, check))
+    ]
     np.testing.assert_allclose(relative[0], relative[1], atol=1e-6)
 
 
@@ -66,7 +71,9 @@ def test_meaningless_poses_are_unusable():
     made = walk(40)
     pose = made.poses()
     rng = np.random.default_rng(0)
-    shuffled = pose[rng.permutation(len(pose))] + np.concatenate([np.zeros((40, 4)), rng.normal(0, 1, (40, 3))], 1)
+    shuffled = pose[rng.permutation(len(pose))] + np.concatenate(
+        [np.zeros((40, 4)), rng.normal(0, 1, (40, 3))], 1
+    )
     for bad in (
         None,
         np.zeros_like(pose),
@@ -108,7 +115,9 @@ def test_a_phone_that_looks_down_is_left_alone():
 
 @pytest.mark.parametrize("turns", range(4))
 def test_surfaces_give_the_turn_where_nothing_else_does(turns):
-    room = textured_room.MemoryClip(RayCaster(textured_room.textured_room(edge_m=0.2)), textured_room.walk(6), None)
+    room = textured_room.MemoryClip(
+        RayCaster(textured_room.textured_room(edge_m=0.2)), textured_room.walk(6), None
+    )
     intrinsics = cameras.turn_intrinsics(textured_room.INTRINSICS, textured_room.SIZE, -turns)
     stored = [(cameras.turn_image(room.depth(frame), -turns), intrinsics) for frame in range(6)]
     assert upright.quarter_turns_from_surfaces(stored) == turns

@@ -4,19 +4,22 @@ import http.client
 import json
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
 
-from pipeline.errors import InputError
-from pipeline.files import arrays, clicks
-from pipeline.space import rigid
-from pipeline.videos import read as read_videos
+from pipeline.core.errors import InputError
+from pipeline.core.videos import read as read_videos
+from pipeline.data import clicks
+from pipeline.data.poses import RegisteredPoses
+from pipeline.geometry import rigid
 from stages.annotate import __main__ as front
-from stages.annotate import choosing, serving
+from stages.annotate import frame_choice, serving, stage
+from stages.annotate.config import Config
 from stages.evaluate import clicked, real_phone
-from stages.evaluate.reading import Folders
+from stages.evaluate.reading import BuildFolders
 from tests.stages.annotate import clicked_room
 from tests.stages.annotate.clicked_room import SESSION, WALKTHROUGH
 from tests.stages.export_simulator.browser import CHROMIUM, FLAGS
@@ -29,7 +32,7 @@ def room(tmp_path_factory):
 
 @contextmanager
 def running(room, path):
-    server = serving.server(front._desk(room.build, path, front.Config()), 0)
+    server = serving.server(stage.run(front._inputs(room.build), Config(), path), 0)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
     try:
@@ -39,12 +42,23 @@ def running(room, path):
         server.server_close()
 
 
-def folders(room, registration) -> Folders:
+def folders(room, registration) -> BuildFolders:
     frames = {id: room.build / "frames" / id for id in ("v000", "v001")}
     nowhere = room.build / "none"
-    unread = dict.fromkeys(("agent_template", "reconstruction", "scene_localizer", "splats", "behavior_data", "behavior"), nowhere)
+    unread = dict.fromkeys(
+        ("agent_template", "reconstruction", "scene_localizer", "splats", "behavior_data", "behavior"),
+        nowhere,
+    )
     template = room.build / "scene_template"
-    return Folders(frames=frames, masks={}, flow={}, scene_template=template, registration=registration, truth=None, **unread)
+    return BuildFolders(
+        frames=frames,
+        masks={},
+        flow={},
+        scene_template=template,
+        registration=registration,
+        truth=None,
+        **unread,
+    )
 
 
 def click(page, view: str, pixel) -> None:
@@ -64,9 +78,15 @@ def test_seven_clicks_in_a_browser_measure_registration(room, tmp_path):
         page.click("#frames button:nth-child(2)")
         for number, pair in enumerate(wanted, start=1):
             page.click(f"#references button:nth-child({pair.reference.source_index // 3 + 1})")
-            page.wait_for_function("[...document.querySelectorAll('.view img')].every((img) => img.complete && img.clientHeight > 50)")
+            page.wait_for_function(
+                "[...document.querySelectorAll('.view img')].every((img) => "
+                "img.complete && img.clientHeight > 50)"
+            )
             click(page, "seen", pair.seen.pixel)
-            page.wait_for_function("[...document.querySelectorAll('.view img')].every((img) => img.complete && img.clientHeight > 50)")
+            page.wait_for_function(
+                "[...document.querySelectorAll('.view img')].every((img) => "
+                "img.complete && img.clientHeight > 50)"
+            )
             click(page, "reference", pair.reference.pixel)
             page.wait_for_function(f"document.querySelectorAll('#pairs li').length == {number}")
         page.wait_for_function("document.getElementById('told').textContent.includes('mm left')")
@@ -87,22 +107,26 @@ def _measures(room, path, tmp_path) -> None:
     ours = room.session.truth @ off
     ours[:, :3, 3] += [0.2, 0, 0]
     (tmp_path / "registration" / "v001").mkdir(parents=True)
-    arrays.save(tmp_path / "registration" / "v001" / "poses.npz", world_from_camera=ours)
+    replace(RegisteredPoses.unknown(np.arange(float(len(ours)))), world_from_camera=ours).write(
+        tmp_path / "registration" / "v001"
+    )
     where, videos = folders(room, tmp_path / "registration"), read_videos(room.build / "plan" / "videos.json")
     cameras = clicked.cameras_from_clicks(path, where, videos)
-    figures = clicked.clicked_figures(cameras, where, videos)
-    assert figures.values["registration/clicked_frames"] == 1
-    assert figures.values["registration/clicked_residual_m_median"] < 0.03
-    assert abs(figures.values["registration/rotation_deg_median"] - 3) < 1
-    assert abs(figures.values["registration/translation_m_median"] - 0.2) < 0.03
-    refused = clicked.clicked_figures(cameras, folders(room, tmp_path / "nothing"), videos)
+    metrics = clicked.clicked_metrics(cameras, where, videos)
+    assert metrics.values["registration/clicked_frames"] == 1
+    assert metrics.values["registration/clicked_residual_m_median"] < 0.03
+    assert abs(metrics.values["registration/rotation_deg_median"] - 3) < 1
+    assert abs(metrics.values["registration/translation_m_median"] - 0.2) < 0.03
+    refused = clicked.clicked_metrics(cameras, folders(room, tmp_path / "nothing"), videos)
     assert refused.values["registration/rotation_deg_median"] is None
 
 
 def test_exact_clicks_give_the_camera(room):
-    parts = [clicks.Recorded.open(room.build / "frames" / id) for id in ("v001", "v000")]
+    parts = [clicks.ClickedClip.open(room.build / "frames" / id) for id in ("v001", "v000")]
     fit = clicks.fit(room.pairs(2, 7, np.random.default_rng(1)), *parts, room.walkthrough.truth)
-    assert np.degrees(rigid.rotation_angle(fit.world_from_camera[:3, :3], room.session.truth[2, :3, :3])) < 0.6
+    assert (
+        np.degrees(rigid.rotation_angle(fit.world_from_camera[:3, :3], room.session.truth[2, :3, :3])) < 0.6
+    )
     np.testing.assert_allclose(fit.world_from_camera[:3, 3], room.session.truth[2, :3, 3], atol=0.015)
     assert clicks.fit(room.pairs(2, 3, np.random.default_rng(1)), *parts, room.walkthrough.truth) is None
 
@@ -110,12 +134,12 @@ def test_exact_clicks_give_the_camera(room):
 def test_clicks_that_disagree_are_left_out(room, tmp_path):
     pairs = room.pairs(0, 7, np.random.default_rng(2))
     spots = [pair.reference for pair in pairs]
-    mixed = [clicks.Pair(pair.seen, spots[(i + 3) % 7]) for i, pair in enumerate(pairs)]
+    mixed = [clicks.ClickedPair(pair.seen, spots[(i + 3) % 7]) for i, pair in enumerate(pairs)]
     (tmp_path / "clicks.json").write_text(clicks.text(mixed))
     videos = read_videos(room.build / "plan" / "videos.json")
     cameras = clicked.cameras_from_clicks(tmp_path / "clicks.json", folders(room, tmp_path), videos)
-    figures = clicked.clicked_figures(cameras, folders(room, tmp_path), videos)
-    assert "disagree" in figures.reasons["registration/rotation_deg_median"]
+    metrics = clicked.clicked_metrics(cameras, folders(room, tmp_path), videos)
+    assert "disagree" in metrics.reasons["registration/rotation_deg_median"]
 
 
 def test_clicked_cameras_reach_all_frames_by_odometry(room):
@@ -135,7 +159,9 @@ def test_clicked_cameras_reach_all_frames_by_odometry(room):
 
 def ask(port: int, method: str, path: str, body: bytes = b"", **headers) -> int:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    given = {"Host": f"127.0.0.1:{port}", "Content-Type": "application/json"} | {k.replace("_", "-"): v for k, v in headers.items()}
+    given = {"Host": f"127.0.0.1:{port}", "Content-Type": "application/json"} | {
+        k.replace("_", "-"): v for k, v in headers.items()
+    }
     connection.request(method, path, body, given)
     code = connection.getresponse().status
     connection.close()
@@ -147,12 +173,25 @@ def test_the_server_serves_its_own_page_only(room, tmp_path):
     pair = {"seen": spot, "reference": spot | {"recording": WALKTHROUGH}}
     good = json.dumps({"pairs": [pair]}).encode()
     with running(room, tmp_path / "clicks.json") as port:
-        assert ask(port, "GET", "/") == ask(port, "GET", "/state") == ask(port, "GET", "/picture/0/0.jpg") == 200
+        assert (
+            ask(port, "GET", "/") == ask(port, "GET", "/state") == ask(port, "GET", "/picture/0/0.jpg") == 200
+        )
         assert ask(port, "GET", "/", Host="evil.example") == 403
-        assert ask(port, "GET", "/picture/0/99.jpg") == ask(port, "GET", "/picture/9/0.jpg") == ask(port, "GET", "/../x") == 404
+        assert (
+            ask(port, "GET", "/picture/0/99.jpg")
+            == ask(port, "GET", "/picture/9/0.jpg")
+            == ask(port, "GET", "/../x")
+            == 404
+        )
         assert ask(port, "POST", "/clicks", good, Origin="http://evil.example") == 403
         assert ask(port, "POST", "/clicks", good, Content_Type="text/plain") == 403
-        for bad in (b"{", b"{}", b'{"pairs": [1]}', good.replace(b"0.5", b"1.5"), good.replace(b"session", b"sossion")):
+        for bad in (
+            b"{",
+            b"{}",
+            b'{"pairs": [1]}',
+            good.replace(b"0.5", b"1.5"),
+            good.replace(b"session", b"sossion"),
+        ):
             assert ask(port, "POST", "/clicks", bad) == 400
         assert not (tmp_path / "clicks.json").exists()
         assert ask(port, "POST", "/clicks", good) == 200
@@ -167,5 +206,7 @@ def test_what_is_no_file_of_clicks_is_refused(tmp_path):
 
 
 def test_the_sharpest_of_each_stretch_is_shown():
-    assert choosing.spread(np.array([0, 3, 1, 5, 4, 2.0]), 2) == [1, 3]
-    assert choosing.spread(np.array([0, 3, 1, 5, 4, 2.0]), 2, np.array([1, 0, 1, 0, 0, 0], bool)) == [2]
+    assert frame_choice.sharpest_per_stretch(np.array([0, 3, 1, 5, 4, 2.0]), 2) == [1, 3]
+    assert frame_choice.sharpest_per_stretch(
+        np.array([0, 3, 1, 5, 4, 2.0]), 2, np.array([1, 0, 1, 0, 0, 0], bool)
+    ) == [2]

@@ -9,21 +9,24 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from pipeline.errors import InputError
-from pipeline.files.clips import Clip
-from pipeline.space import rigid
-from stages.build_agent_template.bones import Skeleton, lay_bones
+from pipeline.core.errors import InputError
+from pipeline.data.clips import Clip
+from pipeline.geometry import rigid
+from stages.build_agent_template.bones import lay_bones
 from stages.build_agent_template.carve import Silhouettes
+from stages.build_agent_template.config import Config
 from stages.build_agent_template.poses import depth_labels, walk_around
-from stages.build_agent_template.template import Options, build
+from stages.build_agent_template.template import build
 
-_spec = importlib.util.spec_from_file_location("room_with_animal", Path(__file__).parent.parent / "room_with_animal.py")
+_spec = importlib.util.spec_from_file_location(
+    "room_with_animal", Path(__file__).parent.parent / "room_with_animal.py"
+)
 scenery = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(scenery)
 
 
 class TrueMasks:
-    """The recording's true masks, as `pipeline.files.clips.Masks` gives them."""
+    """The recording's true masks, as `pipeline.data.clips.Masks` gives them."""
 
     def __init__(self, masks, folder):
         self.masks, self.folder, self.visible = masks, folder, masks.any((1, 2))
@@ -47,7 +50,7 @@ def turnaround(tmp_path_factory):
 @pytest.fixture(scope="module")
 def template(turnaround):
     clip, masks, features, _ = turnaround
-    return build(clip, masks, features, Options(), np.random.default_rng(0))
+    return build(clip, masks, features, Config(), np.random.default_rng(0))
 
 
 def true_from_ours(template, turnaround):
@@ -65,7 +68,9 @@ def test_the_surface_is_closed_and_near_the_truth(template, turnaround):
     assert 1000 < len(mesh.vertices) < 4000
     ours = rigid.apply(true_from_ours(template, turnaround), mesh.sample(4000, seed=0))
     true = scenery.animal().sample(20000, seed=0)
-    assert cKDTree(true).query(ours)[0].mean() < 0.012, "metres; cells of 8 mm, depth noise of 5 mm, pixels of 11 mm"
+    assert cKDTree(true).query(ours)[0].mean() < 0.012, (
+        "metres; cells of 8 mm, depth noise of 5 mm, pixels of 11 mm"
+    )
 
 
 def test_the_axes_point_up_and_to_the_head(template, turnaround):
@@ -78,7 +83,7 @@ def test_the_axes_point_up_and_to_the_head(template, turnaround):
 @pytest.mark.parametrize(("turn_deg", "head"), [(180, [0, 0, -1]), (90, [1, 0, 0])])
 def test_the_animal_can_be_turned(turnaround, template, turn_deg, head):
     clip, masks, features, _ = turnaround
-    turned = build(clip, masks, features, replace(Options(), turn_deg=turn_deg), np.random.default_rng(0))
+    turned = build(clip, masks, features, replace(Config(), turn_deg=turn_deg), np.random.default_rng(0))
     former_from_new = template.agent_from_camera[0, :3, :3] @ turned.agent_from_camera[0, :3, :3].T
     assert np.allclose(former_from_new @ [0, 0, 1], head, atol=1e-6)
 
@@ -101,9 +106,13 @@ def test_limbs_have_bones_of_their_own():
     """Cells of the true animal: every paw, the head and the tail's tip belong to different bones."""
     grid = np.stack(np.meshgrid(*[np.arange(-0.4, 0.4, 0.012)] * 3, indexing="ij"), -1).reshape(-1, 3)
     parts = scenery.animal().split()
-    inside = grid[np.any([np.all((grid > part.bounds[0]) & (grid < part.bounds[1]), axis=1) for part in parts], axis=0)]
-    bones = lay_bones(inside, 0.012, Skeleton(), np.random.default_rng(0))
-    tips = np.array([[x, -0.21, z] for x in (-0.05, 0.05) for z in (-0.16, 0.16)] + [[0, 0.12, 0.28], [0, 0.06, -0.36]])
+    inside = grid[
+        np.any([np.all((grid > part.bounds[0]) & (grid < part.bounds[1]), axis=1) for part in parts], axis=0)
+    ]
+    bones = lay_bones(inside, 0.012, Config().bones, np.random.default_rng(0))
+    tips = np.array(
+        [[x, -0.21, z] for x in (-0.05, 0.05) for z in (-0.16, 0.16)] + [[0, 0.12, 0.28], [0, 0.06, -0.36]]
+    )
     nearest = np.linalg.norm(bones.agent_from_bone_rest[None, :, :3, 3] - tips[:, None], axis=-1)
     assert len(set(nearest.argmin(1))) == len(tips)
     assert nearest.min(1).max() < 0.07, "metres from a tip to its bone's centre"
@@ -112,7 +121,7 @@ def test_limbs_have_bones_of_their_own():
 
 def test_the_same_seed_gives_the_same_template(turnaround, template):
     clip, masks, features, _ = turnaround
-    again = build(clip, masks, features, Options(), np.random.default_rng(0))
+    again = build(clip, masks, features, Config(), np.random.default_rng(0))
     assert np.array_equal(again.mesh.vertices, template.mesh.vertices)
     assert np.array_equal(again.weights, template.weights)
 
@@ -122,14 +131,16 @@ def test_silhouettes_count_only_what_a_ray_passes():
     intrinsics = np.array([[10.0, 0, 2], [0, 10.0, 2], [0, 0, 1]])
     grid.add(np.zeros((4, 4), np.uint8), np.full((4, 4), 1.7, np.float32), intrinsics, np.eye(4))
     grid.add(np.full((4, 4), 255, np.uint8), np.full((4, 4), 1.2, np.float32), intrinsics, np.eye(4))
-    assert grid.share_beside().reshape(-1).tolist() == [0.5, 0.5, 0.0], "the third cell lies behind what the ray met"
+    assert grid.share_off_mask().reshape(-1).tolist() == [0.5, 0.5, 0.0], (
+        "the third cell lies behind what the ray met"
+    )
 
 
 def test_too_few_frames_are_refused(turnaround):
     clip, masks, features, _ = turnaround
     few = TrueMasks(np.where(np.arange(36)[:, None, None] < 5, masks.masks, False), masks.folder)
     with pytest.raises(InputError, match="AGT-001"):
-        build(clip, few, features, Options(), np.random.default_rng(0))
+        build(clip, few, features, Config(), np.random.default_rng(0))
 
 
 def test_an_animal_without_depth_is_refused(turnaround):
@@ -139,5 +150,5 @@ def test_an_animal_without_depth_is_refused(turnaround):
         def depth(self, frame):
             return np.where(depth_labels(masks[frame], self.depth_size) == 255, 0, super().depth(frame))
 
-    with pytest.raises(InputError, match="AGT-001.*only 0 points"):
-        walk_around(Blind(**vars(clip)), masks, Options().straightening)
+    with pytest.raises(InputError, match="AGT-001.*only 0 depth points"):
+        walk_around(Blind(**vars(clip)), masks)

@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.space.tsdf import Volume
-from stages.build_agent_template.fuse import Fusion, extract
+from pipeline.geometry.tsdf import Volume
+from stages.build_agent_template.config import Config
+from stages.build_agent_template.fuse import TRUNCATION_M, extract
 
 RADIUS_M, SIDE_M = 0.03, 0.2
 
 
-def ball(options: Fusion, middle: np.ndarray, scrap: bool) -> Volume:
+def ball(options: Config, middle: np.ndarray, scrap: bool) -> Volume:
     """A ball as thick as a leg, and on its side a sheet one cell thin."""
     cells = int(SIDE_M / options.voxel_m)
-    volume = Volume(np.full(3, -SIDE_M / 2), (cells, cells, cells), options.voxel_m, options.truncation_m)
+    volume = Volume(np.full(3, -SIDE_M / 2), (cells, cells, cells), options.voxel_m, TRUNCATION_M)
     place = volume.origin + np.stack(np.indices(volume.weight.shape), axis=-1) * options.voxel_m
-    volume.distance[:] = np.clip((np.linalg.norm(place - middle, axis=-1) - RADIUS_M) / options.truncation_m, -1, 1)
+    volume.distance[:] = np.clip((np.linalg.norm(place - middle, axis=-1) - RADIUS_M) / TRUNCATION_M, -1, 1)
     if scrap:
         volume.distance[cells // 2, cells // 2 : -4, cells // 2 : cells // 2 + 3] = -0.1
     volume.weight[:] = 1
@@ -24,12 +25,14 @@ def ball(options: Fusion, middle: np.ndarray, scrap: bool) -> Volume:
 
 @pytest.mark.parametrize("scrap", [False, True])
 def test_smoothing_takes_nothing_from_what_is_round(scrap):
-    options, found_m = Fusion(), []
+    options, found_m = Config(), []
     for middle in np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3)) * options.voxel_m:
         volume = ball(options, middle, scrap)
         nowhere = np.zeros(volume.weight.shape)
-        mesh = extract(volume, nowhere, nowhere > 0, options).mesh
+        mesh = extract(volume, nowhere, nowhere > 0, options.vertices).mesh
         surface = trimesh.Trimesh(mesh.vertices, mesh.faces)
         assert surface.is_watertight
         found_m.append((surface.volume / (4 / 3 * np.pi)) ** (1 / 3))
-    assert np.mean(found_m) == pytest.approx(RADIUS_M, abs=0.0008), "28.0 mm are left where nothing makes up for smoothing"
+    assert np.mean(found_m) == pytest.approx(RADIUS_M, abs=0.0008), (
+        "28.0 mm are left where nothing makes up for smoothing"
+    )

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline.space.tsdf import Volume
+from pipeline.geometry.tsdf import Volume
 from stages.build_agent_template import appearance
-from stages.build_agent_template.limbs import Moving, find_limb, space_of
+from stages.build_agent_template.limbs import find_limb, space_of
 
 CELLS = np.stack(np.meshgrid(*[np.arange(-0.1, 0.101, 0.02)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 """of a still body, 20 cm wide"""
@@ -23,24 +23,28 @@ def measured(angles: np.ndarray) -> tuple[dict, dict]:
 
 def test_frames_in_which_a_tail_stood_alike_are_chosen():
     angles = 0.6 * np.sin(np.arange(80) * 0.4)
-    limb = find_limb(*measured(angles), CELLS, Moving())
+    limb = find_limb(*measured(angles), CELLS)
     assert limb is not None and 12 <= len(limb.frames) < 50
-    assert np.ptp(angles[limb.frames]) * 0.3 < 0.09, "metres at the tip: alike within 3 cm to either side of where points are dense"
+    assert np.ptp(angles[limb.frames]) * 0.3 < 0.09, (
+        "metres at the tip: alike within 3 cm to either side of where points are dense"
+    )
     volume = Volume(np.array([-0.4, -0.1, -0.1]), (81, 21, 46), 0.01, 0.03)
-    there = space_of(limb, volume, Moving())
+    there = space_of(limb, volume)
     tip = np.round((tail(angles.max())[-1] - volume.origin) / 0.01).astype(int)
-    assert there[tuple(tip)] and not there[40, 10, 10], "where the limb was, and not in the middle of the body"
+    assert there[tuple(tip)] and not there[40, 10, 10], (
+        "where the limb was, and not in the middle of the body"
+    )
 
 
 def test_a_body_that_stands_still_has_no_moved_limb():
     points, above = measured(np.zeros(40))
     still = np.concatenate([CELLS, tail(0.0)])
-    assert find_limb(points, above, still, Moving()) is None
+    assert find_limb(points, above, still) is None
 
 
 def test_points_on_the_ground_are_no_limb():
     points, above = measured(0.6 * np.sin(np.arange(80) * 0.4))
-    assert find_limb(points, {frame: 0 * each for frame, each in above.items()}, CELLS, Moving()) is None
+    assert find_limb(points, {frame: 0 * each for frame, each in above.items()}, CELLS) is None
 
 
 def test_vertices_beside_the_mask_do_not_count():

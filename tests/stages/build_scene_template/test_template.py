@@ -1,18 +1,21 @@
-"""The walk-through becomes a metric, upright template: structure from motion, its refutation, refinement, fusion, cleaning."""
+"""The walk-through becomes a metric, upright template: structure from motion, its refutation, refinement,
+fusion, cleaning.
+"""
 
 import numpy as np
 import pycolmap
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.files import meshes as mesh_files
-from pipeline.space import ground, rigid, tsdf
-from pipeline.space.meshes import Mesh, RayCaster
-from pipeline.space.sparse import Sparse
+from pipeline.core.errors import InputError
+from pipeline.data import ply as mesh_files
+from pipeline.geometry import ground, rigid, tsdf
+from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.mapping.sparse_model import SparseModel
 from stages.build_scene_template import anchor, fuse, matches, refine, sfm, template
+from stages.build_scene_template.config import Config, FusionConfig, RefinementConfig, SfmConfig
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
-STRUCTURE = sfm.SfmOptions(most_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
+SFM = SfmConfig(most_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
 
 
 @pytest.fixture(scope="module")
@@ -25,18 +28,18 @@ def clip(tmp_path_factory) -> MemoryClip:
 
 
 def test_template_is_metric_upright_and_follows_the_truth(clip, tmp_path):
-    fusion = fuse.FuseOptions(voxel_m=0.05, truncation_m=0.15, island_faces=30, feature_frames=6)
+    fusion = FusionConfig(voxel_m=0.05, truncation_m=0.15, island_faces=30, feature_frames=6)
+    config = Config(sfm=SFM, refinement=RefinementConfig(rounds=6), fusion=fusion)
     features = np.random.default_rng(0).normal(size=(len(clip), 20, 15, 16))
-    made, sparse = template.build(
-        clip, features, structure=STRUCTURE, believe=anchor.AnchorOptions(), weights=refine.RefineOptions(rounds=6),
-        fusion=fusion, workspace=tmp_path, seed=0,
-    )  # fmt: skip
+    made, sparse = template.build(clip, features, config, tmp_path)
     rotation, distance = aligned_errors(made.world_from_camera, clip.truth)
     assert np.median(rotation) < 0.5, "degrees"
     assert np.median(distance) < 0.015, "metres, without any scale"
     assert made.start.source == "colmap"
     assert len(sparse.frame) >= 10
-    up_error = made.world_from_camera[:, :3, :3] @ np.swapaxes(clip.truth[:, :3, :3], 1, 2) @ np.array([0, 1.0, 0])
+    up_error = (
+        made.world_from_camera[:, :3, :3] @ np.swapaxes(clip.truth[:, :3, :3], 1, 2) @ np.array([0, 1.0, 0])
+    )
     assert np.rad2deg(np.arccos(up_error[:, 1])).max() < 1.5, "degrees between the world's +y and gravity"
     camera_height = made.world_from_camera[:, 1, 3].mean() - made.floor_m
     assert abs(camera_height - clip.truth[:, 1, 3].mean()) < 0.06, "metres above the floor"
@@ -46,49 +49,51 @@ def test_template_is_metric_upright_and_follows_the_truth(clip, tmp_path):
 
 
 def test_frames_are_aligned_with_as_many_points_as_memory_may_hold(clip, monkeypatch):
-    taken, contacts = [], fuse.surface.Surface.contacts
+    taken, correspondences = [], fuse.depth_scans.SurfaceMap.correspondences
 
-    def counted(place, frames, scans, poses, reach_m):
+    def counted(surface, frames, scans, poses, reach_m, inflation):
         taken.append(sum(len(scan.sigma_m) for scan in scans))
-        return contacts(place, frames, scans, poses, reach_m)
+        return correspondences(surface, frames, scans, poses, reach_m, inflation)
 
-    monkeypatch.setattr(fuse.surface.Surface, "contacts", counted)
+    monkeypatch.setattr(fuse.depth_scans.SurfaceMap, "correspondences", counted)
     start = clip.truth @ rigid.exp(np.random.default_rng(0).normal(0, 0.01, (len(clip), 6)))
-    options = fuse.FuseOptions(align_points=48 * 60)
-    _, gap = fuse.align_frames(clip, clip.caster.mesh, start, options, refine.RefineOptions())
-    assert max(taken) <= options.align_points
+    monkeypatch.setattr(fuse, "ALIGN_POINTS", 48 * 60)
+    _, gap = fuse.align_frames(clip, clip.caster.mesh, start, FusionConfig(), RefinementConfig())
+    assert max(taken) <= 48 * 60
     assert np.nanmedian(gap) < 0.006, "metres; the depth noise is 4 mm, the cameras began 1.6 cm off"
 
 
 def test_wrong_structure_is_refuted_by_depth(clip):
     frames = np.arange(0, 48, 4)
-    keyframes = [refine.load_keyframe(clip, int(frame), 10) for frame in frames]
+    keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
     bent = clip.truth[frames].copy()
     bent[:, 0, 3] += np.linspace(0, 2.0, len(frames)) ** 2
     rows = np.arange(len(frames) * 40)
     key, pixel = rows % len(frames), np.random.default_rng(0).uniform(20, 100, (len(rows), 2))
-    points = np.stack([matches.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)])
+    points = np.stack(
+        [matches.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)]
+    )
     world = np.stack([rigid.apply(bent[k], p[None])[0] for k, p in zip(key, points, strict=True)])
-    sparse = Sparse(frames, bent, world, rows, key, pixel, 0.5, None)
-    start = anchor.choose_start(clip, frames, keyframes, sparse, anchor.AnchorOptions())
+    sparse = SparseModel(frames, bent, world, rows, key, pixel, 0.5, None)
+    start = anchor.choose_start(clip, frames, keyframes, sparse)
     assert start.source == "odometry"
     assert "depth" in start.reason
 
 
 def test_depth_and_odometry_alone_straighten_keyframes(clip):
     frames = np.arange(0, 48, 4)
-    keyframes = [refine.load_keyframe(clip, int(frame), 8) for frame in frames]
+    keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
     start = clip.odometry_from_camera[frames]
-    found = refine.refine_keyframes(clip, frames, keyframes, start, None, refine.RefineOptions())
+    found = refine.refine_keyframes(clip, frames, keyframes, start, None, RefinementConfig())
     before, after = aligned_errors(start, clip.truth[frames])[1], aligned_errors(found, clip.truth[frames])[1]
     assert np.median(after) < 0.01, "metres"
     assert np.median(after) < 0.7 * np.median(before)
 
 
-def test_bridge_is_exact_where_odometry_is(clip):
+def test_propagation_is_exact_where_odometry_is(clip):
     exact = MemoryClip(clip.caster, clip.truth, drifting(clip.truth, 3, deg=0, m=0))
     frames = np.array([3, 17, 40])
-    assert np.abs(anchor.bridge(exact, frames, clip.truth[frames]) - clip.truth).max() < 1e-9
+    assert np.abs(anchor.propagate(exact, frames, clip.truth[frames]) - clip.truth).max() < 1e-9
 
 
 def test_floor_direction_is_found_from_normals():
@@ -126,16 +131,19 @@ def test_a_cleaner_that_fails_is_told(tmp_path, monkeypatch):
 def test_a_walk_that_shows_nothing_is_refused(code, tmp_path, monkeypatch):
     """Nothing but darkness and no odometry; or odometry, and depth beyond reach."""
     truth = walk(10)
-    dark = MemoryClip(RayCaster(textured_room(edge_m=0.5)), truth, None if code == "MAP-001" else truth, folder=tmp_path / "walk")
+    dark = MemoryClip(
+        RayCaster(textured_room(edge_m=0.5)),
+        truth,
+        None if code == "MAP-001" else truth,
+        folder=tmp_path / "walk",
+    )
     for frame in range(len(dark)):
         far = np.where(dark.depth(frame) > 0, 4.9 if code == "MAP-002" else 0, 0).astype(np.float32)
         dark.cache[frame] = np.zeros((*dark.color_size, 3), np.uint8), far
     dark.write_color(tmp_path / "walk")
+    config = Config(sfm=SFM, refinement=RefinementConfig(rounds=1), fusion=FusionConfig(voxel_m=0.1))
     with pytest.raises(InputError, match=code):
-        template.build(
-            dark, np.zeros((len(dark), 4, 4, 2)), structure=STRUCTURE, believe=anchor.AnchorOptions(),
-            weights=refine.RefineOptions(rounds=1), fusion=fuse.FuseOptions(voxel_m=0.1), workspace=tmp_path, seed=0,
-        )  # fmt: skip
+        template.build(dark, np.zeros((len(dark), 4, 4, 2)), config, tmp_path)
 
 
 def test_nothing_is_marked_seen_by_an_empty_volume():
@@ -144,7 +152,7 @@ def test_nothing_is_marked_seen_by_an_empty_volume():
 
 
 def test_false_matches_are_dropped_by_depth(clip, tmp_path):
-    sfm.reconstruct(clip, STRUCTURE, tmp_path, 0)
+    sfm.reconstruct(clip, SFM, tmp_path, 0)
     with pycolmap.Database.open(tmp_path / "database.db") as table:
         pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
         geometry = table.read_two_view_geometry(*pairs[0])
@@ -153,12 +161,12 @@ def test_false_matches_are_dropped_by_depth(clip, tmp_path):
         geometry.inlier_matches = wrong
         table.delete_two_view_geometry(*pairs[0])
         table.write_two_view_geometry(*pairs[0], geometry)
-    kept, all_pairs = matches.confirm(clip, tmp_path / "database.db", matches.ConfirmOptions(), np.random.default_rng(0))
+    confirmed, all_pairs = matches.confirm(clip, tmp_path / "database.db", np.random.default_rng(0))
     assert all_pairs == len(pairs)
-    assert kept == len(pairs) - 1, "the scrambled pair goes, the others stay"
+    assert confirmed == len(pairs) - 1, "the scrambled pair goes, the others stay"
 
 
 def test_more_than_a_home_is_refused(clip, monkeypatch):
     monkeypatch.setattr(fuse, "MOST_VOXELS", 1000)
     with pytest.raises(InputError, match="MAP-005.*the walk-through spans"):
-        fuse.fuse(clip, np.arange(0, 48, 4), clip.truth, fuse.FuseOptions(voxel_m=0.05))
+        fuse.fuse(clip, np.arange(0, 48, 4), clip.truth, FusionConfig(voxel_m=0.05))

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.core.videos import Role
+from pipeline.geometry import cameras, rigid
+from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.recordings.formats import open_recording
-from pipeline.space import cameras, rigid
-from pipeline.space.meshes import RayCaster, render_view
-from pipeline.videos import Role
 from stages.check_captures import __main__ as front
-from stages.check_captures import looking, movers, overlap, parallax, poses, problems
-from stages.check_captures.looking import Shot
+from stages.check_captures import moving_objects, overlap, parallax, pose_drift, problems, sampling
+from stages.check_captures.sampling import SampledFrame
 from tests.pipeline.recordings import made_formats
 from tests.stages import textured_room
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, Made, walk
@@ -25,7 +25,11 @@ class Textured(Made):
 
     def color(self, frame: int) -> np.ndarray:
         rng = np.random.default_rng(frame)
-        picture = rng.integers(30, 220, (*COLOR_SIZE, 3)) if frame < self.sharp_until else np.full((*COLOR_SIZE, 3), 120)
+        picture = (
+            rng.integers(30, 220, (*COLOR_SIZE, 3))
+            if frame < self.sharp_until
+            else np.full((*COLOR_SIZE, 3), 120)
+        )
         return cameras.turn_image((self.brightness * picture).astype(np.uint8), self.quarter_turns)
 
 
@@ -38,8 +42,13 @@ def _made(seconds: float = 10.0, turns: int = 0, rate_hz: float = 6.0) -> Textur
 
 
 def _codes(path, role: Role = "heldout") -> set[str]:
-    look = looking.look(open_recording(path), 20, max_depth_m=6.0)
-    return {each.code for each in problems.problems(problems.Seen(look, poses.drift_m(look.shots)), role)}
+    sample = sampling.sample(open_recording(path), 20, max_depth_m=6.0)
+    return {
+        each.code
+        for each in problems.problems(
+            problems.CaptureMeasurements(sample, pose_drift.drift_m(sample.shots)), role
+        )
+    }
 
 
 @pytest.mark.parametrize("turns", [0, 1])
@@ -61,12 +70,16 @@ def _gap(made):
 
 def _hollow(made):
     inner = made.depth
-    made.depth = lambda frame: np.where(np.arange(inner(frame).shape[1]) % 4 > 0, 0, inner(frame)).astype("<f4")
+    made.depth = lambda frame: np.where(np.arange(inner(frame).shape[1]) % 4 > 0, 0, inner(frame)).astype(
+        "<f4"
+    )
 
 
 def _far(made):
     inner = made.depth
-    made.depth = lambda frame: np.where(np.arange(inner(frame).shape[1]) % 3 == 0, np.float32(7.5), inner(frame))
+    made.depth = lambda frame: np.where(
+        np.arange(inner(frame).shape[1]) % 3 == 0, np.float32(7.5), inner(frame)
+    )
 
 
 def _identity(made):
@@ -115,10 +128,16 @@ def test_damaged_pictures_and_missing_depth_are_told(tmp_path):
     assert "CAP-030" in _codes(tmp_path / "a.mp4")
 
 
-def _shots(seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: ()) -> list[Shot]:
+def _shots(
+    seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: ()
+) -> list[SampledFrame]:
     """Rendered views of a room with the given colours, with balls of (centre, radius) per frame."""
     mesh = textured_room.textured_room(seed, edge_m=0.08)
-    caster, size, intrinsics = RayCaster(mesh), (240, 180), np.array([[178.0, 0, 90], [0, 178.0, 120], [0, 0, 1]])
+    caster, size, intrinsics = (
+        RayCaster(mesh),
+        (240, 180),
+        np.array([[178.0, 0, 90], [0, 178.0, 120], [0, 0, 1]]),
+    )
     found = []
     for frame, camera in enumerate(textured_room.walk(count, seed=7)):
         depth, hits = render_view(caster, camera, intrinsics, *size)
@@ -129,7 +148,9 @@ def _shots(seed: int, count: int, offset: np.ndarray | None = None, balls=lambda
         gray = color.mean(-1).astype(np.uint8)
         small = depth[1::3, 1::3].astype(np.float32)
         depth_intrinsics = cameras.scale_intrinsics(intrinsics, size, small.shape)
-        found.append(Shot(float(frame), gray, intrinsics, small, depth_intrinsics, odometry, 20.0, 0.5, 0.0))
+        found.append(
+            SampledFrame(float(frame), gray, intrinsics, small, depth_intrinsics, odometry, 20.0, 0.5, 0.0)
+        )
     return found
 
 
@@ -144,12 +165,17 @@ def _ball(camera, intrinsics, size, center, radius):
 def test_the_same_room_is_found_and_another_is_not():
     rng = np.random.default_rng(0)
     offset = rigid.make(rigid.rotation_from_vector(np.array([0, 1.0, 0])), np.array([3.0, 0, 1]))
-    room, again, other = (overlap.describe(shots) for shots in (_shots(0, 24), _shots(0, 9, offset), _shots(5, 9, offset)))
+    room, again, other = (
+        overlap.describe(shots) for shots in (_shots(0, 24), _shots(0, 9, offset), _shots(5, 9, offset))
+    )
     assert overlap.placed_share(room, again, rng) > 0.5
     assert overlap.placed_share(room, other, rng) < problems.LEAST_PLACED
-    for share, told in ((0.01, {"CAP-053"}), (0.6, set())):
-        look = looking.Look(*[None] * 2, [], 0.0)
-        assert {each.code for each in problems._of_content(problems.Seen(look, placed=share), "session")} == told
+    for share, describe_capture in ((0.01, {"CAP-053"}), (0.6, set())):
+        sample = sampling.RecordingSample(*[None] * 2, [], 0.0)
+        assert {
+            each.code
+            for each in problems._of_content(problems.CaptureMeasurements(sample, placed=share), "session")
+        } == describe_capture
 
 
 def test_movers_are_counted():
@@ -157,32 +183,57 @@ def test_movers_are_counted():
         return [((0.6 * np.sin(frame), 0.2, 0.6 * np.cos(frame)), 0.14)]
 
     def two(frame):
-        return [((0.8 * np.sin(frame), 0.2, 0.7 * np.cos(frame)), 0.14), ((-0.8 * np.sin(frame), 0.2, -0.7 * np.cos(frame)), 0.14)]
+        return [
+            ((0.8 * np.sin(frame), 0.2, 0.7 * np.cos(frame)), 0.14),
+            ((-0.8 * np.sin(frame), 0.2, -0.7 * np.cos(frame)), 0.14),
+        ]
 
-    still = movers.moving(_shots(0, 16))
-    lone, pair = movers.moving(_shots(0, 16, balls=one)), movers.moving(_shots(0, 16, balls=two))
+    still = moving_objects.find_motion(_shots(0, 16))
+    lone, pair = (
+        moving_objects.find_motion(_shots(0, 16, balls=one)),
+        moving_objects.find_motion(_shots(0, 16, balls=two)),
+    )
     assert still.seen == 0
     assert lone.seen > 0.6
     assert lone.several < 0.2
     assert pair.several > problems.MOST_SEVERAL
-    look = looking.Look(*[None] * 2, [], 0.0)
-    codes = [{each.code for each in problems._of_content(problems.Seen(look, moving=seen), "session")} for seen in (still, lone, pair)]
+    sample = sampling.RecordingSample(*[None] * 2, [], 0.0)
+    codes = [
+        {
+            each.code
+            for each in problems._of_content(problems.CaptureMeasurements(sample, moving=seen), "session")
+        }
+        for seen in (still, lone, pair)
+    ]
     assert codes == [{"CAP-054"}, set(), {"CAP-055"}]
 
 
 def test_without_poses_nothing_is_claimed():
     shots = [dataclasses.replace(shot, odometry_from_camera=None) for shot in _shots(0, 4)]
-    assert movers.moving(shots) is None
-    assert np.isnan(poses.drift_m(shots))
+    assert moving_objects.find_motion(shots) is None
+    assert np.isnan(pose_drift.drift_m(shots))
 
 
 def test_subsampled_depth_keeps_its_geometry():
     made = _made(2.0)
     size, view = (512, 384), cameras.scale_intrinsics(made.intrinsics, COLOR_SIZE, (512, 384))
     depth = np.fromfunction(lambda row, column: 1 + 0.001 * row + 0.002 * column, size)
-    plan = type("Plan", (), {"depth_intrinsics": view[None], "intrinsics": view[None], "timestamp_s": [0.0], "odometry_from_camera": None})
-    frame = type("Frame", (), {"depth": depth, "color": np.zeros((*size, 3), np.uint8), "sharpness": 1.0, "brightness": 1.0})
-    shot = looking._shot(plan, 0, frame, 0.0)
+    plan = type(
+        "Plan",
+        (),
+        {
+            "depth_intrinsics": view[None],
+            "intrinsics": view[None],
+            "timestamp_s": [0.0],
+            "odometry_from_camera": None,
+        },
+    )
+    frame = type(
+        "Frame",
+        (),
+        {"depth": depth, "color": np.zeros((*size, 3), np.uint8), "sharpness": 1.0, "brightness": 1.0},
+    )
+    shot = sampling._shot(plan, 0, frame, 0.0)
     whole = cameras.back_project(depth, view)[1::2, 1::2]
     np.testing.assert_allclose(cameras.back_project(shot.depth, shot.depth_intrinsics), whole, atol=1e-9)
 
@@ -196,28 +247,53 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
     (tmp_path / "exported/metadata.json").write_text("{")
     (tmp_path / "notes.txt").write_text("x")
     assert front.main([str(tmp_path)]) == 2
-    told = capsys.readouterr().out
-    for expected in ("Record3D .r3d", "CAP-031", "CAP-001", "CAP-004 metadata.json: ", "notes.txt", "CAP-003", "CAP-040", "turnaround"):
-        assert expected in told, told
+    describe_capture = capsys.readouterr().out
+    for expected in (
+        "Record3D .r3d",
+        "CAP-031",
+        "CAP-001",
+        "CAP-004 metadata.json: ",
+        "notes.txt",
+        "CAP-003",
+        "CAP-040",
+        "turnaround",
+    ):
+        assert expected in describe_capture, describe_capture
 
 
-def _layers(near_step_px: int) -> list[Shot]:
-    """Pictures of a far and a near layer of blobs; per picture the far one moves by 4 pixels, the near one by its own step."""
+def _layers(near_step_px: int) -> list[SampledFrame]:
+    """Pictures of a far and a near layer of blobs.
+
+    Per picture the far one moves by 4 pixels, the near one by its own step.
+    """
     rng, nothing = np.random.default_rng(0), np.zeros((0, 0), np.float32)
-    far, near = (cv2.normalize(cv2.GaussianBlur(rng.normal(size=(240, 600)), (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX) for _ in range(2))
+    far, near = (
+        cv2.normalize(cv2.GaussianBlur(rng.normal(size=(240, 600)), (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX)
+        for _ in range(2)
+    )
     shots = []
     for number in range(8):
         picture = far[:, 4 * number : 4 * number + 320].copy()
         picture[120:] = near[120:, near_step_px * number : near_step_px * number + 320]
-        shots.append(Shot(float(number), picture.astype(np.uint8), np.eye(3), nothing, np.eye(3), None, 20.0, 0.5, 0.0))
+        shots.append(
+            SampledFrame(
+                float(number), picture.astype(np.uint8), np.eye(3), nothing, np.eye(3), None, 20.0, 0.5, 0.0
+            )
+        )
     return shots
 
 
 def test_a_video_that_turns_on_the_spot_tells_no_depth():
     walked, turned = parallax.parallax(_layers(16)), parallax.parallax(_layers(4))
     assert min(walked.linked, turned.linked) > 0.8
-    assert walked.telling > 0.8
-    assert turned.telling < 0.2
-    look = looking.Look(None, None, [], 0.0)
-    assert [each.code for each in problems._of_depth(problems.Seen(look, parallax=turned), "walkthrough")] == ["CAP-039", "CAP-056"]
-    assert [each.code for each in problems._of_depth(problems.Seen(look, parallax=walked), "walkthrough")] == ["CAP-039"]
+    assert walked.with_parallax > 0.8
+    assert turned.with_parallax < 0.2
+    sample = sampling.RecordingSample(None, None, [], 0.0)
+    assert [
+        each.code
+        for each in problems._of_depth(problems.CaptureMeasurements(sample, parallax=turned), "walkthrough")
+    ] == ["CAP-039", "CAP-056"]
+    assert [
+        each.code
+        for each in problems._of_depth(problems.CaptureMeasurements(sample, parallax=walked), "walkthrough")
+    ] == ["CAP-039"]

@@ -1,27 +1,27 @@
 """Flow of shifted and rotated textures is found on the stored grid, and uncertainty is told."""
 
-import sys
-
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from pipeline import artifact, cli
-from pipeline.files import arrays, images
-from pipeline.models import raft
-from stages.estimate_flow import __main__ as front
-from stages.estimate_flow.backends.raft import RaftEstimator
-from stages.estimate_flow.estimation import Estimator, Search, flows, grid_centers
+from pipeline.backends import raft
+from pipeline.data import images, npz
+from stages.estimate_flow import stage
+from stages.estimate_flow.backends.raft import UPDATES, RaftEstimator
+from stages.estimate_flow.config import Config
+from stages.estimate_flow.estimation import Estimator, flows, grid_centers
 
-SEARCH = Search(working_side_px=320, patch_stride_px=3, iterations=16)
+WORKING_SIDE_PX = 320
 
 
 def texture(height, width, seed=0):
     """A smooth random RGB picture."""
     rng = np.random.default_rng(seed)
     noise = sum(
-        cv2.resize(rng.normal(size=(height // s, width // s)), (width, height), interpolation=cv2.INTER_CUBIC) * s for s in (4, 8, 16)
+        cv2.resize(rng.normal(size=(height // s, width // s)), (width, height), interpolation=cv2.INTER_CUBIC)
+        * s
+        for s in (4, 8, 16)
     )
     scaled = (noise - noise.min()) / np.ptp(noise) * 255
     return np.repeat(scaled.astype(np.uint8)[..., None], 3, axis=-1)
@@ -31,7 +31,9 @@ def moved(image, matrix):
     """Warp so that a point at p (pixel centres at +0.5) goes to matrix @ (p, 1)."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     indexed = np.linalg.inv(shift) @ np.vstack([matrix, [0, 0, 1]]) @ shift
-    return cv2.warpAffine(image, indexed[:2], image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return cv2.warpAffine(
+        image, indexed[:2], image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
 
 
 def both_ways(estimator, pair):
@@ -44,7 +46,7 @@ def both_ways(estimator, pair):
 @pytest.mark.parametrize("matrix", [[[1, 0, 5.0], [0, 1, -3.0]], [[0.999, -0.04, 4.0], [0.04, 0.999, -2.0]]])
 def test_known_motion_is_found_in_colour_pixels(size, matrix):
     matrix = np.array(matrix)
-    estimator = Estimator(size, SEARCH, tolerance_px=1.5)
+    estimator = Estimator(size, WORKING_SIDE_PX)
     pair = [estimator.reduce(picture) for picture in (texture(*size), moved(texture(*size), matrix))]
     forward, backward = both_ways(estimator, pair)
     grid_px = grid_centers(size)
@@ -57,16 +59,18 @@ def test_known_motion_is_found_in_colour_pixels(size, matrix):
 
 def test_what_leaves_or_changes_is_uncertain():
     size = (160, 120)
-    estimator = Estimator(size, SEARCH, tolerance_px=1.5)
+    estimator = Estimator(size, WORKING_SIDE_PX)
     first, second = texture(*size), moved(texture(*size), np.array([[1, 0, 30.0], [0, 1, 0]]))
     second[60:100, 40:80] = texture(40, 40, seed=5)
-    confidence = both_ways(estimator, [estimator.reduce(picture) for picture in (first, second)])[0].confidence
+    confidence = both_ways(estimator, [estimator.reduce(picture) for picture in (first, second)])[
+        0
+    ].confidence
     assert np.median(confidence[:, -6:]) < 20
     assert np.median(confidence[16:24, 4:11]) < 100
 
 
 def test_pairs_come_in_order_and_only_few_frames_are_asked_for_again():
-    estimator = Estimator((64, 48), SEARCH, tolerance_px=1.5)
+    estimator = Estimator((64, 48), WORKING_SIDE_PX)
     gray, asked = estimator.reduce(texture(64, 48)), []
 
     def ask(frame):
@@ -79,9 +83,10 @@ def test_pairs_come_in_order_and_only_few_frames_are_asked_for_again():
     assert [gap for gap, _, _ in flows(lambda _: gray, 3, (1, 2, 4, 8), estimator)] == [1, 1, 2]
 
 
-def test_the_stage_writes_all_gaps_both_ways(tmp_path, monkeypatch):
+def test_the_stage_writes_all_gaps_both_ways(tmp_path):
     frames = tmp_path / "frames"
-    with artifact.create(frames, stage="extract_frames", config={}, inputs={}, key=None) as folder:
+    frames.mkdir()
+    for folder in [frames]:
         for name in ("color", "depth"):
             (folder / name).mkdir()
         images.write_depth(folder / "depth" / "000000.exr", np.ones((8, 6)))
@@ -89,7 +94,7 @@ def test_the_stage_writes_all_gaps_both_ways(tmp_path, monkeypatch):
             shifted = moved(texture(64, 48), np.array([[1, 0, i], [0, 1, 0.0]]))
             images.write_color(folder / "color" / f"{i:06d}.jpg", shifted)
         eye = np.tile(np.eye(3), (10, 1, 1))
-        arrays.save(
+        npz.save(
             folder / "frames.npz",
             timestamp_s=np.arange(10) / 10,
             intrinsics=eye,
@@ -97,11 +102,12 @@ def test_the_stage_writes_all_gaps_both_ways(tmp_path, monkeypatch):
             gravity_known=np.array(True),
             quality=np.ones(10, np.float32),
         )
-    monkeypatch.setattr(sys, "argv", ["estimate_flow", "--frames", str(frames), "--out", str(tmp_path / "flow")])
-    cli.enter(front.__doc__, front.run, config=front.Config, reads=("frames",))
+    out = tmp_path / "flow"
+    out.mkdir()
+    stage.run(stage.Inputs(frames=frames), Config(), out)
     for gap in (1, 2, 4, 8):
         for sign, way in ((1, "fw"), (-1, "bw")):
-            table = arrays.load(tmp_path / "flow" / f"flow_{gap}_{way}.npz")
+            table = npz.load(tmp_path / "flow" / f"flow_{gap}_{way}.npz")
             assert table["flow"].shape == (10 - gap, 16, 12, 2)
             assert table["flow"].dtype == np.float16
             assert table["confidence"].dtype == np.uint8
@@ -111,7 +117,7 @@ def test_the_stage_writes_all_gaps_both_ways(tmp_path, monkeypatch):
 
 def test_long_gaps_follow_motion_that_search_alone_loses():
     world = texture(200, 460)
-    estimator = Estimator((160, 120), SEARCH, tolerance_px=1.5)
+    estimator = Estimator((160, 120), WORKING_SIDE_PX)
     gray = [estimator.reduce(world[20:180, 12 * i : 12 * i + 120]) for i in range(9)]
     forward = [forward for gap, forward, _ in flows(gray.__getitem__, 9, (1, 2, 4), estimator) if gap == 4]
     error_px = np.linalg.norm(forward[2].flow[8:-8, 16:-4] - np.array([-48.0, 0.0]), axis=-1)
@@ -123,21 +129,23 @@ def test_a_small_thing_that_moves_against_the_camera_is_seen():
     pictures = [room[:200, 8 * i : 8 * i + 160].copy() for i in range(2)]
     for i, picture in enumerate(pictures):
         picture[80:120, 60 + 4 * i : 90 + 4 * i] = thing
-    estimator = Estimator((200, 160), SEARCH, tolerance_px=1.5)
+    estimator = Estimator((200, 160), WORKING_SIDE_PX)
     forward, _ = both_ways(estimator, [estimator.reduce(picture) for picture in pictures])
-    np.testing.assert_allclose(np.median(forward.flow[22:28, 17:21].astype(float), axis=(0, 1)), [4, 0], atol=1.0)
+    np.testing.assert_allclose(
+        np.median(forward.flow[22:28, 17:21].astype(float), axis=(0, 1)), [4, 0], atol=1.0
+    )
 
 
 def test_a_network_fills_the_same_gaps_and_grid():
     torch.manual_seed(0)
     network = raft.Raft().eval()
-    estimator = RaftEstimator(network, (64, 80), Search(80, 3, 12), tolerance_px=1.5, iterations=1)
+    estimator = RaftEstimator(network, (64, 80), 80)
     rng = np.random.default_rng(0)
     pictures = rng.integers(0, 255, (3, 64, 80, 3), dtype=np.uint8)
     made = list(flows(lambda i: estimator.reduce(pictures[i]), 3, (1, 2), estimator))
     assert [gap for gap, _, _ in made] == [1, 1, 2]
     assert made[0][1].flow.shape == (16, 20, 2)
     assert made[2][2].confidence.shape == (16, 20)
-    expected = raft.flow_between(network, pictures[0], pictures[1], 1)
+    expected = raft.flow_between(network, pictures[0], pictures[1], UPDATES)
     on_grid = cv2.resize(expected, (20, 16), interpolation=cv2.INTER_AREA)
     np.testing.assert_allclose(made[0][1].flow.astype(np.float32), on_grid, atol=0.01 * np.abs(on_grid).max())

@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.files import arrays, images
-from pipeline.videos import Video
+from pipeline.core.videos import Video
+from pipeline.data import images, npz
 from stages.evaluate import reading, real_phone, reconstruction
-from stages.evaluate.heldout import Shot
-from stages.evaluate.reading import Folders
+from stages.evaluate.heldout import HeldoutShot
+from stages.evaluate.reading import BuildFolders
 
 PHONE = Video("v002", "heldout.r3d", "heldout", "none", None, "v001", 0.35)
 
 
 @pytest.fixture
-def folders(tmp_path: Path) -> Folders:
+def folders(tmp_path: Path) -> BuildFolders:
     """A session of 1 s and a phone that films 0.35 s longer; nothing is reconstructed."""
     for id in ("v001", "v002"):
         frames, lens = tmp_path / "frames" / id, np.tile(np.eye(3), (11, 1, 1))
@@ -27,12 +27,16 @@ def folders(tmp_path: Path) -> Folders:
             images.write_depth(frames / "depth" / f"{frame:06d}.exr", np.full((9, 7), 2.0, np.float32))
             images.write_gray(frames / "confidence" / f"{frame:06d}.png", np.full((9, 7), 2, np.uint8))
         table = {"timestamp_s": 0.1 * np.arange(11), "intrinsics": lens, "depth_intrinsics": lens}
-        arrays.save(frames / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(11))
-    nowhere = {field.name: tmp_path for field in fields(Folders)} | {"truth": None, "masks": {}, "flow": {}}
-    return Folders(**nowhere | {"frames": {id: tmp_path / "frames" / id for id in ("v001", "v002")}})
+        npz.save(frames / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(11))
+    nowhere = {field.name: tmp_path for field in fields(BuildFolders)} | {
+        "truth": None,
+        "masks": {},
+        "flow": {},
+    }
+    return BuildFolders(**nowhere | {"frames": {id: tmp_path / "frames" / id for id in ("v001", "v002")}})
 
 
-def test_only_what_is_filmed_while_the_session_is_counts(folders: Folders):
+def test_only_what_is_filmed_while_the_session_is_counts(folders: BuildFolders):
     assert reading.filmed_together(folders, PHONE).tolist() == [0, 1, 2, 3, 4, 5, 6]
     cameras = np.tile(np.eye(4), (11, 1, 1))
     cameras[0] = np.nan
@@ -42,15 +46,22 @@ def test_only_what_is_filmed_while_the_session_is_counts(folders: Folders):
     assert len(real_phone.shots(folders, before, cameras, 3)) == 0
 
 
-def test_a_refused_session_is_wrong_everywhere(folders: Folders):
+def test_a_refused_session_is_wrong_everywhere(folders: BuildFolders):
     agent = np.arange(63).reshape(9, 7) < 12
-    shot = Shot(np.eye(4), np.eye(3), 0.0, np.full((9, 7, 3), 99, np.uint8), np.full((9, 7), 2.0, np.float32), agent)
-    values = reconstruction.held_out_figures(folders, [("v001", [shot, shot]), ("v001", [])], "cpu").values
+    shot = HeldoutShot(
+        np.eye(4), np.eye(3), 0.0, np.full((9, 7, 3), 99, np.uint8), np.full((9, 7), 2.0, np.float32), agent
+    )
+    values = reconstruction.held_out_metrics(folders, [("v001", [shot, shot]), ("v001", [])], "cpu").values
     assert [values[f"reconstruction/depth_acc_{part}"] for part in ("all", "agent", "scene")] == [0, 0, 0]
     assert values["reconstruction/psnr_all"] < 10 and values["splats/psnr_all"] < 10
-    assert [values[f"reconstruction/heldout_{what}"] for what in ("phones_drawn", "phones_total", "frames")] == [0, 2, 2]
+    assert [
+        values[f"reconstruction/heldout_{what}"] for what in ("phones_drawn", "phones_total", "frames")
+    ] == [0, 2, 2]
 
 
-def test_without_a_phone_nothing_is_claimed(folders: Folders):
-    figures = reconstruction.held_out_figures(folders, [], "cpu")
-    assert figures.values["reconstruction/depth_acc_all"] is None and figures.values["reconstruction/heldout_phones_total"] == 0
+def test_without_a_phone_nothing_is_claimed(folders: BuildFolders):
+    metrics = reconstruction.held_out_metrics(folders, [], "cpu")
+    assert (
+        metrics.values["reconstruction/depth_acc_all"] is None
+        and metrics.values["reconstruction/heldout_phones_total"] == 0
+    )

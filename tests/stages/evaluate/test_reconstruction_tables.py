@@ -5,28 +5,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.evaluate.figures import Figures
-from stages.evaluate.heldout import Shot, View
+from pipeline.metrics.metrics import Metrics
+from stages.evaluate.heldout import HeldoutShot, HeldoutView
 from stages.evaluate.reading import Reconstructed
 from stages.evaluate.reconstruction_tables import table
 
 
-def view(wrong: int) -> View:
-    """Return a picture of 100 pixels, 20 of them the agent's; so many of the scene's are drawn half a metre too far or not at all."""
+def view(wrong: int) -> HeldoutView:
+    """Return a picture of 100 pixels, 20 of them the agent's; so many of the scene's are drawn half a metre
+    too far or not at all.
+    """
     color, agent = np.zeros((10, 10, 3), np.uint8), np.zeros((10, 10), bool)
     agent[:2] = True
     true = np.full((10, 10), 2.0)
     ours = true.copy()
     ours.reshape(-1)[20 : 20 + wrong] = np.where(np.arange(wrong) % 2, 0.0, 2.5)
-    return View(color, ours, Shot(np.eye(4), np.eye(3), 0.0, color, true, agent))
+    return HeldoutView(color, ours, HeldoutShot(np.eye(4), np.eye(3), 0.0, color, true, agent))
 
 
 def test_what_a_rival_lacks_is_told_with_an_interval():
     right = {
-        name: np.array([table._depth_acc(view(wrong + k % 2)) for k in range(12)]) for name, wrong in (("ours", 8), ("totalrecon", 28))
+        name: np.array([table._depth_acc(view(wrong + k % 2)) for k in range(12)])
+        for name, wrong in (("ours", 8), ("totalrecon", 28))
     }
-    found = Figures()
-    table._compare(found, "totalrecon", right["ours"] - right["totalrecon"], table.Effort(bootstrap_draws=200), np.random.default_rng(0))
+    found = Metrics()
+    table._compare(found, "totalrecon", right["ours"] - right["totalrecon"], np.random.default_rng(0))
     assert found.values["totalrecon/depth_acc_all_less_than_ours"] == pytest.approx(0.2)
     assert found.values["totalrecon/depth_acc_scene_less_than_ours"] == pytest.approx(0.25)
     assert found.values["totalrecon/depth_acc_agent_less_than_ours"] == 0
@@ -36,7 +39,13 @@ def test_what_a_rival_lacks_is_told_with_an_interval():
 
 
 def test_without_truth_nothing_is_claimed():
-    places = Reconstructed({}, Path("scene"), Path("agent"), reconstruction=Path("ours"), truth=None)
-    found = table.figures({"ours": Path("ours")}, places, (), table.Effort(), np.random.default_rng(0), "cpu")
+    places = Reconstructed(
+        frames={},
+        scene_template=Path("scene"),
+        agent_template=Path("agent"),
+        reconstruction=Path("ours"),
+        truth=None,
+    )
+    found = table.metrics({"ours": Path("ours")}, places, (), 24, np.random.default_rng(0), "cpu")
     assert set(found.values.values()) == {None} and set(found.values) == set(found.reasons)
     assert table.text(found.values, ("ours",)).count("- / - / -") == 3

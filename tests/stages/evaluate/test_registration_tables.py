@@ -1,11 +1,15 @@
 """Table 1: every frame counts, a refused recording is a failure, what an ablation costs is told in pairs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pipeline.files import arrays
-from pipeline.space import rigid
-from pipeline.videos import Video
+from pipeline.core.videos import Video
+from pipeline.data import npz
+from pipeline.data.poses import RegisteredPoses
+from pipeline.data.templates import SceneCameras
+from pipeline.geometry import rigid
 from stages.evaluate.registration_tables import table
 from tests.stages.textured_room import walk
 
@@ -18,7 +22,9 @@ VIDEOS = [
 
 @pytest.fixture
 def capture(tmp_path):
-    """Write truth in a world of its own, and registrations that err by 1 degree (ours) and by 3 (an ablation)."""
+    """Write truth in a world of its own, and registrations that err by 1 degree (ours) and by 3 (an
+    ablation).
+    """
     world, count = rigid.exp(np.array([0, 0.7, 0, 1.0, 0, 2.0])), 40
     for name in ("truth", "template"):
         (tmp_path / name).mkdir()
@@ -26,19 +32,33 @@ def capture(tmp_path):
     for number, video in enumerate(VIDEOS):
         cameras = walk(count, seed=number)
         moved = rigid.inverse(world) @ cameras
-        plain = {"intrinsics": np.zeros((count, 3, 3)), "agent_visible": np.zeros(count, bool), "moving": np.zeros(count, bool)}
-        arrays.save(tmp_path / "truth" / f"{video.file[:-4]}.npz", world_from_camera=moved, **plain)
+        plain = {
+            "intrinsics": np.zeros((count, 3, 3)),
+            "agent_visible": np.zeros(count, bool),
+            "moving": np.zeros(count, bool),
+        }
+        npz.save(tmp_path / "truth" / f"{video.file[:-4]}.npz", world_from_camera=moved, **plain)
         frames[video.id] = tmp_path / "frames" / video.id
         frames[video.id].mkdir(parents=True)
-        arrays.save(frames[video.id] / "frames.npz", source_index=np.arange(count), timestamp_s=np.arange(count) * 0.5)
+        npz.save(
+            frames[video.id] / "frames.npz", source_index=np.arange(count), timestamp_s=np.arange(count) * 0.5
+        )
         if video.role == "walkthrough":
-            arrays.save(tmp_path / "template" / "cameras.npz", world_from_camera=cameras, registered=np.ones(count, bool))
+            lens = np.repeat(np.eye(3)[None], count, axis=0)
+            SceneCameras(np.arange(count) * 0.5, cameras, lens, np.ones(count, bool)).write(
+                tmp_path / "template"
+            )
             continue
         for variant, degrees in (("ours", 1.0), ("worse", 3.0)):
             if (variant, video.id) != ("worse", "v002"):
                 wrong = cameras @ rigid.exp(np.array([np.deg2rad(degrees), 0, 0, 0.01 * degrees, 0, 0]))
                 (tmp_path / variant / video.id).mkdir(parents=True)
-                arrays.save(tmp_path / variant / video.id / "poses.npz", world_from_camera=wrong, confidence=np.ones(count))
+                poses = replace(
+                    RegisteredPoses.unknown(np.arange(count) * 0.5),
+                    world_from_camera=wrong,
+                    confidence=np.ones(count),
+                )
+                poses.write(tmp_path / variant / video.id)
     return tmp_path, frames
 
 
@@ -46,12 +66,14 @@ def test_ablations_are_compared_frame_by_frame(capture):
     folder, frames = capture
     resampling = table.Resampling(5.0, 200, np.random.default_rng(0))
     both = {name: folder / name for name in ("ours", "worse")}
-    values = table.figures(both, frames, VIDEOS, folder / "template", folder / "truth", resampling).values
+    values = table.metrics(both, frames, VIDEOS, folder / "template", folder / "truth", resampling).values
     assert values["ours/rotation_deg_median"] == pytest.approx(1.0, abs=1e-6)
     assert values["ours/translation_m_median"] == pytest.approx(0.01, abs=1e-6)
     assert values["worse/videos_registered"] == 1
     assert values["worse/rotation_deg_p95"] is None, "half of the frames have no pose"
-    assert values["worse/rotation_deg_more_than_ours"] == pytest.approx((2.0 + table.MOST_DEG - 1.0) / 2, abs=1e-3)
+    assert values["worse/rotation_deg_more_than_ours"] == pytest.approx(
+        (2.0 + table.MOST_DEG - 1.0) / 2, abs=1e-3
+    )
     low, high = (values[f"worse/rotation_deg_more_than_ours_ci95_{end}"] for end in ("low", "high"))
     assert low < values["worse/rotation_deg_more_than_ours"] < high
     assert values["worse/v001/rotation_deg_more_than_ours"] == pytest.approx(2.0, abs=1e-6)
@@ -65,6 +87,6 @@ def test_ablations_are_compared_frame_by_frame(capture):
 def test_without_truth_nothing_is_claimed(capture):
     folder, frames = capture
     resampling = table.Resampling(5.0, 10, np.random.default_rng(0))
-    found = table.figures({"ours": folder / "ours"}, frames, VIDEOS, folder / "template", None, resampling)
+    found = table.metrics({"ours": folder / "ours"}, frames, VIDEOS, folder / "template", None, resampling)
     assert set(found.values.values()) == {None}
     assert set(found.values) == set(found.reasons)

@@ -3,15 +3,18 @@
 import numpy as np
 import pytest
 
-from stages.evaluate.reliability import reliability_figures
+from pipeline.metrics.pose_errors import PoseErrors
+from stages.evaluate.perception import Overlaps, mask_metrics
+from stages.evaluate.registration import GOOD_ROOT, is_right
+from stages.evaluate.reliability import reliability_metrics
 
 
 def test_honest_and_boasting_probabilities():
     rng = np.random.default_rng(0)
     probability = rng.uniform(0, 1, 20000)
-    honest = reliability_figures("x", probability, rng.random(20000) < probability).values
+    honest = reliability_metrics("x", probability, rng.random(20000) < probability).values
     assert honest["x/calibration_error"] < 0.02
-    boasting = reliability_figures("x", np.full(1000, 0.95), np.arange(1000) % 2 == 0)
+    boasting = reliability_metrics("x", np.full(1000, 0.95), np.arange(1000) % 2 == 0)
     assert boasting.values["x/calibration_error"] == pytest.approx(0.45)
     assert boasting.values["x/confidence_mean"] == pytest.approx(0.95)
     (picture,) = boasting.charts.values()
@@ -19,4 +22,23 @@ def test_honest_and_boasting_probabilities():
 
 
 def test_nothing_measured():
-    assert reliability_figures("x", np.zeros(0), np.zeros(0, bool)).values == {"x/confidence_mean": None, "x/calibration_error": None}
+    assert reliability_metrics("x", np.zeros(0), np.zeros(0, bool)).values == {
+        "x/confidence_mean": None,
+        "x/calibration_error": None,
+    }
+
+
+def test_the_confidence_of_masks_is_compared_with_their_overlap():
+    iou = np.array([0.9, 0.8, 0.2, 0.1])
+    overlaps = Overlaps(iou, np.zeros(4, bool), np.array([1.0, 1.0, 0.0, 0.0]))
+    honest = mask_metrics([overlaps], None)
+    assert honest.values["masks/calibration_error"] == 0 and honest.values["masks/confidence_mean"] == 0.5
+    boasting = mask_metrics([Overlaps(iou, np.zeros(4, bool), np.ones(4))], None)
+    assert boasting.values["masks/calibration_error"] == pytest.approx(0.5)
+    assert len(boasting.charts) == 1
+
+
+def test_a_root_is_right_within_its_own_limits():
+    errors = PoseErrors(np.array([10.0, 30.0, np.inf]), np.array([0.05, 0.01, np.inf]))
+    assert is_right(errors, GOOD_ROOT).tolist() == [True, False, False]
+    assert not is_right(errors).any()

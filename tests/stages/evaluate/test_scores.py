@@ -6,23 +6,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.models import scores
-from pipeline.models.intervals import bootstrapped, episodes
-from pipeline.models.predictors import Samples
-from pipeline.models.trajectories import TEST, TRAIN, BehaviorData, Future, Trajectory
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh, RayCaster
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Future, Trajectory
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.metrics import scores
+from pipeline.metrics.intervals import bootstrapped, episodes
+from pipeline.metrics.metrics import Metrics, median, percentile
+from pipeline.metrics.pose_errors import constant_between, pose_errors
+from pipeline.metrics.surface_distance import TriangleSurface
+from pipeline.rivals.predictors import Samples
 from stages.evaluate import behavior, heldout, registration, surfaces
-from stages.evaluate.alignment import constant_between, pose_errors
-from stages.evaluate.figures import Figures, median, percentile
-from stages.evaluate.heldout import Shot, View
-from stages.evaluate.triangles import Surface
+from stages.evaluate.config import Config
+from stages.evaluate.heldout import HeldoutShot, HeldoutView
 
 
 def poses(count, seed=0, size_m=2.0):
     """Random rigid motions."""
     rng = np.random.default_rng(seed)
-    return rigid.exp(np.concatenate([rng.normal(0, 1, (count, 3)), rng.normal(0, size_m, (count, 3))], axis=1))
+    return rigid.exp(
+        np.concatenate([rng.normal(0, 1, (count, 3)), rng.normal(0, size_m, (count, 3))], axis=1)
+    )
 
 
 def test_a_constant_motion_is_found_and_then_nothing_is_left():
@@ -50,13 +53,13 @@ def test_refused_recordings_count_as_failures():
     truth = poses(10)
     good = pose_errors(truth, truth)
     refused = pose_errors(np.full_like(truth, np.nan), truth)
-    figures = registration.camera_figures({"a": good, "b": refused}, {"a": np.ones(10), "b": np.zeros(10)}, 1)
-    assert figures.values["registration/videos_registered"] == 1
-    assert figures.values["registration/videos_total"] == 2
-    assert figures.values["registration/rotation_deg_p95"] is None
-    assert "registration/rotation_deg_p95" in figures.reasons
-    assert figures.values["registration/at_coverage_50_translation_m_median"] == pytest.approx(0, abs=1e-9)
-    assert figures.values["registration/within_2deg_5cm_share"] == 0.5
+    metrics = registration.camera_metrics({"a": good, "b": refused}, {"a": np.ones(10), "b": np.zeros(10)}, 1)
+    assert metrics.values["registration/videos_registered"] == 1
+    assert metrics.values["registration/videos_total"] == 2
+    assert metrics.values["registration/rotation_deg_p95"] is None
+    assert "registration/rotation_deg_p95" in metrics.reasons
+    assert metrics.values["registration/at_coverage_50_translation_m_median"] == pytest.approx(0, abs=1e-9)
+    assert metrics.values["registration/within_2deg_5cm_share"] == 0.5
 
 
 def test_rotation_error_has_no_floor():
@@ -69,15 +72,15 @@ def test_infinite_failures_stay_infinite_in_percentiles():
     errors = np.array([0.0] * 18 + [np.inf] * 2)
     assert percentile(errors, 90) == np.inf or percentile(errors, 90) == 0.0
     assert percentile(errors, 95) == np.inf
-    figures = Figures()
-    figures.put("x", percentile(errors, 95), "why")
-    assert figures.values["x"] is None
-    assert figures.reasons["x"] == "why"
+    metrics = Metrics()
+    metrics.put("x", percentile(errors, 95), "why")
+    assert metrics.values["x"] is None
+    assert metrics.reasons["x"] == "why"
 
 
 def view(color, depth, true_color, true_depth, agent):
-    true = Shot(np.eye(4), np.eye(3), 0.0, true_color, true_depth.astype(np.float32), agent)
-    return View(color, depth.astype(np.float32), true)
+    true = HeldoutShot(np.eye(4), np.eye(3), 0.0, true_color, true_depth.astype(np.float32), agent)
+    return HeldoutView(color, depth.astype(np.float32), true)
 
 
 def test_held_out_views_count_holes_as_wrong_and_forgive_exposure():
@@ -89,7 +92,7 @@ def test_held_out_views_count_holes_as_wrong_and_forgive_exposure():
     depth = true_depth + 0.05
     depth[:8, :12] = 0
     darker = (0.5 * true_color + 10).astype(np.uint8)
-    values = heldout.view_figures([view(darker, depth, true_color, true_depth, agent)]).values
+    values = heldout.view_metrics([view(darker, depth, true_color, true_depth, agent)]).values
     assert values["reconstruction/depth_acc_agent"] == 0.5
     assert values["reconstruction/depth_acc_scene"] == 1.0
     assert values["reconstruction/depth_acc_all"] == pytest.approx(1 - 8 * 12 / (28 * 24))
@@ -102,7 +105,7 @@ def test_phones_may_be_held_upright_and_across():
     for shape, off_m in (((32, 24), 0.0), ((24, 32), 1.0)):
         color, depth = np.full((*shape, 3), 128, np.uint8), np.full(shape, 2.0)
         views.append(view(color, depth + off_m, color, depth, np.zeros(shape, bool)))
-    assert heldout.view_figures(views).values["reconstruction/depth_acc_scene"] == 0.5
+    assert heldout.view_metrics(views).values["reconstruction/depth_acc_scene"] == 0.5
     drawn = heldout.side_by_side(views)
     assert drawn.shape == (4 * 32, 24 + 32, 3)
     assert (drawn[24:32, 24:] == 0).all() and (drawn[:32, :24] == 128).all()
@@ -122,10 +125,12 @@ def test_worse_pictures_score_worse():
 
 
 def test_only_what_cameras_see_is_seen():
-    corner = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]])
+    corner = np.array(
+        [[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]]
+    )
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     mesh = Mesh(corner.astype(np.float32), faces)
-    points = Surface.of(mesh).sample(2000, np.random.default_rng(0))
+    points = TriangleSurface(mesh.vertices[mesh.faces].astype(float)).sample(2000, np.random.default_rng(0))
     lens = np.array([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]])
     seen = surfaces.seen_by(RayCaster(mesh), points, np.eye(4)[None], lens, (100, 100))
     assert seen[points[:, 2] < 2.5].all()
@@ -135,13 +140,15 @@ def test_only_what_cameras_see_is_seen():
 def test_tracks_follow_the_skin():
     rng = np.random.default_rng(0)
     rest = poses(2, 1).astype(np.float32)
-    skin = surfaces.Skin(rng.normal(size=(50, 3)), np.eye(2)[rng.integers(0, 2, 50)], rest)
+    skin = surfaces.SkinnedPoints(rng.normal(size=(50, 3)), np.eye(2)[rng.integers(0, 2, 50)], rest)
     root, turn = poses(1, 3)[0], poses(1, 4)[0]
     np.testing.assert_allclose(skin.posed(root, rest), rigid.apply(root, skin.points_agent), atol=1e-4)
     moved = skin.posed(np.eye(4), turn @ rest)
     np.testing.assert_allclose(moved, rigid.apply(turn, skin.points_agent), atol=1e-4)
     moved = (skin.points_agent + 0.3, skin.points_agent[::-1])
-    assert np.array_equal(surfaces.matched_once(skin.points_agent, moved), np.arange(50)[::-1]), "in the frame that fits"
+    assert np.array_equal(surfaces.matched_once(skin.points_agent, moved), np.arange(50)[::-1]), (
+        "in the frame that fits"
+    )
 
 
 def wandering(frames, seed):
@@ -161,7 +168,14 @@ def data():
     starts = {"a": np.arange(0, 136, 4), "b": np.arange(97)}
     video = np.concatenate([np.full(len(start), i) for i, start in enumerate(starts.values())])
     split = np.where(video == 0, TRAIN, TEST)
-    return BehaviorData(trajectories, np.tile(np.eye(4), (3, 1, 1)), video, np.concatenate(list(starts.values())), split, ("a", "b"))
+    return BehaviorData(
+        trajectories,
+        np.tile(np.eye(4), (3, 1, 1)),
+        video,
+        np.concatenate(list(starts.values())),
+        split,
+        ("a", "b"),
+    )
 
 
 class Oracle:
@@ -173,18 +187,22 @@ class Oracle:
 
     def sample(self, context, count, rng):
         apart = np.linalg.norm(context.world_from_agent[:, -1, None, :3, 3] - self.now, axis=-1)
-        root, bones = (part[apart.argmin(1)] for part in (self.future.world_from_agent, self.future.agent_from_bone))
+        root, bones = (
+            part[apart.argmin(1)] for part in (self.future.world_from_agent, self.future.agent_from_bone)
+        )
         path = root[:, None, :, :3, 3] + rng.normal(0, 0.01, (len(root), count, 1, 3))
         shape = (len(root), count, *root.shape[1:2])
         rotation = np.broadcast_to(root[:, None, :, :3, :3], (*shape, 3, 3))
-        return Samples(path[:, :, -1], path, rotation, np.broadcast_to(bones[:, None], (*shape, *bones.shape[2:])))
+        return Samples(
+            path[:, :, -1], path, rotation, np.broadcast_to(bones[:, None], (*shape, *bones.shape[2:]))
+        )
 
 
-PROTOCOL = behavior.Protocol(samples=8, trials=2, plan_trials=1, plan_windows=7, draws=200, seed=0)
+PROTOCOL = Config(samples=8, trials=2, plan_windows=7, seed=0)
 
 
 def test_who_knows_the_future_beats_blind_rivals_and_the_interval_says_so(data):
-    values = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
+    values = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
     assert values["behavior/ats/goal_minde_m"] < 0.02
     assert values["behavior/ats/orientation_minade_rad"] == pytest.approx(0, abs=1e-6)
     assert values["behavior/moving_windows_share"] == 1.0
@@ -195,24 +213,30 @@ def test_who_knows_the_future_beats_blind_rivals_and_the_interval_says_so(data):
 
 
 def test_constant_velocity_is_right_about_straight_walks(data):
-    values = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
-    assert values["behavior/constant_velocity/goal_minde_m"] < 0.01 < values["behavior/stand_still/goal_minde_m"]
+    values = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
+    assert (
+        values["behavior/constant_velocity/goal_minde_m"] < 0.01 < values["behavior/stand_still/goal_minde_m"]
+    )
 
 
 def test_plans_are_judged_on_windows_of_the_whole_test_and_their_number_is_told(data):
     for asked, told in ((7, 7), (120, 97)):
-        values = behavior.behavior_figures(data, Oracle(data), replace(PROTOCOL, plan_windows=asked)).values
-        assert values["behavior/plan_windows"] == told and values["behavior/plan_trials"] == 1 and values["behavior/test_windows"] == 97
+        values = behavior.behavior_metrics(data, Oracle(data), replace(PROTOCOL, plan_windows=asked)).values
+        assert (
+            values["behavior/plan_windows"] == told
+            and values["behavior/plan_trials"] == 1
+            and values["behavior/test_windows"] == 97
+        )
         assert values["behavior/ats_minus_stand_still/path_minade_m_ci95_high"] < 0
 
 
 def test_chunks_bound_the_memory_and_change_nothing(data, monkeypatch):
-    few = behavior.behavior_figures(data, Oracle(data), PROTOCOL).values
+    few = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
     monkeypatch.setattr(behavior, "WINDOWS_AT_ONCE", 1000)
-    assert behavior.behavior_figures(data, Oracle(data), PROTOCOL).values == few
+    assert behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values == few
     monkeypatch.undo()
     tracemalloc.start()
-    behavior.behavior_figures(data, Oracle(data), replace(PROTOCOL, samples=32, trials=16))
+    behavior.behavior_metrics(data, Oracle(data), replace(PROTOCOL, samples=32, trials=16))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 60e6, "bytes; 512 paths in each of 97 windows take 67 MB, and their noise as much"
@@ -227,9 +251,9 @@ def test_without_a_test_video_behaviour_is_skipped_and_says_so(data):
         np.full(len(data.start), TRAIN),
         data.videos,
     )
-    figures = behavior.behavior_figures(alone, Oracle(data), PROTOCOL)
-    assert figures.values["behavior/ats/goal_minde_m"] is None
-    assert "test video" in figures.reasons["behavior/ats/goal_minde_m"]
+    metrics = behavior.behavior_metrics(alone, Oracle(data), PROTOCOL)
+    assert metrics.values["behavior/ats/goal_minde_m"] is None
+    assert "test video" in metrics.reasons["behavior/ats/goal_minde_m"]
 
 
 def test_the_energy_score_is_smallest_for_the_right_distribution():
@@ -237,7 +261,10 @@ def test_the_energy_score_is_smallest_for_the_right_distribution():
     truth = rng.normal(0, 1, (4000, 3))
     future = Future(np.tile(np.eye(4), (4000, 1, 1, 1)), np.zeros((4000, 1, 1, 4, 4)))
     future.world_from_agent[:, 0, :3, 3] = truth
-    energy = [scores.goal_energy_score(Samples(rng.normal(0, std, (4000, 16, 3))), future).mean() for std in (0.01, 1, 3)]
+    energy = [
+        scores.goal_energy_score(Samples(rng.normal(0, std, (4000, 16, 3))), future).mean()
+        for std in (0.01, 1, 3)
+    ]
     assert energy[1] == min(energy)
 
 
@@ -250,12 +277,14 @@ def test_intervals_widen_when_windows_repeat_each_other():
     narrow = bootstrapped(values, start, 500, np.random.default_rng(0))
     assert wide.high - wide.low > 3 * (narrow.high - narrow.low)
     assert wide.low <= wide.mean <= wide.high
-    skewed = bootstrapped(np.append(values, 1e6), np.append(blocks, 0), 500, np.random.default_rng(0), median=True)
+    skewed = bootstrapped(
+        np.append(values, 1e6), np.append(blocks, 0), 500, np.random.default_rng(0), median=True
+    )
     assert wide.low - 0.5 < skewed.low <= skewed.mean <= skewed.high < wide.high + 0.5
 
 
 def test_one_episode_alone_has_no_interval():
-    found = Figures()
+    found = Metrics()
     found.put_mean("goal", bootstrapped(np.arange(5.0), np.zeros(5, int), 100, np.random.default_rng(0)))
     assert found.values == {"goal": 2.0, "goal_ci95_low": None, "goal_ci95_high": None}
     assert "one episode" in found.reasons["goal_ci95_low"]

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.models.behavior import Sampling
-from pipeline.models.predictors import Ats
-from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import BehaviorData
-from stages.evaluate import evaluation, speed
-from stages.evaluate.figures import Figures
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import BehaviorData
+from pipeline.metrics.metrics import Metrics
+from pipeline.rivals.predictors import Ats
+from stages.evaluate import measuring, speed
+from stages.evaluate.config import Config
 
 DATA = SimpleNamespace(start=np.zeros(1), windows=lambda index: (None, None), videos=())
 
@@ -23,7 +24,7 @@ class Watched:
     """Remembers with how many threads it was asked."""
 
     device: str = "cpu"
-    sampling: Sampling = Sampling()
+    sampling: PlanSamplingConfig = PlanSamplingConfig()
     threads: list[int] = field(default_factory=list)
 
     def sample(self, context: None, count: int, rng: np.random.Generator) -> None:
@@ -33,7 +34,7 @@ class Watched:
 def test_plans_are_timed_with_one_thread():
     before, ours = torch.get_num_threads(), Watched()
     torch.set_num_threads(2)
-    values = speed.plan_figures(DATA, ours, 0, measure=True).values
+    values = speed.plan_metrics(DATA, ours, 0, measure=True).values
     assert torch.get_num_threads() == 2
     torch.set_num_threads(before)
     assert set(ours.threads) == {1} and values["simulator/plan_few_s"] >= 0
@@ -42,30 +43,29 @@ def test_plans_are_timed_with_one_thread():
 def test_plans_are_timed_on_the_cpu(monkeypatch: pytest.MonkeyPatch):
     asked = {}
 
-    def nothing(*given: object, **named: object) -> Figures:
-        return Figures()
+    def nothing(*given: object, **named: object) -> Metrics:
+        return Metrics()
 
     def loaded(*given: object, device: str) -> Watched:
         return Watched(device)
 
     def remembers(room: str):
-        def figures(data: object, ours: Watched, *given: object, **named: object) -> Figures:
+        def metrics(data: object, ours: Watched, *given: object, **named: object) -> Metrics:
             asked[room] = ours.device
-            return Figures()
+            return Metrics()
 
-        return figures
+        return metrics
 
     for owner, name, double in (
         (BehaviorData, "load", lambda folder: DATA),
         (Scenes, "load", nothing),
         (Ats, "load", loaded),
-        (evaluation, "_against_clicks", nothing),
-        (evaluation.behavior, "behavior_figures", remembers("behavior")),
-        (evaluation.physical, "physical_figures", remembers("physical")),
-        (evaluation.speed, "plan_figures", remembers("speed")),
+        (measuring, "_against_clicks", nothing),
+        (measuring.behavior, "behavior_metrics", remembers("behavior")),
+        (measuring.physical, "physical_metrics", remembers("physical")),
+        (measuring.speed, "plan_metrics", remembers("speed")),
     ):
         monkeypatch.setattr(owner, name, double)
     folders = SimpleNamespace(truth=None, behavior=Path(), behavior_data=Path(), reconstruction=Path())
-    protocol, effort = SimpleNamespace(seed=0), SimpleNamespace(physical_windows=1, time_plans=True)
-    evaluation.evaluate(folders, (), effort, protocol, np.random.default_rng(0), "cuda")
+    measuring.evaluate(folders, (), Config(), "cuda")
     assert asked == {"behavior": "cuda", "physical": "cuda", "speed": "cpu"}

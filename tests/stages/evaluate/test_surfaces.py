@@ -1,4 +1,6 @@
-"""Distances are those of surfaces, exact; the animal is compared where its pose is known, and in what share of the frames is told."""
+"""Distances are those of surfaces, exact; the animal is compared where its pose is known, and in what share
+of the frames is told.
+"""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,27 +9,30 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.files import arrays, meshes
-from pipeline.models.motion import INFERRED, Motion
-from pipeline.space.meshes import Mesh
+from pipeline.data import ply
+from pipeline.data.motion import INTERPOLATED, Motion
+from pipeline.data.templates import SkinTable
+from pipeline.geometry.meshes import Mesh
+from pipeline.metrics.surface_distance import TriangleSurface, chamfer, split
 from stages.evaluate import reconstruction
-from stages.evaluate.surfaces import chamfer
-from stages.evaluate.triangles import Surface, cut
+from stages.evaluate.config import Config
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
 FRAMES = 6
 RNG = np.random.default_rng(0)
 
 
-def plane(height_m: float) -> Surface:
+def plane(height_m: float) -> TriangleSurface:
     """Return a floor of 120 square metres as two triangles."""
     corner = np.array([[0, height_m, 0], [12, height_m, 0], [12, height_m, 10], [0, height_m, 10.0]])
-    return Surface(corner[[[0, 1, 2], [0, 2, 3]]])
+    return TriangleSurface(corner[[[0, 1, 2], [0, 2, 3]]])
 
 
 def soup(count: int) -> np.ndarray:
     """Return triangles of a centimetre to a metre, some of them flat as a line or a point."""
-    corner = RNG.normal(0, 1, (count, 1, 3)) + RNG.normal(0, 1, (count, 3, 3)) * 10 ** RNG.uniform(-2, 0, (count, 1, 1))
+    corner = RNG.normal(0, 1, (count, 1, 3)) + RNG.normal(0, 1, (count, 3, 3)) * 10 ** RNG.uniform(
+        -2, 0, (count, 1, 1)
+    )
     corner[: count // 10, 2] = corner[: count // 10, :2].mean(1)
     corner[0] = corner[0, 0]
     return corner
@@ -35,17 +40,27 @@ def soup(count: int) -> np.ndarray:
 
 def test_distances_are_exact():
     corner, points = soup(60), RNG.normal(0, 2, (300, 3))
-    true = [np.linalg.norm(trimesh.triangles.closest_point(corner[6:], np.tile(point, (54, 1))) - point, axis=1).min() for point in points]
-    np.testing.assert_allclose(Surface(corner[6:]).distance(points), true, atol=1e-12)
-    assert (Surface(corner).distance(points) <= np.array(true) + 1e-12).all(), "triangles without an inside count as lines"
+    true = [
+        np.linalg.norm(
+            trimesh.triangles.closest_point(corner[6:], np.tile(point, (54, 1))) - point, axis=1
+        ).min()
+        for point in points
+    ]
+    np.testing.assert_allclose(TriangleSurface(corner[6:]).distance(points), true, atol=1e-12)
+    assert (TriangleSurface(corner).distance(points) <= np.array(true) + 1e-12).all(), (
+        "triangles without an inside count as lines"
+    )
 
 
 def test_cutting_keeps_the_surface():
     corner = soup(60)
-    pieces = cut(corner, 0.1)
+    pieces = split(corner, 0.1)
     assert np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=-1).max() <= 0.1
-    assert len(cut(pieces, 0.1)) == len(pieces)
-    area = [np.linalg.norm(np.cross(part[:, 1] - part[:, 0], part[:, 2] - part[:, 0]), axis=1).sum() for part in (corner, pieces)]
+    assert len(split(pieces, 0.1)) == len(pieces)
+    area = [
+        np.linalg.norm(np.cross(part[:, 1] - part[:, 0], part[:, 2] - part[:, 0]), axis=1).sum()
+        for part in (corner, pieces)
+    ]
     assert area[0] == pytest.approx(area[1])
 
 
@@ -55,30 +70,37 @@ def test_planes_are_as_far_apart_as_they_are(apart_m: float):
 
 
 def test_a_surface_is_no_way_from_itself():
-    ball = Surface(BALL.triangles)
+    ball = TriangleSurface(BALL.triangles)
     assert chamfer(ball, ball, 2000, RNG) < 1e-12, "metres"
-    assert chamfer(ball, Surface(1.05 * BALL.triangles), 2000, RNG) == pytest.approx(0.01, abs=3e-4)
+    assert chamfer(ball, TriangleSurface(1.05 * BALL.triangles), 2000, RNG) == pytest.approx(0.01, abs=3e-4)
 
 
 def motion_of(confidence: np.ndarray) -> Motion:
     """Return an animal that stays where it is."""
     rest = np.tile(np.eye(4), (FRAMES, 1, 1))
-    return Motion(0.1 * np.arange(FRAMES), rest, rest, rest[:, None], confidence, confidence > INFERRED)
+    return Motion(0.1 * np.arange(FRAMES), rest, rest, rest[:, None], confidence, confidence > INTERPOLATED)
 
 
 def test_the_share_of_frames_in_which_the_animal_is_compared_is_told(tmp_path: Path):
     ball = Mesh(BALL.vertices.astype(np.float32), BALL.faces.astype(np.int32))
     for path in (tmp_path / "agent.ply", tmp_path / "truth" / "agent.ply"):
         path.parent.mkdir(exist_ok=True)
-        meshes.write_ply(path, ball)
-    arrays.save(tmp_path / "skin.npz", weights=np.ones((len(ball.vertices), 1), "f4"), agent_from_bone_rest=np.eye(4, dtype="f4")[None])
-    truth = SimpleNamespace(agent_visible=np.ones(FRAMES, bool), vertices_world=lambda frame: ball.vertices.astype(float))
+        ply.write_ply(path, ball)
+    SkinTable(np.ones((len(ball.vertices), 1)), np.eye(4)[None], np.ones((1, 3))).write(tmp_path)
+    truth = SimpleNamespace(
+        agent_visible=np.ones(FRAMES, bool), vertices_world=lambda frame: ball.vertices.astype(float)
+    )
     sessions = [SimpleNamespace(video=SimpleNamespace(id=id), truth=truth) for id in ("v002", "v003")]
-    motions = {"v002": motion_of(np.array([0.9, 0.9, 0.9, INFERRED, INFERRED, INFERRED])), "v003": None}
+    motions = {
+        "v002": motion_of(np.array([0.9, 0.9, 0.9, INTERPOLATED, INTERPOLATED, INTERPOLATED])),
+        "v003": None,
+    }
     folders = SimpleNamespace(reconstruction=tmp_path, truth=tmp_path / "truth")
-    effort, frames = SimpleNamespace(surface_frames=FRAMES), SimpleNamespace(world_from_true_world=np.eye(4))
-    values = reconstruction._agent_chamfer(folders, sessions, motions, frames, effort, RNG).values
+    config, frames = Config(surface_frames=FRAMES), SimpleNamespace(world_from_true_world=np.eye(4))
+    values = reconstruction._agent_chamfer(folders, sessions, motions, frames, config, RNG).values
     assert values["reconstruction/agent_chamfer_share"] == pytest.approx(3 / 12)
     assert values["reconstruction/agent_chamfer_m"] < 1e-6, "metres"
-    nobody = reconstruction._agent_chamfer(folders, sessions, dict.fromkeys(motions), frames, effort, RNG).values
+    nobody = reconstruction._agent_chamfer(
+        folders, sessions, dict.fromkeys(motions), frames, config, RNG
+    ).values
     assert nobody == {"reconstruction/agent_chamfer_m": None, "reconstruction/agent_chamfer_share": 0}

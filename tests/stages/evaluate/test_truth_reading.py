@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.files import arrays, images
-from pipeline.files.clips import Masks
+from pipeline.data import images, npz
+from pipeline.data.clips import Masks
 from stages.evaluate import perception
-from stages.evaluate.truth import Truth, read_flow
+from stages.evaluate.truth import RecordingTruth, read_flow
 
 FRAMES = 9
 
@@ -17,18 +17,21 @@ def folder(tmp_path):
     masks = np.zeros((FRAMES, 16, 12), bool)
     for i in range(FRAMES):
         masks[i, 4:10, i % 4 : i % 4 + 5] = True
-    arrays.save(tmp_path / "s.masks.npz", packed=np.packbits(masks, axis=-1), shape=np.array(masks.shape))
+    npz.save(tmp_path / "s.masks.npz", packed=np.packbits(masks, axis=-1), shape=np.array(masks.shape))
     eye = np.tile(np.eye(4), (FRAMES, 1, 1))
     camera = eye.copy()
     camera[:, 0, 3] = np.arange(FRAMES)
-    arrays.save(
-        tmp_path / "s.npz", timestamp_s=np.arange(FRAMES) / 15, world_from_camera=camera, intrinsics=eye[:, :3, :3],
+    npz.save(
+        tmp_path / "s.npz", timestamp_s=np.arange(FRAMES) / 15, world_from_camera=camera,
+        intrinsics=eye[:, :3, :3],
         agent_visible=np.ones(FRAMES, bool), moving=np.arange(FRAMES) % 2 == 0, world_from_agent=camera,
         agent_vertices_world=np.zeros((FRAMES, 5, 3), np.float16),
     )  # fmt: skip
     flow = np.full((3, 4, 3, 2), 2.0, np.float16)
     flow[0, 0, 0] = np.nan
-    arrays.save(tmp_path / "s.flow.npz", frame_index=np.array([0, 3, 5]), second_index=np.array([1, 5, 6]), flow=flow)
+    npz.save(
+        tmp_path / "s.flow.npz", frame_index=np.array([0, 3, 5]), second_index=np.array([1, 5, 6]), flow=flow
+    )
     return tmp_path
 
 
@@ -36,7 +39,7 @@ SOURCE = np.array([0, 1, 3, 6, 8])
 
 
 def test_truth_follows_the_extracted_frames(folder):
-    truth = Truth.open(folder, "s", SOURCE)
+    truth = RecordingTruth.open(folder, "s", SOURCE)
     assert np.array_equal(truth.world_from_camera[:, 0, 3], SOURCE)
     assert truth.masks.shape == (5, 16, 12)
     assert truth.masks[2, 5, 3]
@@ -48,14 +51,16 @@ def test_only_flow_between_neighbours_counts(folder):
     true = read_flow(folder, "s", SOURCE)
     assert true.first.tolist() == [0]
     ours = np.zeros((4, 4, 3, 2))
-    figures = perception.flow_figures(perception.flow_pairs(ours, true, Truth.open(folder, "s", SOURCE).masks))
-    assert figures.values["flow/epe_px_mean"] == pytest.approx(np.sqrt(8))
-    assert figures.values["flow/zero_flow_epe_px_mean"] == pytest.approx(np.sqrt(8))
+    metrics = perception.flow_metrics(
+        perception.flow_pairs(ours, true, RecordingTruth.open(folder, "s", SOURCE).masks)
+    )
+    assert metrics.values["flow/epe_px_mean"] == pytest.approx(np.sqrt(8))
+    assert metrics.values["flow/zero_flow_epe_px_mean"] == pytest.approx(np.sqrt(8))
     assert read_flow(folder, "other", SOURCE) is None
 
 
 def test_masks_are_compared_where_they_know(folder):
-    truth, out = Truth.open(folder, "s", SOURCE), folder / "masks"
+    truth, out = RecordingTruth.open(folder, "s", SOURCE), folder / "masks"
     out.mkdir()
     for i, true in enumerate(truth.masks):
         label = np.where(true, 255, 0).astype(np.uint8)
@@ -63,10 +68,15 @@ def test_masks_are_compared_where_they_know(folder):
         if i == 4:
             label[:] = 0
         images.write_gray(out / f"{i:06d}.png", label)
-    arrays.save(out / "masks.npz", visible=np.ones(5, bool), confidence=np.ones(5, np.float32), area=np.ones(5, np.float32))
+    npz.save(
+        out / "masks.npz",
+        visible=np.ones(5, bool),
+        confidence=np.ones(5, np.float32),
+        area=np.ones(5, np.float32),
+    )
     found = perception.overlaps(Masks.open(out), truth)
     np.testing.assert_allclose(found.iou, [1, 1, 1, 1, 0])
-    figures = perception.mask_figures([found], None)
-    assert figures.values["masks/iou_mean"] == pytest.approx(0.8)
-    assert figures.values["masks/iou_resting"] == 1.0
-    assert figures.values["masks/iou_turnaround"] is None
+    metrics = perception.mask_metrics([found], None)
+    assert metrics.values["masks/iou_mean"] == pytest.approx(0.8)
+    assert metrics.values["masks/iou_resting"] == 1.0
+    assert metrics.values["masks/iou_turnaround"] is None

@@ -1,11 +1,13 @@
-"""A skinned, animated tube as glTF, and where its corners are at one moment, for tests that open it elsewhere."""
+"""A skinned, animated tube as glTF, and where its corners are at one moment, for tests that open it
+elsewhere.
+"""
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.files import glb
-from pipeline.files.glb import Action, Skin
-from pipeline.space import rigid
+from pipeline.data import glb
+from pipeline.data.glb import Action, Skin
+from pipeline.geometry import rigid
 from tests.stages.export_simulator import small_world
 
 SECONDS = 1.2

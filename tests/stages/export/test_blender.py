@@ -34,7 +34,9 @@ def test_blender_opens_the_animal_and_moves_it_alike(tmp_path) -> None:
     (tmp_path / "agent.glb").write_bytes(model)
     command = [BLENDER, "-c", SCRIPT, str(tmp_path / "agent.glb"), str(moving_tube.SECONDS)]
     told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    found = json.loads(next(line for line in told.splitlines() if line.startswith("RESULT")).removeprefix("RESULT"))
+    found = json.loads(
+        next(line for line in told.splitlines() if line.startswith("RESULT")).removeprefix("RESULT")
+    )
     assert any(name.startswith("walk") for name in found["names"])
     x, y, z = np.array(found["places"]).T  # Blender's +z is up
     np.testing.assert_allclose(np.stack([x, z, -y], 1), places, atol=2e-5)  # metres

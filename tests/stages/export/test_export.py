@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.files import arrays, glb, images
-from pipeline.files.glb import Action, Skin
-from pipeline.space import rigid
+from pipeline.core.errors import InputError
+from pipeline.data import glb, images, npz
+from pipeline.data.glb import Action, Skin
+from pipeline.geometry import rigid
 from stages.export import bvh, cameras, mjcf, neuro, reading, splats, tables, usd, writing
 from stages.export import glb as glb_export
 from tests.stages.export_simulator import small_world
@@ -53,7 +53,13 @@ def session() -> reading.Session:
     agent = track.world_from_agent.copy()
     agent[4] = np.nan
     return reading.Session(
-        "v002", track.timestamp_s, agent, track.world_from_camera, track.agent_from_bone, np.full(15, 0.9), np.isfinite(agent).all((1, 2))
+        "v002",
+        track.timestamp_s,
+        agent,
+        track.world_from_camera,
+        track.agent_from_bone,
+        np.full(15, 0.9),
+        np.isfinite(agent).all((1, 2)),
     )
 
 
@@ -81,21 +87,32 @@ def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
         pytest.skip("needs node, and `npm ci` in stages/export_simulator/web")
     script = (
         "import v from 'gltf-validator'; import fs from 'fs';"
-        "for (const f of process.argv.slice(1)) {const r = await v.validateBytes(new Uint8Array(fs.readFileSync(f)));"
+        "for (const f of process.argv.slice(1)) {"
+        "const r = await v.validateBytes(new Uint8Array(fs.readFileSync(f)));"
         "console.log(JSON.stringify([r.issues.numErrors, r.issues.numWarnings, r.info.animationCount]))}"
     )
     files = [str(tmp_path / name) for name in ("agent.glb", "scene.glb", "agent_8.glb")]
     told_by_node = subprocess.run(
-        ["node", "--input-type=module", "-e", script, *files], cwd=WEB, capture_output=True, text=True, check=True
+        ["node", "--input-type=module", "-e", script, *files],
+        cwd=WEB,
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    assert [json.loads(line) for line in told_by_node.stdout.splitlines()] == [[0, 0, 2], [0, 0, 0], [0, 0, 2]]
+    assert [json.loads(line) for line in told_by_node.stdout.splitlines()] == [
+        [0, 0, 2],
+        [0, 0, 0],
+        [0, 0, 2],
+    ]
 
 
 def test_flat_bvh_is_exact_and_its_tree_says_what_is_lost(agent: reading.Agent, tmp_path: Path) -> None:
     told = bvh.write(tmp_path, agent)
     assert told.loss_mm["flat_max"] < 0.01, "mm: six decimals"
     assert told.loss_mm["flat_max"] < told.loss_mm["tree_mean"] < 40
-    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{kind}.bvh" for name in ("walk", "turn") for kind in ("flat", "tree")}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"{name}.{kind}.bvh" for name in ("walk", "turn") for kind in ("flat", "tree")
+    }
 
 
 def test_true_tree_loses_nothing(tmp_path: Path) -> None:
@@ -108,12 +125,19 @@ def test_true_tree_loses_nothing(tmp_path: Path) -> None:
         about = rigid.make(turn, pivots[bone - 1] - turn @ pivots[bone - 1])
         motion[:, bone] = motion[:, bone - 1] @ about
     action = Action("bend", np.arange(60) / 10, small_world.trajectory(60, 2).world_from_agent, motion @ rest)
-    told = bvh.write(tmp_path, reading.Agent(mesh=None, skin=_skin(rest), actions=[action], skinning_loss_mm={}))
+    told = bvh.write(
+        tmp_path, reading.Agent(mesh=None, skin=_skin(rest), actions=[action], skinning_loss_mm={})
+    )
     assert told.loss_mm["tree_max"] < 0.5, "mm"
 
 
 def _skin(rest: np.ndarray) -> Skin:
-    return Skin(np.zeros((0, 4), np.uint8), np.zeros((0, 4), np.float32), rest, tuple(f"b{bone}" for bone in range(len(rest))))
+    return Skin(
+        np.zeros((0, 4), np.uint8),
+        np.zeros((0, 4), np.float32),
+        rest,
+        tuple(f"b{bone}" for bone in range(len(rest))),
+    )
 
 
 def test_boxes_cover_what_is_solid_and_nothing_else() -> None:
@@ -144,39 +168,52 @@ def test_rows_of_a_session(session: reading.Session) -> None:
 
 
 @pytest.fixture
-def shots(tmp_path: Path) -> list[reading.Shot]:
+def shots(tmp_path: Path) -> list[reading.CameraFrame]:
     """Three pictures of a session and one of the walk-through, with depth and masks."""
     track = small_world.trajectory(3, 0)
     for video, count in (("v000", 1), ("v002", 3)):
         for name in ("color", "depth"):
             (tmp_path / "frames" / video / name).mkdir(parents=True)
         for index in range(count):
-            images.write_color(tmp_path / f"frames/{video}/color/{index:06d}.jpg", np.full((24, 32, 3), 120, np.uint8))
-            images.write_depth(tmp_path / f"frames/{video}/depth/{index:06d}.exr", np.full((12, 16), 1.234, np.float32))
+            images.write_color(
+                tmp_path / f"frames/{video}/color/{index:06d}.jpg", np.full((24, 32, 3), 120, np.uint8)
+            )
+            images.write_depth(
+                tmp_path / f"frames/{video}/depth/{index:06d}.exr", np.full((12, 16), 1.234, np.float32)
+            )
         camera = np.tile(np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), (count, 1, 1))
-        arrays.save(tmp_path / f"frames/{video}/frames.npz", intrinsics=camera)
+        npz.save(tmp_path / f"frames/{video}/frames.npz", intrinsics=camera)
         motion = tmp_path / "reconstruction" / ("templates" if video == "v000" else video)
         motion.mkdir(parents=True)
         cameras_of = track.world_from_camera[:count].copy()
         cameras_of[2:] = np.nan
-        arrays.save(motion / ("v000.npz" if video == "v000" else "motion.npz"), world_from_camera=cameras_of)
+        npz.save(motion / ("v000.npz" if video == "v000" else "motion.npz"), world_from_camera=cameras_of)
     (tmp_path / "masks/v002").mkdir(parents=True)
     for index in range(3):
-        images.write_gray(tmp_path / f"masks/v002/{index:06d}.png", np.pad(np.full((4, 4), 255, np.uint8), ((0, 20), (0, 28))))
+        images.write_gray(
+            tmp_path / f"masks/v002/{index:06d}.png",
+            np.pad(np.full((4, 4), 255, np.uint8), ((0, 20), (0, 28))),
+        )
     frames = {video: tmp_path / "frames" / video for video in ("v000", "v002")}
-    return reading.shots(tmp_path / "reconstruction", frames, {"v002": tmp_path / "masks/v002"}, 10)
+    return reading.camera_frames(tmp_path / "reconstruction", frames, {"v002": tmp_path / "masks/v002"}, 10)
 
 
-def test_pictures_keep_their_cameras(shots: list[reading.Shot], tmp_path: Path) -> None:
-    assert [shot.name for shot in shots] == ["v000_000000", "v002_000000", "v002_000001"], "a camera that is unknown is left out"
+def test_pictures_keep_their_cameras(shots: list[reading.CameraFrame], tmp_path: Path) -> None:
+    assert [shot.name for shot in shots] == ["v000_000000", "v002_000000", "v002_000001"], (
+        "a camera that is unknown is left out"
+    )
     for name in ("colmap", "nerfstudio"):
         (tmp_path / name).mkdir()
-    told = cameras.write_colmap(tmp_path / "colmap", shots, small_world.room(), 50)
+    told = cameras.write_colmap(tmp_path / "colmap", shots, small_world.room())
     assert told.loss_mm["camera_places"] < 0.01, "mm"
-    cameras.write_nerfstudio(tmp_path / "nerfstudio", shots, small_world.room(), 50)
+    cameras.write_nerfstudio(tmp_path / "nerfstudio", shots)
     frame = json.loads((tmp_path / "nerfstudio/transforms.json").read_bytes())["frames"][1]
-    seen = np.linalg.inv(frame["transform_matrix"]) @ shots[1].world_from_camera @ np.array([0.1, 0.2, 1.0, 1.0])
-    np.testing.assert_allclose(seen[:3], [0.1, -0.2, -1.0], atol=1e-9, err_msg="OpenGL looks along -z, y is up")
+    seen = (
+        np.linalg.inv(frame["transform_matrix"]) @ shots[1].world_from_camera @ np.array([0.1, 0.2, 1.0, 1.0])
+    )
+    np.testing.assert_allclose(
+        seen[:3], [0.1, -0.2, -1.0], atol=1e-9, err_msg="OpenGL looks along -z, y is up"
+    )
     mask = images.read_gray(tmp_path / "nerfstudio" / frame["mask_path"])
     assert mask[0, 0] == 0 and mask[-1, -1] == 255
 
@@ -198,7 +235,9 @@ def test_usd_opens_where_joints_belong(agent: reading.Agent, tmp_path: Path) -> 
 
 def test_mjcf_compiles_and_moves(agent: reading.Agent, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    occupancy = reading.Occupancy(np.pad(np.ones((20, 1, 20), bool), ((0, 0), (0, 5), (0, 0))), np.array([-1.0, -0.1, -1]), 0.1)
+    occupancy = reading.Occupancy(
+        np.pad(np.ones((20, 1, 20), bool), ((0, 0), (0, 5), (0, 0))), np.array([-1.0, -0.1, -1]), 0.1
+    )
     assert mjcf.write(tmp_path, agent, occupancy).loss_mm["bodies"] < 0.01, "mm"
 
 
@@ -216,7 +255,9 @@ def test_extras_agree_with_the_locks_and_hold_no_torch() -> None:
     envs = Path(__file__).parents[3] / "envs"
 
     def pinned(name: str) -> dict[str, str]:
-        lines = (line.split()[0].split("==") for line in (envs / name).read_text().splitlines() if "==" in line)
+        lines = (
+            line.split()[0].split("==") for line in (envs / name).read_text().splitlines() if "==" in line
+        )
         return {package: version for package, version in lines}
 
     extras, core = pinned("extras.txt"), pinned("cuda.txt")

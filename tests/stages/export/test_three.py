@@ -25,8 +25,9 @@ window.moved = async (text, seconds) => {
   mixer.setTime(seconds);
   scene.updateMatrixWorld(true);
   const count = mesh.geometry.attributes.position.count;
-  const places = Array.from({ length: count }, (_, i) => mesh.getVertexPosition(i, new Vector3()).applyMatrix4(mesh.matrixWorld).toArray());
-  return { names: animations.map((animation) => animation.name), places };
+  const places = Array.from({ length: count }, (_, i) => mesh.getVertexPosition(i, new
+  Vector3()).applyMatrix4(mesh.matrixWorld).toArray()); return { names: animations.map((animation) =>
+  animation.name), places };
 };
 """
 
@@ -43,6 +44,9 @@ def test_three_opens_the_animal_and_moves_it_alike() -> None:
     with browser.chromium() as opened:
         page = opened.new_page()
         page.add_script_tag(content=script)
-        told = page.evaluate("([text, seconds]) => moved(text, seconds)", [base64.b64encode(model).decode(), moving_tube.SECONDS])
+        told = page.evaluate(
+            "([text, seconds]) => moved(text, seconds)",
+            [base64.b64encode(model).decode(), moving_tube.SECONDS],
+        )
     assert told["names"] == ["walk"]
     np.testing.assert_allclose(told["places"], places, atol=2e-5)  # metres

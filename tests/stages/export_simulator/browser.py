@@ -11,11 +11,22 @@ from playwright.sync_api import TimeoutError as PlaywrightTimeout
 CHROMIUM = "/usr/bin/chromium"
 READY = "window.ats && ats.state().milliseconds || document.querySelector('.sorry')"
 FLAGS = [
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-default-apps",
-    "--no-first-run", "--no-default-browser-check", "--disable-domain-reliability", "--metrics-recording-only",
-    "--disable-features=OptimizationHints,MediaRouter,Translate", "--no-pings", "--mute-audio",
-]  # fmt: skip
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-default-apps",
+    "--no-first-run",
+    "--no-default-browser-check",
+    "--disable-domain-reliability",
+    "--metrics-recording-only",
+    "--disable-features=OptimizationHints,MediaRouter,Translate",
+    "--no-pings",
+    "--mute-audio",
+]
 
 
 @contextmanager
@@ -31,7 +42,13 @@ def chromium() -> Iterator[Browser]:
 
 @contextmanager
 def shown(
-    browser: Browser, address: str, *, size: tuple[int, int] = (480, 320), script: str = "", timeout_s: float = 60, **more: Any
+    browser: Browser,
+    address: str,
+    *,
+    size: tuple[int, int] = (480, 320),
+    script: str = "",
+    timeout_s: float = 60,
+    **more: Any,
 ) -> Iterator[tuple[Page, list[str]]]:
     """Yield the page at an address, once it is ready or sorry, and a growing list of everything it did wrong.
 
@@ -42,9 +59,17 @@ def shown(
     page = context.new_page()
     page.add_init_script(script)
     wrong: list[str] = []
-    page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
+    page.on(
+        "console",
+        lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None,
+    )
     page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("request", lambda request: None if request.url.startswith((home, "data:", "blob:")) else wrong.append(request.url[:200]))
+    page.on(
+        "request",
+        lambda request: (
+            None if request.url.startswith((home, "data:", "blob:")) else wrong.append(request.url[:200])
+        ),
+    )
     try:
         page.goto(address)
         page.wait_for_function(READY, timeout=timeout_s * 1000)
@@ -56,7 +81,12 @@ def shown(
 
 
 @contextmanager
-def opened(file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60) -> Iterator[tuple[Page, list[str]]]:
+def opened(
+    file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60
+) -> Iterator[tuple[Page, list[str]]]:
     """Yield a page from the disk in a browser of its own."""
-    with chromium() as browser, shown(browser, file.resolve().as_uri() + query, size=size, timeout_s=timeout_s) as page_and_wrong:
+    with (
+        chromium() as browser,
+        shown(browser, file.resolve().as_uri() + query, size=size, timeout_s=timeout_s) as page_and_wrong,
+    ):
         yield page_and_wrong

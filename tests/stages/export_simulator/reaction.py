@@ -1,4 +1,6 @@
-"""Ask an open page how its animal reacts to people: the same noise seeds with the observer far, near, and opposite."""
+"""Ask an open page how its animal reacts to people: the same noise seeds with the observer far, near, and
+opposite.
+"""
 
 import numpy as np
 from playwright.sync_api import Page
@@ -7,7 +9,9 @@ FAR_M = 9.0
 
 
 def goals(page: Page, places: np.ndarray, **more: object) -> np.ndarray:
-    """Sample goals on the floor, metres, for an observer that has walked over `places` [place 2] in 0.1 s steps."""
+    """Sample goals on the floor, metres, for an observer that has walked over `places` [place 2] in 0.1 s
+    steps.
+    """
     question = {"observer": np.atleast_2d(places).tolist(), "seed": 7, "K": 16, **more}
     return np.array(page.evaluate("question => ats.sampleGoals(question)", question))[:, [0, 2]]
 
@@ -18,7 +22,9 @@ def approach(here: np.ndarray, side: np.ndarray, near_m: float, speed_m_s: float
 
 
 def away_m(page: Page, near_m: float = 0.6, speed_m_s: float = 0.8, directions: int = 8) -> np.ndarray:
-    """Return, per direction of approach, how far goals shift away from the observer, metres, against one far away."""
+    """Return, per direction of approach, how far goals shift away from the observer, metres, against one far
+    away.
+    """
     here = np.array(page.evaluate("ats.state()")["animal"])[[0, 2]]
     angle = np.arange(directions) * 2 * np.pi / directions
     shifts = []

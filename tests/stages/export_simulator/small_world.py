@@ -1,4 +1,6 @@
-"""A small true world for the page: a box room, a tube of five bones that walks in it, networks that learned to flee."""
+"""A small true world for the page: a box room, a tube of five bones that walks in it, networks that learned
+to flee.
+"""
 
 import json
 from pathlib import Path
@@ -6,13 +8,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline.files import arrays, meshes
-from pipeline.models.behavior import Architecture, BehaviorNets, Scaling
-from pipeline.models.diffusion import Schedule, noised
-from pipeline.models.strides import GOAL_POWER, powered, strides_from_path
-from pipeline.models.trajectories import FUTURE, BehaviorData, Trajectory
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
+from pipeline.behavior.diffusion import Schedule, noised
+from pipeline.behavior.model import Architecture, BehaviorNets, Scaling
+from pipeline.behavior.path_encoding import (
+    GOAL_LENGTH_POWER,
+    velocity_channels_from_path,
+    with_powered_length,
+)
+from pipeline.behavior.trajectories import FUTURE, BehaviorData, Trajectory
+from pipeline.data import npz, ply
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
 from stages.train_behavior.export import write_model
 
 BONES = 5
@@ -22,23 +28,32 @@ CUPBOARD_M = 1.3
 
 def rest() -> np.ndarray:
     """Five bones along the body, tail to head."""
-    return rigid.make(np.eye(3), np.stack([np.zeros(BONES), np.zeros(BONES), np.linspace(-0.2, 0.2, BONES)], -1))
+    return rigid.make(
+        np.eye(3), np.stack([np.zeros(BONES), np.zeros(BONES), np.linspace(-0.2, 0.2, BONES)], -1)
+    )
 
 
 def tube(rings: int = 24, sides: int = 12) -> tuple[Mesh, np.ndarray]:
     """A spindle along z, and its weights for five bones."""
-    along, around = np.meshgrid(np.linspace(-0.25, 0.25, rings), np.arange(sides) * 2 * np.pi / sides, indexing="ij")
+    along, around = np.meshgrid(
+        np.linspace(-0.25, 0.25, rings), np.arange(sides) * 2 * np.pi / sides, indexing="ij"
+    )
     radius = 0.07 * np.sqrt(np.maximum(1 - (along / 0.26) ** 2, 0.02))
     vertices = np.stack([radius * np.cos(around), radius * np.sin(around), along], -1).reshape(-1, 3)
     corner = np.arange((rings - 1) * sides).reshape(rings - 1, sides)
     beside = np.roll(corner, -1, 1)
     faces = np.concatenate(
-        [np.stack([corner, corner + sides, beside], -1), np.stack([beside, corner + sides, beside + sides], -1)]
+        [
+            np.stack([corner, corner + sides, beside], -1),
+            np.stack([beside, corner + sides, beside + sides], -1),
+        ]
     ).reshape(-1, 3)
     squared = (vertices[:, None, 2] - rest()[None, :, 2, 3]) ** 2
     weights = np.exp(-squared / (2 * 0.06**2))
     color = np.where(np.sin(60 * vertices[:, 2:]) > 0, [214, 150, 92], [238, 214, 180]).astype(np.uint8)
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), color), weights / weights.sum(1, keepdims=True)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), color), weights / weights.sum(
+        1, keepdims=True
+    )
 
 
 def room() -> Mesh:
@@ -63,11 +78,19 @@ def room() -> Mesh:
 
 def _sheet(center, along, up, first, second, cells: int = 16) -> Mesh:
     u, v = np.meshgrid(np.linspace(-1, 1, cells + 1), np.linspace(-1, 1, cells + 1), indexing="ij")
-    vertices = np.asarray(center, float) + HALF_ROOM_M * (u[..., None] * np.array(along) + v[..., None] * np.array(up))
+    vertices = np.asarray(center, float) + HALF_ROOM_M * (
+        u[..., None] * np.array(along) + v[..., None] * np.array(up)
+    )
     row, column = np.meshgrid(np.arange(cells + 1), np.arange(cells + 1), indexing="ij")
-    color = np.where(((row // 2 + column // 2) % 2 == 0)[..., None], first, second).reshape(-1, 3).astype(np.uint8)
+    color = (
+        np.where(((row // 2 + column // 2) % 2 == 0)[..., None], first, second)
+        .reshape(-1, 3)
+        .astype(np.uint8)
+    )
     at = (row * (cells + 1) + column)[:-1, :-1].reshape(-1)
-    faces = np.concatenate([np.stack([at, at + cells + 1, at + 1], -1), np.stack([at + 1, at + cells + 1, at + cells + 2], -1)])
+    faces = np.concatenate(
+        [np.stack([at, at + cells + 1, at + 1], -1), np.stack([at + 1, at + cells + 1, at + cells + 2], -1)]
+    )
     return Mesh(vertices.reshape(-1, 3).astype(np.float32), faces.astype(np.int32), color)
 
 
@@ -79,32 +102,50 @@ def trajectory(frames: int, seed: int) -> Trajectory:
     heading = np.stack([0 * angle, -angle, 0 * angle], -1)  # z towards the direction of travel
     world_from_agent = rigid.make(rigid.rotation_from_vector(heading), position)
     phase = 2 * np.pi * time_s[:, None] + np.arange(BONES)
-    wag = np.stack([0 * phase, 0.25 * np.sin(phase), 0 * phase, 0.02 * np.sin(phase), 0 * phase, 0 * phase], -1)
-    camera = np.stack([rigid.look_at(np.array([0.2, 1.4, 0.1 * seed]), point, np.array([0.0, 1, 0])) for point in position])
-    return Trajectory(time_s, world_from_agent, (rest() @ rigid.exp(wag)).astype(np.float32), camera, np.ones(frames, bool))
+    wag = np.stack(
+        [0 * phase, 0.25 * np.sin(phase), 0 * phase, 0.02 * np.sin(phase), 0 * phase, 0 * phase], -1
+    )
+    camera = np.stack(
+        [rigid.look_at(np.array([0.2, 1.4, 0.1 * seed]), point, np.array([0.0, 1, 0])) for point in position]
+    )
+    return Trajectory(
+        time_s, world_from_agent, (rest() @ rigid.exp(wag)).astype(np.float32), camera, np.ones(frames, bool)
+    )
 
 
 def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[BehaviorNets, Scaling]:
-    """Train perception and goal network, briefly, to run from whoever is near; path network to go straight; the body only at random."""
+    """Train perception and goal network, briefly, to run from whoever is near; path network to go straight;
+    the body only at random.
+    """
     torch.manual_seed(0)
     nets, schedule = BehaviorNets(architecture), Schedule()
     (mind,) = nets.perception
     optimizer = torch.optim.Adam([*mind.observer.parameters(), *nets.goal.parameters()], 3e-3)
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
-        place = (torch.rand(128, 1, 3) * 2 - 1) * torch.tensor([3.0, 0.3, 3.0]) + torch.tensor([0.0, 1.2, 0.0])
+        place = (torch.rand(128, 1, 3) * 2 - 1) * torch.tensor([3.0, 0.3, 3.0]) + torch.tensor(
+            [0.0, 1.2, 0.0]
+        )
         level = place[:, 0] * torch.tensor([1.0, 0.0, 1.0])
         distance = level.norm(dim=-1, keepdim=True)
         pace_m_s = torch.rand(128, 1, 1) * 1.2  # that of walking up; it does not matter either
-        observer = place + level[:, None] / distance[:, None] * pace_m_s * torch.arange(0.7, -0.05, -0.1)[:, None]
+        observer = (
+            place + level[:, None] / distance[:, None] * pace_m_s * torch.arange(0.7, -0.05, -0.1)[:, None]
+        )
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
-        chart = torch.randn(128, architecture.condition - architecture.told)
-        condition = torch.cat([chart, elsewhere[0], mind.observer(observer.flatten(1), torch.ones(128)), elsewhere[1]], dim=-1)
+        chart = torch.randn(128, architecture.condition_length - architecture.code_length)
+        condition = torch.cat(
+            [chart, elsewhere[0], mind.observer(observer.flatten(1), torch.ones(128)), elsewhere[1]], dim=-1
+        )
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
-        loss = (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise).square().mean()
+        loss = (
+            (nets.goal(noised(goal, noise, alpha_bar[t][:, None]), t.float(), condition) - noise)
+            .square()
+            .mean()
+        )
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -117,19 +158,27 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
     return nets, Scaling(np.ones(3), np.ones((1, 4)), path_std, mean, np.full(channels, 0.05))
 
 
-def _teach_paths(nets: BehaviorNets, architecture: Architecture, schedule: Schedule, steps: int = 100) -> None:
+def _teach_paths(
+    nets: BehaviorNets, architecture: Architecture, schedule: Schedule, steps: int = 100
+) -> None:
     """Train the path network, briefly, to go straight to its goal."""
     optimizer = torch.optim.Adam(nets.path.parameters(), 3e-3)
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
         goal = torch.randn(32, 3)
-        place = powered(goal, 1 / GOAL_POWER)[:, None] * torch.arange(1, FUTURE + 1)[:, None] / FUTURE
-        path = strides_from_path(place, torch.zeros(32, 3)).mT + 0.05 * torch.randn(32, 4, FUTURE)
+        place = (
+            with_powered_length(goal, 1 / GOAL_LENGTH_POWER)[:, None]
+            * torch.arange(1, FUTURE + 1)[:, None]
+            / FUTURE
+        )
+        path = velocity_channels_from_path(place, torch.zeros(32, 3)).mT + 0.05 * torch.randn(32, 4, FUTURE)
         t = torch.randint(schedule.steps, (32,))
         noise = torch.randn(32, 4, FUTURE)
         x = noised(path, noise, alpha_bar[t][:, None, None])
-        told = nets.path(x, t.float(), torch.randn(32, architecture.condition), goal, torch.ones(32, 1))
-        loss = (told - noise).square().mean()
+        predicted = nets.path(
+            x, t.float(), torch.randn(32, architecture.condition_length), goal, torch.ones(32, 1)
+        )
+        loss = (predicted - noise).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -143,15 +192,19 @@ def write(build: Path) -> None:
     body, weights = tube()
     write_gaussians(build / "splats/scene.ply", room())
     write_gaussians(build / "splats/agent.ply", body)
-    arrays.save(build / "splats/splats.npz", agent_weights=weights.astype(np.float32), agent_from_bone_rest=rest().astype(np.float32))
+    npz.save(
+        build / "splats/splats.npz",
+        agent_weights=weights.astype(np.float32),
+        agent_from_bone_rest=rest().astype(np.float32),
+    )
     tracks = {f"v{2 + k:03d}": trajectory(120, k) for k in range(2)}
     zeros = np.zeros(2, np.int32)
-    BehaviorData(tracks, rest(), np.arange(2, dtype=np.int32), zeros, np.array([0, 1], np.uint8), tuple(tracks)).save(
-        build / "behavior_data"
-    )
+    BehaviorData(
+        tracks, rest(), np.arange(2, dtype=np.int32), zeros, np.array([0, 1], np.uint8), tuple(tracks)
+    ).save(build / "behavior_data")
     rng = np.random.default_rng(0)
     shape = (44, 24, 44)
-    arrays.save(
+    npz.save(
         build / "behavior_data/volume.npz",
         features=rng.normal(0, 0.1, (16, *shape)).astype(np.float16),
         occupancy=np.zeros(shape, np.uint8),
@@ -161,7 +214,14 @@ def write(build: Path) -> None:
         voxel_m=np.array(0.1),
     )
     architecture = Architecture(
-        bones=BONES, scene_width=8, hidden=32, code=16, unet_width=8, unet_multipliers=(1,), goal_hidden=64, minds=1
+        bones=BONES,
+        scene_width=8,
+        hidden=32,
+        code=16,
+        unet_width=8,
+        unet_multipliers=(1,),
+        goal_hidden=64,
+        ensemble_size=1,
     )
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
@@ -179,9 +239,9 @@ def allowed(shape: tuple[int, int, int]) -> np.ndarray:
 def write_surfaces(reconstruction: Path) -> None:
     """Write the tube, its skin and the room."""
     body, weights = tube()
-    meshes.write_ply(reconstruction / "agent.ply", body)
-    meshes.write_ply(reconstruction / "scene.ply", room())
-    arrays.save(
+    ply.write_ply(reconstruction / "agent.ply", body)
+    ply.write_ply(reconstruction / "scene.ply", room())
+    npz.save(
         reconstruction / "skin.npz",
         weights=weights.astype(np.float32),
         agent_from_bone_rest=rest().astype(np.float32),
@@ -197,7 +257,16 @@ def write_gaussians(path: Path, mesh: Mesh) -> None:
     rows[:, 54] = 4.0
     rows[:, 55:58] = np.log(0.12)
     rows[:, 58] = 1.0
-    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
+    names = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(45)),
+    ]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     head = [
         "ply",

@@ -20,7 +20,8 @@ def test_bundle_is_younger_than_its_sources() -> None:
 
 
 @pytest.mark.skipif(
-    shutil.which("node") is None or not (WEB / "node_modules").is_dir(), reason="needs node, and `npm ci` in stages/export_simulator/web"
+    shutil.which("node") is None or not (WEB / "node_modules").is_dir(),
+    reason="needs node, and `npm ci` in stages/export_simulator/web",
 )
 def test_bundle_built_again_is_the_same(tmp_path: Path) -> None:
     subprocess.run(["node", "build.mjs", str(tmp_path)], cwd=WEB, check=True)

@@ -1,4 +1,6 @@
-"""The page in headless Chromium, from a file: it lives, asks nobody, samples as Python does, and obeys hands."""
+"""The page in headless Chromium, from a file: it lives, asks nobody, samples as Python does, and
+obeys hands.
+"""
 
 import base64
 import functools
@@ -19,14 +21,14 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page
 
-from pipeline import artifact, config, dag
-from pipeline.cli import Task
-from pipeline.files import arrays, meshes
-from pipeline.models.trajectories import BehaviorData
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh, RayCaster
-from stages.export_simulator.__main__ import Config, run
-from stages.simulate.subgoal_file import Written, subgoals, tables
+from pipeline.behavior.trajectories import BehaviorData
+from pipeline.core import config
+from pipeline.data import npz, ply
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh, RayCaster
+from stages.export_simulator import stage
+from stages.export_simulator.config import Config
+from stages.simulate.subgoal_file import SubgoalEntry, subgoals, tables
 from tests.stages.export_simulator import browser, reaction, small_world, twins
 
 pytestmark = pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
@@ -41,7 +43,8 @@ SPOILS_THE_FIRST_PLAN = """
   Worker.prototype.postMessage = function (message, ...rest) {
     const spoil = message.kind === 'plan' && !spoiled;
     spoiled ||= spoil;
-    return post.call(this, spoil ? { ...message, content: { ...message.content, past: null } } : message, ...rest);
+    return post.call(this, spoil ? { ...message, content: { ...message.content, past: null } } : message,
+    ...rest);
   };
 """
 WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED = """
@@ -55,19 +58,18 @@ WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED = """
     setTimeout(() => post.call(this, message, ...rest), 2000);
   };
 """
-SEES_ALL = "points => points.map(ats.screen).every(([x, y]) => x > 0 && x < innerWidth && y > 0 && y < innerHeight)"
+SEES_ALL = (
+    "points => points.map(ats.screen).every(([x, y]) => x > 0 && x < innerWidth && y > 0 && y < innerHeight)"
+)
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
+NAMED = Config(name="tube")
 
 
-def exported(raw: Path, build: Path) -> Task:
-    """Export a world as one file; return what was done, to do it otherwise."""
-    for name in READS:
-        with artifact.create(build / name, stage=dag.NODES[name].stage, config={}, inputs={}) as folder:
-            shutil.copytree(raw / name, folder, dirs_exist_ok=True)
-    paths = {name: build / name for name in READS}
-    task = Task("export_simulator", Config(name="tube"), build / "simulator", None, (), None, 1, None, paths, "cpu")
-    run(task)
-    return task
+def exported(raw: Path, out: Path, config: Config = NAMED) -> Path:
+    """Export a world into an empty folder; return the folder."""
+    out.mkdir(parents=True)
+    stage.run(stage.Inputs(**{name: raw / name for name in READS}), config, out)
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -75,10 +77,10 @@ def simulator(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Export a small world, as one file and as a folder beside it."""
     raw, build = tmp_path_factory.mktemp("raw"), tmp_path_factory.mktemp("build")
     small_world.write(raw)
-    task = exported(raw, build)
-    run(replace(task, config=Config(name="tube", layout="folder"), out=build / "light"))
+    shutil.copytree(raw, build, dirs_exist_ok=True)
+    exported(raw, build / "light", replace(NAMED, layout="folder"))
     shutil.copy(raw / "behavior/golden.json", build / "golden.json")
-    return build / "simulator"
+    return exported(raw, build / "simulator")
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +93,9 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
     golden = json.loads((simulator.parent / "golden.json").read_bytes())
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
         before = page.evaluate("ats.state()")
-        assert 0 < before["marks_s"]["animal"] < before["marks_s"]["plan"], "seconds after opening: the animal is seen, then plans"
+        assert 0 < before["marks_s"]["animal"] < before["marks_s"]["plan"], (
+            "seconds after opening: the animal is seen, then plans"
+        )
         _check_golden(golden, page.evaluate("golden => ats.golden(golden)", golden))
         page.evaluate("ats.pause()")
         _check_reaction(page)
@@ -100,12 +104,18 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
         _check_the_person_is_carried(page)
         page.wait_for_function(f"ats.state().tick > {before['tick'] + 5}", timeout=30_000)
         after = page.evaluate("ats.state()")
-        assert np.linalg.norm(np.subtract(after["animal"], before["animal"])[:3]) > 0.01, "metres within half a second"
+        assert np.linalg.norm(np.subtract(after["animal"], before["animal"])[:3]) > 0.01, (
+            "metres within half a second"
+        )
         assert wrong == []
 
 
-def test_goals_and_paths_are_obeyed_and_takes_are_kept(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
-    with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(900, 760), accept_downloads=True) as (page, wrong):
+def test_goals_and_paths_are_obeyed_and_takes_are_kept(
+    simulator: Path, chromium: Browser, tmp_path: Path
+) -> None:
+    with browser.shown(
+        chromium, (simulator / "index.html").as_uri(), size=(900, 760), accept_downloads=True
+    ) as (page, wrong):
         _check_a_clicked_goal(page)
         _check_goals_in_turn(page, tmp_path)
         _check_a_goal_in_a_cupboard(page)
@@ -129,7 +139,9 @@ def _check_reaction(page: Page) -> None:
     near = here + 0.5 * side
     far = reaction.goals(page, here + 9 * side)
     assert np.abs(reaction.goals(page, here - 9 * side) - far).max() < 1e-5, "a far observer does not matter"
-    assert (reaction.away_m(page, directions=4) > 0.3).all(), "metres: away from who comes near, whichever way"
+    assert (reaction.away_m(page, directions=4) > 0.3).all(), (
+        "metres: away from who comes near, whichever way"
+    )
     page.click("#panel-toggle")
     page.locator("#interactivity").press("Home")
     assert page.inner_text("#interactivity-value") == "0.00"
@@ -144,10 +156,17 @@ def _check_reaction(page: Page) -> None:
 
 
 def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
-    """Of 200 approaches as many drive goals away as in Python, with the same noise; the goals themselves agree as well."""
+    """Of 200 approaches as many drive goals away as in Python, with the same noise; the goals themselves
+    agree as well.
+    """
     met = twins.approaches(BehaviorData.load(build / "behavior_data"), 200, np.random.default_rng(0))
-    here, there = twins.asked_of_the_page(page, met, 5), twins.asked_of_python(build, build / "simulator", met, 5)
-    assert 0.6 < there.rate(met.side) < 0.85, "goals shift away from whoever is nearer than 1.8 m, which are 70 %"
+    here, there = (
+        twins.asked_of_the_page(page, met, 5),
+        twins.asked_of_python(build, build / "simulator", met, 5),
+    )
+    assert 0.6 < there.rate(met.side) < 0.85, (
+        "goals shift away from whoever is nearer than 1.8 m, which are 70 %"
+    )
     assert 0.2 < there.rate(met.side, 0.4) < 0.8, "not all of them far"
     for further_m in (0.1, 0.3, 0.4, 0.5):
         assert abs(here.rate(met.side, further_m) - there.rate(met.side, further_m)) < 0.03
@@ -163,10 +182,14 @@ def _check_the_person_is_carried(page: Page) -> None:
     page.mouse.move(*page.evaluate("ats.screen([1.0, 0.8, 0.5])"))
     page.mouse.down()
     page.mouse.move(*page.evaluate("ats.screen([-0.2, 0, 1.2])"), steps=5)
-    page.wait_for_function("Math.hypot(ats.state().observer[0] + 0.2, ats.state().observer[1] - 1.2) < 0.1", timeout=10_000)
+    page.wait_for_function(
+        "Math.hypot(ats.state().observer[0] + 0.2, ats.state().observer[1] - 1.2) < 0.1", timeout=10_000
+    )
     page.mouse.up()
     page.keyboard.down("d")
-    page.wait_for_function("Math.hypot(ats.state().observer[0] + 0.2, ats.state().observer[1] - 1.2) > 0.3", timeout=10_000)
+    page.wait_for_function(
+        "Math.hypot(ats.state().observer[0] + 0.2, ats.state().observer[1] - 1.2) > 0.3", timeout=10_000
+    )
     page.keyboard.up("d")
 
 
@@ -176,7 +199,9 @@ def _check_a_clicked_goal(page: Page) -> None:
     page.mouse.click(*page.evaluate("ats.screen([-0.6, 0, -0.5])"))
     assert np.allclose(page.evaluate("ats.state().aim"), goal, atol=0.05), "metres"
     assert "aim=" in page.evaluate("location.hash")
-    page.wait_for_function("Math.hypot(ats.state().animal[0] + 0.6, ats.state().animal[2] + 0.5) < 0.3", timeout=30_000)
+    page.wait_for_function(
+        "Math.hypot(ats.state().animal[0] + 0.6, ats.state().animal[2] + 0.5) < 0.3", timeout=30_000
+    )
     page.wait_for_function("ats.state().aim === null", timeout=10_000)
 
 
@@ -196,11 +221,14 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
     with page.expect_download() as download:
         page.click("#toml")
     download.value.save_as(folder / "goals.toml")
-    written = [config.from_table(Written, each, where="") for each in tables(config.read_table(folder / "goals.toml"), folder)]
+    written = [
+        config.from_table(SubgoalEntry, each, where="")
+        for each in tables(config.read_table(folder / "goals.toml"), folder)
+    ]
     journey = subgoals(written, folder)
-    assert np.linalg.norm(journey[0].position_world - begin[:3]) < 0.5 and journey[0].heading_rad is not None, (
-        "metres: it begins where it was"
-    )
+    assert (
+        np.linalg.norm(journey[0].position_world - begin[:3]) < 0.5 and journey[0].heading_rad is not None
+    ), "metres: it begins where it was"
     np.testing.assert_allclose([stop.position_world[[0, 2]] for stop in journey[1:]], goals, atol=0.05)
     for left in (2, 1, 0):
         page.wait_for_function(f"ats.state().stops.length === {left}", timeout=30_000)
@@ -229,7 +257,9 @@ def _check_a_drawn_path(page: Page) -> None:
     page.mouse.up()
     assert "route=" in page.evaluate("location.hash")
     route = np.array(page.evaluate("ats.state().route.points"))
-    assert np.linalg.norm(route[-1] - stroke[-1, [0, 2]]) < 0.1, "metres: the route ends where the stroke does"
+    assert np.linalg.norm(route[-1] - stroke[-1, [0, 2]]) < 0.1, (
+        "metres: the route ends where the stroke does"
+    )
     page.wait_for_timeout(500)  # until the last plan has faded
     aside, ends = [], []
     while page.evaluate("ats.state().route !== null"):
@@ -272,21 +302,29 @@ def _check_a_clip_beside(page: Page) -> None:
 
 
 def _check_an_opened_take(page: Page, folder: Path) -> None:
-    """A take of `stages.simulate` at 30 Hz, chosen or dropped, plays beside; that of another body is refused in words."""
+    """A take of `stages.simulate` at 30 Hz, chosen or dropped, plays beside; that of another body is refused
+    in words.
+    """
     time_s = np.arange(181) / 30
     place = np.stack([0.5 * np.cos(time_s), np.full(181, 0.1), 0.5 * np.sin(time_s)], -1)
-    motion = {"world_from_agent": rigid.make(np.tile(np.eye(3), (181, 1, 1)), place), "arrival_s": np.zeros(1)}
+    motion = {
+        "world_from_agent": rigid.make(np.tile(np.eye(3), (181, 1, 1)), place),
+        "arrival_s": np.zeros(1),
+    }
     bones = np.tile(small_world.rest(), (181, 1, 1, 1)).astype(np.float32)
-    arrays.save(folder / "journey.npz", timestamp_s=time_s, agent_from_bone=bones, **motion)
-    arrays.save(folder / "dropped.npz", timestamp_s=time_s, agent_from_bone=bones, **motion, compress=True)
-    arrays.save(folder / "other.npz", timestamp_s=time_s, agent_from_bone=bones[:, :3], **motion)
+    npz.save(folder / "journey.npz", timestamp_s=time_s, agent_from_bone=bones, **motion)
+    npz.save(folder / "dropped.npz", timestamp_s=time_s, agent_from_bone=bones, **motion, compress=True)
+    npz.save(folder / "other.npz", timestamp_s=time_s, agent_from_bone=bones[:, :3], **motion)
     page.set_input_files("#open-file", folder / "journey.npz")
     _check_it_plays(page, "journey", place)
     dropped = base64.b64encode((folder / "dropped.npz").read_bytes()).decode()
     page.evaluate(DROP, dropped)
     _check_it_plays(page, "dropped", place)
     page.set_input_files("#open-file", folder / "other.npz")
-    page.wait_for_function("document.querySelector('#help').textContent.includes('it has 3 bones, this animal has 5')", timeout=10_000)
+    page.wait_for_function(
+        "document.querySelector('#help').textContent.includes('it has 3 bones, this animal has 5')",
+        timeout=10_000,
+    )
 
 
 def _check_it_plays(page: Page, name: str, place: np.ndarray) -> None:
@@ -302,7 +340,9 @@ def test_keys_stay_alive_while_the_panel_is_used(simulator: Path, chromium: Brow
         _check_a_key_walks(page, "w")
         page.locator("[data-sense=past]").focus()
         page.keyboard.press("Space")
-        assert page.evaluate("ats.state().settings.past") == 0 and page.inner_text("#play") == "pause", "space is the box's"
+        assert page.evaluate("ats.state().settings.past") == 0 and page.inner_text("#play") == "pause", (
+            "space is the box's"
+        )
         _check_a_key_walks(page, "ArrowUp")
         page.locator("#seed").focus()
         page.keyboard.down("w")
@@ -321,7 +361,9 @@ def _check_a_key_walks(page: Page, key: str) -> None:
     before = page.evaluate("ats.state().observer")
     page.keyboard.down(key)
     page.wait_for_function(
-        "([x, z]) => Math.hypot(ats.state().observer[0] - x, ats.state().observer[1] - z) > 0.1", arg=before, timeout=10_000
+        "([x, z]) => Math.hypot(ats.state().observer[0] - x, ats.state().observer[1] - z) > 0.1",
+        arg=before,
+        timeout=10_000,
     )
     page.keyboard.up(key)
 
@@ -333,10 +375,14 @@ def _check_nobody_walks(page: Page) -> None:
 
 
 def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
-    """Not before the first plan, nor in slow motion: nobody takes steps of more than 0.11 m in 0.1 s of the animal's time."""
+    """Not before the first plan, nor in slow motion: nobody takes steps of more than 0.11 m in 0.1 s of the
+    animal's time.
+    """
     address = (simulator / "index.html").as_uri() + "#speed=0.3&at=1.2,1.2"
     with browser.shown(chromium, address, script=WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED) as (page, wrong):
-        assert np.linalg.norm(np.subtract(page.evaluate("ats.state().observer"), 1.2)) > 0.3, "metres, while the first plan is awaited"
+        assert np.linalg.norm(np.subtract(page.evaluate("ats.state().observer"), 1.2)) > 0.3, (
+            "metres, while the first plan is awaited"
+        )
         page.wait_for_function("ats.state().take_s > 0.5 && told.length > 1", timeout=30_000)
         page.keyboard.up("w")
         with page.expect_download() as download:
@@ -359,14 +405,24 @@ def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp
     place = animal + 0.4 * (eye - animal) / np.linalg.norm((eye - animal)[[0, 2]])
     box = trimesh.creation.box((0.3, 0.3, 0.3), rigid.make(np.eye(3), place))
     cast = RayCaster(Mesh(np.asarray(box.vertices, np.float32), np.asarray(box.faces))).cast
-    scene = meshes.read_ply(tmp_path / "reconstruction/scene.ply")
-    vertices, faces = np.concatenate([scene.vertices, box.vertices]), np.concatenate([scene.faces, box.faces + len(scene.vertices)])
+    scene = ply.read_ply(tmp_path / "reconstruction/scene.ply")
+    vertices, faces = (
+        np.concatenate([scene.vertices, box.vertices]),
+        np.concatenate([scene.faces, box.faces + len(scene.vertices)]),
+    )
     color = np.concatenate([scene.color, np.full((8, 3), 99)]).astype(np.uint8)
-    meshes.write_ply(tmp_path / "reconstruction/scene.ply", Mesh(vertices.astype(np.float32), faces.astype(np.int32), color))
-    task = exported(tmp_path, tmp_path / "build")
-    with browser.shown(chromium, (task.out / "index.html").as_uri()) as (page, wrong):
+    ply.write_ply(
+        tmp_path / "reconstruction/scene.ply",
+        Mesh(vertices.astype(np.float32), faces.astype(np.int32), color),
+    )
+    out = exported(tmp_path, tmp_path / "build/simulator")
+    with browser.shown(chromium, (out / "index.html").as_uri()) as (page, wrong):
         shown_from = np.array(page.evaluate("ats.state().eye"))
-        assert cast(eye, (animal - eye)[None]).distance[0] < 1 < cast(shown_from, (animal - shown_from)[None]).distance[0]
+        assert (
+            cast(eye, (animal - eye)[None]).distance[0]
+            < 1
+            < cast(shown_from, (animal - shown_from)[None]).distance[0]
+        )
         assert wrong == []
 
 
@@ -379,11 +435,18 @@ def test_nothing_covers_anything(simulator: Path, chromium: Browser) -> None:
             for first, second in itertools.combinations(parts, 2):
                 a, b = box[first], box[second]
                 beside = a["x"] + a["width"] <= b["x"] or b["x"] + b["width"] <= a["x"]
-                assert beside or a["y"] + a["height"] <= b["y"] or b["y"] + b["height"] <= a["y"], (width, height, first, second)
+                assert beside or a["y"] + a["height"] <= b["y"] or b["y"] + b["height"] <= a["y"], (
+                    width,
+                    height,
+                    first,
+                    second,
+                )
 
 
 def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> None:
-    address = (simulator / "index.html").as_uri() + "#interactivity=0.25&samples=16&steps=50&scene=0&aim=0.5,0.5"
+    address = (
+        simulator / "index.html"
+    ).as_uri() + "#interactivity=0.25&samples=16&steps=50&scene=0&aim=0.5,0.5"
     with browser.shown(chromium, address, size=(390, 780), has_touch=True, is_mobile=True) as (page, wrong):
         state = page.evaluate("ats.state()")
         kept = {"interactivity": 0.25, "samples": 16, "steps": 50, "scene": 0}
@@ -395,7 +458,7 @@ def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> 
         assert np.allclose(page.evaluate("ats.state().aim"), [0.2, -0.3], atol=0.05), "metres"
         assert not page.is_visible("#help")
         page.click("#how")
-        assert page.is_visible("#help") and "Click the floor" in page.inner_text("#help")
+        assert page.is_visible("#help") and "Tap the floor" in page.inner_text("#help")
         page.click("#how")
         page.wait_for_function("document.getElementById('help').classList.contains('gone')")
         _check_a_followed_link(page)
@@ -426,7 +489,10 @@ def test_a_page_that_cannot_live_says_so(simulator: Path, chromium: Browser, scr
 
 
 def test_a_plan_that_fails_is_asked_for_again(simulator: Path, chromium: Browser) -> None:
-    with browser.shown(chromium, (simulator / "index.html").as_uri(), script=SPOILS_THE_FIRST_PLAN) as (page, wrong):
+    with browser.shown(chromium, (simulator / "index.html").as_uri(), script=SPOILS_THE_FIRST_PLAN) as (
+        page,
+        wrong,
+    ):
         assert page.evaluate("ats.state().plans") >= 2
         assert wrong == []
 
@@ -440,16 +506,22 @@ def test_folder_variant_lives_on_a_static_host(simulator: Path, chromium: Browse
         assert [line for line in wrong if "favicon" not in line] == []
 
 
-def test_splats_that_cannot_be_read_leave_the_mesh(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+def test_splats_that_cannot_be_read_leave_the_mesh(
+    simulator: Path, chromium: Browser, tmp_path: Path
+) -> None:
     folder = shutil.copytree(simulator.parent / "light", tmp_path / "light")
     (folder / "assets/splats.gz").write_bytes(b"no splats")
     with served(folder) as address, browser.shown(chromium, f"{address}?splats") as (page, wrong):
-        page.wait_for_function("document.querySelector('#status').textContent.includes('drawn as a mesh')", timeout=30_000)
+        page.wait_for_function(
+            "document.querySelector('#status').textContent.includes('drawn as a mesh')", timeout=30_000
+        )
         assert page.evaluate("document.querySelector('#splash').classList.contains('gone')")
         assert [line for line in wrong if "favicon" not in line] == []
 
 
-def test_a_hall_is_framed_as_a_room_is_and_seen_whole_from_afar(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+def test_a_hall_is_framed_as_a_room_is_and_seen_whole_from_afar(
+    simulator: Path, chromium: Browser, tmp_path: Path
+) -> None:
     folder = shutil.copytree(simulator.parent / "light", tmp_path / "light")
     told = json.loads(gzip.decompress((folder / "assets/simulator.gz").read_bytes()))
     told["scene"]["bounds_m"] = (np.array(told["scene"]["bounds_m"]) * [4, 1, 4]).tolist()
@@ -470,7 +542,9 @@ def served(folder: Path) -> Iterator[str]:
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None: ...
 
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder)) as server:
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Quiet, directory=folder)
+    ) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}/index.html"
         server.shutdown()

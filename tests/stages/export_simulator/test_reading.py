@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.models.behavior import Architecture
+from pipeline.behavior.model import Architecture
+from pipeline.core.errors import InputError
 from stages.export_simulator import reading
 
 
 @pytest.mark.parametrize("variant", [{"family": "gaussian"}, {"family": "one_stage"}, {"ego": "world"}])
 def test_variants_that_the_page_does_not_know_are_refused(tmp_path: Path, variant: dict[str, str]) -> None:
-    (tmp_path / "behavior.json").write_text(json.dumps({"architecture": asdict(Architecture(bones=3, **variant))}))
+    (tmp_path / "behavior.json").write_text(
+        json.dumps({"architecture": asdict(Architecture(bones=3, **variant))})
+    )
     with pytest.raises(InputError, match=f"EXP-002.*{next(iter(variant.values()))}"):
-        reading.minds(tmp_path, tmp_path)
+        reading.behavior_assets(tmp_path, tmp_path)

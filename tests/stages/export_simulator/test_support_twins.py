@@ -8,32 +8,37 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.models.perception import FeatureVolume
-from pipeline.models.scenes import Ground, Scenes
-from pipeline.models.strides import STAYS_M_S
-from pipeline.models.support import Support, marked
-from pipeline.models.trajectories import RATE_HZ
-from stages.export_simulator.reading import support
+from pipeline.behavior.path_encoding import REST_SPEED_M_S
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.scenes import SceneConstraint, Scenes
+from pipeline.behavior.support import Support, mark_supported
+from pipeline.behavior.trajectories import RATE_HZ
+from stages.export_simulator.reading import support_contract
 
 SOURCES = Path(__file__).parents[3] / "stages/export_simulator/web/src"
 ASK = """
 import { nearestAllowed } from '%(sources)s/clearing.js';
 import { Senses } from '%(sources)s/senses.js';
+import { Support } from '%(sources)s/support.js';
 const { volume, marks, paths, fastest } = JSON.parse(await new Response(process.stdin).text());
 const senses = Object.create(Senses.prototype);
 const allowed = Uint8Array.from(marks);
-Object.assign(senses, { volume, allowed, nearest: nearestAllowed(allowed, volume.shape.slice(1)) });
-const told = paths.map((path) => %(answer)s);
-console.log(JSON.stringify(told));
+Object.assign(senses, { volume, allowed, nearest: nearestAllowed(allowed, volume.shape.slice(1)), support: new
+Support(volume, allowed) }); const told = paths.map((path) => %(answer)s); console.log(JSON.stringify(told));
 """
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 
 
+def asked_of_node(script: str, **asked: object) -> np.ndarray:
+    """Return what a script answers to what stands on its standard input."""
+    node = ["node", "--no-warnings", "--input-type=module", "-e", script]
+    answer = subprocess.run(node, input=json.dumps(asked), capture_output=True, text=True, check=True)
+    return np.array(json.loads(answer.stdout))
+
+
 def asked_of_the_page(answer: str, **asked: object) -> np.ndarray:
     """Return what the page's senses make of paths."""
-    node = ["node", "--no-warnings", "--input-type=module", "-e", ASK % {"sources": SOURCES, "answer": answer}]
-    told = subprocess.run(node, input=json.dumps(asked), capture_output=True, text=True, check=True)
-    return np.array(json.loads(told.stdout))
+    return asked_of_node(ASK % {"sources": SOURCES, "answer": answer}, **asked)
 
 
 @needs_node
@@ -41,19 +46,26 @@ def test_page_and_python_tread_the_same_way():
     rng = np.random.default_rng(0)
     occupancy = (rng.random((12, 8, 12)) < 0.2).astype(np.uint8)
     occupancy[:, 0] = 1
-    scene = FeatureVolume(np.zeros((1, *occupancy.shape), np.float32), occupancy, np.array([-0.6, -0.1, -0.6]), 0.1)
-    marks, range_m = marked(occupancy == 0, occupancy), np.array([[0.05, 0.14], [0.08, 0.12]])
+    scene = FeatureVolume(
+        np.zeros((1, *occupancy.shape), np.float32), occupancy, np.array([-0.6, -0.1, -0.6]), 0.1
+    )
+    marks, range_m = mark_supported(occupancy == 0, occupancy), np.array([[0.05, 0.14], [0.08, 0.12]])
     paths = np.cumsum(rng.normal(0, [0.02, 0.01, 0.02], (20, 57, 3)), axis=1)
     paths[..., 1] += 0.3
     scenes = Scenes((scene,), (marks > 0,), np.zeros(1, int), (Support.of(scene, marks, range_m),))
-    ours = Ground(scenes, np.tile(np.eye(4), (20, 1, 1)), None).trodden(paths[:, 1:], paths[:, 0])
-    volume = {"shape": [1, *occupancy.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1, "support": support(range_m)}
+    ours = SceneConstraint(scenes, np.tile(np.eye(4), (20, 1, 1)), None).on_support(paths[:, 1:], paths[:, 0])
+    volume = {
+        "shape": [1, *occupancy.shape],
+        "origin": scene.origin.tolist(),
+        "voxel_m": 0.1,
+        "support": support_contract(range_m),
+    }
     theirs = asked_of_the_page(
-        "senses.trodden(path.slice(1), path[0], fastest)",
+        "senses.support.follow(path.slice(1), path[0], fastest)",
         volume=volume,
         marks=marks.ravel().tolist(),
         paths=paths.tolist(),
-        fastest=STAYS_M_S / RATE_HZ,
+        fastest=REST_SPEED_M_S / RATE_HZ,
     )
     np.testing.assert_allclose(theirs, ours, atol=1e-9)
     assert np.abs(ours - paths[:, 1:])[..., 1].max() > 0.02
@@ -64,12 +76,20 @@ def test_page_and_python_tread_the_same_way():
 def test_page_and_python_clear_the_same_points(free):
     rng = np.random.default_rng(1)
     allowed = rng.random((12, 7, 9)) < free
-    scene = FeatureVolume(np.zeros((1, *allowed.shape), np.float32), (~allowed).astype(np.uint8), np.array([-0.6, -0.1, 0.3]), 0.1)
+    scene = FeatureVolume(
+        np.zeros((1, *allowed.shape), np.float32),
+        (~allowed).astype(np.uint8),
+        np.array([-0.6, -0.1, 0.3]),
+        0.1,
+    )
     points = scene.origin + rng.uniform(-0.2, 1.4, (30, 5, 3))
-    ours = Scenes((scene,), (allowed,), np.zeros(1, int)).cleared(points, None)
+    ours = Scenes((scene,), (allowed,), np.zeros(1, int)).out_of_solid(points, None)
     volume = {"shape": [1, *allowed.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1}
     theirs = asked_of_the_page(
-        "path.map((point) => senses.cleared(point))", volume=volume, marks=allowed.ravel().astype(int).tolist(), paths=points.tolist()
+        "path.map((point) => senses.cleared(point))",
+        volume=volume,
+        marks=allowed.ravel().astype(int).tolist(),
+        paths=points.tolist(),
     )
     if not free:
         np.testing.assert_array_equal(theirs, points)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
 from stages.export_simulator import actions, surfaces
 from tests.stages.export_simulator import small_world
 
 
 def test_thinning_keeps_the_shape() -> None:
     room = small_world.room()
-    light, nearest = surfaces.thin(room, 200)
+    light, nearest = surfaces.decimate(room, 200)
     assert len(light.faces) <= 220
     assert nearest.shape == (len(light.vertices),)
     np.testing.assert_allclose(surfaces.bounds(light), surfaces.bounds(room), atol=0.2)
@@ -35,7 +35,7 @@ def test_walls_face_whoever_stands_inside() -> None:
     room = small_world.room()
     inside_out = Mesh(room.vertices, np.ascontiguousarray(room.faces[:, ::-1]), room.color)
     for mesh in (room, inside_out):
-        turned = surfaces.facing(mesh, np.array([0.1, 1.0, 0.2]))
+        turned = surfaces.orient_towards(mesh, np.array([0.1, 1.0, 0.2]))
         towards = np.array([0.1, 1.0, 0.2]) - turned.vertices[turned.faces].mean(1)
         assert ((turned.face_normals() * towards).sum(-1) > 0).all()
 
@@ -53,7 +53,9 @@ def test_splats_keep_the_strong_and_drop_the_broken() -> None:
 
 def test_resampling_passes_through_the_frames() -> None:
     track = small_world.trajectory(21, 0)
-    motion = actions.Motion("v", track.timestamp_s, track.world_from_agent, track.agent_from_bone, track.world_from_camera)
+    motion = actions.SessionClip(
+        "v", track.timestamp_s, track.world_from_agent, track.agent_from_bone, track.world_from_camera
+    )
     even = actions.resample(motion, 30.0)
     assert len(even.timestamp_s) == 61
     np.testing.assert_allclose(even.world_from_agent[::3], track.world_from_agent, atol=1e-6)
@@ -61,7 +63,9 @@ def test_resampling_passes_through_the_frames() -> None:
     np.testing.assert_allclose(turn, 0.05 / 3, atol=1e-6)
 
 
-@pytest.mark.parametrize(("valid", "expected"), [([0, 1, 1, 0, 1], (1, 3)), ([1, 1, 1], (0, 3)), ([0, 0], (0, 0))])
+@pytest.mark.parametrize(
+    ("valid", "expected"), [([0, 1, 1, 0, 1], (1, 3)), ([1, 1, 1], (0, 3)), ([0, 0], (0, 0))]
+)
 def test_longest_run(valid: list[int], expected: tuple[int, int]) -> None:
     found = actions.longest_run(np.array(valid, bool))
     assert (found.start, found.stop) == expected

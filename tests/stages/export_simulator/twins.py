@@ -1,7 +1,8 @@
-"""The same approaches, met by the page and by Python: twins of recorded moments, with the same noise for both samplers.
+"""The same approaches, met by the page and by Python: twins of recorded moments, with the same noise for both
+samplers.
 
-`approaches` scripts them, `asked_of_the_page` and `asked_of_python` sample a goal for each, `Answers.away_m` says how
-far it shifts away from who comes near.
+`approaches` scripts them, `asked_of_the_page` and `asked_of_python` sample a goal for each, `Answers.away_m`
+says how far it shifts away from who comes near.
 """
 
 import json
@@ -13,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from playwright.sync_api import Page
 
-from pipeline.models.behavior import Sampling
-from pipeline.models.predictors import Ats
-from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import PAST, RATE_HZ, BehaviorData, Context, window_starts
-from pipeline.space import rigid
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import PAST, RATE_HZ, BehaviorData, Context, window_starts
+from pipeline.geometry import rigid
+from pipeline.rivals.predictors import Ats
 from tests.stages.export_simulator.reaction import FAR_M
 
 STEPS = 10
@@ -30,7 +31,9 @@ ASK = """async (text) => {
 
 @dataclass(frozen=True)
 class Approaches:
-    """Recorded moments, and where the observer of each has been in the last 0.8 s: near, far, or far on the other side."""
+    """Recorded moments, and where the observer of each has been in the last 0.8 s: near, far, or far on the
+    other side.
+    """
 
     context: Context
     """its observers are nobody's"""
@@ -69,8 +72,14 @@ class PageNoise:
     def standard_normal(self, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
         """Draw for every plan, which is the first axis, what the page would draw."""
         count = 2 * int(np.prod(shape[1:]))
-        draws = np.array([[next(stream) for _ in range(count)] for stream in self.streams]).reshape(len(self.streams), -1, 2)
-        return (np.sqrt(-2 * np.log(1 - draws[..., 0])) * np.cos(2 * np.pi * draws[..., 1])).reshape(shape).astype(dtype)
+        draws = np.array([[next(stream) for _ in range(count)] for stream in self.streams]).reshape(
+            len(self.streams), -1, 2
+        )
+        return (
+            (np.sqrt(-2 * np.log(1 - draws[..., 0])) * np.cos(2 * np.pi * draws[..., 1]))
+            .reshape(shape)
+            .astype(dtype)
+        )
 
 
 def _uniforms(seed: int) -> Iterator[float]:
@@ -83,11 +92,17 @@ def _uniforms(seed: int) -> Iterator[float]:
 
 
 def approaches(data: BehaviorData, count: int, rng: np.random.Generator) -> Approaches:
-    """Let somebody walk straight at the animal in random recorded moments, ending 0.4 to 2.4 m away, at 0.3 to 1.2 m/s."""
-    moments = [(track, start) for track in data.trajectories.values() for start in window_starts(track.valid, PAST)]
+    """Let somebody walk straight at the animal in random recorded moments, ending 0.4 to 2.4 m away, at 0.3
+    to 1.2 m/s.
+    """
+    moments = [
+        (track, start) for track in data.trajectories.values() for start in window_starts(track.valid, PAST)
+    ]
     drawn = [moments[i] for i in rng.integers(len(moments), size=count)]
     agent = np.stack([track.world_from_agent[start : start + PAST] for track, start in drawn])
-    bones = np.stack([track.agent_from_bone[start : start + PAST] for track, start in drawn]).astype(np.float64)
+    bones = np.stack([track.agent_from_bone[start : start + PAST] for track, start in drawn]).astype(
+        np.float64
+    )
     angle = rng.uniform(0, 2 * np.pi, count)
     side = np.stack([np.cos(angle), np.sin(angle)], -1)
     before_s = np.arange(PAST - 1, -1, -1) / RATE_HZ
@@ -106,18 +121,32 @@ def approaches(data: BehaviorData, count: int, rng: np.random.Generator) -> Appr
 
 def asked_of_the_page(page: Page, met: Approaches, checks: int) -> Answers:
     """Sample in an open page; the last two for the first ``checks`` plans only."""
-    past = np.concatenate([_rows(met.context.world_from_agent[:, :, None]), _rows(met.context.agent_from_bone)], axis=2)
+    past = np.concatenate(
+        [_rows(met.context.world_from_agent[:, :, None]), _rows(met.context.agent_from_bone)], axis=2
+    )
     past = past.reshape(*past.shape[:2], -1)
 
     def goals(observer: np.ndarray, **more: object) -> np.ndarray:
         told = [
-            {"past": rows.tolist(), "observer": places.tolist(), "seed": int(seed), "K": 1, "steps": STEPS, "interactivity": 1, **more}
-            for rows, places, seed in zip(past[: len(observer)], observer, met.seed[: len(observer)], strict=True)
+            {
+                "past": rows.tolist(),
+                "observer": places.tolist(),
+                "seed": int(seed),
+                "K": 1,
+                "steps": STEPS,
+                "interactivity": 1,
+                **more,
+            }
+            for rows, places, seed in zip(
+                past[: len(observer)], observer, met.seed[: len(observer)], strict=True
+            )
         ]
         return np.array(page.evaluate(ASK, json.dumps(told)))[:, [0, 2]]
 
     few = slice(checks)
-    return Answers(goals(met.near), goals(met.far), goals(met.opposite[few]), goals(met.near[few], interactivity=0))
+    return Answers(
+        goals(met.near), goals(met.far), goals(met.opposite[few]), goals(met.near[few], interactivity=0)
+    )
 
 
 def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) -> Answers:
@@ -129,18 +158,26 @@ def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) 
 
     def goals(observer: np.ndarray, guidance: float = 1.0) -> np.ndarray:
         count = len(observer)
-        sampling = Sampling(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance)
+        sampling = PlanSamplingConfig(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance)
         ats = Ats.load(build / "behavior", scenes, sampling)
         eyes = np.stack([observer[..., 0], np.full(observer.shape[:2], eyes_m), observer[..., 1]], -1)
         parts = []
-        for some in np.array_split(np.arange(count), -(-count // 32)):  # a plan a window: noise follows the plan
-            context = Context(met.context.world_from_agent[some], met.context.agent_from_bone[some], eyes[some])
+        for some in np.array_split(
+            np.arange(count), -(-count // 32)
+        ):  # a plan a window: noise follows the plan
+            context = Context(
+                met.context.world_from_agent[some], met.context.agent_from_bone[some], eyes[some]
+            )
             parts.append(ats.goals(context, 1, PageNoise(met.seed[some])).goal[:, 0])
         return np.concatenate(parts)[:, [0, 2]]
 
     few = slice(checks)
-    return Answers(goals(met.near), goals(met.far), goals(met.opposite[few]), goals(met.near[few], guidance=0.0))
+    return Answers(
+        goals(met.near), goals(met.far), goals(met.opposite[few]), goals(met.near[few], guidance=0.0)
+    )
 
 
 def _rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
-    return np.concatenate([a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1)
+    return np.concatenate(
+        [a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1
+    )

@@ -1,4 +1,7 @@
-"""Small recordings with known truth: a phone moves through a box-shaped room, written the way Record3D writes."""
+"""Small recordings with known truth.
+
+A phone moves through a box-shaped room, written the way Record3D writes.
+"""
 
 import io
 import json
@@ -9,8 +12,8 @@ from pathlib import Path
 import lzfse
 import numpy as np
 
-from pipeline.files import images
-from pipeline.space import cameras, rigid
+from pipeline.data import images
+from pipeline.geometry import cameras, rigid
 
 ROOM = np.array([4.0, 2.5, 5.0])
 COLOR_SIZE, DEPTH_SIZE = (64, 48), (32, 24)
@@ -43,7 +46,11 @@ class Made:
         camera = self.stored_from_upright(self.world_from_camera[frame])
         direction, origin = rays @ camera[:3, :3].T, camera[:3, 3]
         with np.errstate(divide="ignore"):
-            return np.where(direction > 0, (ROOM - origin) / direction, -origin / direction).min(-1).astype("<f4")
+            return (
+                np.where(direction > 0, (ROOM - origin) / direction, -origin / direction)
+                .min(-1)
+                .astype("<f4")
+            )
 
     def stored_from_upright(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Camera pose of the stored picture."""
@@ -66,7 +73,9 @@ class Made:
         (height, width), (depth_height, depth_width) = self._size(COLOR_SIZE), self._size(DEPTH_SIZE)
         table = dict(w=width, h=height, dw=depth_width, dh=depth_height, fps=60, cameraType=1)
         table |= dict(K=self.intrinsics.T.ravel().tolist(), poses=self.poses().tolist())
-        table |= dict(frameTimestamps=self.timestamp_s.tolist(), initPose=[0, 0, 0, 1, 0, 0, 0]) | self.metadata
+        table |= (
+            dict(frameTimestamps=self.timestamp_s.tolist(), initPose=[0, 0, 0, 1, 0, 0, 0]) | self.metadata
+        )
         return {key: value for key, value in table.items() if value is not None}
 
     def write(self, path: Path) -> Path:

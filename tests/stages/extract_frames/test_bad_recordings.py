@@ -8,21 +8,24 @@ import lzfse
 import numpy as np
 import pytest
 
-from pipeline import cli
-from pipeline.errors import InputError
-from pipeline.files import images
-from pipeline.recordings import lzfse_blocks
+from pipeline.core.errors import InputError
+from pipeline.data import images
+from pipeline.recordings import record3d
+from pipeline.workflow import cli
 from stages.extract_frames import __main__ as front
-from stages.extract_frames import writing
+from stages.extract_frames import stage, writing
+from stages.extract_frames.config import Config
 from tests.stages.extract_frames.made_recordings import walk, write_zip
 
 
 def _refused(recording, folder, monkeypatch, capsys):
     """Run the stage, expect exit 2 and an unchanged disk, return the message."""
     before = sorted(folder.rglob("*"))
-    monkeypatch.setattr(sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(folder / "out")])
+    monkeypatch.setattr(
+        sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(folder / "out")]
+    )
     with pytest.raises(SystemExit) as stop:
-        cli.enter(front.__doc__, front.run, config=front.Config, reads=("recording",))
+        cli.main(front.__doc__, stage.run, stage.Inputs, Config)
     assert stop.value.code == 2
     assert sorted(folder.rglob("*")) == before
     return capsys.readouterr().err
@@ -49,16 +52,20 @@ CASES = {
         {"metadata": {"frameTimestamps": [0.0] * 12}},
         {"metadata": {"h": 62}},
     ],
-    "CAP-005": [
-        {"metadata": {"cameraType": 0}},
-        {"metadata": {"dw": 480, "dh": 640}},
-    ],
+    "CAP-005": [{"metadata": {"cameraType": 0}}, {"metadata": {"dw": 480, "dh": 640}}],
     "CAP-006": [{"members": {f"rgbd/{i}.depth": None for i in range(12)}}],
     "CAP-007": [
         {"members": {f"rgbd/{i}.jpg": None for i in range(12)}},
-        {"members": {f"rgbd/{i}.depth": lzfse.compress(np.full(768, np.nan, "<f4").tobytes()) for i in range(12)}},
+        {
+            "members": {
+                f"rgbd/{i}.depth": lzfse.compress(np.full(768, np.nan, "<f4").tobytes()) for i in range(12)
+            }
+        },
     ],
-    "CAP-008": [{"members": {DEPTH: lzfse.compress(b"\0" * 100)}}, {"members": {DEPTH: lzfse.compress(bytes(10**6))}}],
+    "CAP-008": [
+        {"members": {DEPTH: lzfse.compress(b"\0" * 100)}},
+        {"members": {DEPTH: lzfse.compress(bytes(10**6))}},
+    ],
     "CAP-001": [{"members": {DEPTH: b"bvx2garbage"}}, {"members": {DEPTH: lzfse.compress(bytes(3072))[:9]}}],
     "CAP-020": [
         {"members": {"rgbd/3.jpg": b"\xff\xd8\xff nothing"}},
@@ -74,7 +81,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("code", "change"), [(code, change) for code, changes in CASES.items() for change in changes])
+@pytest.mark.parametrize(
+    ("code", "change"), [(code, change) for code, changes in CASES.items() for change in changes]
+)
 def test_faulty_recordings_are_refused(tmp_path, monkeypatch, capsys, code, change):
     made = walk(12)
     made.metadata |= change.get("metadata", {})
@@ -130,9 +139,9 @@ def test_something_else_is_refused(tmp_path, monkeypatch, capsys):
 def test_lzfse_headers_promise_what_comes_out(size):
     rng = np.random.default_rng(size)
     for data in (bytes(size), rng.bytes(size), rng.integers(0, 4, size, dtype=np.uint8).tobytes()):
-        assert lzfse_blocks.unpacked_bytes(lzfse.compress(data)) == size
+        assert record3d.unpacked_bytes(lzfse.compress(data)) == size
 
 
 def test_lzfse_blocks_that_stand_still_are_refused():
-    with pytest.raises(lzfse_blocks.BrokenBlockError):
-        lzfse_blocks.unpacked_bytes(b"bvx2" + struct.pack("<I3Q", 0, 0, 0, 0) + bytes(100))
+    with pytest.raises(record3d.BrokenBlockError):
+        record3d.unpacked_bytes(b"bvx2" + struct.pack("<I3Q", 0, 0, 0, 0) + bytes(100))

@@ -6,18 +6,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline import cli
-from pipeline.files import arrays, images, meshes
-from pipeline.files.clips import Clip
-from pipeline.space import cameras, rigid
+from pipeline.data import images, npz, ply
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid
+from pipeline.workflow import cli
 from stages.extract_frames import __main__ as front
+from stages.extract_frames import stage
+from stages.extract_frames.config import Config
 from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 
 def _extract(recording, out, monkeypatch, *options):
-    monkeypatch.setattr(sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(out), *options])
-    cli.enter(front.__doc__, front.run, config=front.Config, reads=("recording",))
+    monkeypatch.setattr(
+        sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(out), *options]
+    )
+    cli.main(front.__doc__, stage.run, stage.Inputs, Config)
     return Clip.open(out)
 
 
@@ -25,7 +29,7 @@ def _extract(recording, out, monkeypatch, *options):
 def test_frames_are_upright_and_agree_with_truth(tmp_path, monkeypatch, turns):
     made = walk(36, quarter_turns=turns)
     clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
-    source = arrays.load(tmp_path / "out" / "frames.npz")["source_index"]
+    source = npz.load(tmp_path / "out" / "frames.npz")["source_index"]
     assert len(clip) == 24
     np.testing.assert_allclose(clip.timestamp_s, made.timestamp_s[source])
     np.testing.assert_allclose(clip.odometry_from_camera, made.world_from_camera[source], atol=1e-6)
@@ -36,7 +40,11 @@ def test_frames_are_upright_and_agree_with_truth(tmp_path, monkeypatch, turns):
     upright = walk(36)
     np.testing.assert_allclose(clip.depth(5), upright.depth(source[5]), rtol=1e-3)
     assert np.abs(clip.color(5).astype(int) - upright.color(source[5])).mean() < 3
-    np.testing.assert_allclose(clip.depth_intrinsics[0], cameras.scale_intrinsics(clip.intrinsics[0], COLOR_SIZE, DEPTH_SIZE), atol=1e-9)
+    np.testing.assert_allclose(
+        clip.depth_intrinsics[0],
+        cameras.scale_intrinsics(clip.intrinsics[0], COLOR_SIZE, DEPTH_SIZE),
+        atol=1e-9,
+    )
 
 
 def test_colour_bytes_are_copied_untouched_when_upright(tmp_path, monkeypatch):
@@ -49,7 +57,7 @@ def test_intrinsics_of_each_frame_win_over_the_first(tmp_path, monkeypatch):
     made = walk(12)
     made.metadata["perFrameIntrinsicCoeffs"] = [[50 + i, 52 + i, 25, 31] for i in range(12)]
     clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
-    source = arrays.load(tmp_path / "out" / "frames.npz")["source_index"]
+    source = npz.load(tmp_path / "out" / "frames.npz")["source_index"]
     np.testing.assert_allclose(clip.intrinsics[:, 0, 0], 50 + source)
 
 
@@ -79,8 +87,12 @@ def test_same_recording_same_bytes(tmp_path, monkeypatch):
     recording = walk(12, quarter_turns=1).write(tmp_path / "a.r3d")
     for out in ("one", "two"):
         _extract(recording, tmp_path / out, monkeypatch)
-    files = [path.relative_to(tmp_path / "one") for path in sorted((tmp_path / "one").rglob("*")) if path.is_file()]
-    assert all((tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files)
+    files = [
+        path.relative_to(tmp_path / "one") for path in sorted((tmp_path / "one").rglob("*")) if path.is_file()
+    ]
+    assert all(
+        (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files
+    )
 
 
 @pytest.mark.parametrize("turns", [0, 1])
@@ -98,4 +110,4 @@ def test_a_mesh_that_the_app_made_comes_along(tmp_path, monkeypatch):
     folder = made_formats.polycam(tmp_path / "a", walk(24))
     made_formats.polycam_mesh(folder, trimesh.creation.box((4.0, 2.5, 5.0)), np.eye(4))
     clip = _extract(folder, tmp_path / "out", monkeypatch)
-    assert np.allclose(np.ptp(meshes.read_ply(clip.folder / "mesh.ply").vertices, axis=0), (4.0, 2.5, 5.0))
+    assert np.allclose(np.ptp(ply.read_ply(clip.folder / "mesh.ply").vertices, axis=0), (4.0, 2.5, 5.0))

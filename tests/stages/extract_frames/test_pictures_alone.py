@@ -1,4 +1,7 @@
-"""A video without depth becomes frames like any other: path and lens by COLMAP, depth from pictures, metres from elsewhere."""
+"""A video without depth becomes frames like any other.
+
+Path and lens by COLMAP, depth from pictures, metres from elsewhere.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,19 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
+from pipeline.core.errors import InputError
+from pipeline.geometry import align, rigid
+from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.recordings.recording import Recording
-from pipeline.space import align, rigid
-from pipeline.space.meshes import RayCaster, render_view
 from stages.extract_frames import photogrammetry, structure, sweep
-from stages.extract_frames.photogrammetry import PhotogrammetryOptions
+from stages.extract_frames.config import Config, PhotogrammetryConfig
 from tests.stages import textured_room
 
 SIZE = (240, 180)
 INTRINSICS = np.array([[178.0, 0, 90], [0, 178.0, 120], [0, 0, 1]])
-OPTIONS = PhotogrammetryOptions(
-    structure=structure.StructureOptions(features=700, overlap=4, look_alikes=1, words=32, focal_share=0.8),
-    sweep=sweep.SweepOptions(side_px=120, planes=64, sources=4),
+CONFIG = PhotogrammetryConfig(
+    features=700, overlap=4, retrieved=1, focal_share=0.8, depth_side_px=120, depth_planes=64, depth_sources=4
 )
 
 
@@ -52,21 +54,23 @@ def _recording(room, path: np.ndarray, *, with_depth: bool = False) -> Recording
 
 
 def _mapped(recording: Recording, measured, folder: Path):
-    return photogrammetry.map_pictures(
-        recording, measured, OPTIONS, rate_hz=10.0, max_side_px=640, max_depth_m=6.0, jpeg_quality=95, workspace=folder
-    )
+    return photogrammetry.map_pictures(recording, measured, Config(without_depth=CONFIG), folder)
 
 
 def test_a_walk_is_mapped_and_a_session_with_depth_tells_its_metres(room, tmp_path):
     truth = textured_room.walk(14)
-    session = _recording(room, textured_room.walk(14)[2:12:3] @ rigid.make(np.eye(3), np.array([0.03, 0, 0])), with_depth=True)
+    session = _recording(
+        room, textured_room.walk(14)[2:12:3] @ rigid.make(np.eye(3), np.array([0.03, 0, 0])), with_depth=True
+    )
     mapped = _mapped(_recording(room, truth), {"v002": session}, tmp_path)
     plan = mapped.plan
     assert plan.scale == "v002"
     assert len(plan.chosen) >= 10
     assert abs(plan.intrinsics[0, 0, 0] / INTRINSICS[0, 0] - 1) < 0.04, "the focal length was not told"
     centres = truth[plan.chosen, :3, 3]
-    moved = rigid.apply(align.kabsch(plan.odometry_from_camera[:, :3, 3], centres), plan.odometry_from_camera[:, :3, 3])
+    moved = rigid.apply(
+        align.kabsch(plan.odometry_from_camera[:, :3, 3], centres), plan.odometry_from_camera[:, :3, 3]
+    )
     assert np.linalg.norm(moved - centres, axis=1).max() < 0.08, "metres, without any scale"
     off, known = [], []
     for frame, row in zip(mapped.frames, plan.chosen, strict=True):
@@ -81,7 +85,9 @@ def test_a_walk_is_mapped_and_a_session_with_depth_tells_its_metres(room, tmp_pa
 def test_a_turn_on_the_spot_gives_no_map(room, tmp_path):
     here = np.array([0.0, 1.3, 0.0])
     angles = np.linspace(0, 1.2, 12)
-    spot = np.stack([rigid.look_at(here, here + np.array([np.cos(a), -0.3, np.sin(a)]), textured_room.UP) for a in angles])
+    spot = np.stack(
+        [rigid.look_at(here, here + np.array([np.cos(a), -0.3, np.sin(a)]), textured_room.UP) for a in angles]
+    )
     with pytest.raises(InputError, match="MAP-004"):
         _mapped(_recording(room, spot), {}, tmp_path)
 
@@ -94,10 +100,15 @@ def test_a_still_camera_gives_no_map(room, tmp_path):
 def test_depth_of_known_cameras_is_right_where_others_agree(room):
     path = textured_room.walk(60)[10:19:3]
     pictures = [_seen(room, camera) for camera in path]
-    views = [sweep.View(color.mean(-1).astype(np.float32), INTRINSICS, camera) for (color, _), camera in zip(pictures, path, strict=True)]
-    options = replace(OPTIONS.sweep, planes=48)
-    depth = [sweep.sweep(views[i], [views[j] for j in range(3) if j != i], (0.5, 4.0), options) for i in range(3)]
-    agree = sweep.agreement(depth[1], views[1], [(depth[i], views[i]) for i in (0, 2)], options)
+    views = [
+        sweep.SweepView(color.mean(-1).astype(np.float32), INTRINSICS, camera)
+        for (color, _), camera in zip(pictures, path, strict=True)
+    ]
+    config = replace(CONFIG, depth_planes=48)
+    depth = [
+        sweep.sweep(views[i], [views[j] for j in range(3) if j != i], (0.5, 4.0), config) for i in range(3)
+    ]
+    agree = sweep.agreement(depth[1], views[1], [(depth[i], views[i]) for i in (0, 2)])
     off = np.abs(depth[1] / np.maximum(pictures[1][1], 1e-3) - 1)
     assert (agree == 2).mean() > 0.15
     assert np.median(off[agree == 2]) < 0.02
@@ -106,12 +117,12 @@ def test_depth_of_known_cameras_is_right_where_others_agree(room):
 
 
 def test_keyframes_follow_motion_and_not_time():
-    options = structure.StructureOptions(keyframe_share=0.1, most_keyframes=20)
+    config = PhotogrammetryConfig(keyframe_share=0.1, most_keyframes=20)
     travelled = np.concatenate([np.zeros(50), np.linspace(0, 1, 50)])
     sharpness = np.ones(100)
     sharpness[::7] = 2.0
-    keys = structure.choose_keyframes(travelled, sharpness, options)
+    keys = structure.choose_keyframes(travelled, sharpness, config)
     assert 10 <= len(keys) <= 12
     assert (keys < 50).sum() == 1, "a phone that rests shows one place"
     assert (keys % 7 == 0).mean() > 0.6, "the sharpest of each step"
-    assert len(structure.choose_keyframes(100 * travelled, sharpness, options)) <= 20
+    assert len(structure.choose_keyframes(100 * travelled, sharpness, config)) <= 20

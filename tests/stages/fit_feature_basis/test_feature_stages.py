@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline import artifact, cli
-from pipeline.files import arrays, images
-from pipeline.models.features import FeatureBasis, describe
-from stages.extract_features import __main__ as extract
-from stages.fit_feature_basis import __main__ as fit
+from pipeline.backends.daisy import FeatureBasis, describe
+from pipeline.data import images, npz
+from pipeline.workflow import artifact, cli
+from stages.extract_features import stage as extract
+from stages.fit_feature_basis import stage as fit
 
 ROLES = ("walkthrough", "turnaround", "session", "session")
 
@@ -28,7 +28,7 @@ def _write_clip(folder, seed):
             images.write_color(inside / "color" / f"{i:06d}.jpg", picture)
         eye = np.tile(np.eye(3), (3, 1, 1))
         table = dict(timestamp_s=np.arange(3) / 10, intrinsics=eye, depth_intrinsics=eye)
-        arrays.save(inside / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(3, np.float32))
+        npz.save(inside / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(3, np.float32))
 
 
 @pytest.fixture
@@ -53,34 +53,35 @@ def world(tmp_path):
     return tmp_path
 
 
-def _run(front, monkeypatch, reads, **options):
+def _fit(world, monkeypatch, out):
     argv = [
-        f"{front.__package__.split('.')[-1]}/__main__.py",
-        *(part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))),
+        "fit_feature_basis/__main__.py",
+        "--frames",
+        world / "frames",
+        "--videos",
+        world / "videos.json",
+        "--out",
+        out,
     ]
-    monkeypatch.setattr(sys, "argv", argv)
-    cli.enter(front.__doc__, front.run, config=front.Config, reads=reads)
+    monkeypatch.setattr(sys, "argv", [str(part) for part in argv])
+    cli.main("Fit.", fit.run, fit.Inputs, fit.Config)
 
 
 def test_basis_ignores_the_test_video_and_features_follow_it(world, monkeypatch):
-    common = dict(frames=world / "frames", videos=world / "videos.json")
-    _run(fit, monkeypatch, ("frames",), **common, out=world / "basis")
+    _fit(world, monkeypatch, world / "basis")
     before = (world / "basis" / "basis.npz").read_bytes()
     test_video = world / "frames" / "v003"
     for i in range(3):
         images.write_color(test_video / "color" / f"{i:06d}.jpg", np.zeros((101, 78, 3), np.uint8))
-    _run(fit, monkeypatch, ("frames",), **common, out=world / "again")
+    _fit(world, monkeypatch, world / "again")
     assert (world / "again" / "basis.npz").read_bytes() == before
-    _run(
-        extract,
-        monkeypatch,
-        ("frames", "feature_basis"),
-        frames=world / "frames" / "v002",
-        feature_basis=world / "basis",
-        out=world / "features",
-    )
-    features = arrays.load(world / "features" / "features.npz")["features"]
+    (world / "features").mkdir()
+    inputs = extract.Inputs(frames=world / "frames" / "v002", feature_basis=world / "basis")
+    extract.run(inputs, extract.Config(), world / "features")
+    features = npz.load(world / "features" / "features.npz")["features"]
     assert features.shape == (3, 12, 9, 16)
     assert features.dtype == np.float16
     color = images.read_color(world / "frames" / "v002" / "color" / "000001.jpg")
-    np.testing.assert_allclose(features[1], FeatureBasis.load(world / "basis").project(describe(color, 8)), atol=1e-3)
+    np.testing.assert_allclose(
+        features[1], FeatureBasis.load(world / "basis").project(describe(color, 8)), atol=1e-3
+    )

@@ -1,17 +1,32 @@
 """Gathering: the summary names what was registered and why the rest was not, the picture survives gaps."""
 
-import numpy as np
+import json
 
-from stages.gather_registration import gather
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.data.poses import RegisteredPoses
+from stages.gather_registration import gather, stage
+from stages.gather_registration.config import Config
 
 STATUS = {"registered": True, "reason": None, "figures": {"depth_gap_m": 0.01, "confidence": 0.9}}
 REFUSED = {"registered": False, "reason": "no overlap", "figures": {}}
 
 
+def _poses() -> RegisteredPoses:
+    camera, agent, ones = (
+        np.repeat(np.eye(4)[None], 5, axis=0),
+        np.repeat(np.eye(4)[None], 5, axis=0),
+        np.ones(5),
+    )
+    agent[2] = np.nan
+    return RegisteredPoses(np.arange(5.0), camera, agent, ones, ones, ones > 0)
+
+
 def test_summary_and_checks():
-    poses = {name: np.repeat(np.eye(4)[None], 5, axis=0) for name in ("world_from_camera", "world_from_agent")}
-    poses["world_from_agent"][2] = np.nan
-    outcomes = [gather.Outcome("v002", STATUS, poses), gather.Outcome("v003", REFUSED, None)]
+    poses = _poses()
+    outcomes = [gather.SessionOutcome("v002", STATUS, poses), gather.SessionOutcome("v003", REFUSED, None)]
     summary = gather.summarise(outcomes)
     assert (summary["registered"], summary["total"]) == (1, 2)
     assert summary["videos"]["v003"]["reason"] == "no overlap"
@@ -20,18 +35,44 @@ def test_summary_and_checks():
 
 
 def test_a_gap_that_was_not_measured_does_not_count():
-    measured = gather.Outcome("v002", STATUS, {})
-    unmeasured = gather.Outcome("v003", {**STATUS, "figures": {"depth_gap_m": None, "confidence": 0.9}}, {})
-    assert [gather.checks(outcomes)[1].value for outcomes in ([measured, unmeasured], [unmeasured])] == [1.0, None]
+    measured = gather.SessionOutcome("v002", STATUS, _poses())
+    unmeasured = gather.SessionOutcome(
+        "v003", {**STATUS, "figures": {"depth_gap_m": None, "confidence": 0.9}}, _poses()
+    )
+    assert [gather.checks(outcomes)[1].value for outcomes in ([measured, unmeasured], [unmeasured])] == [
+        1.0,
+        None,
+    ]
 
 
-def test_nothing_registered_is_told_without_a_fault():
-    outcomes = [gather.Outcome("v002", REFUSED, None)]
+def test_nothing_registered_is_reported_without_a_fault():
+    outcomes = [gather.SessionOutcome("v002", REFUSED, None)]
     assert gather.checks(outcomes)[0].status == "fail"
     assert gather.paths(outcomes).shape == (560, 560, 3)
 
 
-def test_a_refusal_is_told_by_name_with_its_nearest_view():
-    refused = gather.Outcome("v003", {**REFUSED, "nearest_view": {"walkthrough_s": 12.34}}, None, "b.r3d")
-    assert refused.told == "b.r3d: no overlap; its nearest view is the walk-through at 12.3 s"
+def test_a_rejection_is_described_by_name_with_its_nearest_view():
+    refused = gather.SessionOutcome(
+        "v003", {**REFUSED, "nearest_view": {"walkthrough_s": 12.34}}, None, "b.r3d"
+    )
+    assert refused.description == "b.r3d: no overlap; its nearest view is the walk-through at 12.3 s"
     assert gather.summarise([refused])["videos"]["v003"]["file"] == "b.r3d"
+
+
+def test_the_stage_copies_poses_and_stops_where_too_few_fit(tmp_path):
+    folders = {}
+    for name, status in (("v002", STATUS), ("v003", REFUSED)):
+        folders[name] = tmp_path / name
+        folders[name].mkdir()
+        (folders[name] / "status.json").write_text(json.dumps({**status, "figures": status["figures"]}))
+    eye = np.repeat(np.eye(4)[None], 3, axis=0)
+    ones = np.ones(3)
+    RegisteredPoses(np.arange(3.0), eye, eye, ones, ones, ones > 0).write(folders["v002"])
+    out = tmp_path / "out"
+    out.mkdir()
+    summary = stage.run(stage.Inputs(folders), Config(), out)
+    assert summary["registered"] == 1
+    assert (RegisteredPoses.open(out / "v002").world_from_camera == eye).all()
+    assert not (out / "v003").exists()
+    with pytest.raises(InputError, match="REG-001.*no overlap"):
+        stage.run(stage.Inputs(folders), Config(least_registered=2), out)

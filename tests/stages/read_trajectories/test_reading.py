@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.space import rigid
+from pipeline.core.errors import InputError
+from pipeline.geometry import rigid
 from stages.read_trajectories import captured, pictures
-from stages.read_trajectories.captured import Skeleton
-from stages.read_trajectories.life import APART_S, NOBODY_M
-from stages.read_trajectories.reading import Reading, read
+from stages.read_trajectories.config import Config
+from stages.read_trajectories.motion import ABSENT_OBSERVER_M, CLIP_GAP_S
+from stages.read_trajectories.reading import read
 
-READING = Reading(Skeleton(60.0, 0, 2), 0.1, 1.0)
+READING = Config(root_joint=0, front_joint=2)
 
 
 def table(path, rows, header="id,time,x,y,z,heading"):
@@ -20,12 +20,12 @@ def table(path, rows, header="id,time,x,y,z,heading"):
 
 def test_a_table_becomes_poses_id_by_id(tmp_path):
     rows = [f"{name},{0.1 * i},{i * 0.01},0.2,{-i * 0.02},{0.1 * i}" for name in ("b", "a") for i in range(5)]
-    life = read(table(tmp_path / "t.csv", rows), READING)
-    assert len(life.timestamp_s) == 10
-    assert life.timestamp_s[5] - life.timestamp_s[4] == pytest.approx(APART_S)
-    np.testing.assert_allclose(life.world_from_agent[4, :3, 3], [0.04, 0.2, -0.08])
-    np.testing.assert_allclose(life.world_from_agent[4, :3, 2], [np.sin(0.4), 0, np.cos(0.4)], atol=1e-12)
-    assert (life.world_from_camera[:, 0, 3] == NOBODY_M).all()
+    motion = read(table(tmp_path / "t.csv", rows), READING)
+    assert len(motion.timestamp_s) == 10
+    assert motion.timestamp_s[5] - motion.timestamp_s[4] == pytest.approx(CLIP_GAP_S)
+    np.testing.assert_allclose(motion.world_from_agent[4, :3, 3], [0.04, 0.2, -0.08])
+    np.testing.assert_allclose(motion.world_from_agent[4, :3, 2], [np.sin(0.4), 0, np.cos(0.4)], atol=1e-12)
+    assert (motion.world_from_camera[:, 0, 3] == ABSENT_OBSERVER_M).all()
 
 
 def test_stretches_days_apart_become_clips_of_one_recording(tmp_path):
@@ -33,16 +33,18 @@ def test_stretches_days_apart_become_clips_of_one_recording(tmp_path):
     time = read(table(tmp_path / "t.csv", rows, "time,x,y,z,heading"), READING).timestamp_s
     step = np.diff(time)
     assert len(time) == 60 and time[0] == 0
-    np.testing.assert_allclose(step[[19, 39]], APART_S)
+    np.testing.assert_allclose(step[[19, 39]], CLIP_GAP_S)
     np.testing.assert_allclose(np.delete(step, [19, 39]), 0.1, atol=1e-6)
 
 
 def test_unseen_rows_and_observers_are_kept_apart(tmp_path):
     rows = ["a,0.0,1,0,2,0,3,1,4", "a,0.1,,,,,3,1,4", "a,0.2,1,0,2,0,,,"]
-    life = read(table(tmp_path / "t.csv", rows, "id,time,x,y,z,heading,observer_x,observer_y,observer_z"), READING)
-    assert life.motion()["agent_visible"].tolist() == [True, False, True]
-    np.testing.assert_allclose(life.world_from_camera[0, :3, 3], [3, 1, 4])
-    assert life.world_from_camera[2, 0, 3] == NOBODY_M
+    motion = read(
+        table(tmp_path / "t.csv", rows, "id,time,x,y,z,heading,observer_x,observer_y,observer_z"), READING
+    )
+    assert motion.arrays()["agent_visible"].tolist() == [True, False, True]
+    np.testing.assert_allclose(motion.world_from_camera[0, :3, 3], [3, 1, 4])
+    assert motion.world_from_camera[2, 0, 3] == ABSENT_OBSERVER_M
 
 
 def test_an_obstacle_map_stands_where_it_says(tmp_path):
@@ -51,14 +53,21 @@ def test_an_obstacle_map_stands_where_it_says(tmp_path):
     table(folder / "trajectory.csv", [f"a,{0.1 * i},{0.1 * i},0.25,0,1.57" for i in range(20)])
     (folder / "obstacles.csv").write_text("x,z,bottom,top\n1.05,0.55,0,0.5\n")
     volume = read(folder, READING).volume
-    for point, solid in (((1.05, 0.25, 0.55), 1), ((1.05, 0.65, 0.55), 0), ((1.05, 0.25, 0.05), 0), ((1.0, -0.1, 0.0), 1)):
+    for point, solid in (
+        ((1.05, 0.25, 0.55), 1),
+        ((1.05, 0.65, 0.55), 0),
+        ((1.05, 0.25, 0.05), 0),
+        ((1.0, -0.1, 0.0), 1),
+    ):
         voxel, inside = volume.voxel(np.array(point))
         assert inside and volume.occupancy[tuple(voxel)] == solid, point
     assert volume.features[:, volume.occupancy == 0].sum() == 0
 
 
 def skeleton_motion(frames=300):
-    """A pelvis that turns and walks, a two-joint spine ahead, a leg that swings: who hangs on whom is 0 -> 1 -> 2, 0 -> 3 -> 4."""
+    """A pelvis that turns and walks, a two-joint spine ahead, a leg that swings: who hangs on whom is 0 -> 1
+    -> 2, 0 -> 3 -> 4.
+    """
     swing = 0.6 * np.sin(np.arange(frames) * 0.2)
     leg = np.stack([0 * swing, -np.cos(swing), np.sin(swing)], axis=-1)
     bent = np.stack([0 * swing, -np.cos(2 * swing), np.sin(2 * swing)], axis=-1)
@@ -66,7 +75,10 @@ def skeleton_motion(frames=300):
     spine = np.broadcast_to([0, 0.02, 0.3], leg.shape)
     local = np.stack([0 * leg, spine, spine + 0.2 * nod, 0.2 * leg, 0.2 * leg + 0.15 * bent], axis=1)
     yaw = np.linspace(0, 3, frames)
-    root = rigid.make(rigid.rotation_from_vector(np.stack([0 * yaw, yaw, 0 * yaw], -1)), np.stack([yaw, 0 * yaw + 0.5, 0.5 * yaw], -1))
+    root = rigid.make(
+        rigid.rotation_from_vector(np.stack([0 * yaw, yaw, 0 * yaw], -1)),
+        np.stack([yaw, 0 * yaw + 0.5, 0.5 * yaw], -1),
+    )
     return rigid.apply(root, local)
 
 
@@ -74,7 +86,7 @@ def test_joints_find_the_tree_and_bones_turn_with_it():
     joints = skeleton_motion()
     parent = captured.parents(joints, 0)
     assert parent.tolist() == [-1, 0, 1, 0, 3]
-    root = captured.root_from_joints(joints, Skeleton(60.0, 0, 1))
+    root = captured.root_from_joints(joints, Config(root_joint=0, front_joint=1))
     local = rigid.apply(rigid.inverse(root), joints)
     bones, rest = captured.bones_from_joints(local, parent)
     assert rest.shape == (5, 4, 4)
@@ -89,11 +101,11 @@ def _unit(vector):
 def test_clips_of_joints_stand_on_the_floor(tmp_path):
     joints = skeleton_motion() + np.array([0, 3.0, 0])
     np.savez(tmp_path / "clip.npz", walk=joints, run=joints[:100])
-    life = read(tmp_path / "clip.npz", READING)
-    assert len(life.timestamp_s) == 400
-    lowest = rigid.apply(life.world_from_agent, life.agent_from_bone[:, :, :3, 3])[..., 1].min()
+    motion = read(tmp_path / "clip.npz", READING)
+    assert len(motion.timestamp_s) == 400
+    lowest = rigid.apply(motion.world_from_agent, motion.agent_from_bone[:, :, :3, 3])[..., 1].min()
     assert abs(lowest) < 0.02
-    np.testing.assert_allclose(np.linalg.det(life.world_from_agent[:, :3, :3]), 1, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(motion.world_from_agent[:, :3, :3]), 1, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +118,10 @@ def test_clips_of_joints_stand_on_the_floor(tmp_path):
         ("Time,X,Y,Z,Heading\n0,inf,0,0,0\n", "TRJ-002.*no position"),
         ("id,time,x,y,z,heading\na,1,0,0,0,0\na,1,1,0,0,0\n", "TRJ-001.*same time"),
         ("time,x,y,z,heading\n0,0,0,0,0\n100,0,0,0,0\n", "TRJ-001.*100 s apart"),
-        ("time,x,y,z,heading\n0,431250.5,0,5402000,0\n1,431251,0,5402000,0\n", "TRJ-001.*5402 km away(.|\n)*subtract one origin"),
+        (
+            "time,x,y,z,heading\n0,431250.5,0,5402000,0\n1,431251,0,5402000,0\n",
+            "TRJ-001.*5402 km away(.|\n)*subtract one origin",
+        ),
         ("time;x;y;z;heading\n0,1;0,0;0,0;0,0;0,0\n", "TRJ-001.*line 2 has more cells"),
         ("time,x,y,z,heading,observer_x\n0,0,0,0,0,0\n", "TRJ-001.*no column observer_y, observer_z"),
     ],
@@ -117,7 +132,9 @@ def test_nonsense_is_refused(tmp_path, text, code):
         read(tmp_path / "t.csv", READING)
 
 
-@pytest.mark.parametrize("stored", [{"depth": np.zeros((4, 5))}, {}, {"a": np.zeros((0, 5, 3))}, {"a": np.array(["x"])}])
+@pytest.mark.parametrize(
+    "stored", [{"depth": np.zeros((4, 5))}, {}, {"a": np.zeros((0, 5, 3))}, {"a": np.array(["x"])}]
+)
 def test_arrays_that_are_no_joints_are_refused(tmp_path, stored):
     np.savez(tmp_path / "t.npz", **stored)
     with pytest.raises(InputError, match="TRJ-001.*no joint positions"):
@@ -133,7 +150,10 @@ def test_a_file_that_is_no_archive_of_arrays_is_refused(tmp_path):
 @pytest.mark.parametrize(("unit", "status"), [(1.0, "ok"), (180 / np.pi, "warn")])
 def test_degrees_turn_too_fast(tmp_path, unit, status):
     rows = [f"{0.1 * i},{0.01 * i},0,0,{0.05 * np.sin(i) * unit}" for i in range(100)]
-    found = {check.name: check.status for check in pictures.checks(read(table(tmp_path / "t.csv", rows, "time,x,y,z,heading"), READING))}
+    found = {
+        check.name: check.status
+        for check in pictures.checks(read(table(tmp_path / "t.csv", rows, "time,x,y,z,heading"), READING))
+    }
     assert found["turning, 99 % below"] == status
 
 

@@ -5,34 +5,46 @@ import dataclasses
 import numpy as np
 import torch
 
-from pipeline.models.motion import MotionTable
-from pipeline.space import rigid
+from pipeline.data.motion import MotionTable
+from pipeline.geometry import rigid
 from stages.reconstruct import assemble, rays
-from stages.reconstruct.assemble import Doubt
-from stages.reconstruct.problem import FIRMEST, firmness
-from tests.stages.reconstruct.test_optimise import SHAPES, WIDE, film, problem
+from stages.reconstruct.problem import MOST_PRECISE, prior_precision
+from tests.stages.reconstruct.test_optimise import WIDE, film, problem
 
 
-def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.Video:
-    """Return a ball that moves 3 cm a frame along x, two frames a second; where it is doubted, it is registered too high and turned round."""
+def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.RegisteredVideo:
+    """Return a ball that moves 3 cm a frame along x, two frames a second; where it is doubted, it is
+    registered too high and turned round.
+    """
     video = film("v002", len(confidence), True, np.random.default_rng(0), WIDE)
     root = rigid.make(np.eye(3), np.arange(len(confidence))[:, None] * np.array([0.03, 0, 0]))
     root[confidence < 0.4] = root[confidence < 0.4] @ rigid.exp(np.array([0, np.pi, 0, 0, leap_m, 0]))
-    return dataclasses.replace(video, timestamp_s=np.arange(len(confidence)) * 0.5, world_from_agent=root, agent_confidence=confidence)
+    return dataclasses.replace(
+        video,
+        timestamp_s=np.arange(len(confidence)) * 0.5,
+        world_from_agent=root,
+        agent_confidence=confidence,
+    )
 
 
 def test_leaps_are_given_up_where_certain_roots_are_near():
     confidence = np.ones(12)
     confidence[[3, 4, 11]] = 0.1
-    root, kept = assemble.steadied(doubted(confidence), Doubt(longest_gap_s=2.0))
-    np.testing.assert_allclose(root[:11], rigid.make(np.eye(3), np.arange(11)[:, None] * np.array([0.03, 0, 0])), atol=1e-9)
-    assert np.flatnonzero(~kept).tolist() == [3, 4] and root[11, 1, 3] == 2.0, "nothing certain comes after frame 11"
-    assert assemble.steadied(doubted(confidence, 0.2), Doubt(longest_gap_s=2.0))[1].all(), "doubtful, but where the agent may be"
+    root, kept = assemble.without_outliers(doubted(confidence))
+    np.testing.assert_allclose(
+        root[:11], rigid.make(np.eye(3), np.arange(11)[:, None] * np.array([0.03, 0, 0])), atol=1e-9
+    )
+    assert np.flatnonzero(~kept).tolist() == [3, 4] and root[11, 1, 3] == 2.0, (
+        "nothing certain comes after frame 11"
+    )
+    assert assemble.without_outliers(doubted(confidence, 0.2))[1].all(), (
+        "doubtful, but where the agent may be"
+    )
     confidence[2:9] = 0.1
-    assert assemble.steadied(doubted(confidence), Doubt(longest_gap_s=2.0))[1].all(), "the certain ones are 4 s apart"
+    assert assemble.without_outliers(doubted(confidence))[1].all(), "the certain ones are 4 s apart"
     unknown = doubted(np.zeros(4))
     unknown.world_from_agent[:] = np.nan
-    assert np.isnan(assemble.steadied(unknown, Doubt())[0]).all()
+    assert np.isnan(assemble.without_outliers(unknown)[0]).all()
 
 
 def test_what_is_joined_comes_back_from_disk(tmp_path):
@@ -40,7 +52,10 @@ def test_what_is_joined_comes_back_from_disk(tmp_path):
     stores = [video.store for video in videos]
     joined = rays.join(stores, tmp_path, (32, 32))
     starts = (0, len(stores[0].views.intrinsics))
-    assert torch.equal(joined.agent.frame, torch.cat([store.agent.frame + start for store, start in zip(stores, starts, strict=True)]))
+    assert torch.equal(
+        joined.agent.frame,
+        torch.cat([store.agent.frame + start for store, start in zip(stores, starts, strict=True)]),
+    )
     assert torch.equal(joined.scene.feature, stores[0].scene.feature), "the turnaround has no scene"
     depth = joined.views.depth[-1, :32, :24]
     assert torch.equal(depth, stores[1].views.depth[-1]) and not joined.views.depth[-1, :, 24:].any()
@@ -52,12 +67,18 @@ def test_given_up_frames_hardly_count_and_the_joint_phase_leaves_them_out():
     confidence[5] = 0.2
     _, videos = problem()
     built, _ = problem(videos=[doubted(confidence), videos[1]])
-    assert built.trust[5] == SHAPES.doubt.trust and built.trust.sum() == len(built.trust) - 1 + SHAPES.doubt.trust
+    assert (
+        built.trust[5] == assemble.OUTLIER_MASK_WEIGHT
+        and built.trust.sum() == len(built.trust) - 1 + assemble.OUTLIER_MASK_WEIGHT
+    )
     runs = built.runs(3)
-    assert torch.isin(torch.tensor([0, 2, 6]), runs).all() and not torch.isin(torch.tensor([3, 4, 5]), runs).any()
+    assert (
+        torch.isin(torch.tensor([0, 2, 6]), runs).all()
+        and not torch.isin(torch.tensor([3, 4, 5]), runs).any()
+    )
 
 
-def test_masks_count_by_how_much_of_the_animal_they_show():
+def test_masks_count_by_how_much_of_the_animal_they_show(monkeypatch):
     """Three quarters of the ball's mask are hidden in one frame, nearly all of it in another."""
     built, _ = problem()
     views = built.store.views
@@ -65,9 +86,12 @@ def test_masks_count_by_how_much_of_the_animal_they_show():
     for frame, keep in ((2, 4), (3, 50)):
         inside = torch.nonzero((hidden[frame] < 0).flatten())[:, 0]
         hidden[frame].view(-1)[inside[len(inside) // keep :]] = 8.0
-    doubt = Doubt(whole_share=1.0)
-    before, after = assemble.shown(views, doubt), assemble.shown(dataclasses.replace(views, outside_px=hidden), doubt)
-    assert 0.15 < after[2] / before[2] < 0.35 and after[3] == doubt.least_share
+    monkeypatch.setattr(assemble, "WHOLE_SHARE", 1.0)
+    before, after = (
+        assemble.mask_weights(views),
+        assemble.mask_weights(dataclasses.replace(views, outside_px=hidden)),
+    )
+    assert 0.15 < after[2] / before[2] < 0.35 and after[3] == assemble.LEAST_MASK_WEIGHT
     rest = torch.arange(len(before)) > 3
     torch.testing.assert_close(after[rest], before[rest])
 
@@ -76,6 +100,6 @@ def test_cameras_are_held_as_firmly_as_registration_is_sure():
     pose = torch.eye(4).repeat(40, 1, 1)
     table = MotionTable(pose, pose, torch.eye(4)[None], [40], [True], knot_frames=10)
     confidence = np.repeat([0.3, 1.0], 20)
-    firm = firmness(table, confidence)
-    assert firm[0] == firm[1] == 1 and firm[4] == FIRMEST
-    assert 1 < firm[2] < FIRMEST, "between doubtful and certain frames"
+    camera_precision = prior_precision(table, confidence)
+    assert camera_precision[0] == camera_precision[1] == 1 and camera_precision[4] == MOST_PRECISE
+    assert 1 < camera_precision[2] < MOST_PRECISE, "between doubtful and certain frames"

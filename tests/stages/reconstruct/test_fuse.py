@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.models import fields
-from pipeline.models.fields import Body, Field, FieldShape, Reconstruction
-from stages.reconstruct.fuse import Fusion, Ground
+from pipeline.fields import fields
+from pipeline.fields.fields import ArticulatedBody, Field, FieldShape, Reconstruction
+from stages.reconstruct.fuse import SceneFuser
 
 LOW, HIGH = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
-FUSION = Fusion(voxel_m=0.05, truncation_m=0.1)
+VOXEL_M = 0.05
 BALL = torch.tensor([0.4, 0.3, 0.2])
 
 
 def ground():
     """Three videos see a floor at y = -0.5; the last also a ball, red, that the others saw through."""
-    ground = Ground((LOW, HIGH), FUSION)
+    ground = SceneFuser((LOW, HIGH), VOXEL_M)
     x, y, z = np.meshgrid(*(np.arange(n * 8 + 1) * 0.05 - 1 for n in ground.size), indexing="ij")
     floor = y + 0.5
     ball = np.sqrt((x - 0.4) ** 2 + (y - 0.3) ** 2 + (z - 0.2) ** 2) - 0.25
@@ -43,8 +43,12 @@ def test_videos_share_the_floor_and_one_has_the_ball():
         torch.testing.assert_close(found, on_floor[:, 1] + 0.5, atol=0.004, rtol=0)
         at_ball = fused(on_ball, index)
         if video == 2:
-            assert at_ball[:, 0].abs().quantile(0.98) < 0.2, "units of 0.1 m; cells are 5 cm on a ball of 25 cm, slivers are left out"
-            assert at_ball[:, 1].quantile(0.02) > 0.7 and at_ball[:, 3].quantile(0.98) < 0.1, "the ball keeps its own colour"
+            assert at_ball[:, 0].abs().quantile(0.98) < 0.2, (
+                "units of 0.1 m; cells are 5 cm on a ball of 25 cm, slivers are left out"
+            )
+            assert at_ball[:, 1].quantile(0.02) > 0.7 and at_ball[:, 3].quantile(0.98) < 0.1, (
+                "the ball keeps its own colour"
+            )
         else:
             assert at_ball[:, 0].min() > 0.3, "free, or nearly so, for those who saw through it"
     assert len(fused.blocks) < fused.table[0].numel(), "sparse"
@@ -62,8 +66,12 @@ def test_points_outside_are_free_and_gradients_lead_to_the_surface():
 def test_a_field_on_fused_ground_comes_back_from_files(tmp_path: pytest.TempPathFactory):
     shape = FieldShape(LOW, HIGH, (0.5,), videos=3, truncation_m=0.1)
     agent = FieldShape(LOW, HIGH, (0.5,))
-    body = Body(torch.eye(4).repeat(3, 1, 1), torch.full((3, 3), 0.1), agent)
-    fields.save(tmp_path, Reconstruction(Field(shape, 0.0, ground()), Field(agent, 0.1), body, ("a", "b", "c")))
+    body = ArticulatedBody(torch.eye(4).repeat(3, 1, 1), torch.full((3, 3), 0.1), agent)
+    fields.save(
+        tmp_path, Reconstruction(Field(shape, 0.0, ground()), Field(agent, 0.1), body, ("a", "b", "c"))
+    )
     scene = fields.load(tmp_path).scene
     values = scene(BALL[None] + torch.tensor([[0.25, 0, 0]]), torch.tensor([2]))
-    assert values.signed_distance.abs() < 0.02 and values.color[0, 0] > 0.7, "untrained heads leave fused colours as they are"
+    assert values.signed_distance.abs() < 0.02 and values.color[0, 0] > 0.7, (
+        "untrained heads leave fused colours as they are"
+    )

@@ -2,15 +2,17 @@
 
 import torch
 
-from pipeline.space import rigid_torch
-from stages.reconstruct.limbs import Limbs, Waves, legs
+from pipeline.geometry import rigid_torch
+from stages.reconstruct.limbs import KinematicTree, MultiscaleTurns, legs
 
 LENGTH_M = 0.1
 """between bones"""
 
 
 def chain() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return points, weights and bones of a body with its middle at 0: one bone before it, a tail of three behind, in no order."""
+    """Return points, weights and bones of a body with its middle at 0: one bone before it, a tail of three
+    behind, in no order.
+    """
     place = LENGTH_M * torch.tensor([-2.0, 0.0, -3.0, 1.0, -1.0])
     bones = torch.eye(4).repeat(5, 1, 1)
     bones[:, 2, 3] = place
@@ -20,7 +22,7 @@ def chain() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def test_bones_hang_on_each_other_outward_from_the_middle():
-    limbs = Limbs.of(*chain())
+    limbs = KinematicTree.of(*chain())
     parent = dict(zip(limbs.order.tolist(), limbs.order[limbs.parent].tolist(), strict=True))
     assert parent == {1: 1, 3: 1, 4: 1, 0: 4, 2: 0}
     at = dict(zip(limbs.order.tolist(), limbs.joint[:, 2].tolist(), strict=True))
@@ -29,21 +31,28 @@ def test_bones_hang_on_each_other_outward_from_the_middle():
 
 def test_a_turn_at_the_root_of_a_tail_lifts_the_whole_tail():
     points, weights, bones = chain()
-    limbs = Limbs.of(points, weights, bones)
+    limbs = KinematicTree.of(points, weights, bones)
     turn = torch.zeros(2, 5, 3)
     turn[1, 4, 0] = torch.pi / 2
     moved = limbs.motion(turn) @ bones
     torch.testing.assert_close(moved[0], bones, msg="no turn, no motion")
-    torch.testing.assert_close(moved[1, [1, 3]], bones[[1, 3]], msg="the middle and what hangs elsewhere stay")
+    torch.testing.assert_close(
+        moved[1, [1, 3]], bones[[1, 3]], msg="the middle and what hangs elsewhere stay"
+    )
     joint = limbs.joint[limbs.order == 4][0]
     reach = bones[[4, 0, 2], 2, 3] - joint[2]
-    torch.testing.assert_close(moved[1, [4, 0, 2], :3, 3], torch.stack([0 * reach, -reach, joint[2].expand(3)], dim=-1), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        moved[1, [4, 0, 2], :3, 3],
+        torch.stack([0 * reach, -reach, joint[2].expand(3)], dim=-1),
+        atol=1e-5,
+        rtol=0,
+    )
     relative = rigid_torch.inverse(moved[1, 4]) @ moved[1, 2]
     torch.testing.assert_close(relative, rigid_torch.inverse(bones[4]) @ bones[2], msg="straight as before")
 
 
 def test_waves_add_knots_of_each_scale():
-    waves = Waves(frames=20, bones=1, knot_frames=(8,))
+    waves = MultiscaleTurns(frames=20, bones=1, knot_frames=(8,))
     assert waves().shape == (20, 1, 3) and not waves().any()
     with torch.no_grad():
         waves.knots[0][1] = 1.0
@@ -54,15 +63,27 @@ def test_waves_add_knots_of_each_scale():
 
 
 def test_legs_are_what_stands_on_the_ground():
-    """A body of two bones on a fore and a hind leg of two each, with a tail that hangs beside but never so low."""
+    """A body of two bones on a fore and a hind leg of two each, with a tail that hangs beside but never so
+    low.
+    """
     place = torch.tensor(
-        [[0, 0, 0.05], [0, 0, -0.15], [0, -0.25, 0.2], [0, -0.38, 0.2], [0, -0.25, -0.2], [0, -0.38, -0.2], [0, -0.27, -0.4]]
+        [
+            [0, 0, 0.05],
+            [0, 0, -0.15],
+            [0, -0.25, 0.2],
+            [0, -0.38, 0.2],
+            [0, -0.25, -0.2],
+            [0, -0.38, -0.2],
+            [0, -0.27, -0.4],
+        ]
     )
     bones = torch.eye(4).repeat(7, 1, 1)
     bones[:, :3, 3] = place
-    points = (place[:, None] + 0.02 * torch.randn(7, 30, 3, generator=torch.Generator().manual_seed(0))).view(-1, 3)
+    points = (place[:, None] + 0.02 * torch.randn(7, 30, 3, generator=torch.Generator().manual_seed(0))).view(
+        -1, 3
+    )
     points[:, 1].clamp_(-0.4, 0.02)
     points[-30:, 1] = points[-30:, 1].clamp_min(-0.3)
     weights = (-torch.cdist(points, place).square() / 0.1**2).softmax(-1)
-    found = legs(Limbs.of(points, weights, bones), points, weights)
+    found = legs(KinematicTree.of(points, weights, bones), points, weights)
     assert torch.nonzero(found)[:, 0].tolist() == [2, 4]

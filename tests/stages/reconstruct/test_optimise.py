@@ -1,4 +1,6 @@
-"""A ball in a box, seen by a moving camera: the phases find both, and a killed run ends with the same bits."""
+"""A ball in a box, seen by a moving camera: the phases find both, and a killed run ends with the same
+bits.
+"""
 
 from dataclasses import replace
 
@@ -7,28 +9,30 @@ import pytest
 import torch
 import trimesh
 
-from pipeline.models import fields
-from pipeline.models.fields import Field, FieldShape, Reconstruction
-from pipeline.models.fused import Fused
-from pipeline.space import cameras, rigid, rigid_torch
-from pipeline.space.meshes import Mesh
+from pipeline.fields import fields
+from pipeline.fields.fields import Field, FieldShape, Reconstruction
+from pipeline.fields.fused_depth import FusedGeometry
+from pipeline.geometry import cameras, rigid, rigid_torch
+from pipeline.geometry.meshes import Mesh
 from stages.reconstruct import assemble, body, optimise, results
-from stages.reconstruct.assemble import Shapes, Template, Video
+from stages.reconstruct.assemble import AgentTemplate, FieldSizes, RegisteredVideo
 from stages.reconstruct.body import Pose
+from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from stages.reconstruct.problem import Joints, RaysByFrame
-from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, Store, Views, distance_outside, occluder_depth
-from stages.reconstruct.settings import Batches, Rates, Steps, Weights
+from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, RayStore, Views, distance_outside, occluder_depth
 
 WIDE, UPRIGHT = (24, 32), (32, 24)
 """height and width of thumbnails; pictures are four times larger"""
 ROOM_M, RADIUS_M = 1.5, 0.2
-SHAPES = Shapes(scene_voxel_m=(0.4, 0.2), agent_voxel_m=(0.1, 0.05), width=32, knot_frames=4)
+SHAPES = FieldSizes(scene_voxel_m=(0.4, 0.2), agent_voxel_m=(0.1, 0.05), width=32)
 
 
 def cast(origin, direction, world_from_agent, half_m):
     """Return z-depth and whether the animal is hit, an ellipsoid with these half axes, inside a cube room."""
     with np.errstate(divide="ignore"):
-        wall = np.min(np.where(direction > 0, (ROOM_M - origin) / direction, (-ROOM_M - origin) / direction), axis=-1)
+        wall = np.min(
+            np.where(direction > 0, (ROOM_M - origin) / direction, (-ROOM_M - origin) / direction), axis=-1
+        )
     own = world_from_agent[:3, :3] / half_m
     toward, to_ball = direction @ own, (origin - world_from_agent[:3, 3]) @ own
     a, b, c = (toward**2).sum(-1), (toward * to_ball).sum(-1), (to_ball**2).sum(-1) - 1
@@ -38,7 +42,7 @@ def cast(origin, direction, world_from_agent, half_m):
     return np.where(hit, near, wall), hit
 
 
-def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> Video:
+def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> RegisteredVideo:
     """Film the ball as it moves along x; the turnaround's world is the ball."""
     root = np.tile(np.eye(4), (frames, 1, 1))
     if has_scene:
@@ -47,8 +51,12 @@ def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> Video:
     return film_animal(id, root, registered, RADIUS_M, has_scene, rng, size)
 
 
-def film_animal(id: str, root, registered, half_m: float | np.ndarray, has_scene: bool, rng, size=WIDE) -> Video:
-    """Film an ellipsoid of these half axes from all around as its root moves; registration has it elsewhere."""
+def film_animal(
+    id: str, root, registered, half_m: float | np.ndarray, has_scene: bool, rng, size=WIDE
+) -> RegisteredVideo:
+    """Film an ellipsoid of these half axes from all around as its root moves; registration has it
+    elsewhere.
+    """
     frames = len(root)
     height, width = size[0] * 4, size[1] * 4
     intrinsics = np.array([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
@@ -62,13 +70,25 @@ def film_animal(id: str, root, registered, half_m: float | np.ndarray, has_scene
         chosen = np.concatenate([rng.choice(np.flatnonzero(~hit), 60), rng.choice(np.flatnonzero(hit), 40)])
         rays.append((frame, directions[chosen], depth[chosen], hit[chosen]))
         depths.append(depth.reshape(height, width)[2::4, 2::4])
-        outside.append(distance_outside(np.where(hit, AGENT, NOT_AGENT).astype(np.uint8).reshape(height, width), size))
+        outside.append(
+            distance_outside(np.where(hit, AGENT, NOT_AGENT).astype(np.uint8).reshape(height, width), size)
+        )
     store = pack(rays, depths, outside, intrinsics, has_scene)
     ones = np.ones(frames, bool)
-    return Video(id, np.arange(frames) * 0.1, np.stack(camera), registered, ones.astype(float), ones, has_scene, has_scene, store)
+    return RegisteredVideo(
+        id,
+        np.arange(frames) * 0.1,
+        np.stack(camera),
+        registered,
+        ones.astype(float),
+        ones,
+        has_scene,
+        has_scene,
+        store,
+    )
 
 
-def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
+def pack(rays, depths, outside, intrinsics, has_scene: bool) -> RayStore:
     frames, (height, width) = len(depths), depths[0].shape
     frame = torch.cat([torch.full((len(direction),), number) for number, direction, _, _ in rays])
     direction, depth, hit = (torch.from_numpy(np.concatenate([ray[k] for ray in rays])) for k in (1, 2, 3))
@@ -87,30 +107,34 @@ def pack(rays, depths, outside, intrinsics, has_scene: bool) -> Store:
         torch.from_numpy(np.stack(outside)), torch.from_numpy(np.stack(list(map(occluder_depth, depths, outside)))).half(),
         torch.ones(frames, dtype=torch.bool),
     )  # fmt: skip
-    return Store(table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views)
+    return RayStore(
+        table.at(torch.nonzero(~hit)[:, 0] if has_scene else torch.zeros(0, dtype=torch.int64)), table, views
+    )
 
 
-def problem(shapes: Shapes = SHAPES, videos=None):
+def problem(shapes: FieldSizes = SHAPES, videos=None):
     rng = np.random.default_rng(0)
     videos = videos or [film("v002", 12, True, rng), film("v001", 6, False, rng, UPRIGHT)]
     return assemble.build(videos, template(RADIUS_M), shapes, 0, "cpu"), videos
 
 
-def template(half_m: float | np.ndarray) -> Template:
+def template(half_m: float | np.ndarray) -> AgentTemplate:
     """Return the template of a ball, or of an ellipsoid with these half axes."""
     ball = trimesh.creation.icosphere(2)
     mesh = Mesh(
-        (half_m * ball.vertices).astype(np.float32), ball.faces.astype(np.int32), np.full((len(ball.vertices), 3), [200, 40, 40], np.uint8)
+        (half_m * ball.vertices).astype(np.float32),
+        ball.faces.astype(np.int32),
+        np.full((len(ball.vertices), 3), [200, 40, 40], np.uint8),
     )
     feature = np.zeros((len(mesh.vertices), 16), np.float32)
     feature[:, 0] = 1
     rest = rigid.make(np.tile(np.eye(3), (6, 1, 1)), 0.1 * np.concatenate([np.eye(3), -np.eye(3)]))
-    return Template(mesh, feature, rest, np.full((6, 3), 0.1))
+    return AgentTemplate(mesh, feature, rest, np.full((6, 3), 0.1))
 
 
-def plan(resume=None, **steps) -> optimise.Plan:
-    batches = Batches(scene_rays=256, joint_scene_rays=128, rendered_rays=16, runs=2, agent_rays=16, surface_points=32, posed_points=64)
-    return optimise.Plan(Steps(**steps), Weights(), batches, Rates(), 0, resume)
+def plan(resume=None, **steps) -> optimise.OptimizationPlan:
+    batches = RayBatches(scene_rays=256, joint_scene_rays=128, rendered_rays=16, runs=2)
+    return optimise.OptimizationPlan(PhaseSteps(**steps), LossWeights(), batches, LearningRates(), 0, resume)
 
 
 @pytest.fixture(scope="module")
@@ -138,11 +162,23 @@ def test_posed_surface_comes_nearer_to_the_truth(solved):
     found, videos = solved
     motion = results.motions(found, videos, 1.0)["v002"]
     with torch.no_grad():
-        posed = found.body.pose(found.surface.points, torch.from_numpy(motion.agent_from_bone).float()).numpy()
+        posed = found.body.pose(
+            found.surface.points, torch.from_numpy(motion.agent_from_bone).float()
+        ).numpy()
     centre = rigid.apply(motion.world_from_agent, posed).mean(1)
     truth = np.stack([0.03 * np.arange(12), np.zeros(12), np.zeros(12)], axis=-1)
     before = np.linalg.norm(videos[0].world_from_agent[:, :3, 3] - truth, axis=-1).mean()
     assert np.linalg.norm(centre - truth, axis=-1).mean() < 0.6 * before
+
+
+def test_long_gaps_are_interpolated_with_low_confidence(solved):
+    problem_, videos = solved
+    hidden = torch.tensor([2, 6, 7, 8])
+    kept = problem_.agent_frames[~torch.isin(problem_.agent_frames, hidden)]
+    motion = results.motions(replace(problem_, agent_frames=kept), videos, certain_gap_s=0.25)["v002"]
+    assert np.isfinite(motion.world_from_agent).all() and np.isfinite(motion.agent_from_bone).all()
+    assert not motion.agent_visible[hidden].any()
+    assert not motion.agent_known[6:9].any() and motion.agent_known[:6].all() and motion.agent_known[9:].all()
 
 
 def test_posing_is_the_same_however_many_are_posed_at_once():
@@ -159,13 +195,22 @@ def test_bare_masked_pixels_draw_the_surface_to_them():
     found, _ = problem()
     frame, rays, generator = found.agent_frames[:4], found.store.agent, torch.Generator().manual_seed(0)
     masked = torch.nonzero(rays.label == AGENT)[:, 0]
-    rays = rays.at(masked[RaysByFrame.of(rays.frame[masked], len(found.video)).pick(frame, 40, generator).flatten()])
+    rays = rays.at(
+        masked[RaysByFrame.of(rays.frame[masked], len(found.video)).pick(frame, 40, generator).flatten()]
+    )
     pose = Pose.of(found, frame)
 
     def bare(shift: torch.Tensor) -> torch.Tensor:
         there = pose.world_from_agent @ rigid_torch.make(torch.eye(3), shift)
-        terms = body.surface_terms(found, replace(pose, world_from_agent=there), 4000, Weights(), torch.Generator().manual_seed(0), rays)
-        return terms["cover"][1].mean()
+        terms = body.surface_terms(
+            found,
+            replace(pose, world_from_agent=there),
+            4000,
+            LossWeights(),
+            torch.Generator().manual_seed(0),
+            rays,
+        )
+        return terms["uncovered"][1].mean()
 
     home, shift = torch.tensor([-0.03, 0.03, -0.02]), torch.zeros(3, requires_grad=True)
     assert bare(home) < 0.2 * bare(shift), "registered roots are off by as much"
@@ -174,19 +219,32 @@ def test_bare_masked_pixels_draw_the_surface_to_them():
 
 
 def beside(found, metres: float) -> dict:
-    """Return what `surface_terms` says of the session when the ball stands so far to the right in all pictures."""
+    """Return what `surface_terms` says of the session when the ball stands so far to the right in all
+    pictures.
+    """
     pose = Pose.of(found, torch.arange(4))
     right = (
-        pose.world_from_camera @ rigid_torch.make(torch.eye(3), torch.tensor([metres, 0, 0])) @ rigid_torch.inverse(pose.world_from_camera)
+        pose.world_from_camera
+        @ rigid_torch.make(torch.eye(3), torch.tensor([metres, 0, 0]))
+        @ rigid_torch.inverse(pose.world_from_camera)
     )
     pose = replace(pose, world_from_agent=right @ pose.world_from_agent)
-    return {name: term for name, (_, term) in body.surface_terms(found, pose, 4000, Weights(), torch.Generator().manual_seed(0)).items()}
+    return {
+        name: term
+        for name, (_, term) in body.surface_terms(
+            found, pose, 4000, LossWeights(), torch.Generator().manual_seed(0)
+        ).items()
+    }
 
 
 def test_what_pads_pictures_says_nothing():
-    """Across the right border of an upright picture the mask is as far as its last pixel says, also beside a wide recording."""
+    """Across the right border of an upright picture the mask is as far as its last pixel says, also beside a
+    wide recording.
+    """
     alone, padded = (
-        beside(problem(videos=[film("v002", 12, True, rng, UPRIGHT), film("v001", 6, False, rng, size)])[0], 0.45)["outside"]
+        beside(
+            problem(videos=[film("v002", 12, True, rng, UPRIGHT), film("v001", 6, False, rng, size)])[0], 0.45
+        )["outside"]
         for rng, size in ((np.random.default_rng(0), UPRIGHT), (np.random.default_rng(0), WIDE))
     )
     assert alone.max() > 1 and torch.equal(alone, padded)
@@ -200,7 +258,9 @@ def test_where_depth_ends_at_something_nearer_the_surface_may_be_hidden():
     def outside(column: slice | int, depth_m: float):
         views.depth[:4, :, column] = depth_m
         for frame in range(4):
-            views.occluder[frame] = torch.from_numpy(occluder_depth(views.depth[frame].numpy(), views.outside_px[frame].numpy()))
+            views.occluder[frame] = torch.from_numpy(
+                occluder_depth(views.depth[frame].numpy(), views.outside_px[frame].numpy())
+            )
         return beside(found, 0.15)["outside"]
 
     free, hidden = beside(found, 0.15)["outside"], outside(slice(edge, None), 0.3)
@@ -209,75 +269,103 @@ def test_where_depth_ends_at_something_nearer_the_surface_may_be_hidden():
 
 
 def test_what_is_buried_in_the_ground_is_lifted():
-    """A floor 10 cm below the ball's middle: its underside lies as deep as it lies below that, and is drawn up."""
+    """A floor 10 cm below the ball's middle: its underside lies as deep as it lies below that, and is drawn
+    up.
+    """
     found, _ = problem()
     height = torch.linspace(-0.4, 0.4, 9).view(1, 9, 1, 1).expand(9, 9, 9, 1) + 0.1
     block = torch.cat([(height / 0.2).clamp(-1, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
     table = torch.ones(2, 1, 1, 1, dtype=torch.int32)
-    floor = Fused(torch.full((3,), -0.4), 0.1, 0.2, table, torch.stack([torch.ones(9, 9, 9, 5), block]).half())
+    floor = FusedGeometry(
+        torch.full((3,), -0.4), 0.1, 0.2, table, torch.stack([torch.ones(9, 9, 9, 5), block]).half()
+    )
     shape = FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2)
     found = replace(found, scene=Field(shape, free_m=0.1, fused=floor))
     pose, shift = Pose.of(found, found.agent_frames[:2]), torch.zeros(3, requires_grad=True)
     pose = replace(pose, world_from_agent=rigid_torch.make(torch.eye(3), shift).expand(2, 4, 4))
     points = found.surface.points[:200].expand(2, -1, -1)
-    buried = body.buried_m(found, pose, points)
+    buried = body.penetration_depth_m(found, pose, points)
     torch.testing.assert_close(buried, (-0.1 - points[..., 1]).clamp(0, 0.2), atol=2e-3, rtol=0)
     buried.mean().backward()
     assert -shift.grad[1] > 10 * shift.grad[[0, 2]].abs().max()
 
 
 def test_below_the_floor_nothing_is_free_however_deep():
-    """What is fused ends a little below a surface; a ball half a metre below the floor is drawn up all the same."""
+    """What is fused ends a little below a surface; a ball half a metre below the floor is drawn up all the
+    same.
+    """
     found, _ = problem()
     block = torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
-    fused = Fused(torch.full((3,), -0.4), 0.1, 0.2, torch.ones(2, 1, 1, 1, dtype=torch.int32), block.expand(2, -1, -1, -1, -1).half())
+    fused = FusedGeometry(
+        torch.full((3,), -0.4),
+        0.1,
+        0.2,
+        torch.ones(2, 1, 1, 1, dtype=torch.int32),
+        block.expand(2, -1, -1, -1, -1).half(),
+    )
     shape = FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2)
     found = replace(found, scene=Field(shape, free_m=0.1, fused=fused))
     pose, shift = Pose.of(found, found.agent_frames[:2]), torch.zeros(3, requires_grad=True)
-    pose = replace(pose, world_from_agent=rigid_torch.make(torch.eye(3), shift - 0.5 * torch.eye(3)[1]).expand(2, 4, 4))
+    pose = replace(
+        pose, world_from_agent=rigid_torch.make(torch.eye(3), shift - 0.5 * torch.eye(3)[1]).expand(2, 4, 4)
+    )
     points = found.surface.points[:200].expand(2, -1, -1)
-    assert not body.buried_m(found, pose, points).any()
-    buried = body.buried_m(replace(found, floor_m=0.0), pose, points)
+    assert not body.penetration_depth_m(found, pose, points).any()
+    buried = body.penetration_depth_m(replace(found, floor_m=0.0), pose, points)
     torch.testing.assert_close(buried, 0.5 - points[..., 1])
     buried.mean().backward()
     torch.testing.assert_close(shift.grad, -torch.eye(3)[1])
 
 
 def test_soles_that_touch_the_floor_are_drawn_to_where_they_were():
-    """A ball that rolls over the floor of an empty home at 1 cm, then at 1 m a frame, and flies 20 cm above it."""
+    """A ball that rolls over the floor of an empty home at 1 cm, then at 1 m a frame, and flies 20 cm above
+    it.
+    """
     found, _ = problem()
-    free = torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1).expand(2, -1, -1, -1, -1).half()
-    fused = Fused(torch.full((3,), -0.4), 0.1, 0.2, torch.ones(2, 1, 1, 1, dtype=torch.int32), free)
-    field = Field(FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2), free_m=0.1, fused=fused)
+    free = (
+        torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1).expand(2, -1, -1, -1, -1).half()
+    )
+    fused = FusedGeometry(torch.full((3,), -0.4), 0.1, 0.2, torch.ones(2, 1, 1, 1, dtype=torch.int32), free)
+    field = Field(
+        FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2), free_m=0.1, fused=fused
+    )
     found = replace(found, scene=field, floor_m=float(found.surface.sole[:, 1].max()))
     pose, shift = Pose.of(found, found.agent_frames[:3]), torch.tensor([0.0, 0.01, 1.01], requires_grad=True)
     rolling = torch.stack([shift, torch.zeros(3), torch.zeros(3)], dim=-1)
 
-    def slid(place: torch.Tensor) -> torch.Tensor:
-        return body.slid(found, replace(pose, world_from_agent=rigid_torch.make(torch.eye(3).expand(3, 3, 3), place)), 3)
+    def foot_skate(place: torch.Tensor) -> torch.Tensor:
+        return body.foot_skate(
+            found, replace(pose, world_from_agent=rigid_torch.make(torch.eye(3).expand(3, 3, 3), place)), 3
+        )
 
     step_m = torch.tensor([0.01, 1.0])
     expected = step_m.square() / (step_m.square() + body.STRIDE_M**2)
-    found_there = slid(rolling)
+    found_there = foot_skate(rolling)
     torch.testing.assert_close(found_there, expected.view(1, 2, 1).expand_as(found_there), atol=1e-3, rtol=0)
     found_there.mean().backward()
     assert shift.grad[0] < 0 < shift.grad[1], "towards each other"
     assert shift.grad[2].abs() < 0.05 * shift.grad[1], "a stride is left alone"
-    assert not slid(rolling.detach() + 0.2 * torch.eye(3)[1]).gt(1e-6).any()
+    assert not foot_skate(rolling.detach() + 0.2 * torch.eye(3)[1]).gt(1e-6).any()
 
 
 def test_bones_are_tied_along_limbs_and_not_across_them():
     """Two legs nearer to each other than their own bones: each hangs on its own hip."""
     heights = torch.tensor([0.0, -0.1, -0.2])
     side = torch.tensor([-0.02, 0.02])
-    centre = torch.stack([side[:, None].expand(2, 3), heights.expand(2, 3), torch.zeros(2, 3)], dim=-1).view(6, 3)
-    points = torch.cat([torch.stack([x.expand(60), torch.linspace(0, -0.25, 60), torch.zeros(60)], dim=-1) for x in side])
+    centre = torch.stack([side[:, None].expand(2, 3), heights.expand(2, 3), torch.zeros(2, 3)], dim=-1).view(
+        6, 3
+    )
+    points = torch.cat(
+        [torch.stack([x.expand(60), torch.linspace(0, -0.25, 60), torch.zeros(60)], dim=-1) for x in side]
+    )
     across = (points[:, None, 0] * centre[:, 0] < 0) & (points[:, None, 1] < -0.05)
     weights = (-torch.cdist(points, centre).square() / 0.05**2 - 1e3 * across).softmax(-1)
     joints = Joints.of(points, weights)
     pairs = set(zip(joints.first.tolist(), joints.second.tolist(), strict=True))
     assert {(0, 1), (1, 2), (3, 4), (4, 5), (0, 3)} <= pairs and not pairs & {(1, 4), (1, 5), (2, 4), (2, 5)}
-    knee = joints.place[[pair == (1, 2) for pair in zip(joints.first.tolist(), joints.second.tolist(), strict=True)]]
+    knee = joints.place[
+        [pair == (1, 2) for pair in zip(joints.first.tolist(), joints.second.tolist(), strict=True)]
+    ]
     torch.testing.assert_close(knee, torch.tensor([[-0.02, -0.15, 0.0]]), atol=0.01, rtol=0)
 
 
@@ -292,7 +380,9 @@ def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
 
 
 def test_plain_networks_without_codes_learn_and_come_back(tmp_path):
-    """The rivals of Table 3 take the same way: waves of the place instead of grids, one scene for all videos."""
+    """The rivals of Table 3 take the same way: waves of the place instead of grids, one scene for all
+    videos.
+    """
     found, videos = problem(replace(SHAPES, encoding="mlp", code_channels=0))
     records = optimise.optimise(found, plan(template=30, scene=30, body=2, joint=2))
     total = records["scene"].total()
@@ -300,14 +390,18 @@ def test_plain_networks_without_codes_learn_and_come_back(tmp_path):
     assert found.scene.codes is None and not hasattr(found.scene.grid, "levels")
     fields.save(tmp_path, Reconstruction(found.scene, found.agent, found.body, assemble.scene_ids(videos)))
     points = torch.rand(20, 3)
-    torch.testing.assert_close(fields.load(tmp_path).scene(points).signed_distance, found.scene(points).signed_distance.detach())
+    torch.testing.assert_close(
+        fields.load(tmp_path).scene(points).signed_distance, found.scene(points).signed_distance.detach()
+    )
 
 
 def test_volume_tells_free_surface_and_unseen(solved):
     volume = results.feature_volume(solved[0])
 
     def at(*point: float) -> int:
-        return int(volume.occupancy[tuple(np.floor((np.array(point) - volume.origin) / results.VOXEL_M).astype(int))])
+        return int(
+            volume.occupancy[tuple(np.floor((np.array(point) - volume.origin) / results.VOXEL_M).astype(int))]
+        )
 
     assert at(-0.55, 0.35, 0.35) == results.FREE
     surface = volume.occupancy == results.SURFACE
@@ -320,7 +414,7 @@ def test_frames_whose_camera_is_in_doubt_look_through_nothing(solved):
 
     def seen_through(frames: int) -> int:
         rays = found.store.scene.at(torch.nonzero(found.store.scene.frame < frames)[:, 0])
-        return int(results.looked_through(replace(found, store=replace(found.store, scene=rays)), points, 300).sum())
+        return int(results.seen_free(replace(found, store=replace(found.store, scene=rays)), points).sum())
 
     assert 0 == seen_through(0) < seen_through(2) < seen_through(len(found.video))
 

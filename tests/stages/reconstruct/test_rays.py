@@ -9,7 +9,6 @@ from stages.reconstruct.rays import (
     NOT_AGENT,
     THUMBNAIL,
     UNKNOWN,
-    Sampling,
     choose_on_agent,
     distance_outside,
     near_agent,
@@ -22,9 +21,13 @@ def test_distance_from_the_mask_is_that_of_the_thumbnail_pixels_middle(radius_px
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     mask = np.where(np.hypot(x - centre[0], y - centre[1]) < radius_px, label, NOT_AGENT).astype(np.uint8)
     found = distance_outside(mask, (height // THUMBNAIL, width // THUMBNAIL)).astype(float)
-    middle = np.stack(np.meshgrid(*((np.arange(size // THUMBNAIL) + 0.5) * THUMBNAIL for size in (width, height))), axis=-1)
+    middle = np.stack(
+        np.meshgrid(*((np.arange(size // THUMBNAIL) + 0.5) * THUMBNAIL for size in (width, height))), axis=-1
+    )
     true = np.linalg.norm(middle - centre, axis=-1) - radius_px
-    assert np.abs(found - true)[true > -0.5 * radius_px].max() < 1.0, "pixels are counted as in or out whole: below one pixel"
+    assert np.abs(found - true)[true > -0.5 * radius_px].max() < 1.0, (
+        "pixels are counted as in or out whole: below one pixel"
+    )
     assert abs((found - true)[np.abs(true) < 6].mean()) < 0.1, "neither shifted nor eroded, pixels"
 
 
@@ -36,13 +39,16 @@ def test_without_a_mask_everything_is_far():
 def test_thin_limbs_are_looked_at_as_much_as_the_trunk(count):
     mask = np.zeros((100, 100), np.uint8)
     mask[20:60, 20:60] = mask[60:90, 38:42] = AGENT  # a leg four pixels wide
-    sampling = Sampling(0, count, ring_px=5)
-    near = near_agent(mask, sampling.ring_px)
-    row, column = choose_on_agent(mask, near, sampling, np.random.default_rng(0)).T
-    assert len(set(zip(row, column, strict=True))) == len(row) == min(count, near.sum()), "none twice, as many as there are"
+    near = near_agent(mask, 5)
+    row, column = choose_on_agent(mask, near, count, np.random.default_rng(0)).T
+    assert len(set(zip(row, column, strict=True))) == len(row) == min(count, near.sum()), (
+        "none twice, as many as there are"
+    )
     assert near[row, column].all()
     on_mask = mask[row, column] == AGENT
     assert abs(on_mask.sum() - min(0.75 * count, (mask == AGENT).sum())) <= 1
     if count < on_mask.sum() + (mask == AGENT).sum():
         share = (row[on_mask] >= 60).mean()
-        assert share > 2 * (mask[60:] == AGENT).sum() / (mask == AGENT).sum(), "a leg's pixels count more than a trunk's"
+        assert share > 2 * (mask[60:] == AGENT).sum() / (mask == AGENT).sum(), (
+            "a leg's pixels count more than a trunk's"
+        )

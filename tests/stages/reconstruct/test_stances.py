@@ -14,16 +14,16 @@ HALF_M = np.array([0.1, 0.1, 0.3])
 def test_a_stance_must_be_sure_and_lasts():
     level, raised = np.full(6, 0.2), np.full(6, 0.2)
     raised[[1, 3, 4]] -= [0.05, 0.08, 0.08]
-    assert stances.likeliest(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
-    assert stances.likeliest(np.stack([level, level - stances.SURE], -1), 0.2).tolist() == [0] * 6
+    assert stances.most_likely(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
+    assert stances.most_likely(np.stack([level, level - stances.SURE], -1), 0.2).tolist() == [0] * 6
 
 
 def test_the_better_of_two_misfits_tells_nothing():
     loss = np.tile([0.8, 0.5], (6, 1))
-    assert stances.likeliest(loss, 0.39).tolist() == [0] * 6
-    assert stances.likeliest(loss, 0.5).tolist() == [1] * 6
+    assert stances.most_likely(loss, 0.39).tolist() == [0] * 6
+    assert stances.most_likely(loss, 0.5).tolist() == [1] * 6
     loss[2] = np.nan
-    assert stances.likeliest(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
+    assert stances.most_likely(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
 
 
 def test_parts_are_told_by_frame():
@@ -40,4 +40,6 @@ def test_sitting_is_found_where_it_is_seen():
     found = assemble.build([video], template(HALF_M), SHAPES, 0, "cpu")
     optimise.optimise(found, plan(template=100, scene=2, stance=20, body=2, joint=1))
     raised = found.motion.initial_agent[:, 1, 2]
-    assert torch.allclose(raised[SITS], torch.tensor(0.5)) and torch.equal(raised[: SITS.start], torch.zeros(SITS.start))
+    assert torch.allclose(raised[SITS], torch.tensor(0.5)) and torch.equal(
+        raised[: SITS.start], torch.zeros(SITS.start)
+    )

@@ -3,13 +3,13 @@
 import numpy as np
 import torch
 
-from pipeline.models.fields import density
-from pipeline.models.motion import MotionTable, gaps_s
-from pipeline.models.render import Layer, composite
-from pipeline.models.surfaces import zero_level
-from pipeline.space import rigid
+from pipeline.data.motion import MotionTable, gaps_s
+from pipeline.fields.fields import density
+from pipeline.fields.marching_cubes import zero_level
+from pipeline.fields.render import Layer, composite
+from pipeline.geometry import rigid
 from stages.reconstruct import losses, results, scene
-from stages.reconstruct.settings import Batches
+from stages.reconstruct.config import RayBatches
 
 
 def layer(value: torch.Tensor, color: tuple[float, float, float]) -> Layer:
@@ -31,7 +31,12 @@ def test_composite_shows_what_stands_in_front():
 
 def test_composite_mixes_by_density():
     depth = torch.linspace(0, 1, 50)[None]
-    seen = composite(depth, torch.ones(1), layer(torch.full((1, 50), 3.0), (0, 0, 1)), layer(torch.full((1, 50), 1.0), (1, 0, 0)))
+    seen = composite(
+        depth,
+        torch.ones(1),
+        layer(torch.full((1, 50), 3.0), (0, 0, 1)),
+        layer(torch.full((1, 50), 1.0), (1, 0, 0)),
+    )
     torch.testing.assert_close(seen.color[0, 0] / seen.color[0, 2], torch.tensor(1 / 3))
 
 
@@ -46,8 +51,11 @@ def test_eikonal_is_zero_on_a_distance_field_and_not_on_a_scaled_one():
 def test_codes_are_swapped_as_often_as_asked():
     video = torch.zeros(20000, dtype=torch.int64)
     generator = torch.Generator().manual_seed(0)
-    assert scene.swap_probability(0.0, Batches()) == 1.0 and abs(scene.swap_probability(1.0, Batches()) - 0.05) < 1e-9
-    assert scene.swap_probability(0.5, Batches(swap_first=0.0, swap_last=0.0)) == 0, "no annealing"
+    assert (
+        scene.swap_probability(0.0, RayBatches()) == 1.0
+        and abs(scene.swap_probability(1.0, RayBatches()) - 0.05) < 1e-9
+    )
+    assert scene.swap_probability(0.5, RayBatches(swap_first=0.0, swap_last=0.0)) == 0, "no annealing"
     assert (scene.swap(video, 4, 0.0, generator) == 0).all()
     changed = (scene.swap(video, 4, 0.4, generator) != 0).float().mean()
     assert abs(changed - 0.4 * 3 / 4) < 0.02, "a swap may draw the same video again"
@@ -63,15 +71,16 @@ def test_held_cameras_do_not_move_and_free_ones_move_smoothly():
     assert (bend.abs() > 1e-6).sum() <= 3, "corrections bend at knots only"
 
 
-def test_short_gaps_are_bridged_and_long_ones_are_not():
+def test_gaps_are_bridged_by_straight_lines():
     time = np.arange(40) * 0.1
     root = rigid.make(np.tile(np.eye(3), (40, 1, 1)), np.stack([time, 0 * time, 0 * time], axis=-1))
     good = np.ones(40, bool)
     good[5:9] = good[20:36] = False
     garbled = np.where(good[:, None, None], root, 7.0 * np.eye(4))
-    found, _ = results.bridged(time, garbled, garbled[:, None], good, longest_gap_s=1.0)
-    np.testing.assert_allclose(found[:20], root[:20], atol=1e-9)
-    assert np.isnan(found[20:36]).all() and np.isfinite(found[36:]).all()
+    result, bones = results.bridged(time, garbled, garbled[:, None], good)
+    np.testing.assert_allclose(result, root, atol=1e-9)
+    np.testing.assert_allclose(bones[:, 0], root, atol=1e-9)
+    assert np.isnan(results.bridged(time, garbled, garbled[:, None], np.zeros(40, bool))[0]).all()
     gap_s = gaps_s(time, good)
     np.testing.assert_allclose(gap_s[5:9], 0.5)
     np.testing.assert_allclose(gap_s[20:36], 1.7)

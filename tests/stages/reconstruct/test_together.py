@@ -1,4 +1,6 @@
-"""Two processes that share the videos find what one finds in the same batch, and come through all phases alike."""
+"""Two processes that share the videos find what one finds in the same batch, and come through all phases
+alike.
+"""
 
 import os
 import socket
@@ -10,12 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline import fit, together
-from pipeline.errors import InputError
+from pipeline.core import distributed, training
+from pipeline.core.errors import InputError
 from stages.reconstruct import losses, optimise
+from stages.reconstruct.config import LossWeights
 from stages.reconstruct.joint import JointLoss
 from stages.reconstruct.problem import Problem
-from stages.reconstruct.settings import Weights
 from tests.stages.reconstruct.test_optimise import UPRIGHT, WIDE, film, plan, problem
 
 TORCHRUN = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RUN_ID")
@@ -24,35 +26,47 @@ STEPS = 3
 
 def three_videos() -> Problem:
     rng = np.random.default_rng(0)
-    return problem(videos=[film("v002", 9, True, rng, WIDE), film("v003", 7, True, rng, WIDE), film("v001", 6, False, rng, UPRIGHT)])[0]
+    return problem(
+        videos=[
+            film("v002", 9, True, rng, WIDE),
+            film("v003", 7, True, rng, WIDE),
+            film("v001", 6, False, rng, UPRIGHT),
+        ]
+    )[0]
 
 
 def loss_of(found: Problem, rank: int) -> JointLoss:
-    return JointLoss(found.share(rank, 2), Weights(), plan().batches.share(2), STEPS)
+    return JointLoss(found.share(rank, 2), LossWeights(), plan().batches.share(2), STEPS)
 
 
 def learned(found: Problem) -> torch.Tensor:
-    return torch.cat([value.detach().flatten() for module in found.modules().values() for value in module.parameters()])
+    return torch.cat(
+        [value.detach().flatten() for module in found.modules().values() for value in module.parameters()]
+    )
 
 
 def fitted(found: Problem, loss, shared: bool) -> tuple[torch.Tensor, np.ndarray]:
     parameters = [value for module in found.modules().values() for value in module.parameters()]
     optimizer = torch.optim.SGD(parameters, lr=1e-3)
-    record = fit.fit(modules=found.modules(), optimizer=optimizer, loss=loss, steps=STEPS, seed=0, shared=shared)
+    record = training.fit(
+        modules=found.modules(), optimizer=optimizer, loss=loss, steps=STEPS, seed=0, shared=shared
+    )
     return learned(found), record.total()
 
 
 def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
-    """Do what one process of two does; the same steps, and then a whole run, whose weights it leaves in a file."""
+    """Do what one process of two does; the same steps, and then a whole run, whose weights it leaves in a
+    file.
+    """
     torch.set_num_threads(1)
     os.environ.update(zip(TORCHRUN, (str(rank), str(rank), "2", "127.0.0.1", port, "test"), strict=True))
-    together.join("cpu")
+    distributed.join("cpu")
     found, whole = three_videos(), three_videos()
     weights, total = fitted(found, loss_of(found, rank), shared=True)
     optimise.optimise(whole, plan(folder / "resume", template=2, scene=3, body=2, joint=3, save_every=2))
     torch.save(learned(whole), folder / f"rank{rank}.pt")
-    together.wait()
-    assert together.leave() == (rank == 0)
+    distributed.wait()
+    assert distributed.leave() == (rank == 0)
     return learned(whole), weights, total
 
 
@@ -74,8 +88,13 @@ def test_two_processes_do_what_one_does_with_the_same_batch(tmp_path, monkeypatc
         parts = []
         monkeypatch.setattr(losses, "weighted", lambda terms, shared: parts.append(terms))
         for rank, loss in enumerate(shares):
-            loss(step, fit.generator_for(0, step, rank))
-        return weighted({name: (weight, torch.cat([part[name][1].flatten() for part in parts])) for name, (weight, _) in parts[0].items()})
+            loss(step, training.generator_for(0, step, rank))
+        return weighted(
+            {
+                name: (weight, torch.cat([part[name][1].flatten() for part in parts]))
+                for name, (weight, _) in parts[0].items()
+            }
+        )
 
     expected, expected_total = fitted(alone, of_both, shared=False)
     np.testing.assert_allclose(total, expected_total, rtol=1e-5)
@@ -90,7 +109,9 @@ def test_videos_are_dealt_out_whole():
     shares = [found.share(rank, 2) for rank in range(2)]
     for kind in ("scene", "agent"):
         videos = [set(found.video[getattr(share.store, kind).frame].tolist()) for share in shares]
-        assert not videos[0] & videos[1] and videos[0] | videos[1] == set(found.video[getattr(found.store, kind).frame].tolist())
+        assert not videos[0] & videos[1] and videos[0] | videos[1] == set(
+            found.video[getattr(found.store, kind).frame].tolist()
+        )
     assert sum(len(share.agent_frames) for share in shares) == len(found.agent_frames)
     with pytest.raises(InputError, match="RCN-002"):
         found.share(0, 3)

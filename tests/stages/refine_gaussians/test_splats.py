@@ -1,4 +1,6 @@
-"""Gaussians: they cover surfaces, follow bones, survive their file, and their optimisation makes pictures better."""
+"""Gaussians: they cover surfaces, follow bones, survive their file, and their optimisation makes pictures
+better.
+"""
 
 from dataclasses import replace
 
@@ -6,10 +8,10 @@ import numpy as np
 import torch
 import trimesh
 
-from pipeline.models import gaussians, rasterize
-from pipeline.models.gaussians import Splats, see, together
-from pipeline.space import rigid_torch
-from pipeline.space.meshes import Mesh
+from pipeline.fields import gaussians, rasterize
+from pipeline.fields.gaussians import Splats, concatenate, render
+from pipeline.geometry import rigid_torch
+from pipeline.geometry.meshes import Mesh
 from stages.refine_gaussians import views
 
 
@@ -34,12 +36,12 @@ def test_file_has_rows_of_248_bytes_and_leaves_out_what_cannot_be_seen(tmp_path)
     with torch.no_grad():
         cloud.opacity_logit[3] = -20.0
         cloud.means[5, 0] = torch.nan
-    gaussians.save_ply(tmp_path / "a.ply", cloud, gaussians.kept(cloud))
+    gaussians.save_ply(tmp_path / "a.ply", cloud, gaussians.drawable(cloud))
     data = (tmp_path / "a.ply").read_bytes()
     head = data[: data.index(b"end_header\n") + 11]
     assert b"element vertex 48" in head and len(data) - len(head) == 48 * 248
     back = gaussians.load_ply(tmp_path / "a.ply")
-    keep = gaussians.kept(cloud)
+    keep = gaussians.drawable(cloud)
     torch.testing.assert_close(back.means, cloud.means[keep])
     torch.testing.assert_close(back.color, cloud.color[keep])
     torch.testing.assert_close(back.opacity, cloud.opacity[keep])
@@ -54,7 +56,9 @@ def test_the_animal_turns_with_its_root_and_bones():
     torch.testing.assert_close(by_root.means, by_bones.means)
     torch.testing.assert_close(by_root.means, rigid_torch.apply(motion, agent.means))
     expected = motion[:3, :3] @ rigid_torch.rotation_from_quaternion(agent.rotation)
-    torch.testing.assert_close(rigid_torch.rotation_from_quaternion(by_root.rotation), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        rigid_torch.rotation_from_quaternion(by_root.rotation), expected, atol=1e-5, rtol=0
+    )
 
 
 def test_a_picture_of_known_gaussians_is_approached():
@@ -63,12 +67,14 @@ def test_a_picture_of_known_gaussians_is_approached():
     intrinsics = torch.tensor([[40.0, 0, 20], [0, 40.0, 15], [0, 0, 1]])
     splats = Splats(ball(), ball(0.2), torch.ones(400, 1), torch.eye(4)[None], videos=1)
     with torch.no_grad():
-        truth = see(splats.place_scene(0), camera, intrinsics, 30, 40)
-        splats.scene.band0 += 0.5 * torch.randn(splats.scene.band0.shape, generator=torch.Generator().manual_seed(0))
+        truth = render(splats.place_scene(0), camera, intrinsics, 30, 40)
+        splats.scene.band0 += 0.5 * torch.randn(
+            splats.scene.band0.shape, generator=torch.Generator().manual_seed(0)
+        )
     optimizer = torch.optim.Adam([splats.scene.band0, splats.appearance], lr=0.03)
     errors = []
     for _ in range(15):
-        error = (see(splats.place_scene(0), camera, intrinsics, 30, 40).color - truth.color).abs().mean()
+        error = (render(splats.place_scene(0), camera, intrinsics, 30, 40).color - truth.color).abs().mean()
         optimizer.zero_grad()
         error.backward()
         optimizer.step()
@@ -83,9 +89,9 @@ def test_the_animal_hides_the_room_behind_it():
     camera[2, 3] = 1.5
     root = torch.eye(4)
     root[2, 3] = -0.8
-    cloud = together(splats.place_scene(None), splats.place_agent(root, torch.eye(4)[None], None))
+    cloud = concatenate(splats.place_scene(None), splats.place_agent(root, torch.eye(4)[None], None))
     cloud = replace(cloud, log_scale=cloud.log_scale + 0.3)
-    view = see(cloud, camera, torch.tensor([[40.0, 0, 20], [0, 40.0, 15], [0, 0, 1]]), 30, 40)
+    view = render(cloud, camera, torch.tensor([[40.0, 0, 20], [0, 40.0, 15], [0, 0, 1]]), 30, 40)
     assert view.agent[15, 20] > 0.9 and view.agent[1, 1] < 0.05
 
 
@@ -100,6 +106,6 @@ def test_what_is_out_of_view_can_be_left_out():
     camera[0, 3], camera[2, 3] = -0.4, 0.3
     seen = rasterize.in_view(splats.scene.means, splats.scene.log_scale, camera, intrinsics, 30, 40)
     assert 20 < len(seen) < 300
-    whole, part = (see(splats.place_scene(0, which), camera, intrinsics, 30, 40) for which in (None, seen))
+    whole, part = (render(splats.place_scene(0, which), camera, intrinsics, 30, 40) for which in (None, seen))
     torch.testing.assert_close(part.color, whole.color)
     torch.testing.assert_close(part.coverage, whole.coverage)

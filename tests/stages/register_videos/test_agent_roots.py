@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh, RayCaster, render_view
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
+from stages.register_videos import agent_fit
 from stages.register_videos import agent_roots as roots
-from stages.register_videos import body as bodies
 
 UP = np.array([0.0, 1.0, 0.0])
 K = np.array([[236.0, 0, 120], [0, 236.0, 160], [0, 0, 1]])
@@ -15,7 +15,11 @@ K = np.array([[236.0, 0, 120], [0, 236.0, 160], [0, 0, 1]])
 
 def animal() -> Mesh:
     """Body, head, tail and legs of boxes; dark in front, light behind."""
-    parts = [((0.14, 0.15, 0.4), (0, 0, 0)), ((0.12, 0.13, 0.14), (0, 0.12, 0.24)), ((0.03, 0.03, 0.2), (0, 0.06, -0.28))]
+    parts = [
+        ((0.14, 0.15, 0.4), (0, 0, 0)),
+        ((0.12, 0.13, 0.14), (0, 0.12, 0.24)),
+        ((0.03, 0.03, 0.2), (0, 0.06, -0.28)),
+    ]
     parts += [((0.05, 0.2, 0.05), (x, -0.12, z)) for x in (-0.05, 0.05) for z in (-0.16, 0.16)]
     boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in parts]
     whole = trimesh.util.concatenate(boxes)
@@ -24,7 +28,7 @@ def animal() -> Mesh:
     return Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.repeat(shade[:, None], 3, axis=1))
 
 
-def glimpse_of(mesh: Mesh, world_from_agent: np.ndarray, frame: int = 0) -> bodies.Glimpse:
+def observation_of(mesh: Mesh, world_from_agent: np.ndarray, frame: int = 0) -> agent_fit.AgentObservation:
     camera = rigid.look_at(np.array([1.6, 1.2, 0.3]), np.array([0, 0.2, 0.0]), UP)
     depth, hits = render_view(RayCaster(mesh), rigid.inverse(world_from_agent) @ camera, K, 320, 240)
     shade = hits.interpolate(mesh, mesh.color / 255.0)
@@ -32,18 +36,20 @@ def glimpse_of(mesh: Mesh, world_from_agent: np.ndarray, frame: int = 0) -> bodi
     ray = np.stack([(seen % 240 + 0.5 - 120) / 236, (seen // 240 + 0.5 - 160) / 236, np.ones(len(seen))], -1)
     noise = np.random.default_rng(0).normal(0, 0.01, len(seen))
     points = rigid.apply(camera, ray * (depth.ravel()[seen] + noise)[:, None])
-    return bodies.Glimpse(frame, points, shade[seen], depth > 0, np.where(depth > 0, depth, 9.0), camera, K, np.nan, 1.0)
+    return agent_fit.AgentObservation(
+        frame, points, shade[seen], depth > 0, np.where(depth > 0, depth, 9.0), camera, K, np.nan, 1.0
+    )
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 70.0, 160.0, -100.0])
 def test_body_is_found_from_all_headings(yaw_deg):
-    mesh, options = animal(), bodies.FitOptions()
-    body = bodies.make_body(mesh, options, np.random.default_rng(0))
+    mesh = animal()
+    model = agent_fit.make_model(mesh, np.random.default_rng(0))
     truth = rigid.make(rigid.rotation_from_vector(UP * np.deg2rad(yaw_deg)), np.array([0.1, 0.22, -0.05]))
-    glimpse = glimpse_of(mesh, truth)
-    placed = bodies.fit_coarse(glimpse, body, bodies.starts(glimpse, body, 12), options)
-    placed = bodies.fit_fine(glimpse, body, placed, options, tilt=False)
-    best = placed[bodies.cost(glimpse, body, placed, options).argmin()]
+    observation = observation_of(mesh, truth)
+    placed = agent_fit.fit_coarse(observation, model, agent_fit.initial_poses(observation, model, 12))
+    placed = agent_fit.fit_fine(observation, model, placed, rounds=12, tilt=False)
+    best = placed[agent_fit.cost(observation, model, placed).argmin()]
     turn = np.rad2deg(rigid.rotation_angle(best[:3, :3], truth[:3, :3]))
     assert turn < 8, "degrees"
     assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.03, "metres"
@@ -51,22 +57,30 @@ def test_body_is_found_from_all_headings(yaw_deg):
 
 
 def test_tilt_is_followed_when_asked():
-    mesh, options = animal(), bodies.FitOptions()
-    body = bodies.make_body(mesh, options, np.random.default_rng(0))
-    truth = rigid.make(rigid.rotation_from_vector(UP * 1.2) @ rigid.rotation_from_vector(np.array([-0.35, 0, 0])), np.array([0, 0.25, 0]))
+    mesh = animal()
+    model = agent_fit.make_model(mesh, np.random.default_rng(0))
+    truth = rigid.make(
+        rigid.rotation_from_vector(UP * 1.2) @ rigid.rotation_from_vector(np.array([-0.35, 0, 0])),
+        np.array([0, 0.25, 0]),
+    )
     start = rigid.make(rigid.rotation_from_vector(UP * 1.2), np.array([0.02, 0.23, 0]))
-    placed = bodies.fit_fine(glimpse_of(mesh, truth), body, start[None], options, tilt=True)[0]
+    placed = agent_fit.fit_fine(observation_of(mesh, truth), model, start[None], rounds=12, tilt=True)[0]
     assert np.rad2deg(rigid.rotation_angle(placed[:3, :3], truth[:3, :3])) < 10, "degrees, of 20"
 
 
 def test_smoothing_keeps_gaps_and_calms_noise():
     rng, time = np.random.default_rng(0), np.arange(50) * 0.1
-    truth = rigid.make(rigid.rotation_from_vector(0.5 * time[:, None] * UP), np.stack([0.4 * time, 0 * time + 0.2, 0 * time], -1))
+    truth = rigid.make(
+        rigid.rotation_from_vector(0.5 * time[:, None] * UP),
+        np.stack([0.4 * time, 0 * time + 0.2, 0 * time], -1),
+    )
     noisy = truth @ rigid.exp(rng.normal(0, 1, (50, 6)) * ([0.08] * 3 + [0.02] * 3))
     cost, share = np.full(50, 0.03), np.ones(50)
     noisy[20:25], cost[20:25] = np.nan, np.nan
-    smooth = roots.smooth(time, noisy, cost, share, roots.RootOptions())
+    smooth = roots.smooth(time, noisy, cost, share, 0.15)
     assert np.isnan(smooth[20:25]).all()
     known = np.isfinite(cost)
-    before, after = (np.linalg.norm(poses[known, :3, 3] - truth[known, :3, 3], axis=1).mean() for poses in (noisy, smooth))
+    before, after = (
+        np.linalg.norm(poses[known, :3, 3] - truth[known, :3, 3], axis=1).mean() for poses in (noisy, smooth)
+    )
     assert after < 0.7 * before

@@ -1,19 +1,25 @@
-"""Confidence says what is known: how firmly poses are held, and how seldom a wrong pose looks so much alike."""
+"""Confidence says what is known: how firmly poses are held, and how seldom a wrong pose looks so much
+alike.
+"""
 
 import numpy as np
 import pytest
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 from stages.register_videos import confidence
 
 
 def test_near_probability_is_the_share_of_draws_that_stay_near():
     rng = np.random.default_rng(0)
-    sigma = np.array([0.5, 1.0, 3.0])[:, None] * np.array([confidence.NEAR_RAD] * 3 + [confidence.NEAR_M] * 3) / 2
-    spread = np.einsum("fi,ij->fij", sigma**2, np.eye(6))
-    found = confidence.near_probability(spread, rng, draws=4000)
+    sigma = (
+        np.array([0.5, 1.0, 3.0])[:, None] * np.array([confidence.NEAR_RAD] * 3 + [confidence.NEAR_M] * 3) / 2
+    )
+    pose_covariance = np.einsum("fi,ij->fij", sigma**2, np.eye(6))
+    found = confidence.near_probability(pose_covariance, rng, draws=4000)
     drawn = rng.normal(size=(3, 20000, 6)) * sigma[:, None]
-    near = (np.linalg.norm(drawn[..., :3], axis=-1) < confidence.NEAR_RAD) & (np.linalg.norm(drawn[..., 3:], axis=-1) < confidence.NEAR_M)
+    near = (np.linalg.norm(drawn[..., :3], axis=-1) < confidence.NEAR_RAD) & (
+        np.linalg.norm(drawn[..., 3:], axis=-1) < confidence.NEAR_M
+    )
     assert np.abs(found - near.mean(1)).max() < 0.04
 
 
@@ -29,12 +35,17 @@ def test_what_looks_like_decoys_is_not_the_right_place(right, low, high):
 
 def test_nothing_to_compare_is_no_confidence():
     assert (confidence.right_place(np.full(5, np.nan), np.array([0.1]), 3) == 0).all()
-    assert (confidence.right_place(np.full(5, 0.9), np.array([np.nan]), 3) < 0.2).all(), "no decoy, no evidence"
+    assert (confidence.right_place(np.full(5, 0.9), np.array([np.nan]), 3) < 0.2).all(), (
+        "no decoy, no evidence"
+    )
 
 
 def test_decoys_are_wrong():
-    twist = confidence._wrong_twists(confidence.ConfidenceOptions(), np.random.default_rng(0))
-    turned, stepped = np.linalg.norm(twist[:, :3], axis=1) / confidence.NEAR_RAD, np.linalg.norm(twist[:, 3:], axis=1) / confidence.NEAR_M
+    twist = confidence._wrong_twists(120, np.random.default_rng(0))
+    turned, stepped = (
+        np.linalg.norm(twist[:, :3], axis=1) / confidence.NEAR_RAD,
+        np.linalg.norm(twist[:, 3:], axis=1) / confidence.NEAR_M,
+    )
     assert np.maximum(turned, stepped).min() > 1.49
     assert np.allclose(rigid.log(rigid.exp(twist))[:, 3:], twist[:, 3:], atol=1e-6)
 

@@ -1,24 +1,37 @@
-"""Front and back are told apart by walking, and kept while the animal is hardly seen, while it rests, while it turns."""
+"""Front and back are told apart by walking, and kept while the animal is hardly seen, while it rests, while
+it turns.
+"""
 
 import numpy as np
 import pytest
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 from stages.register_videos import headings
-from stages.register_videos.headings import Candidates, HeadingOptions
+from stages.register_videos.headings import RootHypotheses
 
 UP = np.array([0.0, 1.0, 0.0])
 
 
-def seen(frame: int, yaw_deg: float, place, advantage: float, *, share: float = 1.0, misfit: float = 5.0, eye=(2.0, 1, 0)) -> Candidates:
+def seen(
+    frame: int,
+    yaw_deg: float,
+    place,
+    advantage: float,
+    *,
+    share: float = 1.0,
+    misfit: float = 5.0,
+    eye=(2.0, 1, 0),
+) -> RootHypotheses:
     """Return a front and a back placement; the wrong one looks better by ``advantage`` units."""
     yaw, place = np.deg2rad([yaw_deg, yaw_deg + 180]), np.asarray(place, float)
     poses = rigid.make(rigid.rotation_from_vector(yaw[:, None] * UP), np.repeat(place[None], 2, axis=0))
-    return Candidates(frame, poses, np.array([advantage, 0.0]), misfit, share, place, np.asarray(eye, float))
+    return RootHypotheses(
+        frame, poses, np.array([advantage, 0.0]), misfit, share, place, np.asarray(eye, float)
+    )
 
 
-def chosen(sights: list[Candidates]) -> list[int]:
-    return headings.choose(np.arange(len(sights)) * 0.1, sights, HeadingOptions())
+def chosen(sights: list[RootHypotheses]) -> list[int]:
+    return headings.choose(np.arange(len(sights)) * 0.1, sights)
 
 
 def test_animals_walk_head_first():
@@ -27,7 +40,10 @@ def test_animals_walk_head_first():
 
 def test_what_was_learned_walking_is_kept_at_rest():
     z = np.minimum(np.arange(40), 15) * 0.06
-    assert chosen([seen(frame, 0.0, (0, 0, z[frame]), 1.0 if frame > 18 else -1.0) for frame in range(40)]) == [0] * 40
+    assert (
+        chosen([seen(frame, 0.0, (0, 0, z[frame]), 1.0 if frame > 18 else -1.0) for frame in range(40)])
+        == [0] * 40
+    )
 
 
 @pytest.mark.parametrize("spoilt", [{"share": 0.02}, {"misfit": 60.0}])
@@ -41,10 +57,15 @@ def test_frames_that_show_little_or_fit_badly_do_not_turn_it_round(spoilt):
 def test_noise_of_single_placements_is_no_turn():
     rng = np.random.default_rng(0)
     yaw = 1.5 * np.arange(60) + rng.normal(0, 20, 60)
-    sights = [seen(frame, yaw[frame], (0, 0, 0), rng.normal(-0.5, 1.5), eye=(2, 1, 0.1 * frame)) for frame in range(60)]
+    sights = [
+        seen(frame, yaw[frame], (0, 0, 0), rng.normal(-0.5, 1.5), eye=(2, 1, 0.1 * frame))
+        for frame in range(60)
+    ]
     assert chosen(sights) == [0] * 60
-    faced = headings.path(np.arange(60) * 0.1, sights, HeadingOptions())
-    assert np.abs(np.rad2deg(headings.wrap(faced - np.deg2rad(1.5 * np.arange(60))))).mean() < 15, "degrees, of 20 in single frames"
+    faced = headings.path(np.arange(60) * 0.1, sights)
+    assert np.abs(np.rad2deg(rigid.wrap(faced - np.deg2rad(1.5 * np.arange(60))))).mean() < 15, (
+        "degrees, of 20 in single frames"
+    )
 
 
 def test_an_animal_may_turn_round_in_a_second():

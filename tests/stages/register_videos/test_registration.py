@@ -1,18 +1,24 @@
-"""A whole recording in a textured room: registered to a degree and centimetres, its confidence sane, a foreign room refused."""
+"""A whole recording in a textured room: registered to a degree and centimetres, its confidence sane, a
+foreign room refused.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.models import localizer as model
-from pipeline.space import rigid, surface
-from pipeline.space.meshes import Mesh, RayCaster
-from stages.register_videos import alignment, pictures, registration
+from pipeline.backends.descriptors import Describer
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.localization import localizer as model
+from pipeline.mapping import depth_scans
+from stages.register_videos import alignment, flow_alignment, pictures, registration
 from stages.register_videos import votes as voting
-from stages.register_videos.confidence import ConfidenceOptions, camera_confidence, compare, looks_right
+from stages.register_videos.confidence import appearance_probability, camera_confidence, score_appearance
+from stages.register_videos.config import AlignmentConfig, ConfidenceConfig, VoteConfig
+from stages.register_videos.config import Config as RegistrationConfig
 from stages.train_localizer import training
-from stages.train_localizer.views import ViewOptions
+from stages.train_localizer.config import Config, SceneConfig
 from tests.stages.textured_room import MemoryClip, NoAgent, drifting, textured_room, walk
 
 
@@ -20,18 +26,24 @@ from tests.stages.textured_room import MemoryClip, NoAgent, drifting, textured_r
 def maps() -> registration.Maps:
     mesh, path = textured_room(), walk(20)
     clip = MemoryClip(RayCaster(mesh), path, None)
-    options = training.Options(views=45, held_out=14, frames=8, focal_px=90.0, view=ViewOptions(pitch_deg=(-50.0, 0.0)))
-    scene, _ = training.train_scene(mesh, path, 0.0, clip, options, np.random.default_rng(0))
-    agent = Mesh(np.eye(3, dtype=np.float32) * 0.1, np.array([[0, 1, 2]], np.int32), np.full((3, 3), 90, np.uint8))
+    config = Config(scene=SceneConfig(views=45, held_out=14, frames=8, focal_px=90.0, pitch_deg=(-50.0, 0.0)))
+    rng = np.random.default_rng(0)
+    shown = training.scene_views(mesh, path, 0.0, clip, config.scene, rng)
+    scene, _ = training.train(shown, config, Describer(), "cpu", rng)
+    agent = Mesh(
+        np.eye(3, dtype=np.float32) * 0.1, np.array([[0, 1, 2]], np.int32), np.full((3, 3), 90, np.uint8)
+    )
     return registration.Maps(mesh, agent, scene, scene)
 
 
 @pytest.mark.parametrize("with_odometry", [True, False])
 def test_recording_is_registered(maps, with_odometry):
     truth = walk(40, seed=7)
-    clip = MemoryClip(RayCaster(maps.scene), truth, drifting(truth, 2, deg=0.03, m=0.001) if with_odometry else None)
-    options = registration.Options(align=alignment.AlignOptions(stride_px=9, picture_every_frames=8))
-    found = registration.register(clip, NoAgent(40), maps, options, np.random.default_rng(0))
+    clip = MemoryClip(
+        RayCaster(maps.scene), truth, drifting(truth, 2, deg=0.03, m=0.001) if with_odometry else None
+    )
+    config = RegistrationConfig(alignment=AlignmentConfig(stride_px=9, flow_every_frames=8))
+    found = registration.register(clip, NoAgent(40), maps, config, np.random.default_rng(0))
     rotation, distance = model.errors(found.aligned.world_from_camera, truth)
     assert np.median(rotation) < (0.3 if with_odometry else 1.0), "degrees"
     assert np.median(distance) < (0.015 if with_odometry else 0.04), "metres"
@@ -45,8 +57,8 @@ def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
     odometry = drifting(truth, 2, deg=0.03, m=0.001)
     odometry[20:, :3, 3] += np.array([0.5, 0.0, 0.35])
     clip = MemoryClip(RayCaster(maps.scene), truth, odometry)
-    options = registration.Options(align=alignment.AlignOptions(stride_px=9, picture_every_frames=8))
-    found = registration.register(clip, NoAgent(40), maps, options, np.random.default_rng(0))
+    config = RegistrationConfig(alignment=AlignmentConfig(stride_px=9, flow_every_frames=8))
+    found = registration.register(clip, NoAgent(40), maps, config, np.random.default_rng(0))
     rotation, distance = model.errors(found.aligned.world_from_camera, truth)
     assert rotation.max() < 1.0, "degrees"
     assert distance.max() < 0.05, "metres; the jump is 0.6 m"
@@ -57,8 +69,8 @@ def test_foreign_room_is_refused(maps):
     other = textured_room(seed=99)
     stretched = Mesh(other.vertices * np.array([1.5, 1.0, 0.8], np.float32), other.faces, other.color)
     clip = MemoryClip(RayCaster(stretched), truth, drifting(truth, 2))
-    found = registration.register(clip, NoAgent(40), maps, registration.Options(), np.random.default_rng(0))
-    assert isinstance(found, registration.Refused)
+    found = registration.register(clip, NoAgent(40), maps, RegistrationConfig(), np.random.default_rng(0))
+    assert isinstance(found, registration.Rejected)
     assert found.reason
 
 
@@ -68,11 +80,12 @@ def test_a_recording_of_the_right_shape_in_the_wrong_place_is_not_trusted(maps):
     caster = RayCaster(maps.scene)
     middle = rigid.make(np.eye(3), (maps.scene.vertices.min(0) + maps.scene.vertices.max(0)) / 2)
     turned = middle @ rigid.exp(np.array([0, np.pi, 0, 0, 0, 0])) @ rigid.inverse(middle) @ truth
-    clip, options, rng = MemoryClip(caster, truth, truth), ConfidenceOptions(), np.random.default_rng(0)
-    firmly = np.repeat(1e-8 * np.eye(6)[None], 40, axis=0)
+    clip, config, rng = MemoryClip(caster, truth, truth), ConfidenceConfig(), np.random.default_rng(0)
+    certain = np.repeat(1e-8 * np.eye(6)[None], 40, axis=0)
     for poses, low, high in ((truth, 0.8, 1.0), (turned, 0.0, 0.2)):
-        looks = looks_right(clip.timestamp_s, compare(clip, NoAgent(40), caster, poses, options, rng), options)
-        confidence = camera_confidence(firmly, looks, np.ones(40, bool), options, rng)
+        scores = score_appearance(clip, NoAgent(40), caster, poses, config, rng)
+        appearance = appearance_probability(clip.timestamp_s, scores)
+        confidence = camera_confidence(certain, appearance, np.ones(40, bool), rng)
         assert low <= confidence.mean() <= high
 
 
@@ -80,8 +93,11 @@ def test_pictures_pull_a_camera_along_a_wall(maps):
     truth = walk(8)[3]
     clip = MemoryClip(RayCaster(maps.scene), truth[None], None, noise_m=0.0)
     moved = truth @ rigid.exp(np.array([0.01, -0.01, 0.0, 0.03, 0.02, 0.0]))
-    contacts = alignment.picture_contacts(clip, NoAgent(1), RayCaster(maps.scene), 0, moved, alignment.AlignOptions())
-    before, after = (np.median(np.abs(alignment.relax.residuals(pose[None], contacts))) for pose in (moved, truth))
+    correspondences = flow_alignment.flow_correspondences(clip, NoAgent(1), RayCaster(maps.scene), 0, moved)
+    before, after = (
+        np.median(np.abs(alignment.pose_optimization.residuals(pose[None], correspondences)))
+        for pose in (moved, truth)
+    )
     assert after < 0.5 * before, "the flow asks for the true pose"
 
 
@@ -89,8 +105,10 @@ def test_votes_come_from_masked_frames_only(maps):
     truth = walk(12)
     clip = MemoryClip(RayCaster(maps.scene), truth, None)
     hidden = NoAgent(12)
-    hidden.__class__ = type("AllAgent", (NoAgent,), {"__getitem__": lambda self, frame: np.full((160, 120), 255, np.uint8)})
-    votes = voting.collect(clip, hidden, maps.scene_localizer, voting.VoteOptions(every_frames=4))
+    hidden.__class__ = type(
+        "AllAgent", (NoAgent,), {"__getitem__": lambda self, frame: np.full((160, 120), 255, np.uint8)}
+    )
+    votes = voting.collect(clip, hidden, maps.scene_localizer, VoteConfig(every_frames=4))
     assert len(votes.frame) == 0
     assert votes.nearest is None
 
@@ -98,49 +116,67 @@ def test_votes_come_from_masked_frames_only(maps):
 def test_a_repainted_room_of_the_same_shape_is_refused(maps):
     """In dim light as well, and unless frames were recognised with certainty."""
     truth, caster, rng = walk(40, seed=7), RayCaster(maps.scene), np.random.default_rng(0)
-    options = registration.Options(confidence=ConfidenceOptions(decoys=60))
+    config = RegistrationConfig(confidence=ConfidenceConfig(decoys=60))
     right = {}
     for name, color in (("other", textured_room(seed=99).color), ("dim", maps.scene.color // 6)):
         clip = MemoryClip(RayCaster(Mesh(maps.scene.vertices, maps.scene.faces, color)), truth, truth)
-        alike = compare(clip, NoAgent(40), caster, truth, options.confidence, rng)
-        right[name] = looks_right(clip.timestamp_s, alike, options.confidence).mean()
-    assert right["other"] < 0.5 * options.gate.least_right
-    assert right["dim"] > 2 * options.gate.least_right
-    votes = voting.collect(clip, NoAgent(40), maps.scene_localizer, voting.VoteOptions(every_frames=8))
-    doubtful, sure = (replace(votes, answers=[replace(answer, probability=p) for answer in votes.answers]) for p in (0.3, 0.9))
+        scores = score_appearance(clip, NoAgent(40), caster, truth, config.confidence, rng)
+        right[name] = appearance_probability(clip.timestamp_s, scores).mean()
+    assert right["other"] < 0.5 * config.gate.least_appearance
+    assert right["dim"] > 2 * config.gate.least_appearance
+    votes = voting.collect(clip, NoAgent(40), maps.scene_localizer, VoteConfig(every_frames=8))
+    doubtful, sure = (
+        replace(votes, answers=[replace(answer, probability=p) for answer in votes.answers])
+        for p in (0.3, 0.9)
+    )
     supports, fit = np.ones(len(votes.frame), bool), np.full(40, 0.9)
-    assert "looks different" in registration.strange(fit, right["other"], doubtful, supports, options)
-    assert registration.strange(fit, right["dim"], doubtful, supports, options) is None
-    assert registration.strange(fit, right["other"], sure, supports, options) is None, "recognised with certainty"
+    assert "looks different" in registration.rejection_reason(fit, right["other"], doubtful, supports, config)
+    assert registration.rejection_reason(fit, right["dim"], doubtful, supports, config) is None
+    assert registration.rejection_reason(fit, right["other"], sure, supports, config) is None, (
+        "recognised with certainty"
+    )
     rare = replace(doubtful, asked=10 * len(votes.frame))
-    assert "were recognised and agree" in registration.strange(fit, right["dim"], rare, supports, options), "chance, of so many"
+    assert "were recognised and agree" in registration.rejection_reason(
+        fit, right["dim"], rare, supports, config
+    ), "chance, of so many"
 
 
 def test_frames_without_static_depth_do_not_speak_against_a_recording(maps):
-    truth, options = walk(12), registration.Options()
-    clip, place = MemoryClip(RayCaster(maps.scene), truth, None), surface.Surface(maps.scene)
-    seen = [surface.scan(clip.depth(frame), clip.depth_intrinsics[frame], stride=9) for frame in range(12)]
-    blind = surface.scan(np.zeros(clip.depth_size), clip.depth_intrinsics[0], stride=9)
-    votes = voting.collect(clip, NoAgent(12), maps.scene_localizer, voting.VoteOptions(every_frames=2))
-    votes, supports = replace(votes, answers=[replace(one, probability=0.9) for one in votes.answers]), np.ones(len(votes.frame), bool)
-    gap, fit = alignment.measure_fit(place, [blind] * 8 + seen[8:], truth)
+    truth, config = walk(12), RegistrationConfig()
+    clip, surface = MemoryClip(RayCaster(maps.scene), truth, None), depth_scans.SurfaceMap(maps.scene)
+    seen = [
+        depth_scans.scan(clip.depth(frame), clip.depth_intrinsics[frame], stride=9) for frame in range(12)
+    ]
+    blind = depth_scans.scan(np.zeros(clip.depth_size), clip.depth_intrinsics[0], stride=9)
+    votes = voting.collect(clip, NoAgent(12), maps.scene_localizer, VoteConfig(every_frames=2))
+    votes, supports = (
+        replace(votes, answers=[replace(one, probability=0.9) for one in votes.answers]),
+        np.ones(len(votes.frame), bool),
+    )
+    gap, fit = alignment.measure_fit(surface, [blind] * 8 + seen[8:], truth)
     assert (np.isnan(fit) == np.isnan(gap)).all()
     assert np.isnan(fit).sum() == 8
-    assert registration.strange(fit, 0.9, votes, supports, options) is None, "the four others fit"
-    _, fit = alignment.measure_fit(place, [blind] * 11 + seen[11:], truth)
-    assert "only 1 of 12 frames measured" in registration.strange(fit, 0.9, votes, supports, options)
+    assert registration.rejection_reason(fit, 0.9, votes, supports, config) is None, "the four others fit"
+    _, fit = alignment.measure_fit(surface, [blind] * 11 + seen[11:], truth)
+    assert "only 1 of 12 frames measured" in registration.rejection_reason(fit, 0.9, votes, supports, config)
     away = rigid.make(np.eye(3), np.array([0.0, 3.0, 0.0])) @ truth
-    gap, fit = alignment.measure_fit(place, seen, away)
+    gap, fit = alignment.measure_fit(surface, seen, away)
     assert (fit[np.isnan(gap)] == 0).all(), "depth that meets nothing is no fit"
-    assert "5 cm of the room" in registration.strange(fit, 0.9, votes, supports, options)
+    assert "5 cm of the room" in registration.rejection_reason(fit, 0.9, votes, supports, config)
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_was_not_measured_is_told_as_nothing(maps):
+def test_what_was_not_measured_is_null(maps):
     truth, nothing = walk(3), np.full(3, np.nan)
-    aligned = alignment.Aligned(truth, np.zeros((3, 6, 6)), [], nothing, nothing)
+    aligned = alignment.AlignedCameras(truth, np.zeros((3, 6, 6)), [], nothing, nothing)
     found = registration.Registered(
-        aligned, np.ones(3), registration.Roots.unseen(3), np.zeros(3), voting.none_cast(), np.zeros(0, bool), 1.0
+        aligned,
+        np.ones(3),
+        registration.Roots.unseen(3),
+        np.zeros(3),
+        voting.none_cast(),
+        np.zeros(0, bool),
+        1.0,
     )
     figures = pictures.status(found, np.arange(3.0), truth)["figures"]
     assert (figures["depth_gap_m"], figures["depth_fit"]) == (None, None)

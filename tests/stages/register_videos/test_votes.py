@@ -1,13 +1,16 @@
-"""Votes: the motion most of them share is found among wrong ones, and too little agreement is refused in words."""
+"""Votes: the motion most of them share is found among wrong ones, and too little agreement is refused in
+words.
+"""
 
 import numpy as np
 
-from pipeline.models.localizer import Hypothesis
-from pipeline.space import rigid
-from pipeline.space.relax import chain
-from pipeline.space.visual_odometry import Followed
-from stages.register_videos import following
+from pipeline.geometry import rigid
+from pipeline.localization.localizer import PoseHypothesis
+from pipeline.mapping.pose_optimization import odometry_factors
+from pipeline.mapping.visual_odometry import Odometry
+from stages.register_videos import odometry
 from stages.register_videos import votes as voting
+from stages.register_videos.config import VoteConfig
 from tests.stages.textured_room import UP, drifting, walk
 
 
@@ -18,7 +21,7 @@ def cast(truth, frames, wrong, rng) -> voting.Votes:
         pose = truth[frame] @ rigid.exp(rng.normal(0, 1, 6) * ([np.deg2rad(1.0)] * 3 + [0.02] * 3))
         if bad:
             pose = rigid.exp(np.concatenate([UP * rng.uniform(-3, 3), rng.uniform(-1, 1, 3)])) @ pose
-        answers.append(Hypothesis(pose, 0.4, 0.4 if bad else 0.8, np.zeros((0, 3)), np.zeros((0, 3))))
+        answers.append(PoseHypothesis(pose, 0.4, 0.4 if bad else 0.8, np.zeros((0, 3)), np.zeros((0, 3))))
     return voting.Votes(frames, answers, len(frames), answers[0])
 
 
@@ -26,44 +29,47 @@ def test_one_motion_is_found_among_wrong_votes():
     rng, truth = np.random.default_rng(0), walk(60)
     frames = np.arange(2, 60, 5)
     wrong = rng.random(len(frames)) < 0.5
-    odometry = drifting(truth, 4)
-    agreement = voting.agree(cast(truth, frames, wrong, rng), odometry, True, voting.VoteOptions())
-    carried = agreement.world_from_odometry @ odometry
-    assert np.rad2deg(rigid.rotation_angle(carried[:, :3, :3], truth[:, :3, :3])).max() < 3.0, "degrees, drift included"
+    drifted = drifting(truth, 4)
+    agreement = voting.agree(cast(truth, frames, wrong, rng), drifted, True, VoteConfig())
+    carried = agreement.world_from_odometry @ drifted
+    assert np.rad2deg(rigid.rotation_angle(carried[:, :3, :3], truth[:, :3, :3])).max() < 3.0, (
+        "degrees, drift included"
+    )
     assert np.linalg.norm(carried[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.12, "metres"
     assert (agreement.supports == ~wrong).mean() > 0.9
     assert agreement.world_from_odometry[1, 1] > 1 - 1e-9, "gravity stays"
 
 
 def test_scattered_votes_are_refused():
-    rng, truth, options = np.random.default_rng(1), walk(60), voting.VoteOptions()
+    rng, truth, options = np.random.default_rng(1), walk(60), VoteConfig()
     frames = np.arange(2, 60, 5)
     votes = cast(truth, frames, np.ones(len(frames), bool), rng)
     agreement = voting.agree(votes, drifting(truth, 4), True, options)
-    assert "agree" in voting.refusal(votes, agreement.supports if agreement else None, options)
+    assert "agree" in voting.rejection_reason(votes, agreement.supports if agreement else None, options)
     few = voting.Votes(frames[:1], votes.answers[:1], 12, votes.nearest)
-    assert "recognised" in voting.refusal(few, None, options)
+    assert "recognised" in voting.rejection_reason(few, None, options)
 
 
-def followed(truth, torn_at) -> Followed:
-    """Return odometry that drifts, with one tear."""
-    odometry, torn = drifting(truth, 5), np.zeros(len(truth), bool)
-    torn[torn_at] = True
-    odometry[torn_at:] = rigid.exp(np.array([0, 0.5, 0, 0.3, 0, 0.2])) @ odometry[torn_at:]
-    return Followed(odometry, torn, chain(np.arange(len(truth)) * 0.1, odometry, drift_rad_s=0.01, drift_m_s=0.01))
+def broken_odometry(truth, jump_at) -> Odometry:
+    """Return odometry that drifts, with one jump."""
+    poses, jumps = drifting(truth, 5), np.zeros(len(truth), bool)
+    jumps[jump_at] = True
+    poses[jump_at:] = rigid.exp(np.array([0, 0.5, 0, 0.3, 0, 0.2])) @ poses[jump_at:]
+    factors = odometry_factors(np.arange(len(truth)) * 0.1, poses, drift_rad_s=0.01, drift_m_s=0.01)
+    return Odometry(poses, jumps, factors)
 
 
-def test_without_odometry_votes_are_carried_along_the_pictures_and_outliers_dropped():
-    rng, truth, options = np.random.default_rng(2), walk(60), voting.VoteOptions()
+def test_without_odometry_votes_are_propagated_by_visual_odometry_and_outliers_dropped():
+    rng, truth, options = np.random.default_rng(2), walk(60), VoteConfig()
     frames = np.arange(2, 60, 5)
     wrong = np.isin(np.arange(len(frames)), [3, 8])
     votes = cast(truth, frames, wrong, rng)
     for index in np.flatnonzero(wrong):
         votes.answers[index].map_from_camera[:3, 3] += 3.0
-    pictures, time = followed(truth, 31), np.arange(60) * 0.1
-    supports = following.agree_nearby(votes, time, pictures, options)
+    motion, time = broken_odometry(truth, 31), np.arange(60) * 0.1
+    supports = odometry.consistent_votes(votes, time, motion, options)
     assert (supports == ~wrong).all()
-    poses = following.carry(votes, supports, time, pictures)
+    poses = odometry.propagate_votes(votes, supports, time, motion)
     error = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     assert np.median(error) < 0.04, "metres"
-    assert error.max() < 0.15, "metres, the tear included"
+    assert error.max() < 0.15, "metres, the jump included"

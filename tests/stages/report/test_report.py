@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import artifact, dag, qa
-from pipeline.cli import Task
-from pipeline.files import images
-from pipeline.videos import Video
+from pipeline.core.videos import Video
+from pipeline.data import images, qa
+from pipeline.workflow import artifact, dag
 from stages.evaluate.judging import LIMITS
-from stages.report import bars, collect, pages, remedies
-from stages.report.__main__ import Config, run
+from stages.report import bars, collect, pages, remedies, stage
 from stages.report.chapters import CHAPTERS
+from stages.report.config import Config
 
 ROOT = Path(__file__).parents[3]
 ROLES = (
@@ -27,20 +26,34 @@ ROLES = (
     ("heldout", "none"),
 )
 RNG = np.random.default_rng(0)
-VIDEOS = tuple(Video(f"v{number:03d}", "a.r3d", role, split, None) for number, (role, split) in enumerate(ROLES))
+VIDEOS = tuple(
+    Video(f"v{number:03d}", "a.r3d", role, split, None) for number, (role, split) in enumerate(ROLES)
+)
 
 
 def write_notes(build: Path, metrics: dict[str, float | None], reasons: dict[str, str]) -> dict[str, Path]:
     """Write one small artifact per chapter, or per recording, with a note and a picture."""
     rng = np.random.default_rng(0)
     for chapter in CHAPTERS:
-        videos = [video.id for video in VIDEOS if video.role in dag.NODES[chapter.artifact].roles] if chapter.per_video else [""]
+        videos = (
+            [video.id for video in VIDEOS if video.role in dag.NODES[chapter.artifact].roles]
+            if chapter.per_video
+            else [""]
+        )
         for video in videos:
             with artifact.create(
-                build / chapter.artifact / video, stage=dag.NODES[chapter.artifact].stage, config={"steps": 7}, inputs={}
+                build / chapter.artifact / video,
+                stage=dag.NODES[chapter.artifact].stage,
+                config={"steps": 7},
+                inputs={},
             ) as folder:
-                picture = qa.Picture("view", rng.integers(0, 255, (24, 80, 3), dtype=np.uint8), f"a view of {chapter.artifact}")
-                checks = [qa.Check("leak <script>", 2.0, "px", warn=1.0, fail=3.0), qa.Check("unmeasured", None)]
+                picture = qa.Picture(
+                    "view", rng.integers(0, 255, (24, 80, 3), dtype=np.uint8), f"a view of {chapter.artifact}"
+                )
+                checks = [
+                    qa.Check("leak <script>", 2.0, "px", warn=1.0, fail=3.0),
+                    qa.Check("unmeasured", None),
+                ]
                 qa.write(folder, good="sharp", bad="blurred", checks=checks, pictures=[picture])
                 if chapter.artifact == "evaluation":
                     (folder / "metrics.json").write_text(json.dumps(metrics))
@@ -48,10 +61,26 @@ def write_notes(build: Path, metrics: dict[str, float | None], reasons: dict[str
     return {chapter.artifact: build / chapter.artifact for chapter in CHAPTERS}
 
 
+def inputs_of(paths: dict[str, Path]) -> stage.Inputs:
+    """Return the artifacts as the stage takes them."""
+    several = {chapter.artifact for chapter in CHAPTERS if chapter.per_video}
+    return stage.Inputs(
+        **{
+            name: {folder.name: folder for folder in sorted(path.iterdir())} if name in several else path
+            for name, path in paths.items()
+        }
+    )
+
+
 def make_report(build: Path, out: Path) -> dict[str, str]:
     """Run the stage and return its pages."""
-    paths = write_notes(build, {"masks/iou_mean": 0.5, "reconstruction/lpips_all": None}, {"reconstruction/lpips_all": "no weights"})
-    run(Task("report", Config(name="toy"), out, None, VIDEOS, None, 1, None, paths, "cpu"))
+    paths = write_notes(
+        build,
+        {"masks/iou_mean": 0.5, "reconstruction/lpips_all": None},
+        {"reconstruction/lpips_all": "no weights"},
+    )
+    out.mkdir()
+    stage.run(inputs_of(paths), Config(name="toy", times=False), out, videos=VIDEOS)
     return {path.name: path.read_text() for path in out.glob("*.html")}
 
 
@@ -67,54 +96,120 @@ def test_every_note_is_shown_and_nothing_is_asked_for(tmp_path: Path) -> None:
         assert f'href="{chapter.artifact}.html"' in texts["index.html"]
     assert all(f'id="{video.id}"' in texts["frames.html"] for video in VIDEOS)
     assert "no weights" in texts["index.html"]
-    assert "(a.r3d, " in texts["index.html"] and "unmeasured not measured" in texts["index.html"]
-    assert "a.r3d" not in collect.about(VIDEOS[0], safe=True)
+    assert "a.r3d <span" in texts["index.html"] and "unmeasured not measured" in texts["index.html"]
+    assert collect.label(VIDEOS[0], safe=True).name == "v000"
+
+
+def chapter_report(artifact_name: str, light: str, *stands_on: str) -> collect.ChapterReport:
+    chapter = next(chapter for chapter in CHAPTERS if chapter.artifact == artifact_name)
+    note = collect.Note(None, collect.NO_LABEL, light, "", "", [], [])
+    return collect.ChapterReport(chapter, [note], {}, frozenset(stands_on))
+
+
+def test_a_verdict_is_the_worst_of_its_own_and_of_what_it_stands_on() -> None:
+    chapters = [
+        chapter_report("frames", "ok"),
+        chapter_report("masks", "fail", "frames"),
+        chapter_report("reconstruction", "warn", "masks"),
+        chapter_report("simulator", "ok", "reconstruction"),
+        chapter_report("evaluation", "ok", "frames"),
+    ]
+    judged = {each.chapter.artifact: each for each in collect.with_verdicts(chapters, {"evaluation": "fail"})}
+    assert {name: each.light for name, each in judged.items()} == {
+        "frames": "ok", "masks": "fail", "reconstruction": "fail", "simulator": "fail", "evaluation": "fail",
+    }  # fmt: skip
+    assert judged["simulator"].own_light == "ok"
+    assert [cause.artifact for cause in judged["simulator"].causes] == ["masks"], (
+        "the root, not what lies between"
+    )
+    assert judged["evaluation"].causes == (), "its own bars"
+
+
+def test_feet_that_slide_are_not_fine() -> None:
+    slide = {"behavior/ats/foot_slide_m_s": 0.14, "behavior/recorded/foot_slide_m_s": 0.04}
+    judged = bars.judge(slide, {})
+    assert [row.limit for row in judged if "foot" in row.bar.metric] == [pytest.approx(0.06)]
+    assert bars.worst(judged) == "fail" and bars.worst(bars.judge({}, {})) == "ok"
+
+
+def test_no_raw_key_reaches_a_reader(tmp_path: Path) -> None:
+    index = make_report(tmp_path / "first", tmp_path / "report")["index.html"]
+    shown = re.sub(r"<[^>]*>", " ", index)
+    assert "overlap (IoU), mean" in shown and "LPIPS, whole picture" in shown
+    assert not re.findall(r"\b[a-z]+_[a-z_]+\b", shown)
+    assert "prefers-color-scheme: dark" in index
 
 
 def test_same_notes_same_bytes(tmp_path: Path) -> None:
-    assert make_report(tmp_path / "first", tmp_path / "one") == make_report(tmp_path / "second", tmp_path / "two")
+    assert make_report(tmp_path / "first", tmp_path / "one") == make_report(
+        tmp_path / "second", tmp_path / "two"
+    )
 
 
-@pytest.mark.parametrize(("value", "verdict"), [(0.75, "ok"), (0.9, "ok"), (0.74, "fail"), (None, "none"), (float("nan"), "none")])
+@pytest.mark.parametrize(
+    ("value", "verdict"), [(0.75, "ok"), (0.9, "ok"), (0.74, "fail"), (None, "none"), (float("nan"), "none")]
+)
 def test_a_limit_may_be_met(value: float | None, verdict: str) -> None:
-    judged = {row.bar.metric: row for row in bars.judge({"masks/iou_mean": value}, {"masks/iou_mean": "no truth"})}
+    judged = {
+        row.bar.metric: row for row in bars.judge({"masks/iou_mean": value}, {"masks/iou_mean": "no truth"})
+    }
     assert judged["masks/iou_mean"].verdict == verdict
     assert (judged["masks/iou_mean"].reason == "no truth") == (verdict == "none")
 
 
 def test_a_rival_must_be_beaten_and_all_videos_reached() -> None:
     even = {"behavior/ats/goal_minde_m": 0.3, "behavior/stand_still/goal_minde_m": 0.3}
-    assert [row.verdict for row in bars.judge(even, {}) if row.bar.limit == "behavior/stand_still/goal_minde_m"] == ["fail"]
+    assert [
+        row.verdict for row in bars.judge(even, {}) if row.bar.limit == "behavior/stand_still/goal_minde_m"
+    ] == ["fail"]
     for found, verdict in ((5, "fail"), (6, "ok")):
         counts = {"registration/videos_registered": found, "registration/videos_total": 6}
-        assert [row.verdict for row in bars.judge(counts, {}) if row.bar.limit == "registration/videos_total"] == [verdict]
+        assert [
+            row.verdict for row in bars.judge(counts, {}) if row.bar.limit == "registration/videos_total"
+        ] == [verdict]
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "–"), (3.0, "3"), (0.0, "0"), (0.12345, "0.123"), (1234.5, "1234"), (0.00012, "1.2e-04"), (12.345, "12.3")],
+    [
+        (None, "–"),
+        (3.0, "3"),
+        (0.0, "0"),
+        (0.12345, "0.123"),
+        (1234.5, "1234"),
+        (0.00012, "1.2e-04"),
+        (12.345, "12.3"),
+    ],
 )
 def test_numbers_are_readable(value: float | None, text: str) -> None:
     assert pages.number(value) == text
 
 
 def test_a_safe_report_shows_no_view(tmp_path: Path) -> None:
-    """Neighbouring pixels of a blurred picture tell nothing of the original; drawn figures stay as they are."""
+    """Neighbouring pixels of a blurred picture tell nothing of the original; drawn figures stay as they
+    are.
+    """
     sharp = RNG.integers(0, 255, (96, 240, 3), dtype=np.uint8)
     for name in ("masks", "behavior"):
         folder = tmp_path / name
         (folder / "qa").mkdir(parents=True)
         qa.write(folder, good="", bad="", checks=[], pictures=[qa.Picture("view", sharp, "a view")])
         chapter = next(chapter for chapter in CHAPTERS if chapter.artifact == name)
-        shown = {safe: embedded(collect.told(chapter, {None: folder}, {}, {}, safe)) for safe in (False, True)}
-        detail = {safe: np.abs(np.diff(picture.astype(float), axis=1)).mean() for safe, picture in shown.items()}
+        shown = {
+            safe: embedded(collect.read_chapter(chapter, {None: folder}, {}, safe)) for safe in (False, True)
+        }
+        detail = {
+            safe: np.abs(np.diff(picture.astype(float), axis=1)).mean() for safe, picture in shown.items()
+        }
         assert shown[True].shape == sharp.shape
         assert detail[True] < 0.1 * detail[False] if name == "masks" else detail[True] == detail[False]
 
 
-def embedded(told: collect.Told) -> np.ndarray:
+def embedded(chapter: collect.ChapterReport) -> np.ndarray:
     """Decode the first picture of a chapter."""
-    return images.decode_color(base64.b64decode(told.notes[0].pictures[0].source.partition(",")[2]), "report")
+    return images.decode_color(
+        base64.b64decode(chapter.notes[0].pictures[0].source.partition(",")[2]), "report"
+    )
 
 
 def judged_checks() -> list[tuple[str, str]]:
@@ -123,10 +218,16 @@ def judged_checks() -> list[tuple[str, str]]:
     for chapter in CHAPTERS:
         for file in (ROOT / "stages" / dag.NODES[chapter.artifact].stage).glob("*.py"):
             for call in ast.walk(ast.parse(file.read_text())):
-                if not isinstance(call, ast.Call) or ast.unparse(call.func) not in ("Check", "qa.Check") or not call.args:
+                if (
+                    not isinstance(call, ast.Call)
+                    or ast.unparse(call.func) not in ("Check", "qa.Check")
+                    or not call.args
+                ):
                     continue
                 name = call.args[0].values[0] if isinstance(call.args[0], ast.JoinedStr) else call.args[0]
-                if isinstance(name, ast.Constant) and (len(call.args) > 3 or {key.arg for key in call.keywords} & {"warn", "fail"}):
+                if isinstance(name, ast.Constant) and (
+                    len(call.args) > 3 or {key.arg for key in call.keywords} & {"warn", "fail"}
+                ):
                     found.append((chapter.artifact, str(name.value)))
     return found
 
@@ -138,7 +239,13 @@ def test_every_threshold_has_a_remedy() -> None:
 
 
 def test_worries_come_with_a_remedy(tmp_path: Path) -> None:
-    known = {(chapter.artifact, begin) for chapter in CHAPTERS for begin in remedies.REMEDIES.get(chapter.artifact, {})}
-    assert len(known) == sum(len(table) for table in remedies.REMEDIES.values()), "no remedy for an artifact without a page"
+    known = {
+        (chapter.artifact, begin)
+        for chapter in CHAPTERS
+        for begin in remedies.REMEDIES.get(chapter.artifact, {})
+    }
+    assert len(known) == sum(len(table) for table in remedies.REMEDIES.values()), (
+        "no remedy for an artifact without a page"
+    )
     assert "walk once more" in remedies.remedy("scene_template", "keyframes registered by COLMAP")
     assert remedies.remedy("scene_template", "unheard of") == ""

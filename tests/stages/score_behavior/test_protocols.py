@@ -1,31 +1,36 @@
-"""Scores of a trial: the truth scores nothing, every family goes through both protocols that it knows, scenes are its own."""
+"""Scores of a trial: the truth scores nothing, every family goes through both protocols that it knows, scenes
+are its own.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.models import rivals
-from pipeline.models.behavior import BehaviorNets, Sampling, Scaling, channels_from_bones
-from pipeline.models.diffusion import STANDARD
-from pipeline.models.perception import world_from_ego
-from pipeline.models.planning import Observation, TorchNetworks
-from pipeline.models.predictors import Ats
-from pipeline.models.scenes import Scenes
-from pipeline.space import rigid
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.diffusion import STANDARD
+from pipeline.behavior.model import BehaviorNets, Scaling, channels_from_bones
+from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.planning import Observation, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.geometry import rigid
+from pipeline.rivals import samplers
+from pipeline.rivals.predictors import Ats
 from stages.score_behavior import approaches, protocols
-from stages.score_behavior.approaches import Approaches
-from stages.score_behavior.protocols import Effort
-from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
+from stages.score_behavior.approaches import RecordedApproaches
+from stages.score_behavior.config import Config
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 
-EFFORT = Effort(samples=4, trials=2, stride=20, plan_trials=1, plan_stride=30, seed=0)
-QUICK = Sampling(goal_steps=2, sequence_steps=2)
+EFFORT = Config(samples=4, trials=2, stride=20, plan_stride=30)
+QUICK = PlanSamplingConfig(goal_steps=2, sequence_steps=2)
 
 
 def untrained(architecture):
     channels = architecture.body_channels
-    scaling = Scaling(np.ones(3), np.ones(4), np.ones((3, architecture.future)), np.zeros(channels), np.ones(channels))
-    sampler = rivals.sampler_of(architecture, TorchNetworks(BehaviorNets(architecture)), STANDARD, scaling)
+    scaling = Scaling(
+        np.ones(3), np.ones(4), np.ones((3, architecture.future)), np.zeros(channels), np.ones(channels)
+    )
+    sampler = samplers.sampler_of(architecture, TorchNetworks(BehaviorNets(architecture)), STANDARD, scaling)
     return Ats(sampler, Scenes.of(room()), REST, architecture.ego, QUICK)
 
 
@@ -37,7 +42,10 @@ class Oracle:
         ego = rigid.inverse(world_from_ego(context.world_from_agent[:, -1], architecture.ego))
         root = ego[:, None] @ future.world_from_agent
         bones = channels_from_bones(future.agent_from_bone, REST)
-        self.path, self.body = root[..., :3, 3], np.concatenate([rigid.rotation_to_6d(root[..., :3, :3]), bones], -1)
+        self.path, self.body = (
+            root[..., :3, 3],
+            np.concatenate([rigid.rotation_to_6d(root[..., :3, :3]), bones], -1),
+        )
 
     def codes(self, observation, sampling, count=1):
         return count
@@ -62,7 +70,14 @@ def test_a_sampler_that_knows_the_future_makes_no_error_when_fed_with_it():
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"family": "gaussian"}, {"family": "one_stage"}, {"control": "concatenation"}, {"ego": "world"}, {"future": 40}],
+    [
+        {},
+        {"family": "gaussian"},
+        {"family": "one_stage"},
+        {"control": "concatenation"},
+        {"ego": "world"},
+        {"future": 40},
+    ],
     ids=lambda changes: "-".join(map(str, changes.values())) or "ats",
 )
 def test_every_method_goes_through_the_protocols_it_knows(changes):
@@ -95,7 +110,9 @@ def test_flight_is_counted_as_the_animal_does_it():
     poses = np.tile(np.eye(4), (2, 3, 64, 1, 1))
     poses[0, :, :, 2, 3] = steps
     observer = np.tile(np.array([0.0, 1.2, -1.0]), (2, 3, 8, 1))
-    met = Approaches(poses, np.tile(REST.astype(np.float32), (2, 3, 8, 1, 1, 1)), observer, Scenes.of(room()))
+    met = RecordedApproaches(
+        poses, np.tile(REST.astype(np.float32), (2, 3, 8, 1, 1, 1)), observer, Scenes.of(room())
+    )
     found = approaches.shares(untrained(ARCHITECTURE), met, 2, 0)
     assert found["flees/true"].tolist() == [1, 1, 1]
     assert found["flees/true_standing"].tolist() == [0, 0, 0]
@@ -108,21 +125,25 @@ def test_a_gaussian_draws_what_its_networks_tell():
             return np.zeros((len(past), 1), np.float32)
 
         def goal(self, x, t, condition):
-            return np.full_like(x, 2.0 if t[0] == rivals.MEAN else np.log(0.5))
+            return np.full_like(x, 2.0 if t[0] == samplers.MEAN_STEP else np.log(0.5))
 
         def path(self, x, t, condition, control, keep):
-            return np.ones_like(x) if t[0] == rivals.MEAN else np.full_like(x, -9)
+            return np.ones_like(x) if t[0] == samplers.MEAN_STEP else np.full_like(x, -9)
 
     scaling = Scaling(np.full(3, 0.3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6))
-    sampler = rivals.GaussianSampler(Told(), STANDARD, scaling)
-    codes = sampler.codes(behavior_observation(), Sampling(), 4000)
-    goals = sampler.goals(codes, Sampling(), np.random.default_rng(0))
+    sampler = samplers.GaussianSampler(Told(), STANDARD, scaling)
+    codes = sampler.codes(behavior_observation(), PlanSamplingConfig(), 4000)
+    goals = sampler.goals(codes, PlanSamplingConfig(), np.random.default_rng(0))
     drawn = scaling.scaled_goal(goals)
     np.testing.assert_allclose([drawn.mean(), drawn.std()], [2, 0.5], rtol=0.03)
-    course = sampler.course(behavior_observation(), Sampling(), np.random.default_rng(0), count=8)
+    course = sampler.course(behavior_observation(), PlanSamplingConfig(), np.random.default_rng(0), count=8)
     np.testing.assert_allclose(course[:, -1], scaling.goal(np.full((8, 3), 2.0)), atol=1e-5)
-    np.testing.assert_allclose(np.diff(course, axis=1), np.broadcast_to(course[:, -1:] / 56, (8, 55, 3)), atol=0.01)
+    np.testing.assert_allclose(
+        np.diff(course, axis=1), np.broadcast_to(course[:, -1:] / 56, (8, 55, 3)), atol=0.01
+    )
 
 
 def behavior_observation():
-    return Observation(np.zeros((1, 16, 64, 8, 64), np.float32), np.zeros((1, 24), np.float32), np.zeros((1, 72), np.float32))
+    return Observation(
+        np.zeros((1, 16, 64, 8, 64), np.float32), np.zeros((1, 24), np.float32), np.zeros((1, 72), np.float32)
+    )

@@ -30,7 +30,9 @@ def test_only_what_is_no_neighbouring_colour_is_another_one():
     now[20:34, 20:34] = [160, 40, 30]
     votes = Votes(*(np.zeros((60, 60)) for _ in range(3)), before.astype(np.float32))
     whole = slice(0, 60)
-    window = Window(whole, whole, np.clip(now, 0, 255).astype(np.uint8), np.zeros((60, 60, 3)), np.ones((60, 60), bool))
+    window = Window(
+        whole, whole, np.clip(now, 0, 255).astype(np.uint8), np.zeros((60, 60, 3)), np.ones((60, 60), bool)
+    )
     other = recolored(window, votes, np.ones((60, 60), bool))
     assert (other[23:31, 23:31] > 1).mean() > 0.9
     assert (other[:, 40:] > 1).mean() < 0.02

@@ -1,13 +1,15 @@
-"""Grounding DINO and SAM 2 as a backend: every frame a mask, in order, from whichever frame the animal was found in."""
+"""Grounding DINO and SAM 2 as a backend: every frame a mask, in order, from whichever frame the animal was
+found in.
+"""
 
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
+from pipeline.core.errors import InputError
 from stages.segment_agent.backends import foundation
-from stages.segment_agent.backends.foundation import Foundation
+from stages.segment_agent.config import FoundationConfig
 from stages.segment_agent.prompt import Prompt
-from tests.pipeline.models import small_checkpoints
+from tests.pipeline.backends import small_checkpoints
 
 
 class Clip:
@@ -29,24 +31,28 @@ class Clip:
 def options(tmp_path_factory):
     tracker = small_checkpoints.sam2(tmp_path_factory.mktemp("sam2"))
     detector = small_checkpoints.grounding_dino(tmp_path_factory.mktemp("grounding_dino"))
-    return Foundation(str(detector), str(tracker), looked_at=3, threshold=0.0)
+    return FoundationConfig(str(detector), str(tracker), threshold=0.0)
 
 
 def test_a_hint_is_followed_to_both_ends(options):
-    from pipeline.models.sam2 import Sam2
+    from pipeline.backends.sam2 import Sam2
 
     hint, clip = Prompt(4, (14.0, 14, 40, 36)), Clip()
     masks = list(foundation.segment(clip, hint, options, "cpu"))
     assert len(masks) == 9
     tracker = Sam2(options.tracker, "cpu")
     for order in (range(4, -1, -1), range(4, 9)):
-        for frame, (log_odds, presence) in zip(order, tracker.track(clip.color, order, np.array(hint.box_px)), strict=True):
-            np.testing.assert_array_equal(masks[frame].labels, foundation.labelled(log_odds, presence, options.unsure).labels)
+        for frame, (log_odds, presence) in zip(
+            order, tracker.track(clip.color, order, np.array(hint.box_px)), strict=True
+        ):
+            np.testing.assert_array_equal(
+                masks[frame].labels, foundation.labelled(log_odds, presence, foundation.UNSURE).labels
+            )
 
 
 def test_the_detector_takes_a_hint_s_place_or_says_that_it_found_nothing(options):
     assert len(list(foundation.segment(Clip(), None, options, "cpu"))) == 9
-    strict = Foundation(options.detector, options.tracker, threshold=1.0)
+    strict = FoundationConfig(options.detector, options.tracker, threshold=1.0)
     with pytest.raises(InputError, match="MSK-004.*a cat"):
         foundation.segment(Clip(), None, strict, "cpu")
 
@@ -69,4 +75,4 @@ def test_a_click_becomes_a_box():
 
 def test_missing_weights_are_told():
     with pytest.raises(InputError, match="MOD-001"):
-        foundation.segment(Clip(), Prompt(0, (1.0, 1, 9, 9)), Foundation(), "cpu")
+        foundation.segment(Clip(), Prompt(0, (1.0, 1, 9, 9)), FoundationConfig(), "cpu")

@@ -1,4 +1,4 @@
-"""Masks of small rendered recordings with truth: walking, resting, away; standing for the turnaround; hints."""
+"""Masks of small rendered recordings with truth: walking, resting, away; standing; hints."""
 
 import importlib.util
 from pathlib import Path
@@ -6,19 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.files import arrays, images
-from pipeline.files.clips import Clip
+from pipeline.core.errors import InputError
+from pipeline.data import images, npz
+from pipeline.data.clips import Clip
 from stages.segment_agent import masks, movers, prompt
-from stages.segment_agent.appearance import Example, Learning, learn
-from stages.segment_agent.masks import Options
-from stages.segment_agent.movers import Candidate, Hint, Mover
+from stages.segment_agent.appearance import Example, learn
+from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
+from stages.segment_agent.movers import Candidate, Hint
 
-_spec = importlib.util.spec_from_file_location("room_with_animal", Path(__file__).parent.parent / "room_with_animal.py")
+_spec = importlib.util.spec_from_file_location(
+    "room_with_animal", Path(__file__).parent.parent / "room_with_animal.py"
+)
 scenery = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(scenery)
 
-OPTIONS = Options(learning=Learning(examples=30, steps=60, batch=4, crop_px=96))
+OPTIONS = Config(learning=LearningConfig(examples=30, steps=60, batch=4, crop_px=96))
 """a short training: the pictures are small"""
 
 
@@ -41,7 +43,9 @@ def walk(tmp_path_factory):
 
 def test_a_walking_and_a_resting_animal_is_found(walk):
     found, truth = walk
-    scores = np.array([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)][:-3])
+    scores = np.array(
+        [iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)][:-3]
+    )
     assert scores.mean() > 0.8, "share; the pictures are 90 pixels wide"
     assert scores[12:28].mean() > 0.8, "at rest"
     assert scores.min() > 0.6
@@ -64,7 +68,9 @@ def test_masks_speak_three_values_at_colour_resolution(walk):
 def test_a_standing_animal_is_found_from_around(tmp_path):
     poses, agent = scenery.turnaround(30)
     found, truth = make(tmp_path / "frames", "turnaround", poses, agent, scenery.drifted(poses))
-    assert np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.85
+    assert (
+        np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.85
+    )
 
 
 def around(middle, radius_m, outward=False, count=12):
@@ -73,7 +79,10 @@ def around(middle, radius_m, outward=False, count=12):
     away = np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
     eyes = np.array(middle) + radius_m * away
     return np.stack(
-        [scenery.rigid.look_at(eye, eye + (side if outward else -side), scenery.UP) for eye, side in zip(eyes, away, strict=True)]
+        [
+            scenery.rigid.look_at(eye, eye + (side if outward else -side), scenery.UP)
+            for eye, side in zip(eyes, away, strict=True)
+        ]
     )
 
 
@@ -98,9 +107,11 @@ def test_a_recording_without_odometry_still_works(tmp_path):
     flow = tmp_path / "flow"
     flow.mkdir()
     forward = np.zeros((39, scenery.COLOR_SIZE[0] // 4, scenery.COLOR_SIZE[1] // 4, 2), np.float16)
-    arrays.save(flow / "flow_1_fw.npz", flow=forward)
+    npz.save(flow / "flow_1_fw.npz", flow=forward)
     found, truth = make(tmp_path / "frames", "turnaround", poses, agent, None, flow)
-    assert np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.6
+    assert (
+        np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.6
+    )
 
 
 def candidate(x, area=0.03):
@@ -111,24 +122,28 @@ def test_the_track_prefers_a_steady_mover_to_larger_flashes():
     steady = [[candidate(0.05 * i, 0.02)] for i in range(12)]
     for i in (3, 7):
         steady[i].append(candidate(3.0 + i, 0.04))
-    assert movers.track(steady, np.arange(12) * 0.1, Mover()).tolist() == [0] * 12
+    assert movers.track(steady, np.arange(12) * 0.1, AnimalConfig()).tolist() == [0] * 12
 
 
 def test_a_hint_decides_between_two_movers():
     both = [[candidate(0.0, 0.05), candidate(2.0, 0.02)] for _ in range(10)]
     time = np.arange(10) * 0.1
-    assert set(movers.track(both, time, Mover())) == {0}
-    assert set(movers.track(both, time, Mover(), Hint(4, np.array([2.0, 0.0, 0.0])))) == {1}
+    assert set(movers.track(both, time, AnimalConfig())) == {0}
+    assert set(movers.track(both, time, AnimalConfig(), Hint(4, np.array([2.0, 0.0, 0.0])))) == {1}
 
 
 def test_a_hint_holds_what_hangs_together_with_it():
-    """Seen, hidden for two frames, seen, gone for more than a second, and something else in its place or far away."""
+    """Seen, hidden for two frames, seen, gone for more than a second, and something else in its place or far
+    away.
+    """
     at = [0.1 * i for i in range(20)] + [None] * 12 + [2.0] * 8 + [4.0] * 10
     at[7:9] = [None, None]
     chosen, time = [None if x is None else candidate(x) for x in at], np.arange(len(at)) * 0.1
 
     def held(frame, x):
-        return np.flatnonzero(movers.connected(chosen, time, Mover(), Hint(frame, np.array([x, 0.0, 0.0])))).tolist()
+        return np.flatnonzero(
+            movers.connected(chosen, time, AnimalConfig(), Hint(frame, np.array([x, 0.0, 0.0])))
+        ).tolist()
 
     first = [*range(7), *range(9, 20)]
     assert held(3, 0.3) == held(8, 0.8) == first
@@ -156,16 +171,27 @@ def test_an_animal_that_never_moves_is_found_by_a_hint(tmp_path):
 
 
 def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
-    """The animal leaves for good after 1.6 s; something of its size and of another colour walks about all the time."""
+    """The animal leaves for good after 1.6 s; something of its size and of another colour walks about all the
+    time.
+    """
     poses, agent = scenery.session()
-    other = np.stack([scenery.rigid.exp(np.array([0, 0, 0, 0.75, 0.22, z])) for z in np.linspace(-0.9, 0.2, 40)])
-    agent = np.stack([scenery.rigid.exp(np.array([0, np.pi / 2, 0, x, 0.22, -0.2])) for x in np.linspace(-0.6, 0.1, 40)])
+    other = np.stack(
+        [scenery.rigid.exp(np.array([0, 0, 0, 0.75, 0.22, z])) for z in np.linspace(-0.9, 0.2, 40)]
+    )
+    agent = np.stack(
+        [scenery.rigid.exp(np.array([0, np.pi / 2, 0, x, 0.22, -0.2])) for x in np.linspace(-0.6, 0.1, 40)]
+    )
     agent[16:] = np.nan
     truth = scenery.record(tmp_path / "frames", poses, agent, poses, world_from_other=other)
     clip, hint = Clip.open(tmp_path / "frames"), click(truth.masks[8], 8)
     found, _ = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0))
     found = list(found)
-    assert np.mean([iou(mask.labels == 255, true) for mask, true in zip(found[:16], truth.masks[:16], strict=True)]) > 0.6
+    assert (
+        np.mean(
+            [iou(mask.labels == 255, true) for mask, true in zip(found[:16], truth.masks[:16], strict=True)]
+        )
+        > 0.6
+    )
     assert np.mean([mask.visible for mask in found[16:]]) < 0.2, "share of the frames without it"
 
 
@@ -206,11 +232,15 @@ def test_a_click_finds_the_surface(tmp_path):
     clip = Clip.open(tmp_path / "frames")
     (tmp_path / "hint.toml").write_text("frame = 1\nclick = [45, 60]")
     place = prompt.position(prompt.parse(tmp_path / "hint.toml", clip), clip, poses)
-    assert np.linalg.norm(place - agent[0, :3, 3]) < 0.2, "the middle of the picture shows the body, 14 cm thick"
+    assert np.linalg.norm(place - agent[0, :3, 3]) < 0.2, (
+        "the middle of the picture shows the body, 14 cm thick"
+    )
 
 
 def test_looks_are_learnt_in_spite_of_frames_labelled_wrongly():
-    """A striped thing before noise; every seventh frame calls it room, as when first masks miss an animal at rest."""
+    """A striped thing before noise; every seventh frame calls it room, as when first masks miss an animal at
+    rest.
+    """
     rng, examples, truths = np.random.default_rng(1), [], []
     for frame in range(28):
         color = rng.integers(90, 130, (96, 96, 3)).astype(np.uint8)
@@ -220,7 +250,9 @@ def test_looks_are_learnt_in_spite_of_frames_labelled_wrongly():
         truth[top : top + 30, left : left + 30] = True
         truths.append(truth)
         elsewhere = np.roll(truth, 45, axis=1) & ~truth
-        examples.append(Example(color, np.where(elsewhere if frame % 7 == 0 else truth, 255, 0).astype(np.uint8)))
+        examples.append(
+            Example(color, np.where(elsewhere if frame % 7 == 0 else truth, 255, 0).astype(np.uint8))
+        )
     network = learn(examples, OPTIONS.learning, np.random.default_rng(0))
     again = learn(examples, OPTIONS.learning, np.random.default_rng(0))
     for example, truth in list(zip(examples, truths, strict=True))[::7]:
@@ -234,4 +266,6 @@ def test_a_recording_without_depth_asks_for_a_hint(tmp_path):
     for path in (tmp_path / "frames" / "depth").iterdir():
         images.write_depth(path, np.zeros(scenery.DEPTH_SIZE))
     with pytest.raises(InputError, match="MSK-004"):
-        masks.segment(Clip.open(tmp_path / "frames"), tmp_path, "session", None, OPTIONS, np.random.default_rng(0))
+        masks.segment(
+            Clip.open(tmp_path / "frames"), tmp_path, "session", None, OPTIONS, np.random.default_rng(0)
+        )

@@ -4,39 +4,45 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline import config
-from pipeline.errors import InputError
-from pipeline.files import arrays
-from pipeline.models import journeys
-from pipeline.models.contacts import find_contacts
-from pipeline.models.longterm import PoseNet, RouteNet, Sizes, StaticBody
-from pipeline.models.longterm_examples import fitted_poses
-from pipeline.models.motion_optimization import Settings
-from pipeline.models.motion_synthesis import LongTerm, habits_of
-from pipeline.models.short_motions import Moving
-from pipeline.models.subgoals import Subgoal
+from pipeline.core import config
+from pipeline.core.errors import InputError
+from pipeline.data import npz
+from pipeline.longterm import journeys
+from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
+from pipeline.longterm.contacts import find_contact_vertices
+from pipeline.longterm.examples import fit_pose_space
+from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
+from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
+from pipeline.longterm.short_motions import BodyMotion
+from pipeline.longterm.subgoals import Subgoal
 from stages.simulate import journey_files, subgoal_file, takes
-from tests.pipeline.models import strider
+from tests.pipeline.longterm import strider
 
-SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
-SETTINGS = Settings(steps=15, vertices=30)
+SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
+SETTINGS = MotionOptimizationConfig(steps=15, vertices=30)
 
 
 @pytest.fixture(scope="module")
 def world():
-    lives = strider.lives()
+    dataset = strider.dataset()
     torch.manual_seed(0)
-    poses = fitted_poses(lives.stretches, lives.body.agent_from_bone_rest, SIZES.pose)
-    contacts = find_contacts(lives.body, list(lives.stretches), lives.distances)
-    habits = habits_of(list(lives.stretches), list(lives.scenes) * len(lives.stretches))
+    poses = fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, SIZES.pose)
+    contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
+    motion_prior = measure_motion_prior(
+        list(dataset.stretches), list(dataset.scenes) * len(dataset.stretches)
+    )
     nets = (net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES)))
-    return journeys.World(LongTerm(SIZES, poses, contacts, habits, *nets), lives.body, lives.scenes[0])
+    return journeys.LongTermWorld(
+        LongTerm(SIZES, poses, contacts, motion_prior, *nets), dataset.body, dataset.scenes[0]
+    )
 
 
 def read(path, text):
     path.write_text(text)
     tables = subgoal_file.tables(config.read_table(path), path)
-    return subgoal_file.subgoals([config.from_table(subgoal_file.Written, each, where=str(path)) for each in tables], path)
+    return subgoal_file.subgoals(
+        [config.from_table(subgoal_file.SubgoalEntry, each, where=str(path)) for each in tables], path
+    )
 
 
 def test_sub_goals_are_read(tmp_path):
@@ -78,8 +84,10 @@ def test_a_journey_is_made_and_written(world, tmp_path):
     np.testing.assert_allclose(made.subgoals_world[:, [0, 2]], [[-1.2, -1], [1.2, -1]], atol=1e-6)
     assert made.arrival_s[-1] == pytest.approx(made.timestamp_s[-1])
     journey_files.write_journey(tmp_path, made, world.body)
-    journey_files.write_frames(tmp_path, made.moving[:30], world.body, strider.room(), rate_hz=10.0, width=64, height=48)
-    take = arrays.load(tmp_path / "take.npz")
+    journey_files.write_frames(
+        tmp_path, made.moving[:30], world.body, strider.room(), rate_hz=10.0, width=64, height=48
+    )
+    take = npz.load(tmp_path / "take.npz")
     assert take["agent_from_bone"].shape == (len(made.moving), 5, 4, 4)
     about = json.loads((tmp_path / "take.json").read_text())
     assert about["rate_hz"] == 30 and len(about["subgoals_world"]) == 2 and about["after"]["contact"] <= 1
@@ -103,8 +111,10 @@ def test_a_take_of_the_behaviour_model_becomes_physical(world):
     walk = strider.striding(np.array([[1.0, 0, -1.2], [1.0, 0, 1.2]]), 4.0)[::3]
     root = walk.world_from_agent.copy()
     root[:, 1, 3] -= 0.03  # all of it is in the floor
-    given = Moving(root, walk.agent_from_bone)
-    done, before, after = journeys.physical(world, np.arange(len(root)) / 10, given, Settings(steps=60, vertices=30))
+    given = BodyMotion(root, walk.agent_from_bone)
+    done, before, after = journeys.refine_at_rate(
+        world, np.arange(len(root)) / 10, given, MotionOptimizationConfig(steps=60, vertices=30)
+    )
     assert after.penetration_m < 0.5 * before.penetration_m
     assert done.world_from_agent.shape == root.shape
     assert np.abs(done.world_from_agent[:, [0, 2], 3] - root[:, [0, 2], 3]).max() < 0.1
@@ -114,18 +124,20 @@ def test_recorded_motion_becomes_physical(world, tmp_path):
     walk = strider.striding(np.array([[1.0, 0, -1.2], [1.0, 0, 1.2]]), 2.0)
     root = walk.world_from_agent.copy()
     root[:, 1, 3] -= 0.03
-    made = journeys.stayed(world, Moving(root, walk.agent_from_bone), Settings(steps=40, vertices=30))
+    made = journeys.refine_motion(
+        world, BodyMotion(root, walk.agent_from_bone), MotionOptimizationConfig(steps=40, vertices=30)
+    )
     assert made.after.penetration_m < 0.5 * made.before.penetration_m
     journey_files.write_journey(tmp_path, made, world.body)
     assert json.loads((tmp_path / "take.json").read_text())["subgoals_world"] == []
-    left = journeys.stayed(world, walk, None)
+    left = journeys.refine_motion(world, walk, None)
     assert left.moving is walk and left.before == left.after
 
 
 def test_a_model_of_another_version_is_told(world, tmp_path):
     world.model.save(tmp_path)
     document = json.loads((tmp_path / "longterm.json").read_text())
-    assert takes._loaded(LongTerm.load, tmp_path).habits == world.model.habits
-    (tmp_path / "longterm.json").write_text(json.dumps({**document, "habits": {"gait_m": 1}}))
+    assert takes._loaded(LongTerm.load, tmp_path).motion_prior == world.model.motion_prior
+    (tmp_path / "longterm.json").write_text(json.dumps({**document, "motion_prior": {"gait_m": 1}}))
     with pytest.raises(InputError, match="ART-007.*gait_m"):
         takes._loaded(LongTerm.load, tmp_path)

@@ -5,22 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.errors import InputError
-from pipeline.files import arrays, glb
-from pipeline.models.behavior import BehaviorNets, Sampling, Scaling
-from pipeline.models.diffusion import Schedule
-from pipeline.models.planning import Sampler, TorchNetworks
-from pipeline.models.scenes import Scenes
-from pipeline.models.simulator import Chaining, Flock, Frames, Simulator, faded
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh
+from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import BehaviorNets, Scaling
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import AnimalBatch, PoseFrames, Simulator, blended_frames
+from pipeline.core.errors import InputError
+from pipeline.data import glb, npz
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
 from stages.simulate import takes
-from stages.simulate.__main__ import Config
-from stages.simulate.live import Live, Look
+from stages.simulate.config import Config
+from stages.simulate.inputs import Inputs
+from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
 from stages.train_behavior.export import write_contract
-from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 
 
 def scaling():
@@ -39,14 +41,14 @@ def scaling():
 def simulator():
     volume = room()
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
-    sampling = Sampling(goal_steps=4, sequence_steps=2)
+    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
     return Simulator(
         sampler,
         wandering(),
         Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
         "yaw",
         sampling=sampling,
-        chaining=Chaining(candidates=3),
+        chaining=ReplanningConfig(candidates=3),
     )
 
 
@@ -79,24 +81,36 @@ def test_plans_are_followed_until_they_end_or_the_observer_moves(simulator):
     flock, person = simulator.flock, np.array([[0.5, 1.3, 0.5], [0.5, 1.3, 0.5]])
 
     def begin():
-        flock.begin(replace(context, video=None, observer_world=np.repeat(person[:, None], 8, 1)), np.random.default_rng(0))
+        flock.begin(
+            replace(context, video=None, observer_world=np.repeat(person[:, None], 8, 1)),
+            np.random.default_rng(0),
+        )
         return flock.goal.copy()
 
     first, changed = begin(), []
     for _ in range(60):
         flock.step(person)
         changed.append((flock.goal != first).any(1))
-    assert [int(np.argmax(of_one)) for of_one in np.array(changed).T] == [52, 52], "56 frames, of which 4 fade"
+    assert [int(np.argmax(of_one)) for of_one in np.array(changed).T] == [52, 52], (
+        "56 frames, of which 4 fade"
+    )
     first, near = begin(), person + np.array([[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]])
     for frame in range(12):
         flock.step(near)
         assert (flock.goal != first).any(1).tolist() == [frame >= 8, False], frame
     begin()
-    flock.reconsider()
+    flock.invalidate_plans()
     for _ in range(9):
         flock.step(person)
     assert (flock.goal != first).any(1).all()
-    blind = Flock(flock.sampler, flock.scenes, flock.rest, "yaw", sampling=replace(flock.sampling, observer=False), chaining=Chaining())
+    blind = AnimalBatch(
+        flock.sampler,
+        flock.scenes,
+        flock.rest,
+        "yaw",
+        sampling=replace(flock.sampling, observer=False),
+        chaining=ReplanningConfig(),
+    )
     blind.begin(replace(context, video=None), np.random.default_rng(0))
     first = blind.goal.copy()
     for frame in range(40):
@@ -108,7 +122,9 @@ def test_goals_and_paths_are_not_told_sampled_bones(simulator):
     context, _ = simulator.data.windows(np.array([0, 40]))
     lives = []
     for bend in (0.0, 0.3):
-        bones = context.agent_from_bone @ rigid.make(rigid.rotation_from_vector(np.array([bend, 0, 0])), np.zeros(3))
+        bones = context.agent_from_bone @ rigid.make(
+            rigid.rotation_from_vector(np.array([bend, 0, 0])), np.zeros(3)
+        )
         simulator.flock.begin(replace(context, video=None, agent_from_bone=bones), np.random.default_rng(0))
         lives.append(simulator.flock.plan)
     np.testing.assert_array_equal(lives[0].root[..., :3, 3], lives[1].root[..., :3, 3])
@@ -116,15 +132,15 @@ def test_goals_and_paths_are_not_told_sampled_bones(simulator):
 
 
 def test_fading_leaves_the_old_plan_and_reaches_the_new_one():
-    old = Frames(np.tile(np.eye(4), (10, 1, 1)), np.zeros((10, 6)))
+    old = PoseFrames(np.tile(np.eye(4), (10, 1, 1)), np.zeros((10, 6)))
     turned = rigid.make(rigid.rotation_from_vector(np.array([0, 1.0, 0])), np.array([1.0, 0, 0]))
-    new = Frames(np.tile(turned, (10, 1, 1)), np.ones((10, 6)))
-    blend = faded(old, new, 4)
+    new = PoseFrames(np.tile(turned, (10, 1, 1)), np.ones((10, 6)))
+    blend = blended_frames(old, new, 4)
     np.testing.assert_allclose(blend.root[:5, 0, 3], [0.2, 0.4, 0.6, 0.8, 1.0])
     angles = rigid.rotation_angle(np.eye(3), blend.root[:5, :3, :3])
     np.testing.assert_allclose(angles, [0.2, 0.4, 0.6, 0.8, 1.0], atol=1e-9)
     np.testing.assert_allclose(blend.bones[:, 0], [0.2, 0.4, 0.6, 0.8] + [1.0] * 6)
-    assert faded(Frames(old.root[:0], old.bones[:0]), new, 4) is new
+    assert blended_frames(PoseFrames(old.root[:0], old.bones[:0]), new, 4) is new
 
 
 @pytest.mark.parametrize("script", ["away", "still", "approach", "circle"])
@@ -148,11 +164,16 @@ def test_take_is_written_completely(simulator, tmp_path):
 
 
 def homes(folder, seen=None, architecture=ARCHITECTURE):
-    """Write a model and recordings in a home each, 20 m apart, beside observers who are not there, or at `seen`."""
+    """Write a model and recordings in a home each, 20 m apart, beside observers who are not there, or at
+    `seen`.
+    """
     data = wandering()
     for number, (name, track) in enumerate(data.trajectories.items()):
         there = np.array([20.0 * number, 0, 0])
-        person = np.tile(rigid.make(np.eye(3), np.array([1000.0, 0, 0]) if seen is None else there + seen), (len(track.valid), 1, 1))
+        person = np.tile(
+            rigid.make(np.eye(3), np.array([1000.0, 0, 0]) if seen is None else there + seen),
+            (len(track.valid), 1, 1),
+        )
         shifted = rigid.make(np.eye(3), there) @ track.world_from_agent
         data.trajectories[name] = replace(track, world_from_agent=shifted, world_from_camera=person)
     for artifact in ("behavior_data/volumes", "behavior"):
@@ -162,26 +183,32 @@ def homes(folder, seen=None, architecture=ARCHITECTURE):
         bare = room()
         volume = replace(bare, origin=bare.origin + np.array([20.0 * number, 0, 0]))
         known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
-        arrays.save(folder / f"behavior_data/volumes/{name}.npz", **vars(volume), **known)
+        npz.save(folder / f"behavior_data/volumes/{name}.npz", **vars(volume), **known)
     write_contract(folder / "behavior", BehaviorNets(architecture), architecture, scaling(), Schedule(), REST)
-    return {name: folder / name for name in ("behavior", "behavior_data")}
+    return Inputs(behavior_data=folder / "behavior_data", behavior=folder / "behavior")
 
 
 @pytest.mark.parametrize("seen", [None, [0.5, 1.6, -0.5]])
 def test_a_take_in_one_of_several_homes_has_its_observer_there(tmp_path, seen):
-    few = Sampling(goal_steps=4, sequence_steps=2)
-    settings = Config(seconds=1.0, observer="still", seed=3, sampling=few, chaining=Chaining(candidates=2))
+    settings = Config(seconds=1.0, observer="still", seed=3, goal_steps=4, sequence_steps=2)
     takes.of_behavior(homes(tmp_path, seen), settings, "cpu").write(tmp_path)
-    take = arrays.load(tmp_path / "take.npz")
+    take = npz.load(tmp_path / "take.npz")
     begin, person = take["world_from_agent"][0, :3, 3], take["observer_world"]
     assert abs(begin[0] - 20) < 2, "metres: the second home"
-    np.testing.assert_allclose(person, np.tile(begin + takes.BESIDE_M if seen is None else np.add(seen, [20, 0, 0]), (11, 1)))
+    np.testing.assert_allclose(
+        person,
+        np.tile(
+            begin + takes.DEFAULT_OBSERVER_OFFSET_M if seen is None else np.add(seen, [20, 0, 0]), (11, 1)
+        ),
+    )
     assert take["blocked"].mean() < 0.9, "it lives in its own home: elsewhere all is blocked"
 
 
 def test_models_whose_plans_cannot_be_chained_are_refused(tmp_path):
     with pytest.raises(InputError, match="SIM-006.*gaussian"):
-        takes.of_behavior(homes(tmp_path, architecture=replace(ARCHITECTURE, family="gaussian")), Config(), "cpu")
+        takes.of_behavior(
+            homes(tmp_path, architecture=replace(ARCHITECTURE, family="gaussian")), Config(), "cpu"
+        )
 
 
 def look():
@@ -189,12 +216,12 @@ def look():
     mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), None)
     joints = np.tile(np.arange(4, dtype=np.uint8) % 3, (3, 1))
     skin = glb.Skin(joints, np.full((3, 4), 0.25, np.float32), np.tile(np.eye(4), (3, 1, 1)), ("a", "b", "c"))
-    return Look(mesh, skin, glb.static(mesh, "room"))
+    return LiveAppearance(mesh, skin, glb.static(mesh, "room"))
 
 
 def test_live_view_answers_and_keeps_its_take(simulator):
     pytest.importorskip("viser")
-    here = Live(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8117)
+    here = LiveView(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8117)
     with urllib.request.urlopen(f"http://127.0.0.1:{here.port}", timeout=10) as answer:
         assert answer.status == 200
     here.interactivity.value = 0.25
@@ -207,7 +234,7 @@ def test_live_view_answers_and_keeps_its_take(simulator):
 
 def test_starting_again_in_the_middle_of_a_step_keeps_the_take_whole(simulator):
     pytest.importorskip("viser")
-    here = Live(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8119)
+    here = LiveView(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8119)
     step, clicked = simulator.step, []
 
     def stepping(position):
@@ -226,4 +253,4 @@ def test_starting_again_in_the_middle_of_a_step_keeps_the_take_whole(simulator):
 def test_live_view_says_what_it_needs(simulator, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match="make extras"):
-        Live(simulator, look(), np.zeros(3), seed=1, port=8118)
+        LiveView(simulator, look(), np.zeros(3), seed=1, port=8118)

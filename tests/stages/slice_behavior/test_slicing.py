@@ -3,61 +3,76 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline import artifact
-from pipeline.cli import Task
-from pipeline.errors import InputError
-from pipeline.files import arrays
-from pipeline.models.trajectories import TEST, TRAIN, window_starts
-from pipeline.space import rigid
-from pipeline.videos import Video
+from pipeline.behavior.trajectories import TEST, TRAIN, window_starts
+from pipeline.core.errors import InputError
+from pipeline.core.videos import Video
+from pipeline.data import npz
+from pipeline.geometry import rigid
 from stages.slice_behavior import pictures
-from stages.slice_behavior.__main__ import Config, run
-from stages.slice_behavior.gridding import Motion, trajectory_from_motion
+from stages.slice_behavior.config import Config
+from stages.slice_behavior.gridding import ReconstructedMotion, trajectory_from_motion
+from stages.slice_behavior.stage import Inputs, run
 from stages.slice_behavior.windows import allowed_voxels, slice_windows
-from tests.pipeline.models.wandering import REST, room, wander
+from tests.pipeline.behavior.wandering import REST, room, wander
 
 OPTIONS = {"min_confidence": 0.5, "max_gap_s": 0.6, "smooth_s": 0.0}
 
 
-def jittered(rng: np.random.Generator, seconds: float = 20.0) -> Motion:
+def jittered(rng: np.random.Generator, seconds: float = 20.0) -> ReconstructedMotion:
     """A steady walk along x with a steady turn, seen at uneven times."""
     time = np.arange(0, seconds, 0.1) + rng.uniform(-0.03, 0.03, round(seconds * 10))
     time -= time[0]
     turn = rigid.rotation_from_vector(np.stack([0 * time, 0.2 * time, 0 * time], axis=-1))
     agent = rigid.make(turn, np.stack([0.1 * time, 0 * time + 0.2, 0 * time], axis=-1))
     bones = np.broadcast_to(REST, (len(time), *REST.shape)).copy()
-    camera = rigid.make(np.broadcast_to(np.eye(3), turn.shape), np.stack([0.05 * time, 0 * time + 1, 0 * time], axis=-1))
-    return Motion(time, camera, agent, bones, np.ones(len(time)), np.ones(len(time), bool))
+    camera = rigid.make(
+        np.broadcast_to(np.eye(3), turn.shape), np.stack([0.05 * time, 0 * time + 1, 0 * time], axis=-1)
+    )
+    return ReconstructedMotion(time, camera, agent, bones, np.ones(len(time)), np.ones(len(time), bool))
 
 
 def test_uneven_times_become_even_without_error():
     trajectory = trajectory_from_motion(jittered(np.random.default_rng(0)), **OPTIONS)
     np.testing.assert_allclose(np.diff(trajectory.timestamp_s), 0.1, atol=1e-9)
     assert trajectory.valid.all()
-    np.testing.assert_allclose(trajectory.world_from_agent[:-1, 0, 3], 0.1 * trajectory.timestamp_s[:-1], atol=1e-9)
-    np.testing.assert_allclose(trajectory.world_from_camera[:-1, 0, 3], 0.05 * trajectory.timestamp_s[:-1], atol=1e-9)
+    np.testing.assert_allclose(
+        trajectory.world_from_agent[:-1, 0, 3], 0.1 * trajectory.timestamp_s[:-1], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        trajectory.world_from_camera[:-1, 0, 3], 0.05 * trajectory.timestamp_s[:-1], atol=1e-9
+    )
 
 
 def test_only_short_gaps_are_bridged_and_doubtful_frames_are_gaps():
     motion = jittered(np.random.default_rng(0))
-    agent, confidence, visible = motion.world_from_agent.copy(), motion.confidence.copy(), motion.agent_visible.copy()
+    agent, confidence, visible = (
+        motion.world_from_agent.copy(),
+        motion.confidence.copy(),
+        motion.agent_visible.copy(),
+    )
     agent[50:53] = np.nan
     confidence[100:120] = 0.1
     visible[150:153] = visible[160:175] = False
     holed = replace(motion, world_from_agent=agent, confidence=confidence, agent_visible=visible)
     trajectory = trajectory_from_motion(holed, **OPTIONS)
     assert trajectory.valid[45:60].all()
-    np.testing.assert_allclose(trajectory.world_from_agent[45:60, 0, 3], 0.1 * trajectory.timestamp_s[45:60], atol=1e-9)
+    np.testing.assert_allclose(
+        trajectory.world_from_agent[45:60, 0, 3], 0.1 * trajectory.timestamp_s[45:60], atol=1e-9
+    )
     assert not trajectory.valid[101:119].any()
     assert trajectory.valid[122:159].all()
-    assert not trajectory.valid[161:174].any(), "what nobody saw for so long is no motion, whatever stands there"
+    assert not trajectory.valid[161:174].any(), (
+        "what nobody saw for so long is no motion, whatever stands there"
+    )
     assert trajectory.valid[177:].all()
     assert np.isfinite(trajectory.world_from_agent).all()
 
 
 def test_an_agent_never_seen_gives_no_valid_time():
     motion = jittered(np.random.default_rng(0))
-    trajectory = trajectory_from_motion(replace(motion, world_from_agent=motion.world_from_agent * np.nan), **OPTIONS)
+    trajectory = trajectory_from_motion(
+        replace(motion, world_from_agent=motion.world_from_agent * np.nan), **OPTIONS
+    )
     assert not trajectory.valid.any()
     assert np.isfinite(trajectory.world_from_agent).all()
 
@@ -68,7 +83,9 @@ def test_smoothing_takes_jitter_and_keeps_rotations():
     noisy = clean @ rigid.exp(rng.standard_normal((len(clean), 6)) * 0.02)
     smooth = rigid.smoothed(noisy, 1.0)
     np.testing.assert_allclose(np.linalg.det(smooth[:, :3, :3]), 1, atol=1e-9)
-    error = [np.linalg.norm(track[5:-5, :3, 3] - clean[5:-5, :3, 3], axis=-1).mean() for track in (smooth, noisy)]
+    error = [
+        np.linalg.norm(track[5:-5, :3, 3] - clean[5:-5, :3, 3], axis=-1).mean() for track in (smooth, noisy)
+    ]
     assert error[0] < 0.7 * error[1]
 
 
@@ -92,16 +109,24 @@ def test_too_short_a_recording_gives_no_window():
 
 def test_rows_too_far_apart_are_told_how_to_be_bridged(tmp_path):
     still = np.tile(np.eye(4), (60, 1, 1))
-    with artifact.create(tmp_path / "trajectories/v000", stage="read_trajectories", config={}, inputs={}) as folder:
-        motion = {"world_from_agent": still, "world_from_camera": still, "agent_from_bone": still[:, None], "confidence": np.ones(60)}
-        arrays.save(folder / "motion.npz", timestamp_s=np.arange(60.0), agent_visible=np.ones(60, bool), **motion)
-        arrays.save(folder / "skin.npz", agent_from_bone_rest=still[:1])
-        arrays.save(folder / "feature_volume.npz", **vars(room()))
-    videos, paths = (Video("v000", "a.csv", "session", "train", None),), {"trajectories": tmp_path / "trajectories"}
-    task = Task("slice_behavior", Config(), tmp_path / "behavior_data", None, videos, None, 1, None, paths, "cpu")
+    folder = tmp_path / "v000"
+    folder.mkdir()
+    motion = {
+        "world_from_agent": still,
+        "world_from_camera": still,
+        "agent_from_bone": still[:, None],
+        "confidence": np.ones(60),
+    }
+    npz.save(folder / "motion.npz", timestamp_s=np.arange(60.0), agent_visible=np.ones(60, bool), **motion)
+    npz.save(folder / "skin.npz", agent_from_bone_rest=still[:1])
+    npz.save(folder / "feature_volume.npz", **vars(room()))
+    videos = (Video("v000", "a.csv", "session", "train", None),)
+    inputs, out = Inputs(trajectories={"v000": folder}), tmp_path / "behavior_data"
+    out.mkdir()
     with pytest.raises(InputError, match="BEH-001(.|\n)*max_gap_s"):
-        run(task)
-    run(replace(task, config=Config(max_gap_s=1.5)))
+        run(inputs, Config(), out, videos=videos)
+    run(inputs, Config(max_gap_s=1.5), out, videos=videos)
+    assert (out / "windows.npz").is_file() and (out / "volume.npz").is_file()
 
 
 def test_a_day_of_windows_is_judged_by_some_of_them():

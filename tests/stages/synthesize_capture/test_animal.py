@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 from stages.synthesize_capture import animal, gait
 from stages.synthesize_capture.session import AnimalCourse
 
@@ -12,7 +12,11 @@ FEET = [animal.INDEX[name] for name in gait.FEET]
 
 
 def test_surface_is_closed_and_one():
-    surface = trimesh.Trimesh(animal.grow(np.random.default_rng(1)).vertices, animal.grow(np.random.default_rng(1)).faces, process=False)
+    surface = trimesh.Trimesh(
+        animal.grow(np.random.default_rng(1)).vertices,
+        animal.grow(np.random.default_rng(1)).faces,
+        process=False,
+    )
     assert surface.is_watertight
     assert surface.body_count == 1
     assert surface.volume > 0
@@ -42,9 +46,14 @@ def test_planted_feet_do_not_slide():
 def test_bones_are_rigid_and_legs_keep_their_length():
     motion = gait.poses(_straight(0.8, posture=(0.5, 0.0, 0.0)), np.linspace(0.5, 3.0, 60))
     rotation = motion.agent_from_bone[..., :3, :3]
-    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-6)
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-6
+    )
     for upper, lower in (("left upper arm", "left forearm"), ("right thigh", "right shank")):
-        gap = motion.agent_from_bone[:, animal.INDEX[upper], :3, 3] - motion.agent_from_bone[:, animal.INDEX[lower], :3, 3]
+        gap = (
+            motion.agent_from_bone[:, animal.INDEX[upper], :3, 3]
+            - motion.agent_from_bone[:, animal.INDEX[lower], :3, 3]
+        )
         np.testing.assert_allclose(
             np.linalg.norm(gap, axis=-1),
             np.linalg.norm(animal.HEADS[animal.INDEX[upper]] - animal.HEADS[animal.INDEX[lower]]),
@@ -64,8 +73,16 @@ def _straight(speed: float, posture: tuple[float, float, float] = (0.0, 0.0, 0.0
     times = np.arange(130) / 30
     position = np.stack([0 * times, 0 * times, speed * times], axis=-1)
     still = np.zeros(len(times))
-    return AnimalCourse(times, position, still, np.tile(posture, (len(times), 1)), still, position + np.array([0, 0.3, 2.0]), still)
+    return AnimalCourse(
+        times,
+        position,
+        still,
+        np.tile(posture, (len(times), 1)),
+        still,
+        position + np.array([0, 0.3, 2.0]),
+        still,
+    )
 
 
-def _feet(motion: gait.Motion) -> np.ndarray:
+def _feet(motion: gait.AnimalMotion) -> np.ndarray:
     return rigid.apply(motion.world_from_agent, motion.agent_from_bone[:, FEET][..., :3, 3])

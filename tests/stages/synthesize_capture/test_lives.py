@@ -1,10 +1,12 @@
-"""Lives without pictures: homes can be lived in, volumes agree with where the animal goes, approaches have twins."""
+"""Lives without pictures: homes can be lived in, volumes agree with where the animal goes, approaches have
+twins.
+"""
 
 import numpy as np
 import pytest
 
-from pipeline.models.flight import flees
-from pipeline.models.trajectories import PAST
+from pipeline.behavior.trajectories import PAST
+from pipeline.metrics.flight import flees
 from stages.synthesize_capture import dwellings, voxels
 from stages.synthesize_capture.lives import approaches, lives
 
@@ -26,7 +28,9 @@ def test_homes_differ(home):
 def test_the_animal_never_walks_through_what_the_volume_calls_solid(home):
     rng = np.random.default_rng(0)
     life = lives.lived(home.rearranged(rng), rng, 30.0, takes=2)
-    assert np.flatnonzero(np.diff(life.timestamp_s) > 1).tolist() == [149], "two takes, and no window over both"
+    assert np.flatnonzero(np.diff(life.timestamp_s) > 1).tolist() == [149], (
+        "two takes, and no window over both"
+    )
     voxel, inside = life.volume.voxel(life.world_from_agent[:, :3, 3])
     assert inside.all()
     assert (life.volume.occupancy[tuple(voxel.T)] == 1).mean() < 0.01

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.space import rigid
-from pipeline.space.meshes import Mesh, RayCaster, render_view
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from stages.synthesize_capture import raster
 
 INTRINSICS = np.array([[90.0, 0, 40.3], [0, 88.0, 31.1], [0, 0, 1]])
@@ -18,7 +18,9 @@ def test_depth_agrees_with_embree():
     expected, _hits = render_view(RayCaster(Mesh(vertices, faces)), world_from_camera, INTRINSICS, 64, 80)
     view = raster.see(rigid.apply(rigid.inverse(world_from_camera), vertices), faces, INTRINSICS, 64, 80)
     seen = (expected > 2 * raster.NEAR_M) & (view.face >= 0)
-    assert (seen == (expected > 2 * raster.NEAR_M)).mean() > 0.998, "the same pixels are covered, but for edges"
+    assert (seen == (expected > 2 * raster.NEAR_M)).mean() > 0.998, (
+        "the same pixels are covered, but for edges"
+    )
     agree = np.abs(1 / view.inverse_depth[seen] - expected[seen]) < 1e-3 * expected[seen]
     assert agree.mean() > 0.995, "the same depth, but for pixels on an edge"
 
@@ -26,7 +28,9 @@ def test_depth_agrees_with_embree():
 def test_depth_of_another_size_is_exact_on_a_plane():
     wall = np.array([[-9, -9, 2.0], [9, -9, 2.0], [0, 18, 5.0]])
     view = raster.see(wall, np.array([[0, 1, 2]], np.int32), INTRINSICS, 64, 80)
-    depth = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, np.array([72.0, 66.0, 32.24, 23.325]), 48, 64)
+    depth = raster.depth_through(
+        view.face, view.inverse_depth, view.inverse_corners, np.array([72.0, 66.0, 32.24, 23.325]), 48, 64
+    )
     x, y = (np.arange(64) + 0.5 - 32.24) / 72, (np.arange(48) + 0.5 - 23.325) / 66
     expected = (2.0 + 1.0) / (1 - y / 9)  # the plane z = 3 + y / 9
     np.testing.assert_allclose(depth, np.broadcast_to(expected[:, None], (48, 64)), rtol=1e-5)

@@ -1,4 +1,6 @@
-"""A recording is a real Record3D container whose content agrees with its truth, the same bytes at every run."""
+"""A recording is a real Record3D container whose content agrees with its truth, the same bytes at every
+run.
+"""
 
 import json
 import zipfile
@@ -9,11 +11,12 @@ import lzfse
 import numpy as np
 import pytest
 
-from pipeline.space import cameras, rigid
+from pipeline.geometry import cameras, rigid
 from stages.synthesize_capture import animal, film, produce, room, script
+from stages.synthesize_capture.config import Config
 
 CREATURE = animal.grow(np.random.default_rng(0), cell_m=0.016)
-PLAN = script.Plan(
+CONFIG = Config(
     seed=4,
     session_count=2,
     session_s=0.8,
@@ -21,21 +24,15 @@ PLAN = script.Plan(
     walkthrough_s=0.5,
     turnaround_s=0.5,
     heldout_of=1,
-    record_fps=15.0,
     dim_session=0,
     sideways_session=2,
-    harsh_session=0,
-    foreign_sessions=0,
-    color_height=160,
-    color_width=120,
-    depth_height=128,
-    depth_width=96,
 )
+PHONE = script.PhoneFormat(15.0, (160, 120), (128, 96))
 
 
 @pytest.fixture(scope="module")
 def scripts():
-    return script.scripts(PLAN, room.furnish(np.random.default_rng(4)))
+    return script.scripts(CONFIG, room.furnish(np.random.default_rng(4)), PHONE)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +51,9 @@ def test_same_bytes_whatever_the_order(scripts, made, tmp_path):
 def test_container_follows_the_format(scripts, made):
     with zipfile.ZipFile(made / "session-1.r3d") as archive:
         about = json.loads(archive.read("metadata"))
-        depth = np.frombuffer(lzfse.decompress(archive.read("rgbd/0.depth")), "<f4").reshape(about["dh"], about["dw"])
+        depth = np.frombuffer(lzfse.decompress(archive.read("rgbd/0.depth")), "<f4").reshape(
+            about["dh"], about["dw"]
+        )
         confidence = np.frombuffer(lzfse.decompress(archive.read("rgbd/0.conf")), np.uint8)
         color = cv2.imdecode(np.frombuffer(archive.read("rgbd/0.jpg"), np.uint8), cv2.IMREAD_COLOR)
     assert color.shape == (about["h"], about["w"], 3)
@@ -65,7 +64,9 @@ def test_container_follows_the_format(scripts, made):
     assert len(about["poses"]) == len(about["frameTimestamps"]) == len(scripts[2].timestamp_s)
     assert about["frameTimestamps"][0] == 0
     x, y, z, w = about["poses"][3][:4]
-    up = cameras.opencv_from_opengl(rigid.make(rigid.rotation_from_quaternion(np.array([w, x, y, z])), np.array(about["poses"][3][4:])))
+    up = cameras.opencv_from_opengl(
+        rigid.make(rigid.rotation_from_quaternion(np.array([w, x, y, z])), np.array(about["poses"][3][4:]))
+    )
     np.testing.assert_allclose(up, scripts[2].odometry_from_camera[3], atol=1e-6)
 
 
@@ -77,12 +78,16 @@ def test_truth_is_upright_and_the_animal_fills_its_mask(scripts, made):
         assert (truth["world_from_camera"][:, 1, 1] < -0.3).all(), "the picture's y axis points down"
         frame = int(np.argmax(masks.mean((1, 2))))
         points = truth["agent_vertices_world"][frame].astype(float) + truth["world_from_agent"][frame, :3, 3]
-        pixel, depth = cameras.project(rigid.apply(rigid.inverse(truth["world_from_camera"][frame]), points), truth["intrinsics"][frame])
+        pixel, depth = cameras.project(
+            rigid.apply(rigid.inverse(truth["world_from_camera"][frame]), points), truth["intrinsics"][frame]
+        )
         height, width = masks.shape[1:]
         inside = (depth > 0) & (pixel >= 0).all(-1) & (pixel < [width, height]).all(-1)
         at = pixel[inside].astype(int)
         grown = cv2.dilate(masks[frame].astype(np.uint8), np.ones((3, 3), np.uint8))
-        assert grown[at[:, 1], at[:, 0]].mean() > 0.6, "most of its surface falls into its mask, the rest is hidden"
+        assert grown[at[:, 1], at[:, 0]].mean() > 0.6, (
+            "most of its surface falls into its mask, the rest is hidden"
+        )
 
 
 def test_true_flow_moves_depth_onto_depth(scripts):
@@ -94,11 +99,13 @@ def test_true_flow_moves_depth_onto_depth(scripts):
 
 
 def test_a_session_of_another_home_changes_no_other(scripts, made, tmp_path):
-    more = script.scripts(replace(PLAN, foreign_sessions=1), room.furnish(np.random.default_rng(4)))
+    more = script.scripts(replace(CONFIG, foreign_sessions=1), room.furnish(np.random.default_rng(4)), PHONE)
     assert [part.name for part in more] == [*(part.name for part in scripts), "session-3"]
     elsewhere = more[-1]
     here = np.array([f.center for f in scripts[0].room.standing])
-    assert len(elsewhere.room.standing) != len(here) or not np.allclose([f.center for f in elsewhere.room.standing], here, atol=0.3)
+    assert len(elsewhere.room.standing) != len(here) or not np.allclose(
+        [f.center for f in elsewhere.room.standing], here, atol=0.3
+    )
     produce.produce(more[2:], CREATURE, tmp_path, tmp_path, workers=1)
     for name in ("session-1.r3d", "session-2.r3d"):
         assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
@@ -106,12 +113,19 @@ def test_a_session_of_another_home_changes_no_other(scripts, made, tmp_path):
 
 
 def test_harsh_light_changes_pictures_and_nothing_else(scripts, made, tmp_path):
-    harsh = script.scripts(replace(PLAN, harsh_session=1), room.furnish(np.random.default_rng(4)))[2]
+    harsh = script.scripts(replace(CONFIG, harsh_session=1), room.furnish(np.random.default_rng(4)), PHONE)[2]
     produce.record(harsh, CREATURE, tmp_path, tmp_path)
     pictures = []
     for folder in (made, tmp_path):
         with zipfile.ZipFile(folder / "session-1.r3d") as archive:
-            pictures.append(cv2.imdecode(np.frombuffer(archive.read("rgbd/3.jpg"), np.uint8), cv2.IMREAD_COLOR).astype(float))
-    ratio = [np.median(pictures[1][..., channel] / np.maximum(pictures[0][..., channel], 8)) for channel in range(3)]
+            pictures.append(
+                cv2.imdecode(np.frombuffer(archive.read("rgbd/3.jpg"), np.uint8), cv2.IMREAD_COLOR).astype(
+                    float
+                )
+            )
+    ratio = [
+        np.median(pictures[1][..., channel] / np.maximum(pictures[0][..., channel], 8))
+        for channel in range(3)
+    ]
     assert max(ratio) / min(ratio) > 1.2, "colours shift, not only brightness"
     assert np.abs(pictures[1] - pictures[0]).mean() > 15

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.space import rigid
+from pipeline.geometry import rigid
 from stages.synthesize_capture import sensor
 
 
@@ -24,11 +24,14 @@ def test_odometry_is_gravity_aligned_with_small_drift():
     times = np.arange(900) / 15
     angle = 0.3 * times
     position = np.stack([np.sin(angle), 1.4 + 0.1 * np.sin(times), np.cos(angle)], axis=-1)
-    world_from_camera = rigid.make(rigid.rotation_from_vector(np.stack([0 * angle, angle, 0 * angle], -1)), position)
+    world_from_camera = rigid.make(
+        rigid.rotation_from_vector(np.stack([0 * angle, angle, 0 * angle], -1)), position
+    )
     for seed in range(4):
         odometry = sensor.odometry(np.random.default_rng(seed), times, world_from_camera)
         relative = rigid.rotation_angle(
-            odometry[0, :3, :3].T @ odometry[-1, :3, :3], world_from_camera[0, :3, :3].T @ world_from_camera[-1, :3, :3]
+            odometry[0, :3, :3].T @ odometry[-1, :3, :3],
+            world_from_camera[0, :3, :3].T @ world_from_camera[-1, :3, :3],
         )
         assert np.rad2deg(relative) < 4.0, "a minute"
         up = odometry[:, :3, :3] @ np.swapaxes(world_from_camera[:, :3, :3], -1, -2) @ np.array([0, 1.0, 0])

@@ -5,7 +5,7 @@ import numpy as np
 from stages.synthesize_capture import review, room
 from stages.synthesize_capture.navigation import floor_for
 from stages.synthesize_capture.observer import AT_HOME, FILMING
-from stages.synthesize_capture.policy import REASONS, Policy, Seen
+from stages.synthesize_capture.policy import REASONS, Policy, SeenPerson
 from stages.synthesize_capture.session import STEP_S, simulate_session
 
 HOME = room.furnish(np.random.default_rng(0))
@@ -19,10 +19,15 @@ def test_same_seed_same_session():
 
 def test_who_lives_there_comes_up_from_farther_than_who_films():
     nearest = []
-    for habits in (FILMING, AT_HOME):
-        told = simulate_session(HOME, np.random.default_rng(5), 40.0, habits)
+    for style in (FILMING, AT_HOME):
+        told = simulate_session(HOME, np.random.default_rng(5), 40.0, style)
         away = np.linalg.norm(told.animal.position[:, [0, 2]] - told.observer_position, axis=-1)
-        walks = np.linalg.norm(np.diff(told.observer_position, axis=0, append=told.observer_position[-1:]), axis=-1) > 0.02
+        walks = (
+            np.linalg.norm(
+                np.diff(told.observer_position, axis=0, append=told.observer_position[-1:]), axis=-1
+            )
+            > 0.02
+        )
         nearest.append(np.median(away[walks & (np.gradient(away) < 0)]))
     assert nearest[1] > nearest[0]
 
@@ -33,7 +38,9 @@ def test_manner_over_minutes():
     assert manner.moving_windows >= 0.4
     assert manner.flees_when_approached > 0.6
     assert manner.flees_when_left_alone < 0.1
-    assert all(np.isfinite(lived.animal.position).all() and lived.animal.speed().max() < 4.0 for lived in sessions)
+    assert all(
+        np.isfinite(lived.animal.position).all() and lived.animal.speed().max() < 4.0 for lived in sessions
+    )
     inside = np.concatenate([lived.animal.position for lived in sessions])
     assert (np.abs(inside[:, 0]) < room.WIDTH_M / 2).all()
     assert (np.abs(inside[:, 2]) < room.DEPTH_M / 2).all()
@@ -41,7 +48,10 @@ def test_manner_over_minutes():
 
 def test_someone_far_away_or_still_never_makes_it_run():
     floor = floor_for([], breadth_m=0.24, height_m=0.3)
-    for seen in (Seen(np.array([2.8, 2.2]), np.array([-0.9, -0.9])), Seen(np.array([-0.6, -1.0]), np.zeros(2))):
+    for seen in (
+        SeenPerson(np.array([2.8, 2.2]), np.array([-0.9, -0.9])),
+        SeenPerson(np.array([-0.6, -1.0]), np.zeros(2)),
+    ):
         cat = Policy(floor, HOME.places, np.array([-2.0, -1.6]), np.random.default_rng(1))
         for _ in range(20):
             cat.step(STEP_S, seen)
@@ -54,5 +64,5 @@ def test_it_runs_away_from_whoever_comes():
         toward = np.array([np.sin(angle), np.cos(angle)])
         cat = Policy(floor, HOME.places, np.zeros(2), np.random.default_rng(2))
         for _ in range(45):
-            cat.step(STEP_S, Seen(-1.2 * toward, 1.1 * toward))
+            cat.step(STEP_S, SeenPerson(-1.2 * toward, 1.1 * toward))
         assert cat.walker.position @ toward > 0.5, "metres along the way from the person to it"

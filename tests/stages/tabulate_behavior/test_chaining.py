@@ -1,17 +1,19 @@
-"""Chained lives: an animal that only breathes counts as resting, however its millimetres differ from the recorded ones."""
+"""Chained lives: an animal that only breathes counts as resting, however its millimetres differ from the
+recorded ones.
+"""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pipeline.models.behavior import Sampling
-from pipeline.models.planning import Plan
-from pipeline.models.predictors import Ats
-from pipeline.models.scenes import Scenes
-from pipeline.models.trajectories import FUTURE, RATE_HZ
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.planning import SampledPlan
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import FUTURE, RATE_HZ
+from pipeline.rivals.predictors import Ats
 from stages.tabulate_behavior import chaining
-from tests.pipeline.models.wandering import REST, room, wandering
+from tests.pipeline.behavior.wandering import REST, room, wandering
 
 
 class Breathing:
@@ -30,12 +32,12 @@ class Breathing:
 
     def plan(self, observation, sampling, rng, goal, path):
         upright = np.concatenate([[1, 0, 0, 0, 1, 0], np.zeros(6 * len(REST))])
-        return Plan(goal, path, np.tile(upright, (len(path), FUTURE, 1)))
+        return SampledPlan(goal, path, np.tile(upright, (len(path), FUTURE, 1)))
 
 
 def test_breathing_is_rest_and_rest_is_one_speed():
     data, scenes = wandering(), Scenes.of(room())
-    ats = Ats(Breathing(), scenes, REST, "yaw", Sampling())
+    ats = Ats(Breathing(), scenes, REST, "yaw", PlanSamplingConfig())
     found = chaining.figures(ats, data, scenes, count=2, seconds=2.0, seed=0)
     tested = data.trajectories[data.videos[-1]]
     speed = np.linalg.norm(np.diff(tested.world_from_agent[:, :3, 3], axis=0), axis=-1) * RATE_HZ

@@ -1,17 +1,21 @@
-"""Tables: intervals know of seeds and of episodes, differences are paired, and text shows what the figures say."""
+"""Tables: intervals know of seeds and of episodes, differences are paired, and text shows what the figures
+say.
+"""
 
 import numpy as np
 import pytest
 
 from stages.tabulate_behavior import printing, tables, untrained
-from stages.tabulate_behavior.reading import Scores
-from tests.pipeline.models.wandering import wandering
+from stages.tabulate_behavior.reading import MethodScores
+from tests.pipeline.behavior.wandering import wandering
 
 WINDOWS = np.stack([np.zeros(640, int), np.arange(640)], axis=1)
 
 
 def scores(values):
-    return Scores(WINDOWS, WINDOWS, {"end_to_end/goal_minde_m": values, "flees/seen": np.ones((len(values), 7))})
+    return MethodScores(
+        WINDOWS, WINDOWS, {"end_to_end/goal_minde_m": values, "flees/seen": np.ones((len(values), 7))}
+    )
 
 
 def test_intervals_grow_with_what_seeds_disagree_about():
@@ -35,8 +39,12 @@ def test_a_difference_is_taken_window_by_window():
 
 
 def test_flight_is_held_against_the_animals_own():
-    values = {"flees/seen": np.full((2, 40), 0.75), "flees/true": np.ones((2, 40)), "flees/unseen": np.tile([0.0, 1.0], (2, 20))}
-    found = tables.figures({"ats": Scores(WINDOWS, WINDOWS, values)}, "ats", draws=300, seed=0)
+    values = {
+        "flees/seen": np.full((2, 40), 0.75),
+        "flees/true": np.ones((2, 40)),
+        "flees/unseen": np.tile([0.0, 1.0], (2, 20)),
+    }
+    found = tables.figures({"ats": MethodScores(WINDOWS, WINDOWS, values)}, "ats", draws=300, seed=0)
     assert found["behavior/ats/flees_seen_minus_true_ci95_high"] == -0.25
     assert found["behavior/ats/flees_seen_minus_unseen"] == 0.25
     assert found["behavior/ats/flees_seen_minus_unseen_ci95_low"] < 0.2
@@ -52,11 +60,19 @@ def test_plateaus_tell_a_flat_curve_from_a_falling_one():
 def test_untrained_rivals_stand_on_the_same_windows():
     data = wandering()
     test = np.flatnonzero(data.split == 1)[::5]
-    like = Scores(np.stack([data.video[test], data.start[test]], 1), np.stack([data.video[test[::2]], data.start[test[::2]]], 1), {})
+    like = MethodScores(
+        np.stack([data.video[test], data.start[test]], 1),
+        np.stack([data.video[test[::2]], data.start[test[::2]]], 1),
+        {},
+    )
     found = untrained.scores(data, like, samples=16, trials=2, seed=0)
     assert found["stand_still"].values["end_to_end/path_minade_m"].shape == (1, len(test[::2]))
     assert found["location_prior"].values["end_to_end/goal_minde_m"].shape == (1, len(test))
     assert "end_to_end/path_minade_m" not in found["location_prior"].values
     again = untrained.scores(data, like, samples=64, trials=2, seed=0)
-    better = [again[name].values["end_to_end/goal_minde_m"].mean() < found[name].values["end_to_end/goal_minde_m"].mean() for name in found]
+    better = [
+        again[name].values["end_to_end/goal_minde_m"].mean()
+        < found[name].values["end_to_end/goal_minde_m"].mean()
+        for name in found
+    ]
     assert all(better)

@@ -1,52 +1,56 @@
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from pipeline.models import ablated_motion
-from pipeline.models.contacts import find_contacts
-from pipeline.models.longterm import PoseNet, RouteNet, Sizes, StaticBody
-from pipeline.models.longterm_examples import Cutting, cut, encoded, fitted_poses
-from pipeline.models.motion_optimization import Settings
-from pipeline.models.motion_synthesis import LongTerm, habits_of
-from pipeline.models.short_motions import Moving
+from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
+from pipeline.longterm.contacts import find_contact_vertices
+from pipeline.longterm.examples import encode_selection, fit_pose_space, select_clips
+from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
+from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
+from pipeline.longterm.short_motions import BodyMotion
+from pipeline.rivals import longterm_networks
 from stages.tabulate_longterm import comparison, methods, pictures, scores, tables
-from stages.tabulate_longterm.lengths import Length
-from stages.tabulate_longterm.methods import Models
-from stages.tabulate_longterm.reading import Source
-from tests.pipeline.models import strider
+from stages.tabulate_longterm.config import Config
+from stages.tabulate_longterm.lengths import LongMotionLength
+from stages.tabulate_longterm.methods import ComparedModels
+from stages.tabulate_longterm.reading import MotionSource
+from tests.pipeline.longterm import strider
 
-SIZES = Sizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
+SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
 
 
-@dataclass(frozen=True)
-class Small:
-    clips: int = 6
-    optimised_clips: int = 4
-    optimisation: Settings = field(default_factory=lambda: Settings(steps=5, vertices=30))
-    draws: int = 50
-    seed: int = 0
+SMALL = Config(clips=6, optimized_clips=4, optimization=MotionOptimizationConfig(steps=5, vertices=30))
 
 
 @pytest.fixture(scope="module")
 def source():
-    train, held = strider.lives(count=2), strider.lives(seed=7, count=2)
+    train, held = strider.dataset(count=2), strider.dataset(seed=7, count=2)
     torch.manual_seed(0)
-    poses = fitted_poses(train.stretches, train.body.agent_from_bone_rest, SIZES.pose)
-    contacts = find_contacts(train.body, list(train.stretches), train.distances)
-    habits = habits_of(list(train.stretches), list(train.scenes) * len(train.stretches))
-    model = LongTerm(SIZES, poses, contacts, habits, *(net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES))))
+    poses = fit_pose_space(train.stretches, train.body.agent_from_bone_rest, SIZES.pose)
+    contacts = find_contact_vertices(train.body, list(train.stretches), train.distances)
+    motion_prior = measure_motion_prior(list(train.stretches), list(train.scenes) * len(train.stretches))
+    model = LongTerm(
+        SIZES,
+        poses,
+        contacts,
+        motion_prior,
+        *(net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES))),
+    )
     rng = np.random.default_rng(0)
-    bank = encoded(train, cut(train, Cutting(stride=20, resting=0.0), rng), poses, SIZES.points, rng)
-    ablated = {name: ablated_motion.build(kind, SIZES).eval() for name, kind in ablated_motion.KINDS.items()}
-    return Source(train, held, ("held_out", "unseen"), Models(model, ablated, bank))
+    bank = encode_selection(train, select_clips(train, rng, stride=20, resting=0.0), poses, SIZES.points, rng)
+    ablated = {
+        name: longterm_networks.build(kind, SIZES).eval()
+        for name, kind in longterm_networks.ABLATIONS.items()
+    }
+    return MotionSource(train, held, ("held_out", "unseen"), ComparedModels(model, ablated, bank))
 
 
 def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
-    lives, model = source.held_out, source.models.ours
-    part = lives.stretches[0][:61]
-    reference = scores.references([part], np.array([0]), lives, model)[0]
+    dataset, model = source.held_out, source.models.ours
+    part = dataset.stretches[0][:61]
+    reference = scores.references([part], np.array([0]), dataset, model)[0]
     told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
     assert all(told[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
     assert told["contact"] == 1 and told["slide_m_s"] < 0.01 and told["planted"] > 0.5
@@ -54,11 +58,17 @@ def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
     assert told["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
     root = part.world_from_agent.copy()
     root[:, :3, 3] += [0.03, 0.0, 0.04]
-    told = dict(zip(scores.METRICS, scores.score(Moving(root, part.agent_from_bone), reference, model.poses, np.zeros(1)), strict=True))
+    told = dict(
+        zip(
+            scores.METRICS,
+            scores.score(BodyMotion(root, part.agent_from_bone), reference, model.poses, np.zeros(1)),
+            strict=True,
+        )
+    )
     assert told["translation"] == pytest.approx(100 * 0.07 / 3)
     for name in ("mpjpe_mm", "mpvpe_mm"):
         assert told[name] == pytest.approx(50, abs=0.01)
-    assert told["end_v2v_share"] == pytest.approx(0.05 / lives.body.length_m, rel=1e-3)
+    assert told["end_v2v_share"] == pytest.approx(0.05 / dataset.body.length_m, rel=1e-3)
     assert told["orientation"] == told["pose"] == pytest.approx(0, abs=1e-6)
 
 
@@ -76,15 +86,28 @@ def test_route_and_cvae_keeps_the_route(source):
 
 
 def test_tables_hold_every_method_with_intervals(source):
-    found = comparison.figures("longterm", source, Small())
-    for method in ("truth", "ours", "ours_opt", "base", "base_opt", "route_cvae_opt", "nearest_opt", *ablated_motion.KINDS):
-        low, mean, high = (found[f"longterm/{method}/mpjpe_mm{end}"] for end in ("_ci95_low", "", "_ci95_high"))
+    found = comparison.figures("longterm", source, SMALL)
+    for method in (
+        "truth",
+        "ours",
+        "ours_opt",
+        "base",
+        "base_opt",
+        "route_cvae_opt",
+        "nearest_opt",
+        *longterm_networks.ABLATIONS,
+    ):
+        low, mean, high = (
+            found[f"longterm/{method}/mpjpe_mm{end}"] for end in ("_ci95_low", "", "_ci95_high")
+        )
         assert low <= mean <= high, method
     assert found["longterm/truth/mpjpe_mm"] == 0 < found["longterm/ours/mpjpe_mm"]
     apart = found["longterm/base/mpjpe_mm"] - found["longterm/ours/mpjpe_mm"]
     assert found["longterm/base_beyond_ours/mpjpe_mm"] == pytest.approx(apart)
     for method in ("ours", "ours_opt", "base_opt"):
-        assert found[f"longterm/{method}/end_v2v_share"] < 1e-4, "given ends are kept, by the networks and by the optimisation"
+        assert found[f"longterm/{method}/end_v2v_share"] < 1e-4, (
+            "given ends are kept, by the networks and by the optimisation"
+        )
     assert found["longterm/ours_opt/seam_share"] < 0.05
     assert "longterm_unseen/ours/mpvpe_mm" in found and "longterm_unseen/ours_opt/mpvpe_mm" not in found
     text = tables.text(found)
@@ -93,24 +116,26 @@ def test_tables_hold_every_method_with_intervals(source):
 
 
 def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
-    lives, model = source.held_out, source.models.ours
-    cuts = comparison.chosen(cut(lives, Cutting(stride=10, resting=0.0), np.random.default_rng(0)), 6)
+    dataset, model = source.held_out, source.models.ours
+    cuts = comparison.select_pairs(select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0), 6)
     assert len(cuts.start) == 6 and set(cuts.start[1::2] - cuts.start[::2]) == {60}
     assert (cuts.stretch[1::2] == cuts.stretch[::2]).all()
-    assert comparison.pairs(7, 4).tolist() == [0, 1, 4, 5] and not len(comparison.pairs(0, 4))
-    parts = cuts.parts(lives)
-    known = scores.references(parts, np.zeros(6, int), lives, model)
+    assert comparison.even_pairs(7, 4).tolist() == [0, 1, 4, 5] and not len(comparison.even_pairs(0, 4))
+    parts = cuts.parts(dataset)
+    known = scores.references(parts, np.zeros(6, int), dataset, model)
     seam = scores.METRICS.index("seam_share")
     whole = scores.scored(parts, known, model)[:, seam]
     moved = parts[1].world_from_agent.copy()
     moved[1:, 0, 3] += 0.05
-    torn = scores.scored([parts[0], Moving(moved, parts[1].agent_from_bone), *parts[2:]], known, model)[:, seam]
+    torn = scores.scored([parts[0], BodyMotion(moved, parts[1].agent_from_bone), *parts[2:]], known, model)[
+        :, seam
+    ]
     assert whole.max() < 0.02 < (torn - whole)[:2].min()
     np.testing.assert_array_equal(torn[2:], whole[2:])
 
 
 def test_minutes_are_measured(source):
-    found = comparison.minutes(source, Length(12.0, 3), Small())
+    found = comparison.minutes(source, LongMotionLength(12.0, 3), SMALL)
     assert found["longterm_minutes/seconds"] >= 12.0
     assert found["longterm_minutes/subgoals"] == 3
     assert found["longterm_minutes/outside_room_m"] < 0.05
@@ -118,9 +143,9 @@ def test_minutes_are_measured(source):
 
 def test_a_clip_is_blocked_where_the_block_stands_between_its_ends(source):
     """The strider walks around the block: only ends on opposite sides of it have it between them."""
-    clips = comparison.encoded(
+    clips = comparison.encode_selection(
         source.held_out,
-        cut(source.held_out, Cutting(stride=5), np.random.default_rng(0)),
+        select_clips(source.held_out, np.random.default_rng(0), stride=5),
         source.models.ours.poses,
         4,
         np.random.default_rng(0),

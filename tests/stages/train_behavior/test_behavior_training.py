@@ -5,26 +5,32 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline import fit
-from pipeline.errors import InputError
-from pipeline.models import behavior
-from pipeline.models.behavior import Sampling
-from pipeline.models.diffusion import Schedule
-from pipeline.models.perception import GRID_SHAPE
-from pipeline.models.planning import Sampler, TorchNetworks
-from pipeline.models.scenes import Scenes
-from pipeline.models.strides import strides_from_path
-from pipeline.models.trajectories import PAST, TRAIN, frames_from_seconds
-from stages.train_behavior import outcome, training
-from stages.train_behavior.__main__ import Config
+from pipeline.behavior import model
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.path_encoding import velocity_channels_from_path
+from pipeline.behavior.perception import GRID_SHAPE
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import PAST, TRAIN, frames_from_seconds
+from pipeline.core import training as fit
+from pipeline.core.errors import InputError
+from stages.train_behavior import objective, outcome, training
 from stages.train_behavior.batches import (
-    AS_OFTEN,
-    Augmentation,
+    MAX_REPEATS,
     SceneSampler,
     approached,
     draw_batch,
+    largest_turn_rad,
     statistics_from_windows,
     windows_from_data,
+)
+from stages.train_behavior.config import (
+    AugmentationConfig,
+    BehaviorOptimizerConfig,
+    BehaviorTrainingConfig,
+    Config,
+    ObjectiveConfig,
 )
 from stages.train_behavior.export import (
     difference,
@@ -35,13 +41,13 @@ from stages.train_behavior.export import (
     write_contract,
     write_networks,
 )
-from stages.train_behavior.objective import Objective, goal_error, losses, perceive, squared_error
+from stages.train_behavior.objective import goal_error, losses, perceive, squared_error
 from stages.train_behavior.reactions import Reactions, measure, moments
-from stages.train_behavior.refusals import refuse
-from stages.train_behavior.training import Optimization, Settings, initial_nets, train, two_cosines
-from tests.pipeline.models.wandering import ARCHITECTURE, REST, room, wandering
+from stages.train_behavior.refusals import check_settings
+from stages.train_behavior.training import initial_nets, train, two_cosines
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 
-PLAIN = Augmentation(turn=0, yaw_rad=0, mirror=0, observer_m=0, past=0, lapse=0, hide_bones=0)
+PLAIN = AugmentationConfig(turn=0, mirror=0, past=0, posture_offset=0, hide_bones=0)
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +61,14 @@ def windows(data):
 
 
 def drawn(windows, augmentation, seed=0):
-    statistics = statistics_from_windows(windows, augmentation.largest_turn_rad)
+    statistics = statistics_from_windows(windows, largest_turn_rad(augmentation))
     batch = draw_batch(
-        windows, SceneSampler(Scenes.of(room()), 4, "cpu"), statistics, augmentation, 16, torch.Generator().manual_seed(seed)
+        windows,
+        SceneSampler(Scenes.of(room()), 4, "cpu"),
+        statistics,
+        augmentation,
+        16,
+        torch.Generator().manual_seed(seed),
     )
     return batch, statistics.scaling
 
@@ -74,7 +85,9 @@ def test_targets_have_unit_scale(windows):
 def test_windows_begin_at_the_origin_facing_forward(windows):
     tracks = windows.tracks(torch.arange(len(windows)))
     assert tracks.root[:, 7].abs().max() < 1e-5
-    torch.testing.assert_close(tracks.rotation[:, 7], torch.eye(3).expand(len(windows), 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        tracks.rotation[:, 7], torch.eye(3).expand(len(windows), 3, 3), atol=1e-5, rtol=0
+    )
 
 
 def test_turning_and_mirroring_move_everything_together(windows):
@@ -82,26 +95,37 @@ def test_turning_and_mirroring_move_everything_together(windows):
     for augmentation in (replace(PLAIN, turn=1.0), replace(PLAIN, mirror=1.0)):
         moved, _ = drawn(windows, augmentation)
         for ours, theirs in ((plain.goal, moved.goal), (plain.path[:, :, 20], moved.path[:, :, 20])):
-            torch.testing.assert_close(ours[:, [0, 2]].norm(dim=1), theirs[:, [0, 2]].norm(dim=1), atol=1e-4, rtol=1e-4)
+            torch.testing.assert_close(
+                ours[:, [0, 2]].norm(dim=1), theirs[:, [0, 2]].norm(dim=1), atol=1e-4, rtol=1e-4
+            )
             torch.testing.assert_close(ours[:, 1], theirs[:, 1])
         between = [
-            b.observer_past[:, -3:] - torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal(b.goal.numpy())).float()
+            b.observer_past[:, -3:]
+            - torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal(b.goal.numpy())).float()
             for b in (plain, moved)
         ]
         torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
 
 
-def test_approaches_are_drawn_more_often_and_then_perceived(windows):
+def test_approaches_are_drawn_more_often_and_then_perceived(windows, monkeypatch):
+    monkeypatch.setattr(objective, "CONDITION_DROPOUT", 1.0)
     coming = replace(windows, approached=torch.tensor([7]))
     batch, _ = drawn(coming, replace(PLAIN, approached=1.0))
-    assert batch.chosen.all() and (batch.goal == batch.goal[0]).all()
+    assert batch.oversampled.all() and (batch.goal == batch.goal[0]).all()
     nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0)
     seen, unseen = (
-        perceive(nets, replace(batch, chosen=chosen), Objective(drop=1.0, code_dropout=0.0), torch.Generator().manual_seed(0))
-        for chosen in (batch.chosen, ~batch.chosen)
+        perceive(
+            nets,
+            replace(batch, oversampled=chosen),
+            ObjectiveConfig(code_dropout=0.0),
+            torch.Generator().manual_seed(0),
+        )
+        for chosen in (batch.oversampled, ~batch.oversampled)
     )
     assert (seen != unseen).any(1).all() and (unseen == unseen[0]).all()
-    assert not drawn(replace(windows, approached=torch.zeros(0, dtype=torch.long)), PLAIN)[0].chosen.any()
+    assert not drawn(replace(windows, approached=torch.zeros(0, dtype=torch.long)), PLAIN)[
+        0
+    ].oversampled.any()
 
 
 def test_only_who_comes_up_and_is_near_approaches():
@@ -117,15 +141,17 @@ def test_approaches_from_rare_distances_are_asked_as_often():
     distance = np.r_[np.full(20, 0.5), np.full(4, 1.5), 2.1]
     observer = walk + distance[:, None, None] * [0.0, 0.0, 1.0]
     asked = distance[approached(np.zeros((25, 3)), observer)]
-    assert [(asked == near).sum() for near in (0.5, 1.5, 2.1)] == [20, 20, AS_OFTEN]
+    assert [(asked == near).sum() for near in (0.5, 1.5, 2.1)] == [20, 20, MAX_REPEATS]
 
 
 def test_a_lapse_tilts_and_bends_what_is_remembered_and_nothing_else(windows):
-    (plain, _), (lapsed, _) = (drawn(windows, replace(PLAIN, lapse=share)) for share in (0.0, 1.0))
+    (plain, _), (with_posture_noise, _) = (
+        drawn(windows, replace(PLAIN, posture_offset=share)) for share in (0.0, 1.0)
+    )
     for name in ("scene", "observer_past", "goal", "path", "body"):
-        torch.testing.assert_close(getattr(lapsed, name), getattr(plain, name))
-    before, after = (batch.past.unflatten(1, (PAST, -1)) for batch in (plain, lapsed))
-    torch.testing.assert_close(after[:, -3:], lapsed.held)
+        torch.testing.assert_close(getattr(with_posture_noise, name), getattr(plain, name))
+    before, after = (batch.past.unflatten(1, (PAST, -1)) for batch in (plain, with_posture_noise))
+    torch.testing.assert_close(after[:, -3:], with_posture_noise.held)
     torch.testing.assert_close(after[..., :3], before[..., :3])
     bent = after[..., 9:] - before[..., 9:]
     torch.testing.assert_close(bent, bent[:, :1].expand_as(bent), atol=1e-5, rtol=0)
@@ -147,15 +173,24 @@ def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):
 
 def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
     volume = room()
-    exact = torch.nn.functional.avg_pool3d(torch.from_numpy(volume.around(windows.world_from_ego[:4].numpy())), 4)
-    fast = SceneSampler(Scenes.of(volume), 4, "cpu")(windows.world_from_ego[:4], torch.ones(4), torch.zeros(4, dtype=torch.long))
+    exact = torch.nn.functional.avg_pool3d(
+        torch.from_numpy(volume.around(windows.world_from_ego[:4].numpy())), 4
+    )
+    fast = SceneSampler(Scenes.of(volume), 4, "cpu")(
+        windows.world_from_ego[:4], torch.ones(4), torch.zeros(4, dtype=torch.long)
+    )
     assert fast.shape == exact.shape == (4, 16, *(n // 4 for n in GRID_SHAPE))
     together = torch.stack([exact.flatten(), fast.flatten()])
-    assert torch.corrcoef(together)[0, 1] > 0.95  # one reads smoothed voxels, the other averages the nearest ones
+    assert (
+        torch.corrcoef(together)[0, 1] > 0.95
+    )  # one reads smoothed voxels, the other averages the nearest ones
 
 
 def test_the_error_of_rectified_flow_is_that_of_noise_less_clean_sample():
-    schedule, clean = Schedule(course="rectified"), torch.randn(64, 4, generator=torch.Generator().manual_seed(1))
+    schedule, clean = (
+        Schedule(course="rectified"),
+        torch.randn(64, 4, generator=torch.Generator().manual_seed(1)),
+    )
     told = {}
 
     def denoise(x, t):
@@ -171,40 +206,49 @@ def test_the_error_of_rectified_flow_is_that_of_noise_less_clean_sample():
 
 
 def test_strides_are_scaled_frame_by_frame_where_asked(windows):
-    alike, each = (statistics_from_windows(windows, 0.0, per_frame=per_frame).scaling.stride_std for per_frame in (False, True))
+    alike, each = (
+        statistics_from_windows(windows, 0.0, per_frame=per_frame).scaling.stride_std
+        for per_frame in (False, True)
+    )
     assert alike.shape == (1, 4) and each.shape == (56, 4)
     root = windows.tracks(torch.arange(len(windows))).root
-    level = strides_from_path(root[:, PAST:], root[:, PAST - 1])[:, :, [0, 2]]
+    level = velocity_channels_from_path(root[:, PAST:], root[:, PAST - 1])[:, :, [0, 2]]
     np.testing.assert_allclose(each[:, 0], level.square().mean((0, 2)).sqrt().clamp_min(0.05), rtol=1e-3)
 
 
 def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
-    settings = Settings(Optimization(steps=3, goal_steps=1, batch=8))
+    settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=3, goal_steps=1, batch=8))
     half = replace(settings, optimization=replace(settings.optimization, precision="bfloat16"))
-    exact, rough = (train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), each, seed=3) for each in (settings, half))
+    exact, rough = (
+        train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), each, seed=3) for each in (settings, half)
+    )
     for name in ("path", "body"):
         ours, theirs = rough.record.terms[name][1:], exact.record.terms[name][1:]
         np.testing.assert_allclose(ours, theirs, rtol=0.02)
         assert (ours != theirs).any(), "nothing was rounded"
-    assert {value.dtype for value in rough.nets.state_dict().values() if value.is_floating_point()} == {torch.float32}
+    assert {value.dtype for value in rough.nets.state_dict().values() if value.is_floating_point()} == {
+        torch.float32
+    }
 
 
 def test_a_model_that_reads_pointwise_is_written_and_read(data, tmp_path):
-    shape = replace(ARCHITECTURE, reading="pointwise")
-    settings = Settings(Optimization(steps=2, goal_steps=1, batch=8), per_frame=True)
+    shape = replace(ARCHITECTURE, map_lookup="pointwise")
+    settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8), per_frame=True)
     fitted = train(data, Scenes.of(room()), shape, Schedule(course="rectified"), settings, seed=0)
     outcome.write_trained(tmp_path, fitted, shape, Schedule(course="rectified"), REST)
-    architecture, nets, scaling, schedule, _ = behavior.load(tmp_path)
+    architecture, nets, scaling, schedule, _ = model.load(tmp_path)
     assert (architecture, schedule) == (shape, Schedule(course="rectified"))
     np.testing.assert_allclose(scaling.stride_std, fitted.scaling.stride_std)
     assert write_networks(tmp_path, nets.eval(), shape) < 1e-4
 
 
 def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
-    settings = Settings(Optimization(steps=8, goal_steps=4, batch=8, save_every=3))
+    settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=8, goal_steps=4, batch=8))
     whole = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3)
     assert set(whole.record.terms) == {"goal", "path", "body"}
-    learned = {name: np.flatnonzero(np.isfinite(values)).tolist() for name, values in whole.record.terms.items()}
+    learned = {
+        name: np.flatnonzero(np.isfinite(values)).tolist() for name, values in whole.record.terms.items()
+    }
     assert learned == {"goal": [0, 1, 2, 3], "path": [4, 5, 6, 7], "body": [4, 5, 6, 7]}
     restore = fit._Loop.advance
 
@@ -230,7 +274,10 @@ def test_goals_and_paths_ask_for_approaches_each_in_its_own_share(data, monkeypa
         return draw_batch(windows, scene, statistics, augmentation, *rest, **how)
 
     monkeypatch.setattr(training, "draw_batch", watched)
-    settings = Settings(Optimization(steps=3, goal_steps=2, batch=4, goal_batch=4), Augmentation(approached=0.2, approached_paths=0.5))
+    settings = BehaviorTrainingConfig(
+        BehaviorOptimizerConfig(steps=3, goal_steps=2, batch=4, goal_batch=4),
+        AugmentationConfig(approached=0.2, approached_paths=0.5),
+    )
     train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=0)
     assert asked == [0.2, 0.2, 0.5]
 
@@ -241,10 +288,12 @@ def test_contract_is_whole_and_loads_back(windows, tmp_path):
         statistics_from_windows(windows, 0.0).scaling,
     )
     write_contract(tmp_path, nets, ARCHITECTURE, scaling, Schedule(), REST)
-    contract, golden = (json.loads((tmp_path / name).read_text()) for name in ("behavior.json", "golden.json"))
+    contract, golden = (
+        json.loads((tmp_path / name).read_text()) for name in ("behavior.json", "golden.json")
+    )
     assert contract["architecture"]["bones"] == len(contract["bones"]) == 3
     assert len(golden["plans"]["guidance_1"]["path"]) == 56
-    architecture, loaded, rescaled, schedule, rest = behavior.load(tmp_path)
+    architecture, loaded, rescaled, schedule, rest = model.load(tmp_path)
     assert architecture == ARCHITECTURE
     assert schedule == Schedule()
     np.testing.assert_allclose(rest, REST)
@@ -270,23 +319,29 @@ def test_golden_plan_uses_the_noise_it_names(windows):
 
     class Noted:
         def __init__(self):
-            self.queue = [np.array([golden["noise"][level]], np.float32) for level in ("goal", "path", "body")]
+            self.queue = [
+                np.array([golden["noise"][level]], np.float32) for level in ("goal", "path", "body")
+            ]
 
         def standard_normal(self, shape, dtype):
             assert self.queue[0].shape == tuple(shape)
             return self.queue.pop(0)
 
-    plan = sampler.plan(golden_observation(ARCHITECTURE), Sampling("ddim", 10, 10), Noted())
+    plan = sampler.plan(golden_observation(ARCHITECTURE), PlanSamplingConfig("ddim", 10, 10), Noted())
     np.testing.assert_allclose(plan.path[0], golden["plans"]["guidance_1"]["path"], atol=1e-4)
 
 
 class Timid:
-    """Networks of an animal that goes one metre away from an observer who is nearer than 4 m, with 0.1 m of spread."""
+    """Networks of an animal that goes one metre away from an observer who is nearer than 4 m, with 0.1 m of
+    spread.
+    """
 
     def perceive(self, scene_grid, observer_past, past, keep):
         position = observer_past[:, [-3, -1]] * keep[:, 1:2]
         distance = np.linalg.norm(position, axis=1, keepdims=True)
-        return np.where((distance > 0) & (distance < 4), -position / np.maximum(distance, 1e-6), 0).astype(np.float32)
+        return np.where((distance > 0) & (distance < 4), -position / np.maximum(distance, 1e-6), 0).astype(
+            np.float32
+        )
 
     def goal(self, x, t, condition):
         share = Schedule().alpha_bar[int(t[0])]
@@ -315,14 +370,20 @@ def test_learning_rate_falls_twice():
 
 
 def test_each_part_of_training_moves_its_own_networks(data, windows):
-    batch, _ = drawn(windows, Augmentation())
+    batch, _ = drawn(windows, AugmentationConfig())
     nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 3.0), 0)
-    parts = {"goals": {"perception", "goal"}, "sequences": {"path", "body"}, "all": {"perception", "goal", "path", "body"}}
+    parts = {
+        "goals": {"perception", "goal"},
+        "sequences": {"path", "body"},
+        "all": {"perception", "goal", "path", "body"},
+    }
     for part, learning in parts.items():
         nets.zero_grad(set_to_none=True)
         generator = torch.Generator().manual_seed(0)
-        sum(losses(nets, batch, Schedule(), Objective(), generator, part=part).values()).backward()
-        assert {name.split(".")[0] for name, parameter in nets.named_parameters() if parameter.grad is not None} == learning
+        sum(losses(nets, batch, Schedule(), ObjectiveConfig(), generator, phase=part).values()).backward()
+        assert {
+            name.split(".")[0] for name, parameter in nets.named_parameters() if parameter.grad is not None
+        } == learning
 
 
 class Asked:
@@ -331,7 +392,7 @@ class Asked:
     def __init__(self, track):
         self.goal, self.track, self.horizons = self, track, torch.zeros(0)
 
-    def apart(self, x, t, code, horizon):
+    def per_member(self, x, t, code, horizon):
         self.horizons = horizon
         row = code[:, 0].long().repeat_interleave(len(x) // len(code))
         clean = self.track[row, :, (horizon * self.track.shape[-1]).round().long() - 1]
@@ -344,8 +405,8 @@ def test_goals_are_asked_for_earlier_times_as_often_as_told(windows, share, lowe
     batch, _ = drawn(windows, PLAIN)
     torch.testing.assert_close(batch.track[:, :, -1], batch.goal)
     nets, number = Asked(batch.track), torch.arange(len(batch.goal), dtype=torch.float32)[:, None]
-    objective = Objective(earlier_share=share, earliest=0.2, goal_draws=4)
-    error = goal_error(nets, batch, number, Schedule(), objective, torch.Generator().manual_seed(0))
+    settings = ObjectiveConfig(earlier_share=share, goal_draws=4)
+    error = goal_error(nets, batch, number, Schedule(), settings, torch.Generator().manual_seed(0))
     assert error.shape == (4 * len(batch.goal), 3)
     assert error.abs().max() < 1e-3  # the right answer for the time asked for
     assert lowest - 1e-6 <= nets.horizons.min() <= highest
@@ -354,16 +415,21 @@ def test_goals_are_asked_for_earlier_times_as_often_as_told(windows, share, lowe
 @pytest.mark.parametrize(
     ("settings", "code"),
     [
-        (Config(training=Settings(Optimization(steps=100, goal_steps=200))), "REC-002"),
+        (
+            Config(training=BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=100, goal_steps=200))),
+            "REC-002",
+        ),
         (Config(family="one_stage"), "REC-002"),
-        (Config(reading="pointwise", scene="volume"), "REC-002"),
+        (Config(map_lookup="pointwise", scene="volume"), "REC-002"),
         (Config(horizon_s=60.0), "BEH-001"),
     ],
 )
 def test_what_cannot_be_learned_or_made_is_refused_at_once(data, settings, code):
     def asked(config):
         longer = data.with_horizon(frames_from_seconds(config.horizon_s))
-        refuse(vars(config), longer, outcome.architecture_for(vars(config), longer, Scenes.of(room())), "behavior_data")
+        check_settings(
+            config, longer, outcome.architecture_for(config, longer, Scenes.of(room())), "behavior_data"
+        )
 
     with pytest.raises(InputError, match=code):
         asked(settings)

@@ -3,46 +3,59 @@
 import numpy as np
 import torch
 
-from pipeline.models import localizer as model
-from pipeline.models.pose_regressor import GRID, on_grid, pose_loss
-from pipeline.models.sight import Basis, Patches, Sight
-from pipeline.space import rigid
-from stages.train_localizer.describing import Described
-from stages.train_localizer.networks import NetOptions, train_coordinates, train_regressor
+from pipeline.geometry import rigid
+from pipeline.localization import localizer as model
+from pipeline.localization.patches import Patches, PatchSampling, PcaBasis
+from pipeline.localization.pose_regressor import GRID, on_grid, pose_loss
+from stages.train_localizer.config import NetworkConfig
+from stages.train_localizer.describing import DescribedViews
+from stages.train_localizer.networks import train_coordinates, train_regressor
 
 AXES = 16
 
 
-def described(views: int, seed: int) -> Described:
-    """Return views of points in a box, each described by smooth functions of where it lies; a tenth by noise."""
+def described(views: int, seed: int) -> DescribedViews:
+    """Return views of points in a box, each described by smooth functions of where it lies; a tenth by
+    noise.
+    """
     rng, fixed = np.random.default_rng(seed), np.random.default_rng(0)
-    poses = rigid.exp(np.concatenate([rng.normal(0, 0.35, (views, 3)), rng.uniform(-0.7, 0.7, (views, 3))], axis=1))
+    poses = rigid.exp(
+        np.concatenate([rng.normal(0, 0.35, (views, 3)), rng.uniform(-0.7, 0.7, (views, 3))], axis=1)
+    )
     cell = np.stack(np.meshgrid(np.arange(12), np.arange(9), indexing="ij"), axis=-1).reshape(-1, 2)
     frequency, phase = fixed.normal(0, 1.2, (3, AXES)), fixed.uniform(0, 6, AXES)
     patches, descriptors = [], []
     for pose in poses:
-        camera = np.concatenate([(cell[:, ::-1] - (4, 5.5)) * 0.12, np.ones((len(cell), 1))], axis=1) * rng.uniform(1.5, 2.0)
+        camera = np.concatenate(
+            [(cell[:, ::-1] - (4, 5.5)) * 0.12, np.ones((len(cell), 1))], axis=1
+        ) * rng.uniform(1.5, 2.0)
         told = np.sin(rigid.apply(pose, camera) @ frequency + phase)
         spoilt = rng.random(len(cell)) < 0.1
         told[spoilt] = rng.normal(0, 1, (spoilt.sum(), AXES))
         descriptors.append(told / np.linalg.norm(told, axis=1, keepdims=True))
         patches.append(Patches(descriptors[-1], camera, cell))
-    basis = Basis(np.zeros(AXES, np.float32), np.eye(AXES, dtype=np.float32))
-    return Described(basis, np.concatenate(descriptors).astype(np.float32), patches, np.arange(views), poses)
-
-
-def asked(net, seen: Described) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rotation errors (degrees), translation errors (metres) and scores of all views."""
-    sight, solver = Sight("scene", 100.0, 0, 8, (6,)), model.Solver(0.15, 0.3, 200, 1)
-    localizer = model.Localizer(sight, seen.basis, net, model.Calibration(0.0, 1.0), solver)
-    answers = [localizer.match(patches)[0] for patches in seen.patches]
-    return *model.errors(np.stack([answer.map_from_camera for answer in answers]), seen.map_from_camera), np.array(
-        [answer.inlier_ratio for answer in answers]
+    basis = PcaBasis(np.zeros(AXES, np.float32), np.eye(AXES, dtype=np.float32))
+    return DescribedViews(
+        basis, np.concatenate(descriptors).astype(np.float32), patches, np.arange(views), poses
     )
 
 
+def asked(net, seen: DescribedViews) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rotation errors (degrees), translation errors (metres) and scores of all views."""
+    sampling, solver = PatchSampling("scene", 100.0, 0, 8, (6,)), model.RansacSolver(0.15, 0.3, 200, 1)
+    localizer = model.Localizer(sampling, seen.basis, net, model.Calibration(0.0, 1.0), solver)
+    answers = [localizer.localize_patches(patches)[0] for patches in seen.patches]
+    return *model.errors(
+        np.stack([answer.map_from_camera for answer in answers]), seen.map_from_camera
+    ), np.array([answer.inlier_ratio for answer in answers])
+
+
 def test_coordinates_are_learnt():
-    net = train_coordinates(described(40, 1), NetOptions(steps=300, patches=512, coordinate_width=96, coordinate_layers=3), 0)
+    net = train_coordinates(
+        described(40, 1),
+        NetworkConfig(steps=300, batch_patches=512, coordinate_width=96, coordinate_layers=3),
+        0,
+    )
     rotation, distance, share = asked(net, described(12, 2))
     assert np.median(rotation) < 4, "degrees; noise in a tenth of the patches"
     assert np.median(distance) < 0.15, "metres"
@@ -50,18 +63,26 @@ def test_coordinates_are_learnt():
 
 
 def test_poses_are_regressed():
-    net = train_regressor(described(150, 1), "scene", NetOptions(steps=150, views=32, pose_width=16), 0)
+    net = train_regressor(
+        described(150, 1), "scene", NetworkConfig(steps=150, batch_views=32, pose_width=16), 0
+    )
     rotation, distance, certainty = asked(net, described(40, 2))
     assert np.median(rotation) < 25, "degrees; guessing has 34"
     assert np.median(distance) < 0.4, "metres; guessing has 0.7"
     assert ((certainty > 0) & (certainty < 1)).all()
 
 
-def test_least_surprise_is_to_tell_the_error_itself():
+def test_the_likeliest_prediction_is_the_error_itself():
     told = torch.linspace(-4, 1, 400)
-    turned = torch.from_numpy(rigid.exp(np.array([0, 0.2, 0, 0, 0, 0]))[:3, :3].astype(np.float32)).expand(400, 3, 3)
+    turned = torch.from_numpy(rigid.exp(np.array([0, 0.2, 0, 0, 0, 0]))[:3, :3].astype(np.float32)).expand(
+        400, 3, 3
+    )
     error, surprise = pose_loss(
-        torch.eye(3).expand(400, 3, 3), torch.zeros(400, 3), told, turned, torch.tensor([0.0, 0.0, 0.1]).expand(400, 3)
+        torch.eye(3).expand(400, 3, 3),
+        torch.zeros(400, 3),
+        told,
+        turned,
+        torch.tensor([0.0, 0.0, 0.1]).expand(400, 3),
     )
     assert torch.allclose(error, torch.tensor(0.3), atol=1e-4), "0.2 rad + 0.1 m"
     assert abs(float(told[surprise.argmin()]) - np.log(0.3)) < 0.02
@@ -69,17 +90,26 @@ def test_least_surprise_is_to_tell_the_error_itself():
 
 def test_files_keep_networks(tmp_path):
     seen = described(20, 1)
-    options = NetOptions(steps=3, patches=64, views=4, coordinate_width=16, pose_width=8)
-    for name, net in (("c", train_coordinates(seen, options, 0)), ("r", train_regressor(seen, "agent", options, 0))):
-        solver = model.Solver(0.1, 0.2, 50, 1)
+    options = NetworkConfig(steps=3, batch_patches=64, batch_views=4, coordinate_width=16, pose_width=8)
+    for name, net in (
+        ("c", train_coordinates(seen, options, 0)),
+        ("r", train_regressor(seen, "agent", options, 0)),
+    ):
+        solver = model.RansacSolver(0.1, 0.2, 50, 1)
         (tmp_path / name).mkdir()
-        localizer = model.Localizer(Sight("agent", 100.0, 96, 8, (6, 12)), seen.basis, net, model.Calibration(0.1, 2.0), solver)
+        localizer = model.Localizer(
+            PatchSampling("agent", 100.0, 96, 8, (6, 12)),
+            seen.basis,
+            net,
+            model.Calibration(0.1, 2.0),
+            solver,
+        )
         model.save(tmp_path / name, localizer, {})
         again = model.load(tmp_path / name)
-        assert again.sight == localizer.sight
+        assert again.sampling == localizer.sampling
         pairs = zip(again.model.state_dict().values(), net.state_dict().values(), strict=True)
         assert all(torch.equal(first, second) for first, second in pairs)
-        first, second = (each.match(seen.patches[0]) for each in (localizer, again))
+        first, second = (each.localize_patches(seen.patches[0]) for each in (localizer, again))
         assert [a.inlier_ratio for a in first] == [a.inlier_ratio for a in second]
 
 

@@ -1,45 +1,35 @@
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from pipeline.errors import InputError
-from pipeline.models import ablated_motion
-from pipeline.models.longterm import PointNet, Sizes
-from pipeline.models.longterm_examples import Cutting
+from pipeline.core.errors import InputError
+from pipeline.longterm.config import LongTermSizes
+from pipeline.longterm.networks import PointNet
+from pipeline.rivals import longterm_networks
 from stages.train_longterm import learning, objectives, pictures
-from stages.train_longterm.sources import Parted
-from stages.train_longterm.training import Pace, Weights
-from tests.pipeline.models import strider
+from stages.train_longterm.config import Config
+from stages.train_longterm.sources import DatasetSplit
+from stages.train_longterm.training import LongTermOptimizerConfig
+from tests.pipeline.longterm import strider
 
-SIZES = Sizes(pose=12, latent=4, scene=16, hidden=12, width=24, points=32)
-SHORT = Pace(steps=80, batch=16, rate=1e-2)
+SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=12, width=24, points=32)
+SHORT = LongTermOptimizerConfig(steps=80, batch=16, rate=1e-2)
 
 
-@dataclass(frozen=True)
-class Settings:
-    sizes: Sizes = SIZES
-    cutting: Cutting = field(default_factory=lambda: Cutting(stride=10, most_bodies=120))
-    body: Pace = SHORT
-    route: Pace = SHORT
-    pose: Pace = SHORT
-    weights: Weights = field(default_factory=Weights)
-    scene: bool = True
-    ablations: str = "none"
-    point_net: str | None = None
-    seed: int = 0
+SETTINGS = Config(body=SHORT, route=SHORT, pose=SHORT, clip_stride=10, most_bodies=120)
 
 
 @pytest.fixture(scope="module")
-def lives():
-    return strider.lives(count=2)
+def dataset():
+    return strider.dataset(count=2)
 
 
 @pytest.fixture(scope="module")
-def learned(lives):
-    return learning.learn(lives, Settings())
+def learned(dataset):
+    return learning.train_networks(dataset, SETTINGS, sizes=SIZES)
 
 
 def test_every_network_learns(learned):
@@ -48,16 +38,21 @@ def test_every_network_learns(learned):
         assert np.mean(total[-8:]) < 0.9 * np.mean(total[:4]), name
 
 
-def test_same_seed_same_weights_and_ablations_are_written(lives, learned, tmp_path):
-    one = Pace(steps=2, batch=4)
-    settings = Settings(body=one, route=one, pose=one, ablations="all")
-    first, second = learning.learn(lives, settings), learning.learn(lives, replace(settings, ablations="none"))
+def test_same_seed_same_weights_and_ablations_are_written(dataset, learned, tmp_path):
+    one = LongTermOptimizerConfig(steps=2, batch=4)
+    settings = replace(SETTINGS, body=one, route=one, pose=one, ablations="all")
+    first, second = (
+        learning.train_networks(dataset, settings, sizes=SIZES),
+        learning.train_networks(dataset, replace(settings, ablations="none"), sizes=SIZES),
+    )
     for name in ("static", "route", "pose"):
         for key, value in getattr(first.model, name).state_dict().items():
             assert torch.equal(value, getattr(second.model, name).state_dict()[key]), f"{name}.{key}"
-    assert set(first.ablated) == set(ablated_motion.KINDS)
+    assert set(first.ablated) == set(longterm_networks.ABLATIONS)
     learning.write_ablations(tmp_path, first)
-    again = ablated_motion.load(tmp_path / "ablations" / "base.safetensors", ablated_motion.KINDS["base"], SIZES)
+    again = longterm_networks.load(
+        tmp_path / "ablations" / "base.safetensors", longterm_networks.ABLATIONS["base"], SIZES
+    )
     for key, value in first.ablated["base"].state_dict().items():
         assert torch.equal(value, again.state_dict()[key])
 
@@ -65,38 +60,51 @@ def test_same_seed_same_weights_and_ablations_are_written(lives, learned, tmp_pa
 def test_point_nets_start_from_given_weights(tmp_path):
     given = PointNet(SIZES.scene)
     save_file(given.state_dict(), tmp_path / "net.safetensors")
-    settings = Settings(point_net=str(tmp_path / "net.safetensors"))
-    made = learning.fresh(lambda: learning.PoseNet(SIZES), settings)
+    settings = replace(SETTINGS, point_net=str(tmp_path / "net.safetensors"))
+    made = learning.initialized(lambda: learning.PoseNet(SIZES), settings)
     for key, value in given.state_dict().items():
         assert torch.equal(value, made.between.point_net.state_dict()[key])
     with pytest.raises(InputError, match="LTM-002"):
-        learning.fresh(lambda: learning.PoseNet(SIZES), Settings(point_net=str(tmp_path / "none")))
+        learning.initialized(
+            lambda: learning.PoseNet(SIZES), replace(SETTINGS, point_net=str(tmp_path / "none"))
+        )
     with pytest.raises(InputError, match="LTM-002"):
-        learning.fresh(lambda: learning.PoseNet(replace(SIZES, scene=8)), settings)
+        learning.initialized(lambda: learning.PoseNet(replace(SIZES, scene=8)), settings)
 
 
-def test_a_body_in_the_block_collides_and_one_in_the_air_has_no_contact(lives, learned):
+def test_a_body_in_the_block_collides_and_one_in_the_air_has_no_contact(dataset, learned):
     model = learned.model
-    distance = [lives.scenes[0].distance]
-    surface = learning.training.PosedSurface(lives.body, np.concatenate([np.arange(40), model.contacts.vertices]))
+    distance = [dataset.scenes[0].distance]
+    surface = learning.training.PosedSurface(
+        dataset.body, np.concatenate([np.arange(40), model.contacts.vertices])
+    )
     upright = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0, 1, 0, *[0.0] * SIZES.pose]])
     errors = {}
-    for name, place in (("stands", [1.2, strider.HIP_M, 1.2]), ("floats", [1.2, 0.5, 1.2]), ("inside", [0.0, 0.3, 0.0])):
+    for name, place in (
+        ("stands", [1.2, strider.HIP_M, 1.2]),
+        ("floats", [1.2, 0.5, 1.2]),
+        ("inside", [0.0, 0.3, 0.0]),
+    ):
         frame = torch.eye(4)[None].clone()
         frame[0, :3, 3] = torch.tensor(place)
         mesh = objectives.posed(upright, frame, model.poses, surface)
-        errors[name] = [float(e) for e in objectives.scene_errors(mesh, torch.zeros(1, dtype=torch.long), distance, model.contacts, 40)]
+        errors[name] = [
+            float(e)
+            for e in objectives.scene_errors(
+                mesh, torch.zeros(1, dtype=torch.long), distance, model.contacts, 40
+            )
+        ]
     assert errors["inside"][0] > 0.05 > errors["stands"][0] > -1e-6
     assert errors["floats"][0] == 0
     assert errors["floats"][1] > 0.9 > 0.5 > errors["stands"][1]
 
 
 def test_divergence_is_zero_for_a_standard_normal():
-    assert objectives.divergence(torch.zeros(3, 4), torch.zeros(3, 4)) == 0
-    assert objectives.divergence(torch.ones(3, 4), torch.zeros(3, 4)) == pytest.approx(0.5)
+    assert objectives.kl_divergence(torch.zeros(3, 4), torch.zeros(3, 4)) == 0
+    assert objectives.kl_divergence(torch.ones(3, 4), torch.zeros(3, 4)) == pytest.approx(0.5)
 
 
-def test_pictures_show_held_out_motion(lives, learned):
-    shown = pictures.shown(learned, Parted(lives, strider.lives(seed=5, count=1)), 0)
+def test_pictures_show_held_out_motion(dataset, learned):
+    shown = pictures.evaluate_held_out(learned, DatasetSplit(dataset, strider.dataset(seed=5, count=1)), 0)
     assert {picture.name for picture in shown.pictures} == {"losses", "routes"}
     assert all(np.isfinite(check.value) for check in shown.checks)

@@ -1,0 +1,249 @@
+"""Count what makes the code easy or hard to enter: lines, keys, packages, words, shapes, literals, cycles.
+
+    python -m benchmarks.codebase_counts [--list COUNT]
+
+Prints one line per count; `--list` names the places behind one of them. `tests/test_codebase.py` holds the
+bars.
+"""
+
+import argparse
+import ast
+import dataclasses
+import importlib
+import io
+import re
+import tokenize
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+LONGEST_LINE = 110
+PRIVATE_WORDS = frozenset(
+    "minds told tells kept strange torn mended bare slid firmness quicken pace habits haunts sees beside aside "
+    "buried drafted bent missed led cheapest relax relatives alike likeness bore strayed shy bold".split()
+)
+"""Words that this project once used for terms that the field has other names for; see docs/glossary.md."""
+PLAIN_NUMBERS = frozenset((10, 60, 90, 100, 180, 255, 360, 1000, 0.5, 0.25, 0.1, 0.01, 1e-3))
+"""Numbers that explain themselves; so do integers below 10, powers of two, and what only keeps a quotient
+finite."""
+DRAWN = ("stages/synthesize_capture",)
+"""Where numbers are the measures of a drawn world."""
+ARRAYS = re.compile(r"\b(ndarray|Tensor)\b")
+SHAPED = re.compile(r"\b(Float|Int|UInt8|UInt|Bool|Shaped|Num|Inexact|Real|Complex|Int64|Float32|Float64)\[")
+
+
+def sources(*tops: str) -> list[Path]:
+    """Return the Python files below the folders `tops` of the checkout."""
+    files = (path for top in tops for path in (ROOT / top).rglob("*.py"))
+    return sorted(path for path in files if not {"node_modules", "build"} & set(path.parts))
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """Return the syntax tree of a file."""
+    return ast.parse(path.read_text(), str(path))
+
+
+def place(path: Path, line: int) -> str:
+    """Return `file:line` relative to the checkout."""
+    return f"{path.relative_to(ROOT)}:{line}"
+
+
+def lines() -> list[str]:
+    """Every line of `pipeline/` and `stages/`."""
+    return [
+        place(path, number)
+        for path in sources("pipeline", "stages")
+        for number, _ in enumerate(path.read_text().splitlines(), 1)
+    ]
+
+
+def long_lines() -> list[str]:
+    """Lines longer than 110 columns."""
+    return [
+        place(path, number)
+        for path in sources("pipeline", "stages")
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if len(line) > LONGEST_LINE
+    ]
+
+
+def keys() -> list[str]:
+    """Recipe keys: the fields of every stage's `Config`, nested tables resolved."""
+
+    def fields(config: object, table: str) -> list[str]:
+        return [
+            name
+            for key, value in vars(config).items()
+            for name in (
+                fields(value, f"{table}.{key}") if dataclasses.is_dataclass(value) else [f"{table}.{key}"]
+            )
+        ]
+
+    found = []
+    for door in sorted((ROOT / "stages").rglob("__main__.py")):
+        stage = ".".join(door.parent.relative_to(ROOT).parts)
+        module = "config" if door.with_name("config.py").exists() else "__main__"
+        config = getattr(importlib.import_module(f"{stage}.{module}"), "Config", None)
+        if config is not None:
+            found += fields(config(), stage.removeprefix("stages."))
+    return found
+
+
+def large_packages() -> list[str]:
+    """Packages of `pipeline/` with more than 16 modules."""
+    sizes = Counter(path.parent.name for path in sources("pipeline") if path.name != "__init__.py")
+    return [f"{package}: {size}" for package, size in sizes.items() if size > 16]
+
+
+def private_words() -> list[str]:
+    """Identifiers of which a part is one of the project's former private words."""
+    found = []
+    for path in sources("pipeline", "stages"):
+        for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
+            parts = re.findall(r"[A-Z]?[a-z]+", token.string) if token.type == tokenize.NAME else ()
+            if any(part.lower() in PRIVATE_WORDS for part in parts):
+                found.append(f"{place(path, token.start[0])} {token.string}")
+    return found
+
+
+def telling() -> list[str]:
+    """Places in code, recipes and guides that say that something tells or was told."""
+    files = [
+        *sources("pipeline", "stages"),
+        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "agents").rglob("*.toml"),
+    ]
+    files += [ROOT / "README.md", ROOT / "ERRORS.md", ROOT / "data_layout.md"]
+    return [
+        place(path, number)
+        for path in files
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        for _ in re.findall(r"\b(?:tells?|told|telling)\b", line)
+    ]
+
+
+def repeated_classes() -> list[str]:
+    """Class names that stand for different things in different files."""
+    places: dict[str, list[str]] = {}
+    for path in sources("pipeline", "stages"):
+        for node in tree_of(path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(place(path, node.lineno))
+    generic = ("Config", "Inputs")  # every stage has these two
+    return [
+        f"{name}: {' '.join(where)}"
+        for name, where in places.items()
+        if len(where) > 1 and name not in generic
+    ]
+
+
+def unnamed_numbers() -> list[str]:
+    """Numeric literals in function bodies that neither explain themselves nor have a name."""
+
+    def plain(value: float) -> bool:
+        whole = isinstance(value, int) and (value < 10 or value.bit_count() == 1)
+        return whole or value in PLAIN_NUMBERS or abs(value) <= 1e-5
+
+    found = []
+    for path in sources("pipeline", "stages"):
+        drawn = path.relative_to(ROOT).as_posix().startswith(DRAWN)
+        for function in ast.walk(tree_of(path)) if not drawn else ():
+            if isinstance(function, ast.FunctionDef):
+                found += [
+                    f"{place(path, node.lineno)} {node.value}"
+                    for statement in function.body
+                    for node in ast.walk(statement)
+                    if isinstance(node, ast.Constant)
+                    and type(node.value) in (int, float)
+                    and not plain(node.value)
+                ]
+    return sorted(set(found))
+
+
+def public_array_functions() -> list[tuple[str, bool]]:
+    """Public functions and methods that take or return arrays, and whether each array has its shape in the
+    signature.
+    """
+    found = []
+    for path in sources("pipeline", "stages"):
+        scopes = [tree_of(path).body]
+        scopes += [
+            n.body for n in tree_of(path).body if isinstance(n, ast.ClassDef) and not n.name.startswith("_")
+        ]
+        for node in (node for body in scopes for node in body):
+            if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
+                continue
+            hints = [a.annotation for a in (*node.args.args, *node.args.kwonlyargs)] + [node.returns]
+            spelled = [ast.unparse(hint) for hint in hints if hint is not None]
+            arrays = [hint for hint in spelled if ARRAYS.search(hint)]
+            if arrays:
+                bare = any(len(ARRAYS.findall(h)) > len(SHAPED.findall(h)) for h in arrays)
+                found.append((f"{place(path, node.lineno)} {node.name}", not bare))
+    return found
+
+
+def unshaped() -> list[str]:
+    """Public functions with an array that has no shape in the signature."""
+    return [name for name, shaped in public_array_functions() if not shaped]
+
+
+def cycles() -> list[str]:
+    """Modules that import one another, directly or by way of others."""
+    graph = {}
+    for path in sources("pipeline", "stages"):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        graph[name] = {
+            module
+            for node in ast.walk(tree_of(path))
+            if isinstance(node, ast.ImportFrom) and node.module
+            for module in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names))
+        }
+
+    def reached(start: str) -> set[str]:
+        waiting, seen = list(graph[start]), set()
+        while waiting:
+            module = waiting.pop()
+            if module in graph and module not in seen:
+                seen.add(module)
+                waiting += graph[module]
+        return seen
+
+    return [name for name in graph if name in reached(name)]
+
+
+COUNTS = {
+    "lines": lines,
+    "lines over 110 columns": long_lines,
+    "recipe keys": keys,
+    "packages over 16 modules": large_packages,
+    "private words in identifiers": private_words,
+    "tell, told": telling,
+    "class names used twice": repeated_classes,
+    "unnamed numbers": unnamed_numbers,
+    "unshaped public functions": unshaped,
+    "modules in import cycles": cycles,
+}
+
+
+def main() -> None:
+    """Print the counts, or the places behind one of them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--list", choices=COUNTS, help="name the places behind this count")
+    given = parser.parse_args()
+    if given.list:
+        print(*COUNTS[given.list](), sep="\n")
+        return
+    for name, count in COUNTS.items():
+        print(f"{len(count()):7} {name}")
+    shaped = [ok for _, ok in public_array_functions()]
+    print(
+        f"{100 * sum(shaped) / len(shaped):6.1f}% of {len(shaped)} public functions with arrays have shapes"
+    )
+
+
+if __name__ == "__main__":
+    main()

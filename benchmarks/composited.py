@@ -1,0 +1,454 @@
+"""Draw the built-in animal into a real RGB-D sequence: the parts of `semi_real`.
+
+`Sequence` reads a 7-Scenes style folder; `surfaces` finds what an animal can walk on; `course` lets it walk,
+sit, come and go; `Compositor` draws each frame with the sequence's own depth deciding occlusion and its own
+measured noise and holes. World: the sequence's, turned so that +y is up, metres.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numba import njit
+from scipy import ndimage
+
+from pipeline.data import images
+from pipeline.geometry import cameras, rigid
+from pipeline.mapping.icp import DepthImage, depth_image
+from pipeline.mapping.odometry import align_gravity
+from stages.synthesize_capture import animal, gait, raster, shade
+from stages.synthesize_capture.film import SHADOW_BALLS
+from stages.synthesize_capture.session import STEP_S, AnimalCourse
+
+COLOR_FOCAL_PX, DEPTH_FOCAL_PX, BASELINE_M = 525.5, 585.0, 0.025
+"""Kinect v1 as measured on 7-Scenes: focal lengths of both cameras at 640 x 480, and how far the colour
+camera stands right"""
+PROJECTOR_BASELINE_M = 0.075
+"""Kinect v1: from infrared projector to infrared camera; surfaces that the projector does not reach have no
+depth"""
+MILLIMETRES = 1000
+FARTHEST_M = 6.0
+CELL_M = 0.04
+ABSENT_M = 100.0
+"""how far below the world the animal is put while it is away"""
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A 7-Scenes style folder: colour, depth in metres (0 unknown), poses, one pinhole for both."""
+
+    folder: Path
+    numbers: tuple[int, ...]
+    registered: bool
+    """Depth is brought into the colour camera; else colours are only brought to the depth camera's focal
+    length."""
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, "3 3"]:
+        """Return the pinhole of both pictures, pixels."""
+        focal = COLOR_FOCAL_PX if self.registered else DEPTH_FOCAL_PX
+        return np.array([[focal, 0, 320.0], [0, focal, 240.0], [0, 0, 1]])
+
+    def color(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        """Read a picture, RGB."""
+        picture = images.read_color(self._path(index, "color.jpg"))
+        if self.registered:
+            return np.ascontiguousarray(picture)
+        zoom = DEPTH_FOCAL_PX / COLOR_FOCAL_PX
+        matrix = np.array([[zoom, 0, (1 - zoom) * 320], [0, zoom, (1 - zoom) * 240]])
+        return cv2.warpAffine(picture, matrix, (640, 480), flags=cv2.INTER_CUBIC)
+
+    def depth(self, index: int) -> Float[np.ndarray, "height width"]:
+        """Read depth, metres."""
+        raw = (
+            np.asarray(cv2.imread(str(self._path(index, "depth.png")), cv2.IMREAD_UNCHANGED), np.float32)
+            / MILLIMETRES
+        )
+        raw[raw > FARTHEST_M] = 0
+        return _registered(raw, DEPTH_FOCAL_PX, COLOR_FOCAL_PX, BASELINE_M) if self.registered else raw
+
+    def poses(self) -> Float[np.ndarray, "frame 4 4"]:
+        """Read `world_from_camera`, turned so that +y is up."""
+        given = np.stack([np.loadtxt(self._path(index, "pose.txt")) for index in range(len(self.numbers))])
+        if self.registered:
+            given = given @ rigid.make(np.eye(3), np.array([BASELINE_M, 0, 0]))
+        return align_gravity(self.view, given)
+
+    def view(self, index: int) -> DepthImage:
+        """Return points and normals of a frame, camera axes."""
+        depth = self.depth(index)
+        return depth_image(depth, self.intrinsics, depth > 0, 4)
+
+    def _path(self, index: int, kind: str) -> Path:
+        return self.folder / f"frame-{self.numbers[index]:06d}.{kind}"
+
+
+@njit(cache=True)
+def _registered(depth, depth_focal, color_focal, baseline_m):
+    """Bring depth into a camera with another focal length that stands ``baseline_m`` to the right."""
+    height, width = depth.shape
+    out = np.zeros((height, width), np.float32)
+    for i in range(height):
+        for j in range(width):
+            z = depth[i, j]
+            if z > 0:
+                x = ((j + 0.5 - width / 2) / depth_focal * z - baseline_m) / z * color_focal + width / 2
+                y = (i + 0.5 - height / 2) / depth_focal * color_focal + height / 2
+                u, v = int(np.floor(x)), int(np.floor(y))
+                if 0 <= u < width and 0 <= v < height and (out[v, u] == 0 or z < out[v, u]):
+                    out[v, u] = z
+    return out
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the sensor does to depth, measured on the sequence."""
+
+    coefficients: Float[np.ndarray, "3"]
+    """Standard deviation in metres = polynomial of z in metres, constant last."""
+    shadow_side: int
+    """Side of a nearer surface on which depth is missing: -1 left, 1 right."""
+    color: float
+    """Standard deviation of the picture's noise, 0..255."""
+
+
+def measure_noise(sequence: Sequence, frames: int = 12) -> Noise:
+    """Measure depth noise against local planes by range, the side of the projector's shadow, and the
+    picture's noise.
+    """
+    ranges, errors, sides, grain = [], [], np.zeros(2), []
+    for index in np.linspace(0, len(sequence.numbers) - 1, frames).astype(int).tolist():
+        depth = sequence.depth(index)
+        inverse = np.where(depth > 0, 1 / np.maximum(depth, 0.1), 0)  # a plane is linear in 1 / z
+        flat = cv2.erode((depth > 0).astype(np.uint8), np.ones((9, 9))) > 0
+        jump = cv2.dilate(depth, np.ones((9, 9))) - cv2.erode(depth, np.ones((9, 9)))
+        flat &= jump < 0.1
+        error = np.abs(inverse - cv2.blur(inverse, (9, 9))) * depth**2
+        ranges.append(depth[flat]), errors.append(error[flat])
+        hole = depth == 0
+        for side, shift in ((1, -4), (0, 4)):
+            near, far = np.roll(depth, -shift * 4, 1), np.roll(depth, shift * 2, 1)
+            sides[side] += (hole & (near > 0) & (far > near + 0.3)).sum()
+        gray = cv2.cvtColor(sequence.color(index), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        grain.append(np.median(np.abs(gray - cv2.medianBlur(gray, 3))) * 1.48)
+    z, error = np.concatenate(ranges), np.concatenate(errors)
+    bins = np.arange(0.6, FARTHEST_M, 0.25)
+    middle = [
+        (low + 0.125, 1.48 * np.median(error[(z > low) & (z < low + 0.25)]))
+        for low in bins
+        if ((z > low) & (z < low + 0.25)).sum() > 500
+    ]
+    coefficients = (
+        np.polyfit([at for at, _ in middle], [sigma for _, sigma in middle], 2)
+        if len(middle) > 3
+        else np.array([0.0015, 0, 0.001])
+    )
+    return Noise(coefficients, -1 if sides[0] > sides[1] else 1, max(float(np.median(grain)), 1.0))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A level surface: its height, by cell too, and which cells of (x, z) an animal can stand on."""
+
+    height_m: float
+    heights_m: Float[np.ndarray, "x z"]
+    """poses err by a centimetre or two, and a true table is level only so far"""
+    free: Bool[np.ndarray, "x z"]
+    origin: Float[np.ndarray, "2"]
+
+    def points(self) -> Float[np.ndarray, "cell 3"]:
+        """Return the free cells' centres, world."""
+        at = self.origin + (np.argwhere(self.free) + 0.5) * CELL_M
+        return np.stack([at[:, 0], self.heights_m[self.free], at[:, 1]], axis=1)
+
+    def connects(self, a: np.ndarray, b: np.ndarray) -> bool:
+        """Tell whether the straight way between two points is free."""
+        way = a + np.linspace(0, 1, max(2, int(np.linalg.norm(b - a) / (CELL_M / 2))))[:, None] * (b - a)
+        at = np.floor((way[:, [0, 2]] - self.origin) / CELL_M).astype(int)
+        return bool(self.free[at[:, 0], at[:, 1]].all())
+
+
+def surfaces(sequence: Sequence, world_from_camera: np.ndarray, every: int = 8) -> list[Surface]:
+    """Find level surfaces of a quarter of a square metre and more, with free room for an animal, largest
+    first.
+    """
+    points, up = [], []
+    for index in range(0, len(sequence.numbers), every):
+        view = sequence.view(index)
+        seen = view.points[..., 2] > 0
+        points.append(rigid.apply(world_from_camera[index], view.points[seen].astype(float)))
+        up.append(view.normals[seen] @ world_from_camera[index, :3, :3].T[:, 1] > 0.93)
+    points, up = np.concatenate(points), np.concatenate(up)
+    origin = points.min(0) - 0.2
+    shape = tuple(np.ceil((points.max(0) + 0.2 - origin)[[0, 2]] / CELL_M).astype(int))
+    at = np.floor((points[:, [0, 2]] - origin[[0, 2]]) / CELL_M).astype(int)
+    edges = np.arange(points[:, 1].min(), points[:, 1].max() + 0.04, 0.04)
+    count, _ = np.histogram(points[up, 1], edges)
+    found = []
+    for peak in np.argsort(-count)[:8]:
+        own = up & (np.abs(points[:, 1] - edges[peak] - 0.02) < 0.04)
+        if own.sum() < 300:
+            continue
+        height = float(np.median(points[own, 1]))
+        if any(abs(height - other.height_m) < 0.1 for other in found):
+            continue
+        ground, above = np.zeros(shape, int), np.zeros(shape, int)
+        np.add.at(ground, tuple(at[own].T), 1)
+        np.add.at(above, tuple(at[(points[:, 1] > height + 0.06) & (points[:, 1] < height + 0.4)].T), 1)
+        free = np.array(ndimage.binary_closing(ground >= 2)) & ~ndimage.binary_dilation(
+            above >= 4, iterations=3
+        )
+        free = ndimage.binary_erosion(free, iterations=3)
+        if free.sum() * CELL_M**2 > 0.05:
+            total = np.zeros(shape)
+            np.add.at(total, tuple(at[own].T), points[own, 1] - height)
+            smooth = ndimage.gaussian_filter(total, 3) / np.maximum(
+                ndimage.gaussian_filter(ground * 1.0, 3), 1e-3
+            )
+            found.append(Surface(height, height + smooth, free, origin[[0, 2]]))
+    return sorted(found, key=lambda surface: -surface.free.sum())
+
+
+def course(
+    sequence: Sequence,
+    world_from_camera: np.ndarray,
+    timestamp_s: np.ndarray,
+    grounds: list[Surface],
+    rng: np.random.Generator,
+) -> tuple[AnimalCourse, Bool[np.ndarray, "frame"]]:
+    """Let the animal come, walk between places in view, rest there and go; return its course and when it is
+    there.
+    """
+    steps = np.arange(int(np.ceil((timestamp_s[-1] + 2) / STEP_S))) * STEP_S
+    position = np.tile([0.0, -ABSENT_M, 0.0], (len(steps), 1))
+    yaw, posture, air = np.zeros(len(steps)), np.zeros((len(steps), 3)), np.zeros(len(steps))
+    there, now = np.zeros(len(steps), bool), rng.uniform(0.5, 3.0)
+    while now < steps[-1] - 2.5:
+        stay = rng.uniform(3.0, 7.5)
+        chosen = np.flatnonzero((steps >= now) & (steps < now + stay))
+        frame = int(np.argmin(np.abs(timestamp_s - now - 0.4 * stay)))
+        walk = _walk(sequence, world_from_camera[frame], frame, grounds, len(chosen), rng)
+        if walk is not None:
+            position[chosen], yaw[chosen], posture[chosen], air[chosen] = walk
+            there[chosen] = True
+        now += stay + rng.uniform(1.5, 5.0)
+    gaze = position + np.stack([np.sin(yaw), np.full(len(yaw), 0.25), np.cos(yaw)], axis=1)
+    made = AnimalCourse(steps, position, yaw, posture, air, gaze, np.full(len(steps), 0.2))
+    return made, np.interp(timestamp_s, steps, there.astype(float)) > 0.999
+
+
+def _walk(sequence, world_from_camera, frame, grounds, count, rng):
+    """Walk and rest for ``count`` steps within view of a frame; rise over the edge at first, sink behind it
+    at last.
+    """
+    for _ in range(40):
+        ground = grounds[min(int(rng.exponential(0.8)), len(grounds) - 1)]
+        cells = ground.points()
+        pixel, z = cameras.project(rigid.apply(rigid.inverse(world_from_camera), cells), sequence.intrinsics)
+        inside = (np.abs(np.asarray(pixel) - [320, 240]) < [270, 190]).all(1) & (z > 0.7) & (z < 3.5)
+        at = np.clip(np.asarray(pixel).astype(int), 0, [639, 479])
+        measured = sequence.depth(frame)[at[:, 1], at[:, 0]]
+        seen = cells[inside & (measured > z - 0.08)]
+        if len(seen) >= 4:
+            break
+    else:
+        return None
+    here = seen[rng.integers(len(seen))]
+    places, headings, rests, heading = [], [], [], rng.uniform(-np.pi, np.pi)
+    while len(places) < count:
+        target = cells[rng.integers(len(cells))]
+        if rng.random() < 0.35 or not ground.connects(here, target):
+            wait = int(rng.uniform(0.3, 1.6) / STEP_S)
+            kind = np.eye(3)[rng.integers(2)] * (rng.random() < 0.6)
+            places += [here] * wait
+            headings += [heading] * wait
+            rests += [kind] * wait
+            continue
+        step_m = rng.uniform(0.2, 0.6) * STEP_S
+        way = here + np.linspace(0, 1, max(2, int(np.linalg.norm(target - here) / step_m)))[:, None] * (
+            target - here
+        )
+        heading = float(np.arctan2(*(target - here)[[0, 2]]))
+        places += list(way)
+        headings += [heading] * len(way)
+        rests += [np.zeros(3)] * len(way)
+        here = target
+    position = np.array(places[:count])
+    yaw = ndimage.gaussian_filter1d(np.unwrap(np.array(headings[:count])), 5, mode="nearest")
+    posture = ndimage.gaussian_filter1d(np.array(rests[:count]), 5, axis=0, mode="nearest")
+    rise = int(0.5 / STEP_S)
+    air = np.zeros(count)
+    for end in (slice(0, rise), slice(count - 1, count - 1 - rise, -1)):
+        position[end, 1] -= 0.45 * np.linspace(1, 0, rise) ** 2
+        air[end] = 1
+    return position, yaw, posture, air
+
+
+_EMPTY = shade.Backdrop(
+    np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3, 2)), np.zeros(0, np.int32),
+    np.zeros((0, 3), np.float32), np.zeros(1, np.uint8), np.zeros((0, 8, 3), np.int64),
+    np.zeros(0, np.float32),
+)  # fmt: skip
+"""a room without anything: only the animal is rendered"""
+
+
+@dataclass(frozen=True)
+class Composite:
+    """One frame with the animal and what is true of it."""
+
+    color: UInt8[np.ndarray, "height width 3"]
+    depth: Float[np.ndarray, "height width"]
+    mask: Bool[np.ndarray, "height width"]
+
+
+class Compositor:
+    """Draws the animal into frames of a sequence."""
+
+    def __init__(self, sequence: Sequence, creature: animal.Animal, noise: Noise, rng: np.random.Generator):
+        self.sequence, self.creature, self.noise, self._rng = sequence, creature, noise, rng
+        pictures = [sequence.color(i) for i in np.linspace(0, len(sequence.numbers) - 1, 8).astype(int)]
+        self._light = np.mean([((p / 255.0) ** 2.2).mean((0, 1)) for p in pictures], axis=0) / 0.3
+        """of a scene whose surfaces reflect 30 % on average, linear RGB"""
+
+    def frames(
+        self, world_from_camera: np.ndarray, motion: gait.AnimalMotion, there: np.ndarray
+    ) -> Iterator[Composite]:
+        """Draw every frame, in order."""
+        turned = rigid.vector_from_rotation(
+            np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
+        )
+        turned = np.concatenate([turned, turned[-1:]])
+        for index, present in enumerate(there):
+            color, depth = self.sequence.color(index), self.sequence.depth(index)
+            if present:
+                blur = 0.15 * self.sequence.intrinsics[0, 0] * np.array([-turned[index, 1], turned[index, 0]])
+                yield self._draw(color, depth, world_from_camera[index], motion, index, blur)
+            else:
+                yield Composite(color, depth, np.zeros(depth.shape, bool))
+
+    def _draw(self, color, depth, world_from_camera, motion, index, blur_px) -> Composite:
+        height, width = depth.shape
+        camera_from_world = rigid.inverse(world_from_camera)
+        camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
+        body = animal.surface(self.creature, camera_from_bone)
+        k = self.sequence.intrinsics
+        focal = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+        if body[:, 2].max() < 0.3:
+            return Composite(color, depth, np.zeros(depth.shape, bool))
+        view = raster.see(body, self.creature.faces, np.diag([2, 2, 1]) @ k, 2 * height, 2 * width)
+        normals = animal.normals_of(body, self.creature.faces) @ world_from_camera[:3, :3].T
+        shine = (
+            0.45 + 0.4 * (0.5 + 0.5 * normals[:, 1:2]) + 0.25 * np.clip(normals[:, :1], 0, 1)
+        ) * self._light
+        balls = np.zeros((len(SHADOW_BALLS), 4))
+        for row, (bone, rest, radius) in enumerate(SHADOW_BALLS):
+            local = np.asarray(rest) - animal.HEADS[animal.INDEX[bone]]
+            balls[row] = *rigid.apply(camera_from_bone[animal.INDEX[bone]], local[None])[0], radius
+        coat = shade.Coat(
+            self.creature.faces, self.creature.vertices, shine.astype(np.float32), self.creature.fur, balls
+        )
+        fur = shade.shade(view.face, view.inverse_corners, focal, _EMPTY, coat, camera_from_world)
+        own = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, focal, height, width)
+        cover = cv2.resize((view.face >= 0).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        hidden = (_filled(depth) < own - 0.012 - 0.01 * own) & (own > 0)
+        cover[hidden], fur[hidden] = 0, 0
+        if not (cover >= 0.5).any():
+            return Composite(color, depth, np.zeros(depth.shape, bool))
+        dark = _contact_shadow(_filled(depth), np.asarray(focal), camera_from_world[:3, 1].copy(), balls)
+        room = (color / 255.0).astype(np.float32) ** 2.2 * dark[..., None]
+        layer = _smeared(cv2.GaussianBlur(np.dstack([fur, cover]).astype(np.float32), (0, 0), 0.7), blur_px)
+        linear = layer[..., :3] + room * (1 - layer[..., 3:])
+        shown = 255 * np.clip(linear, 0, 1) ** (1 / 2.2)
+        shown += layer[..., 3:] * self._rng.normal(0, self.noise.color, shown.shape)
+        return Composite(
+            np.clip(shown, 0, 255).astype(np.uint8), self._measured(depth, own * (cover >= 0.5)), cover >= 0.5
+        )
+
+    def _measured(self, room: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "height width"]:
+        """Return what the sensor measures of room and animal: noise with grain, a wandering outline, the
+        projector's shadow.
+        """
+        height, width = room.shape
+        bend = cv2.resize(
+            self._rng.standard_normal((height // 8, width // 8, 2)).astype(np.float32), (width, height)
+        )
+        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        own = cv2.remap(own.astype(np.float32), x + bend[..., 0], y + bend[..., 1], cv2.INTER_NEAREST)
+        shadow = _projector_shadow(
+            own, _filled(room), self.sequence.intrinsics[0, 0] * PROJECTOR_BASELINE_M, self.noise.shadow_side
+        )
+        sigma = np.maximum(np.polyval(self.noise.coefficients, own), 0.001)
+        grain = cv2.GaussianBlur(self._rng.standard_normal(own.shape), (0, 0), 1.5) * 5.3
+        own = np.where(own > 0, own + sigma * grain, 0)
+        slant = cv2.morphologyEx(own, cv2.MORPH_GRADIENT, np.ones((3, 3))) / np.maximum(own, 0.3)
+        lost = (own > 0) & (slant > 0.03) & (bend[..., 0] > 0.8)
+        out = np.where(own > 0, np.where(lost, 0, own), np.where(shadow, 0, room))
+        return out.astype(np.float32)
+
+
+@lru_cache(maxsize=1)
+def _nearest_known(shape, data):
+    depth = np.frombuffer(data, np.float32).reshape(shape)
+    return np.array(ndimage.distance_transform_edt(depth == 0, return_distances=False, return_indices=True))
+
+
+def _filled(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Give unknown pixels the nearest known depth."""
+    rows, columns = _nearest_known(depth.shape, np.ascontiguousarray(depth, np.float32).tobytes())
+    return depth[rows, columns]
+
+
+@njit(cache=True)
+def _projector_shadow(own, room, focal_baseline, side):
+    """Mark what the animal hides from the projector: as wide as the disparity between both surfaces."""
+    height, width = own.shape
+    out = np.zeros((height, width), np.bool_)
+    for i in range(height):
+        for j in range(width):
+            if own[i, j] > 0:
+                for step in range(1, 60):
+                    u = j + side * step
+                    if u < 0 or u >= width or own[i, u] > 0:
+                        break
+                    if step > focal_baseline * (1 / own[i, j] - 1 / max(room[i, u], 0.3)):
+                        break
+                    out[i, u] = True
+    return out
+
+
+@njit(cache=True)
+def _contact_shadow(depth, focal_center, up_camera, balls):
+    """Return the share of light left on level ground near the animal (analytic sphere occlusion)."""
+    out = np.ones(depth.shape, np.float32)
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            z = depth[i, j]
+            x, y = (
+                (j + 0.5 - focal_center[2]) / focal_center[0] * z,
+                (i + 0.5 - focal_center[3]) / focal_center[1] * z,
+            )
+            lost = 0.0
+            for ball in range(balls.shape[0]):
+                dx, dy, dz = balls[ball, 0] - x, balls[ball, 1] - y, balls[ball, 2] - z
+                squared = dx * dx + dy * dy + dz * dz
+                if squared < 0.3:
+                    facing = (up_camera[0] * dx + up_camera[1] * dy + up_camera[2] * dz) / np.sqrt(squared)
+                    lost += max(facing, 0.0) * min(balls[ball, 3] ** 2 / max(squared, 1e-6), 0.9)
+            out[i, j] = max(1 - 0.9 * lost, 0.35)
+    return out
+
+
+def _smeared(picture: np.ndarray, blur_px: np.ndarray) -> np.ndarray:
+    """Blur along the camera's motion."""
+    length = min(float(np.hypot(*blur_px)), 12.0)
+    if length < 1:
+        return picture
+    half = int(np.ceil(length / 2))
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    x, y = blur_px / np.hypot(*blur_px) * length / 2
+    cv2.line(kernel, (round(half - x), round(half - y)), (round(half + x), round(half + y)), 1.0)
+    return cv2.filter2D(picture, -1, kernel / kernel.sum())

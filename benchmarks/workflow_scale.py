@@ -1,0 +1,132 @@
+"""Time planner, Make, Snakemake and the runner on many recordings: `python -m benchmarks.workflow_scale
+3000`.
+
+Makes a folder of empty recordings beside this checkout's code, plans it, pretends that everything was built,
+and times each engine on it. `--homes N` times the planning of N agents of 23 recordings instead. Nothing is
+computed.
+"""
+
+import argparse
+import json
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PER_HOME = 23
+"""Recordings of the paper's cat."""
+RUNS = 5
+"""Of the runner, of which the fastest counts."""
+
+
+def checkout(folder: Path, agents: list[str], recordings: int) -> None:
+    """Link the code into `folder` and give every agent as many empty recordings."""
+    for name in ("pipeline", "stages", "profiles", "envs", ".venv"):
+        (folder / name).symlink_to(ROOT / name)
+    for name in ("Makefile", "Snakefile"):
+        shutil.copy(ROOT / name, folder)
+    shutil.copytree(ROOT / "agents", folder / "agents")
+    for agent in agents:
+        (folder / "agents" / f"{agent}.toml").write_text("")
+        captures = folder / "captures" / agent
+        captures.mkdir(parents=True)
+        for name in ("walkthrough", "turnaround", *(f"session_{i:05d}" for i in range(recordings - 2))):
+            (captures / f"{name}.r3d").touch()
+
+
+@dataclass(frozen=True, order=True)
+class Cost:
+    """What a command took."""
+
+    elapsed_s: float
+    cpu_s: float
+    """Of all its processes; on a busy machine the better measure."""
+
+
+def measured(folder: Path, command: list[str]) -> Cost:
+    """Run a command and return what it took."""
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Cost(time.perf_counter() - start, cpu_s)
+
+
+def pretend_built(folder: Path, agent: str) -> str:
+    """Write every stamp; return the id of one job whose artifact stands and is up to date."""
+    code = (
+        "from pathlib import Path; from pipeline.workflow import artifact, run;"
+        f"job = run._job({agent!r}, 'frames.v000'); key = run._key(job)\n"
+        "with artifact.create(Path(job['out']), stage='extract_frames', config={}, inputs={}, key=key) as made:\n"
+        "    (made / 'x').write_text('x')\n"
+    )
+    measured(folder, [sys.executable, "-SE", "-c", code])
+    for job in json.loads((folder / f"build/{agent}/plan/dag.json").read_text()):
+        stamp = folder / job["stamp"]
+        stamp.parent.mkdir(parents=True, exist_ok=True)
+        stamp.touch()
+    return "frames.v000"
+
+
+def many_recordings(folder: Path, count: int, snakemake: bool) -> dict[str, Cost]:
+    """Time everything for one agent of `count` recordings."""
+    checkout(folder, ["many"], count)
+    plan = [sys.executable, "-SE", "-m", "pipeline.workflow.plan", "plan", "many"]
+    snake = [
+        sys.executable,
+        "-m",
+        "snakemake",
+        "-n",
+        "--quiet",
+        "all",
+        "--cores",
+        "2",
+        "--config",
+        "agent=many",
+    ]
+    found = {"first plan": measured(folder, plan), "plan again": measured(folder, plan)}
+    if snakemake:
+        found["snakemake -n, nothing built"] = measured(folder, snake)
+    job = pretend_built(folder, "many")
+    make = ["make", f"PYTHON={sys.executable}", "many"]
+    found["make, all built"] = measured(folder, make)
+    if snakemake:
+        found["snakemake -n, all built"] = measured(folder, snake)
+    runner = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "many", job]
+    found["runner, one job"] = min(measured(folder, runner) for _ in range(RUNS))
+    return found
+
+
+def main() -> None:
+    """Measure and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recordings", type=int, nargs="?", default=3000)
+    parser.add_argument("--homes", type=int, help="time the planning of this many agents instead")
+    parser.add_argument("--no-snakemake", action="store_true")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if given.homes:
+            agents = [f"home{i:05d}" for i in range(given.homes)]
+            checkout(folder, agents, PER_HOME)
+            plan = [sys.executable, "-SE", "-m", "pipeline.workflow.plan", "plan", *agents]
+            found = {
+                f"first plan of {given.homes} homes": measured(folder, plan),
+                "again": measured(folder, plan),
+            }
+        else:
+            found = many_recordings(folder, given.recordings, not given.no_snakemake)
+    for what, cost in found.items():
+        print(f"{what:32}{cost.elapsed_s:8.2f} s{cost.cpu_s:8.2f} s of processor")
+
+
+if __name__ == "__main__":
+    main()

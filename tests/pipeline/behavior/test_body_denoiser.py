@@ -1,0 +1,60 @@
+import numpy as np
+import torch
+
+from pipeline.behavior.body_denoiser import BodyDenoiser, rotated_to_heading
+from pipeline.behavior.diffusion import Schedule
+from pipeline.geometry import rigid_torch
+
+FRAMES = 40
+
+
+def walk(turns: torch.Tensor, speed_m_s: float) -> torch.Tensor:
+    """A path whose direction turns by so much in each frame, and that stops after three quarters."""
+    yaw = turns.cumsum(0)
+    pace = torch.where(torch.arange(FRAMES) < 30, speed_m_s / 10, 0.0)
+    return torch.stack([yaw.sin() * pace, 0 * yaw, yaw.cos() * pace]).cumsum(1)[None], yaw
+
+
+def columns(yaw: torch.Tensor) -> torch.Tensor:
+    turn = rigid_torch.so3_exp(torch.stack([0 * yaw, yaw, 0 * yaw], dim=-1))
+    return rigid_torch.rotation_to_6d(turn).mT[None]
+
+
+def test_a_body_is_held_to_look_where_it_goes_and_to_stay_as_it_is():
+    net = BodyDenoiser(torch.nn.Identity(), 6, FRAMES)
+    for first, speed in ((0.4, 0.8), (0.4, 0.0)):
+        path, yaw = walk(torch.full((FRAMES,), 0.03), speed)
+        held = columns(torch.full((FRAMES,), first))
+        looks = rotated_to_heading(held, net.headings(net.steps(path), held))
+        told = torch.atan2(-looks[0, 2], looks[0, 0])  # of the x axis
+        if speed:
+            assert (told - yaw)[10:30].abs().max() < 0.1
+            assert (told[30:] - told[29]).abs().max() < 1e-4
+        else:
+            assert (told - first).abs().max() < 1e-4
+
+
+def test_what_is_denoised_is_the_departure_from_the_posture():
+    class Noted(torch.nn.Module):
+        def forward(self, x, t, condition, control, keep):
+            self.x = x
+            return x
+
+    net = BodyDenoiser(Noted(), 9, FRAMES)
+    posture = torch.cat([columns(torch.zeros(1))[0, :, 0], torch.tensor([0.3, -0.2, 0.1])])[None]
+    clean, noise, t = (
+        posture[..., None].expand(-1, -1, FRAMES),
+        torch.randn(1, 9, FRAMES),
+        torch.tensor([20.0]),
+    )
+    share = float(Schedule().alpha_bar[20])
+    net(
+        np.sqrt(share) * clean + np.sqrt(1 - share) * noise,
+        t,
+        torch.cat([torch.ones(1, 4), posture], dim=1),
+        torch.zeros(1, 3, FRAMES),
+        None,
+    )
+    torch.testing.assert_close(
+        net.unet.x, np.sqrt(1 - share).astype(np.float32) * noise, atol=6e-3, rtol=0
+    )  # a heading is told by vectors a little shorter than 1

@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.behavior.denoisers import EMBEDDING, ControlUNet, UncontrolledUNet
+from pipeline.behavior.diffusion import Schedule, guided, noised, sample
+
+SCHEDULE = Schedule()
+
+
+def perfect(mean: float, std: float):
+    """The noise that a perfect network predicts when the data are N(mean, std^2)."""
+
+    def denoise(x, t):
+        share = SCHEDULE.alpha_bar[int(t)]
+        clean = mean + np.sqrt(share) * std**2 / (share * std**2 + 1 - share) * (x - np.sqrt(share) * mean)
+        return (x - np.sqrt(share) * clean) / np.sqrt(1 - share)
+
+    return denoise
+
+
+@pytest.mark.parametrize(
+    ("method", "count", "tolerance"), [("ddpm", 50, 0.06), ("ddim", 50, 0.05), ("ddim", 10, 0.12)]
+)
+def test_samplers_reproduce_a_gaussian(method, count, tolerance):
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal(20000)
+    x = sample(
+        perfect(0.7, 0.5),
+        noise,
+        SCHEDULE,
+        method=method,
+        count=count,
+        draw=lambda: rng.standard_normal(20000),
+    )
+    assert abs(x.mean() - 0.7) < tolerance  # 50 steps of the posterior's variance narrow, few large ones blur
+    assert abs(x.std() - 0.5) < tolerance
+
+
+def test_noising_keeps_unit_variance():
+    rng = np.random.default_rng(0)
+    clean, noise = rng.standard_normal((2, 100000))
+    assert noised(clean, noise, 0.3).std() == pytest.approx(1, abs=0.01)
+
+
+def test_schedule_ends_in_noise_and_every_sampler_visits_both_ends():
+    assert SCHEDULE.alpha_bar[0] > 0.999
+    assert SCHEDULE.alpha_bar[-1] < 0.01
+    for count in (4, 10, 50):
+        steps = SCHEDULE.visited(count)
+        assert (steps[0], steps[-1], len(set(steps))) == (49, 0, count)
+
+
+def test_ddim_follows_rectified_flow_in_eulers_steps():
+    schedule = Schedule(course="rectified")
+    moment = np.arange(1, schedule.steps + 1) / (schedule.steps + 1)  # share of noise on the straight way
+    unit = np.sqrt((1 - moment) ** 2 + moment**2)
+
+    def noise_in(way, t):
+        return np.sin(3 * way) + 0.1 * t  # any prediction
+
+    first = np.random.default_rng(0).standard_normal(100)
+    sampled = sample(lambda x, t: noise_in(x * unit[int(t)], t), first, schedule, method="ddim", count=10)
+    steps = schedule.visited(10)
+    way = first * unit[steps[0]]
+    for now, later in zip(steps, [*steps[1:], None], strict=True):
+        noise = noise_in(way, now)
+        clean = ((way - moment[now] * noise) / (1 - moment[now])).clip(-schedule.clip, schedule.clip)
+        noise = (way - (1 - moment[now]) * clean) / moment[now]
+        way = way + ((0.0 if later is None else moment[later]) - moment[now]) * (noise - clean)
+    np.testing.assert_allclose(sampled, way, atol=1e-6)
+
+
+def test_guidance_is_linear_in_its_scale():
+    blend = guided(lambda x, t: x + 3, lambda x, t: x + 1, 0.5)
+    assert blend(0.0, 0) == 2.0
+    assert guided(lambda x, t: 3.0, lambda x, t: 1.0, 1.0)(0.0, 0) == 3.0
+    assert guided(lambda x, t: 3.0, lambda x, t: 1.0, 0.0)(0.0, 0) == 1.0
+
+
+def test_control_enters_every_block_and_can_be_dropped():
+    torch.manual_seed(0)
+    net = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
+    x, t, code = torch.randn(2, 4, 56), torch.tensor([3.0, 40.0]), torch.randn(2, 8)
+    keep, drop = torch.ones(2, 1), torch.zeros(2, 1)
+    first, second = torch.randn(2, 3), torch.randn(2, 3)
+    torch.testing.assert_close(
+        net(x, t, code, first, keep), net(x, t, code, second, keep)
+    )  # begins without influence
+    assert len(net.inject) == 5
+    for zero in net.inject:
+        torch.nn.init.normal_(zero.weight)
+    assert (net(x, t, code, first, keep) - net(x, t, code, second, keep)).abs().max() > 1e-3
+    torch.testing.assert_close(net(x, t, code, first, drop), net(x, t, code, second, drop))
+    sequence = first[..., None].expand(2, 3, 56)
+    torch.testing.assert_close(net(x, t, code, first, keep), net(x, t, code, sequence, keep))
+
+
+def test_nothing_steers_a_free_network_which_is_a_controlled_one_without_control():
+    torch.manual_seed(0)
+    steered = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
+    free = UncontrolledUNet(4, torch.nn.Linear(8, EMBEDDING), width=8, multipliers=(1, 2)).eval()
+    free.load_state_dict(
+        {name: value for name, value in steered.state_dict().items() if name in free.state_dict()}
+    )
+    x, t, code, control = (
+        torch.randn(2, 4, 56),
+        torch.tensor([3.0, 40.0]),
+        torch.randn(2, 8),
+        torch.randn(2, 3),
+    )
+    dropped = torch.zeros(2, 1)
+    torch.testing.assert_close(free(x, t, code, control, dropped + 1), steered(x, t, code, control, dropped))
+
+
+def test_straight_ways_are_followed_without_fresh_noise():
+    assert Schedule().method == "ddpm" and Schedule(course="rectified").method == "ddim"

@@ -1,0 +1,167 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import BehaviorNets, Scaling, bones_from_channels, channels_from_bones
+from pipeline.behavior.path_encoding import goal_error
+from pipeline.behavior.planning import SampledPlan, Sampler, TorchNetworks, observe
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
+from pipeline.geometry import rigid
+from pipeline.rivals.predictors import Ats, ConstantVelocity, LocationPrior, StandStill
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+
+
+@pytest.fixture(scope="module")
+def data():
+    return wandering()
+
+
+@pytest.fixture(scope="module")
+def ats():
+    channels = ARCHITECTURE.body_channels
+    scaling = Scaling(
+        np.array([1.0, 0.1, 1.0]),
+        np.full((1, 4), 0.5),
+        np.ones((3, 56)) * 0.5,
+        np.zeros(channels),
+        np.ones(channels) * 0.1,
+    )
+    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)
+    return Ats(sampler, room(), REST, "yaw", PlanSamplingConfig(goal_steps=4, sequence_steps=2))
+
+
+def test_bones_survive_their_channels(data):
+    bones = data.trajectories["v000"].agent_from_bone
+    channels = channels_from_bones(bones, REST)
+    assert channels.shape == (len(bones), 18)
+    np.testing.assert_allclose(bones_from_channels(channels, REST), bones, atol=1e-6)
+    np.testing.assert_allclose(channels_from_bones(REST, REST), 0, atol=1e-9)
+
+
+def test_plan_returns_to_the_world(data):
+    _, future = data.windows(np.array([5]))
+    frame = rigid.make(rigid.rotation_from_vector(np.array([[0, 0.4, 0]])), np.array([[1.0, 0, 2]]))
+    ego = rigid.inverse(frame)[:, None] @ future.world_from_agent
+    body = np.concatenate(
+        [rigid.rotation_to_6d(ego[..., :3, :3]), channels_from_bones(future.agent_from_bone, REST)], axis=-1
+    )
+    plan = SampledPlan(ego[:, -1, :3, 3], ego[..., :3, 3], body)
+    np.testing.assert_allclose(plan.world_from_agent(frame), future.world_from_agent, atol=1e-9)
+
+
+def test_same_noise_gives_the_same_plan_and_conditions_can_be_switched_off(ats, data):
+    context, _ = data.windows(np.array([0, 40]))
+    observation = observe(context, room(), REST, "yaw")
+
+    def plan(**switches):
+        return ats.sampler.plan(
+            observation,
+            PlanSamplingConfig(goal_steps=4, sequence_steps=2, **switches),
+            np.random.default_rng(1),
+        )
+
+    np.testing.assert_array_equal(plan().goal, plan().goal)
+    ignoring = plan(guidance=0.0).goal
+    np.testing.assert_allclose(ignoring, plan(observer=False).goal, atol=1e-6)
+    full, half = plan(guidance=1.0).goal, plan(guidance=0.5).goal
+    assert np.abs(full - ignoring).max() > np.abs(half - ignoring).max() > 0
+
+
+def test_given_goal_and_path_replace_their_levels(ats, data):
+    context, _ = data.windows(np.array([0]))
+    observation = observe(context, room(), REST, "yaw")
+    goal, path = np.array([[0.3, 0.0, 0.7]]), np.linspace(0, 1, 56)[None, :, None] * [0.3, 0.0, 0.7]
+    plan = ats.sampler.plan(observation, ats.sampling, np.random.default_rng(0), goal=goal, path=path)
+    np.testing.assert_allclose(plan.goal, goal, atol=1e-6)
+    np.testing.assert_allclose(plan.path, path, atol=1e-6)
+
+
+def test_paths_that_miss_their_goals_are_drawn_again(ats, data):
+    context, _ = data.windows(data.indices(TEST)[::20])
+    codes = ats.sampler.codes(
+        observe(context, room(), REST, "yaw"), replace(ats.sampling, avoid_solid=False), 8
+    )
+    goal = codes.start + np.random.default_rng(0).normal(0, 0.4, codes.start.shape)
+
+    def misses(**changes):
+        path = ats.sampler.paths(codes, goal, replace(ats.sampling, **changes), np.random.default_rng(1))
+        return goal_error(path, codes.start, goal)
+
+    once, often = misses(max_path_draws=1), misses(max_path_draws=4)
+    assert (once > 1).any() and (often < once)[once > 1].any(), (
+        "networks that have learned nothing come nearer by luck"
+    )
+    assert (often <= once).all() and (often == once)[once <= 1].all()
+    np.testing.assert_array_equal(
+        misses(max_path_draws=4, guidance=0.5),
+        misses(max_path_draws=1, guidance=0.5),
+        "half a goal binds nobody",
+    )
+    np.testing.assert_array_equal(misses(max_path_draws=4, goal=False), misses(max_path_draws=1, goal=False))
+
+
+def test_bodies_spread_as_far_as_they_are_told(ats, data):
+    context, _ = data.windows(np.array([0]))
+    codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), ats.sampling, 40)
+    path = np.tile(np.linspace(0, 1, 56)[None, :, None] * [0.3, 0.0, 0.7], (40, 1, 1))
+    spread = [
+        ats.sampler.bodies(codes, path, replace(ats.sampling, body_noise_std=told), np.random.default_rng(0))
+        .std(0)
+        .mean()
+        for told in (0.0, 0.3, 1.0)
+    ]
+    assert spread[0] < 1e-6 < spread[1] < spread[2]
+
+
+def test_predictors_share_one_call(ats, data):
+    train = data.windows(data.indices(TRAIN))
+    context, _ = data.windows(data.indices(TEST)[::20])
+    for predictor in (ats, StandStill.fit(*train), ConstantVelocity.fit(*train), LocationPrior.fit(*train)):
+        first, second = (predictor.sample(context, 16, np.random.default_rng(0)) for _ in range(2))
+        assert first.goal.shape == (len(context), 16, 3)
+        np.testing.assert_array_equal(first.goal, second.goal)
+        if first.path is not None:
+            assert first.path.shape == (len(context), 16, 56, 3)
+            assert first.rotation.shape == (len(context), 16, 56, 3, 3)
+            assert first.agent_from_bone.shape == (len(context), 16, 56, 3, 4, 4)
+            np.testing.assert_allclose(np.linalg.det(first.rotation), 1, atol=1e-4)
+
+
+def test_goals_alone_are_those_of_whole_plans(ats, data):
+    context, _ = data.windows(data.indices(TEST)[:3])
+    whole, alone = (draw(context, 4, np.random.default_rng(0)).goal for draw in (ats.sample, ats.goals))
+    np.testing.assert_allclose(alone, whole, atol=1e-6)
+
+
+def test_baseline_noise_is_that_of_training(data):
+    train = data.windows(data.indices(TRAIN))
+    still = StandStill.fit(*train)
+    moved = train[1].goal_world - train[0].world_from_agent[:, -1, :3, 3]
+    assert still.std[-1, 0] == pytest.approx(np.sqrt((moved[:, [0, 2]] ** 2).mean()))
+    drawn = (
+        still.sample(train[0][:50], 400, np.random.default_rng(0)).goal
+        - train[0].world_from_agent[:50, None, -1, :3, 3]
+    )
+    assert drawn[..., 0].std() == pytest.approx(still.std[-1, 0], rel=0.05)
+
+
+def test_location_prior_draws_training_goals(data):
+    context, future = data.windows(data.indices(TRAIN)[:40])
+    prior = LocationPrior.fit(context, future)
+    goals = prior.sample(context[:1], 500, np.random.default_rng(0)).goal[0]
+    here = rigid.apply(rigid.inverse(context.world_from_agent[:, -1]), future.goal_world[:, None])[:, 0]
+    there = rigid.apply(rigid.inverse(context.world_from_agent[:1, -1]), goals[None])[0]
+    nearest = np.linalg.norm(there[:, None] - here, axis=-1).min(1)
+    assert nearest.max() < 0.1 * np.sqrt(3) + 1e-6
+
+
+def test_data_survive_their_files(data, tmp_path):
+    data.save(tmp_path)
+    loaded = BehaviorData.load(tmp_path)
+    assert loaded.videos == data.videos
+    for before, after in zip(data.windows(np.arange(9)), loaded.windows(np.arange(9)), strict=True):
+        for name, value in vars(before).items():
+            np.testing.assert_array_equal(getattr(after, name), value)

@@ -1,0 +1,76 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.behavior.path_encoding import (
+    GOAL_LENGTH_POWER,
+    path_from_velocity_channels,
+    snapped_to_goal,
+    velocity_channels_from_path,
+    warped_path,
+    with_powered_length,
+)
+
+
+def stroll(seed=0, count=20):
+    """Paths that walk for a while at 0.1 to 2 m/s, in curves, and rest before and after."""
+    rng = np.random.default_rng(seed)
+    turn = rng.normal(0, 0.2, (count, 56)).cumsum(1)
+    pace = rng.uniform(0.1, 2.0, (count, 1)) * ((np.arange(56) > 10) & (np.arange(56) < 40))
+    velocity = np.stack([np.sin(turn) * pace, 0.05 * pace, np.cos(turn) * pace], axis=-1)
+    start = rng.normal(0, 1, (count, 3))
+    return start[:, None] + (velocity / 10).cumsum(1), start
+
+
+def strides_of(path, start):
+    return velocity_channels_from_path(torch.from_numpy(path), torch.from_numpy(start)).numpy()
+
+
+def test_paths_survive_their_strides_and_rest_is_told():
+    path, start = stroll()
+    strides = strides_of(path, start)
+    np.testing.assert_allclose(path_from_velocity_channels(strides, start), path, atol=1e-6)
+    assert (strides[:, 11:40, 3] == 1).all() and (strides[:, :11, 3] == -1).all()
+
+
+def test_what_sampling_leaves_of_noise_does_not_move_an_animal_that_stays():
+    path, start = stroll()
+    noisy = strides_of(path, start) + 0.05 * np.random.default_rng(1).standard_normal((20, 56, 4))
+    speed = np.linalg.norm(np.diff(path_from_velocity_channels(noisy, start), axis=1), axis=-1) * 10
+    assert np.median(speed[:, 42:]) < 0.005 and speed[:, 42:].max() < 0.05
+    places = path + 0.1 * np.random.default_rng(1).standard_normal(path.shape)
+    assert np.median(np.linalg.norm(np.diff(places, axis=1), axis=-1) * 10) > 1
+
+
+def test_a_path_is_led_to_its_goal_and_rests_where_it_rested():
+    path, start = stroll()
+    goal = path[:, -1] + np.random.default_rng(2).normal(0, 0.05, (20, 3))
+    there = snapped_to_goal(path, start, goal, 1.0)
+    reached = np.linalg.norm(path[:, -1] - start, axis=-1) > 0.3
+    np.testing.assert_allclose(there[reached, -1], goal[reached], atol=1e-9)
+    np.testing.assert_allclose(np.diff(there[:, 41:], axis=1), 0, atol=1e-9)
+    np.testing.assert_array_equal(snapped_to_goal(path, start, goal, 0.0), path)
+    asleep = np.repeat(start[:, None], 56, axis=1)
+    np.testing.assert_array_equal(snapped_to_goal(asleep, start, goal, 1.0), asleep)
+    far = snapped_to_goal(path, start, goal + 100, 1.0)
+    assert (
+        np.linalg.norm(np.diff(far - path, axis=1), axis=-1)
+        <= np.linalg.norm(np.diff(path, axis=1), axis=-1) + 1e-9
+    ).all()
+
+
+def test_strides_bend_along_a_path_that_was_moved():
+    path, start = stroll()
+    strides, moved = strides_of(path, start), path + np.linspace(0, 0.2, 56)[:, None]
+    np.testing.assert_allclose(
+        path_from_velocity_channels(warped_path(strides, start, moved), start), moved, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("power", [0.5, GOAL_LENGTH_POWER])
+def test_powers_of_ways_are_undone(power):
+    way = np.random.default_rng(0).standard_normal((50, 3))
+    np.testing.assert_allclose(
+        with_powered_length(with_powered_length(way, power), 1 / power), way, atol=1e-9
+    )
+    assert np.isfinite(with_powered_length(np.zeros((1, 3)), power)).all()

@@ -1,0 +1,110 @@
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from pipeline.behavior.model import BehaviorNets
+from pipeline.behavior.perception import VELOCITY_CHANNELS, FeatureVolume, world_from_ego
+from pipeline.behavior.planning import observe
+from pipeline.behavior.trajectories import Context
+from pipeline.geometry import rigid
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+
+
+def heading(yaw: float, pitch: float = 0.0) -> np.ndarray:
+    turn = rigid.rotation_from_vector(np.array([0, yaw, 0])) @ rigid.rotation_from_vector(
+        np.array([pitch, 0, 0])
+    )
+    return rigid.make(turn, np.array([1.0, 0.2, -0.5]))
+
+
+def test_ego_frame_keeps_the_heading_and_stands_upright():
+    frame = world_from_ego(heading(0.7, pitch=-0.5), "yaw")
+    np.testing.assert_allclose(frame[:3, 1], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(frame, heading(0.7), atol=1e-9)
+    np.testing.assert_allclose(world_from_ego(heading(0.7, -0.5), "full"), heading(0.7, -0.5))
+
+
+def test_heading_survives_a_head_that_points_straight_up_or_down():
+    for pitch in (-np.pi / 2, np.pi / 2):
+        np.testing.assert_allclose(world_from_ego(heading(0.7, pitch), "yaw"), heading(0.7), atol=1e-6)
+
+
+def test_grid_reads_the_voxel_at_its_place():
+    features = np.zeros((2, 20, 20, 20), np.float16)
+    features[1, 12, 3, 15] = 0.5
+    volume = FeatureVolume(features, np.zeros((20, 20, 20), np.uint8), np.zeros(3), 0.1)
+    grid = volume.around(rigid.make(np.eye(3), np.array([[1.0, 0.5, 1.0]])))
+    found = np.argwhere(grid[0, 1] > 0)
+    np.testing.assert_array_equal(found, [[32 + 2, 4 - 2, 32 + 5]])
+    assert grid[0, 1].max() == 0.5
+
+
+def test_turning_and_moving_the_world_changes_no_observation():
+    data, volume = wandering(), room()
+    context, _ = data.windows(np.array([3, 50]))
+    quarter = rigid.make(rigid.rotation_from_vector(np.array([0, np.pi / 2, 0])), np.zeros(3))
+    turned_volume = FeatureVolume(
+        np.rot90(volume.features, 1, (3, 1)), np.rot90(volume.occupancy, 1, (2, 0)), volume.origin, 0.1
+    )
+    turned = Context(
+        quarter @ context.world_from_agent,
+        context.agent_from_bone,
+        rigid.apply(quarter, context.observer_world),
+    )
+    before, after = observe(context, volume, REST, "yaw"), observe(turned, turned_volume, REST, "yaw")
+    np.testing.assert_allclose(after.observer_past, before.observer_past, atol=1e-5)
+    np.testing.assert_allclose(after.past, before.past, atol=1e-5)
+    assert (
+        after.scene_grid == before.scene_grid
+    ).mean() > 0.999  # points on the border of two voxels may fall either way
+
+
+def test_far_observer_equals_none_and_a_near_one_does_not():
+    nets = BehaviorNets(ARCHITECTURE).eval()
+    encode = next(iter(nets.perception)).observer
+    track = torch.linspace(1, 0, 8)[:, None] * torch.tensor([[0.5, 0.0, 0.5]]) + torch.tensor(
+        [[0.0, 1.3, 1.0]]
+    )
+    near, far = track.reshape(1, -1), (track + torch.tensor([0.0, 0.0, 3.5])).reshape(1, -1)
+    none = encode(near, torch.zeros(1))
+    torch.testing.assert_close(encode(far, torch.ones(1)), none)
+    torch.testing.assert_close(encode(far * 2, torch.ones(1)), none)
+    assert (encode(near, torch.ones(1)) - none).abs().max() > 1e-3
+
+
+def alike(code: torch.Tensor) -> list[bool]:
+    """Tell of scene, observer and past whether two agents' codes are alike; pace and posture must be so where
+    the past is.
+    """
+    now = VELOCITY_CHANNELS + ARCHITECTURE.body_channels
+    maps = ARCHITECTURE.condition_length - ARCHITECTURE.code_length
+    charts, ensemble_size, posture = code.split([maps, ARCHITECTURE.code_length - now, now], dim=1)
+    parts = ensemble_size.unflatten(1, (ARCHITECTURE.ensemble_size, 3, -1))
+    same = ((parts[0] - parts[1]).abs().amax((0, 2)) < 1e-7).tolist()
+    assert bool((charts[0] == charts[1]).all()) == same[0]
+    assert bool((posture[0] == posture[1]).all()) == same[2]
+    return same
+
+
+def test_a_blind_model_never_sees_its_condition():
+    inputs = [
+        torch.randn(2, 16, 64, 8, 64),
+        torch.rand(2, 24),
+        torch.randn(2, 8 * (9 + 18)),
+        torch.ones(2, 3),
+    ]
+    for number, blind in enumerate(("scene", "observer", "past")):
+        whole = BehaviorNets(replace(ARCHITECTURE, ablated_input=blind)).perception(*inputs)
+        assert alike(whole) == [k == number for k in range(3)]
+
+
+def test_dropped_conditions_do_not_reach_the_code():
+    nets = BehaviorNets(ARCHITECTURE).eval()
+    inputs = [torch.randn(2, 16, 64, 8, 64), torch.rand(2, 24), torch.randn(2, 8 * (9 + 18))]
+    nothing = nets.perception(*inputs, torch.zeros(2, 3))
+    torch.testing.assert_close(nothing[0], nothing[1])
+    for number in range(3):
+        keep = torch.zeros(2, 3)
+        keep[:, number] = 1
+        assert alike(nets.perception(*inputs, keep)) == [k != number for k in range(3)]

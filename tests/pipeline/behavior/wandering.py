@@ -1,0 +1,76 @@
+"""A small truth for behaviour tests: an animal that wanders in a walled room with an observer who walks
+about.
+"""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from pipeline.behavior.model import Architecture
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Trajectory
+from pipeline.geometry import rigid
+
+BONES = 3
+REST = rigid.make(
+    rigid.rotation_from_vector(np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.2, 0.1]])),
+    np.array([[0, 0, 0], [0, 0, 0.1], [0, 0.05, -0.1]]),
+)
+ARCHITECTURE = Architecture(
+    bones=BONES,
+    scene_width=8,
+    hidden=16,
+    code=8,
+    unet_width=8,
+    unet_multipliers=(1, 2),
+    goal_hidden=16,
+    ensemble_size=2,
+)
+
+
+def room() -> FeatureVolume:
+    """A floor and four walls of 4 x 4 m around the origin, each with its own feature."""
+    shape = (44, 12, 44)
+    occupancy = np.zeros(shape, np.uint8)
+    features = np.zeros((16, *shape), np.float16)
+    surfaces = (np.s_[:, :2], np.s_[:2, :], np.s_[-2:, :], np.s_[:, :, :2], np.s_[:, :, -2:])
+    for number, surface in enumerate(surfaces):
+        occupancy[surface] = 1
+        features[(slice(None), *surface)] = 0
+        features[(number, *surface)] = 1
+    return FeatureVolume(features, occupancy, np.array([-2.2, -0.2, -2.2]), 0.1)
+
+
+def wander(rng: np.random.Generator, seconds: float = 12.0) -> Trajectory:
+    """One recording: smooth random motion inside the room, swaying bones."""
+    count = round(seconds * RATE_HZ)
+    course = gaussian_filter1d(rng.standard_normal((count, 2)), 12, axis=0, mode="wrap")
+    course *= 1.4 / np.abs(course).max()
+    velocity = np.gradient(course, axis=0)
+    yaw = np.unwrap(np.arctan2(velocity[:, 0], velocity[:, 1]))
+    upright = np.stack([0 * yaw, yaw, 0 * yaw], axis=-1)
+    position = np.stack([course[:, 0], np.full(count, 0.2), course[:, 1]], axis=-1)
+    sway = 0.3 * np.sin(np.arange(count)[:, None] * 0.7 + np.arange(BONES))
+    turn = rigid.rotation_from_vector(np.stack([sway, 0 * sway, 0 * sway], axis=-1))
+    bones = rigid.make(
+        turn @ REST[:, :3, :3], REST[:, :3, 3] + 0.02 * np.stack([0 * sway, sway, 0 * sway], axis=-1)
+    )
+    person = gaussian_filter1d(rng.standard_normal((count, 2)), 15, axis=0, mode="wrap") * 4
+    camera = rigid.make(
+        np.broadcast_to(np.eye(3), (count, 3, 3)),
+        np.stack([person[:, 0], np.full(count, 1.3), person[:, 1]], axis=-1),
+    )
+    agent = rigid.make(rigid.rotation_from_vector(upright), position)
+    return Trajectory(
+        np.arange(count) / RATE_HZ, agent, bones.astype(np.float32), camera, np.ones(count, bool)
+    )
+
+
+def wandering(seed: int = 0, videos: int = 3) -> BehaviorData:
+    """Several recordings, the last for testing, with all their windows."""
+    rng = np.random.default_rng(seed)
+    trajectories = {f"v{number:03d}": wander(rng) for number in range(videos)}
+    per_video = len(trajectories["v000"].timestamp_s) - PAST - FUTURE + 1
+    video = np.repeat(np.arange(videos), per_video).astype(np.int32)
+    start = np.tile(np.arange(per_video), videos).astype(np.int32)
+    split = (video == videos - 1).astype(np.uint8)
+    return BehaviorData(trajectories, REST.astype(np.float32), video, start, split, tuple(trajectories))

@@ -1,0 +1,39 @@
+"""Work in several processes, and how it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from pipeline.core import processes
+
+ROOT = Path(__file__).parents[3]
+PROGRAM = """
+import signal
+import time
+from pipeline.core import processes
+
+# As in a terminal: what a script leaves in the background ignores it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+try:
+    for _ in processes.unordered(time.sleep, [(0,), (60,), (60,)], 2):
+        print("begun", flush=True)
+except KeyboardInterrupt:
+    print("stopped")
+"""
+
+
+def test_every_job_is_done_once():
+    assert sorted(processes.unordered(pow, [(2, 3), (3, 2), (5, 1)], workers=2)) == [(0, 8), (1, 9), (2, 5)]
+
+
+def test_an_interrupt_ends_all_and_only_the_caller_tells():
+    command = [sys.executable, "-c", PROGRAM]
+    running = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert running.stdout.readline() == "begun\n"
+    os.killpg(running.pid, signal.SIGINT)
+    told, errors = running.communicate(timeout=30)
+    assert (told, errors, running.returncode) == ("stopped\n", "", 0)

@@ -1,0 +1,101 @@
+"""The training loop: resumes with the same bits, skips and rolls back broken steps, gives up with a
+diagnosis.
+"""
+
+import math
+
+import pytest
+import torch
+
+from pipeline.core import training as fitting
+
+
+def make_problem(seed: int = 0):
+    torch.manual_seed(seed)
+    net = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Dropout(0.2), torch.nn.Linear(8, 1))
+    optimizer = torch.optim.AdamW(net.parameters(), 1e-2)
+
+    def loss(step, generator):
+        x = torch.randn(16, 4, generator=generator)
+        return {"fit": ((net(x) - x.sum(1, keepdim=True)) ** 2).mean()}
+
+    return net, optimizer, loss
+
+
+def run(resume, *, loss_of=lambda loss: loss, steps=60, **options):
+    net, optimizer, loss = make_problem()
+    record = fitting.fit(
+        modules={"net": net},
+        optimizer=optimizer,
+        loss=loss_of(loss),
+        steps=steps,
+        seed=3,
+        resume=resume,
+        save_every=7,
+        **options,
+    )
+    return record, torch.cat([p.detach().flatten() for p in net.parameters()])
+
+
+def test_an_interrupted_run_ends_with_the_same_bits(tmp_path):
+    record, whole = run(tmp_path / "whole")
+
+    def dying(loss):
+        def inner(step, generator):
+            if step == 31:
+                raise KeyboardInterrupt
+            return loss(step, generator)
+
+        return inner
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cut", loss_of=dying)
+    resumed_record, resumed = run(tmp_path / "cut")
+    assert torch.equal(whole, resumed)
+    assert (record.total() == resumed_record.total()).all()
+    assert record.total()[-10:].mean() < record.total()[:10].mean()
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(tmp_path):
+    _, whole = run(tmp_path)
+    newest = max(tmp_path.glob("step*.pt"))
+    newest.write_bytes(newest.read_bytes()[:100])
+    _, again = run(tmp_path)
+    assert torch.equal(whole, again)
+
+
+def broken_at(steps_broken):
+    def wrap(loss):
+        return lambda step, generator: {
+            "fit": loss(step, generator)["fit"] * (math.nan if step in steps_broken() else 1.0)
+        }
+
+    return wrap
+
+
+def test_one_broken_step_is_skipped_and_recorded():
+    record, weights = run(None, loss_of=broken_at(lambda: {5}))
+    assert math.isnan(record.total()[5]) and record.rolled_back == 0
+    assert torch.isfinite(weights).all()
+
+
+def test_three_broken_steps_fall_back_once_then_go_on(tmp_path):
+    calls = {"left": 3}
+
+    def wrap(loss):
+        def inner(step, generator):
+            bad = step >= 20 and calls["left"] > 0
+            calls["left"] -= bad
+            return {"fit": loss(step, generator)["fit"] * (math.nan if bad else 1.0)}
+
+        return inner
+
+    record, weights = run(tmp_path, loss_of=wrap)
+    assert record.rolled_back == 1 and torch.isfinite(weights).all() and len(record.total()) == 60
+
+
+def test_a_loss_that_stays_broken_ends_with_a_diagnosis(tmp_path):
+    with pytest.raises(SystemExit) as end:
+        run(tmp_path, loss_of=broken_at(lambda: range(20, 1000)))
+    assert end.value.code == fitting.EXIT_DIVERGED
+    assert "terms" in (tmp_path / "diagnosis.json").read_text()

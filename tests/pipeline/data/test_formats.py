@@ -1,0 +1,113 @@
+"""File formats: what is written comes back, equal data gives equal bytes, damage is refused with a code."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.data import images, npz, ply
+from pipeline.geometry.meshes import Mesh
+
+
+def test_rows_give_the_file_that_save_gives(tmp_path):
+    rng = np.random.default_rng(0)
+    flow, flags = (
+        rng.normal(size=(5, 4, 3, 2)).astype(np.float16),
+        rng.integers(0, 255, (5, 4), dtype=np.uint8),
+    )
+    npz.save(tmp_path / "whole.npz", flow=flow, flags=flags)
+    with npz.Rows(
+        tmp_path / "rows.npz", flow=(flow.shape, np.float16), flags=(flags.shape, np.uint8)
+    ) as table:
+        for one, other in zip(flow, flags, strict=True):
+            table.append(flow=one, flags=other)
+    assert (tmp_path / "rows.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+    with npz.Rows(tmp_path / "none.npz", flow=((0, 4, 3, 2), np.float16)):
+        pass
+    assert npz.open_lazily(tmp_path / "none.npz", "flow").shape == (0, 4, 3, 2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["none.npz", "rows.npz", "whole.npz"]
+
+
+def test_depth_survives_as_half_metres(tmp_path):
+    depth = np.random.default_rng(0).uniform(0.2, 5, (64, 48)).astype(np.float32)
+    depth[:5] = 0
+    images.write_depth(tmp_path / "a.exr", depth)
+    back = images.read_depth(tmp_path / "a.exr")
+    assert back.dtype == np.float32 and np.array_equal(back, depth.astype(np.float16).astype(np.float32))
+    first = (tmp_path / "a.exr").read_bytes()
+    images.write_depth(tmp_path / "a.exr", depth)
+    assert first == (tmp_path / "a.exr").read_bytes()
+
+
+def test_depth_that_is_not_a_distance_is_unknown(tmp_path):
+    images.write_depth(tmp_path / "a.exr", np.array([[np.nan, np.inf, -1, 2]], np.float32))
+    assert images.read_depth(tmp_path / "a.exr").tolist() == [[0, 0, 0, 2]]
+
+
+def test_an_exr_that_asks_for_gigabytes_is_refused_before_decoding(tmp_path):
+    images.write_depth(tmp_path / "a.exr", np.ones((4, 4), np.float32))
+    data = bytearray((tmp_path / "a.exr").read_bytes())
+    at = data.find(b"dataWindow\0box2i\0") + 21
+    struct.pack_into("<4i", data, at, 0, 0, 60000, 60000)
+    (tmp_path / "a.exr").write_bytes(data)
+    with pytest.raises(InputError, match="CAP-022"):
+        images.read_depth(tmp_path / "a.exr")
+
+
+def test_lossless_pictures_come_back(tmp_path):
+    color = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    images.write_color(tmp_path / "a.png", color)
+    assert np.array_equal(images.read_color(tmp_path / "a.png"), color)
+    images.write_gray(tmp_path / "b.png", color[..., 0])
+    assert np.array_equal(images.read_gray(tmp_path / "b.png"), color[..., 0])
+    with pytest.raises(InputError, match="CAP-020"):
+        images.decode_color(b"not a picture", "somewhere")
+
+
+def test_arrays_come_back_with_equal_bytes_for_equal_data(tmp_path):
+    data = {
+        "v002/pose": np.random.default_rng(0).normal(size=(5, 4, 4)),
+        "flag": np.array(True),
+        "names": np.array(["a", "bc"]),
+    }
+    for name in ("a.npz", "b.npz"):
+        npz.save(tmp_path / name, **data)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    back = npz.load(tmp_path / "a.npz")
+    assert back.keys() == data.keys() and all(np.array_equal(back[k], data[k]) for k in data)
+    assert np.array_equal(npz.open_lazily(tmp_path / "a.npz", "v002/pose"), data["v002/pose"])
+
+
+def test_arrays_refuse_pickles_damage_and_missing_names(tmp_path):
+    np.savez(tmp_path / "pickle.npz", bad=np.array([{}], dtype=object))
+    npz.save(tmp_path / "good.npz", a=np.arange(5))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:40])
+    for path, names in (("pickle.npz", None), ("cut.npz", None), ("good.npz", ("b",))):
+        with pytest.raises(InputError, match="ART-010"):
+            npz.load(tmp_path / path, names)
+
+
+def test_meshes_come_back_and_damage_is_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    mesh = Mesh(
+        rng.normal(size=(10, 3)).astype(np.float32),
+        rng.integers(0, 10, (6, 3)).astype(np.int32),
+        rng.integers(0, 256, (10, 3), np.uint8),
+    )
+    ply.write_ply(tmp_path / "a.ply", mesh, nx=np.zeros(10))
+    back = ply.read_ply(tmp_path / "a.ply")
+    assert (
+        np.array_equal(back.vertices, mesh.vertices)
+        and np.array_equal(back.faces, mesh.faces)
+        and np.array_equal(back.color, mesh.color)
+    )
+    (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-8])
+    with pytest.raises(InputError, match="ART-020"):
+        ply.read_ply(tmp_path / "a.ply")
+
+
+def test_a_broken_mask_is_refused(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"not a picture")
+    with pytest.raises(InputError, match="CAP-021"):
+        images.read_gray(tmp_path / "a.png")

@@ -1,0 +1,149 @@
+"""Environments: the libraries' own checks pass, seeds decide, persons keep out of walls, many live as one
+does.
+"""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import BehaviorNets
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.core.errors import InputError
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.floor import to_local, to_world
+from pipeline.environments.rewards import REWARDS, StepOutcome
+from pipeline.environments.world import AnimalWorld
+from stages.train_behavior.export import write_contract
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.stages.simulate.test_simulator import scaling
+
+gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("pettingzoo")
+
+QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
+
+
+def small_world(config=QUICK):
+    volume = room()
+    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
+    scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
+    return AnimalWorld(sampler, wandering(), scenes, "yaw", config)
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory):
+    """A build of an untrained model in a room of 4 m."""
+    from pipeline.data import npz
+
+    folder = tmp_path_factory.mktemp("build")
+    for name in ("behavior", "behavior_data"):
+        (folder / name).mkdir()
+    wandering().save(folder / "behavior_data")
+    volume = room()
+    known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
+    npz.save(folder / "behavior_data/volume.npz", **vars(volume), **known)
+    nets = BehaviorNets(ARCHITECTURE)
+    write_contract(folder / "behavior", nets, ARCHITECTURE, scaling(), Schedule(), REST)
+    return folder
+
+
+@pytest.mark.parametrize("embodiment", ["person", "robot"])
+def test_gymnasium_finds_nothing_to_warn_of(build, embodiment):
+    from gymnasium.utils.env_checker import check_env
+
+    import pipeline.environments.registration  # noqa: F401
+
+    how = {"config": QUICK, "embodiment": embodiment, "episode_s": 3.0}
+    env = gymnasium.make("AgentToSim/Cat-v0", build=str(build), **how)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+
+
+def test_pettingzoo_finds_nothing_to_warn_of():
+    from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+    from pipeline.environments.parallel_env import PersonAnimalEnv
+
+    world = small_world()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(PersonAnimalEnv(world), num_cycles=60)
+        parallel_seed_test(lambda: PersonAnimalEnv(small_world_like(world)), num_cycles=40)
+
+
+def small_world_like(world):
+    """Return another world of the same networks."""
+    return AnimalWorld(world.animals.sampler, world.data, world.scenes, "yaw", world.config)
+
+
+def test_many_at_once_begin_again_and_seeds_decide(build):
+    import pipeline.environments.registration  # noqa: F401
+
+    lives = []
+    for _ in range(2):
+        env = gymnasium.make_vec(
+            "AgentToSim/Cat-v0", num_envs=4, build=str(build), config=QUICK, episode_s=1.0
+        )
+        seen, _ = env.reset(seed=3)
+        ends = np.zeros(4, int)
+        for _ in range(25):
+            seen, reward, terminated, truncated, _ = env.step(np.zeros((4, 3), np.float32))
+            ends += terminated | truncated
+        assert seen["animal"].shape == (4, 7) and (ends >= 2).all() and np.isfinite(reward).all()
+        lives.append(seen["animal"])
+    np.testing.assert_array_equal(*lives)
+
+
+def test_plans_are_followed_and_not_drawn_at_every_step():
+    world = small_world()
+    world.begin(3, np.random.default_rng(0))
+    for _ in range(40):
+        world.step(np.zeros((3, 3)))
+    assert world.plans_per_step < 0.1
+
+
+def test_persons_keep_out_of_walls_and_walk_as_told():
+    world = small_world()
+    world.begin(2, np.random.default_rng(0))
+    world.persons.position[:], world.persons.heading[:] = 0.0, [0.0, np.pi / 2]
+    world.step(np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(world.persons.position, [[0, 0.12], [0.12, 0]], atol=1e-9)
+    for _ in range(60):
+        world.step(np.array([[1.0, 0.0, 0.0], [1.0, 0.3, 0.0]]))
+    assert (np.abs(world.persons.position) < 2.0).all(), "the walls begin at 2 m"
+    assert np.abs(world.persons.position).max(1).min() > 1.7
+
+
+def test_frames_of_persons():
+    np.testing.assert_allclose(to_world(np.array([0.0, 1.0]), np.pi / 2), [1, 0], atol=1e-9)
+    np.testing.assert_allclose(to_world(np.array([1.0, 0.0]), 0.0), [1, 0], atol=1e-9)
+    point = np.array([0.3, -0.7])
+    np.testing.assert_allclose(to_local(to_world(point, 0.4), 0.4), point)
+
+
+def test_a_commanded_animal_goes_there():
+    world = small_world()
+    world.begin(1, np.random.default_rng(0))
+    goal = world.animal_position + np.array([[0.5, 0.0, 0.0]])
+    world.animals.command(goal)
+    for _ in range(12):
+        world.step(np.zeros((1, 3)))
+    np.testing.assert_allclose(world.animals.goal[0, [0, 2]], goal[0, [0, 2]], atol=1e-5)
+
+
+def test_rewards_name_what_they_reward():
+    near = StepOutcome(
+        np.array([1.0, 1.0]), np.array([0.6, 0.9]), np.array([0.0, 0.5]), np.array([False, True])
+    )
+    assert REWARDS["approach"](near).tolist() == pytest.approx([10.4, -9.9])
+    assert REWARDS["follow"](near).tolist() == pytest.approx([-0.6, -0.3])
+    assert REWARDS["calm"](near).tolist() == [0.0, -0.5]
+
+
+def test_a_folder_without_a_model_is_refused(tmp_path):
+    with pytest.raises(InputError, match="ART-003"):
+        AnimalWorld.load(tmp_path, QUICK)

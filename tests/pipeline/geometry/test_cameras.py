@@ -1,0 +1,47 @@
+"""Cameras: projection undoes lifting, turning a picture turns everything together."""
+
+import numpy as np
+import torch
+
+from pipeline.geometry import cameras, rigid
+
+INTRINSICS = np.array([[230.0, 0, 121.3], [0, 228.0, 158.2], [0, 0, 1]])
+
+
+def test_projection_undoes_back_projection():
+    depth = np.random.default_rng(0).uniform(0.3, 5, (32, 24))
+    pixel, z = cameras.project(cameras.back_project(depth, INTRINSICS), INTRINSICS)
+    assert np.allclose(pixel, cameras.pixel_grid(32, 24)) and np.allclose(z, depth)
+    pixel_torch, _ = cameras.project(
+        torch.from_numpy(cameras.back_project(depth, INTRINSICS)), torch.from_numpy(INTRINSICS)
+    )
+    assert np.allclose(pixel_torch.numpy(), pixel)
+
+
+def test_resizing_moves_pixels_in_proportion():
+    point = np.array([[0.2, -0.1, 1.5]])
+    pixel, _ = cameras.project(point, INTRINSICS)
+    small, _ = cameras.project(point, cameras.scale_intrinsics(INTRINSICS, (320, 240), (160, 60)))
+    assert np.allclose(small, pixel * [60 / 240, 160 / 320])
+
+
+def test_a_turned_picture_shows_the_same_world():
+    rng = np.random.default_rng(1)
+    world_from_camera = rigid.exp(rng.normal(size=6))
+    points_camera = np.stack(
+        [rng.uniform(-0.2, 0.2, 50), rng.uniform(-0.3, 0.3, 50), rng.uniform(1, 2, 50)], -1
+    )
+    points_world = rigid.apply(world_from_camera, points_camera)
+    size = (320, 240)
+    image = np.zeros(size)
+    pixel, _ = cameras.project(points_camera, INTRINSICS)
+    image[pixel[:, 1].astype(int), pixel[:, 0].astype(int)] = 1
+    for turns in range(4):
+        turned = cameras.turn_image(image, turns)
+        turned_world_from_camera = cameras.turn_camera(world_from_camera, turns)
+        turned_intrinsics = cameras.turn_intrinsics(INTRINSICS, size, turns)
+        pixel, z = cameras.project(
+            rigid.apply(rigid.inverse(turned_world_from_camera), points_world), turned_intrinsics
+        )
+        assert (z > 0).all()
+        assert turned[pixel[:, 1].astype(int), pixel[:, 0].astype(int)].all(), turns

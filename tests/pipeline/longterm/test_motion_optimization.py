@@ -1,0 +1,225 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter1d
+
+from pipeline.geometry import rigid
+from pipeline.longterm.bodies import PosedSurface, PoseSpace
+from pipeline.longterm.config import MotionOptimizationConfig
+from pipeline.longterm.contacts import (
+    SHORTEST_PHASE_FRAMES,
+    SWING_M_S2,
+    enforce_swing_time,
+    find_contact_vertices,
+    motion_tensors,
+)
+from pipeline.longterm.motion_optimization import (
+    ContactBody,
+    contact_error,
+    foot_error,
+    lift_out_of_solid,
+    optimize_motion,
+    phase_means,
+    settle_bodies,
+    smooth_error,
+)
+from pipeline.longterm.plausibility import PlausibilityMeter, seams
+from pipeline.longterm.short_motions import BodyMotion, smooth_seams
+from tests.pipeline.longterm import strider
+
+SETTINGS = MotionOptimizationConfig(steps=60, vertices=40)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return strider.dataset()
+
+
+@pytest.fixture(scope="module")
+def contact_body(dataset):
+    contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
+    poses = PoseSpace(dataset.body.agent_from_bone_rest, 16).fit(
+        np.concatenate([s.agent_from_bone for s in dataset.stretches])
+    )
+    return ContactBody(dataset.body, contacts, poses)
+
+
+def test_soles_are_found_and_form_four_feet(dataset, contact_body):
+    soles = np.flatnonzero(dataset.body.mesh.vertices[:, 1] < -0.199)
+    assert contact_body.contacts.vertices.tolist() == soles.tolist()
+    assert contact_body.contacts.feet == 4
+    bone = dataset.body.weights[contact_body.contacts.vertices].argmax(1)
+    assert all(len(set(bone[contact_body.contacts.foot == foot])) == 1 for foot in range(4))
+
+
+def test_feet_stand_two_thirds_of_the_time_and_true_motion_is_physical(dataset, contact_body):
+    judge, moving = (
+        PlausibilityMeter(dataset.body, contact_body.contacts, dataset.scenes[0].distance),
+        dataset.stretches[0],
+    )
+    stance = judge.stance(moving)
+    assert stance.mean(0) == pytest.approx([0.67] * 4, abs=0.12)
+    worth = judge.plausibility(moving, stance)
+    assert worth.slide_m_s < 0.01
+    assert worth.contact == 1
+    assert worth.non_collision > 0.999
+
+
+def test_feet_that_should_stand_have_time_to_swing():
+    """One foot glides at the body's pace, one rests, one leaps 10 cm aside between two rests."""
+    feet = np.zeros((120, 3, 3))
+    feet[:, 0, 2] = np.arange(120) / 30
+    feet[60:, 2, 0] = 0.1
+    stance = np.ones((120, 3), bool)
+    stance[60, 2] = False
+    kept = enforce_swing_time(stance, feet, 30.0)
+    assert kept[:, 1].all()
+    gaps = {foot: np.diff(np.flatnonzero(np.diff(kept[:, foot].astype(int))))[::2] for foot in (0, 2)}
+    assert gaps[2].tolist() == [int(np.ceil(np.sqrt(6 * 0.1 / SWING_M_S2) * 30))]
+    assert len(gaps[0]) >= 3 and kept[:, 0].sum() > 3 * SHORTEST_PHASE_FRAMES
+    away = np.diff(
+        [
+            feet[phase, 0, 2].mean()
+            for phase in np.split(np.arange(120), np.flatnonzero(np.diff(kept[:, 0].astype(int))) + 1)[::2]
+        ]
+    )
+    assert (gaps[0] + 2 >= np.sqrt(6 * away / SWING_M_S2) * 30).all()
+
+
+def test_a_shaken_motion_becomes_physical_and_stays_near(dataset, contact_body):
+    truth = dataset.stretches[0][:120]
+    shake = gaussian_filter1d(np.random.default_rng(1).normal(size=(120, 3)), 4, axis=0) * [0.05, 0.05, 0.05]
+    root = truth.world_from_agent.copy()
+    root[:, :3, 3] += shake
+    shaken = BodyMotion(root, truth.agent_from_bone)
+    scene = dataset.scenes[0].distance
+    judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
+    stance = judge.stance(truth)
+    done = optimize_motion(shaken, contact_body, scene, SETTINGS)
+    before, after = judge.plausibility(shaken, stance), judge.plausibility(done, stance)
+    assert after.penetration_m < 0.2 * before.penetration_m
+    assert after.slide_m_s < 0.5 * before.slide_m_s
+    surface = PosedSurface(dataset.body)
+    error = [
+        float((surface(*motion_tensors(m)) - surface(*motion_tensors(truth))).norm(dim=-1).mean())
+        for m in (shaken, done)
+    ]
+    assert error[1] < 1.1 * error[0]
+
+
+def test_a_gliding_motion_gets_feet_that_stand(dataset, contact_body):
+    walk = dataset.stretches[0][:90]
+    mean = np.repeat(walk.agent_from_bone.mean(0, keepdims=True), len(walk), axis=0)
+    mean[..., :3, :3] = walk.agent_from_bone[0, :, :3, :3]
+    gliding = BodyMotion(walk.world_from_agent, 0.85 * mean + 0.15 * walk.agent_from_bone)
+    scene = dataset.scenes[0].distance
+    judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
+    done = optimize_motion(gliding, contact_body, scene, SETTINGS)
+    before, after = (judge.plausibility(each, judge.stance(each)).least_slide_m_s for each in (gliding, done))
+    assert before > 0.1 and after < 0.3 * before
+    assert not judge.stance(gliding).any() and judge.stance(done).any(axis=1).mean() > 0.5
+
+
+def test_held_frames_stay(dataset, contact_body):
+    moving, held = dataset.stretches[1][:30], np.arange(30) % 29 == 0
+    lifted = BodyMotion(moving.world_from_agent + np.eye(4)[:, 3] * 0 + _lift(0.03), moving.agent_from_bone)
+    done = optimize_motion(
+        lifted, contact_body, dataset.scenes[0].distance, replace(SETTINGS, steps=10), held=held
+    )
+    np.testing.assert_allclose(done.world_from_agent[held], lifted.world_from_agent[held], atol=1e-6)
+    assert np.abs(done.world_from_agent[~held] - lifted.world_from_agent[~held]).max() > 1e-3
+
+
+def test_a_motion_pushed_into_the_block_comes_out(dataset, contact_body):
+    walk = strider.striding(np.array([[0.36, 0, -0.2], [0.36, 0, 0.2]]), 1.0)
+    scene = dataset.scenes[0].distance
+    judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
+    stance = judge.stance(walk)
+    assert judge.plausibility(walk, stance).deepest_m > 0.05
+    done = optimize_motion(walk, contact_body, scene, replace(SETTINGS, steps=150))
+    assert judge.plausibility(done, stance).deepest_m < 0.02
+
+
+def test_what_nobody_looks_at_comes_out_of_a_board_too(dataset, contact_body):
+    """Of the trunk one vertex is looked at, on the far side."""
+    board = strider.merged(strider.room(), strider.box([0.85, 0.17, -1], [1.3, 0.6, 1]))
+    scene = replace(dataset.scenes[0], mesh=board).distance
+    walk = strider.striding(np.array([[0.82, 0, -0.3], [0.82, 0, 0.3]]), 1.0)
+    deepest = [
+        float(-scene.at(PosedSurface(dataset.body)(*motion_tensors(each))).min())
+        for each in (
+            walk,
+            optimize_motion(walk, contact_body, scene, replace(SETTINGS, steps=100, vertices=1)),
+        )
+    ]
+    assert deepest[0] > 0.03 and deepest[1] < 0.005
+
+
+def test_terms_are_what_they_say():
+    stance = np.array([[1, 0], [1, 1], [0, 1], [1, 1]], bool)
+    flat, phase = phase_means(stance)
+    assert flat.tolist() == [0, 2, 3, 5, 6, 7]
+    assert phase.tolist() == [0, 0, 2, 2, 1, 2]
+    feet = torch.zeros(4, 2, 3)
+    feet[1, 0, 0] = 0.2
+    torch.testing.assert_close(foot_error(feet, (flat, phase), 1e-6), torch.tensor([0.1, 0.1, 0, 0, 0, 0]))
+    assert foot_error(feet, phase_means(np.zeros((4, 2), bool)), 0.002).shape == (0,)
+    torch.testing.assert_close(
+        contact_error(torch.tensor([0.0, 0.02, 100.0]), 0.02), torch.tensor([0.0, 0.5, 1.0])
+    )
+    even = torch.arange(5.0)[:, None, None].expand(5, 1, 3)
+    assert smooth_error(even).sum() == 0
+    assert smooth_error(even**2).sum() == 3 * 3 * 2**2
+
+
+def test_a_jump_at_a_seam_is_measured(dataset):
+    moving = dataset.stretches[0]
+    assert seams(dataset.body, moving, 60).max() < 0.02
+    root = moving.world_from_agent.copy()
+    root[60:, 0, 3] += 0.1
+    torn = BodyMotion(root, moving.agent_from_bone)
+    assert seams(dataset.body, torn, 60).max() > 0.08
+    whole = smooth_seams(torn)
+    assert seams(dataset.body, whole, 60).max() < 0.02
+    away = np.abs(np.arange(len(torn)) - 60)
+    far = (away > 6) & (np.arange(len(torn)) < 110)
+    np.testing.assert_allclose(whole.world_from_agent[far], torn.world_from_agent[far], atol=1e-9)
+    np.testing.assert_allclose(whole.world_from_agent[60], torn.world_from_agent[60], atol=1e-9)
+
+
+def _lift(height_m):
+    return (
+        rigid.make(np.zeros((3, 3)), np.array([0.0, height_m, 0.0]))
+        * (np.arange(4) == 3)[None]
+        * (np.arange(4) < 3)[:, None]
+    )
+
+
+def test_feet_in_a_board_are_lifted_out_of_it_and_those_in_a_wall_are_not(dataset):
+    scene = dataset.scenes[0].distance  # a floor at 0, a block up to 0.5, walls at 2
+    depth = np.repeat([0.0, 0.06], 40)
+    floor = torch.tensor(
+        np.stack([np.full(80, 1.2), 0.005 - depth, np.full(80, 1.2)], axis=-1)[:, None]
+    ).float()
+    raised = lift_out_of_solid(floor, scene, reach=4).numpy()
+    assert (
+        raised[0] == 0
+        and raised[-1] == pytest.approx(0.06, abs=0.025)
+        and np.abs(np.diff(raised)).max() < 0.02
+    )
+    assert lift_out_of_solid(torch.tensor([[[0.0, 0.1, 0.0]]]), scene, reach=0) == 0, (
+        "0.4 m under the top of the block"
+    )
+
+
+def test_single_bodies_come_out_of_the_floor_and_down_from_the_air(dataset, contact_body):
+    still = dataset.stretches[0][np.array([0, 40, 80])]
+    judge = PlausibilityMeter(dataset.body, contact_body.contacts, dataset.scenes[0].distance)
+    root = still.world_from_agent.copy()
+    root[:, 1, 3] += [-0.06, 0.0, 0.03]
+    done = settle_bodies(BodyMotion(root, still.agent_from_bone), contact_body, judge.scene, SETTINGS)
+    gap, depth = judge.gap_and_penetration(done)
+    assert gap.max() < 0.006 and depth.max() < 0.006
+    assert len(settle_bodies(done[:1], contact_body, judge.scene, replace(SETTINGS, steps=2))) == 1

@@ -1,0 +1,114 @@
+"""Relaxing poses: contacts pull displaced cameras back, odometry bridges what contacts leave open."""
+
+import numpy as np
+
+from pipeline.geometry import rigid
+from pipeline.mapping import pose_optimization
+
+FRAMES = 12
+
+
+def corridor(rng):
+    """Return true poses along a curve and points on three walls, so that planes fix all six directions."""
+    time = np.linspace(0, 1, FRAMES)
+    twist = np.stack(
+        [
+            0.2 * np.sin(3 * time),
+            0.8 * time,
+            0.1 * np.cos(4 * time),
+            time,
+            0.1 * time,
+            0.3 * np.sin(2 * time),
+        ],
+        axis=-1,
+    )
+    points = rng.uniform(-2, 2, (300, 3))
+    normals = np.eye(3)[np.arange(300) % 3]
+    points[np.arange(300), np.arange(300) % 3] = 2.0
+    return time, rigid.exp(twist), points, normals
+
+
+def plane_correspondences(truth, points, normals, frames):
+    """Return contacts of every point of the walls with the map, as the given frames saw them."""
+    first = np.repeat(frames, len(points))
+    seen = np.concatenate([rigid.apply(rigid.inverse(truth[frame]), points) for frame in frames])
+    tiled = np.tile(points, (len(frames), 1))
+    count = len(first)
+    return pose_optimization.Correspondences(
+        first,
+        np.full(count, pose_optimization.MAP),
+        seen,
+        tiled,
+        np.tile(normals, (len(frames), 1)),
+        np.full(count, 0.01),
+    )
+
+
+def test_contacts_recover_displaced_cameras():
+    rng = np.random.default_rng(0)
+    _, truth, points, normals = corridor(rng)
+    start = truth @ rigid.exp(rng.normal(0, 0.05, (FRAMES, 6)))
+    correspondences = plane_correspondences(truth, points, normals, np.arange(FRAMES))
+    found = pose_optimization.optimize_poses(start, lambda *_: correspondences, None, reach_m=(0.5,) * 6)
+    assert np.abs(found.world_from_camera - truth).max() < 1e-5
+    assert np.abs(found.residual_m).max() < 1e-5
+
+
+def test_odometry_carries_frames_without_contacts():
+    rng = np.random.default_rng(1)
+    time, truth, points, normals = corridor(rng)
+    moved = rigid.exp(np.array([0.1, -0.4, 0.2, 1.0, 2.0, 3.0])) @ truth
+    edges = pose_optimization.odometry_factors(time, moved, drift_rad_s=0.01, drift_m_s=0.01)
+    start = truth @ rigid.exp(rng.normal(0, 0.03, (FRAMES, 6)))
+    correspondences = plane_correspondences(truth, points, normals, np.array([0]))
+    found = pose_optimization.optimize_poses(start, lambda *_: correspondences, edges, reach_m=(0.5,) * 8)
+    assert np.abs(found.world_from_camera - truth).max() < 1e-4
+
+
+def test_pairs_of_cameras_share_points_and_held_frames_stay():
+    rng = np.random.default_rng(2)
+    _, truth, _, _ = corridor(rng)
+    first, second = np.repeat(np.arange(FRAMES - 1), 60), np.repeat(np.arange(1, FRAMES), 60)
+    world = rng.uniform(-2, 2, (len(first), 3))
+    local = [
+        np.einsum("cij,cj->ci", rigid.inverse(truth[index])[:, :3, :3], world)
+        + rigid.inverse(truth[index])[:, :3, 3]
+        for index in (first, second)
+    ]
+    correspondences = pose_optimization.Correspondences(
+        first, second, *local, np.eye(3)[np.arange(len(first)) % 3], np.full(len(first), 0.01)
+    )
+    fixed = np.arange(FRAMES) == 0
+    start = truth @ rigid.exp(rng.normal(0, 0.03, (FRAMES, 6)) * ~fixed[:, None])
+    found = pose_optimization.optimize_poses(
+        start, lambda *_: correspondences, None, reach_m=(0.5,) * 8, fixed=fixed
+    )
+    assert np.abs(found.world_from_camera - truth).max() < 1e-4
+    assert (found.world_from_camera[0] == truth[0]).all()
+
+
+def test_gross_outliers_do_not_move_the_answer():
+    rng = np.random.default_rng(3)
+    _, truth, points, normals = corridor(rng)
+    correspondences = plane_correspondences(truth, points, normals, np.arange(FRAMES))
+    wrong = rng.random(len(correspondences.first)) < 0.2
+    correspondences.points_second[wrong] += 1.0
+    start = truth @ rigid.exp(rng.normal(0, 0.02, (FRAMES, 6)))
+    found = pose_optimization.optimize_poses(
+        start, lambda *_: correspondences, None, reach_m=(0.2,) * 4 + (0.05,) * 4
+    )
+    assert rigid.rotation_angle(found.world_from_camera[:, :3, :3], truth[:, :3, :3]).max() < np.deg2rad(0.3)
+
+
+def test_spread_is_the_diagonal_of_the_inverse_and_grows_away_from_contacts():
+    rng = np.random.default_rng(3)
+    time, truth, points, normals = corridor(rng)
+    correspondences = plane_correspondences(truth, points[:40], normals[:40], np.array([0, 1, 2]))
+    edges = pose_optimization.odometry_factors(time, truth, drift_rad_s=0.05, drift_m_s=0.05)
+    found = pose_optimization.marginal_covariance(truth, correspondences, edges, 0.5)
+    normal, _ = pose_optimization._normal_equations(truth, correspondences, edges, 0.5)
+    whole = np.linalg.inv(normal.toarray() + 1e-9 * np.eye(6 * FRAMES))
+    dense = np.stack([whole[6 * frame : 6 * frame + 6, 6 * frame : 6 * frame + 6] for frame in range(FRAMES)])
+    assert np.abs(found - dense).max() < 1e-6 * np.abs(dense).max()
+    size = np.sqrt(found[:, range(3, 6), range(3, 6)].sum(1))
+    assert (np.diff(size[2:]) > 0).all(), "metres: what odometry alone carries drifts"

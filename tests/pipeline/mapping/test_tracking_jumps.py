@@ -1,0 +1,54 @@
+"""Odometry that jumps: the jump is told from fast walking, missing frames and tipping, and taken out."""
+
+import numpy as np
+
+from pipeline.geometry import rigid
+from pipeline.mapping import tracking_jumps
+from tests.stages.textured_room import aligned_errors, drifting, walk
+
+TIME_S = 0.1 * np.arange(60)
+
+
+def jumping(odometry, frame, metres=0.6):
+    """Let tracking jump before a frame: all that follows is displaced and turned."""
+    displaced = odometry.copy()
+    displaced[frame:] = rigid.exp(np.array([0, 0.2, 0, metres, 0, 0])) @ odometry[frame:]
+    return displaced
+
+
+def test_a_jump_is_found_and_repaired():
+    truth = walk(60)
+    odometry = jumping(jumping(drifting(truth, 4, deg=0.03, m=0.001), 20), 41, 0.9)
+    jumps = tracking_jumps.find_jumps(TIME_S, odometry)
+    assert np.flatnonzero(jumps).tolist() == [20, 41]
+    assert aligned_errors(odometry, truth)[1].max() > 0.3, "metres"
+    assert aligned_errors(tracking_jumps.repair(TIME_S, odometry, jumps), truth)[1].max() < 0.03, (
+        "metres, drift included"
+    )
+
+
+def test_one_frame_elsewhere_tears_twice():
+    odometry = walk(60)
+    odometry[30, :3, 3] += 1.0
+    assert np.flatnonzero(tracking_jumps.find_jumps(TIME_S, odometry)).tolist() == [30, 31]
+
+
+def test_what_hands_do_is_no_tear():
+    ends = np.array([0.0, 2.0, 2.5, 6.0])
+    lunge = rigid.make(
+        np.eye(3), np.interp(TIME_S, ends, [0.0, 1.0, 3.5, 5.0])[:, None] * np.array([1.0, 0, 0])
+    )
+    tipped = walk(60)
+    tipped[30:, :3, :3] = tipped[30:, :3, :3] @ rigid.rotation_from_vector(np.array([0, 0, 3.0]))
+    pause_s = TIME_S + 1.0 * (np.arange(60) >= 30)
+    paused = rigid.make(np.eye(3), np.cumsum(np.diff(pause_s, prepend=0.0))[:, None] * np.array([1.0, 0, 0]))
+    for time_s, odometry in (
+        (TIME_S, lunge),
+        (TIME_S, tipped),
+        (pause_s, paused),
+        (TIME_S[:1], tipped[:1]),
+        (TIME_S[:2], lunge[:2]),
+    ):
+        jumps = tracking_jumps.find_jumps(time_s, odometry)
+        assert not jumps.any()
+        assert tracking_jumps.repair(time_s, odometry, jumps) is odometry

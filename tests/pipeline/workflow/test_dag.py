@@ -1,0 +1,28 @@
+"""The declaration holds together."""
+
+from pipeline.workflow import dag
+
+
+def test_every_input_is_declared_before_it_is_used():
+    dag.check()
+
+
+def test_no_model_sees_the_second_phone():
+    for node in dag.FLOW:
+        for need in dag.needs_of(node):
+            roles = need.roles or (
+                node.roles if need.artifact == "frames" else dag.NODES[need.artifact].roles
+            )
+            assert "heldout" not in roles or node.artifact in {"frames", "evaluation", "report"}, (
+                node.artifact
+            )
+
+
+def test_the_feature_basis_does_not_see_the_test_session():
+    (need,) = dag.needs_of(dag.NODES["feature_basis"])
+    assert "test" not in need.splits
+
+
+def test_programs_that_make_two_artifacts_have_a_table_for_each():
+    assert dag.table_of(dag.NODES["scene_localizer"]) == "scene_localizer"
+    assert dag.table_of(dag.NODES["masks"]) == "segment_agent"

@@ -1,0 +1,61 @@
+"""`pip install .` brings everything that the stages need, and the command works outside the checkout."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+ASSETS = (
+    "pipeline/workflow/help.txt",
+    "stages/annotate/page.html",
+    "stages/export_simulator/web/dist/page.html",
+    "stages/report/templates/index.html",
+)
+
+
+@pytest.mark.slow
+def test_a_wheel_installs_and_runs_outside_the_checkout(tmp_path):
+    target = tmp_path / "installed"
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(target)]
+    source = tmp_path / "source"
+    for name in ("pipeline", "stages"):
+        shutil.copytree(
+            ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules")
+        )
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, source)
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(source)], check=True)
+    assert not [name for name in ASSETS if not (target / name).is_file()]
+    assert (target / "bin/agent-to-sim").is_file()
+    code = (
+        f"import sys; sys.path.insert(0, {str(target)!r}); import pipeline.geometry.rigid as rigid;"
+        f"assert rigid.__file__.startswith({str(target)!r}); from pipeline.workflow import command;"
+        "sys.exit(command.main(['stage', 'estimate_flow', '--help']))"
+    )
+    called = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert called.returncode == 0, called.stderr
+    assert "working_side_px = 1280" in called.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["--help"], 0, "agent-to-sim stage NAME"),
+        (["stage", "nothing"], 2, "error: RUN-002"),
+        (["stage", "../plan"], 2, "error: RUN-002"),
+        (["stage"], 2, "error: RUN-002"),
+        (["fly"], 2, "error: RUN-003"),
+    ],
+)
+def test_the_command_refuses_what_it_does_not_know(arguments, code, text):
+    called = subprocess.run(
+        [sys.executable, "-m", "pipeline.workflow.command", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert called.returncode == code
+    assert text in called.stdout + called.stderr

@@ -1,0 +1,264 @@
+"""The planner: roles, split, ids, keys, and refusals that change nothing."""
+
+import json
+
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.workflow import captures
+from pipeline.workflow.captures import Remarks, assign, builtin
+from tests.pipeline.workflow import checkout
+
+
+@pytest.fixture
+def house(tmp_path):
+    return checkout.create(tmp_path)
+
+
+def assigned(names, ids=None, **said):
+    remarks = {name: said.get(name.split(".")[0], Remarks()) for name in names}
+    return {video.file: video for video in assign(remarks, ids or {}, dict.fromkeys(names), "captures/cat")}
+
+
+NAMES = ["walkthrough.r3d", "b.r3d", "a.r3d", "turnaround 1.r3d", "heldout.r3d"]
+
+
+def test_names_decide_roles_order_and_split():
+    videos = assigned(NAMES)
+    assert [(v.id, v.file, v.role, v.split) for v in sorted(videos.values(), key=lambda v: v.id)] == [
+        ("v000", "walkthrough.r3d", "walkthrough", "none"),
+        ("v001", "turnaround 1.r3d", "turnaround", "none"),
+        ("v002", "a.r3d", "session", "train"),
+        ("v003", "b.r3d", "session", "test"),
+        ("v004", "heldout.r3d", "heldout", "none"),
+    ]
+
+
+def test_the_recipe_decides_against_the_name():
+    videos = assigned(
+        NAMES, a=Remarks(split="test"), heldout=Remarks(synchronized_with="a.r3d", offset_s=0.5)
+    )
+    assert (videos["a.r3d"].split, videos["b.r3d"].split) == ("test", "train")
+    assert (videos["heldout.r3d"].synchronized_with, videos["heldout.r3d"].offset_s) == (
+        videos["a.r3d"].id,
+        0.5,
+    )
+
+
+def test_one_session_is_no_test():
+    assert assigned(["walkthrough.r3d", "turnaround.r3d", "x.r3d"])["x.r3d"].split == "train"
+
+
+def test_ids_stay_and_are_never_reused():
+    first = {name: video.id for name, video in assigned(NAMES).items()}
+    later = assigned([*[n for n in NAMES if n != "a.r3d"], "0.r3d"], ids=first)
+    assert all(later[name].id == first[name] for name in later if name in first)
+    assert later["0.r3d"].id == "v005"
+
+
+def test_what_was_written_down_is_written_anew_when_it_is_broken(house):
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    sound = {name: house.folder / f"build/toy/plan/{name}" for name in ("ids.json", "cache.json", "rules.mk")}
+    before = {name: path.read_bytes() for name, path in sound.items()}
+    for broken in ("[]", '{"a": 1}', '{"a": {"mark": [], "value": {}}}'):
+        for name in ("ids.json", "cache.json"):
+            sound[name].write_text(broken)
+        assert house.python("pipeline.workflow.plan", "plan", "toy").stderr == ""
+        assert {name: path.read_bytes() for name, path in sound.items()} == before
+
+
+@pytest.mark.parametrize("missing", ["walkthrough", "turnaround", "session"])
+def test_a_partial_capture_is_refused(missing):
+    names = [
+        name for name in ("walkthrough.r3d", "turnaround.r3d", "session.r3d") if not name.startswith(missing)
+    ]
+    with pytest.raises(InputError, match=f"CAP-040.*no {missing}"):
+        assigned(names)
+
+
+@pytest.mark.parametrize(
+    "remark", [Remarks(role="film"), Remarks(split="tset"), Remarks(synchronized_with="c.r3d")]
+)
+def test_an_impossible_remark_is_refused(remark):
+    with pytest.raises(InputError, match="CAP-041"):
+        assigned(NAMES, a=remark)
+
+
+def test_the_builtin_capture_has_a_partner_for_its_second_phone():
+    said = builtin(3, heldout_of=2)
+    videos = {v.file: v for v in assign(said, {}, dict.fromkeys(said), "")}
+    assert videos["heldout.r3d"].synchronized_with == videos["session-2.r3d"].id
+    assert "heldout.r3d" not in builtin(3, heldout_of=0)
+
+
+HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", "-rf.r3d", "%.r3d", "#.r3d"]
+
+
+def test_file_names_are_never_executed(house):
+    for name in ["walkthrough.r3d", "turnaround.r3d", *HOSTILE]:
+        house.write(f"captures/toy/{name}", name)
+    made = house.make("-j2", "toy.frames")
+    assert made.returncode == 0, made.stderr
+    assert not (house.folder / "hacked").exists()
+    videos = json.loads((house.folder / "build/toy/plan/videos.json").read_text())
+    assert {video["file"] for video in videos} >= set(HOSTILE)
+
+
+def test_what_is_amiss_with_a_stranger_is_told(house):
+    house.write("captures/toy/scan/inner/rgb.mp4", "")
+    house.write("captures/toy/scan/inner/odometry.csv", "")
+    (house.folder / "captures/toy/monday.r3d").symlink_to("/nowhere")
+    told = house.python("pipeline.workflow.plan", "plan", "toy").stderr
+    assert "'monday.r3d' (a link that leads nowhere), 'scan' (move 'inner' out of it: that is one)" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "files", "code"),
+    [
+        (["plan", "../x"], {}, "REC-004"),
+        (["new", "../x"], {}, "REC-004"),
+        (["new", ""], {}, "REC-004"),
+        (["plan", "toy/variants/../.."], {}, "REC-004"),
+        (["plan", "dog"], {}, "REC-005"),
+        (["plan", "toy/variants/none"], {}, "REC-005"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agents]\nseed = 1\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agent]\nsead = 1\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "[scene_localizer]\ntarget = 'agent'\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "seed = 1\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "segment_agent = 1\n"}, "REC-002"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agent]\nseed = '1'\n"}, "REC-002"),
+        (["plan", "toy"], {"agents/toy.toml": "[segment_agent\n"}, "REC-003"),
+        (["plan", "toy"], {"agents/toy.toml": "[videos.'other.r3d']\nsplit = 'test'\n"}, "REC-001"),
+        (["new", "clean", "test", "clean"], {}, "REC-004"),
+        (["plan", "toy"], {"captures/toy/session.heic": "x"}, "CAP-003"),
+        (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
+    ],
+)
+def test_refusals_change_nothing(house, arguments, files, code):
+    for name, text in files.items():
+        house.write(name, text)
+    before = house.tree()
+    refused = house.python("pipeline.workflow.plan", *arguments)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith(f"error: {code} ")
+    assert "\n  -> " in refused.stderr
+    assert "Traceback" not in refused.stderr
+    assert house.tree() == before
+
+
+def test_what_a_variant_does_not_touch_is_its_agents(house):
+    house.write("agents/variants/other.toml", "[train_behavior]\nseed = 3\n")
+    for home, own in (("toy", "build/toy"), ("toy/variants/other", "build/toy/variants/other")):
+        house.python("pipeline.workflow.plan", "plan", home)
+        told = house.python("pipeline.workflow.plan", "inputs", home, "simulator", "behavior_data", "frames")
+        assert told.stdout.split() == [
+            "--simulator",
+            f"{own}/simulator",
+            "--behavior-data",
+            "build/toy/behavior_data",
+            "--frames",
+            "build/toy/frames",
+        ]
+    refused = house.python("pipeline.workflow.plan", "inputs", "toy", "simulators")
+    assert refused.returncode == 2 and refused.stderr.startswith("error: REC-007 ")
+
+
+def key_files(house):
+    folder = house.folder / "build/toy/plan/keys"
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_only_what_matters_changes_a_key(house):
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(house)
+    front = house.folder / "stages/segment_agent/__main__.py"
+    text = front.read_text()
+    front.write_text(text.replace('"""Hash the inputs."""', '"""Other words."""  # and a comment\n'))
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    assert key_files(house) == before
+    front.write_text(text.replace("* 64", "* 65"))
+    house.write("stages/report/page.html", "<p>")
+    house.write("agents/toy.toml", "[estimate_flow]\nseed = 2\n")
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(house)
+    assert {name for name in after if after[name] != before[name]} == {
+        "masks.json",
+        "report.json",
+        "flow.json",
+    }
+
+
+def test_a_new_session_does_not_touch_the_maps(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(house)
+    house.write("captures/toy/c.r3d", "c")
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(house)
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed >= {"registration.json", "reconstruction.json", "behavior_data.json"}
+    assert not changed & {
+        "scene_template.json",
+        "agent_template.json",
+        "frames.json",
+        "video.v002.json",
+        "masks.json",
+    }
+
+
+def test_a_walkthrough_without_depth_is_told_metres_by_sessions_that_train(house):
+    for name in ("walkthrough.mp4", "turnaround.r3d", "a.r3d", "b.mp4", "c.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    told = {job["id"]: job for job in json.loads((house.folder / "build/toy/plan/dag.json").read_text())}
+    walk = told["frames.v000"]
+    assert walk["arguments"][walk["arguments"].index("--captures") + 1] == "captures/toy"
+    assert [key.rpartition("/")[2] for key in walk["keys"]] == [
+        "frames.json",
+        "video.v000.json",
+        "video.v002.json",
+    ]
+    assert not [id for id, job in told.items() if "--captures" in job["arguments"] and id != "frames.v000"]
+
+
+def test_clicks_are_read_by_the_evaluation_alone(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(house)
+    house.write("captures/toy/clicks.json", "not even JSON")
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(house)
+    assert {name for name in after if before.get(name) != after[name]} == {"extra.clicks.json"}
+    jobs = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
+    readers = [job["id"] for job in jobs if "--clicks" in job["arguments"]]
+    assert readers == ["evaluation"]
+    assert all("extra.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)
+
+
+def test_a_prompt_beside_a_recording_reaches_its_masks_alone(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(house)
+    house.write("captures/toy/b.r3d.prompt.toml", "time_s = 2\nclick = [0.5, 0.5]")
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(house)
+    assert {name for name in after if before.get(name) != after[name]} == {"prompt.v003.json"}
+    jobs = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
+    told = {job["id"]: job for job in jobs if "--prompt" in job["arguments"]}
+    assert list(told) == ["masks.v003"], "b.r3d"
+    assert "captures/toy/b.r3d.prompt.toml" in told["masks.v003"]["arguments"]
+    assert any(key.endswith("keys/prompt.v003.json") for key in told["masks.v003"]["keys"])
+    assert captures.not_understood(house.folder / "captures/toy") == []
+
+
+@pytest.mark.parametrize("variable", ["AGENT", "VARIANT", "FORMAT", "PLACES"])
+@pytest.mark.parametrize("value", ["x'; touch hacked; '", "a b", "../x", "$(touch hacked)", '"', ";"])
+def test_names_given_to_make_are_never_executed(house, variable, value):
+    for target in ("help", "export", "annotate"):
+        made = house.make("-n", target, f"{variable}={value.replace('$', '$$')}")
+        assert made.returncode == 2
+        assert f"REC-004 {variable} is no plain name" in made.stderr
+    assert not (house.folder / "hacked").exists()

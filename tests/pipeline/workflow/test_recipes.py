@@ -1,0 +1,88 @@
+"""Where a flow begins and which trials the tables want, as recipes say it."""
+
+import json
+
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.workflow import recipes
+from tests.pipeline.workflow import checkout
+
+
+def test_overlays_go_into_tables_and_leave_the_rest():
+    table = {"seed": 1, "training": {"steps": 5, "augmentation": {"turn": 0.5}}}
+    assert recipes.merged(table, {"training": {"augmentation": {"turn": 0.0}}}) == {
+        "seed": 1,
+        "training": {"steps": 5, "augmentation": {"turn": 0.0}},
+    }
+    assert table["training"]["augmentation"]["turn"] == 0.5
+
+
+@pytest.mark.parametrize("table", [{"begins_at": "pictures"}, {"begin": "recordings"}])
+def test_unknown_beginnings_are_refused(table):
+    with pytest.raises(InputError, match="REC-00"):
+        recipes.flow(table, "agents/cat.toml")
+
+
+def test_every_method_has_every_seed():
+    found = list(recipes.trials({"methods": ["ats", "world"], "seeds": 2}))
+    assert [trial.id for trial in found] == ["ats-0", "ats-1", "world-0", "world-1"]
+    assert found[0].overlay == {"seed": 0}
+    assert found[3].overlay["ego"] == "world" and found[3].overlay["seed"] == 1
+
+
+@pytest.mark.parametrize("table", [{"seeds": "3"}, {"seeds": 1.5}, {"methods": "ats"}, {"methods": [1]}])
+def test_trials_of_the_wrong_type_are_refused(table):
+    with pytest.raises(InputError, match="REC-002"):
+        list(recipes.trials(table))
+
+
+@pytest.mark.parametrize("table", [{"seeds": 0}, {"methods": ["world"]}, {"methods": []}])
+def test_tables_of_nothing_or_without_ours_are_refused(table):
+    with pytest.raises(InputError, match="REC-002.*tabulate_behavior(.|\n)*'ats' among the methods"):
+        list(recipes.trials(table))
+
+
+def test_a_count_of_recordings_of_the_wrong_type_is_refused():
+    with pytest.raises(InputError, match="REC-002.*session_count"):
+        recipes.builtin_remarks(
+            "recordings", {"synthesize_capture": {"session_count": "two"}}, "agents/toy.toml"
+        )
+
+
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("[train_behavior.training.optimization]\nstepz = 1", "optimization: unknown key 'stepz'"),
+        ("[train_behavior.training.optimization]\nsteps = 1.5", "optimization: steps: 1.5"),
+        ("[train_behavior]\ntraining = 3", "training: 3 is no table"),
+        ("[extract_frames]\nrate_hz = 0", "rate_hz: 0 cannot be"),
+        ("[extract_frames]\nmax_depth_m = -1.0", "max_depth_m: -1.0 cannot be"),
+        ("[extract_frames]\nmax_depth_m = nan", "max_depth_m: nan cannot be"),
+        ("[segment_agent]\nbackend = 'sam'", "backend: 'sam'"),
+    ],
+)
+def test_inner_tables_are_checked_before_anything_is_built(tmp_path, text, where):
+    (tmp_path / "cat.toml").write_text(text)
+    with pytest.raises(InputError, match=f"REC-00[12] .*{where}"):
+        recipes.read(tmp_path / "cat.toml")
+
+
+def test_tables_of_motion_need_no_recordings(tmp_path):
+    house = checkout.create(tmp_path)
+    house.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')
+    for name in ("a.csv", "b.npz", "ignored.txt"):
+        house.write(f"captures/dog/{name}", name)
+    told = house.python("pipeline.workflow.plan", "plan", "dog")
+    assert told.returncode == 0, told.stderr
+    assert "'ignored.txt'" in told.stdout
+    jobs = json.loads((tmp_path / "build/dog/plan/dag.json").read_text())
+    assert [job["id"] for job in jobs] == [
+        "trajectories.v000",
+        "trajectories.v001",
+        "behavior_data",
+        "behavior",
+    ]
+    assert "captures/dog/a.csv" in jobs[0]["arguments"]
+    videos = json.loads((tmp_path / "build/dog/plan/videos.json").read_text())
+    assert [(video["file"], video["split"]) for video in videos] == [("a.csv", "train"), ("b.npz", "test")]

@@ -1,0 +1,67 @@
+"""Curves of the best of K, and how physical motion is: exact on constructed cases."""
+
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Context, Future
+from pipeline.rivals.predictors import Samples
+from stages.evaluate import best_of, physical
+from tests.stages.export_simulator import small_world
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_best_of_k_is_the_mean_over_all_choices(count: int) -> None:
+    distance = RNG.uniform(0, 1, (5, 6))
+    choices = [distance[:, list(chosen)].min(1).mean() for chosen in combinations(range(6), count)]
+    np.testing.assert_allclose(best_of.best_of(distance, [count]), [np.mean(choices)], atol=1e-12)
+
+
+@dataclass(frozen=True)
+class Sunk:
+    """Predicts what was recorded, a little lower."""
+
+    future: Future
+    depth_m: float
+
+    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        lower = np.array([0, self.depth_m, 0])
+        path, root = self.future.path_world - lower, self.future.world_from_agent
+        return Samples(
+            path[:, None, -1], path[:, None], root[:, None, :, :3, :3], self.future.agent_from_bone[:, None]
+        )
+
+
+def test_a_body_in_the_floor_penetrates(tmp_path: Path) -> None:
+    small_world.write_surfaces(tmp_path)
+    tracks = {f"v{2 + k:03d}": small_world.trajectory(120, k) for k in range(2)}
+    starts, videos = np.array([0, 20, 0, 20], np.int32), np.array([0, 0, 1, 1], np.int32)
+    data = BehaviorData(
+        tracks,
+        small_world.rest(),
+        videos,
+        starts,
+        np.array([TRAIN, TRAIN, TEST, TEST], np.uint8),
+        tuple(tracks),
+    )
+    sunk = Sunk(data.windows(data.indices(TEST))[1], 0.1)
+    values = physical.physical_metrics(data, sunk, tmp_path, windows=2, seed=0).values
+    assert set(values) == set(physical.NAMES) and values["behavior/physical_windows"] == 2
+    assert (
+        values["behavior/recorded/penetration_m"] < 0.003 < 0.01 < values["behavior/ats/penetration_m"] < 0.1
+    ), "metres"
+    assert (
+        values["behavior/ats/non_collision_share"]
+        < 0.7
+        < 0.95
+        < values["behavior/recorded/non_collision_share"]
+    )
+    nobody = BehaviorData(
+        tracks, small_world.rest(), videos, starts, np.full(4, TRAIN, np.uint8), tuple(tracks)
+    )
+    assert set(physical.physical_metrics(nobody, sunk, tmp_path, windows=2, seed=0).values.values()) == {None}

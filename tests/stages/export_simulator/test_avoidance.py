@@ -1,0 +1,62 @@
+"""The page and Python lead paths around the person alike, and none through the body."""
+
+import numpy as np
+import pytest
+
+from pipeline.behavior.avoidance import BODY_M, around_person
+from tests.stages.export_simulator.test_support_twins import SOURCES, asked_of_node, needs_node
+
+ASK = (
+    f"import {{ aroundPerson }} from '{SOURCES}/avoidance.js';"
+    + """
+const { paths, people } = JSON.parse(await new Response(process.stdin).text());
+console.log(JSON.stringify(paths.map((path, i) => aroundPerson(path.slice(1), path[0], people[i]))));
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def paths() -> np.ndarray:
+    """Straight walks at 0.5 m/s through the origin, each from another side, not all through its middle."""
+    rng = np.random.default_rng(0)
+    along, aside = np.linspace(-1.4, 1.4, 57), rng.uniform(-0.5, 0.5, 40)
+    angle = rng.uniform(0, 2 * np.pi, 40)[:, None]
+    x = along * np.cos(angle) - aside[:, None] * np.sin(angle)
+    z = along * np.sin(angle) + aside[:, None] * np.cos(angle)
+    return np.stack([x, np.full_like(x, 0.2), z], axis=-1)
+
+
+def nearest_m(paths: np.ndarray) -> np.ndarray:
+    """Return how near each path, sampled finely, comes to the origin."""
+    share = np.linspace(0, 1, 20)[:, None, None, None]
+    return np.linalg.norm((paths[:, :-1] * (1 - share) + paths[:, 1:] * share)[..., [0, 2]], axis=-1).min(
+        (0, 2)
+    )
+
+
+def test_no_path_leads_through_the_body(paths):
+    led = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)))
+    whole = np.concatenate([paths[:, :1], led], axis=1)
+    assert nearest_m(paths).min() < 0.05 and nearest_m(whole).min() > BODY_M - 0.01, "metres"
+    steps = np.linalg.norm(np.diff(whole[..., [0, 2]], axis=1), axis=-1)
+    assert steps.max() < 0.09, "metres in 0.1 s: a walk, no jump"
+    past = np.linalg.norm((led[:, -1] - paths[:, -1])[:, [0, 2]], axis=1)
+    assert np.median(past) < 0.02, "metres: those that can arrive arrive"
+
+
+def test_who_stands_too_near_does_not_come_nearer(paths):
+    start = 0.2 * paths[:, 0] / np.linalg.norm(paths[:, 0][:, [0, 2]], axis=1, keepdims=True)
+    led = around_person(paths[:, 1:], start, np.zeros((len(paths), 3)))
+    assert np.linalg.norm(led[..., [0, 2]], axis=-1).min() > 0.19, "metres"
+
+
+def test_nobody_near_changes_nothing(paths):
+    led = around_person(paths[:, 1:], paths[:, 0], np.full((len(paths), 3), 9.0))
+    np.testing.assert_allclose(led, paths[:, 1:], atol=1e-12)
+
+
+@needs_node
+def test_page_and_python_lead_alike(paths):
+    theirs = asked_of_node(ASK, paths=paths.tolist(), people=np.zeros((len(paths), 2)).tolist())
+    ours = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)))
+    np.testing.assert_allclose(theirs, ours, atol=1e-9)

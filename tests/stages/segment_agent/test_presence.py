@@ -1,0 +1,103 @@
+"""Noise is measured, holes and things that people moved prove nothing, and wrong masks are reported as
+such.
+"""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from pipeline.geometry import rigid
+from stages.segment_agent import free_space, movers, painting, pictures
+from stages.segment_agent.config import AnimalConfig
+from stages.segment_agent.evidence import Evidence
+from stages.segment_agent.free_space import DepthNoise, References
+from stages.segment_agent.movers import Candidate
+from stages.segment_agent.painting import Painter
+from stages.segment_agent.writing import Summary
+
+INTRINSICS = np.array([[80.0, 0, 50], [0, 80.0, 40], [0, 0, 1]])
+
+
+def slanted_wall(count, noise, rng):
+    """Return pictures of a wall that runs from 1 m to 4 m, by a still camera, with noise that grows with the
+    square of z.
+    """
+    z = np.broadcast_to(np.linspace(1.0, 4.0, 100), (80, 100))
+    return (z + noise.sigma_m(z) * rng.normal(size=(count, 80, 100))).astype(np.float32)
+
+
+def test_depth_noise_is_measured_by_range():
+    true, rng = DepthNoise(0.004, 0.003), np.random.default_rng(0)
+    depth = slanted_wall(12, true, rng)
+    found = free_space.measure_noise(depth, np.tile(np.eye(4), (12, 1, 1)), np.tile(INTRINSICS, (12, 1, 1)))
+    twice = np.sqrt(2)  # both pictures err
+    for z in (1.5, 3.5):
+        assert found.sigma_m(np.array(z)) == pytest.approx(twice * true.sigma_m(np.array(z)), rel=0.15)
+
+
+def references_of(depth):
+    count = len(depth)
+    nearest = np.stack([free_space._nearest(picture, 80.0) for picture in depth])
+    pose, k = np.tile(rigid.inverse(np.eye(4)), (count, 1, 1)), np.tile(INTRINSICS, (count, 1, 1))
+    color = np.zeros((*depth.shape, 3), np.uint8)
+    return References(pose, k, depth, nearest, color, np.arange(count), DepthNoise())
+
+
+def test_what_is_seen_beside_a_hole_is_not_free():
+    """A thin leg at 1.5 m that the sensor loses in half of the pictures, before a wall at 3 m."""
+    depth = np.full((10, 80, 100), 3.0, np.float32)
+    depth[::2, :, 50] = 1.5
+    depth[1::2, :, 50] = 0.0
+    point = np.array([[[0.5 / 80 * 1.5, 0.0, 1.5]]])
+    votes = free_space.vote(references_of(depth), point, frame=-1)
+    assert votes.free.item() == 0
+    clear = np.full((10, 80, 100), 3.0, np.float32)
+    assert free_space.vote(references_of(clear), point, frame=-1).free.item() == 10
+
+
+def test_what_people_moved_is_no_animal():
+    """Something that stays in place for 2 s where it was put, then something that walks, then flashes."""
+    thing = [Candidate(np.array([1.0, 0.0, 0.0]), 0.05, 0.2)] * 20
+    animal = [Candidate(np.array([0.05 * i, 0.0, 2.0]), 0.05, 0.2) for i in range(20)]
+    flashes = [Candidate(np.array([3.0 * (i % 2), 0.0, 0.0]), 0.05, 0.2) for i in range(6)]
+    chosen = [*thing, *[None] * 10, *animal, *[None] * 10, *flashes]
+    time_s = 0.1 * np.arange(len(chosen))
+    assert np.flatnonzero(movers.self_moving(chosen, time_s, AnimalConfig())).tolist() == list(range(30, 50))
+
+
+@pytest.mark.parametrize(
+    ("similarity", "moved", "presumed", "present"),
+    [
+        (3.0, 0.0, False, True),
+        (1.0, 0.9, False, True),
+        (-2.0, 0.3, False, False),
+        (-1.0, 0.5, False, False),
+        (0.5, 0.0, True, False),
+    ],
+    ids=["rests", "walks", "mug", "rim", "guess"],
+)
+def test_presence_is_decided_by_appearance_and_motion(similarity, moved, presumed, present):
+    shape = (10, 10)
+    clear = np.arange(100).reshape(shape) < 100 * moved
+    no = np.zeros(shape, bool)
+    evidence = Evidence(np.zeros(shape), np.ones(shape), clear, clear, no)
+    painter = cast(Painter, SimpleNamespace())
+    inside = ~no
+    found = Painter._presence(painter, evidence, np.full(shape, similarity), inside, presumed)
+    assert (found > 0) == present
+    assert abs(found) < painting.LOG_ODDS_LIMIT + painting.PRESENCE_LIMIT
+
+
+def test_wrong_masks_are_reported():
+    count, rng = 100, np.random.default_rng(0)
+    good = Summary([True] * count, [0.95] * count, [0.05] * count, [0.02] * count)
+    assert {check.status for check in pictures.checks_of(good, 0.01)} == {"ok"}
+    furniture = replace(good, contradicted=[0.8 if i % 3 == 0 else 0.0 for i in range(count)])
+    unsure = replace(good, confidence=[0.6] * count)
+    jumping = replace(good, area=rng.choice([0.01, 0.05], count).tolist())
+    flashing = replace(good, visible=(rng.random(count) < 0.5).tolist())
+    for wrong in (furniture, unsure, jumping, flashing):
+        assert "fail" in {check.status for check in pictures.checks_of(wrong, 0.01)}

@@ -1,0 +1,78 @@
+"""The example of docs/adding_a_stage.md works as written: its files are put into a copy of the checkout and
+run.
+"""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+GUIDE = (ROOT / "docs/adding_a_stage.md").read_text()
+BLOCKS = re.findall(r"^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Path:
+    """A checkout with the guide's stage in it."""
+    folder = tmp_path_factory.mktemp("checkout")
+    skip = shutil.ignore_patterns("__pycache__", "node_modules", "dist")
+    for name in ("pipeline", "stages", "agents"):
+        shutil.copytree(ROOT / name, folder / name, ignore=skip)
+    for name in ("pyproject.toml", "ERRORS.md"):
+        shutil.copy(ROOT / name, folder)
+    (folder / "tests").mkdir()
+    shutil.copy(ROOT / "tests/test_house.py", folder / "tests")
+    declaration, *files = BLOCKS
+    for text in files:
+        path, _, body = text.removeprefix("# ").partition("\n")
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(body)
+    dag = folder / "pipeline/workflow/dag.py"
+    source = dag.read_text()
+    before = '    Node(\n        "splats",'
+    assert source.count(before) == 1
+    dag.write_text(source.replace(before, declaration + before))
+    return folder
+
+
+def python(folder: Path, *words: str) -> str:
+    done = subprocess.run([sys.executable, *words], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_its_own_test_passes(copy):
+    assert "3 passed" in python(copy, "-m", "pytest", "tests/stages/map_visits")
+
+
+def test_its_command_line_works(copy):
+    usage = python(copy, "-m", "stages.map_visits", "--help")
+    assert "--reconstruction" in usage and "cell_m = 0.25" in usage
+
+
+def test_the_planner_knows_it(copy):
+    python(copy, "-SE", "-m", "pipeline.workflow.plan", "plan", "toy")
+    assert "visits" in (copy / "build/toy/plan/rules.mk").read_text()
+
+
+def test_it_keeps_the_rules(copy):
+    """All but the catalogue of error codes, which section 7 of the guide has the reader extend."""
+    done = python(copy, "-m", "pytest", "tests/test_house.py", "-k", "map_visits or visits")
+    assert " passed" in done
+
+
+@pytest.mark.toy
+def test_the_python_guide_runs(toy, tmp_path, monkeypatch):
+    """The blocks of docs/python.md, one after the other, on the toy build."""
+    (tmp_path / "build").mkdir()
+    (tmp_path / "build/toy").symlink_to(toy)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for block in re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/python.md").read_text(), re.M | re.S):
+        exec(compile(block, "docs/python.md", "exec"), names)
+    assert (tmp_path / "flow_at_160/flow.png").stat().st_size > 1000
+    assert 0 < names["difference_px"].size
