@@ -1,22 +1,27 @@
-# The user's targets. The flow itself is declared in pipeline/dag.py and expanded by pipeline/plan.py into
+# The user's targets. The flow itself is declared in pipeline/workflow/dag.py and expanded by pipeline/workflow/plan.py into
 # build/<agent>/plan/rules.mk, which is included here for the agents named on the command line.
 SHELL := /bin/sh
 MAKEFLAGS += --no-builtin-rules --no-builtin-variables
 ifndef NESTED
-MAKEFLAGS += -j$(shell nproc 2>/dev/null || echo 2)
+MAKEFLAGS += -j$(shell envs/parallel_jobs)
 endif
 .SUFFIXES:
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
 PYTHON := .venv/bin/python
-PLAN   := $(PYTHON) -SE -m pipeline.plan
-RUN    := $(PYTHON) -SE -m pipeline.run $(if $(PROCESSES),--processes $(PROCESSES))
-COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras test doctor clean
+PLAN   := $(PYTHON) -SE -m pipeline.workflow.plan
+RUN    := $(PYTHON) -SE -m pipeline.workflow.run $(if $(PROCESSES),--processes $(PROCESSES))
+COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras dev types test test-fast fuzz reproduce doctor clean
 AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/*.toml)))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
 .PHONY: $(COMMANDS) FORCE
+# What ends in a command line or a path holds plain names only.
+PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
+rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
+$(foreach name,AGENT VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
+  $(name) is no plain name: use a-z, 0-9, _ and -)))
 # Where an agent's, or its variant's, own things stand; what a variant does not touch is its agent's (`INPUTS` knows).
 ANIMAL := $(or $(AGENT),cat)
 HOME_OF := build/$(ANIMAL)$(if $(VARIANT),/variants/$(VARIANT))
@@ -25,15 +30,16 @@ INPUTS = inputs=$$($(PLAN) inputs $(HOME_OF:build/%=%) $1)
 NESTING := --no-print-directory NESTED=1
 
 help:
-	@sed 's/cat/$(ANIMAL)/g' pipeline/help.txt
+	@sed 's/cat/$(ANIMAL)/g' pipeline/workflow/help.txt
 	@echo 'agents: $(AGENTS)'
 
 include $(WANTED:%=build/%$(if $(TABLES),/tables)$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
 build/%/plan/rules.mk: .venv/.ok FORCE
 	@$(PLAN) plan $* $(if $(MAKE_RESTARTS),>/dev/null)
 
-.venv/.ok: envs/cpu.txt envs/cuda.txt envs/setup
-	@envs/setup
+# LOCK=cuda or cpu, where this machine is not the one that computes (a login node without a GPU); `doctor` shows it.
+.venv/.ok: envs/cpu.txt envs/cuda.txt envs/setup $(if $(LOCK),$(if $(filter-out $(LOCK),$(shell cat .venv/lock 2>/dev/null || echo none)),FORCE))
+	@envs/setup $(LOCK)
 
 behavior-tables: .venv/.ok
 	@$(MAKE) $(NESTING) TABLES=1 $(ANIMAL).behavior_tables
@@ -43,7 +49,7 @@ behavior-benchmark: .venv/.ok
 	@$(MAKE) $(NESTING) behavior-tables AGENT=benchmark
 
 registration-tables reconstruction-tables: %-tables: .venv/.ok
-	@set -e; for variant in $$($(PYTHON) -SE -c 'from pipeline import dag; print(*dag.VARIANTS["$*"])'); do \
+	@set -e; for variant in $$($(PYTHON) -SE -c 'from pipeline.workflow import dag; print(*dag.VARIANTS["$*"])'); do \
 	  $(MAKE) $(NESTING) $(ANIMAL).$* VARIANT=$$variant; done
 	@$(MAKE) $(NESTING) $(ANIMAL).$*_tables
 	@cat build/$(ANIMAL)/$*_tables/tables.txt
@@ -71,16 +77,17 @@ export: .venv/.ok
 	$(PYTHON) -m stages.export $$inputs --format $(or $(FORMAT),glb) $(if $(INFLUENCES),--influences $(INFLUENCES)) \
 	  $(if $(wildcard $(HOME_OF)/take/manifest.json),--take $(HOME_OF)/take) \
 	  --videos build/$(ANIMAL)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
-	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); what is lost stands in its export.json'
+	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); export.json lists what is lost'
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
 JOURNEY = $(if $(SUBGOALS)$(PLACES),longterm) $(if $(SUBGOALS)$(filter-out behavior,$(PLACES)),,behavior)
+export SUBGOALS
 simulate: .venv/.ok
-	@test -z '$(SUBGOALS)' || test -f '$(SUBGOALS)' || { { echo "error: SIM-004 $(SUBGOALS): there is no such file"; echo "  -> write it as docs/long_motion.md tells"; } >&2; exit 2; }
+	@test -z "$$SUBGOALS" || test -f "$$SUBGOALS" || { { echo "error: SIM-004 $$SUBGOALS: there is no such file"; echo "  -> write it as docs/long_motion.md explains"; } >&2; exit 2; }
 	@$(if $(PLACES),$(PYTHON) -m stages.simulate --places '$(PLACES)' --help >/dev/null)
 	@$(MAKE) $(NESTING) $(JOURNEY:%=$(ANIMAL).%)
 	@$(call INPUTS,$(JOURNEY) $(if $(filter longterm,$(JOURNEY)),reconstruction) behavior_data) && \
-	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals '$(SUBGOALS)') $(if $(PLACES),--places '$(PLACES)') --out $(HOME_OF)/take
+	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals "$$SUBGOALS") $(if $(PLACES),--places '$(PLACES)') --out $(HOME_OF)/take
 
 serve: .venv/.ok
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator
@@ -89,11 +96,32 @@ serve: .venv/.ok
 extras: .venv/.ok
 	@envs/extras
 
+# The type checker and the run-time checks of array shapes, from a hashed lock; .ci/run uses both.
+dev: .venv/.ok
+	@$(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r envs/dev.txt
+
+types: dev
+	@.venv/bin/basedpyright
+
 test: .venv/.ok
 	@$(PYTHON) -m pytest tests
 
+# The inner loop: what takes seconds; `slow` and `toy` are left to `make test`.
+test-fast: .venv/.ok
+	@$(PYTHON) -m pytest tests -m 'not slow and not toy'
+
+# Mutated files for every reader of user files, a minute each; what fails is kept in build/fuzz.
+fuzz: .venv/.ok
+	@$(PYTHON) -m tests.fuzz $(FUZZ)
+
 doctor: .venv/.ok
-	@$(PYTHON) -m pipeline.doctor
+	@$(PYTHON) -m pipeline.workflow.doctor
+
+# Build again from a report's crate and name the first artifact that differs.
+reproduce: .venv/.ok
+	@agent=$$($(PYTHON) -SE -m pipeline.workflow.reproduce begin '$(CRATE)') && \
+	$(MAKE) $(NESTING) $$agent && \
+	$(PYTHON) -SE -m pipeline.workflow.reproduce compare '$(CRATE)' $$agent
 
 clean:
 	rm -rf build .snakemake
@@ -103,5 +131,5 @@ clean:
 	@case '$@' in build/*/variants/*) \
 	  set -- $(subst /, ,$@); echo "error: REC-007 '$@' belongs to variant $$4 of $$2 and is not there yet" >&2; \
 	  echo "  -> one variant: make $$2.$$5 VARIANT=$$4; a table with all it compares: make $$5-tables AGENT=$$2" >&2; exit 2;; esac
-	@echo "error: REC-007 nobody knows how to make '$@'" >&2
-	@echo "  -> $(if $(filter $(AGENTS:%=%.%),$@),artifacts: $$($(PYTHON) -SE -c 'from pipeline import dag; print(*dag.NODES)'),agents: $(AGENTS); a new one: make new AGENT=<name>); all else: make help" >&2; exit 2
+	@echo "error: REC-007 there is no target '$@'" >&2
+	@echo "  -> $(if $(filter $(AGENTS:%=%.%),$@),artifacts: $$($(PYTHON) -SE -c 'from pipeline.workflow import dag; print(*dag.NODES)'),agents: $(AGENTS); a new one: make new AGENT=<name>); all else: make help" >&2; exit 2

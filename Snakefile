@@ -1,29 +1,51 @@
-# The same flow on another engine: reads build/<agent>/plan/dag.json, which `pipeline/plan.py` writes.
-#   snakemake --cores 2 --config agent=cat            (profile: profiles/local)
-import json
-import subprocess
+# The same flow on another engine, one rule per artifact. What there is to do, pipeline/workflow/plan.py writes to
+# build/<agent>/plan/jobs/, one small file per job; an artifact is published by pipeline/workflow/run.py.
+#   snakemake --cores 2 --config agent=cat                       (profile: profiles/default)
+#   snakemake --config agents=[luna,cat] --workflow-profile profiles/slurm
+#   snakemake --config homes=homes.tsv --workflow-profile profiles/slurm  (a table with the columns agent and, if needed, variant)
+# More configuration: variant=NAME, gpu=N (GPUs of a job that uses one), processes=N (per machine, where several fit one
+# model), launcher="srun --ntasks-per-node=1" (starts them on every machine of an allocation).
+import shlex
 import sys
-from pathlib import Path
 
-HOME = config.get("agent", "cat")
-if config.get("variant"):
-    HOME += f"/variants/{config['variant']}"
-subprocess.run([sys.executable, "-SE", "-m", "pipeline.plan", "plan", HOME], check=True, stdout=sys.stderr)
-JOBS = json.loads(Path("build", HOME, "plan", "dag.json").read_text())
+sys.path.insert(0, workflow.basedir)
+from pipeline.workflow import dag, engine
+
+HOMES = engine.homes(config)
+GPUS = int(config.get("gpu", 0))
+TOGETHER = f"--processes {int(config.get('processes', max(1, GPUS)))}"
+if config.get("launcher"):
+    TOGETHER += f" --launcher {shlex.quote(config['launcher'])}"
+if workflow.is_main_process:
+    engine.plan(HOMES)
+
+
+wildcard_constraints:
+    home=engine.HOME,
+    part="[a-z0-9_-]+",
 
 
 rule all:
-    input: [job["stamp"] for job in JOBS if not job["aside"]]
+    input: engine.targets(HOMES) if workflow.is_main_process else []
     localrule: True
 
 
-for job in JOBS:
+for node in dag.FLOW:
     rule:
-        name: job["id"].replace(".", "_")
-        input: [f"{each['path']}/.ok" for each in job["inputs"]], job["keys"]
-        output: job["stamp"]
-        threads: job["threads"]
-        resources: mem_mb=job["memory_mb"], gpu=job["gpu"] if config.get("gpu") else 0
-        retries: 1 if job["resumable"] else 0
-        params: home=HOME, id=job["id"], python=sys.executable
-        shell: "{params.python} -SE -m pipeline.run {params.home} {params.id}"
+        name: node.artifact
+        input: engine.inputs(node)
+        output: engine.output(node)
+        benchmark: engine.benchmark(node)
+        threads: node.threads
+        resources:
+            mem_mb=engine.memory_mb(node),
+            runtime=engine.runtime_min(node),
+            gpu=GPUS if node.gpu else 0,
+            attempt=lambda wildcards, attempt: attempt,
+        params:
+            id=engine.job_id(node),
+            python=sys.executable,
+            together=TOGETHER if node.distributed else "",
+        shell:
+            "{params.python} -SE -m pipeline.workflow.run {params.together} --attempt {resources.attempt} "
+            "{wildcards.home} {params.id}"
