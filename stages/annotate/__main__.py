@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipeline.core import videos
+from pipeline.core import loopback, videos
 from pipeline.core.errors import InputError
 from pipeline.workflow import artifact
 from stages.annotate import serving, stage
@@ -35,7 +35,7 @@ def main(arguments: list[str]) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    address = f"http://{serving.HOST}:{server.server_address[1]}"
+    address = f"http://{loopback.HOST}:{server.server_address[1]}"
     print(f"open {address} ; clicks go to {given.clicks}; Ctrl-C ends", flush=True)
     try:
         server.serve_forever()

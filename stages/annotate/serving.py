@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.core import loopback
 from pipeline.core.errors import InputError
 from pipeline.data import clicks
 from pipeline.data.clicks import ClickedClip, ClickedPair
 
-HOST = "127.0.0.1"
 MAX_DIGITS = 10
 """a Content-Length of more digits is refused"""
 PICTURE = re.compile(r"/picture/(\d+)/(\d+)\.jpg\Z")
@@ -148,12 +148,8 @@ def server(desk: ClickSession, port: int) -> ThreadingHTTPServer:
             """Stay silent."""
 
         def _from_here(self) -> bool:
-            """Refuse other sites that point a name or a form at this server."""
-            own = {f"{name}:{self.server.server_address[1]}" for name in (HOST, "localhost")}
-            origin = self.headers.get("Origin")
-            return self.headers.get("Host") in own and (
-                origin is None or origin.removeprefix("http://") in own
-            )
+            hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
+            return loopback.is_own(self.server.server_address[1], hosts, origins)
 
         def _json(self, value: Any) -> None:
             self._send(200, json.dumps(value).encode(), "application/json")
@@ -170,7 +166,7 @@ def server(desk: ClickSession, port: int) -> ThreadingHTTPServer:
             self.wfile.write(body)
 
     try:
-        return ThreadingHTTPServer((HOST, port), Handler)
+        return ThreadingHTTPServer((loopback.HOST, port), Handler)
     except OSError as error:
         what = f"port {port}: {error.strerror}"
-        raise InputError("SYS-002", what, HOST, "give another with --port") from error
+        raise InputError("SYS-002", what, loopback.HOST, "give another with --port") from error

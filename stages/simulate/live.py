@@ -1,8 +1,8 @@
 """The animal live in a browser, computed here: for networks and machines that a page cannot hold (viser, an
 extra).
 
-The server listens on this machine alone. One visitor drags the person about; `run` goes on until it is
-stopped, or is interrupted, and returns all that happened as a take.
+The server listens on this machine alone and answers its own page only. One visitor drags the person about;
+`run` goes on until it is stopped, or is interrupted, and returns all that happened as a take.
 """
 
 import time
@@ -16,13 +16,12 @@ from jaxtyping import Float
 
 from pipeline.behavior.simulator import Simulator, SimulatorState
 from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core import loopback
 from pipeline.core.errors import InputError
 from pipeline.data.glb import Skin
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from stages.simulate.rollout import Take, take_of
-
-_HOST = "127.0.0.1"
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class LiveView:
                 "install it: make extras",
             ) from error
         self.simulator, self.seed = simulator, seed
-        self.server = viser.ViserServer(host=_HOST, port=port, verbose=False)
+        self.server = _serving_own_page_only(viser.ViserServer, port)
         self.server.scene.set_up_direction("+y")
         self.server.scene.add_glb("/room", look.scene)
         self.person = self.server.scene.add_transform_controls(
@@ -150,3 +149,38 @@ class LiveView:
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
         gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())
+
+
+def _serving_own_page_only(start: Callable[..., Any], port: int) -> Any:
+    """Start viser's server so that it refuses what other sites send: by itself it looks at no header.
+
+    Raises SIM-010 where viser starts its server in another way than by `websockets.asyncio.server.serve`.
+    """
+    from websockets.asyncio import server  # late: comes with viser
+
+    serve, checked = server.serve, []
+
+    def checked_serve(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            headers, own_port = request.headers, connection.local_address[1]
+            if not loopback.is_own(own_port, headers.get_all("Host"), headers.get_all("Origin")):
+                return connection.respond(403, "")
+            return process_request(connection, request)
+
+        checked.append(process)
+        return serve(*arguments, process_request=process, **options)
+
+    server.serve = checked_serve
+    try:
+        started = start(host=loopback.HOST, port=port, verbose=False)
+    finally:
+        server.serve = serve
+    if not checked:
+        started.stop()
+        raise InputError(
+            "SIM-010",
+            "this version of viser would answer other sites",
+            "the Python environment",
+            "install the version of envs/extras.txt: make extras",
+        )
+    return started

@@ -176,7 +176,8 @@ def test_the_server_serves_its_own_page_only(room, tmp_path):
         assert (
             ask(port, "GET", "/") == ask(port, "GET", "/state") == ask(port, "GET", "/picture/0/0.jpg") == 200
         )
-        assert ask(port, "GET", "/", Host="evil.example") == 403
+        for host in ("evil.example", f"evil.example:{port}", "127.0.0.1"):  # a name that points here
+            assert ask(port, "GET", "/state", Host=host) == 403
         assert (
             ask(port, "GET", "/picture/0/99.jpg")
             == ask(port, "GET", "/picture/9/0.jpg")

@@ -1,3 +1,5 @@
+import http.client
+import socket
 import sys
 import urllib.request
 from dataclasses import replace
@@ -15,7 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.data import glb, npz
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
-from stages.simulate import takes
+from stages.simulate import live, takes
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 from stages.simulate.live import LiveAppearance, LiveView
@@ -230,6 +232,70 @@ def test_live_view_answers_and_keeps_its_take(simulator):
     assert len(take.timestamp_s) == 4 and simulator.flock.sampling.guidance == 0.25
     np.testing.assert_allclose(take.observer_world[-1], [0.4, 1.3, 0.2], atol=1e-6)
     np.testing.assert_allclose(here.animal.position, take.world_from_agent[-1, :3, 3], atol=1e-6)
+
+
+def answered(port: int, **headers: str) -> int:
+    """Ask the live view's server for its page and return the status."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.putrequest("GET", "/", skip_host=True)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    code = connection.getresponse().status
+    connection.close()
+    return code
+
+
+def test_live_view_answers_its_own_page_only(simulator):
+    """Another site may point a name at this machine (Host), or open a socket from its page (Origin)."""
+    viser = pytest.importorskip("viser")
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    def opened(origin: str | None, host: str) -> int:
+        try:
+            protocols = [f"viser-v{viser.__version__}"]
+            with connect(
+                f"ws://{host}",
+                origin=origin,
+                sock=socket.create_connection(("127.0.0.1", here.port), timeout=10),
+                subprotocols=protocols,
+            ) as connection:
+                return connection.response.status_code
+        except InvalidStatus as refused:
+            return refused.response.status_code
+
+    here = LiveView(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8121)
+    try:
+        own = f"127.0.0.1:{here.port}"
+        assert answered(here.port, Host=own) == answered(here.port, Host=f"localhost:{here.port}") == 200
+        assert answered(here.port, Host=own, Origin=f"http://{own}") == 200
+        for host in ("evil.example", f"evil.example:{here.port}", "127.0.0.1", f"{own}.evil.example"):
+            assert answered(here.port, Host=host) == 403, host
+        assert answered(here.port) == 403, "no Host at all"
+        assert opened(f"http://{own}", own) == opened(None, own) == 101
+        for origin in ("http://evil.example", "null", f"http://evil.example:{here.port}", f"https://{own}"):
+            assert answered(here.port, Host=own, Origin=origin) == 403, origin
+            assert opened(origin, own) == 403, origin
+        assert opened(None, f"evil.example:{here.port}") == 403
+    finally:
+        here.server.stop()
+
+
+def test_a_viser_that_cannot_be_checked_does_not_serve():
+    started = []
+
+    class Unchecked:
+        def __init__(self, **_):
+            started.append("running")
+
+        def stop(self):
+            started.append("stopped")
+
+    pytest.importorskip("viser")
+    with pytest.raises(InputError, match="SIM-010"):
+        live._serving_own_page_only(Unchecked, 8122)
+    assert started == ["running", "stopped"]
 
 
 def test_starting_again_in_the_middle_of_a_step_keeps_the_take_whole(simulator):
