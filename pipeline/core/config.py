@@ -7,6 +7,7 @@ unknown keys and ill-typed values are refused with what is known. Standard libra
 import dataclasses
 import json
 import math
+import reprlib
 import tomllib
 import types
 import typing
@@ -17,6 +18,12 @@ from typing import Any, TypeVar
 from pipeline.core.errors import InputError
 
 C = TypeVar("C")
+LARGEST_INTEGER = (1 << 63) - 1
+"""TOML promises no more; larger ones are no float either."""
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxlong, _SHORT.maxstring, _SHORT.maxother = 4, 40, 100, 200
+_SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 20
+"""Of a value in a message: files may hold numbers of thousands of digits, and tables as deep."""
 
 
 def load(config: type[C], path: Path) -> C:
@@ -52,8 +59,9 @@ def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C
         name: default_of(field) if base is None else getattr(base, name) for name, field in fields.items()
     }
     for key, value in table.items():
+        checked = _checked(hints[key], value, f"{where}: {key}", values[key])
         refuse_impossible(value, values[key], where=f"{where}: {key}")
-        values[key] = _checked(hints[key], value, f"{where}: {key}", values[key])
+        values[key] = checked
     for key, value in values.items():
         if value is dataclasses.MISSING:
             raise InputError("REC-002", f"{key!r} is missing", where, f"give a value of type {hints[key]}")
@@ -73,7 +81,10 @@ def refuse_unknown(
     for key in table:
         if key not in known:
             raise InputError(
-                "REC-001", f"unknown {kind} {key!r}", where, f"known: {', '.join(sorted(known)) or 'none'}"
+                "REC-001",
+                f"unknown {kind} {shown(key)}",
+                where,
+                f"known: {', '.join(sorted(known)) or 'none'}",
             )
 
 
@@ -87,17 +98,24 @@ def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
     counts = default > 0 or (default == 0 and isinstance(default, int))
     if not math.isfinite(value) or (counts and value < 0) or (default > 0 and stands_still):
         raise InputError(
-            "REC-002", f"{value!r} cannot be", where, f"give a number as the default is, {default!r}"
+            "REC-002", f"{shown(value)} cannot be", where, f"give a number as the default is, {default!r}"
         )
+
+
+def shown(value: Any) -> str:
+    """Return a value as a message holds it: cut where it is long or deep."""
+    return _SHORT.repr(value)
 
 
 def _checked(hint: Any, value: Any, where: str, default: Any = None) -> Any:
     """Return `value` as `hint` wants it (lists become tuples, integers floats) or raise REC-002."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        raise InputError("REC-002", f"{shown(value)} is too large", where, f"{LARGEST_INTEGER} at most")
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
             known = ", ".join(sorted(field.name for field in dataclasses.fields(hint)))
-            raise InputError("REC-002", f"{value!r} is no table", where, f"keys in it: {known}")
+            raise InputError("REC-002", f"{shown(value)} is no table", where, f"keys in it: {known}")
         return from_table(hint, value, where=where, base=default if isinstance(default, hint) else None)
     if origin is typing.Literal and value in arguments:
         return value
@@ -121,7 +139,9 @@ def _checked(hint: Any, value: Any, where: str, default: Any = None) -> Any:
     expected = (
         hint.__name__ if isinstance(hint, type) and origin is None else str(hint).replace("typing.", "")
     )
-    raise InputError("REC-002", f"{value!r} is not {expected}", where, f"give a value of type {expected}")
+    raise InputError(
+        "REC-002", f"{shown(value)} is not {expected}", where, f"give a value of type {expected}"
+    )
 
 
 def _first_fitting(kinds: tuple[Any, ...], value: Any, hint: Any, where: str) -> Any:
@@ -130,4 +150,4 @@ def _first_fitting(kinds: tuple[Any, ...], value: Any, hint: Any, where: str) ->
             return _checked(kind, value, where)
         except InputError:
             continue
-    raise InputError("REC-002", f"{value!r} is not {hint}", where, f"give a value of type {hint}")
+    raise InputError("REC-002", f"{shown(value)} is not {hint}", where, f"give a value of type {hint}")

@@ -5,6 +5,8 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
+from pipeline.core.errors import printable
+
 T = TypeVar("T")
 
 LINE_EVERY_S = 10.0
@@ -14,7 +16,7 @@ BAR_WIDTH = 28
 
 def log(message: str) -> None:
     """Say one thing once; begin with what is meant and give the numbers."""
-    print(message, file=sys.stderr, flush=True)
+    print(printable(message), file=sys.stderr, flush=True)
 
 
 def track(iterable: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:

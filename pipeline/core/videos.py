@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from pipeline.core import config
 from pipeline.core.errors import InputError
 
 Role = Literal["walkthrough", "turnaround", "session", "heldout"]
@@ -40,8 +41,9 @@ class Video:
 def read(path: Path) -> tuple[Video, ...]:
     """Read `videos.json`. Raises `InputError` ART-003 for anything else."""
     try:
-        return tuple(Video(**entry) for entry in json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError) as error:
+        entries = json.loads(path.read_text())
+        return tuple(config.from_table(Video, dict(entry), where=str(path)) for entry in entries)
+    except (OSError, ValueError, TypeError, RecursionError, InputError) as error:
         raise InputError(
             "ART-003", "is no list of recordings", str(path), "give build/<agent>/plan/videos.json"
         ) from error

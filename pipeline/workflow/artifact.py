@@ -50,9 +50,24 @@ class Manifest:
 def read_manifest(folder: Path) -> Manifest | None:
     """Return the manifest of `folder`, or None where there is no finished artifact."""
     try:
-        return Manifest(**json.loads((folder / MANIFEST).read_bytes()))
-    except (FileNotFoundError, NotADirectoryError, ValueError, TypeError):
+        manifest = Manifest(**json.loads((folder / MANIFEST).read_bytes()))
+    except (FileNotFoundError, NotADirectoryError, ValueError, TypeError, RecursionError):
         return None
+    return manifest if _is_sound(manifest) else None
+
+
+def _is_sound(manifest: Manifest) -> bool:
+    """Tell whether every field holds what it should."""
+    tables = (manifest.inputs, manifest.versions, manifest.files)
+    return (
+        isinstance(manifest.stage, str)
+        and isinstance(manifest.content, str)
+        and isinstance(manifest.key, str | None)
+        and isinstance(manifest.config, dict)
+        and all(
+            isinstance(table, dict) and all(isinstance(v, str) for v in table.values()) for table in tables
+        )
+    )
 
 
 def opened(folder: Path, name: str) -> Manifest:

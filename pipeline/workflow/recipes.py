@@ -46,6 +46,8 @@ def read(path: Path) -> tuple[dict[str, Any], str]:
     for name, table in recipe.items():
         if not isinstance(table, dict):
             raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
+        if name == VIDEOS_TABLE:
+            _refuse_impossible_remarks(table, f"{path}: [{name}]")
         if name not in stages:
             continue
         declared = sources.config_of(stages[name].stage)
@@ -55,14 +57,23 @@ def read(path: Path) -> tuple[dict[str, Any], str]:
     return recipe, str(path)
 
 
+def _refuse_impossible_remarks(table: Mapping[str, Any], where: str) -> None:
+    """Raise REC-001 or REC-002 for unknown keys and values of wrong types in what is said of recordings."""
+    for recording, remarks in table.items():
+        if not isinstance(remarks, dict):
+            what = f"{recording!r}: {config.shown(remarks)} is no table"
+            raise InputError("REC-002", what, where, f"write [{VIDEOS_TABLE}.{recording!r}]")
+        config.from_table(captures.Remarks, remarks, where=f"{where}: {recording!r}")
+
+
 def flow(table: Mapping[str, Any], where: str) -> Flow:
     """Return where the agent's flow begins, as the recipe's `[flow]` says."""
     config.refuse_unknown(table, ("begins_at",), where=f"{where}: [flow]")
     begins = table.get("begins_at", "recordings")
-    if begins not in dag.BUILTIN:
+    if not isinstance(begins, str) or begins not in dag.BUILTIN:
         raise InputError(
             "REC-002",
-            f"no flow begins at {begins!r}",
+            f"no flow begins at {config.shown(begins)}",
             f"{where}: [flow]",
             f"begins_at: {' or '.join(dag.BUILTIN)}",
         )

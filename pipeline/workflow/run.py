@@ -30,7 +30,7 @@ from types import FrameType
 from typing import Any, TextIO
 
 from pipeline.core import processes
-from pipeline.core.errors import InputError, coded_disk_errors
+from pipeline.core.errors import InputError, coded_disk_errors, printable
 from pipeline.workflow import artifact, jobs, sources
 
 LEAST_FREE_BYTES = 1 << 29
@@ -307,7 +307,7 @@ def _environment(threads: int) -> dict[str, str]:
 
 def _forward(job_id: str, lines: Any, log: TextIO) -> None:
     for line in lines:
-        _say(job_id, line.decode(errors="replace").rstrip(), log)
+        _say(job_id, printable(line.decode(errors="replace").rstrip()), log)
 
 
 def _say(job_id: str, text: str, log: TextIO | None = None) -> None:

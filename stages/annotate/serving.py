@@ -117,7 +117,10 @@ def server(desk: ClickSession, port: int) -> ThreadingHTTPServer:
                 page = resources.files("stages.annotate").joinpath("page.html").read_bytes()
                 return self._send(200, page, "text/html; charset=utf-8")
             if self.path == "/state":
-                return self._json(desk.state())
+                try:
+                    return self._json(desk.state())
+                except InputError as error:  # the file of clicks broke since the server began
+                    return self._send(500, str(error).encode(), "text/plain")
             try:
                 found = desk.picture(int(match[1]), int(match[2])) if match else b""
             except LookupError:
@@ -140,7 +143,7 @@ def server(desk: ClickSession, port: int) -> ThreadingHTTPServer:
                 pairs = clicks.parse(json.loads(self.rfile.read(length)))
                 with keeping:
                     desk.keep(pairs)
-            except (ValueError, RecursionError, InputError) as error:
+            except (ValueError, RecursionError, InputError, OSError) as error:
                 return self._send(400, str(error).encode(), "text/plain")
             return self._json({"fits": desk.fits(pairs)})
 

@@ -9,6 +9,7 @@ import base64
 import gzip
 import html
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -97,6 +98,4 @@ def _assembled(contract: Mapping[str, Any], tags: list[str], connect: str) -> st
         "@@SCRIPT@@": bundle.joinpath("boot.js").read_text(),
     }
     text = bundle.joinpath("page.html").read_text()
-    for mark, piece in pieces.items():
-        text = text.replace(mark, piece)
-    return text
+    return re.sub("|".join(pieces), lambda mark: pieces[mark[0]], text)  # at once: a piece may hold a mark

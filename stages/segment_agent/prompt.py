@@ -54,7 +54,7 @@ def parse(path: Path, clip: Clip) -> Prompt:
             and 0 <= y0 <= y1 <= clip.color_size[0]
         ):
             raise ValueError(f"frame {frame}, box {box.tolist()} is not inside the recording")
-    except (OSError, KeyError, ValueError, TypeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(
             "MSK-001",
             f"not a usable hint: {error}",

@@ -1,5 +1,6 @@
 """Configuration is strict, and says what it knows."""
 
+import functools
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -7,6 +8,10 @@ import pytest
 
 from pipeline.core import config
 from pipeline.core.errors import InputError
+
+HUGE = int("9" * 400)
+DEEP = functools.reduce(lambda inner, _: {"a": inner}, range(5000), {})
+"""What TOML makes of a key of 5,000 parts."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +51,20 @@ def test_a_table_becomes_a_dataclass():
         ({"sizes": 3}, "REC-002"),
         ({"name": 3}, "REC-002"),
         ({"inner": 3}, "REC-002"),
+        ({"seed": HUGE}, "REC-002"),
+        ({"inner": {"width_m": HUGE}}, "REC-002"),
+        ({"sizes": [HUGE]}, "REC-002"),
+        ({"name": HUGE}, "REC-002"),
+        ({"name": DEEP}, "REC-002"),
+        ({"seed": DEEP}, "REC-002"),
+        ({"inner": DEEP}, "REC-001"),
     ],
 )
 def test_what_does_not_fit_is_refused(table, code):
     with pytest.raises(InputError) as caught:
         config.from_table(Outer, table, where="recipe")
     assert caught.value.code == code
+    assert len(str(caught.value)) < 500
 
 
 def test_an_unknown_key_is_answered_with_the_known_ones():
@@ -59,7 +72,9 @@ def test_an_unknown_key_is_answered_with_the_known_ones():
         config.from_table(Outer, {"step": 5}, where="recipe")
 
 
-@pytest.mark.parametrize("text", ["[", "a = ", '"\x00'])
+@pytest.mark.parametrize(
+    "text", ["[", "a = ", '"\x00', "seed = " + "[" * 5000 + "]" * 5000, "seed = " + "9" * 5000]
+)
 def test_a_broken_file_is_named(tmp_path, text):
     path = tmp_path / "recipe.toml"
     path.write_text(text)

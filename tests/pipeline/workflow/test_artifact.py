@@ -1,5 +1,6 @@
 """An artifact is complete or absent."""
 
+import json
 import os
 import signal
 import subprocess
@@ -50,6 +51,30 @@ def test_failure_leaves_what_was_there(tmp_path, before):
     assert [path.name for path in tmp_path.iterdir()] == (["x"] if before else [])
     if before:
         assert (tmp_path / "x/inner/data.txt").read_text() == "old"
+
+
+SOUND = {
+    "stage": "s", "key": "k", "content": "c", "inputs": {}, "config": {}, "versions": {}, "files": {"a": "b"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 200_000,
+        '{"a":' * 200_000,
+        "[1]",
+        "null",
+        "",
+        *(json.dumps(SOUND | {name: value}) for name in SOUND for value in (3, ["x"], {"x": 3}, None)
+          if (name, value) not in (("key", None), ("config", {"x": 3}))),
+    ],
+)  # fmt: skip
+def test_what_is_no_manifest_makes_no_artifact(tmp_path, text):
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(InputError, match="ART-001"):
+        artifact.opened(tmp_path, "x")
+    assert artifact.damaged(tmp_path) == []
 
 
 def test_an_empty_artifact_is_refused(tmp_path):

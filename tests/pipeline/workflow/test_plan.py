@@ -91,6 +91,7 @@ def test_the_builtin_capture_has_a_partner_for_its_second_phone():
     assert "heldout.r3d" not in builtin(3, heldout_of=0)
 
 
+RECORDED = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnaround", "a")}
 HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", "-rf.r3d", "%.r3d", "#.r3d"]
 
 
@@ -129,6 +130,10 @@ def test_what_is_amiss_with_a_stranger_is_told(house):
         (["plan", "toy"], {"agents/toy.toml": "[segment_agent]\nseed = '1'\n"}, "REC-002"),
         (["plan", "toy"], {"agents/toy.toml": "[segment_agent\n"}, "REC-003"),
         (["plan", "toy"], {"agents/toy.toml": "[videos.'other.r3d']\nsplit = 'test'\n"}, "REC-001"),
+        (["plan", "toy"], {"agents/toy.toml": "[flow]\nbegins_at = ['x']\n"}, "REC-002"),
+        (["plan", "toy"], {**RECORDED, "captures/toy/a.r3d.toml": f"offset_s = {'9' * 400}\n"}, "REC-002"),
+        (["plan", "toy"], {**RECORDED, "captures/toy/a.r3d.toml": "offset_s = nan\n"}, "CAP-041"),
+        (["plan", "toy"], {**RECORDED, f"captures/toy/{'a' * 249}.r3d": "x"}, "CAP-041"),
         (["new", "clean", "test", "clean"], {}, "REC-004"),
         (["plan", "toy"], {"captures/toy/session.heic": "x"}, "CAP-003"),
         (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
@@ -144,6 +149,16 @@ def test_refusals_change_nothing(house, arguments, files, code):
     assert "\n  -> " in refused.stderr
     assert "Traceback" not in refused.stderr
     assert house.tree() == before
+
+
+def test_a_name_that_a_terminal_would_obey_is_spelled_out(house):
+    for name, text in RECORDED.items():
+        house.write(name, text)
+    house.write("captures/toy/\x1b[2Jnot\na recording", "")
+    house.write("captures/toy/heldout\x1b[2J\n.r3d", "x")
+    for _ in range(2):  # once planned, once remembered
+        told = house.python("pipeline.workflow.plan", "plan", "toy").stdout
+        assert "\x1b" not in told and len(told.splitlines()) == 2
 
 
 def test_what_a_variant_does_not_touch_is_its_agents(house):

@@ -18,7 +18,9 @@ def test_overlays_go_into_tables_and_leave_the_rest():
     assert table["training"]["augmentation"]["turn"] == 0.5
 
 
-@pytest.mark.parametrize("table", [{"begins_at": "pictures"}, {"begin": "recordings"}])
+@pytest.mark.parametrize(
+    "table", [{"begins_at": "pictures"}, {"begin": "recordings"}, {"begins_at": ["x"]}, {"begins_at": {}}]
+)
 def test_unknown_beginnings_are_refused(table):
     with pytest.raises(InputError, match="REC-00"):
         recipes.flow(table, "agents/cat.toml")
@@ -60,6 +62,11 @@ def test_a_count_of_recordings_of_the_wrong_type_is_refused():
         ("[extract_frames]\nmax_depth_m = -1.0", "max_depth_m: -1.0 cannot be"),
         ("[extract_frames]\nmax_depth_m = nan", "max_depth_m: nan cannot be"),
         ("[segment_agent]\nbackend = 'sam'", "backend: 'sam'"),
+        (f"[train_behavior]\nseed = {'9' * 400}", "seed: 99999"),
+        (f"[extract_frames]\nrate_hz = {'9' * 400}", "rate_hz: 99999"),
+        ("[videos]\n'a.r3d' = 3", "'a.r3d': 3 is no table"),
+        ("[videos]\n'a.r3d'." + ".".join("a" * 5000) + " = 3", "'a.r3d': unknown key 'a'"),
+        (f"[videos.'a.r3d']\noffset_s = {'9' * 400}", "offset_s: 99999"),
     ],
 )
 def test_inner_tables_are_checked_before_anything_is_built(tmp_path, text, where):

@@ -194,9 +194,23 @@ def test_the_server_serves_its_own_page_only(room, tmp_path):
             good.replace(b"session", b"sossion"),
         ):
             assert ask(port, "POST", "/clicks", bad) == 400
+        for length in ("abc", "-1", "9" * 400, str(clicks.MAX_BYTES + 1)):
+            assert ask(port, "POST", "/clicks", good, Content_Length=length) == 413
         assert not (tmp_path / "clicks.json").exists()
         assert ask(port, "POST", "/clicks", good) == 200
     assert len(clicks.read(tmp_path / "clicks.json")) == 1
+
+
+def test_a_file_of_clicks_that_breaks_or_cannot_be_written_is_told(room, tmp_path):
+    path = tmp_path / "clicks.json"
+    spot = {"recording": SESSION, "source_index": 0, "pixel": [0.5, 0.5]}
+    good = json.dumps({"pairs": [{"seen": spot, "reference": spot | {"recording": WALKTHROUGH}}]}).encode()
+    with running(room, path) as port:
+        path.write_text("{")
+        assert ask(port, "GET", "/state") == 500
+        path.unlink()
+        path.mkdir()
+        assert ask(port, "POST", "/clicks", good) == 400
 
 
 def test_what_is_no_file_of_clicks_is_refused(tmp_path):

@@ -205,6 +205,11 @@ def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
         "frame = 0\nclick = [3, 4]\nbox = [3, 4, 5, 6]",
         "frame = [",
         "frame = 0\nclick = 'x'",
+        "frame = inf\nclick = [3, 4]",
+        f"frame = {'9' * 400}\nclick = [3, 4]",
+        f"time_s = {'9' * 400}\nclick = [3, 4]",
+        f"frame = 0\nclick = [{'9' * 400}, 4]",
+        "frame = 0\nbox = " + "[" * 5000 + "]" * 5000,
     ],
 )
 def test_a_wrong_hint_is_refused(tmp_path, text):

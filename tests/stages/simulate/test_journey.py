@@ -75,6 +75,20 @@ def test_bad_sub_goals_are_told(tmp_path, text):
         read(tmp_path / "goals.toml", text)
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"position = [{'9' * 400}, 1]",
+        f"position = [1, 2]\nheading_deg = {'9' * 400}",
+        f"position = [1, 2]\ntime_s = {'9' * 400}",
+        "position = " + "[" * 5000 + "]" * 5000,
+    ],
+)
+def test_sub_goals_that_no_number_is_like_are_told(tmp_path, line):
+    with pytest.raises(InputError, match="REC-00[23].*goals.toml"):
+        read(tmp_path / "goals.toml", f"[[subgoal]]\n{line}\n")
+
+
 def test_a_journey_is_made_and_written(world, tmp_path):
     goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, -1.0]))]
     made = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
