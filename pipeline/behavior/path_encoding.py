@@ -35,9 +35,10 @@ MIN_SQUARED_M2 = 1e-12
 
 def with_powered_length(way: Float[Array, "*batch 3"], power: float) -> Float[Array, "*batch 3"]:
     """Return vectors of the same direction, whose lengths are raised to a power; the inverse
-    power undoes it.
+    power undoes it. A vector of length 0 stays one.
     """
-    return way * ((way**2).sum(-1)[..., None] + MIN_SQUARED_M2) ** ((power - 1) / 2)
+    # the lower bound, not a summand: the ONNX exporter drops summands as small as this one
+    return way * (way**2).sum(-1)[..., None].clip(min=MIN_SQUARED_M2) ** ((power - 1) / 2)
 
 
 def velocity_channels_from_path(

@@ -126,6 +126,27 @@ def test_goals_and_paths_are_obeyed_and_takes_are_kept(
         assert wrong == []
 
 
+def test_the_animal_walks_around_a_person_in_its_way(simulator: Path, chromium: Browser) -> None:
+    """Goals to and fro beyond a person who stands still: it may have to wait, but it arrives at each, and
+    never comes nearer than bodies allow.
+    """
+    person, goals = [0.1, 0.1], [[-0.5, -0.4], [0.6, 0.5], [-0.4, 0.6], [0.6, -0.4]]
+    with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
+        page.evaluate("place => ats.moveObserver(place)", person)
+        gaps = []
+        for goal in goals:
+            page.evaluate("goal => ats.visit([goal])", goal)
+            for _ in range(120):
+                page.wait_for_timeout(250)
+                state = page.evaluate("ats.state()")
+                gaps.append(np.hypot(state["animal"][0] - person[0], state["animal"][2] - person[1]))
+                if state["aim"] is None:
+                    break
+            assert state["aim"] is None, f"half a minute, and it stands at {state['animal'][:3]}"
+        assert min(gaps[4:]) > 0.36, "metres: a body's 0.4, less what two plans that fade into each other cut"
+        assert wrong == []
+
+
 def _check_golden(golden: dict, sampled: dict) -> None:
     for name, plan in golden["plans"].items():
         for level, expected in plan.items():
@@ -297,7 +318,7 @@ def _check_a_clip_beside(page: Page) -> None:
     page.wait_for_function("ats.state().replay && ats.state().tick > 4", timeout=20_000)
     state = page.evaluate("ats.state()")
     truth = small_world.trajectory(120, 0).world_from_agent[state["replay"]["tick"], :3, 3]
-    np.testing.assert_allclose(state["replay"]["place"], truth, atol=1e-4)
+    np.testing.assert_allclose(state["replay"]["place"], truth, atol=5e-4)  # metres: clips are half precision
     assert np.linalg.norm(np.array(state["animal"])[[0, 2]] - truth[[0, 2]]) < 1.5, "metres: it began there"
 
 

@@ -331,6 +331,16 @@ def test_golden_plan_uses_the_noise_it_names(windows):
     np.testing.assert_allclose(plan.path[0], golden["plans"]["guidance_1"]["path"], atol=1e-4)
 
 
+def test_an_animal_that_stands_still_is_exported_too(windows, tmp_path):
+    """A past in which every frame is alike: its velocity is zero, and so is the length that a power is taken
+    of.
+    """
+    nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval()
+    inputs, output = signature("perception", ARCHITECTURE)
+    export_network(nets.perception, tmp_path / "perception.onnx", inputs, output)
+    assert difference(nets.perception, tmp_path / "perception.onnx", inputs) < 1e-4
+
+
 class Timid:
     """Networks of an animal that goes one metre away from an observer who is nearer than 4 m, with 0.1 m of
     spread.

@@ -356,8 +356,8 @@ class Simulator {
     while (this.now < end) {
       const next = Math.min(end, Math.floor(this.now) + 1);
       if (this.wouldMeet(next)) {
+        this.timeline.hold(this.now);
         this.urgent = true;
-        break;
       }
       this.walk((next - this.now) * TICK_S);
       this.now = next;
@@ -366,7 +366,7 @@ class Simulator {
     this.timeline.record(this.now);
   }
 
-  // Whether the next moment would lead into the person's body: then time waits for a plan around it.
+  // Whether the next moment would lead into the person's body: then the animal waits for a plan around it.
   wouldMeet(next) {
     const [x, z] = this.observer.place;
     const gap = (now) => {

@@ -132,7 +132,7 @@ export class Sampler {
     );
   }
 
-  // Scaled strides, stridesAlong to where the animal may be.
+  // Scaled strides, led to where the animal may be.
   pathsCleared(frame, start, scaled) {
     const {
       contract: { scaling, strides: encoding, rate_hz: rate },
@@ -149,7 +149,7 @@ export class Sampler {
     return out;
   }
 
-  // Scaled places [3, frames] that scaled strides lead to, stridesAlong towards scaled goals.
+  // Scaled places [3, frames] that scaled strides lead to, snapped to scaled goals.
   snappedPaths(drawn, goals, start, pull) {
     const {
       contract: { scaling, strides: encoding, rate_hz: rate },
@@ -172,7 +172,7 @@ export class Sampler {
     return scaledGoal(goal, this.contract.scaling.goal_std, this.contract.strides);
   }
 
-  // Places as a body is encoding them.
+  // Places as the body's control: scaled frame by frame.
   scaledPath(places) {
     const { path_std: deviation } = this.contract.scaling;
     return [0, 1, 2].flatMap((axis) => places.map((place, i) => place[axis] / deviation[axis][i]));
@@ -249,7 +249,7 @@ export class Sampler {
     const options = this.drawing(frame, question);
     const whole = await this.codes(observation, question.keep, question.interactivity);
     if (question.path) return this.followed(frame, whole, question.path, options);
-    // sampled bones walk less distinctly than recorded ones do: encoding of them, the animal would stop
+    // sampled bones walk less distinctly than recorded ones do: conditioned on them, the animal would stop
     const bare = this.senses.boneless(observation, this.contract.scaling.body_mean);
     const codes = await this.codes(bare, question.keep, question.interactivity);
     const commanded = Boolean(question.aim);

@@ -3,7 +3,8 @@
 
 // The same direction, the length raised to a power.
 function powered(way, power, faint) {
-  const factor = (way.reduce((sum, value) => sum + value * value, 0) + faint) ** ((power - 1) / 2);
+  const squared = way.reduce((sum, value) => sum + value * value, 0);
+  const factor = Math.max(squared, faint) ** ((power - 1) / 2);
   return way.map((value) => value * factor);
 }
 

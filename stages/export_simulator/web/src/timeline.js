@@ -4,6 +4,7 @@
 import { ROW, blend } from './rigid.js';
 
 const FADE_TICKS = 4;
+const HOLD_TICKS = 10; // an animal that has to wait stands so long, unless a plan comes before
 
 export class Timeline {
   constructor(past) {
@@ -27,6 +28,12 @@ export class Timeline {
   follow(start, frames, now) {
     const faded = this.plans.findLastIndex((plan) => share(plan, now) >= 1);
     this.plans = [...this.plans.slice(Math.max(0, faded)), { start, frames, since: now }];
+  }
+
+  // Stand still from now on, until another plan is followed.
+  hold(now) {
+    const pose = this.at(now);
+    this.plans = [{ start: now, frames: Array(HOLD_TICKS).fill(pose), since: now - FADE_TICKS }];
   }
 
   ticksLeft(now) {
