@@ -74,18 +74,18 @@ class Preparation:
         file = path / PREPARATION
         table = json.loads(file.read_text()) if file.is_file() else {}
         table = table.get("image_processor", table)
-        mean, std = (
-            tuple(table.get(key) or default) for key, default in (("image_mean", MEAN), ("image_std", STD))
-        )
-        return cls(mean, std, int(table.get("resample") or resample), table.get("size"))
+        (m0, m1, m2), (s0, s1, s2) = table.get("image_mean") or MEAN, table.get("image_std") or STD
+        resample = int(table.get("resample") or resample)
+        return cls((m0, m1, m2), (s0, s1, s2), resample, table.get("size"))
 
     def pixels(
         self, color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
-    ) -> Float[np.ndarray, "1 3 height width"]:
+    ) -> Float[np.ndarray, "1 3 resized_height resized_width"]:
         """Resize to (height, width), scale to 0..1 and normalise."""
         image = Image.fromarray(color)
+        height, width = size
         if color.shape[:2] != size:
-            image = image.resize(size[::-1], self.resample)
+            image = image.resize((width, height), self.resample)
         scaled = (np.asarray(image, np.float32) / 255 - np.array(self.mean, np.float32)) / np.array(
             self.std, np.float32
         )

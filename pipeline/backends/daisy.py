@@ -48,7 +48,7 @@ def describe(
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     # Beyond its edge a picture goes on as its mirror image: an edge at the border would be the strongest of
     # all.
-    gray = cv2.copyMakeBorder(gray, *4 * (MARGIN_PX,), cv2.BORDER_REFLECT_101)
+    gray = np.pad(gray, MARGIN_PX, "reflect")
     rows, columns = color.shape[0] // stride_px, color.shape[1] // stride_px
     raw = _daisy().compute(gray, _grid(rows, columns, stride_px, scale))[1].reshape(rows, columns, -1)
     return _unit(np.nan_to_num(raw, nan=0.0, posinf=0.0, neginf=0.0))
@@ -74,9 +74,13 @@ class FeatureBasis:
 
     def save(self, folder: Path) -> None:
         """Write ``basis.npz``."""
-        scale = np.array(self.scale, np.float32)
-        table = dict(mean=self.mean, components=self.components, scale=scale, explained=self.explained)
-        npz.save(folder / "basis.npz", **table)
+        npz.save(
+            folder / "basis.npz",
+            mean=self.mean,
+            components=self.components,
+            scale=np.array(self.scale, np.float32),
+            explained=self.explained,
+        )
 
     def project(self, raw: Float[np.ndarray, "*cell channel"]) -> Float[np.ndarray, "*cell 16"]:
         """Return unit-length features of raw descriptors."""

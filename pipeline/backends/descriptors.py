@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, assert_never
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from pipeline.backends import daisy
 
@@ -33,8 +34,10 @@ class Describer:
         """Write ``describer.json``."""
         (folder / FILE).write_text(json.dumps(asdict(self)) + "\n")
 
-    def open(self, device: str) -> Callable[[np.ndarray, int], np.ndarray]:
-        """Return ``describe(color, stride_px) -> [rows columns channel]``."""
+    def open(
+        self, device: str
+    ) -> Callable[[UInt8[np.ndarray, "height width 3"], int], Float[np.ndarray, "rows columns channel"]]:
+        """Return ``describe(color, stride_px)``: descriptors of unit length at cells of ``stride_px``."""
         match self.backend:
             case "daisy":
                 return daisy.describe

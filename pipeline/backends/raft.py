@@ -5,6 +5,7 @@ Written anew; parameters carry the names of the official weights (`raft-things.p
 """
 
 import math
+from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ class Raft(nn.Module):
         pyramid = correlation_pyramid(here, there)
         hidden, context = self.cnet(first).split(HIDDEN, dim=1)
         hidden, context = torch.tanh(hidden), torch.relu(context)
-        cells = _cell_index(*here.shape[-2:], here.device)
+        cells = _cell_index(here.shape[-2], here.shape[-1], here.device)
         target = cells + (torch.zeros_like(here[:, :2]) if start is None else start)
         for _ in range(iterations):
             hidden, step = self.update_block(hidden, context, look_up(pyramid, target), target - cells)
@@ -106,7 +107,9 @@ def flow_between(
     return flow[padding[2] : padding[2] + height, padding[0] : padding[0] + width].cpu().numpy()
 
 
-def correlation_pyramid(here: Tensor, there: Tensor) -> list[Float[Tensor, "cell 1 rows columns"]]:
+def correlation_pyramid(
+    here: Float[Tensor, "batch channel rows columns"], there: Float[Tensor, "batch channel rows columns"]
+) -> list[Float[Tensor, "cell 1 _ _"]]:
     """Correlate every cell with every other; each level averages two by two of the targets."""
     batch, channels, rows, columns = here.shape
     all_pairs = here.flatten(2).transpose(1, 2) @ there.flatten(2) / math.sqrt(channels)
@@ -117,7 +120,7 @@ def correlation_pyramid(here: Tensor, there: Tensor) -> list[Float[Tensor, "cell
 
 
 def look_up(
-    pyramid: list[Tensor], target: Float[Tensor, "batch 2 rows columns"]
+    pyramid: list[Float[Tensor, "cell 1 _ _"]], target: Float[Tensor, "batch 2 rows columns"]
 ) -> Float[Tensor, "batch channel rows columns"]:
     """Read the correlations in a window around each cell's target, on every level."""
     batch, _, rows, columns = target.shape
@@ -135,7 +138,7 @@ def look_up(
 
 
 def upsampled(
-    flow: Float[Tensor, "batch 2 rows columns"], mask: Tensor
+    flow: Float[Tensor, "batch 2 rows columns"], mask: Float[Tensor, "batch 576 rows columns"]
 ) -> Float[Tensor, "batch 2 height width"]:
     """Return pixel flow: each pixel a convex combination of the nine cells around it."""
     batch, _, rows, columns = flow.shape
@@ -192,18 +195,20 @@ class _Update(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.encoder, self.gru, self.flow_head = _Motion(), _Recurrence(), nn.Module()
-        self.flow_head.conv1, self.flow_head.conv2 = (
-            nn.Conv2d(HIDDEN, 256, 3, 1, 1),
-            nn.Conv2d(256, 2, 3, 1, 1),
-        )
+        self.encoder, self.gru = _Motion(), _Recurrence()
+        head = {
+            "conv1": nn.Conv2d(HIDDEN, 256, 3, 1, 1),
+            "relu": nn.ReLU(),
+            "conv2": nn.Conv2d(256, 2, 3, 1, 1),
+        }
+        self.flow_head = nn.Sequential(OrderedDict(head))
         self.mask = nn.Sequential(
             nn.Conv2d(HIDDEN, 256, 3, 1, 1), nn.ReLU(), nn.Conv2d(256, 9 * CELL_PX**2, 1)
         )
 
     def forward(self, hidden: Tensor, context: Tensor, seen: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
         hidden = self.gru(hidden, torch.cat([context, self.encoder(flow, seen)], dim=1))
-        return hidden, self.flow_head.conv2(torch.relu(self.flow_head.conv1(hidden)))
+        return hidden, self.flow_head(hidden)
 
 
 class _Motion(nn.Module):

@@ -34,6 +34,12 @@ class BodyDenoiser(nn.Module):
     sqrt(alpha_bar) posture.
     """
 
+    path_std: Tensor
+    root_mean: Tensor
+    root_std: Tensor
+    share: Tensor
+    past: Tensor
+
     def __init__(self, unet: nn.Module, posture: int, frames: int, schedule: Schedule = STANDARD):
         super().__init__()
         self.unet, self.posture = unet, posture
@@ -49,7 +55,7 @@ class BodyDenoiser(nn.Module):
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
         control: Float[Tensor, "batch 3 frame"],
-        keep: Float[Tensor, "batch 1"],
+        keep: Float[Tensor, "batch 1"] | None,
     ) -> Float[Tensor, "batch channel frame"]:
         held = condition[:, -self.posture :, None].expand(-1, -1, x.shape[-1])
         root = held[:, :ROOT_CHANNELS] * self.root_std[:, None] + self.root_mean[:, None]

@@ -33,6 +33,9 @@ def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
 class NoiseFromVelocity(nn.Module):
     """The noise, given the noisy sample and its velocity."""
 
+    of_sample: Tensor
+    of_velocity: Tensor
+
     def __init__(self, schedule: Schedule):
         super().__init__()
         share = torch.from_numpy(schedule.alpha_bar).float()
@@ -40,8 +43,8 @@ class NoiseFromVelocity(nn.Module):
         self.register_buffer("of_velocity", share.sqrt(), persistent=False)
 
     def forward(
-        self, x: Float[Tensor, "batch ..."], velocity: Float[Tensor, "batch ..."], t: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch ..."]:
+        self, x: Float[Tensor, "batch ..."], velocity: Float[Tensor, "*stack"], t: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "*stack"]:
         step, shape = t.long(), (-1, *[1] * (x.ndim - 1))
         return self.of_sample[step].reshape(shape) * x + self.of_velocity[step].reshape(shape) * velocity
 
@@ -114,12 +117,12 @@ class UNet1d(nn.Module):
         self,
         h: Float[Tensor, "batch channel frame"],
         embedding: Float[Tensor, "batch e"],
-        added: list[Tensor] | None = None,
-    ) -> list[Tensor]:
+        added: list[Float[Tensor, "batch _ _"]] | None = None,
+    ) -> list[Float[Tensor, "batch _ _"]]:
         """Return the output of every block in order; ``added`` holds one tensor per block."""
         outputs: list[Tensor] = []
 
-        def run(block: TemporalBlock, h: Tensor) -> Tensor:
+        def run(block: nn.Module, h: Tensor) -> Tensor:
             h = block(h, embedding)
             outputs.append(h + added[len(outputs)] if added else h)
             return outputs[-1]
@@ -159,9 +162,8 @@ class ControlUNet(nn.Module):
         self.side = UNet1d(control, widths, EMBEDDING)
         self.inject = nn.ModuleList(nn.Conv1d(w, w, 1) for w in self.main.block_widths)
         self.out = nn.Conv1d(widths[0], channels, 1)
-        for zero in self.inject:
-            nn.init.zeros_(zero.weight)
-            nn.init.zeros_(zero.bias)
+        for parameter in self.inject.parameters():
+            nn.init.zeros_(parameter)
 
     def forward(
         self,
@@ -214,7 +216,7 @@ class UncontrolledUNet(nn.Module):
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
         control: Float[Tensor, "batch ..."],
-        keep: Float[Tensor, "batch 1"],
+        keep: Float[Tensor, "batch 1"] | None,
     ) -> Float[Tensor, "batch channel frame"]:
         del control, keep
         return self.noise(x, self.out(self.main(x, self.embedding(t, condition))[-1]), t)

@@ -10,10 +10,11 @@ from typing import Literal, TypeVar, assert_never
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
 from pipeline.behavior.config import NoiseCourse
 
-Array = TypeVar("Array")
+Array = TypeVar("Array", np.ndarray, Tensor)
 
 
 @dataclass(frozen=True)
@@ -119,5 +120,6 @@ def sample(
         variance = (1 - later) / (1 - now) * (1 - now / later) if method == "ddpm" else 0.0
         x = later**0.5 * clean + max(1 - later - variance, 0.0) ** 0.5 * epsilon
         if method == "ddpm":
+            assert draw is not None, "DDPM draws fresh noise"
             x = x + variance**0.5 * draw()
     return x

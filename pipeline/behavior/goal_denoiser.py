@@ -64,20 +64,20 @@ class GoalMLP(nn.Module):
 
     def forward(
         self,
-        x: Float[Tensor, "batch 3"],
-        t: Float[Tensor, "batch"],
+        x: Float[Tensor, "draw 3"],
+        t: Float[Tensor, "draw"],
         condition: Float[Tensor, "batch condition"],
-        horizon: Float[Tensor, "batch"] | None = None,
-    ) -> Float[Tensor, "batch 3"]:
+        horizon: Float[Tensor, "draw"] | None = None,
+    ) -> Float[Tensor, "draw 3"]:
         return self.per_member(x, t, condition, torch.ones_like(t) if horizon is None else horizon).mean(0)
 
     def per_member(
         self,
-        x: Float[Tensor, "batch*draw 3"],
-        t: Float[Tensor, "batch*draw"],
+        x: Float[Tensor, "draw 3"],
+        t: Float[Tensor, "draw"],
         condition: Float[Tensor, "batch condition"],
-        horizon: Float[Tensor, "batch*draw"],
-    ) -> Float[Tensor, "member batch*draw 3"]:
+        horizon: Float[Tensor, "draw"],
+    ) -> Float[Tensor, "member draw 3"]:
         """Return what each member makes of it: they are trained apart and only averaged to sample. A batch
         has its draws together.
         """
@@ -117,6 +117,9 @@ class EnsembleLinear(nn.Module):
 class CleanGoalEstimate(nn.Module):
     """Where the clean goal lies if nothing is known but the noisy one: mean and variance, in scaled units."""
 
+    root: Tensor
+    variance: Tensor
+
     def __init__(self, schedule: Schedule):
         super().__init__()
         share = torch.from_numpy(schedule.alpha_bar).float()
@@ -138,6 +141,7 @@ class RestLikelihood(nn.Module):
     NUMBERS = 5 * len(SPREADS)
     LEAST, MOST = -4.0, 5.0
     """bounds of its outputs"""
+    spread: Tensor
 
     def __init__(self):
         super().__init__()
@@ -170,6 +174,9 @@ class MapAttention(nn.Module):
     NUMBERS = HEADS * (MAP_KEY_CHANNELS + 2) + LOCAL * 2
     FAR = 8.0
     """bound of the noisy goal, in scaled units"""
+    place: Tensor
+    power: Tensor
+    goal_std: Tensor
 
     def __init__(self, cells: int, code_channels: int, ensemble_size: int):
         super().__init__()
@@ -189,11 +196,11 @@ class MapAttention(nn.Module):
 
     def forward(
         self,
-        mean: Float[Tensor, "batch*draw 3"],
-        variance: Float[Tensor, "batch*draw 1"],
-        code_channels: Float[Tensor, "member batch*draw code"],
-        maps: Float[Tensor, "batch member channel*cell"],
-    ) -> Float[Tensor, "member batch*draw 44"]:
+        mean: Float[Tensor, "draw 3"],
+        variance: Float[Tensor, "draw 1"],
+        code_channels: Float[Tensor, "member draw code"],
+        maps: Float[Tensor, "batch member map"],
+    ) -> Float[Tensor, "member draw 44"]:
         """Return what each head reads, where it looks on average, and how far that is from the noisy goal."""
         key, value = maps.transpose(0, 1).unflatten(-1, (2, MAP_KEY_CHANNELS, -1)).unbind(2)
         scaled = self.power / self.goal_std[::2]

@@ -184,53 +184,22 @@ class BehaviorNets(nn.Module):
             map_cells=a.map_cells,
             map_lookup=a.map_lookup,
         )
+        sizes = (a.code_length, a.unet_width, a.unet_multipliers, schedule)
         match a.control:
             case "unet":
                 if a.map_cells and a.map_lookup == "pointwise":
-                    self.path = WaypointUNet(
-                        a.ensemble_size,
-                        a.map_cells,
-                        a.future,
-                        3,
-                        a.code_length,
-                        a.unet_width,
-                        a.unet_multipliers,
-                        schedule,
-                    )
+                    self.path = WaypointUNet(a.ensemble_size, a.map_cells, a.future, 3, *sizes)
                 else:
-                    self.path = ControlUNet(
-                        PATH_CHANNELS, 3, a.code_length, a.unet_width, a.unet_multipliers, schedule
-                    )
-                along = ControlUNet(
-                    a.body_channels,
-                    CONTROL_CHANNELS,
-                    a.code_length,
-                    a.unet_width,
-                    a.unet_multipliers,
-                    schedule,
-                )
+                    self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
+                along = ControlUNet(a.body_channels, CONTROL_CHANNELS, *sizes)
             case "concatenation":
-                self.path = ConcatenationUNet(
-                    PATH_CHANNELS, 3, a.code_length, a.unet_width, a.unet_multipliers, schedule
-                )
-                along = ConcatenationUNet(
-                    a.body_channels,
-                    CONTROL_CHANNELS * a.future,
-                    a.code_length,
-                    a.unet_width,
-                    a.unet_multipliers,
-                    schedule,
-                )
+                self.path = ConcatenationUNet(PATH_CHANNELS, 3, *sizes)
+                along = ConcatenationUNet(a.body_channels, CONTROL_CHANNELS * a.future, *sizes)
             case _:
                 assert_never(a.control)
         if a.family == "one_stage":  # one network for path and body, which nothing steers
-            along = UncontrolledUNet(
-                PATH_CHANNELS + a.body_channels,
-                TrailingLinear(a.code_length, EMBEDDING),
-                a.unet_width,
-                a.unet_multipliers,
-                schedule,
-            )
+            read = TrailingLinear(a.code_length, EMBEDDING)
+            along = UncontrolledUNet(PATH_CHANNELS + a.body_channels, read, *sizes[1:])
         self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
 
 
@@ -257,7 +226,7 @@ def bones_from_channels(
 
 def past_channels(
     ego_from_agent: Float[np.ndarray, "batch 8 4 4"], bones: Float[np.ndarray, "batch 8 channel"]
-) -> Float[np.ndarray, "batch 8*channel"]:
+) -> Float[np.ndarray, "batch past"]:
     """Return per past frame: root position, root rotation (6), bones; oldest frame first."""
     root = np.concatenate(
         [ego_from_agent[..., :3, 3], rigid.rotation_to_6d(ego_from_agent[..., :3, :3])], axis=-1

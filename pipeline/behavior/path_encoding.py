@@ -5,7 +5,7 @@ noise makes a path tremble. Told as strides it is zero, the root sets it apart f
 number of its own states whether the animal moves or stays.
 """
 
-from typing import TypeVar
+from typing import overload
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor
 
 from pipeline.behavior.trajectories import RATE_HZ
 
-Array = TypeVar("Array", np.ndarray, Tensor)
 PATH_CHANNELS = 4
 """numbers of a stride: the root of the velocity (of m/s) along x, y, z, and 1 where the animal moves, -1
 where it stays"""
@@ -33,7 +32,15 @@ MIN_SQUARED_M2 = 1e-12
 """square of a length, in square metres, that has no direction"""
 
 
-def with_powered_length(way: Float[Array, "*batch 3"], power: float) -> Float[Array, "*batch 3"]:
+@overload
+def with_powered_length(
+    way: Float[np.ndarray, "*batch 3"], power: float
+) -> Float[np.ndarray, "*batch 3"]: ...
+@overload
+def with_powered_length(way: Float[Tensor, "*batch 3"], power: float) -> Float[Tensor, "*batch 3"]: ...
+def with_powered_length(
+    way: Float[np.ndarray, "*batch 3"] | Float[Tensor, "*batch 3"], power: float
+) -> Float[np.ndarray, "*batch 3"] | Float[Tensor, "*batch 3"]:
     """Return vectors of the same direction, whose lengths are raised to a power; the inverse
     power undoes it. A vector of length 0 stays one.
     """

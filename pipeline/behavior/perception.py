@@ -6,15 +6,15 @@ happens inside the network. `PerceptionEnsemble` holds several perceptions, each
 by side.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import assert_never
+from typing import assert_never, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from pipeline.behavior.config import AblatedInput, Ego, SceneEncoder
@@ -70,7 +70,7 @@ class FeatureVolume:
     """The scene's features and occupancy on voxels of the world (Psi of the paper)."""
 
     features: Float[np.ndarray, "channel x y z"]
-    occupancy: Int[np.ndarray, "x y z"]
+    occupancy: UInt8[np.ndarray, "x y z"]
     """0 free, 1 surface or inside, 2 unseen"""
     origin: Float[np.ndarray, "3"]
     """world position of the corner of voxel 0"""
@@ -97,12 +97,11 @@ class FeatureVolume:
         """
         index, inside = self.voxel(rigid.apply(ego, grid_points_ego().reshape(-1, 3)))
         features = self.features.reshape(len(self.features), -1)
-        cell = np.ravel_multi_index(np.moveaxis(index, -1, 0), self.occupancy.shape)
+        cell = np.asarray(np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), self.occupancy.shape))
         grid = np.empty((len(ego), len(features), *GRID_SHAPE), np.float32)
-        for each, mine, known in zip(grid, cell, inside, strict=True):
-            np.multiply(
-                features.take(mine, axis=1), known, out=each.reshape(len(features), -1), dtype=np.float32
-            )
+        for number, each in enumerate(grid):
+            known = features.take(cell[number], axis=1)
+            np.multiply(known, inside[number], out=each.reshape(len(features), -1), dtype=np.float32)
         return grid
 
 
@@ -120,8 +119,10 @@ def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
     return nn.Sequential(*layers[:-2])
 
 
-SceneEncoding = tuple[Float[Tensor, "batch channel*cell"], Float[Tensor, "batch code"]]
+SceneEncoding = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code"]]
 """A map's channels, cell after cell (z, then x; none where there is no map), and a code"""
+PerceptionCode = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code_of_all"]]
+"""The same of scene, observer and past together"""
 
 
 class PillarScene(nn.Module):
@@ -193,7 +194,7 @@ class ObserverEncoder(nn.Module):
         self.layers = mlp((frames * 5 + 2, hidden, hidden, code))
 
     def forward(
-        self, observer_past: Float[Tensor, "batch frame*3"], keep: Float[Tensor, "batch"]
+        self, observer_past: Float[Tensor, "batch observer_past"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch code"]:
         position = observer_past.unflatten(1, (self.frames, 3))[:, :, ::2]
         distance = (position.square().sum(-1) + 1e-6).sqrt()
@@ -218,6 +219,8 @@ class PastEncoder(nn.Module):
 
     CHANGE = 3.0
     """scale of changes from frame to frame, and their bound"""
+    mean: Tensor
+    std: Tensor
 
     def __init__(self, frames: int, channels: int, hidden: int, code: int):
         super().__init__()
@@ -228,7 +231,7 @@ class PastEncoder(nn.Module):
         self.layers = mlp(((2 * frames - 1) * 9 + 32, hidden, hidden, code))
 
     def forward(
-        self, past: Float[Tensor, "batch frame*channel"], bones_keep: Float[Tensor, "batch"] | None = None
+        self, past: Float[Tensor, "batch past"], bones_keep: Float[Tensor, "batch"] | None = None
     ) -> Float[Tensor, "batch code"]:
         """``bones_keep`` is for training: 0 hides the bones of a sample (they take their mean)."""
         past = (past.unflatten(1, (self.frames, -1)) - self.mean) / self.std
@@ -263,6 +266,8 @@ class Perception(nn.Module):
     learned null.
     """
 
+    condition_mask: Tensor
+
     def __init__(self, size: PerceptionConfig):
         super().__init__()
         match size.scene:
@@ -284,21 +289,21 @@ class Perception(nn.Module):
     def forward(
         self,
         scene_grid: Float[Tensor, "batch channel 64 8 64"],
-        observer_past: Float[Tensor, "batch frame*3"],
-        past: Float[Tensor, "batch frame*channel"],
+        observer_past: Float[Tensor, "batch observer_past"],
+        past: Float[Tensor, "batch past"],
         keep: Float[Tensor, "batch 3"],
-    ) -> SceneEncoding:
+    ) -> PerceptionCode:
         """``keep`` holds 1 or 0 for scene, observer and past."""
         return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
 
     def encode_training(
         self,
         pooled: Float[Tensor, "batch channel x y z"],
-        observer_past: Float[Tensor, "batch frame*3"],
-        past: Float[Tensor, "batch frame*channel"],
+        observer_past: Float[Tensor, "batch observer_past"],
+        past: Float[Tensor, "batch past"],
         keep: Float[Tensor, "batch 3"],
         bones_keep: Float[Tensor, "batch"],
-    ) -> SceneEncoding:
+    ) -> PerceptionCode:
         """Return map and code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides
         remembered bones.
         """
@@ -307,10 +312,10 @@ class Perception(nn.Module):
     def join(
         self,
         map_lookup: SceneEncoding,
-        observer_past: Float[Tensor, "batch frame*3"],
+        observer_past: Float[Tensor, "batch observer_past"],
         past: Float[Tensor, "batch code"],
         keep: Float[Tensor, "batch 3"],
-    ) -> SceneEncoding:
+    ) -> PerceptionCode:
         """Put the codes side by side, nulls where ``keep`` is 0 and for what the model is blind to; a map's
         null is zero.
         """
@@ -335,24 +340,28 @@ class PerceptionEnsemble(nn.Module):
         self.members = nn.ModuleList(Perception(size) for _ in range(count))
 
     def __iter__(self) -> Iterator[Perception]:
-        return iter(self.members)
+        return iter(cast(Iterable[Perception], self.members))  # torch's lists of modules are not generic
+
+    @property
+    def first(self) -> Perception:
+        """The first member: sizes and scaling of past and observer are the same in all."""
+        return next(iter(self))
 
     def forward(
         self,
         scene_grid: Float[Tensor, "batch channel 64 8 64"],
-        observer_past: Float[Tensor, "batch frame*3"],
-        past: Float[Tensor, "batch frame*channel"],
+        observer_past: Float[Tensor, "batch observer_past"],
+        past: Float[Tensor, "batch past"],
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, observer and past."""
-        frames = past.unflatten(1, (self.members[0].past.frames, -1))[:, -self.POSTURE_FRAMES :]
+        frames = past.unflatten(1, (self.first.past.frames, -1))[:, -self.POSTURE_FRAMES :]
         return self.condition(
-            [member(scene_grid, observer_past, past, keep) for member in self.members],
-            self.now(frames, keep[:, 2]),
+            [member(scene_grid, observer_past, past, keep) for member in self], self.now(frames, keep[:, 2])
         )
 
     def condition(
-        self, readings: list[SceneEncoding], now: Float[Tensor, "batch pace+channel"]
+        self, readings: list[PerceptionCode], now: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch condition"]:
         """Put the encodings of all members and the current state side by side."""
         maps, codes = zip(*readings, strict=True)
@@ -360,11 +369,11 @@ class PerceptionEnsemble(nn.Module):
 
     def now(
         self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch pace+channel"]:
+    ) -> Float[Tensor, "batch state"]:
         """Return velocity, encoded as paths are, and posture, in scaled numbers; zeros where the past is
         not remembered.
         """
-        member = self.members[0]
+        member = self.first
         velocity = (frames[:, -1, :POSITION] - frames[:, 0, :POSITION]) * (
             member.observer.rate_hz / (self.POSTURE_FRAMES - 1)
         )

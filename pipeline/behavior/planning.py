@@ -85,8 +85,8 @@ class Observation:
     """The inputs of perception, in metres and the ego frame."""
 
     scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
-    observer_past: Float[np.ndarray, "batch frame*3"]
-    past: Float[np.ndarray, "batch frame*channel"]
+    observer_past: Float[np.ndarray, "batch observer_past"]
+    past: Float[np.ndarray, "batch past"]
     constraint: SceneConstraint | None = None
     """where the agents may be, for samplers that keep to it"""
 

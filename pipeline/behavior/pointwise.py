@@ -28,7 +28,7 @@ READ = 2 * MAP_KEY_CHANNELS
 
 
 def read_at(
-    maps: Float[Tensor, "batch member channel*cell"], points: Float[Tensor, "batch point 3"]
+    maps: Float[Tensor, "batch member map"], points: Float[Tensor, "batch point 3"]
 ) -> Float[Tensor, "batch member channel point"]:
     """Return what maps say at points in metres of the ego frame, between cells by their distance; zeros
     beyond the edge.
@@ -43,6 +43,7 @@ class MapAtGoal(nn.Module):
     """The map where a noisy goal is expected; called as `MapAttention` is."""
 
     NUMBERS = READ
+    goal_std: Tensor
 
     def __init__(self):
         super().__init__()
@@ -50,11 +51,11 @@ class MapAtGoal(nn.Module):
 
     def forward(
         self,
-        mean: Float[Tensor, "batch*draw 3"],
-        variance: Float[Tensor, "batch*draw 1"],
-        code: Float[Tensor, "member batch*draw code"],
-        maps: Float[Tensor, "batch member channel*cell"],
-    ) -> Float[Tensor, "member batch*draw 16"]:
+        mean: Float[Tensor, "draw 3"],
+        variance: Float[Tensor, "draw 1"],
+        code: Float[Tensor, "member draw code"],
+        maps: Float[Tensor, "batch member map"],
+    ) -> Float[Tensor, "member draw 16"]:
         """Return the map's channels there."""
         del code
         goal = with_powered_length(mean / (1 + variance) * self.goal_std, 1 / GOAL_LENGTH_POWER)
@@ -64,6 +65,9 @@ class MapAtGoal(nn.Module):
 
 class WaypointUNet(ControlUNet):
     """A `ControlUNet` of velocity channels that reads the maps of all members at each noisy waypoint."""
+
+    share: Tensor
+    stride_std: Tensor
 
     def __init__(
         self,

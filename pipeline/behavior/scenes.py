@@ -103,7 +103,7 @@ class Scenes:
         allowed.
         """
         return tuple(
-            distance_transform_edt(~allowed, return_distances=False, return_indices=True)
+            np.asarray(distance_transform_edt(~allowed, return_distances=False, return_indices=True))
             if allowed.any() and not (volume.occupancy == 2).all()
             else None
             for volume, allowed in zip(self.volumes, self.allowed, strict=True)

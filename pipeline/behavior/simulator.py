@@ -70,7 +70,8 @@ class AnimalBatch:
         sampling: PlanSamplingConfig,
         chaining: ReplanningConfig,
     ):
-        self.sampler, self.scenes, self.rest, self.ego = sampler, scenes, rest, ego
+        self.sampler, self.scenes, self.rest = sampler, scenes, rest
+        self.ego: Ego = ego
         self.sampling, self.chaining = sampling, chaining
 
     def begin(self, context: Context, rng: np.random.Generator) -> None:
@@ -268,6 +269,7 @@ class Simulator:
     @property
     def recording(self) -> Trajectory:
         """Return the recording that this life began in."""
+        assert self.flock.video is not None, "windows of recordings name them"
         return self.data.trajectories[self.data.videos[self.flock.video[0]]]
 
     def step(self, observer: Float[np.ndarray, "3"]) -> SimulatorState:

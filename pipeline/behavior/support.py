@@ -8,7 +8,7 @@ tops.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.behavior.perception import FeatureVolume
 
@@ -37,7 +37,7 @@ class Support:
 
     @classmethod
     def of(
-        cls, volume: FeatureVolume, marks: Int[np.ndarray, "x y z"], range_m: Float[np.ndarray, "2 2"]
+        cls, volume: FeatureVolume, marks: UInt8[np.ndarray, "x y z"], range_m: Float[np.ndarray, "2 2"]
     ) -> "Support | None":
         """Gather the tops of a scene, or none where it is not known what carries."""
         carries = marks >= SUPPORTED
@@ -66,8 +66,8 @@ class Support:
 
 
 def mark_supported(
-    allowed: Bool[np.ndarray, "x y z"], occupancy: Int[np.ndarray, "x y z"]
-) -> Int[np.ndarray, "x y z"]:
+    allowed: Bool[np.ndarray, "x y z"], occupancy: UInt8[np.ndarray, "x y z"]
+) -> UInt8[np.ndarray, "x y z"]:
     """Return 1 where the root may be, and 2 where that is right above something solid."""
     beneath = np.zeros_like(allowed)
     beneath[:, 1:] = occupancy[:, :-1] == 1

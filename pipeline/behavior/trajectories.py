@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.data import npz
@@ -86,7 +86,7 @@ def window_starts(
     if len(valid) < length:
         return np.zeros(0, np.int64)
     run = np.lib.stride_tricks.sliding_window_view(valid, length).all(-1)
-    return np.flatnonzero(run & (np.arange(len(run)) % stride == 0))
+    return np.flatnonzero(run & (np.arange(run.size) % stride == 0))
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class BehaviorData:
     """index into ``videos``"""
     start: Int[np.ndarray, "window"]
     """first of the 64 frames"""
-    split: Int[np.ndarray, "window"]
+    split: UInt8[np.ndarray, "window"]
     """0 train, 1 test"""
     videos: tuple[str, ...]
     future: int = FUTURE

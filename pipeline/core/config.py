@@ -13,17 +13,25 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from pipeline.core.errors import InputError
 
-C = TypeVar("C")
 LARGEST_INTEGER = (1 << 63) - 1
 """TOML promises no more; larger ones are no float either."""
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlong, _SHORT.maxstring, _SHORT.maxother = 4, 40, 100, 200
 _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 20
 """Of a value in a message: files may hold numbers of thousands of digits, and tables as deep."""
+
+
+class Dataclass(Protocol):
+    """What `dataclasses` takes for one."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+
+C = TypeVar("C", bound=Dataclass)
 
 
 def load(config: type[C], path: Path) -> C:

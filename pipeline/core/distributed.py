@@ -5,13 +5,18 @@ PROCESSES=4`.
 number of all processes' elements (`total`), so that a step does not depend on who holds what.
 """
 
+import os
 from collections.abc import Callable, Mapping
 
 import torch
+from jaxtyping import Float, Shaped
 from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from pipeline.core import processes
+
+NamedLoss = Callable[[int, torch.Generator], Mapping[str, Float[Tensor, ""]]]
+"""of a step and its generator: weighted terms by name"""
 
 
 def join(device: str) -> None:
@@ -22,7 +27,7 @@ def join(device: str) -> None:
         return
     processes.die_with_parent()
     if device == "cuda":
-        torch.cuda.set_device(distributed.get_node_local_rank())
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))  # torchrun's number of this process here
     distributed.init_process_group("nccl" if device == "cuda" else "gloo")
 
 
@@ -44,7 +49,7 @@ def rank() -> int:
     return distributed.get_rank() if distributed.is_initialized() else 0
 
 
-def total(values: Tensor) -> Tensor:
+def total(values: Shaped[Tensor, "*any"]) -> Shaped[Tensor, "*any"]:
     """Return the sum over all processes, without gradients."""
     if size() == 1:
         return values.detach()
@@ -62,18 +67,16 @@ def wait() -> None:
 class Shared(nn.Module):
     """A loss over modules whose gradients are averaged over all processes as they are computed."""
 
-    def __init__(self, modules: Mapping[str, nn.Module], loss: Callable[..., Mapping[str, Tensor]]):
+    def __init__(self, modules: Mapping[str, nn.Module], loss: NamedLoss):
         super().__init__()
         self.learned, self.loss = nn.ModuleDict(modules), loss
 
-    def forward(self, step: int, generator: torch.Generator) -> Mapping[str, Tensor]:
+    def forward(self, step: int, generator: torch.Generator) -> Mapping[str, Float[Tensor, ""]]:
         """Return the loss's terms."""
         return self.loss(step, generator)
 
 
-def shared(
-    modules: Mapping[str, nn.Module], loss: Callable[..., Mapping[str, Tensor]]
-) -> Callable[..., Mapping[str, Tensor]]:
+def shared(modules: Mapping[str, nn.Module], loss: NamedLoss) -> NamedLoss:
     """Return a loss whose gradients are the mean of all processes'; all begin with the leader's weights."""
     return DistributedDataParallel(
         Shared(modules, loss), forward_sync_buffers=False, find_unused_parameters=True

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
 from pipeline.core.errors import printable
@@ -21,7 +21,7 @@ def log(message: str) -> None:
 
 def track(iterable: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
     """Yield from `iterable` and tell how far it is; `total` is needed where it has no length."""
-    if total is None and hasattr(iterable, "__len__"):
+    if total is None and isinstance(iterable, Sized):
         total = len(iterable)
     on_terminal = sys.stderr.isatty()
     pause = BAR_EVERY_S if on_terminal else LINE_EVERY_S

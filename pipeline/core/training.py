@@ -6,6 +6,8 @@ uninterrupted one. SIGTERM saves and exits with 75; a loss that stays broken exi
 """
 
 import contextlib
+import copy
+import functools
 import json
 import math
 import os
@@ -21,11 +23,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.core import distributed, progress
+from pipeline.core.distributed import NamedLoss
 
 KEEP = 3
 BROKEN_IN_A_ROW = 3
 EXIT_SAVED = 75
 EXIT_DIVERGED = 76
+Loss = Callable[[int, torch.Generator], Float[Tensor, ""] | Mapping[str, Float[Tensor, ""]]]
+"""of a step and its generator; weighted terms by name, or their sum"""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,7 @@ def fit(
     *,
     modules: Mapping[str, torch.nn.Module],
     optimizer: torch.optim.Optimizer,
-    loss: Callable[[int, torch.Generator], Tensor | Mapping[str, Tensor]],
+    loss: Loss,
     steps: int,
     seed: int,
     resume: Path | None = None,
@@ -74,10 +79,11 @@ def fit(
     shared = shared and distributed.size() > 1
     loop = _Loop(dict(modules), optimizer, resume, shared)
     loop.restore()
-    loss = distributed.shared(modules, loss) if shared else loss
+    terms_of = _named(loss)
+    terms_of = distributed.shared(modules, terms_of) if shared else terms_of
     with contextlib.nullcontext(asked_to_stop) if asked_to_stop else termination() as asked_to_stop:
         for _ in progress.track(loop.until(steps), label, total=steps - loop.step):
-            if not loop.advance(loss, steps, seed, schedule, clip_norm):
+            if not loop.advance(terms_of, steps, seed, schedule, clip_norm):
                 continue
             if after_step:
                 after_step(loop.step - 1)
@@ -122,7 +128,14 @@ class _Loop:
         while self.step < steps:
             yield self.step
 
-    def advance(self, loss, steps: int, seed: int, schedule, clip_norm: float | None) -> bool:
+    def advance(
+        self,
+        loss: NamedLoss,
+        steps: int,
+        seed: int,
+        schedule: Callable[[float], float] | None,
+        clip_norm: float | None,
+    ) -> bool:
         """Do one step. Return False when it was broken and the loop fell back to an earlier one."""
         factor = self.rate * (schedule(self.step / max(steps, 1)) if schedule else 1.0)
         for group, base in zip(self.optimizer.param_groups, self.base_rates, strict=True):
@@ -130,15 +143,13 @@ class _Loop:
         generator = generator_for(seed, self.step, self.rank)
         torch.manual_seed(generator.initial_seed())
         terms = loss(self.step, generator)
-        terms = {"loss": terms} if isinstance(terms, Tensor) else terms
-        total = sum(terms.values())
         self.optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        functools.reduce(torch.add, terms.values()).backward()
         parameters = [
             p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None
         ]
         norm = torch.nn.utils.clip_grad_norm_(parameters, clip_norm or math.inf)
-        told = self._told(terms)
+        told = self._values_of(terms)
         if torch.isfinite(norm) and math.isfinite(sum(told.values())):
             self.optimizer.step()
             self.broken = 0
@@ -154,7 +165,7 @@ class _Loop:
         self.step += 1
         return True
 
-    def _told(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
+    def _values_of(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
         """Return the terms as numbers; the mean of all processes'."""
         values = torch.stack([value.detach().float() for value in terms.values()])
         values = distributed.total(values) / distributed.size() if self.shared else values
@@ -180,26 +191,22 @@ class _Loop:
         progress.log(
             f"the loss is not finite at step {self.step}: back to the last checkpoint with half the rate"
         )
-        if self.folder is None:
+        if self.start is not None:
             self._load(self.start)
         else:
             self.restore()
         self.rate, self.rolled_back, self.broken = self.rate / 2, self.rolled_back + 1, 0
 
     def _state(self) -> dict:
-        copy = {
-            name: {key: value.clone() for key, value in module.state_dict().items()}
-            for name, module in self.modules.items()
-        }
-        optimizer = _deep_clone(self.optimizer.state_dict())
-        return {
+        state = {
             "step": self.step,
             "rate": self.rate,
             "rolled_back": self.rolled_back,
-            "terms": {k: list(v) for k, v in self.terms.items()},
-            "modules": copy,
-            "optimizer": optimizer,
+            "terms": self.terms,
+            "modules": {name: dict(module.state_dict()) for name, module in self.modules.items()},
+            "optimizer": self.optimizer.state_dict(),
         }
+        return copy.deepcopy(state)  # later steps must not change it
 
     def _load(self, state: dict) -> None:
         self.step, self.rate, self.rolled_back = state["step"], state["rate"], state["rolled_back"]
@@ -212,7 +219,7 @@ class _Loop:
         """Write a checkpoint by temp file, fsync and rename; keep the newest three. Of several processes, the
         first does.
         """
-        if self.rank:
+        if self.rank or self.folder is None:
             return
         temp = self.folder / f".step.tmp.{os.getpid()}"
         with open(temp, "wb") as file:
@@ -220,7 +227,7 @@ class _Loop:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temp, self.folder / f"step{self.step:09d}.pt")
-        for old in self._checkpoints()[KEEP:]:
+        for old in _checkpoints(self.folder)[KEEP:]:
             old.unlink()
 
     def restore(self) -> None:
@@ -230,18 +237,17 @@ class _Loop:
         if self.folder is None:
             return
         if self.rank == 0:
-            self._restore()
-        if self.shared:
-            distributed.wait()
-        if self.rank:
-            self._restore()
-
-    def _restore(self) -> None:
-        if self.rank == 0:
             self.folder.mkdir(parents=True, exist_ok=True)
             for dead in self.folder.glob(".step.tmp.*"):
                 dead.unlink()
-        for path in self._checkpoints():
+            self._restore(self.folder)
+        if self.shared:
+            distributed.wait()
+        if self.rank:
+            self._restore(self.folder)
+
+    def _restore(self, folder: Path) -> None:
+        for path in _checkpoints(folder):
             try:
                 state = torch.load(path, weights_only=True, map_location="cpu")
             except Exception as error:  # any damage: the file before it is as good
@@ -252,19 +258,19 @@ class _Loop:
             return
         self.save()
 
-    def _checkpoints(self) -> list[Path]:
-        return sorted(self.folder.glob("step*.pt"), reverse=True)
+
+def _checkpoints(folder: Path) -> list[Path]:
+    return sorted(folder.glob("step*.pt"), reverse=True)
 
 
-def _deep_clone(value):
-    """Copy nested containers, cloning tensors, so that later steps cannot change the copy."""
-    if isinstance(value, Tensor):
-        return value.clone()
-    if isinstance(value, dict):
-        return {key: _deep_clone(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_deep_clone(item) for item in value]
-    return value
+def _named(loss: Loss) -> NamedLoss:
+    """Return the loss as named terms."""
+
+    def terms(step: int, generator: torch.Generator) -> Mapping[str, Tensor]:
+        value = loss(step, generator)
+        return {"loss": value} if isinstance(value, Tensor) else value
+
+    return terms
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ content, same bytes.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import pygltflib as gltf
@@ -14,6 +15,8 @@ from jaxtyping import Float, Float32, UInt8
 
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+
+T = TypeVar("T")
 
 _FLOAT, _U8, _U32 = gltf.FLOAT, gltf.UNSIGNED_BYTE, gltf.UNSIGNED_INT
 _ROOT_NODE, _MESH_NODE, _FIRST_JOINT = 0, 1, 2
@@ -104,20 +107,20 @@ class _Document:
         return len(self.file.accessors) - 1
 
     def add_mesh(self, mesh: Mesh, name: str, skin: Skin | None) -> None:
-        vertex = {"target": gltf.ARRAY_BUFFER}
+        target = gltf.ARRAY_BUFFER
         attributes = gltf.Attributes(
-            POSITION=self.add(mesh.vertices.astype(np.float32), "VEC3", _FLOAT, bounds=True, **vertex),
-            NORMAL=self.add(_unit_normals(mesh), "VEC3", _FLOAT, **vertex),
+            POSITION=self.add(mesh.vertices.astype(np.float32), "VEC3", _FLOAT, target=target, bounds=True),
+            NORMAL=self.add(_unit_normals(mesh), "VEC3", _FLOAT, target=target),
         )
         if mesh.color is not None:
-            attributes.COLOR_0 = self.add(_linear_rgba(mesh.color), "VEC4", _FLOAT, **vertex)
+            attributes.COLOR_0 = self.add(_linear_rgba(mesh.color), "VEC4", _FLOAT, target=target)
         if skin is not None:
             for number in range(skin.joints.shape[1] // 4):
                 four = slice(4 * number, 4 * number + 4)
-                setattr(attributes, f"JOINTS_{number}", self.add(skin.joints[:, four], "VEC4", _U8, **vertex))
-                setattr(
-                    attributes, f"WEIGHTS_{number}", self.add(skin.weights[:, four], "VEC4", _FLOAT, **vertex)
-                )
+                joints = self.add(skin.joints[:, four], "VEC4", _U8, target=target)
+                weights = self.add(skin.weights[:, four], "VEC4", _FLOAT, target=target)
+                setattr(attributes, f"JOINTS_{number}", joints)
+                setattr(attributes, f"WEIGHTS_{number}", weights)
         indices = self.add(
             mesh.faces.astype(np.uint32).reshape(-1), "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER
         )
@@ -208,7 +211,7 @@ def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
     matrices = (
         document.values(table.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
     )
-    names = tuple(document.file.nodes[joint].name for joint in table.joints)
+    names = tuple(_given(document.file.nodes[joint].name) for joint in _given(table.joints))
     joints, weights = (
         np.concatenate(
             [
@@ -228,18 +231,24 @@ def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
     )
 
 
+def _given(value: T | None) -> T:
+    """Return what pygltflib declares optional and `_Document` always writes."""
+    assert value is not None, "not a file of this module"
+    return value
+
+
 class _Opened:
     """A glTF document that is read."""
 
     def __init__(self, data: bytes) -> None:
-        self.file = gltf.GLTF2.load_from_bytes(data)
-        self.blob = self.file.binary_blob()
+        self.file = _given(gltf.GLTF2.load_from_bytes(data))
+        self.blob = _given(self.file.binary_blob())
 
-    def values(self, index: int) -> np.ndarray:
-        accessor = self.file.accessors[index]
+    def values(self, index: int | None) -> np.ndarray:
+        accessor = self.file.accessors[_given(index)]
         kind = {_FLOAT: "<f4", _U8: "u1", _U32: "<u4"}[accessor.componentType]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]
-        start = self.file.bufferViews[accessor.bufferView].byteOffset
+        start = _given(self.file.bufferViews[_given(accessor.bufferView)].byteOffset)
         return np.frombuffer(self.blob, kind, accessor.count * width, start).reshape(accessor.count, -1)
 
     def mesh(self) -> Mesh:
@@ -263,7 +272,7 @@ class _Opened:
         )
         assert poses.shape[1] == 1 + bones, poses.shape
         return Action(
-            animation.name,
+            _given(animation.name),
             self.values(animation.samplers[0].input).ravel().astype(np.float64),
             poses[:, 0],
             poses[:, 1:],

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import OpenEXR
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 
 from pipeline.core.errors import InputError
 
@@ -131,7 +131,7 @@ def _is_complete(path: Path) -> bool:
     return path.stat().st_size == last + 8 + length
 
 
-def decoded(data: bytes, flags: int) -> np.ndarray | None:
+def decoded(data: bytes, flags: int) -> Shaped[np.ndarray, "height width *channel"] | None:
     """Decode with OpenCV; None for what it cannot read, PNG with a wrong checksum among them.
 
     PNG and JPEG whose header asks for too many pixels are not tried.

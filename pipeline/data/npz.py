@@ -16,9 +16,10 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Self
+from typing import IO
 
 import numpy as np
+from jaxtyping import Shaped
 
 from pipeline.core.errors import InputError
 
@@ -63,14 +64,14 @@ class Rows:
         self._kinds = {name: (shape, np.dtype(kind)) for name, (shape, kind) in arrays.items()}
         self._parts = {name: tempfile.TemporaryFile(dir=path.parent) for name in arrays}
 
-    def append(self, **rows: np.ndarray) -> None:
+    def append(self, **rows: Shaped[np.ndarray, "..."]) -> None:
         """Add one row to each of the named arrays."""
         for name, row in rows.items():
             (_, *shape), dtype = self._kinds[name]
             assert row.shape == tuple(shape) and row.dtype == dtype, (name, row.shape, row.dtype)
             self._parts[name].write(row.tobytes())
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Rows":
         return self
 
     def __exit__(self, failed: type | None, *_: object) -> None:
@@ -108,13 +109,13 @@ class Column:
         """``folder`` is where the file lies; None: where temporary files do."""
         self._file, self._rows, self._like = tempfile.TemporaryFile(dir=folder), 0, np.zeros(0)
 
-    def append(self, rows: np.ndarray) -> Self:
+    def append(self, rows: Shaped[np.ndarray, "row ..."]) -> "Column":
         """Add rows at the end."""
         self._file.write(np.ascontiguousarray(rows).data)
         self._rows, self._like = self._rows + len(rows), rows[:0].copy()
         return self
 
-    def array(self) -> np.ndarray:
+    def array(self) -> Shaped[np.ndarray, "row ..."]:
         """Return all rows."""
         if not self._rows:
             return self._like
@@ -124,7 +125,7 @@ class Column:
 
 def load(
     path: Path, names: tuple[str, ...] | None = None, optional: tuple[str, ...] = ()
-) -> dict[str, np.ndarray]:
+) -> dict[str, Shaped[np.ndarray, "..."]]:
     """Read the named arrays (default: all) and those ``optional`` ones that are there.
 
     Raises InputError ART-010 for damaged files, missing names and object arrays.
@@ -138,7 +139,7 @@ def load(
         return {name: _read(archive, name) for name in wanted}
 
 
-def open_lazily(path: Path, name: str) -> np.ndarray:
+def open_lazily(path: Path, name: str) -> Shaped[np.ndarray, "..."]:
     """Map one uncompressed member read-only, so that only what is indexed is read from disk.
 
     Raises InputError ART-010 for damaged files and missing names.

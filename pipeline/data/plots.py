@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Num, UInt8
+from jaxtyping import Bool, Float, Int, Num, Shaped, UInt8
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -28,7 +28,9 @@ LABEL_PX = 20
 """Height of a line of text below a picture."""
 
 
-def panels(rows: int, columns: int, *, width_in: float, height_in: float) -> tuple[Figure, np.ndarray]:
+def panels(
+    rows: int, columns: int, *, width_in: float, height_in: float
+) -> tuple[Figure, Shaped[np.ndarray, "rows columns"]]:
     """Return a figure and its axes [row, column]; sizes in inches of 80 pixels."""
     figure = Figure(figsize=(width_in, height_in), dpi=DOTS_PER_INCH, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
@@ -139,7 +141,7 @@ def sample(count: int, most: int) -> Int[np.ndarray, "chosen"]:
 
 def resized(
     image: UInt8[np.ndarray, "height width *channel"], size: tuple[int, int]
-) -> UInt8[np.ndarray, "height width *channel"]:
+) -> UInt8[np.ndarray, "resized_height resized_width *channel"]:
     """Return a picture of ``size`` (height, width) in pixels, averaged where it shrinks."""
     shrinks = size[0] < image.shape[0]
     return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
@@ -153,9 +155,7 @@ def labelled(image: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.
     return np.concatenate([image, strip])
 
 
-def grid(
-    images: Sequence[UInt8[np.ndarray, "height width 3"]], columns: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def grid(images: Sequence[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np.ndarray, "height width 3"]:
     """Lay pictures out on a grid, row by row; smaller ones are padded to the largest."""
     height, width = np.max([image.shape[:2] for image in images], axis=0)
     sheet = np.full((-(-len(images) // columns), columns, height, width, 3), BACKGROUND, np.uint8)

@@ -17,20 +17,18 @@ _TYPES = {
     "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
     "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
 }  # fmt: skip
+_COLOR = ("red", "green", "blue")
 
 
 def write_ply(path: Path, mesh: Mesh, **properties: Float[np.ndarray, "vertex"]) -> None:
     """Write a mesh; each extra property becomes a float column of the vertices."""
     columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     columns += [(name, "<f4") for name in properties]
-    columns += [(name, "u1") for name in ("red", "green", "blue")] if mesh.color is not None else []
+    colors = {} if mesh.color is None else dict(zip(_COLOR, mesh.color.T, strict=True))
+    columns += [(name, "u1") for name in colors]
     table = np.zeros(len(mesh.vertices), columns)
-    for axis, name in enumerate("xyz"):
-        table[name] = mesh.vertices[:, axis]
-    for name, values in properties.items():
+    for name, values in {**dict(zip("xyz", mesh.vertices.T, strict=True)), **properties, **colors}.items():
         table[name] = values
-    for channel, name in enumerate(("red", "green", "blue") if mesh.color is not None else ()):
-        table[name] = mesh.color[:, channel]
     faces = np.zeros(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
     faces["count"], faces["index"] = 3, mesh.faces
     names = {"<f4": "float", "u1": "uchar"}
@@ -44,7 +42,7 @@ def read_ply(path: Path) -> Mesh:
     """Read a binary triangle mesh. Raises InputError ART-020 when it is not one or is damaged."""
     try:
         return _parse(Path(path).read_bytes())
-    except (ValueError, IndexError, KeyError, TypeError, OverflowError, StopIteration) as error:
+    except (ValueError, IndexError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             "ART-020",
             what=f"not a binary PLY of triangles: {error}",
@@ -58,16 +56,12 @@ def _parse(data: bytes) -> Mesh:
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise ValueError("only binary_little_endian 1.0 is read")
-    elements = [(line[1], int(line[2]), []) for line in lines if line[:1] == ["element"]]
-    current = iter(elements)
-    columns: list[list[str]] | None = None
+    elements: list[tuple[str, int, list[list[str]]]] = []
     for line in lines:
         if line[:1] == ["element"]:
-            columns = next(current)[2]
-        elif line[:1] == ["property"] and columns is None:
-            raise ValueError("a property before any element")
+            elements.append((line[1], int(line[2]), []))
         elif line[:1] == ["property"]:
-            columns.append(line[1:])
+            elements[-1][2].append(line[1:])
     if any(not 0 <= count <= len(data) for _, count, _ in elements):
         raise ValueError("the file is shorter than its header declares")
     if [name for name, _, _ in elements][:2] != ["vertex", "face"]:
@@ -87,10 +81,6 @@ def _parse(data: bytes) -> Mesh:
         raise ValueError("faces are not triangles of existing vertices")
     if not np.isfinite(vertices).all():
         raise ValueError("vertices are not finite")
-    has_color = {"red", "green", "blue"} <= set(row.names)
-    color = (
-        np.stack([table[name] for name in ("red", "green", "blue")], axis=-1).astype(np.uint8)
-        if has_color
-        else None
-    )
+    has_color = set(_COLOR) <= {name for _, name in vertex_columns}
+    color = np.stack([table[name] for name in _COLOR], axis=-1).astype(np.uint8) if has_color else None
     return Mesh(vertices, index, color)

@@ -73,7 +73,7 @@ def write(
 
 def worst(statuses: Sequence[Status]) -> Status:
     """Return the most serious of several judgements; none at all is ok."""
-    return max(statuses, key=("ok", "warn", "fail").index, default="ok")
+    return max(("ok", *statuses), key=("ok", "warn", "fail").index)
 
 
 def _beyond(value: float, limit: float | None, better: Literal["lower", "higher"]) -> bool:

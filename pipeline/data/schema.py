@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Shaped
 
 from pipeline.core.errors import InputError
 from pipeline.data import npz
@@ -60,7 +61,7 @@ class FileSchema:
         assert problem is None, (self.file, problem)
         npz.save(path, compress=compress, **known)
 
-    def load(self, path: Path, *keys: str) -> dict[str, np.ndarray]:
+    def load(self, path: Path, *keys: str) -> dict[str, Shaped[np.ndarray, "..."]]:
         """Read the named arrays (default: all) in the schema's dtypes.
 
         Raises InputError ART-010 for damaged files, missing keys, and arrays of other axes or kinds.

@@ -60,8 +60,8 @@ class PersonFloor:
 
 
 def to_world(
-    local: Float[np.ndarray, "*batch 2"], heading: Float[np.ndarray, "*batch"]
-) -> Float[np.ndarray, "*batch 2"]:
+    local: Float[np.ndarray, "*#batch 2"], heading: Float[np.ndarray, "*#batch"]
+) -> Float[np.ndarray, "*#batch 2"]:
     """Rotate vectors (left, ahead) by headings about world +y (0 is +z) into world x and z."""
     cosine, sine = np.cos(heading), np.sin(heading)
     left, ahead = local[..., 0], local[..., 1]
@@ -69,7 +69,7 @@ def to_world(
 
 
 def to_local(
-    world: Float[np.ndarray, "*batch 2"], heading: Float[np.ndarray, "*batch"]
-) -> Float[np.ndarray, "*batch 2"]:
+    world: Float[np.ndarray, "*#batch 2"], heading: Float[np.ndarray, "*#batch"]
+) -> Float[np.ndarray, "*#batch 2"]:
     """Undo `to_world`."""
     return to_world(world, -heading)

@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from jaxtyping import Float
 from pettingzoo import ParallelEnv
 
 from pipeline.behavior.trajectories import RATE_HZ
@@ -78,8 +79,8 @@ class PersonAnimalEnv(ParallelEnv):
         self.world.begin(1, self.rng, (options or {}).get("split", "train"))
         return self._observations(), {agent: {} for agent in self.agents}
 
-    def step(self, actions: dict[str, np.ndarray]):
-        """Let 0.1 s pass."""
+    def step(self, actions: dict[str, Float[np.ndarray, "_"]]):
+        """Let 0.1 s pass; actions in -1..1 are parts of the highest speeds, or of the farthest goal."""
         root = self.world.animals.past[-1].root[0, 0]
         if ANIMAL in actions:
             goal = to_world(GOAL_M * np.asarray(actions[ANIMAL], float)[None], self._animal_heading())[0]

@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.config import EnvironmentConfig
@@ -47,8 +48,8 @@ class PersonEnv(gymnasium.Env):
         self._show()
         return self._observation(), {"distance_m": float(self.world.distance_m[0])}
 
-    def step(self, action: np.ndarray):
-        """Let 0.1 s pass."""
+    def step(self, action: Float[np.ndarray, "action"]):
+        """Let 0.1 s pass; an action in -1..1 is a part of the highest speeds."""
         outcome = self.world.step(np.asarray(action)[None])
         self.frame += 1
         reward = float(REWARDS[self.config.reward](outcome)[0])

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space
+from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.config import EnvironmentConfig
@@ -48,7 +49,7 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         self.world.begin(self.num_envs, self.np_random, self.split)
         return person_observation(self.world), {"distance_m": self.world.distance_m}
 
-    def step(self, actions: np.ndarray):
+    def step(self, actions: Float[np.ndarray, "person action"]):
         """Let 0.1 s pass everywhere; where an episode had ended, another begins instead."""
         again = np.flatnonzero(self.ended)
         outcome = self.world.step(np.where(self.ended[:, None], 0.0, actions))

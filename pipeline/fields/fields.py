@@ -10,11 +10,9 @@ Points and distances are in metres.
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Literal, assert_never
+from typing import Any, Literal, assert_never
 
 import torch
 from jaxtyping import Float, Int
@@ -24,6 +22,7 @@ from torch.nn import functional
 
 from pipeline.fields import fused_depth as fused
 from pipeline.fields import skinning
+from pipeline.fields.encodings import DenseGrid, PositionalMLP
 from pipeline.fields.fused_depth import FusedGeometry
 from pipeline.geometry import rigid_torch
 
@@ -35,8 +34,8 @@ limbs"""
 START_SOFTNESS_M, START_RANGE_M = 0.1, (0.004, 0.2)
 """beta and its range where rendering alone has to find surfaces: samples lie about a decimetre apart at
 first"""
-GRID_STD, CODE_STD = 0.01, 0.1
-"""standard deviations of untrained grids and codes"""
+CODE_STD = 0.1
+"""standard deviation of untrained codes"""
 LATTICE_M = 0.05
 """resolution at which a learned scene is extracted, below its finest cell"""
 CORRECTION_M = 0.1
@@ -79,74 +78,6 @@ class Values:
     feature: Float[Tensor, "point 16"]
 
 
-class DenseGrid(nn.Module):
-    """Trilinear interpolation in dense grids of several resolutions; their channels are concatenated."""
-
-    low: Float[Tensor, "3"]
-    extents: Float[Tensor, "level 3"]
-
-    def __init__(
-        self,
-        low_m: Sequence[float],
-        high_m: Sequence[float],
-        voxel_m: Sequence[float],
-        channels: int,
-        initial: float = GRID_STD,
-    ):
-        super().__init__()
-        low, high = torch.tensor(low_m, dtype=torch.float32), torch.tensor(high_m, dtype=torch.float32)
-        self.register_buffer("low", low, persistent=False)
-        self.levels, extents = nn.ParameterList(), []
-        for voxel in voxel_m:
-            nodes = ((high - low) / voxel).ceil().int() + 1
-            extents.append((nodes - 1) * voxel)
-            self.levels.append(nn.Parameter(torch.randn(1, channels, *nodes.flip(0).tolist()) * initial))
-        self.register_buffer("extents", torch.stack(extents), persistent=False)
-        self.channels = channels * len(voxel_m)
-
-    def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
-        """Interpolate at points; outside the box the border's values hold."""
-        found = []
-        for extent, level in zip(self.extents, self.levels, strict=True):
-            place = ((points - self.low) / extent * 2 - 1).view(1, 1, 1, -1, 3)
-            found.append(
-                functional.grid_sample(level, place, padding_mode="border", align_corners=True).view(
-                    level.shape[1], -1
-                )
-            )
-        return torch.cat(found).t()
-
-
-class PositionalMLP(nn.Module):
-    """An MLP on the positional encoding of points, from the box's size to twice ``finest_m`` (paper 001, Sec.
-    3.1).
-    """
-
-    middle: Float[Tensor, "3"]
-    frequency: Float[Tensor, "octave"]
-
-    def __init__(
-        self, low_m: Sequence[float], high_m: Sequence[float], finest_m: float, width: int, layers: int = 3
-    ):
-        super().__init__()
-        low, high = torch.tensor(low_m, dtype=torch.float32), torch.tensor(high_m, dtype=torch.float32)
-        self.register_buffer("middle", (low + high) / 2, persistent=False)
-        longest = float((high - low).max())
-        octaves = max(1, math.ceil(math.log2(longest / finest_m)))
-        self.register_buffer("frequency", math.pi / longest * 2.0 ** torch.arange(octaves), persistent=False)
-        sizes = [3 + 6 * octaves] + [width] * layers
-        self.network = nn.Sequential(
-            *(part for pair in pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU()))
-        )
-        self.channels = width
-
-    def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
-        """Return the MLP's features of points, metres."""
-        place = points - self.middle
-        phase = (place[:, :, None] * self.frequency).flatten(1)
-        return self.network(torch.cat([place, phase.sin(), phase.cos()], dim=1))
-
-
 def encoding_of(shape: FieldShape) -> DenseGrid | PositionalMLP:
     """Return what a field reads places from."""
     match shape.encoding:
@@ -172,31 +103,26 @@ class Field(nn.Module):
             + (shape.code_channels if shape.videos else 0)
             + (FUSED_CHANNELS if fused else 0)
         )
-        self.geometry = (
-            None
-            if fused
-            else nn.Sequential(nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 1))
-        )
-        self.appearance = nn.Sequential(
-            nn.Linear(inputs, shape.width), nn.ReLU(), nn.Linear(shape.width, 3 + FEATURE_CHANNELS)
-        )
+        self.geometry = None
+        if not fused:
+            self.geometry, last = _head(inputs, shape.width, 1)
+            limit = shape.truncation_m
+            if shape.starts_as_box:
+                nn.init.zeros_(last.weight)
+                nn.init.zeros_(last.bias)
+            elif limit:
+                nn.init.constant_(last.bias, torch.atanh(torch.tensor(min(free_m / limit, 0.9))).item())
+            else:
+                nn.init.constant_(last.bias, free_m)
+        self.appearance, last = _head(inputs, shape.width, 3 + FEATURE_CHANNELS)
+        if fused:
+            nn.init.zeros_(last.weight.data[:3])
+            nn.init.zeros_(last.bias.data[:3])
         self.log_beta = nn.Parameter(
             torch.tensor(math.log(START_SOFTNESS_M) if shape.starts_as_box else -4.0)
         )
         if self.codes:
             nn.init.normal_(self.codes.weight, std=CODE_STD)
-        if fused:
-            nn.init.zeros_(self.appearance[-1].weight.data[:3])
-            nn.init.zeros_(self.appearance[-1].bias.data[:3])
-        elif shape.starts_as_box:
-            nn.init.zeros_(self.geometry[-1].weight)
-            nn.init.zeros_(self.geometry[-1].bias)
-        else:
-            limit = shape.truncation_m
-            nn.init.constant_(
-                self.geometry[-1].bias,
-                torch.atanh(torch.tensor(min(free_m / limit, 0.9))).item() if limit else free_m,
-            )
 
     @property
     def lattice_m(self) -> float:
@@ -219,6 +145,7 @@ class Field(nn.Module):
         read = [self.grid(points)]
         if self.codes is not None:
             code = video if code is None else code
+            assert code is not None, "the scene of several videos is asked for one of them"
             read.append(
                 torch.where(code[:, None] < 0, self.codes.weight.mean(0), self.codes(code.clamp_min(0)))
             )
@@ -232,7 +159,8 @@ class Field(nn.Module):
     def distance(self, encoded: Float[Tensor, "point channel"]) -> Float[Tensor, "point"]:
         """Return signed distances, metres, positive in free space: fused ones, or else the head's."""
         limit = self.shape.truncation_m
-        if self.fused:
+        if self.geometry is None:
+            assert limit is not None, "fused distances saturate"
             return limit * encoded[:, -FUSED_CHANNELS]
         if self.shape.starts_as_box:
             return encoded[:, -1] + self.geometry(encoded[:, :-1])[:, 0]
@@ -266,7 +194,7 @@ class Field(nn.Module):
         code: Int[Tensor, "point"] | None = None,
     ) -> Float[Tensor, "point"]:
         """Return signed distances alone, metres; arguments as `encode`'s."""
-        if self.fused:
+        if self.fused and self.shape.truncation_m:
             return self.shape.truncation_m * self.fused(points, video)[:, 0]
         return self.distance(self.encode(points, video, code))
 
@@ -274,6 +202,12 @@ class Field(nn.Module):
     def beta_m(self) -> Float[Tensor, ""]:
         """The scale of the Laplace distribution in `density`, metres."""
         return self.log_beta.exp().clamp(*(START_RANGE_M if self.shape.starts_as_box else SOFTNESS_M))
+
+
+def _head(inputs: int, width: int, outputs: int) -> tuple[nn.Sequential, nn.Linear]:
+    """Return two layers, and the last of them."""
+    first, last = nn.Linear(inputs, width), nn.Linear(width, outputs)
+    return nn.Sequential(first, nn.ReLU(), last), last
 
 
 def density(signed_distance: Float[Tensor, "*point"], beta_m: Float[Tensor, ""]) -> Float[Tensor, "*point"]:
@@ -304,26 +238,30 @@ class ArticulatedBody(nn.Module):
         """Standard deviations of the Gaussian bones along their axes."""
         return self.log_scale.exp()
 
-    def _delta(self, points_rest: Float[Tensor, "*batch point 3"]) -> Float[Tensor, "*batch point bone"]:
+    def _delta(self, points_rest: Float[Tensor, "*#batch point 3"]) -> Float[Tensor, "*#batch point bone"]:
         return self.delta(points_rest.reshape(-1, 3)).view(*points_rest.shape[:-1], -1)
 
-    def weights(self, points_rest: Float[Tensor, "*batch point 3"]) -> Float[Tensor, "*batch point bone"]:
+    def weights(self, points_rest: Float[Tensor, "*#batch point 3"]) -> Float[Tensor, "*#batch point bone"]:
         """Return the skinning weights of points of the rest shape."""
         return skinning.skinning_weights(
             points_rest, self.agent_from_bone_rest, self.bone_scale_m, delta=self._delta(points_rest)
         )
 
     def pose(
-        self, points_rest: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]
-    ) -> Float[Tensor, "*batch point 3"]:
+        self,
+        points_rest: Float[Tensor, "*#batch point 3"],
+        agent_from_bone: Float[Tensor, "*#batch bone 4 4"],
+    ) -> Float[Tensor, "*#batch point 3"]:
         """Move points of the rest shape to where the posed bones take them (forward warp)."""
         return skinning.move(
             skinning.blend(self.weights(points_rest), agent_from_bone, self.agent_from_bone_rest), points_rest
         )
 
     def unpose(
-        self, points_posed: Float[Tensor, "*batch point 3"], agent_from_bone: Float[Tensor, "*batch bone 4 4"]
-    ) -> Float[Tensor, "*batch point 3"]:
+        self,
+        points_posed: Float[Tensor, "*#batch point 3"],
+        agent_from_bone: Float[Tensor, "*#batch bone 4 4"],
+    ) -> Float[Tensor, "*#batch point 3"]:
         """Move posed points back to the rest shape (backward warp).
 
         The weights come from the posed bones; the learned correction is read where they alone would land.
@@ -376,21 +314,14 @@ def save(folder: Path, reconstruction: Reconstruction) -> None:
 def load(folder: Path, device: str = "cpu") -> Reconstruction:
     """Read what `save` wrote, ready to be asked (no gradients)."""
     table = json.loads((folder / "fields.json").read_text())
-    shapes = {
-        name: FieldShape(
-            **{key: tuple(value) if isinstance(value, list) else value for key, value in table[name].items()}
-        )
-        for name in ("scene", "agent")
-    }
+    shapes = {name: _shape_of(table[name]) for name in ("scene", "agent")}
     state = load_file(folder / "scene_field.safetensors")
     ground = {key.removeprefix("fused."): value for key, value in state.items() if key.startswith("fused.")}
-    scene = Field(
-        shapes["scene"],
-        free_m=0.1,
-        fused=FusedGeometry(ground["low"], *ground["sizes"].tolist(), ground["table"], ground["blocks"])
-        if ground
-        else None,
-    )
+    geometry = None
+    if ground:
+        voxel_m, truncation_m = ground["sizes"].tolist()
+        geometry = FusedGeometry(ground["low"], voxel_m, truncation_m, ground["table"], ground["blocks"])
+    scene = Field(shapes["scene"], free_m=0.1, fused=geometry)
     agent = Field(shapes["agent"], free_m=0.1)
     body = ArticulatedBody(
         torch.eye(4).repeat(table["bones"], 1, 1), torch.ones(table["bones"], 3), shapes["agent"]
@@ -404,3 +335,10 @@ def load(folder: Path, device: str = "cpu") -> Reconstruction:
     for module in (scene, agent, body):
         module.to(device).requires_grad_(False).eval()
     return Reconstruction(scene, agent, body, tuple(table["videos"]))
+
+
+def _shape_of(table: dict[str, Any]) -> FieldShape:
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in table.items()
+    }
+    return FieldShape(**values)

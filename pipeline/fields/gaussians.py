@@ -102,6 +102,7 @@ class SurfaceSamples:
 
 def sample_surface(mesh: Mesh, number: int, rng: np.random.Generator) -> SurfaceSamples:
     """Spread points over a colored surface, the same number on equal areas."""
+    assert mesh.color is not None, "the surface has no colors"
     corner = mesh.vertices[mesh.faces].astype(np.float64)
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = 0.5 * np.linalg.norm(normal, axis=-1)
@@ -280,7 +281,7 @@ def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> 
 
 
 @torch.no_grad()
-def drawable(gaussians: Gaussians) -> Tensor:
+def drawable(gaussians: Gaussians) -> Bool[Tensor, "point"]:
     """Return which Gaussians are worth a file: finite ones of an opacity of at least 1/255."""
     finite = torch.stack(
         [

@@ -18,7 +18,10 @@ CHUNK = 1 << 18
 
 @torch.no_grad()
 def sample_distance(
-    distance: Callable[[Tensor], Tensor], low_m: Tensor, high_m: Tensor, step_m: float
+    distance: Callable[[Float[Tensor, "point 3"]], Float[Tensor, "point"]],
+    low_m: Float[Tensor, "3"],
+    high_m: Float[Tensor, "3"],
+    step_m: float,
 ) -> Float[np.ndarray, "x y z"]:
     """Evaluate a signed distance on a regular lattice that starts at ``low_m``."""
     nodes = ((high_m - low_m) / step_m).ceil().int().tolist()
@@ -65,6 +68,7 @@ def extract_scene(field: Field, code: int, step_m: float) -> Mesh:
 @torch.no_grad()
 def extract_moved(field: Field, code: int) -> Mesh:
     """Return the surfaces that one video saw and that are not where all videos together have one, colored."""
+    assert field.fused is not None, "only fused scenes differ from video to video"
     pieces, count = [Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))], 0
     for low, distance in zip(*field.fused.own_blocks(code), strict=True):
         piece = zero_level(distance.cpu().numpy(), low.cpu().numpy(), field.fused.voxel_m)
@@ -81,6 +85,7 @@ def on_surface(field: Field, points: Float[np.ndarray, "point 3"], code: int) ->
     """Return which points lie on a surface of one video's scene (-1: the shared one), within half of the
     truncation.
     """
+    assert field.fused is not None, "only fused scenes have a truncation of their own"
     at = torch.from_numpy(np.asarray(points, np.float32)).to(field.log_beta.device)
     distance_m = field.distance_at(at, torch.full((len(at),), code, device=at.device))
     return (distance_m.abs() < field.fused.truncation_m / 2).cpu().numpy()
@@ -99,7 +104,7 @@ def extract_agent(field: Field, step_m: float) -> Mesh:
     return paint(field, keep_vertices(mesh, np.isin(np.arange(len(mesh.vertices)), max(pieces, key=len))), -1)
 
 
-def keep_vertices(mesh: Mesh, keep: np.ndarray) -> Mesh:
+def keep_vertices(mesh: Mesh, keep: Bool[np.ndarray, "vertex"]) -> Mesh:
     """Return the mesh without the other vertices and the faces that need them."""
     index = np.cumsum(keep) - 1
     faces = index[mesh.faces[keep[mesh.faces].all(-1)]].astype(np.int32)

@@ -1,6 +1,9 @@
 """The Gaussian rasteriser for CUDA: gsplat, an optional dependency."""
 
+import importlib
+
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.core.errors import InputError
@@ -12,7 +15,7 @@ class Gsplat:
     def __init__(self):
         """Raises `InputError` DEP-001 when gsplat is not installed or there is no CUDA device."""
         try:
-            import gsplat
+            gsplat = importlib.import_module("gsplat")
         except ImportError as error:
             raise InputError(
                 "DEP-001",
@@ -30,10 +33,18 @@ class Gsplat:
         self._rasterization = gsplat.rasterization
 
     def draw(
-        self, means_world: Tensor, rotation: Tensor, log_scale: Tensor, opacity: Tensor, values: Tensor,
-        camera_from_world: Tensor, intrinsics: Tensor, height: int, width: int,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Draw one view; see `pipeline.fields.rasterize.draw`."""
+        self,
+        means_world: Float[Tensor, "point 3"],
+        rotation: Float[Tensor, "point 4"],
+        log_scale: Float[Tensor, "point 3"],
+        opacity: Float[Tensor, "point"],
+        values: Float[Tensor, "point channel"],
+        camera_from_world: Float[Tensor, "4 4"],
+        intrinsics: Float[Tensor, "3 3"],
+        height: int,
+        width: int,
+    ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
+        """Draw one view, metres; see `pipeline.fields.rasterize.draw`."""
         image, coverage, _ = self._rasterization(
             means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
             camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=0.3,

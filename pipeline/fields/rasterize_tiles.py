@@ -140,9 +140,11 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(context, pixel, conic, opacity, values, radius, depth, height, width):
-        arrays = [tensor.detach().contiguous().numpy() for tensor in (pixel, conic, opacity, values)]
+        pixel, conic, opacity, values = (
+            tensor.detach().contiguous().numpy() for tensor in (pixel, conic, opacity, values)
+        )
         reach, near = radius.detach().numpy(), depth.detach().numpy()
-        x, y = arrays[0].T
+        x, y = pixel.T
         seen = (
             (near > NEAREST_M)
             & (x + reach > 0)
@@ -152,14 +154,16 @@ class _Blend(torch.autograd.Function):
         )
         order = np.flatnonzero(seen)
         order = order[np.argsort(near[order], kind="stable")]
-        start, ids = _bin(arrays[0], reach, order, height, width)
-        image, through, last = _forward(*arrays, start, ids, height, width)
-        context.state = (*arrays, start, ids, through, last)
+        start, ids = _bin(pixel, reach, order, height, width)
+        image, through, last = _forward(pixel, conic, opacity, values, start, ids, height, width)
+        context.state = (pixel, conic, opacity, values, start, ids, through, last)
         return torch.from_numpy(image), torch.from_numpy(1 - through)
 
     @staticmethod
     def backward(context, grad_image, grad_coverage):
-        grads = _backward(*context.state, grad_image.contiguous().numpy(), grad_coverage.contiguous().numpy())
+        pixel, conic, opacity, values, start, ids, through, last = context.state
+        upstream = grad_image.contiguous().numpy(), grad_coverage.contiguous().numpy()
+        grads = _backward(pixel, conic, opacity, values, start, ids, through, last, upstream[0], upstream[1])
         total = torch.from_numpy(grads.sum(0))
         return total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:], None, None, None, None
 

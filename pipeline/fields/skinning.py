@@ -15,10 +15,10 @@ from pipeline.geometry import rigid_torch
 
 
 def squared_mahalanobis(
-    points_agent: Float[Tensor, "*batch point 3"],
-    agent_from_bone: Float[Tensor, "*batch bone 4 4"],
+    points_agent: Float[Tensor, "*#batch point 3"],
+    agent_from_bone: Float[Tensor, "*#batch bone 4 4"],
     bone_scale_m: Float[Tensor, "bone 3"],
-) -> Float[Tensor, "*batch point bone"]:
+) -> Float[Tensor, "*#batch point bone"]:
     """Measure each point from each Gaussian bone in units of the bone's scale, squared.
 
     Each distance is the quadric p' Q p of the homogeneous point p: one matrix product for all points and
@@ -33,12 +33,12 @@ def squared_mahalanobis(
 
 
 def skinning_weights(
-    points_agent: Float[Tensor, "*batch point 3"],
-    agent_from_bone_rest: Float[Tensor, "*batch bone 4 4"],
+    points_agent: Float[Tensor, "*#batch point 3"],
+    agent_from_bone_rest: Float[Tensor, "*#batch bone 4 4"],
     bone_scale_m: Float[Tensor, "bone 3"],
     temperature: float = 1.0,
-    delta: Float[Tensor, "*batch point bone"] | None = None,
-) -> Float[Tensor, "*batch point bone"]:
+    delta: Float[Tensor, "*#batch point bone"] | None = None,
+) -> Float[Tensor, "*#batch point bone"]:
     """Return the probability of each bone for each point (paper 001, Sec. 3.1).
 
     Args:
@@ -53,8 +53,8 @@ def skinning_weights(
 
 
 def multiply(
-    first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]
-) -> Float[Tensor, "*batch 4"]:
+    first: Float[Tensor, "*#batch 4"], second: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*#batch 4"]:
     """Multiply quaternions wxyz (Hamilton product); leading axes broadcast."""
     w, vector, scalar, other = first[..., :1], first[..., 1:], second[..., :1], second[..., 1:]
     vector, other = torch.broadcast_tensors(vector, other)
@@ -63,10 +63,10 @@ def multiply(
 
 
 def blend(
-    weights: Float[Tensor, "*batch point bone"],
-    agent_from_bone: Float[Tensor, "*batch bone 4 4"],
+    weights: Float[Tensor, "*#batch point bone"],
+    agent_from_bone: Float[Tensor, "*#batch bone 4 4"],
     agent_from_bone_rest: Float[Tensor, "bone 4 4"],
-) -> Float[Tensor, "*batch point 4 4"]:
+) -> Float[Tensor, "*#batch point 4 4"]:
     """Blend bone motions into one rigid motion a point, by dual quaternions (Kavan et al. 2007, Sec. 3).
 
     Leading axes broadcast: `weights [point bone]` with `agent_from_bone [frame bone 4 4]` gives
@@ -93,8 +93,8 @@ def blend(
 
 
 def move(
-    target_from_source: Float[Tensor, "*batch point 4 4"], points_source: Float[Tensor, "*batch point 3"]
-) -> Float[Tensor, "*batch point 3"]:
+    target_from_source: Float[Tensor, "*#batch point 4 4"], points_source: Float[Tensor, "*#batch point 3"]
+) -> Float[Tensor, "*#batch point 3"]:
     """Apply one transform a point."""
     turned = (target_from_source[..., :3, :3] * points_source[..., None, :]).sum(-1)
     return turned + target_from_source[..., :3, 3]

@@ -7,7 +7,7 @@ pixels or points work on NumPy arrays and on torch tensors alike.
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -109,8 +109,10 @@ def turn_camera(
     return world_from_camera @ before_from_after
 
 
-def turn_image(image: np.ndarray, quarter_turns: int) -> np.ndarray:
-    """Turn an image ``[height width ...]`` clockwise by quarter turns."""
+def turn_image(
+    image: Shaped[np.ndarray, "height width *channel"], quarter_turns: int
+) -> Shaped[np.ndarray, "turned_height turned_width *channel"]:
+    """Turn an image clockwise by quarter turns."""
     return np.ascontiguousarray(np.rot90(image, -quarter_turns, axes=(0, 1)))
 
 

@@ -4,9 +4,9 @@ draws depth."""
 from dataclasses import dataclass
 
 import numpy as np
-from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
-from jaxtyping import Float, Int, UInt8
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float, Int, Num, UInt8
 
 from pipeline.geometry import cameras
 
@@ -57,7 +57,7 @@ class Hits:
     barycentric: Float[np.ndarray, "ray 3"]
 
     def interpolate(
-        self, mesh: Mesh, attribute: Float[np.ndarray, "vertex channel"]
+        self, mesh: Mesh, attribute: Num[np.ndarray, "vertex channel"]
     ) -> Float[np.ndarray, "ray channel"]:
         """Blend a vertex attribute at the hit points; rays that missed get the values of face 0 and must be
         masked."""
@@ -71,13 +71,19 @@ class RayCaster:
 
     def __init__(self, mesh: Mesh):
         self.mesh = mesh
-        self._scene = rtcore_scene.EmbreeScene()
+        self._scene = EmbreeScene()
         self._geometry = TriangleMesh(
             self._scene, np.ascontiguousarray(mesh.vertices[mesh.faces], np.float32)
         )
 
-    def cast(self, origins: Float[np.ndarray, "ray 3"], directions: Float[np.ndarray, "ray 3"]) -> Hits:
-        """Return the first hit of each ray."""
+    def cast(
+        self,
+        origins: Float[np.ndarray, "ray 3"] | Float[np.ndarray, "3"],
+        directions: Float[np.ndarray, "ray 3"],
+    ) -> Hits:
+        """Return the first hit of each ray, from origins of its own or one of all, in the mesh's frame,
+        metres.
+        """
         origins = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), np.float32)
         found = self._scene.run(origins, np.ascontiguousarray(directions, np.float32), output=True)
         hit = found["primID"] >= 0

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 
 def make(
-    rotation: Float[np.ndarray, "*batch 3 3"], translation: Float[np.ndarray, "*batch 3"]
-) -> Float[np.ndarray, "*batch 4 4"]:
+    rotation: Float[np.ndarray, "*#batch 3 3"], translation: Float[np.ndarray, "*#batch 3"]
+) -> Float[np.ndarray, "*#batch 4 4"]:
     """Assemble transforms from rotations and translations (broadcast over the batch)."""
     rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
@@ -30,8 +30,8 @@ def inverse(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*ba
 
 
 def apply(
-    a_from_b: Float[np.ndarray, "*batch 4 4"], points_b: Float[np.ndarray, "*batch point 3"]
-) -> Float[np.ndarray, "*batch point 3"]:
+    a_from_b: Float[np.ndarray, "*#batch 4 4"], points_b: Float[np.ndarray, "*#batch point 3"]
+) -> Float[np.ndarray, "*#batch point 3"]:
     """Move points from frame b to frame a."""
     return points_b @ np.swapaxes(a_from_b[..., :3, :3], -1, -2) + a_from_b[..., None, :3, 3]
 
@@ -60,7 +60,7 @@ def log(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 
 
 def accumulate(
     steps: Float[np.ndarray, "step 4 4"], start: Float[np.ndarray, "4 4"] | None = None
-) -> Float[np.ndarray, "step+1 4 4"]:
+) -> Float[np.ndarray, "pose 4 4"]:
     """Chain relative motions ``first_from_second`` to poses in the start's frame (default: the first
     one's)."""
     poses = [np.eye(4) if start is None else start]
@@ -85,8 +85,8 @@ def wrap(angle_rad: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
 
 
 def rotation_angle(
-    first: Float[np.ndarray, "*batch 3 3"], second: Float[np.ndarray, "*batch 3 3"]
-) -> Float[np.ndarray, "*batch"]:
+    first: Float[np.ndarray, "*#batch 3 3"], second: Float[np.ndarray, "*#batch 3 3"]
+) -> Float[np.ndarray, "*#batch"]:
     """Return the geodesic angle between rotations, exact at zero and at pi (atan2 form)."""
     relative = np.swapaxes(first, -1, -2) @ second
     axis = np.stack(

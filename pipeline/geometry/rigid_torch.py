@@ -16,8 +16,8 @@ def so3_exp(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def make(
-    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 4 4"]:
+    rotation: Float[Tensor, "*#batch 3 3"], translation: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*#batch 4 4"]:
     """Assemble transforms from rotations and translations."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=rotation.dtype, device=rotation.device).expand(
@@ -38,8 +38,8 @@ def inverse(a_from_b: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"
 
 
 def apply(
-    a_from_b: Float[Tensor, "*batch 4 4"], points_b: Float[Tensor, "*batch point 3"]
-) -> Float[Tensor, "*batch point 3"]:
+    a_from_b: Float[Tensor, "*#batch 4 4"], points_b: Float[Tensor, "*#batch point 3"]
+) -> Float[Tensor, "*#batch point 3"]:
     """Move points from frame b to frame a."""
     return points_b @ a_from_b[..., :3, :3].transpose(-1, -2) + a_from_b[..., None, :3, 3]
 
@@ -69,8 +69,8 @@ def rotation_to_6d(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 
 
 def rotation_angle(
-    first: Float[Tensor, "*batch 3 3"], second: Float[Tensor, "*batch 3 3"]
-) -> Float[Tensor, "*batch"]:
+    first: Float[Tensor, "*#batch 3 3"], second: Float[Tensor, "*#batch 3 3"]
+) -> Float[Tensor, "*#batch"]:
     """Return the geodesic angle between rotations in radians (atan2 form, exact at zero)."""
     relative = first.transpose(-1, -2) @ second
     axis = torch.stack(

@@ -140,9 +140,8 @@ def _to_points(
     chosen[flat] = np.flatnonzero(inside)
     if not len(flat):
         return np.full(shape, np.inf)
-    nearest = ndimage.distance_transform_edt(
-        (chosen < 0).reshape(shape), return_distances=False, return_indices=True
-    )
+    far = (chosen < 0).reshape(shape)
+    nearest = np.asarray(ndimage.distance_transform_edt(far, return_distances=False, return_indices=True))
     return np.linalg.norm(centres - surface.points[chosen.reshape(shape)[tuple(nearest)]], axis=-1)
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 
 def viterbi_decode(
-    cost: Sequence[Float[np.ndarray, "state"]], change: Callable[[int], Float[np.ndarray, "before state"]]
+    cost: Sequence[Float[np.ndarray, "_"]], change: Callable[[int], Float[np.ndarray, "_ _"]]
 ) -> Int[np.ndarray, "step"]:
     """Return the state of each step whose costs, those of changes included, are least in sum; of equal ones
     the first.

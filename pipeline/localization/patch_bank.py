@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 BLOCK = 4096
 """Patches of the bank compared at once: their similarities stay in the processor's cache."""
@@ -45,11 +45,11 @@ class PatchBank:
         sector = np.floor((np.arctan2(eye[:, 0], eye[:, 2]) / (2 * np.pi) + 0.5) * count).astype(int) % count
         return [np.flatnonzero(sector[self.view] == index) for index in range(count)]
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Shaped[np.ndarray, "..."]]:
         """Return the arrays to store."""
         return vars(self) | {"descriptors": self.descriptors.astype(np.float16)}
 
     @staticmethod
-    def from_arrays(arrays: dict[str, np.ndarray]) -> "PatchBank":
+    def from_arrays(arrays: dict[str, Shaped[np.ndarray, "..."]]) -> "PatchBank":
         """Rebuild a bank from stored arrays."""
         return PatchBank(**arrays | {"descriptors": arrays["descriptors"].astype(np.float32)})

@@ -63,7 +63,9 @@ class PoseRegressor(nn.Module):
         self.register_buffer("middle", torch.zeros(3))
         self.register_buffer("extent", torch.ones(()))
 
-    def forward(self, grid: Float[Tensor, "batch axis row column"]) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, grid: Float[Tensor, "batch axis row column"]
+    ) -> tuple[Float[Tensor, "batch 3 3"], Float[Tensor, "batch 3"], Float[Tensor, "batch"]]:
         """Return rotations ``map_from_camera``, positions of the anchor in the map (metres), and log
         errors."""
         out = self.head(self.trunk(grid * grid.shape[1] ** 0.5))

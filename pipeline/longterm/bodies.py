@@ -63,7 +63,7 @@ def load_body(reconstruction: Path) -> SkinnedBody:
 class PosedSurface(nn.Module):
     """Some vertices of a body under linear blending, one matrix product for all frames."""
 
-    blend: Float[Tensor, "vertex bone*4"]
+    blend: Float[Tensor, "vertex bone_column"]
 
     def __init__(self, body: SkinnedBody, vertices: Int[np.ndarray, "vertex"] | None = None):
         super().__init__()

@@ -135,7 +135,7 @@ class EncodedPlaces:
 
 def encode_places(
     world_from_agent: Float[np.ndarray, "body 4 4"],
-    scene: Sequence[int],
+    scene: Int[np.ndarray, "body"],
     scenes: Sequence[MotionScene],
     points: int,
     rng: np.random.Generator,
@@ -143,7 +143,7 @@ def encode_places(
     """Describe where single bodies are to be: their heading frame, clearance, orientation and scene
     points.
     """
-    world_from_place, scene = world_from_ego(world_from_agent, "yaw"), np.asarray(scene)
+    world_from_place = world_from_ego(world_from_agent, "yaw")
     centre = np.asarray(world_from_agent)[:, :3, 3]
     clearance = torch.zeros(len(scene), 1)
     for index, each in enumerate(scenes):

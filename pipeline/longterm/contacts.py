@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.geometry.signed_distance import SignedDistance
@@ -92,7 +92,7 @@ def _feet(
     points: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"]
 ) -> Int[np.ndarray, "vertex"]:
     """Group close vertices of the same bone, and those that nearly touch; largest group first."""
-    pairs = cKDTree(points).query_pairs(FOOT_M, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(FOOT_M, output_type="ndarray")
     bone, apart = weights.argmax(1), np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     pairs = pairs[(bone[pairs[:, 0]] == bone[pairs[:, 1]]) | (apart < FOOT_M / 3)]
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
@@ -186,11 +186,10 @@ def _make_room_to_swing(
     return range(before.start, before.stop - early), range(after.start + lacking - early, after.stop)
 
 
-def motion_tensors(motion: BodyMotion) -> tuple[Tensor, Tensor]:
-    """Return root and bones of a motion as torch tensors."""
-    return torch.from_numpy(np.asarray(motion.world_from_agent)).float(), torch.from_numpy(
-        np.asarray(motion.agent_from_bone)
-    ).float()
+def motion_tensors(motion: BodyMotion) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
+    """Return root and bones of a motion, metres, as torch tensors."""
+    root, bones = np.asarray(motion.world_from_agent), np.asarray(motion.agent_from_bone)
+    return torch.from_numpy(root).float(), torch.from_numpy(bones).float()
 
 
 def _speed(points: Float[np.ndarray, "frame foot 3"], rate_hz: float) -> Float[np.ndarray, "frame foot"]:

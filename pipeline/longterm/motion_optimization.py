@@ -171,7 +171,8 @@ def _minimize(
         optimizer.zero_grad(set_to_none=True)
         objective(points, distance, weight).backward()
         for parameter in correction.parameters():
-            parameter.grad *= free[:, None]
+            if parameter.grad is not None:
+                parameter.grad *= free[:, None]
         optimizer.step()
     with torch.no_grad():
         root, bones = correction()
@@ -251,7 +252,7 @@ def lift_out_of_solid(
     return torch.from_numpy(needed)
 
 
-def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Tensor, Tensor]:
+def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Int[Tensor, "stand"], Int[Tensor, "stand"]]:
     """Return which (frame, foot) stand, flat, and the number of the phase that each belongs to."""
     began = stance & ~np.concatenate([np.zeros_like(stance[:1]), stance[:-1]])
     number = np.cumsum(began.T.reshape(-1)).reshape(stance.T.shape).T  # counts along one foot after the other
@@ -260,7 +261,9 @@ def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Tensor, Tensor]
 
 
 def foot_error(
-    feet: Float[Tensor, "frame foot 3"], phases: tuple[Tensor, Tensor], give_m: float
+    feet: Float[Tensor, "frame foot 3"],
+    phases: tuple[Int[Tensor, "stand"], Int[Tensor, "stand"]],
+    give_m: float,
 ) -> Float[Tensor, "stand"]:
     """Return the distance of each standing foot from its mean place in that phase (E_foot), even at nothing.
 
@@ -273,22 +276,20 @@ def foot_error(
     return (((points - mean[phase]) ** 2).sum(-1) + give_m**2).sqrt() - give_m
 
 
-def collision_error(
-    distance_m: Float[Tensor, "frame vertex"], margin_m: float
-) -> Float[Tensor, "frame vertex"]:
+def collision_error(distance_m: Float[Tensor, "*vertex"], margin_m: float) -> Float[Tensor, "*vertex"]:
     """Return how deep each vertex is inside the scene or its margin, given its distance from the scene
     (E_col, Eq. 5).
     """
     return (margin_m - distance_m).clamp_min(0)
 
 
-def contact_error(distance_m: Float[Tensor, "frame vertex"], scale_m: float) -> Float[Tensor, "frame vertex"]:
+def contact_error(distance_m: Float[Tensor, "*vertex"], scale_m: float) -> Float[Tensor, "*vertex"]:
     """Return the Geman-McClure function of the distance to the scene (E_cont, Eq. 6)."""
     square = distance_m**2
     return square / (square + scale_m**2)
 
 
-def smooth_error(points: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "frame vertex"]:
+def smooth_error(points: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "change vertex"]:
     """Return the squared change of the difference between neighbouring meshes, square metres (E_smooth, Eq.
     7).
 

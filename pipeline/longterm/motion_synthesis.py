@@ -96,12 +96,10 @@ class LongTerm:
         document = json.loads((folder / "longterm.json").read_text())
         state, sizes = load_file(folder / "longterm.safetensors"), LongTermSizes(**document["sizes"])
         poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
-        nets = (
-            StaticBody(sizes),
-            RouteNet(sizes, sees_scene=document["sees_scene"]),
-            PoseNet(sizes, sees_scene=document["sees_scene"]),
-        )
-        for name, module in zip(("poses", *NETWORKS), (poses, *nets), strict=True):
+        static = StaticBody(sizes)
+        route = RouteNet(sizes, sees_scene=document["sees_scene"])
+        pose = PoseNet(sizes, sees_scene=document["sees_scene"])
+        for name, module in zip(("poses", *NETWORKS), (poses, static, route, pose), strict=True):
             module.load_state_dict(
                 {
                     key.removeprefix(f"{name}."): value
@@ -112,9 +110,8 @@ class LongTerm:
         contacts = ContactVertices(
             np.array(document["contact_vertices"]), np.array(document["foot_of_contact_vertex"])
         )
-        return cls(
-            sizes, poses, contacts, MotionPrior(**document["motion_prior"]), *(net.eval() for net in nets)
-        )
+        motion_prior = MotionPrior(**document["motion_prior"])
+        return cls(sizes, poses, contacts, motion_prior, static.eval(), route.eval(), pose.eval())
 
     def contact_body(self, body: SkinnedBody) -> ContactBody:
         """Return what the optimisation needs of a body."""
@@ -138,11 +135,8 @@ class LongTerm:
             world_from_agent, np.zeros(len(world_from_agent), int), [scene], self.sizes.points, rng
         )
         shape = torch.from_numpy(body.shape).float().expand(len(world_from_agent), -1)
-        judge, best, least = (
-            PlausibilityMeter(body, self.contacts, scene.distance),
-            None,
-            np.full(len(world_from_agent), np.inf),
-        )
+        judge = PlausibilityMeter(body, self.contacts, scene.distance)
+        best, least = None, np.full(len(world_from_agent), np.inf)
         with torch.no_grad():
             given = self.static.given(places.place, shape, places.points)
         for _ in range(candidates):
@@ -155,6 +149,7 @@ class LongTerm:
             better = (cost < least)[:, None, None]
             best = made if best is None else _where(better, made, best)
             least = np.minimum(least, cost)
+        assert best is not None, candidates
         return settle_bodies(best, self.contact_body(body), scene.distance, MotionOptimizationConfig())
 
     def short_motions(
@@ -218,8 +213,10 @@ class LongTerm:
         scene: MotionScene,
         rng: np.random.Generator,
     ) -> BodyMotion:
-        middle = _stacked(
-            [part[STEPS // 2] for part in self.short_motions(bodies[:-1], bodies[1:], scene, rng)]
+        parts = self.short_motions(bodies[:-1], bodies[1:], scene, rng)
+        middle = BodyMotion(
+            np.stack([part.world_from_agent[STEPS // 2] for part in parts]),
+            np.stack([part.agent_from_bone[STEPS // 2] for part in parts]),
         )
         made = self.short_motions(middle[passing - 1], middle[passing], scene, rng)
         bones = bodies.agent_from_bone.copy()
@@ -264,13 +261,6 @@ def measure_motion_prior(
     clearance_m, pace_m, above_m = found
     turn_rad = max(float(np.percentile(np.concatenate(turn), 99)), np.pi / RATE_HZ)
     return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)
-
-
-def _stacked(frames: list[BodyMotion]) -> BodyMotion:
-    return BodyMotion(
-        np.stack([each.world_from_agent for each in frames]),
-        np.stack([each.agent_from_bone for each in frames]),
-    )
 
 
 def _where(first: np.ndarray, one: BodyMotion, other: BodyMotion) -> BodyMotion:

@@ -47,7 +47,7 @@ class PointNet(nn.Module):
         )
 
     def forward(self, points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch code"]:
-        if not self.sees_scene:
+        if self.layers is None:
             return points.new_zeros(len(points), self.code)
         return self.layers(points).amax(1)
 
@@ -98,7 +98,7 @@ class StaticBody(nn.Module):
 
     def encode(
         self, body: Float[Tensor, "batch channel"], given: Float[Tensor, "batch width"]
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Float[Tensor, "batch latent"], Float[Tensor, "batch latent"]]:
         """Return mean and log variance of z."""
         features = self.encoder(self.encoder_in(body))
         return self.encoder_out(torch.cat([features, given], dim=-1)).chunk(2, dim=-1)
@@ -220,7 +220,7 @@ class RouteNet(nn.Module):
     ):
         super().__init__()
         self.predicts_rotation, self.blind, self.sees_scene = predicts_rotation, blind, sees_scene
-        self.between = (
+        self.between: InbetweenNet | CoarseToFine = (
             InbetweenNet(ROOT_CHANNELS, 0, sizes, sees_scene)
             if blind
             else CoarseToFine(ROOT_CHANNELS, 2 * sizes.pose, sizes, sees_scene)
@@ -231,7 +231,7 @@ class RouteNet(nn.Module):
     ) -> list[Float[Tensor, "batch frame 9"]]:
         """Return the routes that are made one after the other, the last of which counts."""
         first, last = start[:, :ROOT_CHANNELS], end[:, :ROOT_CHANNELS]
-        if self.blind:
+        if isinstance(self.between, InbetweenNet):
             routes = [orthonormalized(self.between(first, last, seen.points))]
         else:
             poses = torch.cat([start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:]], -1)[:, None].expand(
@@ -326,7 +326,7 @@ class PoseNet(nn.Module):
         """Return t, r and p of all frames: the route's, with the poses and, as a variant, the turns."""
         if self.predicts_rotation:
             start, end = torch.cat([route[:, 0, 3:], start], -1), torch.cat([route[:, -1, 3:], end], -1)
-        if self.strides is None:
+        if self.strides is None or self.short is None:
             made = self.between(start, end, points, with_velocity(route) if self.follows_route else None)
         else:
             carried = self.strides(start, end, route)

@@ -5,7 +5,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.surroundings import MotionScene
 
 Split = Literal["train", "held_out", "unseen"]
+SPLITS: tuple[Split, ...] = get_args(Split)
 """to learn from; another session in a known home; a home never seen"""
 
 
@@ -74,4 +75,4 @@ def load(folder: Path) -> tuple[MotionDataset, list[Split]]:
         tuple(stored["scene"].tolist()),
         scenes,
     )
-    return dataset, [str(each) for each in stored["split"]]
+    return dataset, [SPLITS[SPLITS.index(each)] for each in stored["split"].tolist()]

@@ -5,6 +5,7 @@ SMPL-X parameters into motion of that body. Corrective blend shapes and faces ar
 moves the surface.
 """
 
+import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,8 +39,7 @@ def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> 
     Raises InputError LTM-003 where the package is missing, LTM-004 where the file is, or is none of SMPL-X.
     """
     try:
-        from smplx import SMPLXLayer
-        from smplx.lbs import blend_shapes, vertices2joints
+        smplx, lbs = importlib.import_module("smplx"), importlib.import_module("smplx.lbs")
     except ImportError as error:
         remedy = "install it beside the others: .venv/bin/pip install --no-deps smplx"
         raise InputError("LTM-003", "SMPL-X bodies need the package smplx", str(model), remedy) from error
@@ -52,7 +52,7 @@ def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> 
         )
     npz.load(model, ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs"))
     try:
-        layer = SMPLXLayer(str(model), ext="npz", num_betas=SHAPES, use_pca=False)
+        layer = smplx.SMPLXLayer(str(model), ext="npz", num_betas=SHAPES, use_pca=False)
     except (KeyError, AttributeError, ValueError, RuntimeError, AssertionError, IndexError) as error:
         raise InputError(
             "LTM-004", f"not a model of SMPL-X: {error!r}", str(model), "give SMPLX_NEUTRAL.npz as it came"
@@ -60,8 +60,8 @@ def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> 
     shape = np.zeros(SHAPES) if betas is None else np.asarray(betas, float)[:SHAPES]
     with torch.no_grad():
         known = layer.shapedirs[:, :, : len(shape)]
-        surface = layer.v_template[None] + blend_shapes(torch.from_numpy(shape).to(known)[None], known)
-        joints = vertices2joints(layer.J_regressor, surface)[0].double().numpy()
+        surface = layer.v_template[None] + lbs.blend_shapes(torch.from_numpy(shape).to(known)[None], known)
+        joints = lbs.vertices2joints(layer.J_regressor, surface)[0].double().numpy()
     vertices = surface[0].numpy() - joints[0].astype(np.float32)
     rest = rigid.make(np.eye(3)[None], joints - joints[0])
     mesh = Mesh(vertices, np.asarray(layer.faces, np.int32))
@@ -74,7 +74,7 @@ def motion_from_parameters(
     person: Person,
     transl: Float[np.ndarray, "frame 3"],
     global_orient: Float[np.ndarray, "frame 3"],
-    pose: Float[np.ndarray, "frame 3*joint"],
+    pose: Float[np.ndarray, "frame joint_axis"],
 ) -> BodyMotion:
     """Return motion of SMPL-X parameters: rotation vectors of the pelvis and of the joints after it, as many
     as there are.

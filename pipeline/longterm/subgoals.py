@@ -7,10 +7,11 @@ furniture and returns a place every two seconds. Sub-goals come from the user, t
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from skimage.graph import route_through_array
 
 from pipeline.core.errors import InputError
@@ -92,12 +93,12 @@ class WalkableFloor:
         above = grid.at(torch.from_numpy(points).float()).numpy()
         beneath = grid.at(torch.from_numpy(points[:, 0] * [1, 0, 1] + [0, floor, 0]).float()).numpy()
         free = (above.min(1) > np.minimum(breadth_m / 2, 0.6 * root_m)) & (np.abs(beneath) < 0.1)
-        area, _ = label(free, np.ones((3, 3)))
+        _, area = cv2.connectedComponents(free.astype(np.uint8))
         free &= area == np.bincount(area[free], minlength=1).argmax()
         heights = np.asarray(scene.mesh.vertices)[:, 1]
         return cls(
             free,
-            CELL_M * distance_transform_edt(free),
+            CELL_M * np.asarray(distance_transform_edt(free)),
             low[[0, 2]],
             floor,
             heights.min() - BEYOND_M,
@@ -150,7 +151,8 @@ class WalkableFloor:
     def _nearest(self, wanted: Bool[np.ndarray, "x z"], position: Float[np.ndarray, "3"]) -> tuple[int, int]:
         cells = self._cells(wanted)
         off = self.corner + CELL_M * cells - np.asarray(position)[[0, 2]]
-        return tuple(int(v) for v in cells[np.argmin((off**2).sum(1))])
+        x, z = cells[np.argmin((off**2).sum(1))]
+        return int(x), int(z)
 
     def contains(self, position: Float[np.ndarray, "3"]) -> bool:
         """Return whether a position is within the scene's edges; one without height, if x and z are."""

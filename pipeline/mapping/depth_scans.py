@@ -137,7 +137,7 @@ class SurfaceMap:
         )
         distance, nearest = self._tree.query(world, distance_upper_bound=QUERY_REACH * reach_m)
         matched = np.flatnonzero(np.isfinite(distance))
-        nearest, first, world = nearest[matched], first[matched], world[matched]
+        nearest, first, world = np.asarray(nearest)[matched], first[matched], world[matched]
         normal = self.normals_world[nearest]
         facing = np.einsum("ci,ci->c", normal, world_from_camera[first, :3, 3] - world) > 0
         matched, nearest, first, normal = matched[facing], nearest[facing], first[facing], normal[facing]

@@ -230,5 +230,5 @@ def _solve(normal, gradient, free):
     part = sparse.csc_array(normal)[index][:, index]
     damping = DAMPING * (part.diagonal() + part.diagonal().mean()) + np.finfo(float).tiny
     step = np.zeros(len(gradient))
-    step[index] = spsolve((part + sparse.diags_array(damping)).tocsc(), -gradient[index])
+    step[index] = np.asarray(spsolve((part + sparse.diags_array(damping)).tocsc(), -gradient[index]))
     return step.reshape(-1, 6)

@@ -144,11 +144,12 @@ def _flow_targets(first, second, guess, row, column):
     there = cameras.project(moved, second.intrinsics)[0].astype(np.float32)
     warped = cv2.remap(second.gray, there[..., 0] - 0.5, there[..., 1] - 0.5, cv2.INTER_LINEAR)
     contrast = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
+    start = np.zeros((*first.gray.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
-        contrast.apply(first.gray), contrast.apply(warped), None
+        contrast.apply(first.gray), contrast.apply(warped), start
     )
-    end = (np.stack([column, row], axis=1) + flow[row, column]).astype(np.float32)
-    return np.floor(cv2.remap(there, end[None], None, cv2.INTER_LINEAR, borderValue=(-1, -1))[0]).astype(int)
+    x, y = (np.stack([column, row], axis=1) + flow[row, column]).astype(np.float32).T[:, None]
+    return np.floor(cv2.remap(there, x, y, cv2.INTER_LINEAR, borderValue=(-1, -1))[0]).astype(int)
 
 
 def _motion_from_sift(first, second, rng):

@@ -43,8 +43,8 @@ class Metrics:
 
     def add_as(self, variant: str, other: "Metrics", stage: str) -> None:
         """Take over the metrics of one variant: ``<stage>/<figure>`` becomes ``<variant>/<figure>``."""
-        for there, here in ((other.values, self.values), (other.reasons, self.reasons)):
-            here.update({name.replace(stage, variant, 1): value for name, value in there.items()})
+        self.values.update({name.replace(stage, variant, 1): value for name, value in other.values.items()})
+        self.reasons.update({name.replace(stage, variant, 1): why for name, why in other.reasons.items()})
 
     def add(self, other: "Metrics") -> None:
         """Take over another room's metrics; what is measured there needs no reason any more."""

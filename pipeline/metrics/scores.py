@@ -24,7 +24,7 @@ def goal_distances(samples: Samples, future: Future) -> Float[np.ndarray, "windo
 
 def path_distances(samples: Samples, future: Future) -> Float[np.ndarray, "window sample"]:
     """Return the mean distance along every sampled path, metres."""
-    return np.linalg.norm(samples.path - future.path_world[:, None], axis=-1).mean(-1)
+    return np.linalg.norm(_predicted(samples.path) - future.path_world[:, None], axis=-1).mean(-1)
 
 
 def goal_minde(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
@@ -49,15 +49,22 @@ def path_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]
 
 def orientation_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
     """Return the mean geodesic angle of the root along the best sample, radians."""
-    true = np.broadcast_to(future.world_from_agent[:, None, :, :3, :3], samples.rotation.shape)
-    return rigid.rotation_angle(samples.rotation, true).mean(-1).min(1)
+    rotation = _predicted(samples.rotation)
+    true = np.broadcast_to(future.world_from_agent[:, None, :, :3, :3], rotation.shape)
+    return rigid.rotation_angle(rotation, true).mean(-1).min(1)
 
 
 def joints_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
     """Return the mean geodesic angle of the bones along the best sample, radians."""
-    true = np.broadcast_to(future.agent_from_bone[:, None], samples.agent_from_bone.shape)
-    angle = rigid.rotation_angle(samples.agent_from_bone[..., :3, :3], true[..., :3, :3])
+    bones = _predicted(samples.agent_from_bone)
+    true = np.broadcast_to(future.agent_from_bone[:, None], bones.shape)
+    angle = rigid.rotation_angle(bones[..., :3, :3], true[..., :3, :3])
     return angle.mean((-1, -2)).min(1)
+
+
+def _predicted(part: np.ndarray | None) -> np.ndarray:
+    assert part is not None, "the method does not predict this"
+    return part
 
 
 SCORES: dict[str, Callable[[Samples, Future], Float[np.ndarray, "window"]]] = {

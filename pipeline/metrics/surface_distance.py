@@ -60,7 +60,7 @@ def split(corners: Float[np.ndarray, "face 3 3"], longest_m: float) -> Float[np.
     """Halve the edges of triangles until none is longer than ``longest_m``."""
     assert longest_m > 0, longest_m
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    vertices, faces = subdivide_to_size(corners.reshape(-1, 3), faces, longest_m, max_iter=HALVINGS)
+    vertices, faces, *_ = subdivide_to_size(corners.reshape(-1, 3), faces, longest_m, max_iter=HALVINGS)
     return vertices[faces]
 
 

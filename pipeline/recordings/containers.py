@@ -53,6 +53,7 @@ class Container(Protocol):
 
     def read(self, name: str, max_bytes: int) -> bytes:
         """Read one member. Raises InputError when it is damaged or longer than ``max_bytes``."""
+        ...
 
 
 class FolderContainer:

@@ -101,8 +101,8 @@ def check_poses(
 
     ``depth_view(i)`` gives frame i's depth on demand.
     """
-    broken = _fault_of(pose)
-    if broken:
+    broken = "the recording has no device poses" if pose is None else _fault_of(pose)
+    if pose is None or broken:
         return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
     chosen = _moving_pairs(odometry_from_pose(pose, documented), timestamp_s, pairs)
     if len(chosen) == 0:
@@ -136,17 +136,15 @@ class _Score:
         return self.residual_m / max(self.overlap, 1e-3)
 
 
-def _fault_of(pose: Float[np.ndarray, "frame 7"] | None) -> str | None:
-    """Name what makes poses meaningless without looking at depth."""
-    if pose is None:
-        return "the recording has no device poses"
+def _fault_of(pose: Float[np.ndarray, "frame 7"]) -> str:
+    """Name what makes poses meaningless without looking at depth; nothing where they may mean something."""
     if not np.isfinite(pose).all():
         return "device poses are not finite"
     if np.any(np.abs(np.linalg.norm(pose[:, :4], axis=1) - 1) > 0.05):
         return "device poses hold quaternions that are not of unit length"
     if len(pose) > 1 and np.ptp(pose, axis=0).max() < 1e-6:
         return "all device poses are the same"
-    return None
+    return ""
 
 
 def _moving_pairs(

@@ -6,7 +6,7 @@ First understand the whole, then read picture by picture.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -76,9 +76,9 @@ class ExtractedFrame:
     color: UInt8[np.ndarray, "height width 3"]
     jpeg: bytes
     """the phone's own bytes where the picture is kept as it is"""
-    depth: Float[np.ndarray, "height width"]
+    depth: Float[np.ndarray, "depth_height depth_width"]
     """metres, 0 = unknown"""
-    confidence: UInt8[np.ndarray, "height width"]
+    confidence: UInt8[np.ndarray, "depth_height depth_width"]
     """0 low, 1 medium, 2 high"""
     sharpness: float
     """standard deviation of the Laplacian of the picture at a common width"""
@@ -101,7 +101,7 @@ def understand(
             recording.where,
             f"{recording.kind}; an animal moves, so its distance cannot be triangulated from pictures",
         )
-    _refuse_other_pictures(recording)
+    _refuse_other_pictures(recording.intrinsics, recording.color_size, recording.where)
     if recording.depth_camera is None:
         _refuse_other_shape(recording.color_size, recording.depth_size, recording.where)
     _refuse_other_unit(recording, max_depth_m)
@@ -113,37 +113,20 @@ def understand(
     used, pose, lost = _tracked(recording)
 
     def view(frame: int) -> conventions.DepthPicture:
-        return conventions.DepthPicture(
-            stored_depth(recording, int(recording.index[used[frame]]), max_depth_m),
-            depth_intrinsics[used[frame]],
-        )
+        number = int(recording.index[frame])
+        return conventions.DepthPicture(stored_depth(recording, number, max_depth_m), depth_intrinsics[frame])
 
-    check = conventions.check_poses(pose, recording.timestamp_s[used], view, documented=recording.convention)
-    if lost and check.verdict == "unusable":
-        used, check = (
-            np.arange(len(recording.index)),
-            dataclasses.replace(check, reason=f"{check.reason}; {lost}"),
-        )
-    chosen = used[choose_frames(recording.timestamp_s[used], rate_hz)]
-    odometry_from_camera, turns = None, recording.quarter_turns
-    looked_at = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
-
-    def room() -> list[tuple[np.ndarray, np.ndarray]]:
-        views = [view(int(frame)) for frame in np.searchsorted(used, chosen[looked_at])]
-        return [(each.depth, each.intrinsics) for each in views]
-
-    if check.verdict == "unusable":
-        turns = turns or quarter_turns_from_surfaces(room())
-    else:
-        odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)[
-            np.searchsorted(used, chosen)
-        ]
-        if recording.up is not None:
-            odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
-            turns = quarter_turns_from_gravity(odometry_from_camera)
-        elif not turns:
-            turns = quarter_turns_from_room(odometry_from_camera, room())
-        odometry_from_camera = cameras.turn_camera(odometry_from_camera, turns)
+    check = conventions.check_poses(
+        pose, recording.timestamp_s[used], lambda i: view(used[i]), documented=recording.convention
+    )
+    if pose is None or check.verdict == "unusable":
+        used = np.arange(len(recording.index))
+        pose, check = None, dataclasses.replace(check, reason="; ".join(filter(None, (check.reason, lost))))
+    kept = choose_frames(recording.timestamp_s[used], rate_hz)
+    chosen = used[kept]
+    odometry_from_camera, turns = _upright(
+        recording, None if pose is None else pose[kept], check, chosen, view
+    )
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
     return ExtractionPlan(
@@ -159,18 +142,47 @@ def understand(
     )
 
 
-def _refuse_other_pictures(recording: Recording) -> None:
+def _upright(
+    recording: Recording,
+    pose: Float[np.ndarray, "frame 7"] | None,
+    check: PoseCheck,
+    chosen: Int[np.ndarray, "frame"],
+    view: Callable[[int], conventions.DepthPicture],
+) -> tuple[Float[np.ndarray, "frame 4 4"] | None, int]:
+    """Return the upright cameras of the chosen frames, if their poses are of use, and the quarter turns,
+    clockwise, from stored to upright.
+    """
+
+    def room() -> list[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]]:
+        shown = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
+        return [(each.depth, each.intrinsics) for each in map(view, chosen[shown])]
+
+    turns = recording.quarter_turns
+    if pose is None:
+        return None, turns or quarter_turns_from_surfaces(room())
+    odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)
+    if recording.up is not None:
+        odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
+        turns = quarter_turns_from_gravity(odometry_from_camera)
+    elif not turns:
+        turns = quarter_turns_from_room(odometry_from_camera, room())
+    return cameras.turn_camera(odometry_from_camera, turns), turns
+
+
+def _refuse_other_pictures(
+    intrinsics: Float[np.ndarray, "frame 3 3"], color_size: tuple[int, int], where: str
+) -> None:
     """Raise CAP-004 for intrinsics whose centre lies outside of the picture.
 
     Those of another resolution, or of one turned.
     """
-    (height, width), center = recording.color_size, np.median(recording.intrinsics[:, :2, 2], axis=0)
+    (height, width), center = color_size, np.median(intrinsics[:, :2, 2], axis=0)
     if not ((center > 0) & (center < (width, height))).all():
         why = (
             f"the intrinsics' centre, {center[0]:.0f} {center[1]:.0f}, lies "
             f"outside of pictures of {width} x {height}"
         )
-        raise broken_metadata(recording.where, why)
+        raise broken_metadata(where, why)
 
 
 def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int], where: str) -> None:
@@ -254,13 +266,11 @@ def frames(
             color, depth, confidence = (
                 cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence)
             )
-        untouched = (
-            isinstance(stored, bytes)
-            and stored[:2] == JPEG
-            and not plan.quarter_turns
-            and plan.stored_size == recording.color_size
-        )
-        jpeg = stored if untouched else images.encode_jpeg(color, jpeg_quality)
+        as_stored = not plan.quarter_turns and plan.stored_size == recording.color_size
+        if as_stored and isinstance(stored, bytes) and stored[:2] == JPEG:
+            jpeg = stored
+        else:
+            jpeg = images.encode_jpeg(color, jpeg_quality)
         sharpness, brightness = picture_statistics(color)
         yield ExtractedFrame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import av
+import av.container
+import av.error
 import numpy as np
 from jaxtyping import UInt8
 
@@ -36,7 +38,7 @@ class Movie:
         with self._opened() as container:
             stream = container.streams.video[0]
             times = sorted(set(_packet_times(container, stream)))
-            if not times:
+            if not times or stream.time_base is None:
                 raise no_frames(self.where, "the video is empty")
             self._pts = np.array(times)
             self.timestamp_s = (self._pts - self._pts[0]) * float(stream.time_base)

@@ -31,6 +31,8 @@ from pipeline.recordings.recording import (  # fmt: skip
 COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
 LEAST_REACH_M = 4.0
 """depth beyond what 16 bits reach comes back as near: what reaches less is refused, metres"""
+LARGEST_UNIT = 65535
+"""of 16 bits"""
 ASSUMED_HZ = 10.0
 """of streams whose frames carry no times"""
 
@@ -42,27 +44,7 @@ def open_recording(path: Path) -> Recording:
     """
     container: Container = FolderContainer(path) if path.is_dir() else ZipContainer(path)
     table = _table(container)
-    if not path.is_dir() or "depth_integer_scale" in table:
-        what = (
-            "NeRFCapture's saved zip holds no metric depth"
-            if "depth_integer_scale" in table
-            else "a zip of transforms has no metric depth"
-        )
-        remedy = "stream from the app with its nerfcapture_dataset.py and give the folder that it writes"
-        raise InputError("CAP-010", what, container.where, remedy)
-    scale = table.get("integer_depth_scale")
-    if not isinstance(scale, int | float) or not 0 < scale < 1:
-        raise broken_metadata(container.where, "'integer_depth_scale' (metres per unit of depth) is missing")
-    if 65535 * scale < LEAST_REACH_M:
-        what = (
-            f"depth beyond {65535 * scale:.3g} m was written as if it were "
-            "near: the stream's depth_scale is too small"
-        )
-        remedy = (
-            "stream again with a depth_scale of 10; where nerfcapture_dataset.py "
-            "fails with that option, change its default"
-        )
-        raise InputError("CAP-010", what, container.where, remedy)
+    scale = _meters_per_unit(table, container)
     frames = [
         frame
         for frame in _frames(table, container)
@@ -101,6 +83,32 @@ def open_recording(path: Path) -> Recording:
         up=Y_UP,
         remarks=remarks,
     )
+
+
+def _meters_per_unit(table: dict[str, Any], container: Container) -> float:
+    """Return the unit of the depth pictures, metres. Raises CAP-004 and CAP-010 where there is none."""
+    if isinstance(container, ZipContainer) or "depth_integer_scale" in table:
+        what = (
+            "NeRFCapture's saved zip holds no metric depth"
+            if "depth_integer_scale" in table
+            else "a zip of transforms has no metric depth"
+        )
+        remedy = "stream from the app with its nerfcapture_dataset.py and give the folder that it writes"
+        raise InputError("CAP-010", what, container.where, remedy)
+    scale = table.get("integer_depth_scale")
+    if not isinstance(scale, int | float) or not 0 < scale < 1:
+        raise broken_metadata(container.where, "'integer_depth_scale' (metres per unit of depth) is missing")
+    if LARGEST_UNIT * scale < LEAST_REACH_M:
+        what = (
+            f"depth beyond {LARGEST_UNIT * scale:.3g} m was written as if it were "
+            "near: the stream's depth_scale is too small"
+        )
+        remedy = (
+            "stream again with a depth_scale of 10; where nerfcapture_dataset.py "
+            "fails with that option, change its default"
+        )
+        raise InputError("CAP-010", what, container.where, remedy)
+    return scale
 
 
 def _table(container: Container) -> dict[str, Any]:

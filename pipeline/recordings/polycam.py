@@ -140,7 +140,7 @@ def _mesh(container: FolderContainer) -> Mesh:
         )
     except Exception as error:  # whatever the reader meets in a file that was cut
         raise damaged(f"{container.where}/raw.glb", repr(error)) from error
-    if not len(loaded.faces):
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise damaged(f"{container.where}/raw.glb", "it holds no surface")
     vertices = rigid.apply(world_from_aligned, np.asarray(loaded.vertices, float)).astype(np.float32)
     return Mesh(vertices, np.asarray(loaded.faces, np.int32), np.full((len(vertices), 3), 128, np.uint8))

@@ -159,7 +159,7 @@ class _Metadata:
         columns).
         """
         coefficients = self._rows("perFrameIntrinsicCoeffs", (4,), index)
-        missing = ~(np.isfinite(coefficients).all(1) & (coefficients[:, :2] > 0).all(1))
+        missing = ~(np.all(np.isfinite(coefficients), axis=1) & np.all(coefficients[:, :2] > 0, axis=1))
         if missing.any():
             first = self._numbers("K", (9,)).reshape(3, 3).T
             coefficients[missing] = first[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -181,7 +181,7 @@ class _Metadata:
         if not self._table.get("poses"):
             return None
         pose = self._rows("poses", (7,), index)
-        self._remark(~np.isfinite(pose).all(1), "have no device pose")
+        self._remark(~np.all(np.isfinite(pose), axis=1), "have no device pose")
         return pose
 
     def up(self) -> tuple[float, float, float] | None:
@@ -261,15 +261,16 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
     size = metadata.depth_size()
     if size is not None:
         return size
-    if layout is _FOLDER:
-        return images.read_depth(container.path(layout.depth % first), channel="R").shape
+    if layout is _FOLDER and isinstance(container, FolderContainer):
+        height, width = images.read_depth(container.path(layout.depth % first), channel="R").shape
+        return height, width
     floats = len(_decompress(container, layout.depth % first, 4 * max(DEPTH_SIZES))) // 4
     if floats not in DEPTH_SIZES:
         raise wrong_depth(
             f"{container.where}:{layout.depth % first}", f"{floats} values fit no known depth camera"
         )
-    portrait = DEPTH_SIZES[floats]
-    return portrait if metadata.color_size[0] >= metadata.color_size[1] else portrait[::-1]
+    height, width = DEPTH_SIZES[floats]  # upright
+    return (height, width) if metadata.color_size[0] >= metadata.color_size[1] else (width, height)
 
 
 def _refuse_face_id(depth_size: tuple[int, int], camera_type: int | None, where: str) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8, UInt16
+from jaxtyping import Float, Int, UInt, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.data import images
@@ -144,9 +144,7 @@ def intrinsics_from_coefficients(
     return intrinsics
 
 
-def decode_gray(
-    data: bytes, where: str, dtype: type = np.uint16
-) -> UInt16[np.ndarray, "height width"] | UInt8[np.ndarray, "height width"]:
+def decode_gray(data: bytes, where: str, dtype: type = np.uint16) -> UInt[np.ndarray, "height width"]:
     """Decode a single-channel PNG of 16 bits (depth) or 8 bits (confidence).
 
     Raises CAP-008 for anything else.

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.data import images
 from pipeline.geometry import cameras
@@ -39,15 +39,15 @@ DEFAULT = (525.0, 525.0, 319.5, 239.5)
 def open_recording(path: Path) -> Recording:
     """Open a TUM folder. Raises InputError CAP-003..011."""
     container = FolderContainer(path)
-    color, depth = (_listed(container, name) for name in ("rgb.txt", "depth.txt"))
-    if not depth:
+    color, depth_files = _listed(container, "rgb.txt"), _listed(container, "depth.txt")
+    if not depth_files:
         raise no_depth(container.where, "depth.txt lists nothing")
     if not color:
         raise no_frames(container.where, "rgb.txt lists nothing")
     times = np.array([time for time, _ in color])
-    partner = nearest(times, np.array([time for time, _ in depth]), NEAREST_S)
+    partner = nearest(times, np.array([time for time, _ in depth_files]), NEAREST_S)
     kept = np.flatnonzero(partner >= 0)
-    pairs = [(color[i][1], depth[partner[i]][1]) for i in kept]
+    pairs = [(color[i][1], depth_files[partner[i]][1]) for i in kept]
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
     kept, pairs = kept[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     if not pairs:
@@ -94,7 +94,7 @@ def open_recording(path: Path) -> Recording:
 
 def nearest(
     times: Float[np.ndarray, "frame"], others: Float[np.ndarray, "other"], within_s: float
-) -> np.ndarray:
+) -> Int[np.ndarray, "frame"]:
     """Return for each time the index of the nearest of `others` (increasing), -1 where none is near
     enough.
     """
@@ -169,11 +169,15 @@ def _units_per_meter(
         if not 0 < per_meter < np.inf:
             raise broken_metadata(where, "the units per metre must be positive")
         return per_meter, ()
-    known = np.flatnonzero(np.isfinite(pose).all(1)) if pose is not None else np.arange(0)
+    assumed = PER_METER, (f"no {name}: {PER_METER:g} units per metre are assumed",)
+    known = np.arange(0) if pose is None else np.flatnonzero(np.isfinite(pose).all(1))
+    if pose is None or not len(known):
+        return assumed
+    tracked = pose[known]
 
     def off(per_meter: float) -> float:
         check = check_poses(
-            pose[known],
+            tracked,
             timestamp_s[known],
             lambda i: view(known[i], per_meter),
             documented=OPENCV,
@@ -181,8 +185,8 @@ def _units_per_meter(
         )
         return check.residual_m / check.tolerance_m
 
-    if len(known) and off(MILLIMETERS) < min(1.0, CLEARLY * off(PER_METER)):
+    if off(MILLIMETERS) < min(1.0, CLEARLY * off(PER_METER)):
         return MILLIMETERS, (
             f"no {name}: {MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not",
         )
-    return PER_METER, (f"no {name}: {PER_METER:g} units per metre are assumed",)
+    return assumed

@@ -64,6 +64,7 @@ class AblatedNetworks(nn.Module):
         with torch.no_grad():
             if self.base is not None:
                 return self.base(start, end, seen)
+            assert self.route is not None and self.pose is not None, "one network or two"
             route = self.route(start, end, seen)
             return self.pose(start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:], route, seen.points)
 

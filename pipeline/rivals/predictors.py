@@ -43,6 +43,7 @@ class Predictor(Protocol):
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` futures for each window of the context."""
+        ...
 
 
 @dataclass(frozen=True)

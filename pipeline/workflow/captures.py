@@ -150,7 +150,7 @@ def assign(
     `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another
     file. Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be).
     """
-    roles = {name: role_of(name, remark, where) for name, remark in said.items()}
+    roles: dict[str, Role] = {name: role_of(name, remark, where) for name, remark in said.items()}
     for role, what in missing_roles(list(roles.values()), flow):
         raise InputError("CAP-040", f"there is no {role} among the recordings", where, f"add {what}")
     order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
@@ -175,13 +175,13 @@ def role_of(name: str, remark: Remarks, where: str) -> Role:
 
     Raises CAP-041 for an unknown one.
     """
+    for role in ROLES:
+        if role == remark.role or (remark.role is None and name.lower().startswith(role)):
+            return role
     if remark.role is None:
-        return next((role for role in ROLES if name.lower().startswith(role)), "session")
-    if remark.role not in ROLES:
-        raise InputError(
-            "CAP-041", f"{name!r} cannot have the role {remark.role!r}", where, f"roles: {', '.join(ROLES)}"
-        )
-    return remark.role
+        return "session"
+    what, remedy = f"{name!r} cannot have the role {remark.role!r}", f"roles: {', '.join(ROLES)}"
+    raise InputError("CAP-041", what, where, remedy)
 
 
 def missing_roles(roles: Sequence[Role], flow: Flow = "recordings") -> list[tuple[Role, str]]:
@@ -210,7 +210,7 @@ def builtin_lives(
     homes: int, sessions_per_home: int, test_homes: int, test_sessions: int
 ) -> dict[str, Remarks]:
     """Return the recordings that `synthesize_capture.lives` writes; those of the last homes are the test."""
-    splits: list[Split] = ["train"] * (homes * sessions_per_home) + ["test"] * (test_homes * test_sessions)
+    splits = ["train"] * (homes * sessions_per_home) + ["test"] * (test_homes * test_sessions)
     return {f"session-{number:02d}.npz": Remarks(split=split) for number, split in enumerate(splits, start=1)}
 
 
@@ -219,18 +219,18 @@ def _is_table(path: Path) -> bool:
 
 
 def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) -> dict[str, Split]:
+    wanted: dict[str, Split | None] = {}
     for name, remark in said.items():
-        allowed = SPLITS if name in sessions else ("none", None)
-        if remark.split not in (*allowed, None):
-            raise InputError(
-                "CAP-041",
-                f"{name!r} cannot be in the split {remark.split!r}",
-                where,
-                "sessions: train or test",
-            )
-    if any(said[name].split == "test" for name in sessions) or len(sessions) < 2:
-        return {name: said[name].split or "train" for name in sessions}
-    return {name: said[name].split or ("test" if name == sessions[-1] else "train") for name in sessions}
+        wanted[name] = next((split for split in SPLITS if split == remark.split), None)
+        allowed = SPLITS if name in sessions else ("none",)
+        if remark.split is not None and wanted[name] not in allowed:
+            what = f"{name!r} cannot be in the split {remark.split!r}"
+            raise InputError("CAP-041", what, where, "sessions: train or test")
+    tested = any(wanted[name] == "test" for name in sessions) or len(sessions) < 2
+    return {
+        name: wanted[name] or ("test" if name == sessions[-1] and not tested else "train")
+        for name in sessions
+    }
 
 
 def _ids(order: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:

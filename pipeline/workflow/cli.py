@@ -242,10 +242,12 @@ def _settings(defaults: Any, table: str = "") -> Iterator[str]:
     """
     documented: dict[str, str] = {}
     for cls in (cls for cls in reversed(type(defaults).__mro__) if dataclasses.is_dataclass(cls)):
-        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
-        for line, beneath in itertools.pairwise(body):
+        definition = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+        assert isinstance(definition, ast.ClassDef), cls
+        for line, beneath in itertools.pairwise(definition.body):
             if (
                 isinstance(line, ast.AnnAssign)
+                and isinstance(line.target, ast.Name)
                 and isinstance(beneath, ast.Expr)
                 and isinstance(beneath.value, ast.Constant)
             ):

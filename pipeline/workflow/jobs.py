@@ -173,54 +173,26 @@ def lock_file(home: str, job_id: str) -> Path:
 
 
 def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
-    home, video, trial = (
-        plan.home_of(node.artifact),
-        part if isinstance(part, Video) else None,
-        part if isinstance(part, Trial) else None,
-    )
+    home = plan.home_of(node.artifact)
+    video = part if isinstance(part, Video) else None
+    trial = part if isinstance(part, Trial) else None
     out = home.folder / node.artifact / (part.id if part else "")
-    folder, deciding = Path("captures", plan.home.agent), [video.id] if video else []
-    inputs: list[Input] = []
-    arguments: list[str] = []
-    for need in dag.needs_of(node, plan.flow):
-        if need.artifact in dag.BUILTIN.values() and not plan.builtin:
-            if video:
-                scale_from = formats.scale_sources(folder, video, plan.videos)
-                arguments += [
-                    f"--{need.option}",
-                    f"{folder}/{video.file}",
-                    *(["--captures", str(folder)] if scale_from else []),
-                ]
-                deciding += [other.id for other in scale_from]
-            continue
-        found = list(_inputs(plan, need, node, part))
-        inputs += found
-        source = dag.NODES[need.artifact]
-        several = (source.roles and not node.roles) or (source.trials == "each" and not trial)
-        path = (
-            plan.home_of(need.artifact).folder / need.artifact
-            if several
-            else Path(found[0].path, found[0].part or "")
-        )
-        arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
-        arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
+    inputs, arguments, deciding = _needed(plan, node, part)
     named = f"{node.artifact}.{trial.id}" if trial else node.artifact
     arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
     arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
+    keys_folder = home.base.plan / "keys"
     keys = [
         str(home.plan / f"keys/{named}.json"),
-        *(str(home.base.plan / f"keys/video.{id}.json") for id in deciding),
+        *(str(keys_folder / f"video.{id}.json") for id in deciding),
     ]
     for file in captures.extra_inputs(plan.home.agent, node.extra_inputs):
-        keys, arguments = (
-            [*keys, str(home.base.plan / f"keys/extra.{file.name}")],
-            [*arguments, f"--{file.stem}", str(file)],
-        )
-    for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items() if video else ():
-        keys, arguments = (
-            [*keys, str(home.base.plan / f"keys/{name}.{video.id}.json")],
-            [*arguments, f"--{name}", str(file)],
-        )
+        keys.append(str(keys_folder / f"extra.{file.name}"))
+        arguments += [f"--{file.stem}", str(file)]
+    if video:
+        for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items():
+            keys.append(str(keys_folder / f"{name}.{video.id}.json"))
+            arguments += [f"--{name}", str(file)]
     return Job(
         id=f"{node.artifact}.{part.id}" if part else node.artifact,
         artifact=node.artifact,
@@ -241,6 +213,35 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     )
 
 
+def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[Input], list[str], list[str]]:
+    """Return the artifacts that a job reads, the part of its command line that names them and the recording,
+    and the ids of the recordings that decide its result.
+    """
+    folder, video = Path("captures", plan.home.agent), part if isinstance(part, Video) else None
+    inputs: list[Input] = []
+    arguments: list[str] = []
+    deciding = [video.id] if video else []
+    for need in dag.needs_of(node, plan.flow):
+        if need.artifact in dag.BUILTIN.values() and not plan.builtin:
+            if video:
+                scale_from = formats.scale_sources(folder, video, plan.videos)
+                arguments += [f"--{need.option}", f"{folder}/{video.file}"]
+                arguments += ["--captures", str(folder)] if scale_from else []
+                deciding += [other.id for other in scale_from]
+            continue
+        found = list(_inputs(plan, need, node, part))
+        inputs += found
+        source = dag.NODES[need.artifact]
+        several = (source.roles and not node.roles) or (
+            source.trials == "each" and not isinstance(part, Trial)
+        )
+        whole = plan.home_of(need.artifact).folder / need.artifact
+        path = whole if several else Path(found[0].path, found[0].part or "")
+        arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
+        arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
+    return inputs, arguments, deciding
+
+
 def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> Iterator[Input]:
     """Yield the artifacts that one need of one job means."""
     source = dag.NODES[need.artifact]
@@ -257,10 +258,7 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
             Input(f"{other}/{need.artifact}", str(other.folder / need.artifact), inner) for other in others
         )
         return
-    for other in [part] if node.roles else plan.videos:
-        if node.roles or (
-            other.role in (need.roles or source.roles)
-            and other.role in source.roles
-            and other.split in need.splits
-        ):
-            yield Input(f"{need.artifact}/{other.id}", str(folder / other.id), need.part)
+    roles = set(source.roles).intersection(need.roles or source.roles)
+    several = [video for video in plan.videos if video.role in roles and video.split in need.splits]
+    for video in [part] if isinstance(part, Video) else several:
+        yield Input(f"{need.artifact}/{video.id}", str(folder / video.id), need.part)

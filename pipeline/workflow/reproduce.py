@@ -73,8 +73,9 @@ def begin(crate: Crate, agents: Path, captures: Path) -> str:
     recording.
     """
     name = "again_" + artifact.digest_of([each.content for each in crate.artifacts])[:8]
-    found = {file: _found(digest, captures) for file, digest in crate.recordings.items() if digest}
-    missing = [file for file, path in found.items() if path is None]
+    wanted = {file: _found(digest, captures) for file, digest in crate.recordings.items() if digest}
+    found = {file: path for file, path in wanted.items() if path}
+    missing = [file for file in wanted if file not in found]
     if missing:
         remedy = "put the recordings with these hashes into captures/<any agent>/"
         raise InputError("CRT-002", "recordings of the crate are not here", ", ".join(missing), remedy)

@@ -160,4 +160,4 @@ def _drop_docstrings(node: ast.AST) -> None:
     body = getattr(node, "body", None)
     if isinstance(body, list):
         kept = [n for n in body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
-        node.body = kept or [ast.Pass()]
+        body[:] = kept or [ast.Pass()]

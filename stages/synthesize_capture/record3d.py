@@ -8,7 +8,6 @@ import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import cv2
 import lzfse
@@ -61,7 +60,7 @@ class Writer:
         self._zip = zipfile.ZipFile(path, "w", zipfile.ZIP_STORED)
         self._count = 0
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Writer":
         return self
 
     def __exit__(self, *error) -> None:

@@ -91,8 +91,8 @@ class TrainingBatch:
     """One augmented batch: inputs of perception, and clean targets in scaled units."""
 
     scene: Float[Tensor, "batch channel x y z"]
-    observer_past: Float[Tensor, "batch frame*3"]
-    past: Float[Tensor, "batch frame*channel"]
+    observer_past: Float[Tensor, "batch observer_past"]
+    past: Float[Tensor, "batch past"]
     held: Float[Tensor, "batch frame channel"]
     """root and bones of the frames that give velocity and posture, as they were"""
     bones_keep: Float[Tensor, "batch"]

@@ -63,7 +63,7 @@ def moments(
 
 def approach(
     side: Float[np.ndarray, "3"], distance_m: float, speed_m_s: float
-) -> Float[np.ndarray, "frame*3"]:
+) -> Float[np.ndarray, "observer_past"]:
     """Return an observer's past in the ego frame: walking up from ``side``, now ``distance_m`` away."""
     before_s = np.arange(PAST - 1, -1, -1)[:, None] / RATE_HZ
     return ((distance_m + speed_m_s * before_s) * side + [0.0, 1.0, 0.0]).ravel().astype(np.float32)
@@ -82,7 +82,7 @@ def measure(
     sampling = PlanSamplingConfig(avoid_solid=False)
 
     def mean_goals(
-        observer: Float[np.ndarray, "frame*3"], sampling: PlanSamplingConfig
+        observer: Float[np.ndarray, "observer_past"], sampling: PlanSamplingConfig
     ) -> Float[np.ndarray, "window 3"]:
         seen = replace(observation, observer_past=np.tile(observer, (len(observation), 1)))
         goals = sampler.goals(sampler.codes(seen, sampling, SAMPLES), sampling, np.random.default_rng(seed))

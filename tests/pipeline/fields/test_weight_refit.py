@@ -33,7 +33,7 @@ def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
         np.testing.assert_allclose(fitted.weights.sum(1), 1, atol=1e-6)
     heaviest = np.argsort(-weights, axis=1)[:, :4]
     plain = np.take_along_axis(weights, heaviest, 1)
-    plain /= plain.sum(1, keepdims=True)
+    plain = (plain / plain.sum(1, keepdims=True)).astype(np.float32)
     blends = (eight, four, weight_refit.Influences(heaviest.astype(np.uint8), plain))
     best, good, before = ((weight_refit.residual_m(points, blend, poses) ** 2).mean() for blend in blends)
     assert best <= good * (1 + 1e-6) and good <= before * (1 + 1e-6)
