@@ -98,78 +98,89 @@ class ClickSession:
         return (self.recordings[name].clip.folder / "color" / f"{frame:06d}.jpg").read_bytes()
 
 
-def server(desk: ClickSession, port: int) -> ThreadingHTTPServer:
+class ClickServer(ThreadingHTTPServer):
+    """Serves one session of clicking; bound, but not yet running."""
+
+    def __init__(self, desk: ClickSession, port: int) -> None:
+        """Bind to a port of this machine; 0 takes any free one."""
+        super().__init__((loopback.HOST, port), Handler)
+        self.desk = desk
+        self.keeping = threading.Lock()  # requests have a thread each, and write one file
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One request; only the page itself, asked for by its own address, is served."""
+
+    server: "ClickServer"
+
+    def do_GET(self) -> None:
+        """Serve the page, its state or a picture."""
+        if not self._from_here():
+            return self._send(403, b"", "text/plain")
+        match = PICTURE.match(self.path)
+        if self.path == "/":
+            page = resources.files("stages.annotate").joinpath("page.html").read_bytes()
+            return self._send(200, page, "text/html; charset=utf-8")
+        if self.path == "/state":
+            try:
+                return self._json(self.server.desk.state())
+            except InputError as error:  # the file of clicks broke since the server began
+                return self._send(500, str(error).encode(), "text/plain")
+        try:
+            found = self.server.desk.picture(int(match[1]), int(match[2])) if match else b""
+        except LookupError:
+            found = b""
+        return self._send(200, found, "image/jpeg") if found else self._send(404, b"", "text/plain")
+
+    def do_POST(self) -> None:
+        """Keep the clicks and answer with their fits."""
+        stated = self.headers.get("Content-Length") or ""
+        length = int(stated) if stated.isascii() and stated.isdigit() and len(stated) < MAX_DIGITS else 0
+        if (
+            not self._from_here()
+            or self.path != "/clicks"
+            or self.headers.get("Content-Type") != "application/json"
+        ):
+            return self._send(403, b"", "text/plain")
+        if not 0 < length <= clicks.MAX_BYTES:
+            return self._send(413, b"", "text/plain")
+        try:
+            pairs = clicks.parse(json.loads(self.rfile.read(length)))
+            with self.server.keeping:
+                self.server.desk.keep(pairs)
+        except (ValueError, RecursionError, InputError, OSError) as error:
+            return self._send(400, str(error).encode(), "text/plain")
+        return self._json({"fits": self.server.desk.fits(pairs)})
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Stay silent."""
+
+    def _from_here(self) -> bool:
+        hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
+        return loopback.is_own(self.server.server_port, hosts, origins)
+
+    def _json(self, value: Any) -> None:
+        self._send(200, json.dumps(value).encode(), "application/json")
+
+    def _send(self, code: int, body: bytes, kind: str) -> None:
+        self.send_response(code)
+        for name, text in (
+            ("Content-Type", kind),
+            ("Content-Length", str(len(body))),
+            ("Cache-Control", "no-store"),
+        ):
+            self.send_header(name, text)
+        self.end_headers()
+        self.wfile.write(body)
+
+
+def server(desk: ClickSession, port: int) -> ClickServer:
     """Return a server that is bound but not yet running; port 0 takes any free one.
 
     Raises InputError SYS-002 for a port in use.
     """
-    keeping = threading.Lock()  # requests have a thread each, and write one file
-
-    class Handler(BaseHTTPRequestHandler):
-        """One request; only the page itself, asked for by its own address, is served."""
-
-        def do_GET(self) -> None:
-            """Serve the page, its state or a picture."""
-            if not self._from_here():
-                return self._send(403, b"", "text/plain")
-            match = PICTURE.match(self.path)
-            if self.path == "/":
-                page = resources.files("stages.annotate").joinpath("page.html").read_bytes()
-                return self._send(200, page, "text/html; charset=utf-8")
-            if self.path == "/state":
-                try:
-                    return self._json(desk.state())
-                except InputError as error:  # the file of clicks broke since the server began
-                    return self._send(500, str(error).encode(), "text/plain")
-            try:
-                found = desk.picture(int(match[1]), int(match[2])) if match else b""
-            except LookupError:
-                found = b""
-            return self._send(200, found, "image/jpeg") if found else self._send(404, b"", "text/plain")
-
-        def do_POST(self) -> None:
-            """Keep the clicks and answer with their fits."""
-            stated = self.headers.get("Content-Length") or ""
-            length = int(stated) if stated.isascii() and stated.isdigit() and len(stated) < MAX_DIGITS else 0
-            if (
-                not self._from_here()
-                or self.path != "/clicks"
-                or self.headers.get("Content-Type") != "application/json"
-            ):
-                return self._send(403, b"", "text/plain")
-            if not 0 < length <= clicks.MAX_BYTES:
-                return self._send(413, b"", "text/plain")
-            try:
-                pairs = clicks.parse(json.loads(self.rfile.read(length)))
-                with keeping:
-                    desk.keep(pairs)
-            except (ValueError, RecursionError, InputError, OSError) as error:
-                return self._send(400, str(error).encode(), "text/plain")
-            return self._json({"fits": desk.fits(pairs)})
-
-        def log_message(self, format: str, *arguments: Any) -> None:
-            """Stay silent."""
-
-        def _from_here(self) -> bool:
-            hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
-            return loopback.is_own(self.server.server_address[1], hosts, origins)
-
-        def _json(self, value: Any) -> None:
-            self._send(200, json.dumps(value).encode(), "application/json")
-
-        def _send(self, code: int, body: bytes, kind: str) -> None:
-            self.send_response(code)
-            for name, text in (
-                ("Content-Type", kind),
-                ("Content-Length", str(len(body))),
-                ("Cache-Control", "no-store"),
-            ):
-                self.send_header(name, text)
-            self.end_headers()
-            self.wfile.write(body)
-
     try:
-        return ThreadingHTTPServer((loopback.HOST, port), Handler)
+        return ClickServer(desk, port)
     except OSError as error:
         what = f"port {port}: {error.strerror}"
         raise InputError("SYS-002", what, loopback.HOST, "give another with --port") from error

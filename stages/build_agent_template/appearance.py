@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
@@ -72,7 +72,7 @@ def gather(
     seen = weight.sum(0) > 0.05
     mean = total / np.maximum(weight.sum(0), 1e-9)[:, None]
     if seen.any() and not seen.all():
-        mean[~seen] = mean[seen][cKDTree(vertices[seen]).query(vertices[~seen])[1]]
+        mean[~seen] = mean[seen][KDTree(vertices[seen]).query(vertices[~seen])[1]]
     return mean
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.geometry import rigid
 
@@ -58,12 +58,12 @@ def body_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sp
     """Connect cells nearer than two spacings, weighted by distance; loose parts are tied to the rest at their
     nearest points.
     """
-    pairs = cKDTree(cells).query_pairs(2.0 * spacing_m, output_type="ndarray")
+    pairs = KDTree(cells).query_pairs(2.0 * spacing_m, output_type="ndarray")
     length = np.linalg.norm(cells[pairs[:, 0]] - cells[pairs[:, 1]], axis=1)
     graph = scipy.sparse.coo_matrix((length, pairs.T), shape=(len(cells),) * 2).tocsr()
     while (found := connected_components(graph, directed=False))[0] > 1:
         small = found[1] == np.bincount(found[1]).argmin()
-        distance, nearest = cKDTree(cells[~small]).query(cells[small])
+        distance, nearest = map(np.asarray, KDTree(cells[~small]).query(cells[small]))
         a, b = np.flatnonzero(small)[distance.argmin()], np.flatnonzero(~small)[nearest[distance.argmin()]]
         graph = graph + scipy.sparse.coo_matrix(([distance.min()], ([a], [b])), shape=graph.shape).tocsr()
     return graph
@@ -94,5 +94,5 @@ def group_cells(
 
 def _thinness(cells: np.ndarray, inside: np.ndarray) -> Float[np.ndarray, "cell"]:
     """Weigh each cell by how few others lie within `NEAR_M` of it."""
-    count = cKDTree(inside).query_ball_point(cells, NEAR_M, return_length=True)
+    count = KDTree(inside).query_ball_point(cells, NEAR_M, return_length=True)
     return 1.0 / np.maximum(count, 1)

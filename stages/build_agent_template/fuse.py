@@ -6,12 +6,13 @@ Cells that hardly any frame sees through are inside the body; cells below the gr
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import fast_simplification
 import numpy as np
 import scipy.ndimage
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from skimage import measure
 
 from pipeline.data.clips import Clip, Masks
@@ -123,9 +124,9 @@ def extract(
     outside = below_ground | (share_off_mask > np.where(fused, SEE_THROUGH_FUSED, SEE_THROUGH))
     distance = np.where(outside, 1.0, np.where(fused, volume.distance, -1.0)).astype(np.float32)
     distance = np.pad(distance, 1, constant_values=1.0)
-    group, count = scipy.ndimage.label(distance < 0)
+    group, count = cast("tuple[np.ndarray, int]", scipy.ndimage.label(distance < 0))
     own = group == (np.bincount(group.ravel())[1:].argmax() + 1 if count else -1)
-    own = scipy.ndimage.binary_fill_holes(own)
+    own = np.asarray(scipy.ndimage.binary_fill_holes(own))
     distance = np.where(own, np.minimum(distance, -LEAST_DISTANCE), np.maximum(distance, LEAST_DISTANCE))
     distance = scipy.ndimage.gaussian_filter(distance, SMOOTH_VOXELS)
     cells = int((own & scipy.ndimage.binary_dilation(distance < 0)).sum())
@@ -143,14 +144,15 @@ def extract(
     return ClosedBody(mesh, origin + np.argwhere(own) * volume.voxel_m, volume.voxel_m)
 
 
-def simplify(mesh: trimesh.Trimesh, vertices: int) -> tuple[Float[np.ndarray, "vertex 3"], np.ndarray]:
+def simplify(
+    mesh: trimesh.Trimesh, vertices: int
+) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
     """Collapse edges until about so many vertices are left; a closed mesh stays closed and faces outward."""
     share = min(1.0, vertices / len(mesh.vertices))
     points, faces = mesh.vertices, mesh.faces
     if share < 1:
-        points, faces = fast_simplification.simplify(
-            points.astype(np.float32), faces, 1 - share, agg=AGGRESSIVENESS
-        )
+        points = points.astype(np.float32).astype(np.float64)  # as precise as meshes are stored
+        points, faces = fast_simplification.simplify(points, faces, 1 - share, agg=AGGRESSIVENESS)[:2]
     result = trimesh.Trimesh(points, faces, process=True)
     if not result.is_watertight:
         trimesh.repair.fill_holes(result)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.geometry.tsdf import Volume
 
@@ -44,7 +44,7 @@ def find_limb(
     """Find what moved among the points measured on the animal in each frame; None when (nearly) all stood
     still.
     """
-    body = cKDTree(inside_world)
+    body = KDTree(inside_world)
     off_body = {}
     for frame, points in points_world.items():
         away, _ = body.query(points, distance_upper_bound=FARTHEST_M)
@@ -77,4 +77,4 @@ def space_of(limb: Limb, volume: Volume) -> Bool[np.ndarray, "x y z"]:
     """Return which cells of a volume lie near where the limb has been."""
     axes = [volume.origin[axis] + np.arange(volume.weight.shape[axis]) * volume.voxel_m for axis in range(3)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    return np.isfinite(cKDTree(limb.points_world).query(cells, distance_upper_bound=AROUND_M)[0])
+    return np.isfinite(KDTree(limb.points_world).query(cells, distance_upper_bound=AROUND_M)[0])

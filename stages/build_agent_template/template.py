@@ -78,7 +78,7 @@ def build(
         [appearance.on_mask(at, masks[view]) for at, view in zip(pixel, views, strict=True)]
     )
     color = appearance.gather(mesh.vertices, weight, pixel, [clip.color(view) for view in views], 1)
-    vertex_features = appearance.gather(mesh.vertices, weight, pixel, features[views], STRIDE_PX)
+    vertex_features = appearance.gather(mesh.vertices, weight, pixel, list(features[views]), STRIDE_PX)
     vertex_features /= np.maximum(np.linalg.norm(vertex_features, axis=1, keepdims=True), 1e-9)
     mesh = Mesh(mesh.vertices, mesh.faces, np.round(color).astype(np.uint8))
     cameras[~masks.visible] = np.nan

@@ -150,10 +150,10 @@ def choose_start(
             ]
             ratio = float(step[0] / max(step[1], 1e-9))
     registered = sparse.frame if sparse is not None else np.zeros(0, int)
-    if poses is None and odometry is None:
-        return None
-    if poses is None or (reason and odometry is not None):
+    if odometry is not None and (poses is None or reason):
         return InitialTrajectory(odometry, "odometry", reason, registered, deviation, ratio, gap)
+    if poses is None:
+        return None
     return InitialTrajectory(poses, "colmap", reason, registered, deviation, ratio, gap)
 
 

@@ -12,7 +12,8 @@ import pymeshlab
 
 def clean(source: str, target: str, least_faces: int) -> None:
     """Read a PLY, clean it and write it with vertex colours."""
-    meshes = pymeshlab.MeshSet(verbose=False)
+    # Its module is a compiled one without stubs, filled in when it is imported.
+    meshes = pymeshlab.MeshSet(verbose=False)  # pyright: ignore[reportAttributeAccessIssue]
     meshes.load_new_mesh(source)
     meshes.meshing_remove_duplicate_vertices()
     meshes.meshing_remove_duplicate_faces()

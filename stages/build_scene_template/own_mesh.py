@@ -6,7 +6,7 @@ close holes), and the frames colour it.
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
@@ -37,7 +37,7 @@ def build(
         return None
     vertices, faces = trimesh.remesh.subdivide_to_size(
         mesh.vertices, mesh.faces, EDGE_M, max_iter=SUBDIVISIONS
-    )
+    )[:2]
     fine = Mesh(
         vertices.astype(np.float32), faces.astype(np.int32), np.full((len(vertices), 3), 128, np.uint8)
     )
@@ -99,7 +99,7 @@ def depth_against(
 
 def seen_and_colored(
     clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"]
-) -> tuple[Bool[np.ndarray, "vertex"], np.ndarray]:
+) -> tuple[Bool[np.ndarray, "vertex"], UInt8[np.ndarray, "vertex 3"]]:
     """Return which vertices some frame's depth confirms, and the mean colour that those frames give them."""
     total, weight = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
     for frame in subsampling.evenly(len(clip), COLOR_VIEWS):

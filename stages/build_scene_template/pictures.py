@@ -1,6 +1,7 @@
 """Quality page of the scene template: a turntable, the bird's-eye coverage, real beside rendered frames."""
 
 import numpy as np
+from jaxtyping import UInt8
 
 from pipeline.data import plots
 from pipeline.data.clips import Clip
@@ -31,7 +32,7 @@ def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
     ]
 
 
-def turntable(template: SceneTemplate, caster: RayCaster) -> np.ndarray:
+def turntable(template: SceneTemplate, caster: RayCaster) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the mesh from four raised corners."""
     low, high = np.quantile(template.mesh.vertices, [0.01, 0.99], axis=0)
     centre, reach = (low + high) / 2, np.linalg.norm(high - low) * 0.95
@@ -43,14 +44,14 @@ def turntable(template: SceneTemplate, caster: RayCaster) -> np.ndarray:
     return plots.grid(views, 2)
 
 
-def coverage(template: SceneTemplate) -> np.ndarray:
+def coverage(template: SceneTemplate) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the path of the walk-through over the seen surface."""
     picture = overview.bird_view(template.mesh, floor_m=template.floor_m)
     picture.draw(template.world_from_camera[:, :3, 3], (220, 40, 40))
     return picture.image
 
 
-def frames(template: SceneTemplate, clip: Clip, caster: RayCaster) -> np.ndarray:
+def frames(template: SceneTemplate, clip: Clip, caster: RayCaster) -> UInt8[np.ndarray, "height width 3"]:
     """Put frames beside the mesh as their cameras see it."""
     chosen = np.linspace(0, len(clip) - 1, 7).astype(int)[1:-1]
     height, width = clip.color_size

@@ -48,12 +48,13 @@ def find_motion(shots: Sequence[SampledFrame]) -> MotionShare | None:
 def _vanished(shot: SampledFrame, others: Sequence[SampledFrame]) -> Bool[np.ndarray, "height width"]:
     """Mark pixels whose points at least two other frames saw through, and fewer saw in place."""
     points = rigid.apply(
-        shot.odometry_from_camera, cameras.back_project(shot.depth, shot.depth_intrinsics).reshape(-1, 3)
+        rigid.inverse(shot.camera_from_odometry),
+        cameras.back_project(shot.depth, shot.depth_intrinsics).reshape(-1, 3),
     )
     through, there = np.zeros(len(points), int), np.zeros(len(points), int)
     for other in others:
         pixel, depth = cameras.project(
-            rigid.apply(rigid.inverse(other.odometry_from_camera), points), other.depth_intrinsics
+            rigid.apply(other.camera_from_odometry, points), other.depth_intrinsics
         )
         height, width = other.depth.shape
         inside = (depth > 0.1) & (pixel >= 1).all(-1) & (pixel[:, 0] < width - 1) & (pixel[:, 1] < height - 1)

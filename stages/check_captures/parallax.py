@@ -54,9 +54,10 @@ def _link(
     first: tuple[np.ndarray, np.ndarray | None], second: tuple[np.ndarray, np.ndarray | None]
 ) -> float | None:
     """Return the share of a pair's matches that a turn explains; None where the pair has too few."""
-    if min(len(first[0]), len(second[0])) < LINKED:
+    mine, theirs = first[1], second[1]
+    if mine is None or theirs is None or min(len(mine), len(theirs)) < LINKED:
         return None
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first[1], second[1], k=2)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(mine, theirs, k=2)
     good = np.array(
         [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance], int
     ).reshape(-1, 2)

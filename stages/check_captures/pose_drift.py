@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.geometry import rigid
 from pipeline.recordings.conventions import DepthPicture, compare
 from stages.check_captures.sampling import SampledFrame
 
@@ -28,9 +27,9 @@ def drift_m(shots: Sequence[SampledFrame]) -> float:
     ]
     found = []
     for first, second in pairs[:: max(1, len(pairs) // MOST_PAIRS)]:
-        second_from_first = rigid.inverse(second.odometry_from_camera) @ first.odometry_from_camera
-        views = (DepthPicture(shot.depth, shot.depth_intrinsics) for shot in (first, second))
-        residual_m, overlap, _ = compare(*views, second_from_first)
+        views = [DepthPicture(shot.depth, shot.depth_intrinsics) for shot in (first, second)]
+        second_from_first = second.camera_from_odometry @ first.odometry_from_camera
+        residual_m, overlap, _ = compare(*views, second_from_first=second_from_first)
         if overlap > MIN_OVERLAP:
             found.append(residual_m)
     return float(np.median(found)) if found else np.nan
@@ -38,5 +37,5 @@ def drift_m(shots: Sequence[SampledFrame]) -> float:
 
 def _looks_alike(first: SampledFrame, second: SampledFrame) -> bool:
     """Tell whether two cameras look into about the same direction from about the same place."""
-    relative = rigid.inverse(first.odometry_from_camera) @ second.odometry_from_camera
+    relative = first.camera_from_odometry @ second.odometry_from_camera
     return relative[2, 2] > 0.8 and float(np.linalg.norm(relative[:3, 3])) < 1.5

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from pipeline.data import images
+from pipeline.geometry import rigid
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
@@ -36,6 +38,12 @@ class SampledFrame:
     brightness: float
     beyond: float
     """share of the depth that is known but beyond the sensor's range"""
+
+    @property
+    def camera_from_odometry(self) -> Float[np.ndarray, "4 4"]:
+        """The inverse of the device's pose; only where there is one."""
+        assert self.odometry_from_camera is not None, "the recording has no poses"
+        return rigid.inverse(self.odometry_from_camera)
 
 
 @dataclass(frozen=True)
@@ -144,19 +152,21 @@ def _look_at_pictures(recording: Recording, count: int) -> RecordingSample:
     rows = np.unique(np.linspace(0, len(recording.index) - 1, count).round().astype(int))
     nothing, shots = np.zeros((0, 0), np.float32), []
     for row in rows:
-        color = recording.read_color(int(recording.index[row]))
-        if color is not None:
-            gray, statistics = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), extraction.picture_statistics(color)
+        stored = recording.read_color(int(recording.index[row]))
+        if stored is not None:
+            color = images.decode_color(stored, recording.where) if isinstance(stored, bytes) else stored
+            sharpness, brightness = extraction.picture_statistics(color)
             shots.append(
                 SampledFrame(
-                    float(recording.timestamp_s[row]),
-                    gray,
-                    np.eye(3),
-                    nothing,
-                    np.eye(3),
-                    None,
-                    *statistics,
-                    0.0,
+                    timestamp_s=float(recording.timestamp_s[row]),
+                    gray=cv2.cvtColor(color, cv2.COLOR_RGB2GRAY),
+                    intrinsics=np.eye(3),
+                    depth=nothing,
+                    depth_intrinsics=np.eye(3),
+                    odometry_from_camera=None,
+                    sharpness=sharpness,
+                    brightness=brightness,
+                    beyond=0.0,
                 )
             )
     _refuse_empty(recording, shots)

@@ -106,15 +106,11 @@ class Estimator:
     def _searched(
         self, search: cv2.DISOpticalFlow, first: Gray, second: Gray, guess: Dense | None = None
     ) -> Dense:
-        start = (
-            None
-            if guess is None
-            else 2 * cv2.resize(guess, first.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        )
-        return (
-            cv2.resize(search.calc(first, second, start), self.dense_size[::-1], interpolation=cv2.INTER_AREA)
-            / 2
-        )
+        start = np.zeros(0, np.float32)  # an empty array is no guess
+        if guess is not None:
+            start = 2 * cv2.resize(guess, first.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        found = search.calc(first, second, start)
+        return cv2.resize(found, self.dense_size[::-1], interpolation=cv2.INTER_AREA) / 2
 
     def _on_grid(self, dense: Dense) -> Float[np.ndarray, "height width 2"]:
         return _sampled(dense, self.grid_px / self._color_per_dense - 0.5) * self._color_per_dense

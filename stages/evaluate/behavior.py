@@ -67,7 +67,7 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
         name: _judged(method, data, test, test[plans], config)
         for name, method in ({OURS: ours} | rivals(data)).items()
     }
-    episode_of = dict.fromkeys(GOAL_SCORES, episode) | dict.fromkeys(PLAN_SCORES, episode[plans])
+    episode_of = {name: episode if name in GOAL_SCORES else episode[plans] for name in SCORES}
     _report(metrics, {name: each.scores for name, each in judged.items()}, episode_of, config)
     metrics.charts[CURVES] = best_of.drawn({name: each.distances for name, each in judged.items()})
     return metrics

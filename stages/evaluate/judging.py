@@ -1,11 +1,12 @@
 """The stage's own judgement of the metrics that matter most."""
 
 from pathlib import Path
+from typing import Literal
 
 from pipeline.data import qa
 from pipeline.metrics.metrics import Metrics
 
-LIMITS = (
+LIMITS: tuple[tuple[str, str, float, Literal["lower", "higher"]], ...] = (
     ("registration/rotation_deg_median", "deg", 1.0, "lower"),
     ("registration/translation_m_median", "m", 0.04, "lower"),
     ("masks/iou_mean", "", 0.75, "higher"),

@@ -161,8 +161,8 @@ def _single_frames(
 ) -> Metrics:
     """Place single frames by our localizer and by its rivals."""
     cameras = SceneCameras.open(folders.scene_template)
-    mapped = np.flatnonzero(cameras.registered)
-    mapped = mapped[plots.sample(len(mapped), MAP_FRAMES)]
+    known = np.flatnonzero(cameras.registered)
+    mapped = known[plots.sample(len(known), MAP_FRAMES)].tolist()
     ours = localizers.load(folders.scene_localizer)
     sift = localizing.sift_map(walkthrough.clip, cameras.world_from_camera, mapped)
     pictures = localizing.gallery(walkthrough.clip, cameras.world_from_camera, mapped)
@@ -204,7 +204,7 @@ def _perception(
     }
     pairs = []
     for each in sessions:
-        true = read_flow(folders.truth, each.name, each.source_index)
+        true = read_flow(folders.truth_folder, each.name, each.source_index)
         if true is not None:
             forward = flow.open_flow(folders.flow[each.video.id], 1)
             pairs += perception.flow_pairs(forward, true, each.truth.masks)

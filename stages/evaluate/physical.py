@@ -21,7 +21,7 @@ from pipeline.longterm.plausibility import Plausibility, PlausibilityMeter
 from pipeline.longterm.short_motions import BodyMotion, resample_motion, stretches
 from pipeline.longterm.surroundings import MotionScene
 from pipeline.metrics.metrics import Metrics
-from pipeline.rivals.predictors import Predictor
+from pipeline.rivals.predictors import Predictor, Samples
 
 WINDOWS = 16
 """Test windows in which motion is judged; each costs a second."""
@@ -52,13 +52,7 @@ def physical_metrics(
     metrics.put("behavior/physical_windows", len(chosen))
     context, future = data.windows(chosen)
     made = ours.sample(context, 1, np.random.default_rng(seed))
-    found = {
-        "recorded": _judged(judge, _recorded(future)),
-        "ats": _judged(
-            judge,
-            [_moving(*parts) for parts in zip(made.rotation, made.path, made.agent_from_bone, strict=True)],
-        ),
-    }
+    found = {"recorded": _judged(judge, _recorded(future)), "ats": _judged(judge, _sampled(made))}
     for kind, worth in found.items():
         _put(metrics, kind, worth)
     metrics.charts[PICTURE] = _drawn(found)
@@ -83,9 +77,14 @@ def _recorded(future: Future) -> list[BodyMotion]:
     return [BodyMotion(*parts) for parts in zip(future.world_from_agent, future.agent_from_bone, strict=True)]
 
 
-def _moving(rotation: np.ndarray, path: np.ndarray, bones: np.ndarray) -> BodyMotion:
-    """Put the one sampled plan of a window together."""
-    return BodyMotion(rigid.make(rotation[0], path[0]), bones[0])
+def _sampled(made: Samples) -> list[BodyMotion]:
+    """Put the one sampled plan of each window together."""
+    rotation, path, bones = made.rotation, made.path, made.agent_from_bone
+    assert rotation is not None and path is not None and bones is not None, "whole plans are judged"
+    return [
+        BodyMotion(rigid.make(turn[0], way[0]), posed[0])
+        for turn, way, posed in zip(rotation, path, bones, strict=True)
+    ]
 
 
 def _judged(judge: PlausibilityMeter, motions: Sequence[BodyMotion]) -> list[Plausibility]:

@@ -28,6 +28,12 @@ class Reconstructed:
     truth: Path | None = None
     """None for a user's own recordings"""
 
+    @property
+    def truth_folder(self) -> Path:
+        """The folder of the truth; only where it is known."""
+        assert self.truth is not None, "the true poses of this capture are not known"
+        return self.truth
+
 
 @dataclass(frozen=True, kw_only=True)
 class BuildFolders(Reconstructed):
@@ -79,10 +85,10 @@ def recorded(folders: Reconstructed, videos: tuple[Video, ...]) -> list[Recordin
     found = []
     for video in videos:
         name = Path(video.file).stem
-        if not (folders.truth / f"{name}.npz").exists():
+        if not (folders.truth_folder / f"{name}.npz").exists():
             continue
         source_index = read_source_index(folders.frames[video.id])
-        truth = RecordingTruth.open(folders.truth, name, source_index)
+        truth = RecordingTruth.open(folders.truth_folder, name, source_index)
         found.append(
             RecordingWithTruth(video, name, Clip.open(folders.frames[video.id]), truth, source_index)
         )
@@ -106,6 +112,7 @@ def frames_of_truth(
 
 def filmed_together(folders: Reconstructed, phone: Video) -> Int[np.ndarray, "frame"]:
     """Return the frames of a held-out phone that lie within the session that it is synchronized with."""
+    assert phone.synchronized_with is not None, f"{phone.id} shares its clock with no session"
     when, session_s = (
         FRAMES.load(folders.frames[id] / "frames.npz", "timestamp_s")["timestamp_s"]
         for id in (phone.id, phone.synchronized_with)

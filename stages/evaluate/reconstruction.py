@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from pipeline.core import devices
 from pipeline.data import gaussian_ply, plots, ply
@@ -74,10 +75,10 @@ def _held_out(
     device: devices.Device,
 ) -> Metrics:
     """Compare with what the held-out phones truly saw."""
-    phones = [phone for phone in phones if phone.video.synchronized_with]
     seen = [
-        (phone.video.synchronized_with, shots_of(folders, phone, frames, config.heldout_frames))
+        (session, shots_of(folders, phone, frames, config.heldout_frames))
         for phone in phones
+        if (session := phone.video.synchronized_with)
     ]
     return held_out_metrics(folders, seen, device, config.lpips_weights)
 
@@ -138,7 +139,7 @@ def shots_of(
     depth's resolution.
     """
     true, cameras, shots = (
-        read_depth(folders.truth, phone.name, phone.source_index),
+        read_depth(folders.truth_folder, phone.name, phone.source_index),
         frames.cameras(phone.truth),
         [],
     )
@@ -167,8 +168,9 @@ def drawn_by_fields(
         return [HeldoutView.empty(shot) for shot in shots]
     renderer, views = Renderer(fields.load(folders.reconstruction, device), session), []
     for shot in shots:
+        height, width = shot.depth.shape
         picture = renderer.draw(
-            shot.world_from_camera, shot.intrinsics, *shot.depth.shape, *motion.at(shot.time_s)
+            shot.world_from_camera, shot.intrinsics, height, width, *motion.at(shot.time_s)
         )
         views.append(HeldoutView(picture.color, picture.depth, shot))
     return views
@@ -194,13 +196,15 @@ def _drawn_by_splats(
     for shot in shots:
         cloud, (root, bones) = splats.place_scene(None), motion.at(shot.time_s)
         if root is not None:
-            posed = (torch.as_tensor(part, dtype=torch.float32) for part in (root, bones))
-            cloud = gaussians.concatenate(cloud, splats.place_agent(*posed, None))
-        camera = (rigid.inverse(shot.world_from_camera), shot.intrinsics)
+            posed = [torch.as_tensor(part, dtype=torch.float32) for part in (root, bones)]
+            cloud = gaussians.concatenate(cloud, splats.place_agent(*posed, video=None))
+        camera_from_world, intrinsics = (
+            torch.as_tensor(part, dtype=torch.float32)
+            for part in (rigid.inverse(shot.world_from_camera), shot.intrinsics)
+        )
+        height, width = shot.depth.shape
         with torch.no_grad():
-            seen = gaussians.render(
-                cloud, *(torch.as_tensor(part, dtype=torch.float32) for part in camera), *shot.depth.shape
-            )
+            seen = gaussians.render(cloud, camera_from_world, intrinsics, height, width)
         color = (seen.color.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
         views.append(HeldoutView(color, seen.depth.numpy(), shot))
     return views
@@ -214,10 +218,10 @@ def _skin(folders: Reconstructed) -> tuple[Mesh, SkinnedPoints]:
 def track_distances(
     folders: Reconstructed,
     sessions: Sequence[RecordingWithTruth],
-    motions: dict,
+    motions: Mapping[str, Motion | None],
     turnaround: RecordingWithTruth,
     frames: TruthAlignment,
-) -> list[np.ndarray]:
+) -> list[Float[np.ndarray, "point"]]:
     """Follow surface points that are matched to truth once, in the turnaround; return distances per visible
     frame, metres.
     """
@@ -226,7 +230,7 @@ def track_distances(
     distances = []
     for each in sessions:
         motion = motions[each.video.id]
-        for frame in np.flatnonzero(each.truth.agent_visible):
+        for frame in np.flatnonzero(each.truth.agent_visible).tolist():
             true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame)[partner])
             ours = _posed(skin, motion, frame)
             distances.append(
@@ -254,7 +258,7 @@ def _posed(skin: SkinnedPoints, motion: Motion | None, frame: int) -> np.ndarray
 def _agent_chamfer(
     folders: BuildFolders,
     sessions: Sequence[RecordingWithTruth],
-    motions: dict,
+    motions: Mapping[str, Motion | None],
     frames: TruthAlignment,
     config: Config,
     rng: np.random.Generator,
@@ -263,14 +267,16 @@ def _agent_chamfer(
     is.
     """
     metrics, (mesh, skin), distances, total = Metrics(), _skin(folders), [], 0
-    faces = ply.read_ply(folders.truth / "agent.ply").faces
+    faces = ply.read_ply(folders.truth_folder / "agent.ply").faces
     for each in sessions:
         motion = motions[each.video.id]
         chosen = reading.subsampled(np.flatnonzero(each.truth.agent_visible), config.surface_frames)
         total += len(chosen)
-        for frame in chosen if motion is not None else ():
-            if motion.agent_known[frame]:
-                ours = TriangleSurface(_posed(skin, motion, frame)[mesh.faces])
+        for frame in chosen.tolist():
+            known = motion is not None and motion.agent_known[frame]
+            posed = _posed(skin, motion, frame) if known else None
+            if posed is not None:
+                ours = TriangleSurface(posed[mesh.faces])
                 true = TriangleSurface(
                     rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))[faces]
                 )
@@ -290,7 +296,8 @@ def _scene_chamfer(
 ) -> Metrics:
     """Compare the scene's surface with the true room, on what the walk-through saw of it."""
     metrics = Metrics()
-    ours, true = ply.read_ply(folders.reconstruction / "scene.ply"), ply.read_ply(folders.truth / "scene.ply")
+    ours = ply.read_ply(folders.reconstruction / "scene.ply")
+    true = ply.read_ply(folders.truth_folder / "scene.ply")
     true = Mesh(
         rigid.apply(frames.world_from_true_world, true.vertices.astype(float)).astype(np.float32), true.faces
     )

@@ -48,7 +48,7 @@ def matched_once(
     all in our agent frame.
     """
     answers = [KDTree(vertices).query(points_agent) for vertices in true_vertices_agent]
-    return min(answers, key=lambda answer: answer[0].mean())[1]
+    return np.asarray(min(answers, key=lambda answer: np.mean(answer[0]))[1])
 
 
 def track_metrics(distances: Sequence[Float[np.ndarray, "point"]]) -> Metrics:

@@ -8,33 +8,38 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.data import npz
 
-CAMERA = ("world_from_camera", "intrinsics", "agent_visible", "moving")
-AGENT = ("world_from_agent", "agent_vertices_world")
+FILED_AS = {
+    name: name for name in ("world_from_camera", "intrinsics", "agent_visible", "moving", "world_from_agent")
+} | {"vertices": "agent_vertices_world"}
+"""Names in the file of the fields below; the last two only where there is an agent."""
 
 
 @dataclass(frozen=True)
 class RecordingTruth:
-    """Everything known of a recording, in the truth's own frames; the agent's parts are None without an
-    agent.
+    """Everything known of a recording, in the truth's own frames; without an agent its poses are NaN, its
+    vertices none and its masks empty.
     """
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     intrinsics: Float[np.ndarray, "frame 3 3"]
     agent_visible: Bool[np.ndarray, "frame"]
     moving: Bool[np.ndarray, "frame"]
-    world_from_agent: Float[np.ndarray, "frame 4 4"] | None
-    vertices: Float[np.ndarray, "frame vertex 3"] | None
+    world_from_agent: Float[np.ndarray, "frame 4 4"]
+    vertices: Float[np.ndarray, "frame vertex 3"]
     """world positions less the agent's"""
-    masks: Bool[np.ndarray, "frame height width"] | None
+    masks: Bool[np.ndarray, "frame height width"]
 
     @classmethod
     def open(cls, folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> "RecordingTruth":
         """Read ``<name>.npz`` and ``<name>.masks.npz`` for the extracted frames."""
         table = npz.load(folder / f"{name}.npz")
-        camera = [table[key][source_index] for key in CAMERA]
-        agent = [table[key][source_index] if key in table else None for key in AGENT]
-        masks = folder / f"{name}.masks.npz"
-        return cls(*camera, *agent, _masks(masks)[source_index] if masks.exists() else None)
+        frames = len(source_index)
+        no_agent = {"world_from_agent": np.full((frames, 4, 4), np.nan), "vertices": np.zeros((frames, 0, 3))}
+        masks = np.zeros((frames, 0, 0), bool)
+        if "world_from_agent" in table:
+            masks = _masks(folder / f"{name}.masks.npz")[source_index]
+        parts = {field: table[key][source_index] for field, key in FILED_AS.items() if key in table}
+        return cls(**no_agent | parts, masks=masks)
 
     def vertices_world(self, frame: int) -> Float[np.ndarray, "vertex 3"]:
         """Return the true surface's vertices of one frame, metres, in the truth's world."""

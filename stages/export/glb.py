@@ -16,7 +16,7 @@ def write(folder: Path, agent: Agent, scene: bytes) -> ExportRecord:
     (folder / "agent.glb").write_bytes(data)
     (folder / "scene.glb").write_bytes(scene)
     for content in (data, scene):
-        opened = trimesh.load(io.BytesIO(content), file_type="glb")
+        opened = trimesh.load_scene(io.BytesIO(content), file_type="glb")
         assert len(opened.geometry) == 1, "one surface a file"
     loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()}
     influences = agent.skin.joints.shape[1]

@@ -20,7 +20,7 @@ def rows(session: Session) -> Float[np.ndarray, "frame 15"]:
     """Return the columns above: metres, seconds, world frame, quaternion wxyz; NaN where the animal is
     unknown.
     """
-    known = np.isfinite(session.world_from_agent).all((1, 2))
+    known = np.all(np.isfinite(session.world_from_agent), axis=(1, 2))
     position = session.world_from_agent[:, :3, 3]
     quaternion = np.full((len(known), 4), np.nan)
     quaternion[known] = rigid.quaternion_from_rotation(session.world_from_agent[known, :3, :3])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from pipeline.behavior.support import JUMP_KERNEL, SUPPORTED
 from pipeline.behavior.trajectories import BehaviorData
@@ -108,9 +108,9 @@ def support_contract(range_m: Float[np.ndarray, "2 2"]) -> dict[str, Any] | None
     return {"mark": SUPPORTED, "range_m": np.asarray(range_m, float).tolist(), "flight": JUMP_KERNEL.tolist()}
 
 
-def supported_share(volume: Mapping[str, np.ndarray], data: BehaviorData) -> float | None:
-    """Return the share of recorded frames with a carrying voxel beneath the root; None where
-    nothing carries.
+def supported_share(volume: Mapping[str, Shaped[np.ndarray, "..."]], data: BehaviorData) -> float | None:
+    """Return the share (0..1) of recorded frames with a carrying voxel beneath the root; None where
+    nothing carries. ``volume`` holds the arrays of a `volume.npz`.
     """
     carries = volume["allowed"] >= SUPPORTED
     if not carries.any():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import fast_simplification
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.geometry.meshes import Mesh
 
@@ -23,11 +23,11 @@ def decimate(mesh: Mesh, max_faces: int) -> tuple[Mesh, Int[np.ndarray, " vertex
     if len(mesh.faces) <= max_faces:
         return mesh, np.arange(len(mesh.vertices))
     vertices, faces = fast_simplification.simplify(
-        np.ascontiguousarray(mesh.vertices, np.float32),
+        np.ascontiguousarray(mesh.vertices, np.float64),
         np.ascontiguousarray(mesh.faces, np.int32),
         target_count=max_faces,
-    )
-    nearest = cKDTree(mesh.vertices).query(vertices)[1]
+    )[:2]
+    nearest = np.asarray(KDTree(mesh.vertices).query(vertices)[1])
     color = None if mesh.color is None else mesh.color[nearest]
     return Mesh(vertices.astype(np.float32), faces.astype(np.int32), color), nearest
 

@@ -6,6 +6,7 @@ similarity; the median of its scale over the pairs that agree is taken, and only
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -76,7 +77,8 @@ def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:
         return None
     source, target = known.points_camera[theirs], frame.points_camera[mine]
     ransac = pycolmap.RANSACOptions(max_error=WITHIN_M, random_seed=seed, max_num_trials=RANSAC_TRIALS)
-    fitted = pycolmap.estimate_sim3d_robust(source, target, ransac)
+    # The stub names the transform alone; the function returns it with the inliers.
+    fitted = cast("dict[str, Any] | None", pycolmap.estimate_sim3d_robust(source, target, ransac))
     if fitted is None:
         return None
     close = target[np.asarray(fitted["inlier_mask"], bool)]

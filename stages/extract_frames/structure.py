@@ -74,7 +74,10 @@ class PictureMotion:
         corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
         if corners is None or len(corners) < LEAST_CORNERS:
             return LOST_STEP
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, winSize=(15, 15), maxLevel=3)
+        no_guess = np.zeros(0, np.float32)
+        moved, found, _ = cv2.calcOpticalFlowPyrLK(
+            before, after, corners, no_guess, winSize=(15, 15), maxLevel=3
+        )
         good = found[:, 0] == 1
         if good.sum() < LEAST_FOLLOWED * len(corners):
             return LOST_STEP
@@ -185,7 +188,8 @@ def _bag_of_words_similarity(
     if len(sample) < words:
         return np.zeros((len(descriptors), len(descriptors)))
     cv2.setRNGSeed(seed)
-    centres = cv2.kmeans(sample, words, None, (cv2.TERM_CRITERIA_MAX_ITER, 8, 0), 1, cv2.KMEANS_PP_CENTERS)[2]
+    no_guess, rounds = np.zeros(0, np.int32), (cv2.TERM_CRITERIA_MAX_ITER, 8, 0)
+    centres = cv2.kmeans(sample, words, no_guess, rounds, 1, cv2.KMEANS_PP_CENTERS)[2]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     counts = np.stack(
         [

@@ -80,7 +80,8 @@ def write_frames(
         remedy = "record some seconds at least, things within 5 m, in light, with the LiDAR camera"
         raise InputError("CAP-007", what=what, where=where, remedy=remedy)
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))
-    return WrittenFrames(kept, lost / total, *np.array(statistics).T, color_strip, depth_strip)
+    sharpness, brightness, depth_valid = np.array(statistics).T
+    return WrittenFrames(kept, lost / total, sharpness, brightness, depth_valid, color_strip, depth_strip)
 
 
 def write_table(folder: Path, recording: Recording, plan: ExtractionPlan, written: WrittenFrames) -> None:

@@ -26,7 +26,7 @@ class MeasuredMotion:
 
     def arrays(self) -> dict[str, Float[np.ndarray, "..."] | Bool[np.ndarray, "frame"]]:
         """Return the arrays of a ``motion.npz``."""
-        known = np.isfinite(self.world_from_agent).all((1, 2))
+        known = np.all(np.isfinite(self.world_from_agent), axis=(1, 2))
         return {
             "timestamp_s": self.timestamp_s.astype("f8"),
             "world_from_camera": self.world_from_camera.astype("f8"),

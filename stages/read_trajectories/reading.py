@@ -65,17 +65,16 @@ def _from_csv(path: Path, map_path: Path | None, config: Config) -> MeasuredMoti
 
 
 def _from_life(stored: dict[str, np.ndarray]) -> MeasuredMotion:
-    names = FeatureVolume.__dataclass_fields__
-    volume = {name: stored[f"volume/{name}"] for name in names}
-    return MeasuredMotion(
-        **{name: stored[name] for name in MOTION_KEYS},
-        volume=FeatureVolume(**volume | {"voxel_m": float(volume["voxel_m"])}),
-    )
+    features, occupancy, origin = (stored[f"volume/{name}"] for name in ("features", "occupancy", "origin"))
+    volume = FeatureVolume(features, occupancy, origin, float(stored["volume/voxel_m"]))
+    return MeasuredMotion(**{name: stored[name] for name in MOTION_KEYS}, volume=volume)
 
 
 def _from_joints(path: Path, stored: dict[str, np.ndarray], config: Config) -> MeasuredMotion:
     """Put the clips of a motion capture one after another; the lowest joint touches the floor at y = 0."""
-    clips = [np.asarray(clip, float) if clip.dtype.kind in "fiu" else np.zeros(0) for clip in stored.values()]
+    clips: list[np.ndarray] = [
+        np.asarray(clip, float) if clip.dtype.kind in "fiu" else np.zeros(0) for clip in stored.values()
+    ]
     fitting = [
         clip.ndim == 3 and clip.shape[1:] == clips[0].shape[1:] and clip.shape[2] == 3 and len(clip) > 0
         for clip in clips

@@ -117,8 +117,8 @@ def build(
     """
     videos = scene_first(videos)
     torch.manual_seed(seed)
-    thumbnail = tuple(max(video.store.views.depth.shape[axis] for video in videos) for axis in (1, 2))
-    store = join((usable(video) for video in videos), scratch, thumbnail)
+    height, width = (max(video.store.views.depth.shape[axis] for video in videos) for axis in (1, 2))
+    store = join((usable(video) for video in videos), scratch, (height, width))
     lengths = [len(video.timestamp_s) for video in videos]
     camera = np.concatenate([interpolated(video.timestamp_s, video.world_from_camera) for video in videos])
     roots, inliers = zip(*(without_outliers(video) for video in videos), strict=True)
@@ -137,8 +137,8 @@ def build(
     by_frame = RaysByFrame.of(store.agent.frame, len(camera))
     usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
-    free, poses = [video.camera_free for video in videos], map(torch.from_numpy, (camera, agent))
-    motion = MotionTable(*poses, rest, lengths, free, KNOT_FRAMES)
+    free = [video.camera_free for video in videos]
+    motion = MotionTable(torch.from_numpy(camera), torch.from_numpy(agent), rest, lengths, free, KNOT_FRAMES)
     body = ArticulatedBody(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape)
     surface = TemplateSurface.of(template.mesh, template.feature, np.random.default_rng(seed))
     with torch.no_grad():
@@ -213,9 +213,8 @@ def usable(video: RegisteredVideo) -> RayStore:
         np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= LEAST_CONFIDENCE)
     )
     store = video.store
-    return RayStore(
-        *(rays.at(torch.nonzero(good[rays.frame])[:, 0]) for rays in (store.scene, store.agent)), store.views
-    )
+    scene, agent = (rays.at(torch.nonzero(good[rays.frame])[:, 0]) for rays in (store.scene, store.agent))
+    return RayStore(scene, agent, store.views)
 
 
 def without_outliers(
@@ -227,7 +226,7 @@ def without_outliers(
         The roots, world from agent (NaN where unknown), and which frames are no outliers.
     """
     root, time = video.world_from_agent.copy(), video.timestamp_s
-    known = np.isfinite(root).all((1, 2))
+    known = np.all(np.isfinite(root), axis=(1, 2))
     certain = known
     if video.agent_confidence is not None:
         certain = known & (video.agent_confidence >= DOUBTFUL_ROOT)

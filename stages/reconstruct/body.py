@@ -8,7 +8,7 @@ the same terms while everything learns.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 from torch.nn import functional
 
@@ -82,8 +82,8 @@ class Pose:
         posed = motion.world_from_camera(frame), motion.world_from_agent(frame), motion.agent_from_bone(frame)
         return cls(frame, *posed, motion.initial_agent[frame])
 
-    def at(self, chosen: Tensor | slice) -> "Pose":
-        """Choose frames."""
+    def at(self, chosen: Int[Tensor, "chosen"] | Bool[Tensor, "frame"] | slice) -> "Pose":
+        """Choose frames by their numbers, a mask or a slice."""
         return Pose(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 

@@ -112,7 +112,7 @@ def sample_points(
 
 
 def agent_layer(
-    problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"], shape: tuple[int, int]
+    problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"], shape: tuple[int, ...]
 ) -> tuple[Layer, Float[Tensor, "frame point 3"]]:
     """Evaluate the agent's field along rays; also return the samples in the rest shape. It is empty outside
     its box.

@@ -72,7 +72,9 @@ def eikonal(
     return (((shifted - distance) / step_m).square().sum(0).clamp_min(1e-8).sqrt() - 1).square()
 
 
-def weighted(terms: Mapping[str, tuple[float, Tensor]], shared: bool = False) -> dict[str, Tensor]:
+def weighted(
+    terms: Mapping[str, tuple[float, Float[Tensor, "..."]]], shared: bool = False
+) -> dict[str, Float[Tensor, ""]]:
     """Average each term over its elements and weigh it; terms without elements vanish.
 
     With ``shared``, the elements of all processes count (`pipeline.core.distributed`), whose gradients will

@@ -11,7 +11,8 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from torch import nn
+from jaxtyping import Int
+from torch import Tensor, nn
 
 from pipeline.core import distributed, progress, threads
 from pipeline.core.training import FitRecord, fit, generator_for, termination
@@ -107,8 +108,8 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     return records
 
 
-def chunks(problem: Problem, length: int) -> Iterable[torch.Tensor]:
-    """Cut each video's frames into segments that hold at least one usable frame."""
+def chunks(problem: Problem, length: int) -> Iterable[Int[Tensor, "frame"]]:
+    """Cut each video's frames into segments of up to ``length`` that hold at least one usable frame."""
     for video in range(int(problem.video.max()) + 1):
         frames = torch.nonzero(problem.video == video)[:, 0]
         for part in frames.split(length):

@@ -101,7 +101,8 @@ class ChunkLoss:
         parts = [slice(first, first + length) for first in range(0, len(pose.frame), length)]
         terms = [self._terms(pose.at(part), twist[part], self.seen[part], generator) for part in parts]
         seen = torch.stack([self.seen[part].any() for part in parts])
-        return torch.stack([sum(each.values()) for each in terms]).where(seen, torch.nan)
+        totals = [sum(each.values(), start=torch.zeros(())) for each in terms]
+        return torch.stack(totals).where(seen, torch.nan)
 
     def _terms(
         self,

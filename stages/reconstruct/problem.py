@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Generator, Tensor, nn
 
 from pipeline.core.errors import InputError
@@ -197,7 +197,7 @@ class TemplateSurface:
         noise = rng.choice(NOISE_M, half)[:, None]
         near = points[rng.integers(len(points), size=half)] + rng.normal(size=(half, 3)) * noise
         around = np.concatenate([near, rng.uniform(low, high, (half, 3))])
-        near_m, near = cKDTree(points).query(around, 8)
+        near_m, near = map(np.asarray, KDTree(points).query(around, 8))
         side = ((around[:, None] - points[near]) * normal[near]).sum(-1).mean(-1)
         distance = near_m[:, 0] * np.where(side < 0, -1, 1)
         vertex = mesh.faces[face[near[:, 0]]]

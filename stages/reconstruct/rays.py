@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Int, Int8, UInt8
+from jaxtyping import Bool, Float, Int, Int8, UInt8
 from numpy.random import Generator
 from scipy.ndimage import minimum_filter
 from torch import Tensor
@@ -144,7 +144,7 @@ def collect(source: RaySource, sampling: PixelSampling, rng: Generator) -> RaySt
         if seen:
             reader = _Reader(source, frame, mask, thin_depth(source.clip, frame), slope)
             agent.append(reader.read(choose_on_agent(mask, near, sampling.agent_per_frame, rng), rng))
-        small = tuple(size // THUMBNAIL for size in mask.shape)
+        small = (mask.shape[0] // THUMBNAIL, mask.shape[1] // THUMBNAIL)
         depths.append(
             cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
         )
@@ -174,18 +174,14 @@ def join(stores: Iterable[RayStore], folder: Path | None, size: tuple[int, int] 
     parts = [[npz.Column(folder) for _ in fields(kind)] for kind in (Rays, Rays, Views)]
     frames = 0
     for store in stores:
-        size = size or tuple(store.views.depth.shape[1:])
-        tables = _shift(store.scene, frames), _shift(store.agent, frames), _padded(store.views, *size)
+        height, width = size = size or (store.views.depth.shape[1], store.views.depth.shape[2])
+        tables = _shift(store.scene, frames), _shift(store.agent, frames), _padded(store.views, height, width)
         for columns, table in zip(parts, tables, strict=True):
             for column, field in zip(columns, fields(table), strict=True):
                 column.append(getattr(table, field.name).numpy())
         frames += len(store.views.intrinsics)
-    return RayStore(
-        *(
-            kind(*(torch.from_numpy(column.array()) for column in columns))
-            for kind, columns in zip((Rays, Rays, Views), parts, strict=True)
-        )
-    )
+    scene, agent, views = ([torch.from_numpy(column.array()) for column in columns] for columns in parts)
+    return RayStore(Rays(*scene), Rays(*agent), Views(*views))
 
 
 def _padded(views: Views, height: int, width: int) -> Views:
@@ -272,7 +268,7 @@ def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np
 
 def distance_outside(
     mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]
-) -> Float16[np.ndarray, "small_height small_width"]:
+) -> Float[np.ndarray, "small_height small_width"]:
     """Return how many colour pixels the middles of a thumbnail's pixels lie outside the mask's edge, negative
     inside.
 

@@ -67,7 +67,7 @@ class _Reader:
         """
         table, source = AgentCameras.open(self.inputs.agent_template), self._masked(id, has_scene=False)
         cameras = table.agent_from_registered
-        known = np.isfinite(cameras).all((1, 2))
+        known = np.all(np.isfinite(cameras), axis=(1, 2))
         return RegisteredVideo(
             id,
             table.timestamp_s,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.data.motion import INTERPOLATED, Motion, gaps_s
@@ -94,7 +94,7 @@ def scene_surface(problem: Problem) -> Mesh:
     `SEEN_WITHIN_M`.
     """
     mesh = marching_cubes.extract_scene(problem.scene, -1, problem.scene.lattice_m)
-    near, _ = cKDTree(measured_points(problem)).query(mesh.vertices, distance_upper_bound=SEEN_WITHIN_M)
+    near, _ = KDTree(measured_points(problem)).query(mesh.vertices, distance_upper_bound=SEEN_WITHIN_M)
     return marching_cubes.keep_vertices(mesh, np.isfinite(near))
 
 
@@ -131,7 +131,7 @@ def feature_volume(problem: Problem) -> SceneFeatures:
     )
     free = seen_free(problem, points).cpu().numpy()
     measured = np.isfinite(
-        cKDTree(measured_points(problem)).query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)[0]
+        KDTree(measured_points(problem)).query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)[0]
     )
     solid = (distance < 0.5 * VOXEL_M) & measured | (distance < 0) & ~free
     occupancy = np.where(solid, SURFACE, np.where(free, FREE, UNSEEN)).astype(np.uint8)

@@ -49,7 +49,7 @@ def write(
         features=volume.features,
         occupancy=volume.occupancy,
         origin=volume.origin,
-        voxel_m=np.float64(results.VOXEL_M),
+        voxel_m=np.asarray(results.VOXEL_M, np.float64),
     )
     index, rest = results.track_points(agent)
     TRACKS.save(folder / "tracks.npz", vertex_index=index, rest_agent=rest)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.data.clips import usable_depth
 from pipeline.fields import gaussians, marching_cubes
@@ -113,12 +113,13 @@ def sample_surfaces(
             parts.append(gaussians.sample_surface(moved, count, rng))
             layers.append(np.full(count, code))
     layer = np.concatenate(layers)
-    joined = (
+    points, normal, color = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "normal", "color")
     )
-    together = SurfaceSamples(*joined, parts[0].spacing_m)
+    together = SurfaceSamples(points, normal, color, parts[0].spacing_m)
     stands = np.stack([(layer == -1) | (layer == code) for code in (*codes, -1)])
     for row, code in zip(stands, keep_own, strict=False):
+        assert field.fused is not None, "a scene without fused geometry has no surfaces of single videos"
         own = field.fused.is_own(torch.from_numpy(together.points), code).numpy() & (layer == -1)
         row[own] = marching_cubes.on_surface(field, together.points[own], code)
     return together, layer, stands
@@ -211,7 +212,7 @@ def subsample(
     seen: ObservedColors,
     number: int,
     rng: np.random.Generator,
-) -> tuple[np.ndarray, Float[np.ndarray, "chosen"]]:
+) -> tuple[Int[np.ndarray, "chosen"], Float[np.ndarray, "chosen"]]:
     """Choose about ``number`` points; returns their indices and their spacing on the same surface, metres.
 
     The error of a cover with spacing s is about (slope of colors * s)^2 times how often it is looked at; for
@@ -220,8 +221,8 @@ def subsample(
     """
     shown = seen.weight > 0
     gone = seen.through > seen.weight
-    gone[~shown] |= np.isfinite(cKDTree(points[shown]).query(points[~shown], distance_upper_bound=SHELL_M)[0])
-    near = cKDTree(points).query(points, NEIGHBOURS + 1)[1][:, 1:]
+    gone[~shown] |= np.isfinite(KDTree(points[shown]).query(points[~shown], distance_upper_bound=SHELL_M)[0])
+    near = np.asarray(KDTree(points).query(points, NEIGHBOURS + 1)[1])[:, 1:]
     slope = np.abs(seen.color[near] - seen.color[:, None]).mean((1, 2)) + PLAIN
     visits = seen.weight / max(seen.weight.mean(), 1e-9)
     density = np.where(gone, 0, slope * np.sqrt(visits))
@@ -234,7 +235,7 @@ def subsample(
     for one in np.unique(layer[chosen]):
         here = points[chosen[layer[chosen] == one]]
         fourth_m[layer[chosen] == one] = (
-            cKDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0].reshape(len(here), -1)[:, -1]
+            KDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0].reshape(len(here), -1)[:, -1]
         )
     return chosen, np.clip(fourth_m, LEAST_SPACING_M, np.quantile(fourth_m, WIDEST))
 

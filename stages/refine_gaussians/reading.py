@@ -39,11 +39,9 @@ def read_sequences(
 def _recording(
     id: str, frames: Mapping[str, Path], masks: Mapping[str, Path], flow: Mapping[str, Path]
 ) -> DrawnRecording:
-    forward = confidence = None
-    if id in flow:
-        forward, confidence = open_flow(flow[id], 1), open_confidence(flow[id], 1)
+    tables = (open_flow(flow[id], 1), open_confidence(flow[id], 1)) if id in flow else None
     labels = Masks.open(masks[id]) if id in masks else None
-    return DrawnRecording(id, Clip.open(frames[id]), labels, forward, confidence)
+    return DrawnRecording(id, Clip.open(frames[id]), labels, tables)
 
 
 def read_splats(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
@@ -61,12 +61,11 @@ class MotionDeltas(nn.Module):
         self,
         world_from_agent: Float[Tensor, "*batch 4 4"],
         agent_from_bone: Float[Tensor, "*batch bone 4 4"],
-        frame,
-    ) -> tuple[Tensor, Tensor]:
+        frame: int | Int[Tensor, "*batch"],
+    ) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch bone 4 4"]]:
         """Return the corrected root and bones of frames."""
-        return world_from_agent @ rigid_torch.se3_exp(
-            self.root[frame]
-        ), agent_from_bone @ rigid_torch.se3_exp(self.bone[frame])
+        root, bone = (rigid_torch.se3_exp(table[frame]) for table in (self.root, self.bone))
+        return world_from_agent @ root, agent_from_bone @ bone
 
 
 class FrameLoss:
@@ -82,7 +81,8 @@ class FrameLoss:
         backend: Backend,
     ):
         self.splats, self.deltas, self.sequences = splats, deltas, sequences
-        self.weights, self.long_side_px, self.backend = weights, long_side_px, backend
+        self.weights, self.long_side_px = weights, long_side_px
+        self.backend: Backend = backend
         self.device = str(splats.appearance.device)
         self.frames = [(s, f) for s, sequence in enumerate(sequences) for f in usable_frames(sequence)]
 
@@ -94,7 +94,7 @@ class FrameLoss:
         camera = self.camera(sequence, frame)
         cloud = self.cloud(sequence, frame, camera, target)
         later = self._later_pixels(sequence, frame, target, cloud)
-        view = render(cloud, camera, target.intrinsics, *size, self.backend, extra=later)
+        view = render(cloud, camera, target.intrinsics, *size, backend=self.backend, extra=later)
         room = torch.ones_like(target.agent) if cloud.agent.any() else ~target.agent
         everywhere = room if sequence.video is not None else target.agent
         measured = (target.depth > 0) & everywhere
@@ -189,9 +189,10 @@ class FrameLoss:
     def _flow_errors(
         self, sequence: Sequence4D, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor
     ) -> Tensor:
-        lattice = flow_lattice(
-            *target.flow_confidence.shape, sequence.recording.clip.color_size, tuple(target.color.shape[:2])
-        )
+        assert target.flow_px is not None and target.flow_confidence is not None, "a frame without flow"
+        rows, columns = target.flow_confidence.shape
+        height, width = target.color.shape[:2]
+        lattice = flow_lattice(rows, columns, sequence.recording.clip.color_size, (height, width))
         row, column = (index.to(self.device) for index in lattice)
         found = drawn[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
         error = (
@@ -206,9 +207,11 @@ class FrameLoss:
 
 def usable_frames(sequence: Sequence4D) -> list[int]:
     """Return the frames whose camera is known, and for the turnaround also the agent's mask."""
-    good = np.isfinite(sequence.motion.world_from_camera).all((1, 2))
+    good = np.all(np.isfinite(sequence.motion.world_from_camera), axis=(1, 2))
     if sequence.video is None:
-        good &= np.isfinite(sequence.motion.world_from_agent).all((1, 2)) & sequence.recording.masks.visible
+        assert sequence.recording.masks is not None, "the turnaround has masks"
+        rooted = np.all(np.isfinite(sequence.motion.world_from_agent), axis=(1, 2))
+        good &= rooted & sequence.recording.masks.visible
     return np.flatnonzero(good).tolist()
 
 

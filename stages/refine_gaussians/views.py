@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.data.clips import Clip, Masks, usable_depth
@@ -23,9 +23,8 @@ class DrawnRecording:
     id: str
     clip: Clip
     masks: Masks | None
-    flow: np.ndarray | None
-    """forward flow of gap 1, [frame height width 2], color pixels at stride 4, memory-mapped"""
-    flow_confidence: np.ndarray | None
+    flow: tuple[Float[np.ndarray, "frame height width 2"], UInt8[np.ndarray, "frame height width"]] | None
+    """forward flow of gap 1, color pixels at stride 4, and its confidence; memory-mapped"""
 
 
 @dataclass(frozen=True)
@@ -60,19 +59,29 @@ def read(recording: DrawnRecording, frame: int, size: tuple[int, int], device: s
     if recording.masks is not None:
         mask = cv2.resize(recording.masks[frame], small, interpolation=cv2.INTER_NEAREST_EXACT)
     flow = confidence = None
-    if recording.flow is not None and frame < len(recording.flow):
+    if recording.flow is not None and frame < len(recording.flow[0]):
         scale = np.array([size[1] / clip.color_size[1], size[0] / clip.color_size[0]])
-        flow = torch.from_numpy((recording.flow[frame] * scale).astype(np.float32)).to(device)
-        confidence = torch.from_numpy(recording.flow_confidence[frame].astype(np.float32) / 255).to(device)
-    tensors = (color.astype(np.float32) / 255, depth.astype(np.float32), mask == AGENT, mask != UNKNOWN)
+        forward, trust = (table[frame] for table in recording.flow)
+        flow = torch.from_numpy((forward * scale).astype(np.float32)).to(device)
+        confidence = torch.from_numpy(trust.astype(np.float32) / 255).to(device)
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size).astype(np.float32)
-    return Target(*(torch.from_numpy(array).to(device) for array in (*tensors, intrinsics)), flow, confidence)
+    measured = (
+        color.astype(np.float32) / 255,
+        depth.astype(np.float32),
+        mask == AGENT,
+        mask != UNKNOWN,
+        intrinsics,
+    )
+    tensors = (torch.from_numpy(array).to(device) for array in measured)
+    return Target(*tensors, flow_px=flow, flow_confidence=confidence)
 
 
 def flow_lattice(
     rows: int, columns: int, color_size: tuple[int, int], size: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """Return the drawn pixel (row, column) nearest to each cell centre of the flow."""
+) -> tuple[Int[Tensor, "row 1"], Int[Tensor, "1 column"]]:
+    """Return the drawn pixel (row, column) nearest to each cell centre of the flow; sizes are height and
+    width.
+    """
     row = (torch.arange(rows) * STRIDE_PX + STRIDE_PX / 2) * size[0] / color_size[0]
     column = (torch.arange(columns) * STRIDE_PX + STRIDE_PX / 2) * size[1] / color_size[1]
     return row.long().clamp_max(size[0] - 1)[:, None], column.long().clamp_max(size[1] - 1)[None]

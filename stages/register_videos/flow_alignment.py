@@ -71,7 +71,8 @@ def flow_correspondences(
 def _flow(first, second):
     """Return optical flow and how far from its start it ends there and back, pixels."""
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    forward, backward = dense.calc(first, second, None), dense.calc(second, first, None)
+    no_guess = np.zeros(0, np.float32)
+    forward, backward = dense.calc(first, second, no_guess), dense.calc(second, first, no_guess)
     row, column = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
     border = (OUTSIDE_PX, OUTSIDE_PX)
     returned = cv2.remap(

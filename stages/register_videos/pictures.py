@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from pipeline.data import plots
 from pipeline.data.clips import Clip
@@ -106,7 +106,9 @@ def pictures(result: Registered | Rejected, clip: Clip, maps: Maps) -> list[Pict
     ]
 
 
-def outlined(result: Registered, clip: Clip, scene: RayCaster, agent: RayCaster, frame: int) -> np.ndarray:
+def outlined(
+    result: Registered, clip: Clip, scene: RayCaster, agent: RayCaster, frame: int
+) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the depth edges of the rendered template and the animal's outline over one frame."""
     height, width = clip.color_size
     camera = result.aligned.world_from_camera[frame]
@@ -125,7 +127,7 @@ def _edges(depth, jump_m):
     return cv2.dilate(depth, window) - cv2.erode(depth, window) > jump_m * (1 + depth / 3)
 
 
-def paths(result: Registered, maps: Maps) -> np.ndarray:
+def paths(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]:
     """Draw both paths over the room."""
     picture = views.bird_view(maps.scene, floor_m=_floor(maps))
     root = result.roots.world_from_agent
@@ -136,7 +138,7 @@ def paths(result: Registered, maps: Maps) -> np.ndarray:
     return picture.image
 
 
-def depth_on_map(result: Registered, maps: Maps) -> np.ndarray:
+def depth_on_map(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the static depth of some frames over the room, coloured by its distance from the surface."""
     picture = views.bird_view(maps.scene, floor_m=_floor(maps))
     surface = SurfaceMap(maps.scene)

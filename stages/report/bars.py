@@ -82,7 +82,9 @@ def judge(metrics: Metrics, reasons: Mapping[str, str]) -> list[Judged]:
 
 def _judged(bar: Bar, metrics: Metrics, reasons: Mapping[str, str]) -> Judged:
     value = _known(metrics.get(bar.metric))
-    limit = bar.limit if isinstance(bar.limit, float) else _scaled(_known(metrics.get(bar.limit)), bar.factor)
+    limit = bar.limit
+    if isinstance(limit, str):
+        limit = _scaled(_known(metrics.get(limit)), bar.factor)
     if value is None or limit is None:
         missing = bar.metric if value is None else str(bar.limit)
         return Judged(bar, value, limit, "none", reasons.get(missing, "not measured"))

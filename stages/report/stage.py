@@ -42,7 +42,7 @@ class Inputs:
 
     def folders(self, artifact: str) -> dict[str | None, Path]:
         """Return an artifact's folders by recording; None where there is one in all."""
-        given: Path | Mapping[str, Path] = getattr(self, artifact)
+        given: Path | Mapping[str | None, Path] = getattr(self, artifact)
         return {None: given} if isinstance(given, Path) else dict(given)
 
 

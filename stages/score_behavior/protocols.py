@@ -3,11 +3,12 @@ truth (Table 5).
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import observe
+from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
 from pipeline.geometry import rigid
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
@@ -17,13 +18,17 @@ from stages.score_behavior.config import Config
 WINDOWS_AT_ONCE = 32
 
 
-def scores(ats: Ats, data: BehaviorData, family: str, scoring: Config) -> dict[str, np.ndarray]:
+def scores(
+    ats: Ats, data: BehaviorData, family: str, scoring: Config
+) -> dict[str, Shaped[np.ndarray, "..."]]:
     """Return per protocol and score one number per window, averaged over trials, and the windows themselves.
 
     ``goal_window``, ``plan_window``: recording and first frame of the windows on which goals, and plans, are
     judged. ``end_to_end/solid``: share of each window's sampled positions inside something solid or outside
     the room.
     """
+    scenes = ats.volume
+    assert isinstance(scenes, Scenes), "the model is opened with the windows' own scenes"
     rng, test = np.random.default_rng(scoring.seed), data.indices(TEST)
     many, few = test[:: scoring.stride], test[:: scoring.plan_stride]
     context, future = data.windows(many)
@@ -34,9 +39,9 @@ def scores(ats: Ats, data: BehaviorData, family: str, scoring: Config) -> dict[s
     if len(few):
         samples = ats.sample(context, scoring.samples, rng)
         _add(found, "end_to_end", samples, future)
-        found.setdefault("end_to_end/solid", []).append(
-            ats.volume.inside_solid(samples.path, context.video).mean((1, 2))
-        )
+        assert samples.path is not None, "a behaviour model samples whole plans"
+        solid = scenes.inside_solid(samples.path, context.video).mean((1, 2))
+        found.setdefault("end_to_end/solid", []).append(solid)
         if family != "one_stage":  # it has no level that could be fed
             _add(found, "truth_fed", fed_with_truth(ats, context, future, scoring.samples, rng), future)
     listed = {
@@ -44,7 +49,7 @@ def scores(ats: Ats, data: BehaviorData, family: str, scoring: Config) -> dict[s
         "plan_window": _listed(data, few),
         "videos": np.array(data.videos, np.str_),
     }
-    true = ats.volume.inside_solid(future.path_world, context.video).mean(1)
+    true = scenes.inside_solid(future.path_world, context.video).mean(1)
     return (
         {name: np.mean(values, axis=0) for name, values in found.items()} | {"recorded/solid": true} | listed
     )

@@ -114,9 +114,8 @@ def grab(
 ) -> Bool[np.ndarray, "height width"]:
     """Cut something out of a picture by GrabCut (Rother et al. 2004); ``marks`` are OpenCV's four."""
     cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
-    found = cv2.grabCut(
-        color, marks.copy(), None, np.zeros((1, 65)), np.zeros((1, 65)), 8, cv2.GC_INIT_WITH_MASK
-    )[0]
+    models, by_mask = np.zeros((2, 1, 65)), cv2.GC_INIT_WITH_MASK
+    found = cv2.grabCut(color, marks.copy(), (0, 0, 0, 0), models[0], models[1], 8, by_mask)[0]
     return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
 
 
@@ -193,6 +192,7 @@ def _carried(
 ) -> Float[np.ndarray, "height width"]:
     """Carry log-odds of another frame to this one along the flow."""
     moved = footage.to(frame, other)
+    assert moved is not None, f"flow of gap 1 is stored for frames {frame} and {other}"
     columns, rows = (np.arange(side, dtype=np.float32) for side in log_odds.shape[::-1])
     return cv2.remap(
         log_odds,
@@ -244,4 +244,6 @@ def _packed(mask: Bool[np.ndarray, "height width"]) -> bytes:
 
 
 def _unpacked(packed: bytes) -> Bool[np.ndarray, "height width"]:
-    return cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_GRAYSCALE) > 0
+    mask = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert mask is not None, "a PNG of our own"
+    return mask > 0

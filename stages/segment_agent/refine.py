@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ def label(
 ) -> UInt8[np.ndarray, "height width"]:
     """Decide 255 / 0 / 128: parts that hold sure pixels stay, holes close, a weak boundary is unknown."""
     inside = (log_odds > 0).astype(np.uint8)
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)
-    held = np.bincount(parts[sure], minlength=count) > np.maximum(3, 0.05 * stats[:, cv2.CC_STAT_AREA])
+    parts, area = _parts(inside, 8)
+    held = np.bincount(parts[sure], minlength=len(area)) > np.maximum(3, 0.05 * area)
     held[0] = False
     inside = held[parts].astype(np.uint8)
     inside = _fill_holes(inside, limit=0.05)
@@ -90,19 +90,26 @@ def without_strays(
     """Take away parts, but for the largest, that look rather like the room: rims of furniture that drift
     makes seem to move.
     """
-    count, parts, stats, _ = cv2.connectedComponentsWithStats((labels > 0).astype(np.uint8), connectivity=8)
-    if count < 3:
+    parts, area = _parts((labels > 0).astype(np.uint8), 8)
+    if len(area) < 3:
         return labels
-    mean_odds = np.bincount(parts.ravel(), like.ravel(), count) / stats[:, cv2.CC_STAT_AREA]
-    stray = mean_odds < 0
-    stray[[0, 1 + stats[1:, cv2.CC_STAT_AREA].argmax()]] = False
+    stray = np.bincount(parts.ravel(), like.ravel(), len(area)) / area < 0
+    stray[[0, 1 + area[1:].argmax()]] = False
     return np.where(stray[parts], 0, labels).astype(np.uint8)
+
+
+def _parts(
+    inside: UInt8[np.ndarray, "height width"], connectivity: int
+) -> tuple[Int[np.ndarray, "height width"], Int[np.ndarray, "part"]]:
+    """Return the connected part of each pixel (0: none) and the parts' areas."""
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=connectivity)
+    return np.asarray(parts, np.int32), stats[:, cv2.CC_STAT_AREA]
 
 
 def _fill_holes(inside: UInt8[np.ndarray, "height width"], limit: float) -> UInt8[np.ndarray, "height width"]:
     """Close holes smaller than a share of the whole."""
-    _, parts, stats, _ = cv2.connectedComponentsWithStats(1 - inside, connectivity=4)
-    small = stats[:, cv2.CC_STAT_AREA] < limit * max(int(inside.sum()), 1)
+    parts, area = _parts(1 - inside, 4)
+    small = area < limit * max(int(inside.sum()), 1)
     small[0] = False
     return np.where(small[parts], 1, inside).astype(np.uint8)
 

@@ -66,7 +66,7 @@ def _lift(clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"]) -> Float[
     at = np.floor(
         pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]
     ).astype(int)
-    inside = ((at >= 0) & (at < [clip.depth_size[1], clip.depth_size[0]])).all(1)
+    inside = np.all((at >= 0) & (at < [clip.depth_size[1], clip.depth_size[0]]), axis=1)
     at = np.where(inside[:, None], at, 0)
     z = np.where(inside, depth[at[:, 1], at[:, 0]], 0)
     points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]

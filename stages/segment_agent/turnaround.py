@@ -7,6 +7,7 @@ cluster of points above that ground nearest to the axes' meeting point is the an
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import scipy.ndimage
@@ -140,9 +141,8 @@ def find_cluster(
     hits = np.bincount(np.ravel_multi_index(at.T, (count,) * 3), minlength=count**3).reshape((count,) * 3)
     filled = hits >= least_hits
     around = np.ones((3, 3, 3), bool)
-    closed = np.array(scipy.ndimage.binary_closing(filled, around)) | filled
-    group = np.zeros(filled.shape, np.int32)
-    groups = scipy.ndimage.label(closed, around, output=group)
+    closed = np.asarray(scipy.ndimage.binary_closing(filled, around), bool) | filled
+    group, groups = cast("tuple[np.ndarray, int]", scipy.ndimage.label(closed, around))
     centre = origin + (np.argwhere(filled) + 0.5) * VOXEL_M
     nearness = np.exp(-((np.linalg.norm(centre - focus, axis=1) / 0.25) ** 2))
     score = np.bincount(group[filled], nearness, minlength=groups + 1)

@@ -87,7 +87,7 @@ def following(
     roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Return a camera that looks down at the animal from the side of the room's centre, moving smoothly."""
-    target = gaussian_filter1d(roots_world, 12.0, axis=0, mode="nearest")
+    target = np.asarray(gaussian_filter1d(roots_world, 12.0, axis=0, mode="nearest"))
     away = (centre - target) * [1.0, 0.0, 1.0]
     away = gaussian_filter1d(
         away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 0.3), 20.0, axis=0, mode="nearest"

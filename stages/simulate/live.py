@@ -125,11 +125,7 @@ class LiveView:
         weights = np.zeros((len(look.mesh.vertices), len(look.skin.bone_names)), np.float32)
         np.add.at(weights, (np.arange(len(weights))[:, None], look.skin.joints), look.skin.weights)
         rest = look.skin.agent_from_bone_rest
-        color = (
-            (150, 120, 90)
-            if look.mesh.color is None
-            else tuple(int(value) for value in look.mesh.color.mean(0))
-        )
+        red, green, blue = (150, 120, 90) if look.mesh.color is None else look.mesh.color.mean(0).astype(int)
         return self.server.scene.add_mesh_skinned(
             "/animal",
             look.mesh.vertices.astype(np.float32),
@@ -137,7 +133,7 @@ class LiveView:
             bone_wxyzs=rigid.quaternion_from_rotation(rest[:, :3, :3]),
             bone_positions=rest[:, :3, 3],
             skin_weights=weights,
-            color=color,
+            color=(int(red), int(green), int(blue)),
             side="double",
         )
 

@@ -2,6 +2,8 @@
 the home.
 """
 
+from typing import cast
+
 import numpy as np
 from jaxtyping import Bool, Int
 from scipy.ndimage import binary_dilation, label
@@ -42,7 +44,8 @@ def with_filled_floor(
         1
     )  # under a seat that nobody saw from below there is no floor
     kept[:, level][bare] = FILLED
-    kept[np.broadcast_to(~(kept >= SUPPORTED).any(1)[:, None], kept.shape)] = 0
+    carried = np.any(kept >= SUPPORTED, axis=1, keepdims=True)
+    kept[np.broadcast_to(~carried, kept.shape)] = 0
     return kept
 
 
@@ -54,7 +57,8 @@ def floor_level(carries: Bool[np.ndarray, "x y z"]) -> int | None:
 
 def connected(floor: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:
     """Return the largest part of the floor that hangs together, over gaps of twice `JOINS_VOXELS`."""
-    part, _ = label(binary_dilation(floor, iterations=JOINS_VOXELS))
+    grown = binary_dilation(floor, iterations=JOINS_VOXELS)
+    part, _ = cast("tuple[np.ndarray, int]", label(grown))
     largest = np.bincount(part[floor], minlength=1)
     return floor & (part == largest.argmax())
 

@@ -25,7 +25,7 @@ from stages.slice_behavior.floor import with_filled_floor
 def slice_windows(
     trajectories: dict[str, Trajectory],
     test: frozenset[str],
-    agent_from_bone_rest: np.ndarray,
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
     *,
     stride: int,
 ) -> BehaviorData:

@@ -27,7 +27,11 @@ class Bone:
     radius: tuple[float, float]
 
 
-def _limbs(side: int) -> list[tuple[str, str, tuple, tuple, tuple]]:
+BoneRow = tuple[str, str, tuple[float, float, float], tuple[float, float, float], tuple[float, float]]
+"""name, parent, head, tail and the radii at both, metres"""
+
+
+def _limbs(side: int) -> list[BoneRow]:
     x, tag = (0.045, "left") if side > 0 else (-0.045, "right")
     f, h = x * 1.0, x * 1.1
     return [
@@ -48,7 +52,7 @@ def _limbs(side: int) -> list[tuple[str, str, tuple, tuple, tuple]]:
 
 
 def _skeleton() -> tuple[Bone, ...]:
-    rows = [
+    rows: list[BoneRow] = [
         ("pelvis", "spine", (0, 0.0, -0.10), (0, -0.005, -0.185), (0.072, 0.058)),
         ("spine", "loin", (0, 0.0, -0.02), (0, 0.0, -0.10), (0.073, 0.072)),
         ("loin", "", (0, 0.0, 0.0), (0, 0.0, 0.05), (0.074, 0.076)),

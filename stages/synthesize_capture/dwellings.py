@@ -6,6 +6,7 @@ seen.
 """
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy.ndimage import label
@@ -172,8 +173,8 @@ def _home(standing: tuple[Standing, ...], things: list[Piece], rng: np.random.Ge
         [floor[rng.integers(len(floor), size=len(things))], rng.uniform(-np.pi, np.pi, len(things))]
     )
     movables = tuple(
-        Movable(tuple(t.sheets), t.size, t.top, tuple(map(float, h)))
-        for t, h in zip(things, homes, strict=True)
+        Movable(tuple(t.sheets), t.size, t.top, (x, z, yaw))
+        for t, (x, z, yaw) in zip(things, homes.tolist(), strict=True)
     )
     window = next(s for s in standing if s.name == "window")
     corner = np.array([[window.x, 2.1, window.z], [0, 0, 1.5], [0, -1.2, 0]], float)
@@ -205,7 +206,7 @@ def _livable(room: Room) -> bool:
     """
     for breadth, height in ((ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M), (PERSON_BREADTH_M, PERSON_HEIGHT_M)):
         floor = floor_for(room.footprints(), breadth_m=breadth, height_m=height)
-        parts, count = label(floor.free)
+        parts, count = cast("tuple[np.ndarray, int]", label(floor.free))
         sizes = np.bincount(parts.ravel())[1:]
         if not count or sizes.max() < 0.93 * sizes.sum() or floor.free.mean() < 0.3:
             return False

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.geometry import cameras, rigid
 from stages.synthesize_capture import animal, light, raster, sensor, shade
@@ -56,8 +56,12 @@ class Stage:
             return None
         return animal.surface(self.creature, motion.world_from_agent[index] @ motion.agent_from_bone[index])
 
-    def mesh(self, vertices_world: Float[np.ndarray, "vertex 3"] | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return vertices (world) and faces of room and animal together; the animal's faces come last."""
+    def mesh(
+        self, vertices_world: Float[np.ndarray, "vertex 3"] | None
+    ) -> tuple[Float[np.ndarray, "joined 3"], Int[np.ndarray, "face 3"]]:
+        """Return vertices (world, metres) and faces of room and animal together; the animal's faces come
+        last.
+        """
         if vertices_world is None:
             return self.room.vertices, self.room.faces
         return np.concatenate([self.room.vertices, vertices_world]), np.concatenate(
@@ -101,7 +105,8 @@ class Stage:
         return Frame(color, depth, confidence, true_depth, samples >= 2, body)
 
     def _coat(self, index: int, body: np.ndarray | None, camera_from_world: np.ndarray) -> shade.Coat:
-        if body is None:
+        motion = self.script.motion
+        if body is None or motion is None:
             return shade.Coat(
                 self.empty,
                 np.zeros((0, 3), np.float32),
@@ -112,7 +117,6 @@ class Stage:
         received = light.light_on_body(
             body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light
         )
-        motion = self.script.motion
         camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
         balls = np.zeros((len(SHADOW_BALLS), 4))
         for row, (bone, rest, radius) in enumerate(SHADOW_BALLS):

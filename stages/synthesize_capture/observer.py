@@ -57,7 +57,7 @@ class Observer:
         self.rng, self.style = rng, style
         self.mode, self.left_s, self.speed_m_s, self.since_plan_s = "watch", rng.uniform(1.0, 2.0), 0.0, 0.0
         self.velocity = np.zeros(2)
-        self.looks_at: Float[np.ndarray, 3] | None = None
+        self.looks_at: Float[np.ndarray, 3] = np.full(3, np.nan)
         self._last: np.ndarray | None = None
         self._glance: tuple[float, np.ndarray] | None = None
 
@@ -146,6 +146,6 @@ class Observer:
             left, sideways = self._glance
             target = sideways
             self._glance = (left - seconds, sideways) if left > seconds else None
-        if self.looks_at is None:
+        if np.isnan(self.looks_at).any():  # the first look
             self.looks_at = target.copy()
         self.looks_at = self.looks_at + (target - self.looks_at) * (1 - np.exp(-seconds / REACTION_S))

@@ -221,6 +221,7 @@ class Policy:
 
     def _fly(self, seconds: float) -> None:
         leap = self.leap
+        assert leap is not None, "only a leap is flown"
         leap.elapsed_s += seconds
         share = min(leap.elapsed_s / JUMP_S, 1.0)
         course = share * share * (3 - 2 * share)

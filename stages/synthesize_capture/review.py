@@ -135,14 +135,8 @@ def _from_above(script: Script) -> UInt8[np.ndarray, "height width 3"]:
     )
     for pose in script.world_from_camera[::15]:
         start = pose[[0, 2], 3]
-        cv2.arrowedLine(
-            canvas,
-            *map(tuple, _pixels(np.stack([start, start + 0.22 * pose[[0, 2], 2]])).tolist()),
-            (120, 160, 240),
-            1,
-            cv2.LINE_AA,
-            tipLength=0.3,
-        )
+        tail, tip = _pixels(np.stack([start, start + 0.22 * pose[[0, 2], 2]])).tolist()
+        cv2.arrowedLine(canvas, tail, tip, (120, 160, 240), 1, cv2.LINE_AA, tipLength=0.3)
     if script.motion is not None:
         way = script.motion.world_from_agent[:, [0, 2], 3]
         cv2.polylines(canvas, [_pixels(way)], False, (240, 150, 40), 2, cv2.LINE_AA)

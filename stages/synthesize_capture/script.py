@@ -101,7 +101,8 @@ def scripts(config: Config, room: Room, phone: PhoneFormat = PHONE) -> list[Scri
         rng = next(streams)
         seconds = config.test_session_s if number == config.session_count else config.session_s
         arranged = room.arranged(rng)
-        hour: Hour = {config.dim_session: "evening", config.harsh_session: "sunset"}.get(number, "day")
+        hours: dict[int, Hour] = {config.dim_session: "evening", config.harsh_session: "sunset"}
+        hour = hours.get(number, "day")
         lit = light.light_of_session(rng, hour)
         lived = session.simulate_session(arranged, rng, seconds)
         path = camera_motion.filming(lived, rng)

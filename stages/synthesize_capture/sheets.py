@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.geometry import rigid
 
@@ -142,11 +142,16 @@ def ball(center, radius: float, paint: Paint, *, squash: float = 1.0, rings: int
 
 def triangles(
     sheets: Sequence[Sheet],
-) -> tuple[Float[np.ndarray, "vertex 3"], np.ndarray, Float[np.ndarray, "vertex 2"], np.ndarray]:
+) -> tuple[
+    Float[np.ndarray, "vertex 3"],
+    Int[np.ndarray, "face 3"],
+    Float[np.ndarray, "vertex 2"],
+    Int[np.ndarray, "face"],
+]:
     """Join sheets to one mesh.
 
-    Returns vertices, faces (counter-clockwise from the front), picture coordinates in [0, 1], and each face's
-    sheet.
+    Returns vertices (metres), faces (counter-clockwise from the front), picture coordinates in [0, 1], and
+    each face's sheet.
     """
     vertices, faces, coordinates, owner, start = [], [], [], [], 0
     for index, sheet in enumerate(sheets):

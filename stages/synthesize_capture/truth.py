@@ -35,7 +35,7 @@ class TruthWriter:
         self.masks.append(cameras.turn_image(frame.mask, turns))
         if self.keep_depth:
             self.depth.append(cameras.turn_image(frame.true_depth, turns).astype(np.float16))
-        if frame.vertices_world is not None:
+        if frame.vertices_world is not None and self.script.motion is not None:
             root = self.script.motion.world_from_agent[index, :3, 3]
             self.vertices.append((frame.vertices_world - root).astype(np.float16))
 
@@ -66,7 +66,7 @@ class TruthWriter:
                 packed=np.packbits(masks, axis=-1),
                 shape=np.array(masks.shape, np.int64),
             )
-        npz.save(folder / f"{name}.npz", **contents)
+        npz.save(folder / f"{name}.npz", compress=False, **contents)
         if self.keep_depth:
             stored = cameras.scale_intrinsics(
                 matrices(script.intrinsics), script.color_size, script.depth_size

@@ -69,7 +69,7 @@ def _taken(
         return block & (np.abs(centres[..., 1] + VOXEL_M / 2) < VOXEL_M / 2)
     if thing.name == "window":  # radiator and curtains hang on the wall
         return block & (centres[..., 1] > 0) & (centres[..., 1] < thing.piece.top)
-    taken = np.zeros(centres.shape[:3], bool)
+    taken: np.ndarray = np.zeros(centres.shape[:3], bool)
     placed = [sheet.moved(upright(thing.x, thing.z, thing.yaw)) for sheet in thing.piece.sheets]
     points = np.concatenate([surface_points(sheet) for sheet in placed])
     index = np.floor((points[points[:, 1] > max(thing.piece.bottom, 0.01)] - origin) / VOXEL_M).astype(int)

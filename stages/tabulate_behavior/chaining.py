@@ -2,6 +2,8 @@
 does?
 """
 
+from typing import cast
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import ks_2samp
@@ -105,7 +107,8 @@ def _speeds(path: Float[np.ndarray, "frame 3"]) -> Float[np.ndarray, "step"]:
 def _ks_distance(
     mine: Float[np.ndarray, "step"], others: Float[np.ndarray, "other"], least: float = 0.0
 ) -> float:
-    return float(ks_2samp(np.maximum(mine, least), np.maximum(others, least)).statistic)
+    found = ks_2samp(np.maximum(mine, least), np.maximum(others, least))
+    return cast("tuple[float, float]", found)[0]  # statistic and p-value
 
 
 def _ks_among_recordings(recorded: list[Float[np.ndarray, "step"]], least: float = 0.0) -> float:

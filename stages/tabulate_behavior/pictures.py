@@ -37,7 +37,9 @@ def checks(figures: Mapping[str, float | None], ours: str) -> list[Check]:
         and name.endswith("/goal_minde_m_ci95_high")
         and value is not None
     ]
-    falling = [value for name, value in figures.items() if name.endswith("_loss_still_falls")]
+    falling = [
+        value for name, value in figures.items() if name.endswith("_loss_still_falls") and value is not None
+    ]
     return [
         *ahead,
         Check("losses still falling over the last tenth, at most", max(falling), "of itself", PLATEAU_SLOPE),

@@ -123,6 +123,7 @@ def samples(
 ) -> dict[str, float | None]:
     """Make samples of the behaviour model physical, on windows of the test recording if there is one."""
     data = source.data
+    assert data is not None, "only recorded motion has samples of the behaviour model"
     architecture, nets, scaling, schedule, _ = behavior.load(model)
     scenes = Scenes.load(behavior_data, data.videos)
     windows = np.flatnonzero(data.split != TRAIN)

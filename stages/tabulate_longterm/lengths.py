@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.longterm.bodies import PosedSurface
 from pipeline.longterm.config import MotionOptimizationConfig
@@ -22,12 +23,13 @@ class LongMotionLength:
 
 def figures(
     world: LongTermWorld,
-    been: np.ndarray,
+    been: Float[np.ndarray, "place 3"],
     length: LongMotionLength,
     settings: MotionOptimizationConfig,
     seed: int,
 ) -> dict[str, float | None]:
-    """Travel through preferred places for minutes and measure what the bars ask for.
+    """Travel through preferred places for minutes and measure what the bars ask for; ``been`` is where the
+    root was, metres, world.
 
     Sub-goals are due at even times, so that the animal rests at those that it reaches early.
     """

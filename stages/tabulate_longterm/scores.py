@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.behavior.model import channels_from_bones
@@ -133,8 +133,8 @@ def scored(
 
 
 def references(
-    parts: list[BodyMotion], scene: np.ndarray, dataset: MotionDataset, model: LongTerm
+    parts: list[BodyMotion], scene: Int[np.ndarray, "clip"], dataset: MotionDataset, model: LongTerm
 ) -> list[Reference]:
-    """Pair true short motions with what judges them."""
+    """Pair true short motions with what judges them, by the number of each one's scene."""
     judges = [PlausibilityMeter(dataset.body, model.contacts, each.distance) for each in dataset.scenes]
     return [Reference(part, judges[index]) for part, index in zip(parts, scene, strict=True)]

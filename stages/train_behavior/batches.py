@@ -183,7 +183,8 @@ def windows_from_data(
     tables = (torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, bones, frame))
     met = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST]])
     met = met[:0] if architecture.ablated_input == "observer" else met
-    return TrainingWindows(*tables, torch.from_numpy(rows), torch.from_numpy(number), torch.from_numpy(met))
+    indices = (torch.from_numpy(index) for index in (rows, number, met))
+    return TrainingWindows(*tables, *indices)
 
 
 def approached(

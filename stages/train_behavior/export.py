@@ -12,6 +12,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
+from jaxtyping import Float
 from safetensors.torch import save_file
 
 from pipeline.behavior.config import PlanSamplingConfig
@@ -31,7 +32,7 @@ def write_model(
     architecture: Architecture,
     scaling: Scaling,
     schedule: Schedule,
-    rest: np.ndarray,
+    rest: Float[np.ndarray, "bone 4 4"],
 ) -> float:
     """Write everything a sampler needs. Return the largest difference between ONNX and torch."""
     write_contract(folder, nets, architecture, scaling, schedule, rest)
@@ -44,7 +45,7 @@ def write_contract(
     architecture: Architecture,
     scaling: Scaling,
     schedule: Schedule,
-    rest: np.ndarray,
+    rest: Float[np.ndarray, "bone 4 4"],
 ) -> None:
     """Write weights, `behavior.json` and, of the model that other samplers know, `golden.json`."""
     save_file(
@@ -90,6 +91,7 @@ def export_network(
             external_data=False,
             verbose=False,
         )
+    assert program is not None, "dynamo always returns the program"
     model = program.model_proto
     for item in (
         model,

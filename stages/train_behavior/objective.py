@@ -31,7 +31,7 @@ def losses(
     generator: torch.Generator,
     *,
     phase: TrainingPhase = "all",
-) -> dict[str, Tensor]:
+) -> dict[str, Float[Tensor, ""]]:
     """Return the weighted mean squared error of the predicted noise, per network.
 
     Only what learns has an error.

@@ -52,9 +52,8 @@ def write_trained(
 ) -> None:
     """Write weights, contract and the losses of every step."""
     export.write_contract(folder, fitted.nets.cpu(), architecture, fitted.scaling, schedule, rest)
-    npz.save(
-        folder / "losses.npz", **{f"loss/{name}": values for name, values in fitted.record.terms.items()}
-    )
+    losses = {f"loss/{name}": values for name, values in fitted.record.terms.items()}
+    npz.save(folder / "losses.npz", compress=False, **losses)
 
 
 def write_exported(

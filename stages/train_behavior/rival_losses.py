@@ -32,7 +32,7 @@ def gaussian_losses(
     generator: torch.Generator,
     *,
     phase: TrainingPhase = "all",
-) -> dict[str, Tensor]:
+) -> dict[str, Float[Tensor, ""]]:
     """Return the negative log-likelihood per number of goal, path and body, each given the level above it."""
     del schedule
     with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
@@ -76,7 +76,7 @@ def one_stage_losses(
     generator: torch.Generator,
     *,
     phase: TrainingPhase = "all",
-) -> dict[str, Tensor]:
+) -> dict[str, Float[Tensor, ""]]:
     """Return the denoising errors of path and body as one sequence without control; perception learns with
     them.
     """

@@ -85,7 +85,7 @@ def train_ablations(
         made = initialized(lambda spec=spec: longterm_networks.build(spec, sizes), config)
         if made.base is not None:
             training.fit_base(made.base, clips, trainer, config.pose, name)
-        else:
+        elif made.route is not None and made.pose is not None:
             key = (spec.sees_scene, spec.route_turns, spec.paper)
             if key not in routes:
                 training.fit_route(made.route, clips, trainer, config.route, f"{name}_route")

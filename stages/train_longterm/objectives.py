@@ -15,11 +15,12 @@ from pipeline.longterm.networks import ROOT_CHANNELS
 
 
 def route_error(
-    made: Float[Tensor, "batch frame 9"], truth: Float[Tensor, "batch frame 9"]
-) -> tuple[Tensor, Tensor]:
-    """Return the mean L1 distance of t (metres) and of r."""
-    return (made[..., :3] - truth[..., :3]).abs().mean(), (
-        made[..., 3:ROOT_CHANNELS] - truth[..., 3:ROOT_CHANNELS]
+    made: Float[Tensor, "*batch channel"], truth: Float[Tensor, "*batch known"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Return the mean L1 distance of t (metres) and of r (6D rotations, no unit), the first nine channels."""
+    shift, turn = slice(0, 3), slice(3, ROOT_CHANNELS)
+    return (made[..., shift] - truth[..., shift]).abs().mean(), (
+        made[..., turn] - truth[..., turn]
     ).abs().mean()
 
 
@@ -27,7 +28,7 @@ def pose_error(
     made: Float[Tensor, "*batch pose"],
     truth: Float[Tensor, "*batch pose"],
     lever: Float[Tensor, "pose channel"],
-) -> Tensor:
+) -> Float[Tensor, ""]:
     """Return the mean L1 distance between the bones' channels that p stands for, metres (radians at a lever
     of 0.1 m).
     """
@@ -40,7 +41,9 @@ def lever_of(poses: PoseSpace, lever_m: float = 0.1) -> Float[Tensor, "pose chan
     return poses.basis * scale
 
 
-def kl_divergence(mean: Float[Tensor, "batch latent"], log_variance: Float[Tensor, "batch latent"]) -> Tensor:
+def kl_divergence(
+    mean: Float[Tensor, "batch latent"], log_variance: Float[Tensor, "batch latent"]
+) -> Float[Tensor, ""]:
     """Return the mean KL divergence of N(mean, variance) from the standard normal distribution, per number of
     z.
     """
@@ -64,9 +67,9 @@ def scene_errors(
     scenes: list[SignedDistance],
     contacts: ContactVertices,
     count: int,
-) -> tuple[Tensor, Tensor]:
-    """Return mean collision and contact error; the last vertices, from ``count`` on, are the contact
-    vertices.
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Return mean collision and contact error, metres; the last vertices, from ``count`` on, are the contact
+    vertices. Vertices are in the world; ``scene`` numbers the scene of each body.
     """
     distance = torch.zeros(vertices.shape[:2])
     for index, each in enumerate(scenes):

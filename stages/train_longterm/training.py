@@ -1,12 +1,12 @@
 """Fit the networks of long-term motion in turn: static bodies, routes, then poses along fixed routes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor, nn
 
@@ -76,7 +76,7 @@ class NetworkTrainer:
         name: str,
         net: nn.Module,
         optimizer_config: LongTermOptimizerConfig,
-        loss: Callable[[Tensor], dict[str, Tensor]],
+        loss: Callable[[Int[Tensor, "batch"]], dict[str, Float[Tensor, ""]]],
         examples: int,
     ) -> FitRecord:
         """Fit one network in place to random batches of examples."""
@@ -115,12 +115,21 @@ def fit_route(
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
-        shift, turn = map(sum, zip(*(objectives.route_error(each, truth) for each in made), strict=True))
+        shift, turn = _summed_route_errors(made, truth)
         return {"translation": w.translation * shift} | (
             {"rotation": w.rotation * turn} if net.predicts_rotation else {}
         )
 
     return trainer.fitted(name, net, optimizer_config, loss, len(clips))
+
+
+def _summed_route_errors(
+    made: Sequence[Float[Tensor, "clip frame channel"]], truth: Float[Tensor, "clip frame channel"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Return translation and rotation error of a route, its draft's added."""
+    errors = [objectives.route_error(each, truth) for each in made]
+    shift, turn = (sum(parts, start=torch.zeros(())) for parts in zip(*errors, strict=True))
+    return shift, turn
 
 
 def predicted_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:
@@ -184,20 +193,14 @@ def fit_base(
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
-        shift, turn = map(
-            sum,
-            zip(
-                *(
-                    objectives.route_error(each[..., :ROOT_CHANNELS], truth[..., :ROOT_CHANNELS])
-                    for each in made
-                ),
-                strict=True,
-            ),
+        shift, turn = _summed_route_errors(
+            [each[..., :ROOT_CHANNELS] for each in made], truth[..., :ROOT_CHANNELS]
         )
-        pose = sum(
+        errors = [
             objectives.pose_error(each[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
             for each in made
-        )
+        ]
+        pose = sum(errors, start=torch.zeros(()))
         return {"translation": w.translation * shift, "rotation": w.rotation * turn, "pose": w.pose * pose}
 
     return trainer.fitted(name, net, optimizer_config, loss, len(clips))

@@ -9,6 +9,7 @@ from jaxtyping import UInt8
 from pipeline.backends import raft
 from stages.estimate_flow.estimation import Dense, Estimator, chain
 
+Color = UInt8[np.ndarray, "working_height working_width 3"]
 UPDATES = 20
 """iterations of the network, updates of the flow: its authors evaluate with 24 to 32; the last ones change
 little"""
@@ -22,24 +23,20 @@ class RaftEstimator(Estimator):
         super().__init__(color_size, working_side_px)
         self._network = network
 
-    def reduce(
-        self, color: UInt8[np.ndarray, "height width 3"]
-    ) -> UInt8[np.ndarray, "working_height working_width 3"]:
+    def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> Color:
         """Reduce a picture to the working size."""
         height, width = self.dense_size
         return cv2.resize(color, (2 * width, 2 * height), interpolation=cv2.INTER_AREA)
 
-    def neighbours(self, first: np.ndarray, second: np.ndarray) -> Dense:
+    def neighbours(self, first: Color, second: Color) -> Dense:
         """Estimate from nothing."""
         return self._estimated(first, second, None)
 
-    def chained(
-        self, first: np.ndarray, last: np.ndarray, first_to_middle: Dense, middle_to_last: Dense
-    ) -> Dense:
+    def chained(self, first: Color, last: Color, first_to_middle: Dense, middle_to_last: Dense) -> Dense:
         """Follow one flow, then the other, and let the network go on from there."""
         return self._estimated(first, last, chain(first_to_middle, middle_to_last))
 
-    def _estimated(self, first: np.ndarray, second: np.ndarray, guess: Dense | None) -> Dense:
+    def _estimated(self, first: Color, second: Color, guess: Dense | None) -> Dense:
         start = (
             None
             if guess is None

@@ -187,7 +187,7 @@ def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
 
 def _interval(values: Mapping[str, float | None], name: str, form: str, scale: float = 1.0) -> str:
     mean, low, high = (
-        None if values.get(name + end) is None else scale * values[name + end]
+        None if (value := values.get(name + end)) is None else scale * value
         for end in ("", "_ci95_low", "_ci95_high")
     )
     return f"{formatted(mean, form)} [{formatted(low, form)}, {formatted(high, form)}]"

@@ -78,7 +78,9 @@ def _follow(
         before.append((cv2.imencode(".png", mask.labels)[1].tobytes(), mask.visible, mask.confidence))
     while len(before) > 1:
         png, visible, confidence = before.pop()
-        yield Mask(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), visible, confidence)
+        labels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert labels is not None, "a PNG of our own"
+        yield Mask(labels, visible, confidence)
     for log_odds, presence in tracker.track(clip.color, range(start, len(clip)), box_px):
         yield labelled(log_odds, presence, UNSURE)
 

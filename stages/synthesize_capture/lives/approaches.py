@@ -70,7 +70,7 @@ def scripted(home: Dwelling, rng: np.random.Generator, count: int) -> ScriptedAp
         person = Observer(floor, near[rng.integers(len(near))], rng.spawn(1)[0])
         windows.append(_pair(animal, person, rng.uniform(0.9, 1.2)))
     columns = [np.stack([[pair[twin][part] for pair in windows] for twin in (0, 1)]) for part in range(3)]
-    return ScriptedApproaches(*columns, volume_of(home))
+    return ScriptedApproaches(*columns, volume=volume_of(home))
 
 
 def _pair(animal: Policy, person: Observer, speed_m_s: float) -> tuple[tuple[np.ndarray, ...], ...]:

@@ -16,6 +16,7 @@ from pipeline.geometry.meshes import Mesh
 from pipeline.metrics.surface_distance import TriangleSurface, chamfer, split
 from stages.evaluate import reconstruction
 from stages.evaluate.config import Config
+from stages.evaluate.reading import Reconstructed
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
 FRAMES = 6
@@ -95,7 +96,13 @@ def test_the_share_of_frames_in_which_the_animal_is_compared_is_told(tmp_path: P
         "v002": motion_of(np.array([0.9, 0.9, 0.9, INTERPOLATED, INTERPOLATED, INTERPOLATED])),
         "v003": None,
     }
-    folders = SimpleNamespace(reconstruction=tmp_path, truth=tmp_path / "truth")
+    folders = Reconstructed(
+        frames={},
+        scene_template=tmp_path,
+        agent_template=tmp_path,
+        reconstruction=tmp_path,
+        truth=tmp_path / "truth",
+    )
     config, frames = Config(surface_frames=FRAMES), SimpleNamespace(world_from_true_world=np.eye(4))
     values = reconstruction._agent_chamfer(folders, sessions, motions, frames, config, RNG).values
     assert values["reconstruction/agent_chamfer_share"] == pytest.approx(3 / 12)

@@ -27,9 +27,8 @@ def session() -> Sequence4D:
     root[:, 2, 3] = 1.0
     masks = _Masks([np.where(np.indices(SIZE)[1] > 80, 255, 0).astype(np.uint8)] * 4)
     cells = (3, SIZE[0] // 4, SIZE[1] // 4)
-    recording = DrawnRecording(
-        "v0", plain.recording.clip, masks, np.zeros((*cells, 2), np.float16), np.full(cells, 255, np.uint8)
-    )
+    flow = np.zeros((*cells, 2), np.float16), np.full(cells, 255, np.uint8)
+    recording = DrawnRecording("v0", plain.recording.clip, masks, flow)
     motion = replace(plain.motion, world_from_agent=root, agent_from_bone=np.tile(np.eye(4), (4, 1, 1, 1)))
     return replace(plain, recording=recording, motion=motion)
 
