@@ -72,19 +72,10 @@ def build(
         clip, frames, keyframes, start.world_from_camera[frames], trusted, config.refinement
     )
     poses = anchor.propagate(clip, frames, keys)
-    normals = np.concatenate(
-        [
-            (k.normals.reshape(-1, 3)[k.scan.pixel_index]) @ p[:3, :3].T
-            for k, p in zip(keyframes, keys, strict=True)
-        ]
-    )
-    points = np.concatenate(
-        [rigid.apply(p, k.scan.points_camera) for k, p in zip(keyframes, keys, strict=True)]
-    )
-    known = np.abs(normals).sum(1) > 0
-    if known.sum() < LEAST_POINTS:
+    points, normals = _measured(keyframes, keys)
+    if len(points) < LEAST_POINTS:
         raise _no_surface(clip)
-    upright_from_world, gravity = anchor.upright(clip, poses, points[known], normals[known])
+    upright_from_world, gravity = anchor.upright(clip, poses, points, normals)
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, config.fusion)
     if len(mesh.faces) < LEAST_POINTS:
         raise _no_surface(clip)
@@ -107,6 +98,17 @@ def build(
         scale=clip.scale,
     )
     return made, sparse
+
+
+def _measured(
+    keyframes: list[refine.Keyframe], world_from_camera: Float[np.ndarray, "key 4 4"]
+) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, "point 3"]]:
+    """Return the keyframes' measured points that have a normal, and the normals, in the world."""
+    pairs = list(zip(keyframes, world_from_camera, strict=True))
+    normals = np.concatenate([k.normals.reshape(-1, 3)[k.scan.pixel_index] @ p[:3, :3].T for k, p in pairs])
+    points = np.concatenate([rigid.apply(p, k.scan.points_camera) for k, p in pairs])
+    known = np.abs(normals).sum(1) > 0
+    return points[known], normals[known]
 
 
 def _no_surface(clip: Clip) -> InputError:

@@ -120,25 +120,18 @@ def build(
     height, width = (max(video.store.views.depth.shape[axis] for video in videos) for axis in (1, 2))
     store = join((usable(video) for video in videos), scratch, (height, width))
     lengths = [len(video.timestamp_s) for video in videos]
-    camera = np.concatenate([interpolated(video.timestamp_s, video.world_from_camera) for video in videos])
-    roots, inliers = zip(*(without_outliers(video) for video in videos), strict=True)
-    agent = np.concatenate(
-        [interpolated(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)]
-    )
-    rooted = torch.from_numpy(np.concatenate([np.isfinite(root).all((1, 2)) for root in roots]))
-    trust = torch.from_numpy(np.where(np.concatenate(inliers), 1.0, OUTLIER_MASK_WEIGHT)).float()
-    trust *= mask_weights(store.views)
+    start = _starting_poses(videos)
     vertices = template.mesh.vertices
     low, high = corner(vertices.min(0) - AGENT_MARGIN_M), corner(vertices.max(0) + AGENT_MARGIN_M)
     agent_shape = FieldShape(
         low, high, sizes.agent_voxel_m, GRID_CHANNELS, sizes.width, encoding=sizes.encoding
     )
     rest = torch.from_numpy(template.agent_from_bone_rest).float()
-    by_frame = RaysByFrame.of(store.agent.frame, len(camera))
-    usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
+    by_frame = RaysByFrame.of(store.agent.frame, sum(lengths))
+    usable_frames = torch.nonzero(start.rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
     free = [video.camera_free for video in videos]
-    motion = MotionTable(torch.from_numpy(camera), torch.from_numpy(agent), rest, lengths, free, KNOT_FRAMES)
+    motion = MotionTable(start.camera, start.agent, rest, lengths, free, KNOT_FRAMES)
     body = ArticulatedBody(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape)
     surface = TemplateSurface.of(template.mesh, template.feature, np.random.default_rng(seed))
     with torch.no_grad():
@@ -157,11 +150,37 @@ def build(
         tree=tree,
         agent_frames=usable_frames,
         agent_rays=by_frame,
-        trust=trust,
+        trust=start.trust * mask_weights(store.views),
         camera_precision=prior_precision(motion, np.concatenate([video.confidence for video in videos])),
         floor_m=floor_m,
     )
     return problem if device == "cpu" else _moved(problem, device)
+
+
+@dataclass(frozen=True)
+class _StartingPoses:
+    """Registered poses of all videos' frames in one row, unknown ones interpolated."""
+
+    camera: Float[Tensor, "frame 4 4"]
+    agent: Float[Tensor, "frame 4 4"]
+    rooted: Bool[Tensor, "frame"]
+    """the agent's root is known"""
+    trust: Float[Tensor, "frame"]
+    """weight of the mask: small where the root was an outlier"""
+
+
+def _starting_poses(videos: Sequence[RegisteredVideo]) -> _StartingPoses:
+    camera = [interpolated(video.timestamp_s, video.world_from_camera) for video in videos]
+    roots, inliers = zip(*(without_outliers(video) for video in videos), strict=True)
+    agent = [interpolated(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)]
+    rooted = [np.all(np.isfinite(root), axis=(1, 2)) for root in roots]
+    trust = np.where(np.concatenate(inliers), 1.0, OUTLIER_MASK_WEIGHT)
+    return _StartingPoses(
+        torch.from_numpy(np.concatenate(camera)),
+        torch.from_numpy(np.concatenate(agent)),
+        torch.from_numpy(np.concatenate(rooted)),
+        torch.from_numpy(trust).float(),
+    )
 
 
 def corner(point: Float[np.ndarray, "3"]) -> Corner:

@@ -71,84 +71,45 @@ def scripts(config: Config, room: Room, phone: PhoneFormat = PHONE) -> list[Scri
         np.random.default_rng([config.seed, 1]).spawn(4 * config.session_count + 16 + config.foreign_sessions)
     )
     day = light.light_of_session(next(streams), "day")
-    rng = next(streams)
-    out = [
-        _script(
-            phone,
-            rng,
-            "walkthrough",
-            room,
-            day,
-            camera_motion.walkthrough(room, rng, config.walkthrough_s),
-            config.walkthrough_s,
-        )
-    ]
-    rng = next(streams)
-    course = session.standing_course(room, rng, config.turnaround_s)
-    out.append(
-        _script(
-            phone,
-            rng,
-            "turnaround",
-            room,
-            day,
-            camera_motion.turnaround(course, rng),
-            config.turnaround_s,
-            course=course,
-        )
-    )
+    rng, seconds = next(streams), config.walkthrough_s
+    path = camera_motion.walkthrough(room, rng, seconds)
+    walkthrough = _script(phone, rng, "walkthrough", room, day, path, seconds)
+    rng, seconds = next(streams), config.turnaround_s
+    course = session.standing_course(room, rng, seconds)
+    path = camera_motion.turnaround(course, rng)
+    turnaround = _script(phone, rng, "turnaround", room, day, path, seconds, course=course)
+    sessions = _sessions(config, room, phone, streams)
+    return [walkthrough, turnaround, *sessions, *_foreign(config, phone, streams)]
+
+
+def _sessions(
+    config: Config, room: Room, phone: PhoneFormat, streams: Iterator[np.random.Generator]
+) -> Iterator[Script]:
+    """Write the sessions of this home, and the second phone of one."""
+    hours: dict[int, Hour] = {config.dim_session: "evening", config.harsh_session: "sunset"}
     for number in range(1, config.session_count + 1):
-        rng = next(streams)
+        rng, name, hour = next(streams), f"session-{number}", hours.get(number, "day")
         seconds = config.test_session_s if number == config.session_count else config.session_s
         arranged = room.arranged(rng)
-        hours: dict[int, Hour] = {config.dim_session: "evening", config.harsh_session: "sunset"}
-        hour = hours.get(number, "day")
         lit = light.light_of_session(rng, hour)
         lived = session.simulate_session(arranged, rng, seconds)
-        path = camera_motion.filming(lived, rng)
-        turns = 1 if number == config.sideways_session else 0
-        out.append(
-            _script(
-                phone,
-                rng,
-                f"session-{number}",
-                arranged,
-                lit,
-                path,
-                seconds,
-                course=lived.animal,
-                lived=lived,
-                hour=hour,
-                turns=turns,
-            )
-        )
+        path, turns = camera_motion.filming(lived, rng), int(number == config.sideways_session)
+        seen = {"course": lived.animal, "hour": hour}
+        yield _script(phone, rng, name, arranged, lit, path, seconds, lived=lived, turns=turns, **seen)
         rng = next(streams)
         if number == config.heldout_of:
             path = camera_motion.bystanding(lived, arranged, rng)
-            out.append(
-                _script(phone, rng, "heldout", arranged, lit, path, seconds, course=lived.animal, hour=hour)
-            )
-    return [*out, *_foreign(config, phone, streams)]
+            yield _script(phone, rng, "heldout", arranged, lit, path, seconds, **seen)
 
 
 def _foreign(config: Config, phone: PhoneFormat, streams: Iterator[np.random.Generator]) -> Iterator[Script]:
     """Write the sessions of other homes; those of this one are the same with and without them."""
     for number in range(config.session_count + 1, config.session_count + config.foreign_sessions + 1):
-        rng = next(streams)
+        rng, name, seconds = next(streams), f"session-{number}", config.session_s
         home = dwellings.filmed_elsewhere(rng)
-        lived = session.simulate_session(home, rng, config.session_s)
+        lived = session.simulate_session(home, rng, seconds)
         lit, path = light.light_of_session(rng, "day"), camera_motion.filming(lived, rng)
-        yield _script(
-            phone,
-            rng,
-            f"session-{number}",
-            home,
-            lit,
-            path,
-            config.session_s,
-            course=lived.animal,
-            lived=lived,
-        )
+        yield _script(phone, rng, name, home, lit, path, seconds, course=lived.animal, lived=lived)
 
 
 def _script(

@@ -6,7 +6,7 @@ image from a view at twice the image's size: pixels whose four samples agree are
 times.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,9 +18,10 @@ from stages.synthesize_capture.sheets import Sheet, triangles
 RADIANCE_RANGE = 2.0
 
 
-@dataclass(frozen=True)
-class Backdrop:
+class Backdrop(NamedTuple):
     """The lit room: mesh, picture coordinates per face corner, and the atlas of mip maps.
+
+    A named tuple, as `Coat`, because compiled functions take those.
 
     ``levels`` holds start, height and width of each sheet's maps in the flat atlas.
     """
@@ -68,8 +69,7 @@ def backdrop(sheets: list[Sheet], lit: list[UInt8[np.ndarray, "height width 3"]]
     )
 
 
-@dataclass(frozen=True)
-class Coat:
+class Coat(NamedTuple):
     """The animal in one frame: faces, rest points, light per vertex, and balls that shade the ground."""
 
     faces: Int[np.ndarray, "face 3"]
@@ -83,9 +83,9 @@ class Coat:
 
 
 def shade(
-    view_face,
-    inverse_corners,
-    focal_center,
+    view_face: Int[np.ndarray, "rows columns"],
+    inverse_corners: Float[np.ndarray, "face 3 3"],
+    focal_center: tuple[float, float, float, float],
     room: Backdrop,
     coat: Coat,
     camera_from_world: Float[np.ndarray, "4 4"],
@@ -97,51 +97,20 @@ def shade(
     """
     height, width = view_face.shape[0] // 2, view_face.shape[1] // 2
     out = np.zeros((height, width, 3), np.float32)
-    normals_camera = (room.normals @ camera_from_world[:3, :3].T).astype(np.float32)
+    in_camera = room._replace(normals=(room.normals @ camera_from_world[:3, :3].T).astype(np.float32))
     surface = np.concatenate([room.owner, np.full(len(coat.faces), len(room.levels), np.int32)])
-    _shade(
-        view_face,
-        inverse_corners,
-        np.asarray(focal_center, float),
-        surface,
-        room.corners,
-        room.atlas,
-        room.levels,
-        room.texels_per_m,
-        normals_camera,
-        coat.faces,
-        coat.rest,
-        coat.light,
-        coat.pattern,
-        coat.shadow,
-        out,
-    )
+    _shade(view_face, inverse_corners, np.asarray(focal_center, float), surface, in_camera, coat, out)
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def _shade(
-    view_face,
-    inverse_corners,
-    focal_center,
-    surface,
-    corners,
-    atlas,
-    levels,
-    density,
-    normals,
-    coat_faces,
-    rest,
-    light,
-    pattern,
-    shadow,
-    out,
-):
+def _shade(view_face, inverse_corners, focal_center, surface, room, coat, out):
+    """Add the light of every pixel to ``out``; the room's normals are in the camera."""
     height, width, _ = out.shape
     fx, fy, cx, cy = focal_center
     pixel = np.empty(3, np.float32)
-    bounds = _shadow_bounds(shadow, focal_center, height, width)
-    room_faces = corners.shape[0]
+    bounds = _shadow_bounds(coat.shadow, focal_center, height, width)
+    room_faces = room.corners.shape[0]
     for i in range(height):
         for j in range(width):
             first = view_face[2 * i, 2 * j]
@@ -163,27 +132,11 @@ def _shade(
                 z = 1.0 / max(a + b + c, 0.05)
                 a, b, c = a * z, b * z, c * z
                 if face >= room_faces:
-                    _fur(coat_faces[face - room_faces], a, b, c, rest, light, pattern, z / fx, pixel)
+                    _fur(coat.faces[face - room_faces], a, b, c, coat, z / fx, pixel)
                 else:
-                    _sample(
-                        face,
-                        a,
-                        b,
-                        c,
-                        x,
-                        y,
-                        z,
-                        fx,
-                        surface[face],
-                        corners,
-                        atlas,
-                        levels,
-                        density,
-                        normals,
-                        pixel,
-                    )
+                    _sample(face, a, b, c, x, y, z, fx, surface[face], room, pixel)
                     if bounds[0] <= i < bounds[1] and bounds[2] <= j < bounds[3]:
-                        dark = _shadow(x * z, y * z, z, normals[face], shadow)
+                        dark = _shadow(x * z, y * z, z, room.normals[face], coat.shadow)
                         for channel in range(3):
                             pixel[channel] *= dark
                 for channel in range(3):
@@ -191,12 +144,13 @@ def _shade(
 
 
 @njit(cache=True, error_model="numpy")
-def _sample(face, a, b, c, x, y, z, fx, sheet, corners, atlas, levels, density, normals, pixel):
+def _sample(face, a, b, c, x, y, z, fx, sheet, room, pixel):
     """Sample the sheet's picture with trilinear filtering into ``pixel`` (linear)."""
+    corners, atlas, levels, normals = room.corners, room.atlas, room.levels, room.normals
     u = a * corners[face, 0, 0] + b * corners[face, 1, 0] + c * corners[face, 2, 0]
     v = a * corners[face, 0, 1] + b * corners[face, 1, 1] + c * corners[face, 2, 1]
     slope = abs(normals[face, 0] * x + normals[face, 1] * y + normals[face, 2]) / np.sqrt(x * x + y * y + 1.0)
-    footprint = z / fx * density[sheet] / np.sqrt(max(slope, 0.12))
+    footprint = z / fx * room.texels_per_m[sheet] / np.sqrt(max(slope, 0.12))
     level = min(max(np.log2(max(footprint, 1e-3)), 0.0), 6.0)
     low = int(level)
     blend = level - low
@@ -224,8 +178,9 @@ def _sample(face, a, b, c, x, y, z, fx, sheet, corners, atlas, levels, density, 
 
 
 @njit(cache=True, error_model="numpy")
-def _fur(corner, a, b, c, rest, light, pattern, footprint, pixel):
+def _fur(corner, a, b, c, coat, footprint, pixel):
     """Blend base colour and light, and add the fine fur that the footprint (metres a pixel) can resolve."""
+    rest, light, pattern = coat.rest, coat.light, coat.pattern
     a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
     total = a + b + c
     a, b, c = a / total, b / total, c / total

@@ -1,6 +1,7 @@
 """What the quality page of the tables shows: errors of all methods, and the figures against their bars."""
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,86 +16,71 @@ QUALITY = {
     "bad": "a rival ahead, feet that slide, bodies inside furniture",
 }
 RIVALS = ("base", "route_cvae", "nearest")
+OPTIMIZED, SAMPLES, MINUTES = "longterm/ours_opt", "longterm_samples", "longterm_minutes"
+BARS: tuple[tuple[str, str | tuple[str, str], str, float, Literal["lower", "higher"]], ...] = (
+    ("non-collision, optimised", f"{OPTIMIZED}/non_collision", "share", 0.995, "higher"),
+    ("contact, optimised", f"{OPTIMIZED}/contact", "share", 0.97, "higher"),
+    ("foot slide, optimised", f"{OPTIMIZED}/slide_m_s", "m/s", 0.01, "lower"),
+    (
+        "MPVPE, optimised against not",
+        (f"{OPTIMIZED}/mpvpe_mm", "longterm/ours_same/mpvpe_mm"),
+        "",
+        1.2,
+        "lower",
+    ),
+    (
+        "distance of the ends from the given bodies, optimised",
+        f"{OPTIMIZED}/end_v2v_share",
+        "of body length",
+        0.006,
+        "lower",
+    ),
+    (
+        "neighbour v2v where two motions join, beyond their own, optimised",
+        f"{OPTIMIZED}/seam_share",
+        "of body length",
+        0.006,
+        "lower",
+    ),
+    *(
+        (f"samples: {words} left", (f"{SAMPLES}/{name}", f"{SAMPLES}/{before}"), "", warn, "lower")
+        for words, name, before, warn in (
+            ("penetration", "penetration_m", "penetration_before_m", 0.5),
+            ("slide", "slide_m_s", "slide_before_m_s", 0.5),
+            ("goal error", "goal_error_m", "goal_error_before_m", 1.03),
+            ("path error", "path_error_m", "path_error_before_m", 1.03),
+        )
+    ),
+    ("minutes: largest seam", f"{MINUTES}/largest_seam_m", "m", 0.02, "lower"),
+    ("minutes: outside of the room", f"{MINUTES}/outside_room_m", "m", 0.01, "lower"),
+    ("minutes: deepest vertex inside something", f"{MINUTES}/deepest_m", "m", 0.02, "lower"),
+)
+"""What is judged: name, metric or pair of metrics, unit, the bar, and which way is better."""
 
 
 def checks(figures: Mapping[str, float | None]) -> list[Check]:
-    """Judge the figures by the bars of long-term motion."""
+    """Judge the figures by the bars of long-term motion; a pair of metrics is judged by its ratio."""
 
-    def of(name: str) -> float | None:
-        return figures.get(name)
-
-    def ratio(upper: str, lower: str) -> float | None:
-        above, below = of(upper), of(lower)
+    def of(metric: str | tuple[str, str]) -> float | None:
+        if isinstance(metric, str):
+            return figures.get(metric)
+        above, below = (figures.get(name) for name in metric)
         return None if above is None or not below else above / below
 
-    found = [
-        Check(
-            f"MPJPE against {rival}", ratio("longterm/ours/mpjpe_mm", f"longterm/{rival}/mpjpe_mm"), "", 1.0
-        )
+    compared = [
+        (f"MPJPE against {rival}", ("longterm/ours/mpjpe_mm", f"longterm/{rival}/mpjpe_mm"))
         for rival in RIVALS
+    ] + [
+        (
+            f"translation against blind to the scene: {name}",
+            (f"longterm/{name}/translation", f"longterm/{blind}/translation"),
+        )
+        for name, blind in WITHOUT_SCENE.items()
     ]
-    found += [
-        *(
-            Check(
-                f"translation against blind to the scene: {name}",
-                ratio(f"longterm/{name}/translation", f"longterm/{blind}/translation"),
-                "",
-                1.0,
-            )
-            for name, blind in WITHOUT_SCENE.items()
-        ),
-        Check(
-            "non-collision, optimised", of("longterm/ours_opt/non_collision"), "share", 0.995, better="higher"
-        ),
-        Check("contact, optimised", of("longterm/ours_opt/contact"), "share", 0.97, better="higher"),
-        Check("foot slide, optimised", of("longterm/ours_opt/slide_m_s"), "m/s", 0.01),
-        Check(
-            "MPVPE, optimised against not",
-            ratio("longterm/ours_opt/mpvpe_mm", "longterm/ours_same/mpvpe_mm"),
-            "",
-            1.2,
-        ),
-        Check(
-            "distance of the ends from the given bodies, optimised",
-            of("longterm/ours_opt/end_v2v_share"),
-            "of body length",
-            0.006,
-        ),
-        Check(
-            "neighbour v2v where two motions join, beyond their own, optimised",
-            of("longterm/ours_opt/seam_share"),
-            "of body length",
-            0.006,
-        ),
-        Check(
-            "samples: penetration left",
-            ratio("longterm_samples/penetration_m", "longterm_samples/penetration_before_m"),
-            "",
-            0.5,
-        ),
-        Check(
-            "samples: slide left",
-            ratio("longterm_samples/slide_m_s", "longterm_samples/slide_before_m_s"),
-            "",
-            0.5,
-        ),
-        Check(
-            "samples: goal error left",
-            ratio("longterm_samples/goal_error_m", "longterm_samples/goal_error_before_m"),
-            "",
-            1.03,
-        ),
-        Check(
-            "samples: path error left",
-            ratio("longterm_samples/path_error_m", "longterm_samples/path_error_before_m"),
-            "",
-            1.03,
-        ),
-        Check("minutes: largest seam", of("longterm_minutes/largest_seam_m"), "m", 0.02),
-        Check("minutes: outside of the room", of("longterm_minutes/outside_room_m"), "m", 0.01),
-        Check("minutes: deepest vertex inside something", of("longterm_minutes/deepest_m"), "m", 0.02),
+    return [
+        *(Check(name, of(metrics), "", 1.0) for name, metrics in compared),
+        *(Check(name, of(metric), unit, warn, better=better) for name, metric, unit, warn, better in BARS),
     ]
-    return found
 
 
 def pictures(figures: Mapping[str, float | None]) -> list[Picture]:

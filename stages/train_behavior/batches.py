@@ -288,6 +288,29 @@ def with_posture_noise(
     return rigid_torch.so3_exp(tilt)[:, None] @ rotation, bones + bend[:, None]
 
 
+def _drawn_windows(
+    windows: TrainingWindows, augmentation: AugmentationConfig, size: int, generator: torch.Generator
+) -> tuple[Int[Tensor, "batch"], Bool[Tensor, "batch"]]:
+    """Draw windows with replacement; return them and which were drawn for an observer that comes up."""
+    index = torch.randint(len(windows), (size,), generator=generator)
+    wanted = torch.rand(size, generator=generator) < augmentation.approached
+    chosen = wanted & (len(windows.approached) > 0)
+    often = torch.randint(max(len(windows.approached), 1), (size,), generator=generator)
+    index[chosen] = windows.approached[often[chosen]]
+    return index, chosen
+
+
+def _drawn_turns(
+    augmentation: AugmentationConfig, size: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch 3 3"]]:
+    """Draw which samples are mirrored (-1, else 1) and how each ego frame is turned about its up axis."""
+    mirrored, turned, share = (torch.rand(size, generator=generator) for _ in range(3))
+    jitter_rad = min(largest_turn_rad(augmentation), YAW_JITTER_RAD)
+    yaw = (share * 2 - 1) * torch.where(turned < augmentation.turn, torch.pi, jitter_rad)
+    side = 1.0 - 2.0 * (mirrored < augmentation.mirror).float()
+    return side, rigid_torch.so3_exp(torch.stack([torch.zeros(size), yaw, torch.zeros(size)], dim=-1))
+
+
 def draw_batch(
     windows: TrainingWindows,
     scene: SceneSampler,
@@ -304,20 +327,8 @@ def draw_batch(
     Without ``bodies``, which take the longest, those have no frames.
     """
     scaling, posed = statistics.scaling, slice(PAST, None if bodies else PAST)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
-
-    index = torch.randint(len(windows), (size,), generator=generator)
-    chosen = (uniform(size) < augmentation.approached) & (len(windows.approached) > 0)
-    often = torch.randint(max(len(windows.approached), 1), (size,), generator=generator)
-    index[chosen] = windows.approached[often[chosen]]
-    side = 1.0 - 2.0 * (uniform(size) < augmentation.mirror).float()
-    reach = torch.where(
-        uniform(size) < augmentation.turn, torch.pi, min(largest_turn_rad(augmentation), YAW_JITTER_RAD)
-    )
-    yaw = (uniform(size) * 2 - 1) * reach
-    turn = rigid_torch.so3_exp(torch.stack([torch.zeros(size), yaw, torch.zeros(size)], dim=-1))
+    index, chosen = _drawn_windows(windows, augmentation, size, generator)
+    side, turn = _drawn_turns(augmentation, size, generator)
     flip = torch.diag_embed(torch.stack([side, torch.ones(size), torch.ones(size)], dim=-1))
     new_from_old = flip @ turn.mT
     tracks = windows.tracks(index)
@@ -351,7 +362,7 @@ def draw_batch(
         observer.flatten(1),
         past.flatten(1),
         held,
-        ((uniform(size) >= augmentation.hide_bones) & (side > 0)).float(),
+        ((torch.rand(size, generator=generator) >= augmentation.hide_bones) & (side > 0)).float(),
         side < 0,
         chosen,
         track[:, -1],

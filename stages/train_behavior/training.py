@@ -88,16 +88,6 @@ def train(
         batch = draw_batch(windows, scene, statistics, how, size, generator, bodies=phase != "goals")
         return minimised(nets, batch, schedule, settings.objective, generator, phase=phase)
 
-    def after_step(step: int) -> None:
-        begun = step - goal_steps if step >= goal_steps else step
-        decay = min(optimization.average, (begun + 1) / (begun + AVERAGE_WARMUP_STEPS))
-        with torch.no_grad():
-            for mean, parameter in zip(average.parameters(), nets.parameters(), strict=True):
-                mean.lerp_(parameter, 1 - decay)
-        if step + 1 == goal_steps:
-            nets.perception.load_state_dict(average.perception.state_dict())
-            nets.goal.load_state_dict(average.goal.state_dict())
-
     record = fit(
         modules={"nets": nets, "average": average},
         optimizer=optimizer,
@@ -109,9 +99,23 @@ def train(
         schedule=lambda progress: two_cosines(progress, goal_steps / optimization.steps),
         label="behaviour",
         clip_norm=CLIP_NORM,
-        after_step=after_step,
+        after_step=lambda step: _average(average, nets, step, goal_steps, optimization.average),
     )
     return TrainedBehavior(rounded(average.eval()), statistics.scaling, record)
+
+
+def _average(
+    average: BehaviorNets, nets: BehaviorNets, step: int, goal_steps: int, most_decay: float
+) -> None:
+    """Move the average towards the weights; when the goals' phase ends, its nets take over the average."""
+    begun = step - goal_steps if step >= goal_steps else step
+    decay = min(most_decay, (begun + 1) / (begun + AVERAGE_WARMUP_STEPS))
+    with torch.no_grad():
+        for mean, parameter in zip(average.parameters(), nets.parameters(), strict=True):
+            mean.lerp_(parameter, 1 - decay)
+    if step + 1 == goal_steps:
+        nets.perception.load_state_dict(average.perception.state_dict())
+        nets.goal.load_state_dict(average.goal.state_dict())
 
 
 def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device: str) -> None:
