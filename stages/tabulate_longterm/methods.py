@@ -61,7 +61,7 @@ def route_cvae(
                 _with_pose(route[index], model), clips.world_from_clip[index], model.poses
             ).world_from_agent
             places = encode_places(
-                roots, [int(clips.scene[index])] * len(roots), dataset.scenes, model.sizes.points, rng
+                roots, np.full(len(roots), clips.scene[index]), dataset.scenes, model.sizes.points, rng
             )
             shape = torch.from_numpy(dataset.body.shape).float().expand(len(roots), -1)
             z = torch.from_numpy(rng.standard_normal(model.sizes.latent)).float().expand(len(roots), -1)
