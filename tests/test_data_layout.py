@@ -130,6 +130,14 @@ def test_arrays_are_as_promised(toy, name):
                     check_arrays(folder / file, row)
 
 
+@pytest.mark.toy
+def test_what_stands_beside_the_artifacts_is_told(toy):
+    beside = (ROOT / "data_layout.md").read_text().split("Beside the artifacts")[1].split("\n\n")[1]
+    cells = [row.strip("|").split(" | ")[0] for row in beside.splitlines()]
+    told = {name.split("/")[0] for cell in cells for name in re.findall(r"`([^`]+)`", cell)}
+    assert {path.name for path in toy.iterdir()} - {*dag.NODES, "variants", "tables"} <= told
+
+
 def check_arrays(path: Path, row: Row) -> None:
     with np.load(path, allow_pickle=False) as arrays:
         for name, axes, dtype, may_be_absent in row.arrays:

@@ -1,6 +1,7 @@
 """Serve a page on which the same things are clicked in sessions and in the walk-through.
 
-`evaluate` reads the clicks.
+`evaluate` reads the clicks. It has a command line of its own because it makes no artifact: it serves
+until it is stopped, and the file of clicks is the user's, beside the recordings.
 
 make annotate AGENT=luna        or: python -m stages.annotate build/luna --clicks captures/luna/clicks.json
 """

@@ -1,6 +1,7 @@
 """Check recordings before a build, in under a minute each.
 
-What each is, how good it is, and what to do better.
+What each is, how good it is, and what to do better. It has a command line of its own because
+it makes no artifact: it runs before there is a plan, and prints each verdict as soon as it is known.
 
 make capture-check AGENT=luna        or: python -m stages.check_captures captures/luna
 """
