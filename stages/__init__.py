@@ -1,1 +1,1 @@
-"""The rooms. Each `__main__.py` is a program of its own; `pipeline/workflow/dag.py` tells their order."""
+"""The rooms. Each `__main__.py` is a program of its own; `pipeline/workflow/dag.py` has their order."""

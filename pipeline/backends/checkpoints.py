@@ -2,7 +2,7 @@
 `transformers`.
 
 Nothing is downloaded: a missing library or checkpoint is an error that says where to get it. Pictures are
-prepared here, without torchvision, as the checkpoint's own `preprocessor_config.json` tells.
+prepared here, without torchvision, as the checkpoint's own `preprocessor_config.json` says.
 """
 
 import json
@@ -20,7 +20,7 @@ from pipeline.core.errors import InputError
 CONFIG = "config.json"
 PREPARATION = "preprocessor_config.json"
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's, where a checkpoint tells none"""
+"""ImageNet's, where a checkpoint has none"""
 
 
 def library() -> ModuleType:
@@ -66,11 +66,11 @@ class Preparation:
     std: tuple[float, float, float] = STD
     resample: int = Image.Resampling.BICUBIC
     size: Any = None
-    """as the checkpoint tells it"""
+    """as in the checkpoint"""
 
     @classmethod
     def read(cls, path: Path, resample: int) -> "Preparation":
-        """Read a checkpoint's own; ``resample`` is the method of its family where it tells none."""
+        """Read a checkpoint's own; ``resample`` is the method of its family where it has none."""
         file = path / PREPARATION
         table = json.loads(file.read_text()) if file.is_file() else {}
         table = table.get("image_processor", table)

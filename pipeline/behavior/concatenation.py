@@ -20,7 +20,7 @@ class ConcatenationUNet(UncontrolledUNet):
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
     ):
-        """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of what is told of a
+        """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of what is known of a
         path.
         """
         read = nn.Sequential(

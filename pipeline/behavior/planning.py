@@ -1,4 +1,4 @@
-"""PlanSamplingConfig plans: what the agent perceives goes in, goal, then path, then body come out (Fig. 3).
+"""Sampled plans: what the agent perceives goes in, goal, then path, then body come out (Fig. 3).
 
 `observe` turns a context into network inputs, `Sampler.plan` draws plans from them,
 `SampledPlan.world_from_agent` puts them into the world. Networks are met through `Networks`, which torch
@@ -269,7 +269,7 @@ class Sampler:
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan 56 3"]:
         """Draw paths to goals, and others for those that do not get there although the goal is all that
-        guidance tells.
+        guidance follows.
         """
         path = self.draw_paths(codes, goal, sampling, rng)
         for _ in range(sampling.max_path_draws - 1 if sampling.goal and sampling.guidance >= 1 else 0):

@@ -32,7 +32,7 @@ def join(device: str) -> None:
 
 
 def leave() -> bool:
-    """Leave the group; tell whether this process is the one that writes what was found."""
+    """Leave the group; return whether this process is the one that writes what was found."""
     leads = rank() == 0
     if distributed.is_initialized():
         distributed.destroy_process_group()

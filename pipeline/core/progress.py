@@ -20,21 +20,21 @@ def log(message: str) -> None:
 
 
 def track(iterable: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-    """Yield from `iterable` and tell how far it is; `total` is needed where it has no length."""
+    """Yield from `iterable` and report how far it is; `total` is needed where it has no length."""
     if total is None and isinstance(iterable, Sized):
         total = len(iterable)
     on_terminal = sys.stderr.isatty()
     pause = BAR_EVERY_S if on_terminal else LINE_EVERY_S
-    start = told = time.monotonic()
+    start = reported = time.monotonic()
     done = 0
     for item in iterable:
         yield item
         done += 1
         now = time.monotonic()
-        if now - told >= pause:
-            told = now
+        if now - reported >= pause:
+            reported = now
             _tell(label, done, total, now - start, on_terminal)
-    if on_terminal and told > start:
+    if on_terminal and reported > start:
         _tell(label, done, total, time.monotonic() - start, on_terminal)
         print(file=sys.stderr)
 

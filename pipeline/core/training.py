@@ -72,7 +72,7 @@ def fit(
     scalar or named, weighted, scalar terms. ``schedule`` maps progress 0..1 to a factor on each group's rate.
     Steps whose loss or gradient is not finite are skipped; three in a row fall back to the last checkpoint at
     half the rate, and the second such fall ends the run (exit 76, ``diagnosis.json`` in ``resume``).
-    ``asked_to_stop`` tells instead of signals whether to save and exit: several fits in threads share one
+    ``asked_to_stop`` says instead of signals whether to save and exit: several fits in threads share one
     `termination`. With ``shared``, all processes of `pipeline.core.distributed` minimise the mean of their
     losses; the first keeps checkpoints.
     """
@@ -149,18 +149,18 @@ class _Loop:
             p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None
         ]
         norm = torch.nn.utils.clip_grad_norm_(parameters, clip_norm or math.inf)
-        told = self._values_of(terms)
-        if torch.isfinite(norm) and math.isfinite(sum(told.values())):
+        values = self._values_of(terms)
+        if torch.isfinite(norm) and math.isfinite(sum(values.values())):
             self.optimizer.step()
             self.broken = 0
         else:
             self.broken += 1
             if self.broken >= BROKEN_IN_A_ROW:
-                self._fall_back(told, float(norm))
+                self._fall_back(values, float(norm))
                 return False
-        for name in self.terms | told:
+        for name in self.terms | values:
             self.terms.setdefault(name, [math.nan] * self.step).append(
-                told.get(name, math.nan) if self.broken == 0 else math.nan
+                values.get(name, math.nan) if self.broken == 0 else math.nan
             )
         self.step += 1
         return True
@@ -175,11 +175,11 @@ class _Loop:
         """Tell whether something is so in any of the processes."""
         return bool(distributed.total(torch.tensor(float(here)))) if self.shared else here
 
-    def _fall_back(self, told: Mapping[str, float], norm: float) -> None:
+    def _fall_back(self, values: Mapping[str, float], norm: float) -> None:
         diagnosis = {
             "step": self.step,
             "gradient_norm": repr(norm),
-            "terms": {name: repr(value) for name, value in told.items()},
+            "terms": {name: repr(value) for name, value in values.items()},
         }
         if self.rolled_back >= 1:
             if self.folder and self.rank == 0:
@@ -275,7 +275,7 @@ def _named(loss: Loss) -> NamedLoss:
 
 @contextlib.contextmanager
 def termination() -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether SIGTERM or SIGINT has come; the handlers live as long as the
+    """Yield a function that returns whether SIGTERM or SIGINT has come; the handlers live as long as the
     block.
     """
     came = []

@@ -76,7 +76,7 @@ def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
 
 
 def named(path: Path, flow: Flow = "recordings") -> str:
-    """Return a stranger's name for a message: with what is amiss with it, where that can be told."""
+    """Return a stranger's name for a message: with what is amiss with it, where that is known."""
     if not path.exists():
         return f"{path.name!r} (a link that leads nowhere)"
     inner = find(path, flow)
@@ -112,7 +112,7 @@ def extra_inputs(agent: str, names: Sequence[str]) -> list[Path]:
 
 
 def sidecars(agent: str, file: str, names: Sequence[str]) -> dict[str, Path]:
-    """Return, by name, those files that tell something of one recording and exist."""
+    """Return, by name, those files that belong to one recording and exist."""
     paths = {name: Path("captures", agent, f"{file}.{name}{SIDECAR}") for name in names}
     return {name: path for name, path in paths.items() if path.is_file()}
 

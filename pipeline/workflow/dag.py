@@ -77,7 +77,7 @@ class Node:
     role_dependencies: tuple[Role, ...] = ()
     """Roles whose set and split decide the result although no per-recording input depends on them."""
     fixed: dict[str, object] = field(default_factory=dict)
-    """Keys of the configuration that tell two nodes of one program apart."""
+    """Keys of the configuration that distinguish two nodes of one program."""
     version: int = 1
     """Raise it when results change although no code of the stage does."""
     threads: int = 1

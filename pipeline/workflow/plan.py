@@ -9,7 +9,7 @@ read.
 HOME is an agent, <agent>/variants/<name>, or <agent>/tables; TAKEN are names that no animal may have.
 
 Every check of the user's input happens before anything is written; a file is rewritten only when its content
-changes, so that its age tells Make what is to be looked at. Standard library only: it runs at every `make`.
+changes, so that Make sees by its age what to look at. Standard library only: it runs at every `make`.
 """
 
 import json

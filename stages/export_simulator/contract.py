@@ -18,7 +18,7 @@ VERSION = 3
 GOAL_CHOICES = (1, 4, 16)
 """Goals that a visitor may let the animal consider at once."""
 GOALS = 4
-"""Goals that are considered until a visitor chooses: a fan that can be told apart."""
+"""Goals that are considered until a visitor chooses: a fan wide enough to see apart."""
 FINE_STEPS = 50
 """Denoising steps of the finer of both choices, as in the paper."""
 _WALKING_M_S = 0.15
