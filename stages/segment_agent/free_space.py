@@ -1,8 +1,8 @@
 """Free space: a point that other frames saw through is not part of the still room.
 
 `References` keeps a fixed number of depth pictures spread over the recording, before and after any frame, so
-that an animal that rests for a while is recognised by the times when its place was empty. Votes cost O(references)
-a frame.
+that an animal that rests for a while is recognised by the times when its place was empty. Votes cost
+O(references) a frame.
 """
 
 from collections.abc import Callable
