@@ -6,10 +6,9 @@ files; the functions between define the channels of body and past. Plans are dra
 """
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, assert_never
+from typing import assert_never
 
 import numpy as np
 from jaxtyping import Float
@@ -131,7 +130,7 @@ class Scaling:
     """What turns ego-frame metres and radians into the unit-variance numbers that are diffused, and back."""
 
     goal_std: Float[np.ndarray, "3"]
-    stride_std: Float[np.ndarray, "#frame 4"]
+    velocity_std: Float[np.ndarray, "#frame 4"]
     """of strides, see `pipeline.behavior.path_encoding`: of all frames alike, or of each on its own"""
     path_std: Float[np.ndarray, "3 56"]
     """of places, as they condition the body, metres"""
@@ -150,7 +149,7 @@ class Scaling:
         self, scaled: Float[np.ndarray, "plan 4 frame"], start: Float[np.ndarray, "plan 3"]
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Return the paths in metres, from ``start`` on, that scaled strides lead along."""
-        return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.stride_std, start)
+        return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.velocity_std, start)
 
     def warped_path(
         self,
@@ -160,7 +159,7 @@ class Scaling:
     ) -> Float[np.ndarray, "plan 4 frame"]:
         """Return scaled strides that lead along other paths."""
         return np.swapaxes(
-            warped_path(np.swapaxes(scaled, 1, 2) * self.stride_std, start, path) / self.stride_std, 1, 2
+            warped_path(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, path) / self.velocity_std, 1, 2
         )
 
     def scaled_path(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan 3 frame"]:
@@ -234,21 +233,6 @@ def past_channels(
     return np.concatenate([root, bones], axis=-1).reshape(len(root), -1).astype(np.float32)
 
 
-EXPORTED_NAMES = {
-    "avoid_solid": "clear",
-    "body_noise_std": "body_spread",
-    "max_path_draws": "path_draws",
-    "observer_motion_ratio": "noticeable",
-    "blend_frames": "fade_frames",
-}
-"""Keys of the exported contract that differ from the names of the fields that they hold."""
-
-
-def exported(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings under the names that the exported contract gives them."""
-    return {EXPORTED_NAMES.get(name, name): value for name, value in settings.items()}
-
-
 def contract(
     architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: Float[np.ndarray, "bone 4 4"]
 ) -> dict:
@@ -282,19 +266,19 @@ def contract(
             "sampling": "nearest",
             "order": "channel, x, y, z",
         },
-        "strides": {
-            "numbers": PATH_CHANNELS,
-            "root_power": VELOCITY_POWER,
-            "goal_power": GOAL_LENGTH_POWER,
-            "breath": REST_DAMPING,
-            "faint_m2": MIN_SQUARED_M2,
-            "stays_m_s": REST_SPEED_M_S,
-            "reach_m": GOAL_TOLERANCE_M,
-            "reach": GOAL_TOLERANCE_SHARE,
+        "path_encoding": {
+            "channels": PATH_CHANNELS,
+            "velocity_power": VELOCITY_POWER,
+            "goal_length_power": GOAL_LENGTH_POWER,
+            "rest_damping": REST_DAMPING,
+            "min_squared_m2": MIN_SQUARED_M2,
+            "rest_speed_m_s": REST_SPEED_M_S,
+            "goal_tolerance_m": GOAL_TOLERANCE_M,
+            "goal_tolerance_share": GOAL_TOLERANCE_SHARE,
         },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
-        "sampling": exported(asdict(PlanSamplingConfig(method=schedule.method))),
+        "sampling": asdict(PlanSamplingConfig(method=schedule.method)),
     }
 
 

@@ -67,7 +67,7 @@ class WaypointUNet(ControlUNet):
     """A `ControlUNet` of velocity channels that reads the maps of all members at each noisy waypoint."""
 
     share: Tensor
-    stride_std: Tensor
+    velocity_std: Tensor
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class WaypointUNet(ControlUNet):
         self.ensemble_size, self.map_numbers = ensemble_size, READ * map_cells**2
         self.main.enter = nn.Conv1d(PATH_CHANNELS + ensemble_size * READ, self.main.block_widths[0], 1)
         self.register_buffer("share", torch.from_numpy(schedule.alpha_bar).float().sqrt(), persistent=False)
-        self.register_buffer("stride_std", torch.ones(frames, PATH_CHANNELS))
+        self.register_buffer("velocity_std", torch.ones(frames, PATH_CHANNELS))
 
     def unet_input(
         self,
@@ -101,6 +101,6 @@ class WaypointUNet(ControlUNet):
         self, x: Float[Tensor, "batch 4 frame"], t: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch frame 3"]:
         """Return where noisy strides are expected to lead, metres from the animal."""
-        strides = (self.share[t.long()][:, None, None] * x).mT * self.stride_std
+        strides = (self.share[t.long()][:, None, None] * x).mT * self.velocity_std
         root = strides[..., :3] * torch.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
         return (with_powered_length(root, 1 / VELOCITY_POWER) / RATE_HZ).cumsum(1)

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.behavior.config import ReplanningConfig
-from pipeline.behavior.model import exported
 from pipeline.data.glb import Skin
 from pipeline.geometry import rigid
 from stages.export_simulator.actions import SessionClip
@@ -90,7 +89,7 @@ def contract(
         ],
         "volume": volume,
         "controls": controls(behavior["sampling"]),
-        "chaining": exported(vars(ReplanningConfig())),
+        "replanning": vars(ReplanningConfig()),
         "behavior": behavior,
     }
 

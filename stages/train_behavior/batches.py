@@ -234,9 +234,9 @@ def statistics_from_windows(
         velocity_channels_from_path(tracks.root[:, PAST:], tracks.root[:, PAST - 1])[..., :3].double().numpy()
     )
     each = np.swapaxes(strides, 0, 1) if per_frame else strides.reshape(1, -1, 3)
-    stride_std = np.array([[*_spread(frame), 1.0] for frame in each])
+    velocity_std = np.array([[*_spread(frame), 1.0] for frame in each])
     scaling = Scaling(
-        _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER)), stride_std, path_std, *whole
+        _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER)), velocity_std, path_std, *whole
     )
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
     position = tracks.root[:, :PAST].std().clip(0.05).expand(3)
@@ -355,7 +355,8 @@ def draw_batch(
     device, future = scene.points.device, root[:, PAST:]
     track = with_powered_length(future, GOAL_LENGTH_POWER) / torch.from_numpy(scaling.goal_std).float()
     strides = (
-        velocity_channels_from_path(future, root[:, PAST - 1]) / torch.from_numpy(scaling.stride_std).float()
+        velocity_channels_from_path(future, root[:, PAST - 1])
+        / torch.from_numpy(scaling.velocity_std).float()
     )
     return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),

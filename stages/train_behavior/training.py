@@ -163,7 +163,7 @@ def initial_nets(
     if nets.goal.map is not None:
         nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
     if isinstance(nets.path, WaypointUNet):
-        nets.path.stride_std[:] = torch.from_numpy(scaling.stride_std)
+        nets.path.velocity_std[:] = torch.from_numpy(scaling.velocity_std)
     return nets
 
 

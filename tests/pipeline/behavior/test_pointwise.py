@@ -47,9 +47,9 @@ def test_a_goal_is_read_where_it_is_expected():
 
 def test_waypoints_are_where_strides_lead():
     net = WaypointUNet(1, CELLS, 12, 3, 5, 8, (1, 2, 4))
-    net.stride_std[:] = torch.tensor([0.7, 0.1, 0.7, 1.0])
+    net.velocity_std[:] = torch.tensor([0.7, 0.1, 0.7, 1.0])
     strides = np.random.default_rng(0).standard_normal((2, 12, 4)).astype(np.float32)
-    scaled = torch.from_numpy(strides / net.stride_std.numpy()).mT * STANDARD.alpha_bar[0] ** -0.5
+    scaled = torch.from_numpy(strides / net.velocity_std.numpy()).mT * STANDARD.alpha_bar[0] ** -0.5
     np.testing.assert_allclose(
         net.waypoints(scaled, torch.zeros(2)),
         path_from_velocity_channels(strides, np.zeros((2, 3))),

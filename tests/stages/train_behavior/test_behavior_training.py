@@ -207,7 +207,7 @@ def test_the_error_of_rectified_flow_is_that_of_noise_less_clean_sample():
 
 def test_strides_are_scaled_frame_by_frame_where_asked(windows):
     alike, each = (
-        statistics_from_windows(windows, 0.0, per_frame=per_frame).scaling.stride_std
+        statistics_from_windows(windows, 0.0, per_frame=per_frame).scaling.velocity_std
         for per_frame in (False, True)
     )
     assert alike.shape == (1, 4) and each.shape == (56, 4)
@@ -238,7 +238,7 @@ def test_a_model_that_reads_pointwise_is_written_and_read(data, tmp_path):
     outcome.write_trained(tmp_path, fitted, shape, Schedule(course="rectified"), REST)
     architecture, nets, scaling, schedule, _ = model.load(tmp_path)
     assert (architecture, schedule) == (shape, Schedule(course="rectified"))
-    np.testing.assert_allclose(scaling.stride_std, fitted.scaling.stride_std)
+    np.testing.assert_allclose(scaling.velocity_std, fitted.scaling.velocity_std)
     assert write_networks(tmp_path, nets.eval(), shape) < 1e-4
 
 

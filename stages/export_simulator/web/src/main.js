@@ -20,7 +20,7 @@ import { readPlaces, readPoint, readState, writeState } from './state.js';
 import { Stops, metres, placesText } from './stops.js';
 import { Support } from './support.js';
 import { BODY_M } from './avoidance.js';
-import { distance } from './strides.js';
+import { distance } from './path_encoding.js';
 import { Tags } from './tags.js';
 import { Take, save } from './take.js';
 import { Timeline, rootOf } from './timeline.js';
@@ -418,7 +418,7 @@ class Simulator {
   // noticeably. Replanned at every step, the goal would switch mid-walk; only a visitor's commands are
   // replanned at once.
   get due() {
-    const { reaction_frames: soonest, fade_frames: fade } = this.contract.chaining;
+    const { reaction_frames: soonest, blend_frames: fade } = this.contract.replanning;
     if (this.urgent) return true;
     const thinking = ((this.milliseconds ?? 0) / 1000 / TICK_S) * this.state.speed;
     if (this.timeline.ticksLeft(this.now) <= fade + thinking) return true;
@@ -433,7 +433,8 @@ class Simulator {
     const here = this.observer.pose();
     return (
       Boolean(this.state.observer) &&
-      distance(here, this.noticed) > this.contract.chaining.noticeable * distance(here, this.observer.animal)
+      distance(here, this.noticed) >
+        this.contract.replanning.observer_motion_ratio * distance(here, this.observer.animal)
     );
   }
 

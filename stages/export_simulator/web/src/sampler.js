@@ -5,7 +5,14 @@ import { aroundPerson } from './avoidance.js';
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
-import { stridesAlong, distance, goalFrom, snappedToGoal, pathFrom, scaledGoal } from './strides.js';
+import {
+  velocityChannelsAlong,
+  distance,
+  goalFrom,
+  snappedToGoal,
+  pathFrom,
+  scaledGoal,
+} from './path_encoding.js';
 
 const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
 const SOONEST = 6; // frames that a visitor's goal leaves at least
@@ -23,7 +30,7 @@ export class Sampler {
       senses,
     });
     this.frames = this.contract.future_frames;
-    this.stride = this.contract.strides.numbers;
+    this.pathChannels = this.contract.path_encoding.channels;
     this.channels = this.contract.scaling.body_mean.length;
   }
 
@@ -73,7 +80,7 @@ export class Sampler {
       );
       const others = await this.pathsOnce(codes, targets, {
         ...options,
-        noise: draw(this.stride * this.frames * again.length),
+        noise: draw(this.pathChannels * this.frames * again.length),
       });
       const closer = this.goalErrors(others, targets, codes.start);
       again.forEach((index, other) => {
@@ -86,14 +93,14 @@ export class Sampler {
 
   // How far from their goals paths end, in parts of what still counts as there: more than 1 does not.
   goalErrors(paths, goals, start) {
-    const { reach_m: least, reach } = this.contract.strides;
+    const { goal_tolerance_m: least, goal_tolerance_share: share } = this.contract.path_encoding;
     const length = 3 * this.frames;
     return Array.from({ length: goals.length / 3 }, (_, i) => {
       const [goal, end] = [
         this.goal(goals, i),
         this.positions(paths.subarray(i * length, (i + 1) * length)).at(-1),
       ];
-      return distance(end, goal) / Math.max(least, reach * distance(goal, start));
+      return distance(end, goal) / Math.max(least, share * distance(goal, start));
     });
   }
 
@@ -103,7 +110,7 @@ export class Sampler {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) =>
       this.networks.path({
-        x: [x, [count, this.stride, this.frames]],
+        x: [x, [count, this.pathChannels, this.frames]],
         ...this.step(count, t, code),
         control: [goals, [count, 3]],
         keep: [new Float32Array(count).fill(keep), [count, 1]],
@@ -135,16 +142,16 @@ export class Sampler {
   // Scaled strides, led to where the animal may be.
   pathsCleared(frame, start, scaled) {
     const {
-      contract: { scaling, strides: encoding, rate_hz: rate },
+      contract: { scaling, path_encoding: encoding, rate_hz: rate },
       frames,
     } = this;
-    const [egoFromWorld, length] = [inverse(frame), this.stride * frames];
+    const [egoFromWorld, length] = [inverse(frame), this.pathChannels * frames];
     const out = new Float32Array(scaled.length);
     for (let at = 0; at < scaled.length; at += length) {
       const mine = scaled.subarray(at, at + length);
-      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, encoding);
+      const path = pathFrom(mine, frames, scaling.velocity_std, start, rate, encoding);
       const moved = path.map((place) => apply(egoFromWorld, this.senses.cleared(apply(frame, place))));
-      out.set(stridesAlong(mine, frames, scaling.stride_std, start, moved, rate, encoding), at);
+      out.set(velocityChannelsAlong(mine, frames, scaling.velocity_std, start, moved, rate, encoding), at);
     }
     return out;
   }
@@ -152,12 +159,12 @@ export class Sampler {
   // Scaled places [3, frames] that scaled strides lead to, snapped to scaled goals.
   snappedPaths(drawn, goals, start, pull) {
     const {
-      contract: { scaling, strides: encoding, rate_hz: rate },
+      contract: { scaling, path_encoding: encoding, rate_hz: rate },
       frames,
     } = this;
     const each = Array.from({ length: goals.length / 3 }, (_, i) => {
-      const mine = drawn.subarray(i * this.stride * frames, (i + 1) * this.stride * frames);
-      const path = pathFrom(mine, frames, scaling.stride_std, start, rate, encoding);
+      const mine = drawn.subarray(i * this.pathChannels * frames, (i + 1) * this.pathChannels * frames);
+      const path = pathFrom(mine, frames, scaling.velocity_std, start, rate, encoding);
       return this.scaledPath(snappedToGoal(path, start, this.goal(goals, i), pull));
     });
     return Float32Array.from(each.flat());
@@ -165,11 +172,15 @@ export class Sampler {
 
   // The i-th of scaled goals in metres, and back.
   goal(scaled, i = 0) {
-    return goalFrom(scaled.subarray(3 * i, 3 * i + 3), this.contract.scaling.goal_std, this.contract.strides);
+    return goalFrom(
+      scaled.subarray(3 * i, 3 * i + 3),
+      this.contract.scaling.goal_std,
+      this.contract.path_encoding,
+    );
   }
 
   scaled(goal) {
-    return scaledGoal(goal, this.contract.scaling.goal_std, this.contract.strides);
+    return scaledGoal(goal, this.contract.scaling.goal_std, this.contract.path_encoding);
   }
 
   // Places as the body's control: scaled frame by frame.
@@ -188,7 +199,7 @@ export class Sampler {
         control: [path, [1, 3, this.frames]],
         keep: [Float32Array.of(1), [1, 1]],
       });
-    const faint = noise.map((value) => value * this.contract.sampling.body_spread);
+    const faint = noise.map((value) => value * this.contract.sampling.body_noise_std);
     return this.run(denoise(codes.full), denoise(codes.withoutObserver), faint, {
       method: 'ddim',
       count: steps,
@@ -267,8 +278,8 @@ export class Sampler {
       ...options,
       keepGoal,
       commanded,
-      draws: this.contract.sampling.path_draws,
-      noise: options.draw(this.stride * this.frames * tried.length),
+      draws: this.contract.sampling.max_path_draws,
+      noise: options.draw(this.pathChannels * this.frames * tried.length),
     });
     if (commanded)
       for (let i = 0; i < tried.length; i++)
@@ -337,7 +348,11 @@ export class Sampler {
       clear,
     );
     const world = perceived
-      ? this.senses.support.follow(around, from, this.contract.strides.stays_m_s / this.contract.rate_hz)
+      ? this.senses.support.follow(
+          around,
+          from,
+          this.contract.path_encoding.rest_speed_m_s / this.contract.rate_hz,
+        )
       : around;
     return Float32Array.from(this.scaledPath(world.map((place) => apply(egoFromWorld, place))));
   }

@@ -1,31 +1,33 @@
-// Goals and paths as the numbers that are diffused. Counterpart of pipeline/behavior/strides.py, whose powers
-// and breath come with the contract: {numbers, root_power, goal_power, breath, faint_m2}.
+// Goals and paths in the channels that are diffused. Counterpart of pipeline/behavior/path_encoding.py, whose
+// constants come with the contract as `path_encoding`.
 
 // The same direction, the length raised to a power.
-function powered(way, power, faint) {
+function withPoweredLength(way, power, minSquared) {
   const squared = way.reduce((sum, value) => sum + value * value, 0);
-  const factor = Math.max(squared, faint) ** ((power - 1) / 2);
+  const factor = Math.max(squared, minSquared) ** ((power - 1) / 2);
   return way.map((value) => value * factor);
 }
 
 // Goals in metres as they are diffused, and back.
 export const scaledGoal = (goal, deviation, encoding) =>
-  powered(goal, encoding.goal_power, encoding.faint_m2).map((value, axis) => value / deviation[axis]);
+  withPoweredLength(goal, encoding.goal_length_power, encoding.min_squared_m2).map(
+    (value, axis) => value / deviation[axis],
+  );
 export const goalFrom = (scaled, deviation, encoding) =>
-  powered(
+  withPoweredLength(
     Array.from(scaled, (value, axis) => value * deviation[axis]),
-    1 / encoding.goal_power,
-    encoding.faint_m2,
+    1 / encoding.goal_length_power,
+    encoding.min_squared_m2,
   );
 
 // The places that scaled strides [numbers, frames] lead to, one after another, from `start` on.
 export function pathFrom(scaled, frames, deviation, start, rate, encoding) {
   let place = start;
   return Array.from({ length: frames }, (_, i) => {
-    const spread = deviation[i] ?? deviation[0]; // of each frame on its own, or of all alike
-    const stays = scaled[3 * frames + i] > 0 ? 1 : encoding.breath;
-    const root = [0, 1, 2].map((axis) => scaled[axis * frames + i] * spread[axis] * stays);
-    place = powered(root, 1 / encoding.root_power, encoding.faint_m2).map(
+    const deviationHere = deviation[i] ?? deviation[0]; // of each frame on its own, or of all alike
+    const stays = scaled[3 * frames + i] > 0 ? 1 : encoding.rest_damping;
+    const root = [0, 1, 2].map((axis) => scaled[axis * frames + i] * deviationHere[axis] * stays);
+    place = withPoweredLength(root, 1 / encoding.velocity_power, encoding.min_squared_m2).map(
       (value, axis) => place[axis] + value / rate,
     );
     return place;
@@ -33,17 +35,17 @@ export function pathFrom(scaled, frames, deviation, start, rate, encoding) {
 }
 
 // Scaled strides [numbers, frames] that lead along another path, as far as they move.
-export function stridesAlong(scaled, frames, deviation, start, path, rate, encoding) {
+export function velocityChannelsAlong(scaled, frames, deviation, start, path, rate, encoding) {
   const out = Float32Array.from(scaled);
   path.forEach((place, i) => {
-    const [spread, before] = [deviation[i] ?? deviation[0], i ? path[i - 1] : start];
-    const root = powered(
+    const [deviationHere, before] = [deviation[i] ?? deviation[0], i ? path[i - 1] : start];
+    const root = withPoweredLength(
       place.map((value, axis) => (value - before[axis]) * rate),
-      encoding.root_power,
-      encoding.faint_m2,
+      encoding.velocity_power,
+      encoding.min_squared_m2,
     );
-    const stays = scaled[3 * frames + i] > 0 ? 1 : encoding.breath;
-    for (const axis of [0, 1, 2]) out[axis * frames + i] = root[axis] / stays / spread[axis];
+    const stays = scaled[3 * frames + i] > 0 ? 1 : encoding.rest_damping;
+    for (const axis of [0, 1, 2]) out[axis * frames + i] = root[axis] / stays / deviationHere[axis];
   });
   return out;
 }
