@@ -12,7 +12,7 @@ endif
 PYTHON := .venv/bin/python
 PLAN   := $(PYTHON) -SE -m pipeline.workflow.plan
 RUN    := $(PYTHON) -SE -m pipeline.workflow.run $(if $(PROCESSES),--processes $(PROCESSES))
-COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras dev types test test-fast fuzz reproduce doctor clean
+COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras dev types test test-fast fuzz reproduce verify doctor clean
 AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/*.toml)))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
@@ -122,6 +122,10 @@ reproduce: .venv/.ok
 	@agent=$$($(PYTHON) -SE -m pipeline.workflow.reproduce begin '$(CRATE)') && \
 	$(MAKE) $(NESTING) $$agent && \
 	$(PYTHON) -SE -m pipeline.workflow.reproduce compare '$(CRATE)' $$agent
+
+# Hash all that stands in build/<agent> and captures/<agent>: a build itself looks at keys, sizes and times.
+verify: .venv/.ok
+	@$(PYTHON) -SE -m pipeline.workflow.verify $(HOME_OF:build/%=%)
 
 clean:
 	rm -rf build .snakemake

@@ -235,7 +235,7 @@ def _json(value: Any) -> str:
 
 
 def _cache(home: Home) -> sources.Cache:
-    """Return what earlier runs of the planner read, by size and time of the files; lost, it only costs
+    """Return what earlier runs of the planner read, by size and times of the files; lost, it only costs
     time.
     """
     known: dict[str, Any] = {}

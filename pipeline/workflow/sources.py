@@ -32,7 +32,8 @@ READER = 4
 
 @dataclass
 class Cache:
-    """What was read before, by path, for as long as size and time of a file stay the same."""
+    """What was read before, by path, for as long as size and times of a file stay the same: of its content,
+    and of its entry in the file system, which no program sets."""
 
     known: dict[str, Any] = field(default_factory=dict)
     fresh: dict[str, Any] = field(default_factory=dict)
@@ -42,7 +43,7 @@ class Cache:
     def get(self, path: Path, read: Any) -> Any:
         """Return `read(path)`, a value of plain JSON types, or what it was last time."""
         stat = path.stat()
-        mark = [READER, stat.st_size, stat.st_mtime_ns]
+        mark = [READER, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
         entry = self.fresh.get(str(path)) or self.known.get(str(path))
         if entry is None or entry["mark"] != mark:
             entry = {"mark": mark, "value": read(path)}
@@ -83,7 +84,7 @@ def digest(stage: str, cache: Cache) -> str:
 
 
 def marks(folder: Path) -> list[list[Any]]:
-    """Return path, size and time of every file below `folder`, in order; what changes them has the planner
+    """Return path, size and times of every file below `folder`, in order; what changes them has the planner
     look again.
     """
     found: list[list[Any]] = []
@@ -98,7 +99,7 @@ def marks(folder: Path) -> list[list[Any]]:
             found += marks(Path(entry.path))
         else:
             stat = entry.stat(follow_symlinks=entry.is_file())
-            found.append([entry.path, stat.st_size, stat.st_mtime_ns])
+            found.append([entry.path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns])
     return found
 
 

@@ -1,6 +1,7 @@
 """The planner: roles, split, ids, keys, and refusals that change nothing."""
 
 import json
+import os
 
 import pytest
 
@@ -220,6 +221,19 @@ def test_a_new_session_does_not_touch_the_maps(house):
         "video.v002.json",
         "masks.json",
     }
+
+
+def test_a_recording_that_changed_within_its_size_and_time_is_noticed(house):
+    for name, text in RECORDED.items():
+        house.write(name, text)
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    before, path = key_files(house), house.folder / "captures/toy/a.r3d"
+    age = path.stat()
+    path.write_text("b")
+    os.utime(path, ns=(age.st_atime_ns, age.st_mtime_ns))
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(house)
+    assert {name for name in after if before.get(name) != after[name]} == {"video.v002.json"}
 
 
 def test_a_walkthrough_without_depth_is_told_metres_by_sessions_that_train(house):

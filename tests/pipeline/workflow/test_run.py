@@ -124,6 +124,22 @@ def test_a_damaged_input_is_named_when_a_stage_fails(house):
     assert "rm -r build/toy/behavior_data" in failed.stderr
 
 
+def test_what_changed_behind_a_builds_back_is_found(house):
+    assert house.make("verify", "AGENT=toy").returncode == 0
+    changed = house.folder / "build/toy/flow/v001/1.bin"
+    before = changed.stat()
+    changed.write_bytes(changed.read_bytes()[::-1])
+    os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))
+    found = house.make("verify", "AGENT=toy")
+    assert found.returncode == 2
+    assert [line for line in found.stderr.splitlines() if line.startswith("error: ")] == [
+        "error: ART-005 build/toy/flow/v001/1.bin: has been damaged, changed or deleted since it was made"
+    ]
+    shutil.rmtree(house.folder / "build/toy/flow/v001")
+    assert begun(house.make("toy")) == {"flow.v001"}
+    assert house.make("verify", "AGENT=toy").returncode == 0
+
+
 def test_an_unfinished_input_is_named(house):
     (house.folder / "build/toy/reconstruction/manifest.json").unlink()
     refused = house.python("pipeline.workflow.run", "toy", "splats")

@@ -1,0 +1,64 @@
+"""Hash everything that was built, and the recordings it was built from, and report what is not what it was.
+
+    python -SE -m pipeline.workflow.verify HOME
+
+A build looks at the keys of artifacts, not at their bytes: what a failing disk or another program changed in
+a finished one is found here. Of recordings the planner looks at size and times; what differs all the same is
+forgotten, so that the next build starts from it. Exit code 2 where anything differs. Standard library only.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.core import videos
+from pipeline.core.errors import InputError, coded_disk_errors
+from pipeline.workflow import artifact
+from pipeline.workflow.jobs import Home
+from pipeline.workflow.reproduce import recording_digest
+
+
+def differences(home: Home) -> Iterator[InputError]:
+    """Yield an error per artifact and per recording of `home` that differs. Raises RUN-001 without a plan."""
+    try:
+        planned = json.loads((home.plan / "dag.json").read_text())
+    except FileNotFoundError:
+        raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
+    for folder in dict.fromkeys(Path(job["out"]) for job in planned):
+        if changed := artifact.damaged(folder):
+            more = f" (and {len(changed) - 1} more files)" if changed[1:] else ""
+            what = f"has been damaged, changed or deleted since it was made{more}"
+            remedy = f"rm -r {folder}, and build again"
+            yield InputError("ART-005", what, str(folder / changed[0]), remedy)
+    for video in videos.read(home.base.plan / "videos.json"):
+        recording = Path("captures", home.agent, video.file)
+        if video.sha256 is None or not recording.exists():
+            continue
+        if recording_digest(recording) != video.sha256:
+            for remembered in ("cache.json", "state.json"):
+                (home.base.plan / remembered).unlink(missing_ok=True)
+            what = "has changed since it was planned"
+            yield InputError("ART-005", what, str(recording), "build again, or put back what was there")
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line; returns its exit code."""
+    if len(arguments) != 1:
+        print(__doc__, file=sys.stderr)
+        return 2
+    try:
+        with coded_disk_errors("build"):
+            found = 0
+            for found, error in enumerate(differences(Home.parse(arguments[0])), start=1):
+                print(f"error: {error}", file=sys.stderr, flush=True)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    if not found:
+        print(f"[{arguments[0]}] every artifact and recording is what it was")
+    return 2 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
