@@ -43,7 +43,7 @@ for node in dag.FLOW:
             gpu=GPUS if node.gpu else 0,
             attempt=lambda wildcards, attempt: attempt,
         params:
-            id=engine.job_id(node),
+            id=engine.job_pattern(node),
             python=sys.executable,
             together=TOGETHER if node.distributed else "",
         shell:

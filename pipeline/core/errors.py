@@ -6,7 +6,14 @@ library only.
 
 import contextlib
 import errno
+import os
+import re
 from collections.abc import Iterator
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""No space, a quota, or a limit of the shell (`ulimit -f`)."""
+_OF_RUST = re.compile(r"\(os error (\d+)\)")
+"""How safetensors' messages name the system's error."""
 
 
 class InputError(Exception):
@@ -35,16 +42,32 @@ def printable(text: str) -> str:
 
 @contextlib.contextmanager
 def coded_disk_errors(where: str) -> Iterator[None]:
-    """Turn an `OSError` that the user can cure into an `InputError`: SYS-001 (full), SYS-003 (forbidden)."""
+    """Turn an error that the user can cure into an `InputError`: SYS-001 (full), SYS-003 (forbidden)."""
     try:
         yield
-    except OSError as error:
-        place = str(error.filename or where)
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    except InputError:
+        raise
+    except Exception as error:
+        cause = _of_the_system(error)
+        if cause is None:
+            raise
+        place = str(cause.filename or where)
+        if cause.errno in _FULL:
             raise InputError(
                 "SYS-001", "the disk is full", place, "free some space and run the same again"
             ) from error
-        if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+        if cause.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
             remedy = "look at who owns it and whether the disk is mounted read-only, then run the same again"
-            raise InputError("SYS-003", f"cannot be used: {error.strerror}", place, remedy) from error
+            raise InputError("SYS-003", f"cannot be used: {cause.strerror}", place, remedy) from error
         raise
+
+
+def _of_the_system(error: Exception) -> OSError | None:
+    """Return the system's error, which torch puts behind one of its own and safetensors into a text."""
+    if isinstance(error, OSError):
+        return error
+    behind = error.__context__
+    if isinstance(error, RuntimeError) and isinstance(behind, OSError) and behind.errno in _FULL:
+        return behind
+    told = _OF_RUST.search(str(error))
+    return OSError(int(told[1]), os.strerror(int(told[1]))) if told else None

@@ -222,11 +222,15 @@ class _Loop:
         if self.rank or self.folder is None:
             return
         temp = self.folder / f".step.tmp.{os.getpid()}"
-        with open(temp, "wb") as file:
-            torch.save(self._state(), file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temp, self.folder / f"step{self.step:09d}.pt")
+        try:
+            with open(temp, "wb") as file:
+                torch.save(self._state(), file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temp, self.folder / f"step{self.step:09d}.pt")
+        except BaseException:
+            temp.unlink(missing_ok=True)
+            raise
         for old in _checkpoints(self.folder)[KEEP:]:
             old.unlink()
 

@@ -86,12 +86,16 @@ def job_id(node: dag.Node) -> Callable[[Any], str]:
     return lambda wildcards: f"{node.artifact}.{wildcards.part}" if is_several(node) else node.artifact
 
 
+def job_pattern(node: dag.Node) -> str:
+    """Return the id of a node's jobs, as a pattern."""
+    return f"{node.artifact}.{{part}}" if is_several(node) else node.artifact
+
+
 def inputs(node: dag.Node) -> Callable[[Any], list[str]]:
-    """Return a function from a rule's wildcards to all files that the job depends on."""
+    """Return a function from a rule's wildcards to the stamps that its job waits for."""
 
     def of(wildcards: Any) -> list[str]:
-        job = _job(wildcards.home, job_id(node)(wildcards))
-        return [*(f"{each['path']}/{artifact.STAMP}" for each in job["inputs"]), *job["keys"]]
+        return _job(wildcards.home, job_id(node)(wildcards))["after"]
 
     return of
 

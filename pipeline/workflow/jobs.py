@@ -4,7 +4,7 @@ Standard library only, nothing is written here: `plan` writes it down, `run` doe
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -140,6 +140,22 @@ def jobs(plan: Plan) -> list[Job]:
         return [video for video in plan.videos if video.role in node.roles] if node.roles else [None]
 
     return [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
+
+
+def followed(all_jobs: Sequence[Job]) -> dict[str, list[str]]:
+    """Return per stamp the stamps that an engine waits for: of its inputs those that no other input has.
+
+    An input of an input is older than that, so that it need not be told; thousands of recordings have tens of
+    thousands of such inputs.
+    """
+    inputs = {job.stamp: dict.fromkeys(f"{i.path}/{artifact.STAMP}" for i in job.inputs) for job in all_jobs}
+    found = {}
+    for stamp, mine in inputs.items():
+        implied: set[str] = set()
+        for theirs in (inputs.get(each, {}) for each in mine):
+            implied |= mine.keys() & theirs.keys()  # as fast as the shorter of both
+        found[stamp] = [each for each in mine if each not in implied]
+    return found
 
 
 def deciding_videos(plan: Plan, node: Node) -> list[Video]:

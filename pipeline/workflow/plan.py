@@ -8,8 +8,8 @@ read.
 
 HOME is an agent, <agent>/variants/<name>, or <agent>/tables; TAKEN are names that no animal may have.
 
-Every check of the user's input happens before anything is written; a file is rewritten only when its content
-changes, so that Make sees by its age what to look at. Standard library only: it runs at every `make`.
+Every check of the user's input happens before anything is written. Where what decides an artifact has
+changed, its stamp is removed, so that an engine looks at it. Standard library only: it runs at every `make`.
 """
 
 import json
@@ -21,8 +21,18 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import InputError, coded_disk_errors
-from pipeline.workflow import artifact, captures, dag, recipes, sources
-from pipeline.workflow.jobs import Home, Job, Plan, deciding_videos, job_file, jobs, lock_file, redo_mark
+from pipeline.workflow import artifact, captures, dag, recipes, sources, stamps
+from pipeline.workflow.jobs import (
+    Home,
+    Job,
+    Plan,
+    deciding_videos,
+    followed,
+    job_file,
+    jobs,
+    lock_file,
+    redo_mark,
+)
 
 CODE_CACHE = Path("build", "code-cache.json")
 """What the planner read of the code, for all homes; lost, it only costs time."""
@@ -82,13 +92,15 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     for job in all_jobs:  # there from the start, so that a job that fails leaves no trace
         lock_file(job.home, job.id).parent.mkdir(parents=True, exist_ok=True)
         lock_file(job.home, job.id).touch()
+    after = followed(all_jobs)
     for number, job in enumerate(all_jobs, start=1):
         if job.home == str(plan.home):
-            one = job.as_dict() | {"place": f"{number} of {len(all_jobs)}"}
+            one = job.as_dict() | {"place": f"{number} of {len(all_jobs)}", "after": after[job.stamp]}
             _write(job_file(job.home, job.id), json.dumps(one, sort_keys=True) + "\n")
     lines = [json.dumps(job.as_dict(), sort_keys=True) for job in all_jobs]
     _write(plan.home.plan / "dag.json", "[\n" + ",\n".join(lines) + "\n]\n")
-    _write(plan.home.plan / "rules.mk", _rules(plan, all_jobs))
+    _write(plan.home.plan / "rules.mk", _rules(plan, all_jobs, after))
+    stamps.remove_outdated(all_jobs)
 
 
 def _write(path: Path, text: str) -> None:
@@ -193,16 +205,15 @@ def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any]) -> frozenset
     return frozenset(touched)
 
 
-def _rules(plan: Plan, all_jobs: list[Job]) -> str:
+def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) -> str:
     """Return the Make rules: one stamp per job, one target per artifact, and the agent's own."""
     name, home = plan.home.agent, plan.home
     lines = ["# written by pipeline/workflow/plan.py"]
-    stamps: dict[str, list[str]] = {}
+    stamped: dict[str, list[str]] = {}
     for job in all_jobs:
-        stamps.setdefault(job.artifact, []).append(job.stamp)
-        needed = dict.fromkeys([*(f"{i.path}/{artifact.STAMP}" for i in job.inputs), *job.keys])
-        lines += [f"{job.stamp}: {' '.join(needed)}", f"\t@$(RUN) {job.home} {job.id}"]
-    for node, made in stamps.items():
+        stamped.setdefault(job.artifact, []).append(job.stamp)
+        lines += [f"{job.stamp}: {' '.join(after[job.stamp])}", f"\t@$(RUN) {job.home} {job.id}"]
+    for node, made in stamped.items():
         lines += [f".PHONY: {name}.{node} {name}.{node}.redo", f"{name}.{node}: {' '.join(made)}"]
         lines += [
             f"{name}.{node}.redo:",
@@ -213,7 +224,7 @@ def _rules(plan: Plan, all_jobs: list[Job]) -> str:
         pages = [
             f"{plan.home_of(node).folder}/{node}/index.html"
             for node in ("report", "simulator")
-            if node in stamps
+            if node in stamped
         ]
         lines += [
             f".PHONY: {name}",
@@ -292,6 +303,8 @@ def _plan(home: Home, cache: sources.Cache) -> None:
     """Plan `home`, unless nothing that a plan is made from has changed; a variant stands on a plan of its
     agent.
     """
+    for each in dict.fromkeys((home.base, home)):
+        stamps.remove_impossible(each)
     read_marks, state = _read_marks(home), home.plan / "state.json"
     try:
         before = json.loads(state.read_text())

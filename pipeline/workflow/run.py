@@ -3,13 +3,13 @@ call.
 
     python -SE -m pipeline.workflow.run [OPTIONS] HOME JOB      for example `toy masks.v002`
 
-lock -> key -> unchanged? refresh the stamp -> clean up after the dead -> run the stage program, which
-publishes atomically -> record -> stamp. Exit codes: the stage's own (2 bad input, 75 stopped but resumable,
-76 diverged), 128 + n when signal n ended it. --processes: as many per machine fit one model together
-(torchrun); across machines --launcher starts torchrun on each, for example `srun --ntasks-per-node=1`, and
-torchrun's own variables (PET_NNODES, PET_RDZV_ENDPOINT ...) say how they meet. --attempt: of an engine that
-tries again; above 1, a job that ended with 2 or 76 and has the same key is not run. What a job printed stands
-in build/<home>/logs/<job>.<number>.log. Standard library only.
+lock -> key -> unchanged? stamp -> clean up after the dead -> run the stage program, which publishes
+atomically -> record -> stamp -> key changed meanwhile? once more. Exit codes: the stage's own (2 bad input,
+75 stopped but resumable, 76 diverged), 128 + n when signal n ended it. --processes: as many per machine fit
+one model together (torchrun); across machines --launcher starts torchrun on each, for example
+`srun --ntasks-per-node=1`, and torchrun's own variables (PET_NNODES, PET_RDZV_ENDPOINT ...) say how they
+meet. --attempt: of an engine that tries again; above 1, a job that ended with 2 or 76 and has the same key is
+not run. What a job printed stands in build/<home>/logs/<job>.<number>.log. Standard library only.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from typing import Any, TextIO
 
 from pipeline.core import processes
 from pipeline.core.errors import InputError, coded_disk_errors, printable
-from pipeline.workflow import artifact, jobs, sources
+from pipeline.workflow import artifact, jobs, sources, stamps
 
 LEAST_FREE_BYTES = 1 << 29
 """A stage does not begin on a disk with less than this free."""
@@ -66,6 +66,13 @@ class Engine:
 
 def run(home: str, job_id: str, engine: Engine = Engine()) -> int:
     """Do the job if anything that decides its artifact has changed; return the exit code."""
+    while (code := _run(home, job_id, engine)) is None:
+        _say(job_id, "what decides it changed meanwhile: looking at it again")
+    return code
+
+
+def _run(home: str, job_id: str, engine: Engine) -> int | None:
+    """Do it once; None where its key changed while it was done, so that it has no stamp."""
     job = _job(home, job_id)
     out, stamp = Path(job["out"]), Path(job["stamp"])
     resume = Path("build", job["home"], "resume", job_id)
@@ -88,10 +95,21 @@ def run(home: str, job_id: str, engine: Engine = Engine()) -> int:
                 _write_json(_failure(job), {"key": key, "code": code})
                 return code
         _failure(job).unlink(missing_ok=True)
-        stamp.touch()
-        shutil.rmtree(resume, ignore_errors=True)
         redo.unlink(missing_ok=True)
+        stamps.put(stamp, job["keys"])
+        if _key_now(home, job_id) != key:  # looked at after the stamp: a planner looks at stamps after keys
+            stamp.unlink(missing_ok=True)
+            return None
+        shutil.rmtree(resume, ignore_errors=True)
     return 0
+
+
+def _key_now(home: str, job_id: str) -> str | None:
+    """Return the key of a job as its plan and inputs stand now; None where they are broken."""
+    try:
+        return _key(_job(home, job_id))
+    except (InputError, FileNotFoundError):
+        return None
 
 
 def _job(home: str, job_id: str) -> dict[str, Any]:

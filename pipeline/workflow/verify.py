@@ -49,12 +49,12 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         with coded_disk_errors("build"):
-            found = 0
-            for found, error in enumerate(differences(Home.parse(arguments[0])), start=1):
-                print(f"error: {error}", file=sys.stderr, flush=True)
+            found = list(differences(Home.parse(arguments[0])))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    for error in found:
+        print(f"error: {error}", file=sys.stderr)
     if not found:
         print(f"[{arguments[0]}] every artifact and recording is what it was")
     return 2 if found else 0

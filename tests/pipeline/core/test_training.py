@@ -3,11 +3,16 @@ diagnosis.
 """
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 
 from pipeline.core import training as fitting
+
+ROOT = Path(__file__).parents[3]
 
 
 def make_problem(seed: int = 0):
@@ -99,3 +104,39 @@ def test_a_loss_that_stays_broken_ends_with_a_diagnosis(tmp_path):
         run(tmp_path, loss_of=broken_at(lambda: range(20, 1000)))
     assert end.value.code == fitting.EXIT_DIVERGED
     assert "terms" in (tmp_path / "diagnosis.json").read_text()
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+import torch
+from safetensors.torch import save_file
+from pipeline.core import training
+from pipeline.core.errors import InputError, coded_disk_errors
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+folder, tensors = Path(sys.argv[1]), {"a": torch.nn.Parameter(torch.ones(1 << 20))}
+module = torch.nn.ParameterDict(tensors)
+try:
+    with coded_disk_errors(str(folder)):
+        match sys.argv[2]:
+            case "checkpoint":
+                training.fit(modules={"m": module}, optimizer=torch.optim.SGD(module.parameters(), 0.1),
+                             loss=lambda step, generator: module["a"].square().sum(), steps=2, seed=0, resume=folder)
+            case "tensors":
+                save_file(dict(module.state_dict()), folder / "a.safetensors")
+except InputError as error:
+    print(f"error: {error}", file=sys.stderr)
+    sys.exit(2)
+"""
+
+
+@pytest.mark.parametrize("what", ["checkpoint", "tensors"])
+def test_a_full_disk_is_told_and_leaves_no_half_checkpoint(tmp_path, what):
+    """A file may have 1 MB here, which is what a full disk is to its writer."""
+    command = [sys.executable, "-c", FULL, str(tmp_path), what]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert ended.returncode == 2, ended.stderr
+    assert ended.stderr.startswith(f"error: SYS-001 {tmp_path}")
+    if what == "checkpoint":
+        assert list(tmp_path.iterdir()) == []

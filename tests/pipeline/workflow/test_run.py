@@ -62,6 +62,44 @@ def test_touching_reruns_nothing(house):
     assert begun(house.make("toy")) == set()
 
 
+FUTURE_NS = time.time_ns() + 10**9 * 3600 * 24 * 365
+
+
+def test_stamps_from_the_future_hide_nothing(house):
+    """The clock was a year ahead when it was built, or the stamps were copied from where it was."""
+    for stamp in (house.folder / "build/toy").rglob(artifact.STAMP):
+        os.utime(stamp, ns=(FUTURE_NS, FUTURE_NS))
+    house.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
+    assert begun(house.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
+    assert begun(house.make("toy")) == set()
+
+
+def test_a_clock_that_goes_back_hides_nothing(house):
+    """All was stamped by a clock that was a year ahead; it is put right while a build runs."""
+    os.utime(house.folder / "build/toy/clock", ns=(FUTURE_NS, FUTURE_NS))
+    for stamp in (house.folder / "build/toy").rglob(artifact.STAMP):
+        os.utime(stamp, ns=(FUTURE_NS - 1000, FUTURE_NS - 1000))
+    assert begun(house.make("toy")) == set()
+    front = house.folder / "stages/estimate_flow/__main__.py"
+    front.write_text(front.read_text().replace("* 64", "* 65"))
+    assert {"flow.v001", "registration", "behavior", "report"} <= begun(house.make("-j2", "toy"))
+    assert begun(house.make("toy")) == set()
+
+
+def test_a_key_that_changes_while_its_job_runs_is_not_stamped(house):
+    house.write("agents/toy.toml", "[train_behavior]\npause_s = 1.0\n")
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    command = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "toy", "behavior"]
+    running = subprocess.Popen(command, cwd=house.folder, stderr=subprocess.PIPE, text=True)
+    while not leftovers(house) and running.poll() is None:
+        time.sleep(0.02)
+    house.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    assert running.communicate(timeout=60)[1].count("] begins (") == 2
+    assert running.returncode == 0
+    assert begun(house.make("toy")) == {"simulator", "evaluation", "report"}
+
+
 def test_a_changed_table_reruns_that_stage_and_what_depends_on_it(house):
     house.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
     assert begun(house.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
