@@ -22,11 +22,9 @@ def visibility(
     ``size`` is (height, width) of the color pictures; hidden means behind the mesh by more than the
     tolerance.
     """
-    caster, normals, vertices = (
-        RayCaster(mesh_agent),
-        mesh_agent.vertex_normals(),
-        mesh_agent.vertices.astype(float),
-    )
+    caster = RayCaster(mesh_agent)
+    normals = mesh_agent.vertex_normals()
+    vertices = mesh_agent.vertices.astype(float)
     coarse = (size[0] // 2, size[1] // 2)
     weights, pixels = [], []
     for pose, k in zip(agent_from_camera, intrinsics, strict=True):

@@ -107,11 +107,10 @@ def propagate(
         return rigid.interpolate(time[frames], world_from_camera, time)
     odometry = clip.odometry_from_camera
     world_from_odometry = world_from_camera @ rigid.inverse(odometry[frames])
-    after = (
-        np.clip(np.searchsorted(frames, np.arange(len(time)), side="right"), 1, len(frames) - 1)
-        if len(frames) > 1
-        else np.zeros(len(time), int)
-    )
+    if len(frames) > 1:
+        after = np.clip(np.searchsorted(frames, np.arange(len(time)), side="right"), 1, len(frames) - 1)
+    else:
+        after = np.zeros(len(time), int)
     before = np.maximum(after - 1, 0)
     blend = np.clip(
         (time - time[frames[before]]) / np.maximum(time[frames[after]] - time[frames[before]], 1e-9), 0, 1

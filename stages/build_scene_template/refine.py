@@ -185,11 +185,9 @@ def refine_keyframes(
 
     def find(poses, reach_m):
         correspondences = depth_correspondences(keyframes, pairs, poses, reach_m)
-        return (
-            correspondences
-            if tracks is None
-            else pose_optimization.Correspondences.join(correspondences, tracks.correspondences(poses))
-        )
+        if tracks is None:
+            return correspondences
+        return pose_optimization.Correspondences.join(correspondences, tracks.correspondences(poses))
 
     fixed = np.arange(len(frames)) == 0
     reach = tuple(np.geomspace(*REACH_M, config.rounds))

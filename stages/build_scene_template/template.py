@@ -123,11 +123,9 @@ def _no_surface(clip: Clip) -> InputError:
 def floor_height(mesh: Mesh) -> float:
     """Return the height below which only a twentieth of the upward-facing surface lies."""
     up = mesh.vertex_normals()[:, 1] > UP_COSINE
-    return (
-        float(np.quantile(mesh.vertices[up, 1], FLOOR_SHARE))
-        if up.any()
-        else float(mesh.vertices[:, 1].min())
-    )
+    if up.any():
+        return float(np.quantile(mesh.vertices[up, 1], FLOOR_SHARE))
+    return float(mesh.vertices[:, 1].min())
 
 
 def write_model(

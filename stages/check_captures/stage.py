@@ -75,11 +75,10 @@ def _seen(
         room += overlap.describe(sample.shots)
         return CaptureMeasurements(sample, drift_m)
     # A turnaround may be filmed anywhere: it makes the animal's template, not the room's.
-    placed = (
-        None
-        if role == "turnaround" or not room
-        else overlap.placed_share(room, overlap.describe(sample.shots), rng)
-    )
+    if role == "turnaround" or not room:
+        placed = None
+    else:
+        placed = overlap.placed_share(room, overlap.describe(sample.shots), rng)
     return CaptureMeasurements(
         sample, drift_m, moving_objects.find_motion(sample.shots) if role == "session" else None, placed
     )

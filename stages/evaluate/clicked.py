@@ -56,10 +56,8 @@ def cameras_from_clicks(path: Path, folders: BuildFolders, videos: Sequence[Vide
             continue
         recorded, rows = ClickedClip.open(folders.frames[video.id]), []
         for group in groups.values():
-            frame, fit = (
-                recorded.frame_of(group[0].seen),
-                clicks.fit(group, recorded, reference, world_from_reference),
-            )
+            frame = recorded.frame_of(group[0].seen)
+            fit = clicks.fit(group, recorded, reference, world_from_reference)
             if fit is not None and frame is not None:
                 rows.append((frame, fit.world_from_camera, fit.typical_m))
         if rows:
@@ -87,11 +85,9 @@ def clicked_metrics(
         residual_m.append(clicked.residual_m[trusted])
     every: PoseErrors = joined(errors)
     if not len(every.degrees):
-        why = (
-            f"all {left_out} clicked frames disagree by more than {100 * TRUSTED_M:.0f} cm: click again"
-            if left_out
-            else NO_CLICKS
-        )
+        why = NO_CLICKS
+        if left_out:
+            why = f"all {left_out} clicked frames disagree by more than {100 * TRUSTED_M:.0f} cm: click again"
         metrics.skip((*NAMES, *OWN_NAMES), why)
         return metrics
     for unit, values in (("rotation_deg", every.degrees), ("translation_m", every.meters)):

@@ -127,10 +127,8 @@ def _drawn(found: Mapping[str, Sequence[Plausibility]]) -> UInt8[np.ndarray, "he
     for axes, (label, values_of) in zip(grid[0], panels, strict=True):
         for kind, worth in found.items():
             values, (color, dash) = np.sort(values_of(worth)).clip(0.1), STYLES[kind]
-            share, middle = (
-                np.arange(1, len(values) + 1) / max(len(values), 1),
-                f"{np.median(values):.1f}" if len(values) else "none",
-            )
+            share = np.arange(1, len(values) + 1) / max(len(values), 1)
+            middle = f"{np.median(values):.1f}" if len(values) else "none"
             axes.step(values, share, dash, color=color, where="post", label=f"{KINDS[kind]}, median {middle}")
         axes.set(xscale="log", xlabel=label, ylabel="share of windows", ylim=(0, 1.02))
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

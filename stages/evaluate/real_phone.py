@@ -53,13 +53,11 @@ def cameras_of(
             [answers[0].map_from_camera @ rigid.inverse(clip.odometry_from_camera[frame])] if answers else []
         )
     agreed = agreement(np.array(votes).reshape(-1, 4, 4))
+    if agreed is None:
+        return None
     return (
-        None
-        if agreed is None
-        else (
-            agreed[0] @ clip.odometry_from_camera,
-            f"registration: {agreed[1]} of {len(votes)} single frames agree",
-        )
+        agreed[0] @ clip.odometry_from_camera,
+        f"registration: {agreed[1]} of {len(votes)} single frames agree",
     )
 
 

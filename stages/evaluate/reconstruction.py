@@ -138,11 +138,9 @@ def shots_of(
     """Return what the held-out phone saw while its session was filmed, in up to ``count`` frames, at its
     depth's resolution.
     """
-    true, cameras, shots = (
-        read_depth(folders.truth_folder, phone.name, phone.source_index),
-        frames.cameras(phone.truth),
-        [],
-    )
+    true = read_depth(folders.truth_folder, phone.name, phone.source_index)
+    cameras = frames.cameras(phone.truth)
+    shots = []
     for frame in reading.subsampled(reading.filmed_together(folders, phone.video), count).tolist():
         size = true.depth[frame].shape[::-1]
         color = cv2.resize(phone.clip.color(frame), size, interpolation=cv2.INTER_AREA)
@@ -184,10 +182,8 @@ def _drawn_by_splats(
     """
     if motion is None:
         return [HeldoutView.empty(shot) for shot in shots]
-    scene, agent = (
-        gaussians.load_scene(folders.splats, session),
-        gaussians.load_ply(folders.splats / "agent.ply"),
-    )
+    scene = gaussians.load_scene(folders.splats, session)
+    agent = gaussians.load_ply(folders.splats / "agent.ply")
     weights = torch.from_numpy(
         gaussian_ply.SPLATS.load(folders.splats / "splats.npz", "agent_weights")["agent_weights"]
     )
@@ -301,10 +297,8 @@ def _scene_chamfer(
     true = Mesh(
         rigid.apply(frames.world_from_true_world, true.vertices.astype(float)).astype(np.float32), true.faces
     )
-    cameras, pieces = (
-        frames.cameras(walkthrough.truth),
-        split(true.vertices[true.faces].astype(np.float64), SEEN_M),
-    )
+    cameras = frames.cameras(walkthrough.truth)
+    pieces = split(true.vertices[true.faces].astype(np.float64), SEEN_M)
     chosen = plots.sample(len(cameras), CAMERAS_FOR_SEEN)
     camera = (cameras[chosen], walkthrough.truth.intrinsics[chosen], walkthrough.clip.color_size)
     seen = TriangleSurface(pieces[surfaces.seen_by(RayCaster(true), pieces.mean(1), *camera)])

@@ -149,11 +149,10 @@ def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], na
     columns = [action.world_from_agent[:, :3, :3] @ action.agent_from_bone[:, root, :3, 3, None]]
     columns = [columns[0][..., 0] + action.world_from_agent[:, :3, 3]]
     for bone in written:
-        local = (
-            world[:, bone]
-            if bone == root
-            else np.swapaxes(world[:, tree.parent[bone]], 1, 2) @ world[:, bone]
-        )
+        if bone == root:
+            local = world[:, bone]
+        else:
+            local = np.swapaxes(world[:, tree.parent[bone]], 1, 2) @ world[:, bone]
         columns.append(_turns(local))
     return _text(lines, action, np.concatenate(columns, 1))
 
@@ -179,11 +178,10 @@ def read_places(path: Path, names: list[str]) -> Float[np.ndarray, "frame joint 
                 count = int(rest[0])
                 values, column = rows[:, column : column + count], column + count
                 place = values[:, :3] if count == 6 else np.zeros((len(rows), 3))
-                turn = (
-                    Rotation.from_euler(_ORDER, values[:, -3:], degrees=True).as_matrix()
-                    if count
-                    else np.eye(3)
-                )
+                if count:
+                    turn = Rotation.from_euler(_ORDER, values[:, -3:], degrees=True).as_matrix()
+                else:
+                    turn = np.eye(3)
                 stack[-1] = stack[-1] @ rigid.make(np.broadcast_to(turn, (len(rows), 3, 3)), place)
                 places[name] = stack[-1][:, :3, 3]
             case "}":

@@ -97,10 +97,8 @@ def agent(simulator: Path, take: Path | None, rate_hz: float, influences: Influe
         actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in names))]
     loss = "skinning_residual_mm"
     if influences == "8":
-        skin, loss = (
-            replace(skin, **npz.load(simulator / "skin_8.npz", ("joints", "weights"))),
-            "skinning_residual_8_mm",
-        )
+        skin = replace(skin, **npz.load(simulator / "skin_8.npz", ("joints", "weights")))
+        loss = "skinning_residual_8_mm"
     about = json.loads((simulator / "simulator.json").read_bytes())
     return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], about["agent"][loss])
 

@@ -87,11 +87,9 @@ def fit_weights(
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
     chosen = weight_refit.different_poses(recorded, poses)
     others = np.setdiff1d(np.arange(len(recorded)), chosen)
-    judged = (
-        others[np.linspace(0, len(others) - 1, min(_JUDGED_POSES, len(others))).astype(int)]
-        if len(others)
-        else chosen
-    )
+    judged = chosen
+    if len(others):
+        judged = others[np.linspace(0, len(others) - 1, min(_JUDGED_POSES, len(others))).astype(int)]
     vertices, rest = body.mesh.vertices.astype(np.float64), body.agent_from_bone_rest
     fit, held = (
         weight_refit.Poses(

@@ -263,17 +263,14 @@ def _frame(
 def _summary(recording: Recording, rows: np.ndarray, solved: Structure, scale: str) -> str:
     lost = np.setdiff1d(rows, solved.sparse.frame)
     seconds = ", ".join(f"{recording.timestamp_s[row]:.1f}" for row in lost[:12])
-    left_out = (
-        (f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > 12 else ''} s")
-        if len(lost)
-        else ""
-    )
+    left_out = ""
+    if len(lost):
+        left_out = f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > 12 else ''} s"
     split = f", the largest of {solved.models} models" if solved.models > 1 else ""
-    metres = (
-        "the scale is relative: lengths are no metres"
-        if scale == extraction.RELATIVE
-        else f"metres from the depth of {scale}"
-    )
+    if scale == extraction.RELATIVE:
+        metres = "the scale is relative: lengths are no metres"
+    else:
+        metres = f"metres from the depth of {scale}"
     focal = solved.intrinsics[0, 0]
     focal_source = "given" if recording.intrinsics is not None else "calibrated"
     return (

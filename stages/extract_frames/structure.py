@@ -142,11 +142,9 @@ def _parallax_share(database: Path) -> float:
     )
     with pycolmap.Database.open(database) as table:
         kinds = [geometry.config for geometry in table.read_two_view_geometries()[1]]
-    return (
-        float(np.mean([pycolmap.TwoViewGeometryConfiguration(kind) in places for kind in kinds]))
-        if kinds
-        else 0.0
-    )
+    if kinds:
+        return float(np.mean([pycolmap.TwoViewGeometryConfiguration(kind) in places for kind in kinds]))
+    return 0.0
 
 
 def _descriptors(database: Path, names: list[str]) -> list[UInt8[np.ndarray, "feature 128"]]:

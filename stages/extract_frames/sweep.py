@@ -111,10 +111,8 @@ def _correlation(
     to_pixel, from_pixel = centred @ other.intrinsics, np.linalg.inv(centred @ view.intrinsics)
     own_mean = mean(view.gray)
     own_variance = np.maximum(mean(view.gray**2) - own_mean**2, 0)
-    inside, correlation = (
-        np.full(other.gray.shape, 255, np.uint8),
-        np.empty((len(distances), height, width), np.float32),
-    )
+    inside = np.full(other.gray.shape, 255, np.uint8)
+    correlation = np.empty((len(distances), height, width), np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     for plane, distance in enumerate(distances):
         through = relative[:3, :3].copy()

@@ -162,11 +162,10 @@ def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
     """
     check = plan.pose_check
     if plan.scale != MEASURED:
-        scale_text = (
-            "relative: lengths are no metres"
-            if plan.scale == RELATIVE
-            else f"metres from the depth of {plan.scale}"
-        )
+        if plan.scale == RELATIVE:
+            scale_text = "relative: lengths are no metres"
+        else:
+            scale_text = f"metres from the depth of {plan.scale}"
         return qa.Check(
             f"scale known ({check.reason}; {scale_text})",
             float(plan.scale != RELATIVE),

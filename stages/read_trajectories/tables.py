@@ -28,10 +28,8 @@ def columns(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
             names = [name.strip().lower() for name in rows.fieldnames or ()]
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
-                what, remedy = (
-                    f"column {', '.join(twice)} appears more than once",
-                    "keep one of each, whatever its case",
-                )
+                what = f"column {', '.join(twice)} appears more than once"
+                remedy = "keep one of each, whatever its case"
                 raise InputError("TRJ-001", what, str(path), remedy)
             found: dict[str, list[str]] = {name: [] for name in names}
             for row in rows:

@@ -86,11 +86,9 @@ def compare(
     """Render one frame; return (PSNR, share of depth within 0.1 m, IoU) and one row of pictures."""
     height, width = (round(side * LONG_SIDE_PX / max(clip.color_size)) for side in clip.color_size)
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, (height, width))
-    camera, root, bones = (
-        motion.world_from_camera[frame],
-        motion.world_from_agent[frame],
-        motion.agent_from_bone[frame],
-    )
+    camera = motion.world_from_camera[frame]
+    root = motion.world_from_agent[frame]
+    bones = motion.agent_from_bone[frame]
     drawn = renderer.draw(camera, intrinsics, height, width, root, bones)
     color = plots.resized(clip.color(frame), (height, width))
     measured = cv2.resize(clip.depth(frame), (width, height), interpolation=cv2.INTER_NEAREST)
@@ -103,10 +101,8 @@ def compare(
         opposite.color,
         draw_bones(color, camera, intrinsics, root, bones),
     ]
-    known, agent = (
-        (measured > 0.1) & (measured < 5),
-        cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) == 255,
-    )
+    known = (measured > 0.1) & (measured < 5)
+    agent = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) == 255
     error = np.mean((color.astype(float) - drawn.color)[drawn.depth > 0] ** 2)
     iou = (agent & drawn.agent).sum() / max((agent | drawn.agent).sum(), 1)
     share = np.mean(np.abs(drawn.depth - measured)[known] < 0.1) if known.any() else np.nan

@@ -329,10 +329,8 @@ class _Reader:
         pixel = np.stack([column, row], axis=-1) + 0.5
         direction = cameras.unproject(pixel, clip.intrinsics[self.frame])
         at_depth = cameras.project(direction, clip.depth_intrinsics[self.frame])[0].astype(int)
-        x, y = (
-            np.clip(at_depth[:, 0], 0, self.depth.shape[1] - 1),
-            np.clip(at_depth[:, 1], 0, self.depth.shape[0] - 1),
-        )
+        x = np.clip(at_depth[:, 0], 0, self.depth.shape[1] - 1)
+        y = np.clip(at_depth[:, 1], 0, self.depth.shape[0] - 1)
         features = self.source.features
         feature = np.asarray(features[self.frame])[
             feature_cell(row, features.shape[1]), feature_cell(column, features.shape[2])

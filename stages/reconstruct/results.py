@@ -125,10 +125,8 @@ def feature_volume(problem: Problem) -> SceneFeatures:
     index = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
     points = torch.from_numpy(low + (index + 0.5) * VOXEL_M).float().to(problem.device)
     encoded = field.encode(points, torch.full((len(points),), -1, device=points.device))
-    distance, feature = (
-        field.distance(encoded).cpu().numpy(),
-        field.color_and_feature(encoded)[1].cpu().numpy(),
-    )
+    distance = field.distance(encoded).cpu().numpy()
+    feature = field.color_and_feature(encoded)[1].cpu().numpy()
     free = seen_free(problem, points).cpu().numpy()
     measured = np.isfinite(
         KDTree(measured_points(problem)).query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)[0]

@@ -101,10 +101,8 @@ def sample_surfaces(
     Returns the points, on whose surface each lies (-1: the shared one) and where it stands, as
     `CoveredScene.stands`.
     """
-    shared, keep_own = (
-        marching_cubes.extract_scene(field, -1, field.lattice_m),
-        list(codes) if field.fused else [],
-    )
+    shared = marching_cubes.extract_scene(field, -1, field.lattice_m)
+    keep_own = list(codes) if field.fused else []
     parts, layers = [gaussians.sample_surface(shared, number, rng)], [np.full(number, -1)]
     for code in keep_own:
         moved = marching_cubes.extract_moved(field, code)
@@ -242,10 +240,8 @@ def subsample(
 
 def _along_a_curve(points: Float[np.ndarray, "point 3"]) -> np.ndarray:
     """Return each point's place on a curve through space along which neighbours stay near (Morton's)."""
-    cell, place = (
-        np.floor((points - points.min(0)) / CURVE_CELL_M).astype(np.uint64),
-        np.zeros(len(points), np.uint64),
-    )
+    cell = np.floor((points - points.min(0)) / CURVE_CELL_M).astype(np.uint64)
+    place = np.zeros(len(points), np.uint64)
     for bit in range(CURVE_BITS):
         for axis in range(3):
             place |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)

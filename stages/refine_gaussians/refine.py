@@ -52,10 +52,8 @@ class MotionDeltas(nn.Module):
 
     def __init__(self, frames: int, bones: int):
         super().__init__()
-        self.root, self.bone = (
-            nn.Parameter(torch.zeros(frames, 6)),
-            nn.Parameter(torch.zeros(frames, bones, 6)),
-        )
+        self.root = nn.Parameter(torch.zeros(frames, 6))
+        self.bone = nn.Parameter(torch.zeros(frames, bones, 6))
 
     def apply(
         self,

@@ -282,10 +282,8 @@ def _outside(observation, model, world_from_agent):
     pixel, z = cameras.project(points, observation.intrinsics)
     height, width = observation.mask.shape
     inside = (pixel >= 0).all(-1) & (pixel[..., 0] < width) & (pixel[..., 1] < height) & (z > NEAREST_M)
-    column, row = (
-        np.clip(pixel[..., 0], 0, width - 1).astype(int),
-        np.clip(pixel[..., 1], 0, height - 1).astype(int),
-    )
+    column = np.clip(pixel[..., 0], 0, width - 1).astype(int)
+    row = np.clip(pixel[..., 1], 0, height - 1).astype(int)
     scale = np.array(observation.depth.shape) / (height, width)
     behind = observation.depth[(row * scale[0]).astype(int), (column * scale[1]).astype(int)] > z + BEHIND_M
     wrong = facing & inside & ~observation.mask[row, column] & behind

@@ -43,10 +43,8 @@ def flow_correspondences(
     rows, columns = np.mgrid[inner].reshape(2, -1)
     start = np.stack([columns, rows], axis=-1) + 0.5
     ray = cameras.unproject(start + flow[rows, columns], intrinsics)
-    z, template_z = (
-        cameras.read_depth(clip.depth(frame), clip.depth_intrinsics[frame], ray),
-        pair.depth[rows, columns],
-    )
+    z = cameras.read_depth(clip.depth(frame), clip.depth_intrinsics[frame], ray)
+    template_z = pair.depth[rows, columns]
     good = (
         known[rows, columns]
         & (z > 0)

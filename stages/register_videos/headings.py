@@ -99,10 +99,8 @@ def motion_cues(
     middle = np.stack([each.middle_world for each in candidates]) * (1, 0, 1)
     phone = np.stack([each.eye_world for each in candidates])
     time = timestamp_s[[each.frame for each in candidates]]
-    before, after = (
-        np.maximum(np.arange(len(time)) - span, 0),
-        np.minimum(np.arange(len(time)) + span, len(time) - 1),
-    )
+    before = np.maximum(np.arange(len(time)) - span, 0)
+    after = np.minimum(np.arange(len(time)) + span, len(time) - 1)
     elapsed = np.maximum(time[after] - time[before], 1e-3)[:, None]
     velocity = (middle[after] - middle[before]) / elapsed
     moved = np.linalg.norm(velocity, axis=1) + CAMERA_SHARE * np.linalg.norm(

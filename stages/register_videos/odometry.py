@@ -59,11 +59,9 @@ def consistent_votes(
     votes: Votes, timestamp_s: Float[np.ndarray, "frame"], motion: Odometry, config: VoteConfig
 ) -> Bool[np.ndarray, "vote"]:
     """Return which votes most of the others near in time confirm, carried along by what was motion."""
-    voted, time, piece = (
-        votes.world_from_camera,
-        timestamp_s[votes.frame],
-        np.cumsum(motion.jumps)[votes.frame],
-    )
+    voted = votes.world_from_camera
+    time = timestamp_s[votes.frame]
+    piece = np.cumsum(motion.jumps)[votes.frame]
     odometry, supports = motion.odometry_from_camera[votes.frame], np.zeros(len(voted), bool)
     first, last = (np.searchsorted(time, time - NEAR_S, side="right"), np.searchsorted(time, time + NEAR_S))
     for vote in range(len(voted)):

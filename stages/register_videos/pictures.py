@@ -22,15 +22,14 @@ def status(
     walk-through."""
     votes = result.votes
     figures = {"frames_localized": votes.asked, "votes": len(votes.frame)}
-    nearest = (
-        None
-        if votes.nearest is None
-        else {
+    if votes.nearest is None:
+        nearest = None
+    else:
+        nearest = {
             "inlier_ratio": votes.nearest.inlier_ratio,
             "walkthrough_s": float(walk_time_s[nearest_frame(walk, votes.nearest.map_from_camera)]),
             "world_from_camera": votes.nearest.map_from_camera.round(6).tolist(),
         }
-    )
     if isinstance(result, Rejected):
         return {"registered": False, "reason": result.reason, "nearest_view": nearest, "figures": figures}
     figures |= {

@@ -38,11 +38,9 @@ class Votes:
     @property
     def world_from_camera(self) -> Float[np.ndarray, "vote 4 4"]:
         """The voted poses."""
-        return (
-            np.stack([answer.map_from_camera for answer in self.answers])
-            if self.answers
-            else np.zeros((0, 4, 4))
-        )
+        if self.answers:
+            return np.stack([answer.map_from_camera for answer in self.answers])
+        return np.zeros((0, 4, 4))
 
     @property
     def probability(self) -> Float[np.ndarray, "vote"]:

@@ -175,11 +175,9 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 def _read(folder: Path) -> dict[str, Any]:
     path = folder / "qa.json"
-    return (
-        json.loads(path.read_bytes())
-        if path.exists()
-        else {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
-    )
+    if path.exists():
+        return json.loads(path.read_bytes())
+    return {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
 
 
 def _note(

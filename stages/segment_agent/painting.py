@@ -32,13 +32,11 @@ SMALL_PX, BACKED = 250, 0.7
 must look like the animal or have moved clearly"""
 LEAST_PRESUMED_PX = 25
 """sure pixels that a frame needs in which the track was lost"""
-PRESENCE_BIAS, PRESENCE_APPEARANCE, PRESENCE_MOVED, PRESENCE_PRESUMED, PRESENCE_LIMIT = (
-    -1.0,
-    1.0,
-    3.0,
-    1.5,
-    4.0,
-)
+PRESENCE_BIAS = -1.0
+PRESENCE_APPEARANCE = 1.0
+PRESENCE_MOVED = 3.0
+PRESENCE_PRESUMED = 1.5
+PRESENCE_LIMIT = 4.0
 """log-odds that a mask shows the animal: without evidence; per unit of its mean appearance, which is limited;
 where all of it clearly moved; and less where its place is only guessed"""
 LOG_ODDS_LIMIT = 5.0

@@ -39,11 +39,10 @@ def parse(path: Path, clip: Clip) -> Prompt:
                 f"either frame or time_s, either box or click, and nothing else: {', '.join(table)}"
             )
         passed_s = clip.timestamp_s - clip.timestamp_s[0]
-        frame = (
-            int(table["frame"])
-            if "frame" in table
-            else int(np.abs(passed_s - float(table["time_s"])).argmin())
-        )
+        if "frame" in table:
+            frame = int(table["frame"])
+        else:
+            frame = int(np.abs(passed_s - float(table["time_s"])).argmin())
         if "time_s" in table and not -0.5 <= float(table["time_s"]) <= passed_s[-1] + 0.5:
             raise ValueError(f"time_s = {table['time_s']} of a recording of {passed_s[-1]:.1f} s")
         box = np.array(table["box"] if "box" in table else table["click"] * 2, float)
@@ -84,10 +83,8 @@ def position(
     """
     x0, y0, x1, y1 = prompt.box_px
     scale = np.array([clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]])
-    centre, half = (
-        np.array([x0 + x1, y0 + y1]) / 2 * scale,
-        np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2),
-    )
+    centre = np.array([x0 + x1, y0 + y1]) / 2 * scale
+    half = np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2)
     low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)
     depth = steady_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():

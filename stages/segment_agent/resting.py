@@ -56,11 +56,10 @@ def find_resting(
     Raises InputError MSK-003 when nothing stands out from the ground there.
     """
     _, ground = surroundings(clip, world_from_camera, hint.centre_world)
-    shown = (
-        None
-        if ground is None
-        else _cut_out(clip, world_from_camera[hint.frame], hint, ground, height_px, rng)
-    )
+    if ground is None:
+        shown = None
+    else:
+        shown = _cut_out(clip, world_from_camera[hint.frame], hint, ground, height_px, rng)
     if ground is None or shown is None:
         raise InputError(
             "MSK-003",

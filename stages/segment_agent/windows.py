@@ -115,9 +115,7 @@ def unblurred(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "he
     step where it is.
     """
     around = np.ones((3, 3), np.uint8)
-    low, high = (
-        cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around),
-        cv2.dilate(depth, around),
-    )
+    low = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around)
+    high = cv2.dilate(depth, around)
     snapped = np.where(depth - low < high - depth, low, high)
     return np.where((depth > 0) & (high - low > STEP_M), snapped, depth)

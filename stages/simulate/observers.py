@@ -42,11 +42,9 @@ class ApproachingObserver:
     """Walks up to the animal for 4 s, goes back to the centre for 4 s."""
 
     def __init__(self, center: Float[np.ndarray, "3"], speed_m_s: float):
-        self.center, self.position, self.stride = (
-            np.asarray(center, float),
-            np.asarray(center, float),
-            speed_m_s / RATE_HZ,
-        )
+        self.center = np.asarray(center, float)
+        self.position = np.asarray(center, float)
+        self.stride = speed_m_s / RATE_HZ
 
     def __call__(self, time_s: float, animal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         target = np.array([animal[0], self.center[1], animal[2]]) if time_s % 8.0 < 4.0 else self.center

@@ -162,10 +162,8 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
 
 
 def _world(inputs: Inputs, data: BehaviorData) -> LongTermWorld:
-    model, reconstruction = (
-        _loaded(LongTerm.load, _required(inputs, "longterm")),
-        _required(inputs, "reconstruction"),
-    )
+    model = _loaded(LongTerm.load, _required(inputs, "longterm"))
+    reconstruction = _required(inputs, "reconstruction")
     roots = np.concatenate(
         [trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in data.trajectories.values()]
     )

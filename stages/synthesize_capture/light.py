@@ -42,10 +42,8 @@ def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
     if hour == "evening":
         window, lamp, ambient = 0.10 * cool, rng.uniform(0.75, 0.95) * warm, 0.16 * np.array([1.0, 0.9, 0.78])
     else:
-        window, lamp = (
-            rng.uniform(1.3, 2.2) * (cool + rng.uniform(-0.06, 0.06, 3)),
-            rng.uniform(0.0, 0.25) * warm,
-        )
+        window = rng.uniform(1.3, 2.2) * (cool + rng.uniform(-0.06, 0.06, 3))
+        lamp = rng.uniform(0.0, 0.25) * warm
         ambient = rng.uniform(0.42, 0.55) * (1.0 + rng.uniform(-0.05, 0.05, 3))
     sun = np.array([1.0, rng.uniform(0.3, 0.7), rng.uniform(-0.8, 0.8)])
     if hour == "sunset":  # as many draws as by day, so that life goes on as it would have

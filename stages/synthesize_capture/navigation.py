@@ -55,11 +55,9 @@ class Floor:
             cost, self.cell(start), self.cell(goal), fully_connected=True, geometric=True
         )
         way = (np.array(cells) + 0.5) * CELL_M - [WIDTH_M / 2, DEPTH_M / 2]
-        return (
-            np.concatenate([way[1:-1], np.asarray(goal, float)[None]])
-            if len(way) > 1
-            else np.asarray(goal, float)[None]
-        )
+        if len(way) > 1:
+            return np.concatenate([way[1:-1], np.asarray(goal, float)[None]])
+        return np.asarray(goal, float)[None]
 
 
 def floor_for(footprints: list[Footprint], *, breadth_m: float, height_m: float) -> Floor:

@@ -86,11 +86,9 @@ def cushion(center, size, paint: Paint, *, bulge: float, skip: str = "-y") -> li
     """Make a box whose faces bulge softly outwards by ``bulge`` metres."""
     soft = []
     for sheet in box(center, size, paint, skip=skip):
-        corner, right, down = (
-            sheet.points[0, 0],
-            sheet.points[0, 1] - sheet.points[0, 0],
-            sheet.points[1, 0] - sheet.points[0, 0],
-        )
+        corner = sheet.points[0, 0]
+        right = sheet.points[0, 1] - sheet.points[0, 0]
+        down = sheet.points[1, 0] - sheet.points[0, 0]
         v, u = np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7), indexing="ij")
         rise = bulge * (np.sin(np.pi * u) * np.sin(np.pi * v)) ** 0.6
         points = corner + v[..., None] * down + u[..., None] * right + rise[..., None] * sheet.normals()[0, 0]

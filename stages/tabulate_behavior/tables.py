@@ -35,11 +35,10 @@ def figures(
             table |= interval(values, window, draws, seed).as_figures(f"behavior/{method}/{_figure(name)}")
             rival = found[ours].values.get(name)
             if method != ours and rival is not None and np.array_equal(window, found[ours].windows_of(name)):
-                both = (
-                    min(len(rival), len(values))
-                    if min(len(rival), len(values)) > 1
-                    else max(len(rival), len(values))
-                )
+                if min(len(rival), len(values)) > 1:
+                    both = min(len(rival), len(values))
+                else:
+                    both = max(len(rival), len(values))
                 less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(
                     values[:both], (both, values.shape[1])
                 )

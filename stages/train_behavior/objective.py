@@ -38,11 +38,10 @@ def losses(
     """
     with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
         code = perceive(nets, batch, objective, generator)
-    goal_loss = (
-        {}
-        if phase == "sequences"
-        else {"goal": goal_error(nets, batch, code, schedule, objective, generator).mean()}
-    )
+    if phase == "sequences":
+        goal_loss = {}
+    else:
+        goal_loss = {"goal": goal_error(nets, batch, code, schedule, objective, generator).mean()}
     if phase == "goals":
         return goal_loss
 

@@ -25,10 +25,8 @@ def pictures(
 ) -> list[Picture]:
     """Draw a few training windows, sampled under different conditions."""
     chosen = np.linspace(0, len(moments.observation) - 1, SHOWN_WINDOWS + 2).astype(int)[1:-1]
-    rooms, frame = (
-        [RoomMap(scenes.volumes[number]) for number in moments.scene[chosen]],
-        moments.world_from_ego[chosen],
-    )
+    rooms = [RoomMap(scenes.volumes[number]) for number in moments.scene[chosen]]
+    frame = moments.world_from_ego[chosen]
     some = moments.observation[chosen]
     removed = {
         "all": PlanSamplingConfig(),

@@ -15,10 +15,8 @@ EDGE_PX = 240
 
 def report(held: HeldOut, target: Target) -> dict[str, float | int]:
     """Return the held-out figures for ``localizer.json``; views without an answer count as failures."""
-    rotation, translation = (
-        np.nan_to_num(held.rotation_deg, nan=180.0),
-        np.nan_to_num(held.translation_m, nan=10.0),
-    )
+    rotation = np.nan_to_num(held.rotation_deg, nan=180.0)
+    translation = np.nan_to_num(held.translation_m, nan=10.0)
     return {
         "views": len(held.views),
         "rotation_deg_median": float(np.median(rotation)),

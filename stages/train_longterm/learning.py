@@ -91,11 +91,10 @@ def train_ablations(
                 training.fit_route(made.route, clips, trainer, config.route, f"{name}_route")
                 routes[key] = made.route
             made.route.load_state_dict(routes[key].state_dict())
-            along = (
-                training.predicted_routes(made.route, clips)
-                if spec.paper
-                else training.smoothed_true_routes(clips)
-            )
+            if spec.paper:
+                along = training.predicted_routes(made.route, clips)
+            else:
+                along = training.smoothed_true_routes(clips)
             training.fit_pose(made.pose, along, clips, trainer, config.pose, f"{name}_pose")
         trained[name] = made.eval()
     return trained

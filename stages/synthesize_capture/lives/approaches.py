@@ -99,12 +99,10 @@ def _played(
     rows, seen = [], []
     for step in range(int(np.ceil((CALM_S + WALKED_S + FUTURE / RATE_HZ + 0.5) / STEP_S))):
         if speed_m_s is not None and step == round(CALM_S / STEP_S):
-            person.mode, person.speed_m_s, person.left_s, person.since_plan_s = (
-                "approach",
-                speed_m_s,
-                4.0,
-                np.inf,
-            )
+            person.mode = "approach"
+            person.speed_m_s = speed_m_s
+            person.left_s = 4.0
+            person.since_plan_s = np.inf
         if person.mode != "approach":
             person.left_s = np.inf
         person.step(STEP_S, animal.position)
