@@ -52,25 +52,19 @@ def beaten(metric: str, words: str) -> list[Bar]:
 
 
 BARS = (
-    Bar("registration/rotation_deg_median", (
-"camera rotation error, "
-"median of all frames"
-), "lower", 1.0, "deg"),
-    Bar("registration/translation_m_median", (
-"camera position error, "
-"median of all frames"
-), "lower", 0.04, "m"),
+    Bar("registration/rotation_deg_median", "camera rotation error, median of all frames",
+        "lower", 1.0, "deg"),
+    Bar("registration/translation_m_median", "camera position error, median of all frames",
+        "lower", 0.04, "m"),
     Bar("registration/videos_registered", "sessions on the map", "higher", "registration/videos_total"),
     Bar("masks/iou_mean", "overlap of masks with the true animal", "higher", 0.75),
     Bar("reconstruction/depth_acc_all", "depth within 0.1 m, seen by the held-out phone", "higher", 0.88),
     Bar("reconstruction/agent_root_m_median", "position error of the animal, median", "lower", 0.08, "m"),
     *beaten("behavior/ats/goal_minde_m", "goal error, best of 16"),
     *beaten("behavior/ats/goal_energy_score_m", "energy score of goals"),
-    Bar("behavior/ats/foot_slide_m_s", (
-"foot skate of generated motion: at most 1.5 "
-"times that of recorded motion"
-), "lower",
-        "behavior/recorded/foot_slide_m_s", "m/s", 1.5),
+    Bar("behavior/ats/foot_slide_m_s",
+        "foot skate of generated motion: at most 1.5 times that of recorded motion",
+        "lower", "behavior/recorded/foot_slide_m_s", "m/s", 1.5),
     Bar("simulator/plan_few_s", "time of a plan in few steps, one core", "lower", 1.5, "s"),
 )  # fmt: skip
 

@@ -1,6 +1,15 @@
-"""The chapters of the report in flow order: one per artifact, with the words a newcomer needs."""
+"""The words of the report, from `templates/words.toml`: chapters in flow order, what to do about checks."""
 
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+WORDS: Mapping[str, Any] = tomllib.loads(
+    resources.files("stages.report").joinpath("templates", "words.toml").read_text("utf-8")
+)
+"""Chapters, methods and remedies as written."""
 
 
 @dataclass(frozen=True)
@@ -17,88 +26,12 @@ class Chapter:
     of the home than its outline, can be in them"""
 
 
-CHAPTERS = (
-    Chapter(
-        "frames", "Frames", "Each recording became upright pictures at 10 per second with metric depth.", True
-    ),
-    Chapter(
-        "flow",
-        "Optical flow",
-        "How every pixel moves between neighbouring pictures, both ways in time.",
-        True,
-    ),
-    Chapter(
-        "masks", "Masks", "Which pixels show the animal, found from depth and motion alone.", True, ("area",)
-    ),
-    Chapter("feature_basis", "Feature basis", "One basis of picture features, shared by all recordings."),
-    Chapter(
-        "features",
-        "Features",
-        "Every picture described in that basis, so that places can be recognised.",
-        True,
-    ),
-    Chapter(
-        "scene_template",
-        "Map of the room",
-        "The walk-through became a metric, upright map with known cameras.",
-    ),
-    Chapter(
-        "agent_template",
-        "Shape of the animal",
-        "The turnaround became a first body with 25 bones.",
-        nobody_in=("*",),
-    ),
-    Chapter(
-        "scene_localizer",
-        "Finding the camera",
-        "Views rendered from the map teach where a picture was taken.",
-        nobody_in=("errors",),
-    ),
-    Chapter(
-        "agent_localizer",
-        "Finding the animal",
-        "Views rendered from the body teach how the animal stands.",
-        nobody_in=("*",),
-    ),
-    Chapter(
-        "video_poses", "Sessions on the map", "Each session's cameras and animal, placed on the map.", True
-    ),
-    Chapter(
-        "registration",
-        "Registration",
-        "All sessions together in one world; those that do not fit are named.",
-        nobody_in=("*",),
-    ),
-    Chapter(
-        "reconstruction",
-        "4D reconstruction",
-        "Room, animal, bones and motion, fitted to all recordings at once.",
-        nobody_in=("losses",),
-    ),
-    Chapter("splats", "Gaussians", "The same world as 3D Gaussians, refined for looks and motion."),
-    Chapter(
-        "behavior_data",
-        "Behaviour data",
-        "The motion cut into windows of 6.4 s, split by recording.",
-        nobody_in=("*",),
-    ),
-    Chapter(
-        "behavior",
-        "Behaviour model",
-        "Goal, path and body diffusion, conditioned on room, observer and past.",
-        nobody_in=("*",),
-    ),
-    Chapter(
-        "longterm",
-        "Long-term motion",
-        "Bodies at sub-goals, routes between them and poses along routes, in two-second pieces.",
-        nobody_in=("*",),
-    ),
-    Chapter("simulator", "Simulator", "The page that lets the animal live, and files for other programs."),
-    Chapter(
-        "evaluation",
-        "Evaluation",
-        "Everything measured against what is known to be true.",
-        nobody_in=("chart_*",),
-    ),
+CHAPTERS = tuple(
+    Chapter(**entry | {"nobody_in": tuple(entry.get("nobody_in", ()))}) for entry in WORDS["chapters"]
 )
+
+
+def remedy(artifact: str, check: str) -> str:
+    """Return what to do about a check that warns or fails, or nothing where nothing is known."""
+    known = WORDS["remedies"].get(artifact, {})
+    return next((words for begin, words in known.items() if check.lower().startswith(begin)), "")

@@ -7,8 +7,8 @@ import jinja2
 
 from pipeline.metrics import words as metric_words
 from stages.report.bars import Judged
+from stages.report.chapters import remedy
 from stages.report.collect import ChapterReport
-from stages.report.remedies import remedy
 
 WORDS = {"ok": "fine", "warn": "to look at", "fail": "not good", "none": "without a note"}
 MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}

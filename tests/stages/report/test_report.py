@@ -13,8 +13,8 @@ from pipeline.core.videos import Video
 from pipeline.data import images, qa
 from pipeline.workflow import artifact, dag
 from stages.evaluate.judging import LIMITS
-from stages.report import bars, collect, pages, remedies, stage
-from stages.report.chapters import CHAPTERS
+from stages.report import bars, collect, pages, stage
+from stages.report.chapters import CHAPTERS, WORDS, remedy
 from stages.report.config import Config
 
 ROOT = Path(__file__).parents[3]
@@ -235,17 +235,17 @@ def judged_checks() -> list[tuple[str, str]]:
 def test_every_threshold_has_a_remedy() -> None:
     checks = judged_checks() + [("evaluation", name) for name, *_ in LIMITS]
     assert len(checks) > 50
-    assert [each for each in checks if not remedies.remedy(*each)] == []
+    assert [each for each in checks if not remedy(*each)] == []
 
 
 def test_worries_come_with_a_remedy(tmp_path: Path) -> None:
     known = {
         (chapter.artifact, begin)
         for chapter in CHAPTERS
-        for begin in remedies.REMEDIES.get(chapter.artifact, {})
+        for begin in WORDS["remedies"].get(chapter.artifact, {})
     }
-    assert len(known) == sum(len(table) for table in remedies.REMEDIES.values()), (
+    assert len(known) == sum(len(table) for table in WORDS["remedies"].values()), (
         "no remedy for an artifact without a page"
     )
-    assert "walk once more" in remedies.remedy("scene_template", "keyframes registered by COLMAP")
-    assert remedies.remedy("scene_template", "unheard of") == ""
+    assert "walk once more" in remedy("scene_template", "keyframes registered by COLMAP")
+    assert remedy("scene_template", "unheard of") == ""
