@@ -73,22 +73,12 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     if distributed.size() > 1:
         problem = problem.share(distributed.rank(), distributed.size())
         plan = replace(plan, batches=plan.batches.share(distributed.size()))
-    records = {}
-    records["template"] = _run(
-        problem, plan, "template", TemplateLoss(problem), steps.template, field_groups(problem.agent, rates)
-    )
-    scene = [
-        *field_groups(problem.scene, rates),
-        _motion_group([problem.motion.camera], rates.camera, momentum=0.9),
-    ]
-    records["scene"] = _run(
-        problem,
-        plan,
-        "scene",
-        SceneLoss(problem, plan.weights, plan.batches, steps.scene, plan.rendered),
-        steps.scene,
-        scene,
-    )
+    records, agent = {}, field_groups(problem.agent, rates)
+    records["template"] = _run(problem, plan, "template", TemplateLoss(problem), steps.template, agent)
+    cameras = _motion_group([problem.motion.camera], rates.camera, momentum=0.9)
+    scene = [*field_groups(problem.scene, rates), cameras]
+    loss = SceneLoss(problem, plan.weights, plan.batches, steps.scene, plan.rendered)
+    records["scene"] = _run(problem, plan, "scene", loss, steps.scene, scene)
     if len(everything.agent_frames):
         segments = list(chunks(everything, SEGMENT_FRAMES))
         if steps.stance:
@@ -97,14 +87,8 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
             _pose(problem, plan, segments)
         for corrections in (problem.motion.root, problem.motion.bone):
             corrections.data.copy_(distributed.total(corrections))
-        records["joint"] = _run(
-            problem,
-            plan,
-            "joint",
-            JointLoss(problem, plan.weights, plan.batches, steps.joint, plan.rendered),
-            steps.joint,
-            joint_groups(problem, rates),
-        )
+        loss = JointLoss(problem, plan.weights, plan.batches, steps.joint, plan.rendered)
+        records["joint"] = _run(problem, plan, "joint", loss, steps.joint, joint_groups(problem, rates))
     return records
 
 

@@ -5,6 +5,7 @@ follow from them elsewhere, so this runs alone and fast.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,33 +68,32 @@ def simulate_session(
     observer = Observer(person_floor, start, rng, style)
     past: deque[SeenPerson] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
     count = int(np.ceil(duration_s / STEP_S)) + 2
-    rows: list[tuple] = []
+    course, person, reason = [], [], []
     for _ in range(count):
         observer.step(STEP_S, animal.position)
         past.append(SeenPerson(observer.walker.position.copy(), observer.velocity.copy()))
         animal.step(STEP_S, past[0])
-        mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (
-            1.0 - 0.6 * animal.posture[:2].sum()
-        )
-        rows.append(
-            (
-                animal.position,
-                animal.walker.yaw,
-                animal.posture.copy(),
-                float(animal.leap is not None),
-                animal.gaze.copy(),
-                mood,
-                observer.walker.position.copy(),
-                observer.looks_at.copy(),
-                REASONS.index(animal.reason),
-            )
-        )
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    timestamp_s = np.arange(count) * STEP_S
-    course = AnimalCourse(
-        timestamp_s, columns[0], np.unwrap(columns[1]), columns[2], columns[3], columns[4], columns[5]
-    )
-    return SessionTrajectories(course, columns[6], columns[7], columns[8])
+        course.append(course_row(animal))
+        person.append((observer.walker.position.copy(), observer.looks_at.copy()))
+        reason.append(REASONS.index(animal.reason))
+    position, looks_at = (np.array(column) for column in zip(*person, strict=True))
+    return SessionTrajectories(course_from_rows(course), position, looks_at, np.array(reason))
+
+
+CourseRow = tuple[np.ndarray, float, np.ndarray, float, np.ndarray, float]
+
+
+def course_row(animal: Policy) -> CourseRow:
+    """Return where the animal is now, for `course_from_rows`."""
+    mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason]
+    tail, airborne = mood * (1.0 - 0.6 * animal.posture[:2].sum()), float(animal.leap is not None)
+    return animal.position, animal.walker.yaw, animal.posture.copy(), airborne, animal.gaze.copy(), tail
+
+
+def course_from_rows(rows: Sequence[CourseRow]) -> AnimalCourse:
+    """Put the rows of steps of `STEP_S` together."""
+    position, yaw, *others = (np.array(column) for column in zip(*rows, strict=True))
+    return AnimalCourse(np.arange(len(rows)) * STEP_S, position, np.unwrap(yaw), *others)
 
 
 def standing_course(room: Room, rng: np.random.Generator, duration_s: float) -> AnimalCourse:

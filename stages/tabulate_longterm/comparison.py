@@ -24,6 +24,7 @@ from stages.tabulate_longterm import samples as behavior_samples
 from stages.tabulate_longterm.config import Config
 from stages.tabulate_longterm.lengths import LongMotionLength
 from stages.tabulate_longterm.reading import MotionSource
+from stages.tabulate_longterm.samples import SampledModel
 
 CLIP_STRIDE = 10
 """Frames (30 fps) between the starts of held-out clips."""
@@ -130,17 +131,8 @@ def samples(
     windows = windows if len(windows) else np.flatnonzero(data.split == TRAIN)
     some = windows[np.unique(np.linspace(0, len(windows) - 1, min(config.samples, len(windows))).astype(int))]
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
-    return behavior_samples.figures(
-        world_of(source),
-        sampler,
-        data,
-        scenes,
-        architecture.ego,
-        some,
-        config.optimization,
-        draws=RESAMPLES,
-        seed=config.seed,
-    )
+    asked = SampledModel(world_of(source), sampler, data, scenes, architecture.ego, some)
+    return behavior_samples.figures(asked, config.optimization, draws=RESAMPLES, seed=config.seed)
 
 
 def world_of(source: MotionSource) -> LongTermWorld:

@@ -2,6 +2,8 @@
 path errors.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -21,17 +23,20 @@ NAMES = ("penetration", "slide", "goal_error", "path_error")
 UNITS = ("m", "m_s", "m", "m")
 
 
+@dataclass(frozen=True)
+class SampledModel:
+    """A behaviour model, recorded windows to ask it on, and the world in which samples are made physical."""
+
+    world: LongTermWorld
+    sampler: Sampler
+    data: BehaviorData
+    scenes: Scenes
+    ego: Ego
+    windows: Int[np.ndarray, "window"]
+
+
 def figures(
-    world: LongTermWorld,
-    sampler: Sampler,
-    data: BehaviorData,
-    scenes: Scenes,
-    ego: Ego,
-    windows: Int[np.ndarray, "window"],
-    settings: MotionOptimizationConfig,
-    *,
-    draws: int,
-    seed: int,
+    asked: SampledModel, settings: MotionOptimizationConfig, *, draws: int, seed: int
 ) -> dict[str, float | None]:
     """Draw one plan per window, make it physical, and compare penetration, sliding feet and distances from
     the truth.
@@ -39,7 +44,7 @@ def figures(
     `<name>_before_<unit>`, `<name>_<unit>` and `<name>_more_<unit>`, the second less the first, with
     intervals over episodes.
     """
-    both = rows(world, sampler, data, scenes, ego, windows, settings, seed)
+    both, data, windows = rows(asked, settings, seed), asked.data, asked.windows
     episode = episodes(data.start[windows], data.video[windows], FUTURE)
     found: dict[str, float | None] = {"longterm_samples/windows": float(len(windows))}
     for column, (name, unit) in enumerate(zip(NAMES, UNITS, strict=True)):
@@ -47,41 +52,30 @@ def figures(
         for ending, values in (("_before", before), ("", after), ("_more", after - before)):
             key, known = f"longterm_samples/{name}{ending}_{unit}", np.isfinite(values)
             groups = np.unique(episode[known], return_inverse=True)[1]
-            interval = (
-                bootstrapped(values[known], groups, draws, np.random.default_rng(seed)).as_figures(key)
-                if known.any()
-                else None
-            )
-            found |= interval or dict.fromkeys(names_of(key))
+            if known.any():
+                rng = np.random.default_rng(seed)
+                found |= bootstrapped(values[known], groups, draws, rng).as_figures(key)
+            else:
+                found |= dict.fromkeys(names_of(key))
     return found
 
 
 def rows(
-    world: LongTermWorld,
-    sampler: Sampler,
-    data: BehaviorData,
-    scenes: Scenes,
-    ego: Ego,
-    windows: Int[np.ndarray, "window"],
-    settings: MotionOptimizationConfig,
-    seed: int,
+    asked: SampledModel, settings: MotionOptimizationConfig, seed: int
 ) -> Float[np.ndarray, "window 2 4"]:
     """Return `NAMES` of each window's plan before and after."""
-    context, future = data.windows(windows)
-    observation = observe(context, scenes, data.agent_from_bone_rest, ego)
-    plan = sampler.plan(observation, PlanSamplingConfig(), np.random.default_rng(seed))
-    roots = plan.world_from_agent(world_from_ego(context.world_from_agent[:, -1], ego))
+    data = asked.data
+    context, future = data.windows(asked.windows)
+    observation = observe(context, asked.scenes, data.agent_from_bone_rest, asked.ego)
+    plan = asked.sampler.plan(observation, PlanSamplingConfig(), np.random.default_rng(seed))
+    roots = plan.world_from_agent(world_from_ego(context.world_from_agent[:, -1], asked.ego))
     bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], data.agent_from_bone_rest)
     count = min(roots.shape[1], future.path_world.shape[1])
     time_s, found = np.arange(count) / RATE_HZ, []
     plans = zip(roots[:, :count], bones[:, :count], future.path_world[:, :count], strict=True)
     for root, bone, truth in progress.track(plans, "samples", total=len(roots)):
-        done, *worth = refine_at_rate(world, time_s, BodyMotion(root, bone), settings)
+        done, *worth = refine_at_rate(asked.world, time_s, BodyMotion(root, bone), settings)
         off = [np.linalg.norm(each[:, :3, 3] - truth, axis=1) for each in (root, done.world_from_agent)]
-        found.append(
-            [
-                [each.penetration_m, each.slide_m_s, away[-1], away.mean()]
-                for each, away in zip(worth, off, strict=True)
-            ]
-        )
+        both = zip(worth, off, strict=True)
+        found.append([[each.penetration_m, each.slide_m_s, away[-1], away.mean()] for each, away in both])
     return np.array(found)

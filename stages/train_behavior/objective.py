@@ -36,18 +36,33 @@ def losses(
 
     Only what learns has an error.
     """
-    with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
-        code = perceive(nets, batch, objective, generator)
-    if phase == "sequences":
-        goal_loss = {}
-    else:
-        goal_loss = {"goal": goal_error(nets, batch, code, schedule, objective, generator).mean()}
-    if phase == "goals":
-        return goal_loss
+
+    def goal(code: Tensor) -> Tensor:
+        return goal_error(nets, batch, code, schedule, objective, generator)
 
     def error(denoise: Denoise, clean: Tensor) -> Tensor:
         return squared_error(denoise, clean, schedule, objective.weighting, generator)
 
+    return level_losses(nets, batch, objective, generator, phase, goal, error)
+
+
+def level_losses(
+    nets: BehaviorNets,
+    batch: TrainingBatch,
+    objective: ObjectiveConfig,
+    generator: torch.Generator,
+    phase: TrainingPhase,
+    goal: Callable[[Float[Tensor, "batch condition"]], Float[Tensor, "draw 3"]],
+    error: Callable[[Denoise, Float[Tensor, "row ..."]], Float[Tensor, "row ..."]],
+) -> dict[str, Float[Tensor, ""]]:
+    """Return the mean error of goal, path and body, each given the level above it; ``goal`` takes the
+    perception code.
+    """
+    with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
+        code = perceive(nets, batch, objective, generator)
+    goal_loss = {} if phase == "sequences" else {"goal": goal(code).mean()}
+    if phase == "goals":
+        return goal_loss
     path_rows, body_rows, known = sequence_rows(batch, objective)
     steered = keep_mask(len(code), 1, generator).to(code.device)
     towards, along = batch.goal[path_rows], batch.places[body_rows]

@@ -1,6 +1,5 @@
 """What the rival models of Table 4 minimise, on the same batches and with the same dropping of conditions."""
 
-import contextlib
 import math
 
 import torch
@@ -13,15 +12,7 @@ from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.rivals.samplers import LOG_STD_BOUNDS, LOG_STD_STEP, MEAN_STEP
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig
-from stages.train_behavior.objective import (
-    Denoise,
-    TrainingPhase,
-    keep_mask,
-    mean_of_known,
-    perceive,
-    sequence_rows,
-    squared_error,
-)
+from stages.train_behavior.objective import Denoise, TrainingPhase, level_losses, perceive, squared_error
 
 
 def gaussian_losses(
@@ -35,22 +26,11 @@ def gaussian_losses(
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the negative log-likelihood per number of goal, path and body, each given the level above it."""
     del schedule
-    with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
-        code = perceive(nets, batch, objective, generator)
-        goal = negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal).mean()
-    goal_loss = {} if phase == "sequences" else {"goal": goal}
-    if phase == "goals":
-        return goal_loss
-    path_rows, body_rows, known = sequence_rows(batch, objective)
-    steered = keep_mask(len(code), 1, generator).to(code.device)
-    towards, along = batch.goal[path_rows], batch.places[body_rows]
-    path = negative_log_likelihood(
-        lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows]
-    )
-    body = negative_log_likelihood(
-        lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows]
-    )
-    return goal_loss | {"path": path.mean(), "body": mean_of_known(body, known)}
+
+    def goal(code: Tensor) -> Tensor:
+        return negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal)
+
+    return level_losses(nets, batch, objective, generator, phase, goal, negative_log_likelihood)
 
 
 def negative_log_likelihood(

@@ -29,6 +29,8 @@ from stages.synthesize_capture.session import (
     PERSON_HEIGHT_M,
     STEP_S,
     AnimalCourse,
+    course_from_rows,
+    course_row,
 )
 from stages.synthesize_capture.voxels import volume_of
 
@@ -108,24 +110,9 @@ def _played(
         person.step(STEP_S, animal.position)
         past.append(SeenPerson(person.walker.position.copy(), person.velocity.copy()))
         animal.step(STEP_S, past[0])
-        mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason] * (
-            1.0 - 0.6 * animal.posture[:2].sum()
-        )
-        rows.append(
-            (
-                animal.position,
-                animal.walker.yaw,
-                animal.posture.copy(),
-                float(animal.leap is not None),
-                animal.gaze.copy(),
-                mood,
-            )
-        )
+        rows.append(course_row(animal))
         seen.append([person.walker.position[0], EYE_M, person.walker.position[1]])
-    position, yaw, posture, air, gaze, tail = (np.array(column) for column in zip(*rows, strict=True))
-    return AnimalCourse(
-        np.arange(len(rows)) * STEP_S, position, np.unwrap(yaw), posture, air, gaze, tail
-    ), np.array(seen)
+    return course_from_rows(rows), np.array(seen)
 
 
 def write(folder: Path, met: ScriptedApproaches) -> None:
