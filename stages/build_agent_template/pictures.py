@@ -1,11 +1,11 @@
 """What the report shows of the template: turntables of color and bones, figures with thresholds."""
 
-import colorsys
-
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
+from matplotlib.colors import hsv_to_rgb
 
+from pipeline.data import plots
 from pipeline.data.qa import Check, Picture
 from pipeline.geometry import rigid
 from pipeline.geometry import views as overview
@@ -18,41 +18,23 @@ def turntable(mesh: Mesh, views: int = 8, size_px: int = 220) -> UInt8[np.ndarra
     above.
     """
     caster, radius = RayCaster(mesh), float(np.linalg.norm(mesh.vertices, axis=1).max())
-    focal = 1.4 * size_px
+    focal, up = 1.4 * size_px, np.array([0.0, 1.0, 0.0])
     intrinsics = np.array([[focal, 0, size_px / 2], [0, focal, size_px / 2], [0, 0, 1]])
-    rows = []
+    shown = []
     for lift in (0.25, 0.9):
-        row = []
-        for index in range(views):
-            turn = 2 * np.pi * index / views
-            eye = (
-                3.2
-                * radius
-                * np.array([np.cos(lift) * np.sin(turn), np.sin(lift), np.cos(lift) * np.cos(turn)])
-            )
-            row.append(
-                overview.view(
-                    caster,
-                    rigid.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0])),
-                    intrinsics,
-                    size_px,
-                    size_px,
-                )
-            )
-        rows.append(np.hstack(row))
-    return np.vstack(rows)
+        for turn in 2 * np.pi * np.arange(views) / views:
+            toward = np.array([np.cos(lift) * np.sin(turn), np.sin(lift), np.cos(lift) * np.cos(turn)])
+            camera = rigid.look_at(3.2 * radius * toward, np.zeros(3), up)
+            shown.append(overview.view(caster, camera, intrinsics, size_px, size_px))
+    return plots.grid(shown, views)
 
 
 def bone_colors(weights: Float[np.ndarray, "vertex bone"]) -> UInt8[np.ndarray, "vertex 3"]:
     """Mix one hue per bone by the skinning weights."""
-    count = weights.shape[1]
-    hue = np.array(
-        [
-            colorsys.hsv_to_rgb((7 * bone % count) / count, 0.75, 0.95 if bone % 2 else 0.7)
-            for bone in range(count)
-        ]
-    )
-    return np.round(255 * weights @ hue).astype(np.uint8)
+    bone = np.arange(weights.shape[1])
+    hue, value = (7 * bone % len(bone)) / len(bone), np.where(bone % 2, 0.95, 0.7)
+    color = hsv_to_rgb(np.stack([hue, np.full(len(bone), 0.75), value], axis=1))
+    return np.round(255 * weights @ color).astype(np.uint8)
 
 
 def report(template: CanonicalTemplate) -> tuple[list[Check], list[Picture]]:
@@ -60,6 +42,7 @@ def report(template: CanonicalTemplate) -> tuple[list[Check], list[Picture]]:
     mesh = template.mesh
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     influence = template.weights.sum(0)
+    idle = influence < 0.01 * influence.mean() * len(influence)
     checks = [
         Check("circle covered", template.around_deg, "deg", warn=330, fail=200, better="higher"),
         Check("agreement of depth pictures", 1000 * template.residual_m, "mm", warn=20, fail=50),
@@ -69,12 +52,7 @@ def report(template: CanonicalTemplate) -> tuple[list[Check], list[Picture]]:
         Check("volume", 1000 * float(abs(solid.volume)), "l"),
         Check("longer than wide (1 = ambiguous)", template.elongation, "", warn=1.3, better="higher"),
         Check("head against tail (50 = ambiguous)", 100 * template.head_share, "%", warn=55, better="higher"),
-        Check(
-            "bones that move less than 1 % of the surface",
-            float((influence < 0.01 * influence.mean() * len(influence)).sum()),
-            "",
-            warn=8,
-        ),
+        Check("bones that move less than 1 % of the surface", float(idle.sum()), "", warn=8),
     ]
     bones = Mesh(mesh.vertices, mesh.faces, bone_colors(template.weights))
     pictures = [

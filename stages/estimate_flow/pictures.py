@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.data import qa
+from pipeline.data import plots, qa
 from pipeline.data.flow import STRIDE_PX, open_confidence, open_flow
 
 SHOWN_FRAMES = 6
+LEAST_AGREEMENT = {1: 0.6, 2: 0.5, 4: 0.35, 8: 0.2}
+"""share of vectors that should agree, by the gap"""
 CERTAIN = 128
 """stored confidence (of 255) that counts as agreement"""
 
@@ -39,7 +41,7 @@ def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "hei
         agreement.append(float(certain.mean()))
         if certain.any():
             speed_px.append(float(np.linalg.norm(flow[certain].astype(np.float32), axis=-1).mean()))
-    shown = np.unique(np.linspace(0, len(flows) - 1, SHOWN_FRAMES).astype(int))
+    shown = plots.sample(len(flows), SHOWN_FRAMES)
     columns = [_column(color(int(i)), flows[i], confidences[i]) for i in shown]
     strip = np.concatenate([*columns, _key(len(columns[0]))], axis=1)
     return Review(gap, float(np.mean(agreement)), float(np.mean(speed_px)) if speed_px else 0.0, strip)
@@ -47,17 +49,11 @@ def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "hei
 
 def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
     """Write the stage's own judgement."""
-    limits = {1: 0.6, 2: 0.5, 4: 0.35, 8: 0.2}
-    checks = [
-        qa.Check(
-            f"both directions agree, {each.gap} apart",
-            100 * each.agreement,
-            "%",
-            warn=100 * limits[each.gap],
-            better="higher",
-        )
-        for each in reviews
-    ] + [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
+    checks = []
+    for each in reviews:
+        name, least = f"both directions agree, {each.gap} apart", 100 * LEAST_AGREEMENT[each.gap]
+        checks.append(qa.Check(name, 100 * each.agreement, "%", warn=least, better="higher"))
+    checks += [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
     pictures = [
         qa.Picture(
             f"gap_{each.gap}",
@@ -107,7 +103,6 @@ def _column(
 ) -> UInt8[np.ndarray, "height width 3"]:
     full_px = max(float(np.percentile(np.linalg.norm(flow.astype(np.float32), axis=-1), 95)), 1.0)
     wheel = flow_wheel(flow, full_px) * (0.25 + 0.75 * confidence[..., None] / 255)
-    size = (2 * flow.shape[1], 2 * flow.shape[0])
-    big = cv2.resize(wheel.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     crop = color[: flow.shape[0] * STRIDE_PX, : flow.shape[1] * STRIDE_PX]
-    return np.concatenate([cv2.resize(crop, size, interpolation=cv2.INTER_AREA), big], axis=0)
+    size = (2 * flow.shape[0], 2 * flow.shape[1])
+    return plots.grid([plots.resized(crop, size), plots.resized(wheel.astype(np.uint8), size)], 1)

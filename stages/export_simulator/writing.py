@@ -111,7 +111,7 @@ def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> d
         "pictures": [
             Picture(
                 "visits",
-                pictures.visits(parts.scene, parts.setting, parts.motions),
+                pictures.visits(parts.scene, parts.setting.floor_m, parts.motions),
                 "the room from above: where the animal (amber) and the person (blue) have been",
             )
         ],
