@@ -2,7 +2,7 @@
 windows.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,13 +33,25 @@ def names_of(name: str) -> tuple[str, str, str]:
     return name, f"{name}_ci95_low", f"{name}_ci95_high"
 
 
-def formatted_interval(figures: Mapping[str, float | None], name: str, form: str = ".4g") -> str:
-    """Write a figure of a table with its interval, where it has one; ``-`` where it is nothing."""
-    mean, *ends = (figures.get(each) for each in names_of(name))
+def formatted_interval(
+    figures: Mapping[str, float | None], name: str, form: str = ".4g", scale: float = 1.0
+) -> str:
+    """Write ``scale`` times a figure of a table with its interval, where it has one; ``-`` where it is
+    nothing.
+    """
+    mean, *ends = (None if (v := figures.get(each)) is None else scale * v for each in names_of(name))
     if mean is None:
         return "-"
-    return format(mean, form) + (
-        f" [{' '.join(format(end, form) for end in ends)}]" if None not in ends else ""
+    known = [format(end, form) for end in ends if end is not None]
+    return format(mean, form) + (f" [{' '.join(known)}]" if len(known) == len(ends) else "")
+
+
+def aligned(title: str, rows: Sequence[Sequence[str]]) -> str:
+    """Write a table: its title, then the rows in columns as wide as their widest cell."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = (zip(row, widths, strict=True) for row in rows)
+    return "\n".join(
+        [title, *("  ".join(text.ljust(width) for text, width in row).rstrip() for row in cells)]
     )
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from pipeline.metrics.intervals import formatted_interval
+from pipeline.metrics.intervals import aligned, formatted_interval
 
 END_TO_END = (
     ("goal_minde_m", "goal [m]"),
@@ -51,8 +51,4 @@ def table(
         cells = [formatted_interval(figures, f"behavior/{method}/{name}", ".3f") for name, _ in columns]
         if any(text != "-" for text in cells):
             rows.append([method, *cells])
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
-    return "\n".join([title, *lines])
+    return aligned(title, rows)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.metrics.intervals import bootstrapped, formatted_interval, names_of
+from pipeline.metrics.intervals import aligned, bootstrapped, formatted_interval, names_of
 from stages.tabulate_longterm.scores import MEDIANS, METRICS
 
 TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
@@ -34,9 +34,8 @@ def figures(
                 found |= dict.fromkeys(names_of(name))
                 continue
             groups = np.unique(episode[: len(column)][known], return_inverse=True)[1]
-            found |= bootstrapped(
-                column[known], groups, draws, np.random.default_rng(seed), median=metric in MEDIANS
-            ).as_figures(name)
+            rng, middle = np.random.default_rng(seed), metric in MEDIANS
+            found |= bootstrapped(column[known], groups, draws, rng, median=middle).as_figures(name)
     return found
 
 
@@ -58,14 +57,8 @@ def text(found: Mapping[str, float | None]) -> str:
                 parts.append(_table(f"Table {number}: {title}", prefix, list(methods), columns, found))
     others = [name for name in found if name.split("/")[0] in ("longterm_minutes", "longterm_samples")]
     if others:
-        parts.append(
-            "\n".join(
-                [
-                    "Minutes of motion, and samples of the behaviour model",
-                    *(f"{name}  {formatted_interval(found, name)}" for name in others),
-                ]
-            )
-        )
+        rows = [(name, formatted_interval(found, name)) for name in others]
+        parts.append(aligned("Minutes of motion, and samples of the behaviour model", rows))
     return "\n\n".join(parts)
 
 
@@ -74,16 +67,6 @@ def _table(
 ) -> str:
     rows = [["method", *columns]]
     for method in methods:
-        rows.append(
-            [method, *(formatted_interval(found, f"{prefix}/{method}/{column}") for column in columns)]
-        )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join(
-        [
-            title,
-            *(
-                "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-                for row in rows
-            ),
-        ]
-    )
+        names = (f"{prefix}/{method}/{column}" for column in columns)
+        rows.append([method, *(formatted_interval(found, name) for name in names)])
+    return aligned(title, rows)

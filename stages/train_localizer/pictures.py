@@ -31,29 +31,12 @@ def checks(held: HeldOut, target: Target) -> list[Check]:
     """Judge the held-out figures."""
     figures = report(held, target)
     rotation, translation = (2.0, 0.05) if target == "scene" else (20.0, 0.08)
+    right = "right answers (within {:g} deg, {:g} m)".format(*GOOD[target])
+    turned, moved = figures["rotation_deg_median"], figures["translation_m_median"]
     return [
-        Check(
-            "rotation, median of held-out renders",
-            figures["rotation_deg_median"],
-            "deg",
-            rotation,
-            10 * rotation,
-        ),
-        Check(
-            "translation, median of held-out renders",
-            figures["translation_m_median"],
-            "m",
-            translation,
-            10 * translation,
-        ),
-        Check(
-            "right answers (within {:g} deg, {:g} m)".format(*GOOD[target]),
-            figures["good_share"],
-            "share",
-            0.6,
-            0.1,
-            "higher",
-        ),
+        Check("rotation, median of held-out renders", turned, "deg", rotation, 10 * rotation),
+        Check("translation, median of held-out renders", moved, "m", translation, 10 * translation),
+        Check(right, figures["good_share"], "share", 0.6, 0.1, "higher"),
     ]
 
 
@@ -66,19 +49,12 @@ def pictures(held: HeldOut, localizer: Localizer, target: Target) -> list[Pictur
         _shown(held.views[index].color, f"{rotation[index]:.1f} deg, p {probability[index]:.2f}")
         for index in worst
     ]
+    shown = {"rotation error [deg]": np.clip(rotation, 0.1, 180)}
+    errors = plots.histograms(shown, log=True, good_below=GOOD[target][0])
+    what = "The eight held-out renders with the largest error, and the probability they were given."
     return [
-        Picture(
-            "errors",
-            plots.histograms(
-                {"rotation error [deg]": np.clip(rotation, 0.1, 180)}, log=True, good_below=GOOD[target][0]
-            ),
-            "Rotation error of held-out renders, in degrees; green: counted as right.",
-        ),
-        Picture(
-            "worst",
-            plots.grid(tiles, 4),
-            "The eight held-out renders with the largest error, and the probability they were given.",
-        ),
+        Picture("errors", errors, "Rotation error of held-out renders, in degrees; green: counted as right."),
+        Picture("worst", plots.grid(tiles, 4), what),
     ]
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from pipeline.core import devices
 from pipeline.core.videos import Video
 from pipeline.data.qa import Check
-from pipeline.metrics.intervals import bootstrapped, episodes
+from pipeline.metrics.intervals import aligned, bootstrapped, episodes, formatted_interval
 from pipeline.metrics.metrics import Metrics, formatted
 from stages.evaluate import heldout, reading, reconstruction, surfaces
 from stages.evaluate.heldout import PARTS, HeldoutView
@@ -32,6 +32,14 @@ NAMES = {
     "totalrecon_single": "TotalRecon, one video",
 }
 COLUMNS = {"depth_acc": "DepthAcc@0.1m", "psnr": "PSNR, dB", "ssim": "SSIM"}
+TITLE = (
+    "Table 3: seen by the held-out phone (all / agent / scene); roots and followed points in the sessions it "
+    "filmed too"
+)
+FOOTNOTE = (
+    "paper: DepthAcc on its own cat; tracks: median / 90th percentile; '-': nothing could be measured; "
+    "what was refused counts as wrong. Same steps and seed for all."
+)
 NO_TRUTH = "what the held-out phone truly saw is not known for this capture"
 EPISODE_FRAMES = 3
 """Rendered frames that are resampled together: neighbours look alike."""
@@ -124,38 +132,23 @@ def _compare(
 
 def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
     """Lay the metrics out as Table 3, the paper's beside ours."""
-    lines = [
-        (
-            "Table 3: seen by the held-out phone (all / agent / scene); roots and "
-            "followed points in the sessions it filmed too"
-        )
-    ]
-    head = f"{'':34}" + "".join(f"{name:>24}" for name in COLUMNS.values())
-    lines.append(head + f"{'all, less than ours':>28}{'root, m / deg':>18}{'tracks, m':>18}{'paper':>24}")
+    rows = [["", *COLUMNS.values(), "all, less than ours", "root, m / deg", "tracks, m", "paper"]]
     for variant in variants:
-        row = f"{NAMES.get(variant, variant):34}"
-        for kind in COLUMNS:
-            form = ".1f" if kind == "psnr" else ".3f"
-            row += (
-                f"{' / '.join(formatted(values.get(f'{variant}/{kind}_{part}'), form) for part in PARTS):>24}"
-            )
-        lacking = [
-            formatted(values.get(f"{variant}/depth_acc_all_less_than_ours{end}"))
-            for end in ("", "_ci95_low", "_ci95_high")
+
+        def several(*names: str, form: str = ".3f", variant: str = variant) -> str:
+            return " / ".join(formatted(values.get(f"{variant}/{name}"), form) for name in names)
+
+        seen = [
+            several(*(f"{kind}_{part}" for part in PARTS), form=".1f" if kind == "psnr" else ".3f")
+            for kind in COLUMNS
         ]
-        row += f"{'' if variant == 'ours' else f'{lacking[0]} [{lacking[1]}, {lacking[2]}]':>28}"
-        root = (
-            formatted(values.get(f"{variant}/agent_root_m_median")),
-            formatted(values.get(f"{variant}/agent_root_deg_median"), ".1f"),
-        )
-        tracks = (formatted(values.get(f"{variant}/agent_track_m_{which}")) for which in ("median", "p90"))
-        row += f"{' / '.join(root):>18}{' / '.join(tracks):>18}"
-        lines.append(row + f"{' / '.join(f'{value:g}' for value in PAPER.get(variant, ())):>24}")
-    lines.append(
-        "paper: DepthAcc on its own cat; tracks: median / 90th percentile; '-': nothing could be measured; "
-        "what was refused counts as wrong. Same steps and seed for all."
-    )
-    return "\n".join(lines) + "\n"
+        lacking = formatted_interval(values, f"{variant}/depth_acc_all_less_than_ours", ".3f")
+        root = f"{several('agent_root_m_median')} / {several('agent_root_deg_median', form='.1f')}"
+        tracks = several("agent_track_m_median", "agent_track_m_p90")
+        paper = " / ".join(f"{value:g}" for value in PAPER.get(variant, ()))
+        lacking = "" if variant == "ours" else lacking
+        rows.append([NAMES.get(variant, variant), *seen, lacking, root, tracks, paper])
+    return f"{aligned(TITLE, rows)}\n{FOOTNOTE}\n"
 
 
 def pictures(found: Metrics) -> dict[str, tuple[UInt8[np.ndarray, "height width 3"], str]]:
@@ -168,15 +161,10 @@ def pictures(found: Metrics) -> dict[str, tuple[UInt8[np.ndarray, "height width 
 
 def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:
     """Judge whether ours is ahead of each rival over all pixels."""
-    found = [
-        Check("DepthAcc of all pixels, ours", values.get("ours/depth_acc_all"), "share", 0.85, 0.7, "higher")
-    ]
-    for variant in variants:
-        if variant != "ours":
-            name = f"DepthAcc that is lacking: {NAMES.get(variant, variant)}"
-            found.append(
-                Check(
-                    name, values.get(f"{variant}/depth_acc_all_less_than_ours"), "share", 0.0, None, "higher"
-                )
-            )
+    share = values.get("ours/depth_acc_all")
+    found = [Check("DepthAcc of all pixels, ours", share, "share", 0.85, 0.7, "higher")]
+    for variant in (each for each in variants if each != "ours"):
+        name = f"DepthAcc that is lacking: {NAMES.get(variant, variant)}"
+        less = values.get(f"{variant}/depth_acc_all_less_than_ours")
+        found.append(Check(name, less, "share", 0.0, None, "higher"))
     return found

@@ -12,7 +12,7 @@ from pipeline.data.clips import FRAMES
 from pipeline.data.poses import RegisteredPoses
 from pipeline.data.qa import Check
 from pipeline.data.templates import SceneCameras
-from pipeline.metrics.intervals import bootstrapped, episodes
+from pipeline.metrics.intervals import aligned, bootstrapped, episodes, formatted_interval
 from pipeline.metrics.metrics import Metrics, formatted, median
 from pipeline.metrics.pose_errors import PoseErrors, constant_between, joined, pose_errors
 from stages.evaluate import registration
@@ -27,6 +27,11 @@ NAMES = {
     "no_odometry": "without odometry",
     "regression_only": "regression only",
 }
+TITLE = (
+    "Table 1: camera registration, all frames of all sessions (median; 95th percentile; mean difference to "
+    "ours with 95 % interval)"
+)
+FOOTNOTE = "paper: on its own cat videos; '-': more than half (a twentieth) of the frames has no pose."
 EPISODE_S = 5.0
 """Intervals resample stretches of this length together: poses of neighbouring frames err alike."""
 BOOTSTRAP_DRAWS = 2000
@@ -140,57 +145,35 @@ def _confidence(poses, session):
 
 def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:
     """Lay the metrics out as Table 1, the paper's beside ours."""
-    lines = [
-        (
-            "Table 1: camera registration, all frames of all sessions (median; 95th "
-            "percentile; mean difference to ours with 95 % interval)"
-        ),
-        f"{'':34}{'rotation, deg':>20}{'translation, m':>20}{'videos':>9}{'to ours, deg':>28}{'paper':>16}",
-    ]
+    rows = [["", "rotation, deg", "translation, m", "videos", "to ours, deg", "paper"]]
     for variant in variants:
         pairs = [
             "; ".join(formatted(values.get(f"{variant}/{unit}_{which}")) for which in ("median", "p95"))
             for unit in UNITS
         ]
-        videos = "/".join(
-            formatted(values.get(f"{variant}/videos_{which}"), "g") for which in ("registered", "total")
-        )
-        against = (
-            "" if variant == "ours" else _interval(values, f"{variant}/rotation_deg_more_than_ours", ".3f")
-        )
+        counts = (values.get(f"{variant}/videos_{which}") for which in ("registered", "total"))
+        videos = "/".join(formatted(count, "g") for count in counts)
+        against = formatted_interval(values, f"{variant}/rotation_deg_more_than_ours", ".3f")
         paper = "{:g} / {:g}".format(*PAPER[variant]) if variant in PAPER else ""
-        lines.append(
-            f"{NAMES.get(variant, variant):34}{pairs[0]:>20}{pairs[1]:>20}{videos:>9}{against:>28}{paper:>16}"
-        )
+        rows.append([_name(variant), *pairs, videos, "" if variant == "ours" else against, paper])
+    parts = [aligned(TITLE, rows)]
     sessions = sorted({name.split("/")[1] for name in values if name.count("/") == 2})
-    lines += (
-        ["", f"{'per session: median deg':34}" + "".join(f"{id:>26}" for id in sessions)] if sessions else []
-    )
-    for variant in variants if sessions else ():
-        row = "".join(
-            f"{formatted(values.get(f'{variant}/{id}/rotation_deg_median')):>26}" for id in sessions
-        )
-        lines.append(f"{NAMES.get(variant, variant):34}{row}")
-    lines += ["", "per session: mean difference to ours, mm"] if sessions else []
-    for variant in [each for each in variants if each != "ours"] if sessions else ():
-        row = "".join(
-            f"{_interval(values, f'{variant}/{id}/translation_m_more_than_ours', '.1f', 1000):>26}"
-            for id in sessions
-        )
-        lines.append(f"{NAMES.get(variant, variant):34}{row}")
-    lines.append(
-        "paper: its own cat videos, degrees / metres; '-': more than half "
-        "(a twentieth) of the frames has no pose."
-    )
-    return "\n".join(lines) + "\n"
+    if sessions:
+        rows = [["", *sessions]]
+        for variant in variants:
+            medians = (values.get(f"{variant}/{id}/rotation_deg_median") for id in sessions)
+            rows.append([_name(variant), *map(formatted, medians)])
+        parts.append(aligned("per session: median deg", rows))
+        rows = [["", *sessions]]
+        for variant in (each for each in variants if each != "ours"):
+            names = (f"{variant}/{id}/translation_m_more_than_ours" for id in sessions)
+            rows.append([_name(variant), *(formatted_interval(values, name, ".1f", 1000) for name in names)])
+        parts.append(aligned("per session: mean difference to ours, mm", rows))
+    return "\n\n".join([*parts, FOOTNOTE]) + "\n"
 
 
-def _interval(values: Mapping[str, float | None], name: str, form: str, scale: float = 1.0) -> str:
-    mean, low, high = (
-        None if (value := values.get(name + end)) is None else scale * value
-        for end in ("", "_ci95_low", "_ci95_high")
-    )
-    return f"{formatted(mean, form)} [{formatted(low, form)}, {formatted(high, form)}]"
+def _name(variant: str) -> str:
+    return NAMES.get(variant, variant)
 
 
 def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:
