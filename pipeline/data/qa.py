@@ -5,7 +5,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -49,6 +49,11 @@ class Picture:
     """File name without ending."""
     image: UInt8[ndarray, "height width 3"]
     caption: str
+
+
+def captioned(captions: Mapping[str, str], **images: UInt8[ndarray, "_ _ 3"]) -> list[Picture]:
+    """Return pictures by name with their captions, in the order of the pictures."""
+    return [Picture(name, image, captions[name]) for name, image in images.items()]
 
 
 def write(

@@ -5,31 +5,25 @@ from jaxtyping import UInt8
 
 from pipeline.data import plots
 from pipeline.data.clips import Clip
-from pipeline.data.qa import Check, Picture
+from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid
 from pipeline.geometry import views as overview
 from pipeline.geometry.meshes import RayCaster
 from stages.build_scene_template.template import SceneTemplate
 
 UP = np.array([0.0, 1.0, 0.0])
+CAPTIONS = {
+    "turntable": "The fused mesh from four sides, seen through its walls' backs.",
+    "coverage": "From above: the seen surface and the walk-through's path.",
+    "frames": "Upper row: frames of the walk-through; lower row: the mesh from the same cameras.",
+}
 
 
 def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
     """Draw the template for people."""
     caster = RayCaster(template.mesh)
-    return [
-        Picture(
-            "turntable",
-            turntable(template, caster),
-            "The fused mesh from four sides, seen through its walls' backs.",
-        ),
-        Picture("coverage", coverage(template), "From above: the seen surface and the walk-through's path."),
-        Picture(
-            "frames",
-            frames(template, clip, caster),
-            "Upper row: frames of the walk-through; lower row: the mesh from the same cameras.",
-        ),
-    ]
+    turned, beside = turntable(template, caster), frames(template, clip, caster)
+    return captioned(CAPTIONS, turntable=turned, coverage=coverage(template), frames=beside)
 
 
 def turntable(template: SceneTemplate, caster: RayCaster) -> UInt8[np.ndarray, "height width 3"]:
@@ -73,23 +67,13 @@ def checks(template: SceneTemplate) -> list[Check]:
     ]
     if template.own_mesh:
         return surface
+    registered = len(start.registered) / template.keyframes
+    odometry = None if start.odometry_scale is None else abs(start.odometry_scale - 1)
     return [
-        Check(
-            "keyframes registered by COLMAP",
-            len(start.registered) / template.keyframes,
-            "share",
-            0.8,
-            0.0,
-            "higher",
-        ),
+        Check("keyframes registered by COLMAP", registered, "share", 0.8, 0.0, "higher"),
         Check("reprojection error", template.reprojection_px, "px", 1.5),
         Check("scale against depth, relative spread", start.scale_deviation, "", 0.05),
-        Check(
-            "scale against odometry",
-            None if start.odometry_scale is None else abs(start.odometry_scale - 1),
-            "relative difference",
-            0.05,
-        ),
+        Check("scale against odometry", odometry, "relative difference", 0.05),
         *surface,
     ]
 

@@ -91,6 +91,8 @@ def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], l
 def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> dict[str, Any]:
     """Return checks and pictures of the simulator for `qa.write`."""
     residual_mm = parts.residual_m * 1000
+    visits = pictures.visits(parts.scene, parts.setting.floor_m, parts.motions)
+    about = "the room from above: where the animal (amber) and the person (blue) have been"
     return {
         "good": "the page opens within seconds; the skin of `agent.glb` is within 2 mm of the reconstruction",
         "bad": "limbs of `agent.glb` that thin out at the joints, or a page too big to send",
@@ -100,19 +102,9 @@ def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> d
             Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
             Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),
             Check(
-                "recorded motion that the scene carries",
-                supported,
-                "share",
-                warn=LEAST_SUPPORTED,
-                better="higher",
+                "recorded motion that the scene carries", supported, "share", LEAST_SUPPORTED, None, "higher"
             ),
             Check("sessions to replay", len(parts.motions), "", warn=1, better="higher"),
         ],
-        "pictures": [
-            Picture(
-                "visits",
-                pictures.visits(parts.scene, parts.setting.floor_m, parts.motions),
-                "the room from above: where the animal (amber) and the person (blue) have been",
-            )
-        ],
+        "pictures": [Picture("visits", visits, about)],
     }

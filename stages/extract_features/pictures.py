@@ -21,19 +21,12 @@ def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame 
     steady = [
         np.einsum("hwc,hwc->hw", *features[i : i + 2].astype(np.float32)) for i in range(len(features) - 1)
     ]
+    similarity = float(np.median(steady))
     qa.write(
         folder,
         good="the same thing has the same colour in all pictures and in all recordings",
         bad="colours flicker between neighbouring pictures, or all is one colour",
-        checks=[
-            qa.Check(
-                "cosine similarity of neighbouring frames",
-                float(np.median(steady)),
-                "",
-                warn=0.5,
-                better="higher",
-            )
-        ],
+        checks=[qa.Check("cosine similarity of neighbouring frames", similarity, "", 0.5, None, "higher")],
         pictures=[qa.Picture("features", sheet, "frames and their first three channels")],
     )
 

@@ -6,13 +6,18 @@ from jaxtyping import Float, UInt8
 
 from pipeline.data import plots
 from pipeline.data.clips import Clip
-from pipeline.data.qa import Check, Picture
+from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid, views
 from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.mapping.depth_scans import SurfaceMap
 from stages.register_videos.registration import Maps, Registered, Rejected
 
 EDGE, PHONE, ANIMAL, HEAD = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
+CAPTIONS = {
+    "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
+    "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
+    "depth": "Static depth on the map from above: green within 5 cm of the surface, red further away.",
+}
 
 
 def status(
@@ -62,16 +67,10 @@ def checks(result: Registered | Rejected) -> list[Check]:
     """Judge the outcome."""
     if isinstance(result, Rejected):
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
+    agreed = float(result.supports.mean()) if len(result.supports) else None
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
-        Check(
-            "frame votes that agree",
-            float(result.supports.mean()) if len(result.supports) else None,
-            "share",
-            0.5,
-            0.25,
-            "higher",
-        ),
+        Check("frame votes that agree", agreed, "share", 0.5, 0.25, "higher"),
         Check("depth against the template", result.aligned.median_gap_m * 100, "cm, median", 2.5, 6.0),
         Check("static depth within 5 cm", result.aligned.median_fit, "share", 0.6, 0.35, "higher"),
         Check("appearance of frames and renderings", result.appearance, "share", 0.5, None, "higher"),
@@ -86,23 +85,8 @@ def pictures(result: Registered | Rejected, clip: Clip, maps: Maps) -> list[Pict
         return _refused(result, clip, maps)
     scene, agent = RayCaster(maps.scene), RayCaster(maps.agent)
     chosen = np.linspace(0, len(clip) - 1, 9).astype(int)[1:-1]
-    return [
-        Picture(
-            "edges",
-            plots.grid([outlined(result, clip, scene, agent, int(frame)) for frame in chosen], len(chosen)),
-            "Template edges (magenta) and the placed animal (orange) over frames.",
-        ),
-        Picture(
-            "bird",
-            paths(result, maps),
-            "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
-        ),
-        Picture(
-            "depth",
-            depth_on_map(result, maps),
-            "Static depth on the map from above: green within 5 cm of the surface, red further away.",
-        ),
-    ]
+    edges = plots.grid([outlined(result, clip, scene, agent, int(frame)) for frame in chosen], len(chosen))
+    return captioned(CAPTIONS, edges=edges, bird=paths(result, maps), depth=depth_on_map(result, maps))
 
 
 def outlined(

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data import plots, qa
 from pipeline.data.clips import Clip
-from pipeline.data.qa import Check, Picture
+from pipeline.data.qa import Check
 from stages.segment_agent.writing import Summary
 
 FLASH_FRAMES = 3
@@ -18,6 +18,10 @@ CONTRADICTED = 0.4
 """share of a mask that looks like the room, or lies where other frames saw a surface, from which on it is
 doubtful"""
 GREEN, BLUE = (60, 255, 90), (60, 90, 255)
+CAPTIONS = {
+    "overlay": "masks over frames: outline green, unknown blue",
+    "area": "share of the picture over time, red where the agent is out of view",
+}
 
 
 def overlay(
@@ -85,21 +89,11 @@ def _percent(flags: Bool[np.ndarray, "frame"]) -> float:
 def report_quality(folder: Path, clip: Clip, summary: Summary, residual_m: float) -> None:
     """Write the stage's quality page."""
     area, visible = np.array(summary.area), np.array(summary.visible)
+    over_time = plots.time_series({"share": area}, clip.timestamp_s, absent=~visible)
     qa.write(
         folder,
         good="the green outline hugs the animal in every frame, resting frames too",
         bad="the outline sits on furniture, flickers, or is missing while the animal is in view",
         checks=checks_of(summary, residual_m),
-        pictures=[
-            Picture(
-                "overlay",
-                contact_sheet(clip, summary.shown),
-                "masks over frames: outline green, unknown blue",
-            ),
-            Picture(
-                "area",
-                plots.time_series({"share": area}, clip.timestamp_s, absent=~visible),
-                "share of the picture over time, red where the agent is out of view",
-            ),
-        ],
+        pictures=qa.captioned(CAPTIONS, overlay=contact_sheet(clip, summary.shown), area=over_time),
     )

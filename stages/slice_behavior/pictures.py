@@ -8,34 +8,24 @@ from jaxtyping import Int, UInt8
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, TEST, TRAIN, BehaviorData
 from pipeline.data import plots
-from pipeline.data.qa import Check, Picture
+from pipeline.data.qa import Check, Picture, captioned
 
 MOVED_M = 0.15
 VISIT_M = 0.1
 """Edge of the cells in which visits are counted."""
+CAPTIONS = {
+    "visitation": "Where animal (left) and observer (right) have been in training, from above.",
+    "histograms": "The animal's speed, distance to the observer, and how far it gets in 5.6 s (training).",
+    "windows": "Valid times of every recording, and how many windows start there.",
+}
 MOST_WINDOWS = 8192
 """Training windows that are gathered, evenly chosen: a day of a table holds 864 000, of 16 KB each."""
 
 
 def pictures(data: BehaviorData, volume: FeatureVolume, test: Collection[str]) -> list[Picture]:
     """Draw the training recordings for people; the test recordings only count."""
-    return [
-        Picture(
-            "visitation",
-            visitation(data, volume, test),
-            "Where animal (left) and observer (right) have been in the training recordings, from above.",
-        ),
-        Picture(
-            "histograms",
-            histograms(data),
-            "The animal's speed, its distance to the observer, and how far it gets in 5.6 s (training).",
-        ),
-        Picture(
-            "windows",
-            validity(data, test),
-            "Valid times of every recording, and how many windows start there.",
-        ),
-    ]
+    where, when = visitation(data, volume, test), validity(data, test)
+    return captioned(CAPTIONS, visitation=where, histograms=histograms(data), windows=when)
 
 
 def checks(data: BehaviorData) -> list[Check]:
@@ -45,19 +35,13 @@ def checks(data: BehaviorData) -> list[Check]:
     context, future = data.windows(some(train), bones=False)
     moved = np.linalg.norm(future.goal_world - context.world_from_agent[:, -1, :3, 3], axis=-1) > MOVED_M
     valid = np.concatenate([trajectory.valid for trajectory in data.trajectories.values()])
+    moving = f"training windows in which the animal moves more than {MOVED_M:g} m"
     return [
         Check("training windows", len(train), "windows", 200, 1, "higher"),
         Check("test windows", len(test), "windows", 1, None, "higher"),
         Check("recordings in both training and test", len(shared), "recordings", 0, 0),
         Check("valid times", float(valid.mean()), "share", 0.7, 0.2, "higher"),
-        Check(
-            f"training windows in which the animal moves more than {MOVED_M:g} m",
-            float(moved.mean()) if len(moved) else None,
-            "share",
-            0.2,
-            None,
-            "higher",
-        ),
+        Check(moving, float(moved.mean()) if len(moved) else None, "share", 0.2, None, "higher"),
     ]
 
 

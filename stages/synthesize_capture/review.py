@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipeline.data import qa
-from pipeline.data.qa import Check, Picture
+from pipeline.data.qa import Check
 from stages.synthesize_capture.policy import REASONS
 from stages.synthesize_capture.produce import FilmedRecording
 from stages.synthesize_capture.room import DEPTH_M, WIDTH_M
@@ -19,6 +19,10 @@ from stages.synthesize_capture.session import STEP_S, SessionTrajectories
 
 WINDOW_S = 6.4
 PIXELS_PER_M = 130
+CAPTIONS = {
+    "contact_sheet": "Every recording, the animal's true outline, stored depth",
+    "birds_eye": "From above: the phone (blue), the animal (orange), its flights (red)",
+}
 
 
 @dataclass(frozen=True)
@@ -61,39 +65,19 @@ def report_quality(folder: Path, scripts: list[Script], made: list[FilmedRecordi
     """Write the stage's checks and pictures into the artifact in the making."""
     shown = manner([part.session for part in scripts if part.session is not None])
     visible = _mean([part.visible_share for part in made if part.outlines.any()])
-    qa.write(
-        folder,
-        good=(
-            "a lived-in room under changing light, and a cat that walks, "
-            "sits and runs from whoever comes close"
-        ),
-        bad="an animal that never moves or is never in the picture",
-        checks=[
-            Check("windows in which the animal moves", shown.moving_windows, "share", 0.5, 0.4, "higher"),
-            Check(
-                "quick approaches that it runs from",
-                shown.flees_when_approached,
-                "share",
-                0.6,
-                None,
-                "higher",
-            ),
-            Check("seconds left alone in which it runs", shown.flees_when_left_alone, "share", 0.1, None),
-            Check("frames that show the animal", visible, "share", 0.7, 0.5, "higher"),
-        ],
-        pictures=[
-            Picture(
-                "contact_sheet",
-                contact_sheet(made),
-                "Every recording, the animal's true outline, stored depth",
-            ),
-            Picture(
-                "birds_eye",
-                birds_eye(scripts),
-                "From above: the phone (blue), the animal (orange), its flights (red)",
-            ),
-        ],
+    flees, alone = shown.flees_when_approached, shown.flees_when_left_alone
+    checks = [
+        Check("windows in which the animal moves", shown.moving_windows, "share", 0.5, 0.4, "higher"),
+        Check("quick approaches that it runs from", flees, "share", 0.6, None, "higher"),
+        Check("seconds left alone in which it runs", alone, "share", 0.1, None),
+        Check("frames that show the animal", visible, "share", 0.7, 0.5, "higher"),
+    ]
+    pictures = qa.captioned(CAPTIONS, contact_sheet=contact_sheet(made), birds_eye=birds_eye(scripts))
+    good = (
+        "a lived-in room under changing light, and a cat that walks, sits and runs from whoever comes close"
     )
+    bad = "an animal that never moves or is never in the picture"
+    qa.write(folder, good=good, bad=bad, checks=checks, pictures=pictures)
 
 
 def contact_sheet(made: list[FilmedRecording]) -> UInt8[np.ndarray, "height width 3"]:

@@ -11,13 +11,19 @@ from pipeline.behavior.planning import Observation, Sampler
 from pipeline.behavior.scenes import Scenes
 from pipeline.core.training import FitRecord
 from pipeline.data import plots
-from pipeline.data.qa import Check, Picture
+from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid
 from stages.train_behavior.reactions import SIDES, Reactions, SampledMoments, approach
 
 FAN_GOALS = 64
 SHOWN_WINDOWS = 4
 WINDOW_HALF_M = 3.0
+CAPTIONS = {
+    "goals": "Sampled goals (orange) with conditions removed; animal blue, observer green.",
+    "guidance": "The same with an observer who walks up from ahead; same noise at each interactivity.",
+    "paths": "Sampled paths with and without the scene.",
+    "losses": "Squared error of the predicted noise, smoothed.",
+}
 
 
 def pictures(
@@ -37,42 +43,26 @@ def pictures(
     strength = {f"interactivity {s:g}": PlanSamplingConfig(guidance=s) for s in (0.0, 0.5, 1.0)}
     with_scene = {name: removed[name] for name in ("all", "no scene")}
     close = replace(some, observer_past=np.tile(approach(SIDES[0], 0.8, 1.0), (len(chosen), 1)))
-    captions = {
-        "goals": "Sampled goals (orange) with conditions removed; animal blue, observer green.",
-        "guidance": "The same with an observer who walks up from ahead; same noise at each interactivity.",
-        "paths": "Sampled paths with and without the scene.",
-        "losses": "Squared error of the predicted noise, smoothed.",
-    }
-    images = {
-        "goals": fans(rooms, sampler, some, frame, removed, seed),
-        "guidance": fans(rooms, sampler, close, frame, strength, seed),
-        "paths": fans(rooms, sampler, some, frame, with_scene, seed, paths=True),
-        "losses": plots.loss_curves({"training": record.terms}),
-    }
-    return [Picture(name, image, captions[name]) for name, image in images.items()]
+    return captioned(
+        CAPTIONS,
+        goals=fans(rooms, sampler, some, frame, removed, seed),
+        guidance=fans(rooms, sampler, close, frame, strength, seed),
+        paths=fans(rooms, sampler, some, frame, with_scene, seed, paths=True),
+        losses=plots.loss_curves({"training": record.terms}),
+    )
 
 
 def checks(record: FitRecord, reactions: Reactions, onnx_difference: float) -> list[Check]:
     """Judge the training."""
     learned = {name: values[np.isfinite(values)] for name, values in record.terms.items()}
     last = {name: float(values[-max(len(values) // 10, 1) :].mean()) for name, values in learned.items()}
+    each, share = "squared error of the noise, last tenth", reactions.away_share
+    sides = "goals after an approach from one side against the other"
     return [
-        *(
-            Check(f"{name}: squared error of the noise, last tenth", value, "", 0.9)
-            for name, value in last.items()
-        ),
+        *(Check(f"{name}: {each}", value, "", 0.9) for name, value in last.items()),
         Check("goals move away from an approaching observer", reactions.away_m, "m", 0.1, None, "higher"),
-        Check(
-            "share of approaches that drive goals away", reactions.away_share, "share", 0.6, None, "higher"
-        ),
-        Check(
-            "goals after an approach from one side against the other",
-            reactions.reversal_m,
-            "m",
-            0.2,
-            None,
-            "higher",
-        ),
+        Check("share of approaches that drive goals away", share, "share", 0.6, None, "higher"),
+        Check(sides, reactions.reversal_m, "m", 0.2, None, "higher"),
         Check("shift by a far observer against none", reactions.far_m, "m", 0.01, 0.1),
         Check("shift by a far observer against a farther one", reactions.farther_m, "m", 0.01, 0.1),
         Check("ONNX against torch, largest difference", onnx_difference, "", 1e-4, 1e-2),

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from pipeline.data import plots
-from pipeline.data.qa import Check, Picture
+from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid
 from pipeline.longterm.clip_channels import Clips
 from pipeline.longterm.examples import MotionDataset, encode_selection, select_clips
@@ -28,6 +28,10 @@ STILLS = 12
 """Places at which a body is drawn."""
 CANDIDATES = 4
 """Bodies drawn at each of them, of which the best counts."""
+CAPTIONS = {
+    "losses": "Loss of each network over its training, smoothed.",
+    "routes": "Held-out routes from above: true (blue), made (orange), what stands nearby (grey).",
+}
 
 
 @dataclass(frozen=True)
@@ -50,34 +54,17 @@ def evaluate_held_out(learned: TrainedLongTerm, dataset: DatasetSplit, seed: int
     )
     error, straight = (float((each - clips.channels)[..., :3].abs().mean()) for each in (made, line))
     gap, depth = _stills(learned, where, rng)
+    explained = float(learned.model.poses.explained)
     checks = [
         Check("L1 of held-out routes", 100 * error, "cm", 10.0),
         Check("L1 of held-out routes against straight lines", error / max(straight, 1e-9), "", 0.9),
         Check("bodies at sub-goals: gap to the scene, median", 100 * gap, "cm", 2.0),
         Check("bodies at sub-goals: deepest vertex in the scene, median", 100 * depth, "cm", 4.0),
         Check("contact vertices found", len(learned.model.contacts.vertices), "", 10, 1, "higher"),
-        Check(
-            "spread of poses that p explains",
-            float(learned.model.poses.explained),
-            "share",
-            0.9,
-            0.5,
-            "higher",
-        ),
+        Check("spread of poses that p explains", explained, "share", 0.9, 0.5, "higher"),
     ]
-    pictures = [
-        Picture(
-            "losses",
-            plots.loss_curves({name: {"total": record.total()} for name, record in learned.records.items()}),
-            "Loss of each network over its training, smoothed.",
-        ),
-        Picture(
-            "routes",
-            routes(clips, made, where),
-            "Held-out routes from above: true (blue), made (orange), what stands nearby (grey).",
-        ),
-    ]
-    return ModelReport(checks, pictures)
+    losses = plots.loss_curves({name: {"total": record.total()} for name, record in learned.records.items()})
+    return ModelReport(checks, captioned(CAPTIONS, losses=losses, routes=routes(clips, made, where)))
 
 
 def _stills(learned: TrainedLongTerm, where: MotionDataset, rng: np.random.Generator) -> tuple[float, float]:
