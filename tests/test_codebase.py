@@ -5,15 +5,15 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 55_000,
+    "lines": 54_500,
     "lines over 110 columns": 0,
     "recipe keys": 350,
     "packages over 16 modules": 0,
-    "private words in identifiers": 220,
-    "tell, told": 40,
+    "private words in identifiers": 205,
+    "tell, told": 10,
     "class names used twice": 3,
-    "unnamed numbers": 640,
-    "unshaped public functions": 70,
+    "unnamed numbers": 625,
+    "unshaped public functions": 0,
     "modules in import cycles": 0,
 }
 """Today's counts, rounded up. Lower a bar when a count has gone down; never raise one."""
