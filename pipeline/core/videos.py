@@ -36,6 +36,8 @@ class Video:
     """Id of the session whose clock this one shares (held-out phone)."""
     offset_s: float = 0.0
     """Time in the other recording = time in this one + offset."""
+    mapped: bool = False
+    """A turnaround or session without depth: its cameras and depth come from the map of the walk-through."""
 
 
 def read(path: Path) -> tuple[Video, ...]:

@@ -28,6 +28,17 @@ FRAMES = FileSchema.of(
     "depth_valid [frame] f4",
     "quality [frame] f4",
 )
+PICTURES = FileSchema.of(
+    "pictures/pictures.npz",
+    "timestamp_s [frame] f8",
+    "source_index [frame] i8",
+    "quarter_turns [] i8",
+    "sharpness [frame] f4",
+    "brightness [frame] f4",
+)
+MAPPED = "mapped"
+"""`Clip.scale` of a recording without depth: its cameras and the room's depth come from the map, its animal's
+depth is inferred, or confirmed by several views"""
 MASKS = FileSchema.of("masks/masks.npz", "visible [frame] bool", "confidence [frame] f4", "area [frame] f4")
 CLIP_KEYS = (
     "timestamp_s", "intrinsics", "depth_intrinsics", "odometry_from_camera",
@@ -60,8 +71,13 @@ class Clip:
     """(height, width) in pixels"""
     scale: str = "measured"
     """what makes its lengths metres: its own depth, the id of another recording whose depth does, or
-    nothing: `relative`
+    nothing: `relative`; `mapped` where cameras and depth are the map's, and so no evidence against it
     """
+
+    @property
+    def mapped(self) -> bool:
+        """Tell whether its cameras lie in the map's world, and its depth is no measurement of its own."""
+        return self.scale == MAPPED
 
     @classmethod
     def open(cls, folder: Path) -> "Clip":
@@ -94,6 +110,39 @@ class Clip:
     def confidence(self, frame: int) -> UInt8[np.ndarray, "height width"]:
         """Read one frame's depth confidence: 0 low, 1 medium, 2 high."""
         return images.read_gray(self.folder / "confidence" / f"{frame:06d}.png")
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Upright pictures of a recording without depth, at 10 Hz."""
+
+    folder: Path
+    timestamp_s: Float[np.ndarray, "frame"]
+    source_index: Int[np.ndarray, "frame"]
+    quarter_turns: int
+    sharpness: Float[np.ndarray, "frame"]
+    brightness: Float[np.ndarray, "frame"]
+    color_size: tuple[int, int]
+    """(height, width) in pixels"""
+
+    @classmethod
+    def open(cls, folder: Path) -> "Pictures":
+        """Open a finished ``pictures/<id>`` artifact."""
+        table = PICTURES.load(folder / "pictures.npz")
+        size = images.read_color(folder / "color" / "000000.jpg").shape[:2]
+        turns = int(table.pop("quarter_turns"))
+        return cls(folder=folder, color_size=size, quarter_turns=turns, **table)
+
+    def __len__(self) -> int:
+        return len(self.timestamp_s)
+
+    def file(self, frame: int) -> Path:
+        """Return where one frame's picture lies."""
+        return self.folder / "color" / f"{frame:06d}.jpg"
+
+    def color(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        """Read one frame's RGB."""
+        return images.read_color(self.file(frame))
 
 
 @dataclass(frozen=True)

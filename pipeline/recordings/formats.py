@@ -140,12 +140,13 @@ def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[V
 
     For a walk-through without depth these are some training sessions with depth; for any other none.
     """
-    if video.role != "walkthrough" or _has_depth(folder / video.file):
+    if video.role != "walkthrough" or has_depth(folder / video.file):
         return []
     sessions = (other for other in videos if other.role == "session" and other.split == "train")
-    return [other for other in sessions if _has_depth(folder / other.file)][:MOST_SCALE_SOURCES]
+    return [other for other in sessions if has_depth(folder / other.file)][:MOST_SCALE_SOURCES]
 
 
-def _has_depth(path: Path) -> bool:
+def has_depth(path: Path) -> bool:
+    """Tell, by its names alone, whether a recording has depth."""
     found = format_of(path)
     return found is not None and found.has_depth

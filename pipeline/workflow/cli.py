@@ -96,7 +96,7 @@ class Task:
             return self.per_trial(field.name, dag.trial_ids(self.config.methods, self.config.seeds))
         for need in needs:
             if need.artifact == field.name:
-                return self.per_video(field.name, need.roles, need.splits)
+                return self.per_video(field.name, need.roles, need.splits, measured=need.measured)
         return self.per_video(field.name)
 
     def recording(self) -> Video | None:
@@ -114,9 +114,15 @@ class Task:
         )
 
     def per_video(
-        self, name: str, roles: tuple[Role, ...] | None = None, splits: tuple[Split, ...] | None = None
+        self,
+        name: str,
+        roles: tuple[Role, ...] | None = None,
+        splits: tuple[Split, ...] | None = None,
+        *,
+        measured: bool = False,
     ) -> dict[str, Path]:
-        """Return the folder of `name` for every recording of `roles` and `splits`, by id, in id order.
+        """Return the folder of `name` for every recording of `roles` and `splits`, by id, in id order; if
+        ``measured``, without those whose depth comes from the map.
 
         By default: every recording for which the flow makes this artifact.
         """
@@ -128,10 +134,19 @@ class Task:
                 "give --videos build/<agent>/plan/videos.json",
             )
         chosen_roles = dag.NODES[name].roles if roles is None else roles
-        chosen = sorted(
-            v.id for v in self.videos if v.role in chosen_roles and (splits is None or v.split in splits)
-        )
-        return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in chosen}
+        chosen = [
+            v
+            for v in sorted(self.videos, key=lambda video: video.id)
+            if v.role in chosen_roles
+            and (splits is None or v.split in splits)
+            and not (measured and v.mapped)
+        ]
+        kept = {v.id: dag.folder_of(name, v) for v in chosen}
+        folder = {
+            made: self.paths[name] if made == name else self.paths[name].parent / made
+            for made in kept.values()
+        }
+        return {id: self._opened(folder[made] / id, f"{made}/{id}") for id, made in kept.items()}
 
     def per_trial(self, name: str, trials: Sequence[str]) -> dict[str, Path]:
         """Return the folder of `name` for every one of the trials, by id."""
@@ -154,10 +169,12 @@ class Task:
 
     def _opened(self, path: Path, name: str) -> Path:
         made, kind = artifact.opened(path, name), name.partition("/")[0]
-        maker = dag.NODES[kind].stage.rpartition(".")[2] if kind in dag.NODES else made.stage
-        if made.stage != maker:
+        makers = [
+            node.stage.rpartition(".")[2] for node in dag.FLOW if kind in (node.artifact, node.stands_in_for)
+        ]
+        if makers and made.stage not in makers:
             raise InputError(
-                "ART-006", f"is no {kind}: {made.stage} wrote it", str(path), f"give what {maker} wrote"
+                "ART-006", f"is no {kind}: {made.stage} wrote it", str(path), f"give what {makers[0]} wrote"
             )
         self.contents[name] = made.content
         return path

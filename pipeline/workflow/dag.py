@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipeline.core.videos import Role, Split
+from pipeline.core.videos import Role, Split, Video
 
 Flow = Literal["recordings", "trajectories"]
 """Where an agent's flow begins: at recordings of it, or at tables of its motion, which spares all that comes
@@ -62,6 +62,8 @@ class Need:
     as --variants."""
     flow: Flow | None = None
     """The flow in which it is an input; None: in all that the node is part of."""
+    measured: bool = False
+    """Only recordings with depth of their own, and the walk-through: what the map itself is made from."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,10 @@ class Node:
     """The recipe's table that configures it, where it is another node's too."""
     on_demand: bool = False
     """Made only where it is requested by its name, or needed by something that is."""
+    mapped: bool = False
+    """Made only of recordings whose depth comes from the map."""
+    stands_in_for: str | None = None
+    """Artifact in whose place others read this one, of those recordings."""
 
 
 def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Need, ...]:
@@ -121,6 +127,15 @@ FLOW: tuple[Node, ...] = (
         roles=("walkthrough", "turnaround", "session", "heldout"),
         seconds_per_frame=0.006,
     ),
+    Node(
+        "pictures",
+        "extract_frames",
+        (Need("synthetic_capture", part="recordings", option="recording"),),
+        roles=AGENT,
+        table="extract_frames",
+        mapped=True,
+        seconds_per_frame=0.006,
+    ),
     Node("flow", "estimate_flow", ("frames",), roles=AGENT, seconds_per_frame=0.06),
     Node(
         "masks",
@@ -130,9 +145,22 @@ FLOW: tuple[Node, ...] = (
         sidecars=("prompt",),
         seconds_per_frame=0.11,
     ),
-    Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, splits=("train", "none")),)),
+    Node(
+        "feature_basis",
+        "fit_feature_basis",
+        (Need("frames", VIEWED, splits=("train", "none"), measured=True),),
+    ),
     Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
     Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),
+    Node(
+        "estimated_frames",
+        "estimate_depth",
+        ("pictures", Need("frames", roles=("walkthrough",)), "scene_template"),
+        roles=AGENT,
+        mapped=True,
+        stands_in_for="frames",
+        seconds_per_frame=0.5,
+    ),
     Node(
         "agent_template",
         "build_agent_template",
@@ -357,6 +385,12 @@ def nodes_of(flow: Flow, *, trials: bool = False) -> tuple[Node, ...]:
     return tuple(node for node in FLOW if flow in node.flows and (trials or node.trials == "none"))
 
 
+def folder_of(name: str, video: Video) -> str:
+    """Return the artifact that holds `name` of one recording: another one where its depth is the map's."""
+    stand_ins = (node.artifact for node in FLOW if node.stands_in_for == name)
+    return next(stand_ins, name) if video.mapped else name
+
+
 def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
     """Return the node's inputs, in declared order; those of one flow only, if given."""
     needs = tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
@@ -380,7 +414,7 @@ def check() -> None:
             )
             source = declared[need.artifact]
             if node.roles and source.roles:
-                assert set(node.roles) <= set(source.roles), (
+                assert set(need.roles or node.roles) <= set(source.roles), (
                     f"{node.artifact}: no {need.artifact} for every role"
                 )
         assert node.artifact not in declared, f"{node.artifact} is declared twice"

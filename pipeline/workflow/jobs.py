@@ -137,7 +137,12 @@ def jobs(plan: Plan) -> list[Job]:
     def parts(node: Node) -> list[Video | Trial | None]:
         if node.trials == "each":
             return list(plan.trials)
-        return [video for video in plan.videos if video.role in node.roles] if node.roles else [None]
+        if not node.roles:
+            return [None]
+        shown = [video for video in plan.videos if video.role in node.roles]
+        if node.mapped:
+            return [video for video in shown if video.mapped]
+        return [video for video in shown if dag.folder_of(node.artifact, video) == node.artifact]
 
     return [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
 
@@ -248,7 +253,7 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
         found = list(_inputs(plan, need, node, part))
         inputs += found
         source = dag.NODES[need.artifact]
-        several = (source.roles and not node.roles) or (
+        several = (source.roles and (need.roles or not node.roles)) or (
             source.trials == "each" and not isinstance(part, Trial)
         )
         whole = plan.home_of(need.artifact).folder / need.artifact
@@ -275,6 +280,11 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
         )
         return
     roles = set(source.roles).intersection(need.roles or source.roles)
-    several = [video for video in plan.videos if video.role in roles and video.split in need.splits]
-    for video in [part] if isinstance(part, Video) else several:
-        yield Input(f"{need.artifact}/{video.id}", str(folder / video.id), need.part)
+    several = [
+        video
+        for video in plan.videos
+        if video.role in roles and video.split in need.splits and not (need.measured and video.mapped)
+    ]
+    for video in [part] if isinstance(part, Video) and not need.roles else several:
+        kept = dag.folder_of(need.artifact, video)
+        yield Input(f"{kept}/{video.id}", str(plan.home_of(kept).folder / kept / video.id), need.part)

@@ -16,7 +16,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,10 @@ def read(home: Home, cache: sources.Cache) -> Plan:
         said = recipes.builtin_remarks(flow, recipe, where)
         hashes = dict.fromkeys(said)
     videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
-    touched = _touched(tables, changed) if home.variant else frozenset(dag.NODES)
+    if names and flow == "recordings":
+        videos = tuple(replace(video, mapped=captures.is_mapped(folder, video)) for video in videos)
+    mapped = any(video.mapped for video in videos)
+    touched = _touched(tables, changed, mapped) if home.variant else frozenset(dag.NODES)
     if home.tables:
         touched = frozenset(n.artifact for n in dag.FLOW if n.trials != "none")
     trials = tuple(recipes.trials(recipe.get(recipes.TABLES_STAGE, {}))) if home.tables else ()
@@ -195,13 +198,18 @@ def _known_ids(base: Home) -> dict[str, str]:
     return known if sound else {}
 
 
-def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any]) -> frozenset[str]:
-    """Return what an overlay changes: the artifacts with another table, and all that is made from them."""
+def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any], mapped: bool) -> frozenset[str]:
+    """Return what an overlay changes: the artifacts with another table, and all that is made from them; of
+    recordings that are ``mapped``, also what their artifacts stand in for, so that both lie in one home.
+    """
     touched: set[str] = set()
-    for node in dag.FLOW:
-        from_touched = any(need.artifact in touched for need in dag.needs_of(node))
-        if tables[node.artifact] != changed[node.artifact] or from_touched:
-            touched.add(node.artifact)
+    for _ in range(2 if mapped else 1):
+        for node in dag.FLOW:
+            from_touched = any(need.artifact in touched for need in dag.needs_of(node))
+            if tables[node.artifact] != changed[node.artifact] or from_touched:
+                touched.add(node.artifact)
+                if mapped and node.stands_in_for:
+                    touched.add(node.stands_in_for)
     return frozenset(touched)
 
 

@@ -134,8 +134,8 @@ def _of_depth(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
 
 _NO_DEPTH = CaptureProblem(
     "CAP-036",
-    "there is no depth: the build stops at this file (CAP-006)",
-    "record with a LiDAR phone, or add a depth picture per frame",
+    "there is no depth: cameras and depth come from the walk-through's map, the animal's is inferred",
+    "keep furniture of the walk-through's room in view; record with a LiDAR phone for measured depth",
 )
 
 

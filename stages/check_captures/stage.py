@@ -31,8 +31,8 @@ class CaptureVerdict:
 
     @property
     def usable(self) -> bool:
-        """Tell whether a build goes on with it: a walk-through is mapped without depth, nothing else is."""
-        return self.seen is not None and (self.seen.sample.plan is not None or self.role == "walkthrough")
+        """Tell whether a build goes on with it: the held-out phone must have depth."""
+        return self.seen is not None and (self.seen.sample.plan is not None or self.role != "heldout")
 
 
 def run(files: Sequence[tuple[Path, Role]], config: Config) -> Iterator[CaptureVerdict]:

@@ -19,16 +19,16 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import track
 from pipeline.data import images
 from pipeline.geometry import cameras
-from pipeline.mapping import sift
+from pipeline.mapping import plane_sweep, sift
+from pipeline.mapping.plane_sweep import SweepView
 from pipeline.mapping.sparse_model import SparseModel
 from pipeline.recordings import extraction, upright
 from pipeline.recordings.conventions import OPENCV, TOLERANCE_M, PoseCheck
 from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan, choose_frames
 from pipeline.recordings.recording import Recording
-from stages.extract_frames import scaling, structure, sweep
+from stages.extract_frames import scaling, structure
 from stages.extract_frames.config import Config, PhotogrammetryConfig
 from stages.extract_frames.structure import Structure
-from stages.extract_frames.sweep import SweepView
 
 LEAST_AGREEING = 2
 """pictures that must confirm a depth; one more makes it trusted"""
@@ -168,16 +168,23 @@ def _depths(
     views: list[SweepView], sparse: SparseModel, config: PhotogrammetryConfig
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return depth (model units, 0 = unknown) and confidence (0..2) of every view."""
-    others = sweep.neighbours(sparse, config)
+    others = plane_sweep.neighbours(sparse, config.depth_sources)
     swept = [
-        sweep.sweep(view, [views[other] for other in others[key]], sweep.depth_range(sparse, key), config)
+        plane_sweep.sweep(
+            view,
+            [views[other] for other in others[key]],
+            plane_sweep.depth_range(sparse, key),
+            config.depth_planes,
+        )
         if len(others[key])
         else np.zeros_like(view.gray)
         for key, view in enumerate(track(views, "depth from pictures"))
     ]
     depth, confidence = [], []
     for key, view in enumerate(views):
-        agree = sweep.agreement(swept[key], view, [(swept[other], views[other]) for other in others[key]])
+        agree = plane_sweep.agreement(
+            swept[key], view, [(swept[other], views[other]) for other in others[key]]
+        )
         depth.append(np.where(agree >= LEAST_AGREEING, swept[key], 0))
         confidence.append(np.clip(agree.astype(int) - LEAST_AGREEING + 1, 0, 2).astype(np.uint8))
     return depth, confidence

@@ -13,7 +13,7 @@ from pipeline.recordings import extraction, formats
 from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan
 from pipeline.recordings.formats import open_recording
 from pipeline.recordings.recording import Recording
-from stages.extract_frames import photogrammetry, writing
+from stages.extract_frames import photogrammetry, pictures, writing
 from stages.extract_frames.config import Config
 
 
@@ -30,8 +30,14 @@ class Inputs:
 def run(
     inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = (), video: Video | None = None
 ) -> None:
-    """Extract one recording into `out`. Raises InputError CAP-001..022, MAP-004 for what cannot be used."""
+    """Extract one recording into `out`: frames, or pictures alone of a session or turnaround without depth.
+
+    Raises InputError CAP-001..022, MAP-004 for what cannot be used.
+    """
     recording = open_recording(inputs.recording)
+    if recording.depth_size is None and video is not None and video.role in ("session", "turnaround"):
+        pictures.write(out, recording, config)
+        return
     if recording.depth_size is None and (video is None or video.role == "walkthrough"):
         sources = _scale_sources(inputs.captures, video, videos)
         with tempfile.TemporaryDirectory() as workspace:

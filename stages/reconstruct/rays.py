@@ -42,6 +42,9 @@ FAR_PX = 255.0
 """distances from the mask saturate here"""
 NEAREST_M = 0.15
 """nearer depth is not trusted"""
+CONFIRMED = 2
+"""confidence of depth that is the map's or that several views confirmed, of a recording without a depth
+sensor: what was inferred is not fitted to"""
 
 
 @dataclass(frozen=True)
@@ -236,6 +239,8 @@ def trusted_depth(
     normals.
     """
     depth = usable_depth(clip, frame, nearest_m=NEAREST_M)
+    if clip.mapped:
+        depth[clip.confidence(frame) < CONFIRMED] = 0
     directions = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape).astype(np.float32)
     smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(
         cv2.blur((depth > 0).astype(np.float32), (3, 3)), 1e-6
@@ -257,6 +262,8 @@ def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     edge.
     """
     depth = clip.depth(frame).astype(np.float32)
+    if clip.mapped:
+        depth[clip.confidence(frame) < CONFIRMED] = 0
     return np.where(supported(depth) & (depth >= NEAREST_M), depth, 0)
 
 

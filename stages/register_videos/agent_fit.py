@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.data.clips import Clip
-from pipeline.geometry import cameras, rigid, subsampling
+from pipeline.geometry import cameras, contact, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -42,6 +42,8 @@ LEAST_POINTS, LEAST_ERODED_PX, NEAREST_M = 25, 60, 0.1
 RADIUS, FULL_VIEW, DEPTH_SHARE = 0.75, 0.3, 0.1
 """In body lengths: radius around the median that points must lie in, silhouette area in full view (squared),
 and distance from the seen side to the middle."""
+BACK_QUANTILE = 0.8
+"""Quantile of the template's heights that is its back's: head and tail rise above."""
 STANDING_STEP = 8
 """One point in so many measures the surface below."""
 BEHIND_M = 0.05
@@ -130,11 +132,15 @@ def observe(
     inside = mask == 255
     depth = clip.depth(frame)
     small = cv2.resize(inside.astype(np.uint8), depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    if clip.mapped:
+        depth = _standing_depth(
+            depth, small > 0, clip.depth_intrinsics[frame], world_from_camera, model, standing
+        )
     eroded = cv2.erode(small, np.ones((3, 3), np.uint8))
     chosen = np.flatnonzero(
         ((eroded if eroded.sum() > LEAST_ERODED_PX else small) > 0)
         & (depth > NEAREST_M)
-        & (clip.confidence(frame) >= 1)
+        & (clip.mapped | (clip.confidence(frame) >= 1))
     )
     if len(chosen) < LEAST_POINTS:
         return None
@@ -161,6 +167,24 @@ def observe(
         standing_m=float(np.median(standing.below(inner))) + model.stand_m,
         share=float(min(1.0, inside.sum() / full_px)),
     )
+
+
+def _standing_depth(
+    inferred: Float[np.ndarray, "height width"],
+    inside: Bool[np.ndarray, "height width"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    world_from_camera: Float[np.ndarray, "4 4"],
+    model: AgentModel,
+    standing: StandingSurface,
+) -> Float[np.ndarray, "height width"]:
+    """Return the depth of an animal that no sensor measured: where its mask's lowest pixels touch the map;
+    what was inferred before it was segmented where they touch nothing level.
+    """
+    touched = contact.find(inside, intrinsics, world_from_camera, standing.caster)
+    if touched is None or not touched.certain:
+        return inferred
+    back_m = model.stand_m + float(np.quantile(model.points_agent[:, 1], BACK_QUANTILE))
+    return contact.depth_of(inside, touched.point_world, back_m, intrinsics, world_from_camera)
 
 
 def initial_poses(

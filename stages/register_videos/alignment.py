@@ -122,6 +122,32 @@ def align(
     return AlignedCameras(poses, covariance, scans, *measure_fit(surface, scans, poses))
 
 
+def keep(
+    clip: Clip,
+    masks: Masks,
+    caster: RayCaster,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    odometry: RelativePoseFactors,
+    config: AlignmentConfig,
+) -> AlignedCameras:
+    """Keep cameras that the map itself gave, and measure how well optical flow from it holds them.
+
+    Depth that was cast from these very cameras would confirm them whatever they are, so none takes part.
+    """
+    chosen = track(range(0, len(clip), max(config.flow_every_frames, 1)), "optical flow")
+    found = (flow_correspondences(clip, masks, caster, frame, world_from_camera[frame]) for frame in chosen)
+    ties = [tie for tie in found if tie is not None]
+    unknown = np.full(len(clip), np.nan)
+    scans = [depth_scans.Scan(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))] * len(clip)
+    if not ties:
+        wide = np.repeat(np.eye(6)[None], len(clip), axis=0)
+        return AlignedCameras(world_from_camera, wide, scans, unknown, unknown)
+    covariance = pose_optimization.marginal_covariance(
+        world_from_camera, Correspondences.join(*ties), odometry, LAST_REACH_M
+    )
+    return AlignedCameras(world_from_camera, covariance, scans, unknown, unknown)
+
+
 def measure_fit(
     surface: depth_scans.SurfaceMap,
     scans: list[depth_scans.Scan],

@@ -68,11 +68,12 @@ def checks(result: Registered | Rejected) -> list[Check]:
     if isinstance(result, Rejected):
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
     agreed = float(result.supports.mean()) if len(result.supports) else None
+    gap_cm = _finite(result.aligned.median_gap_m * 100)
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
         Check("frame votes that agree", agreed, "share", 0.5, 0.25, "higher"),
-        Check("depth against the template", result.aligned.median_gap_m * 100, "cm, median", 2.5, 6.0),
-        Check("static depth within 5 cm", result.aligned.median_fit, "share", 0.6, 0.35, "higher"),
+        Check("depth against the template", gap_cm, "cm, median", 2.5, 6.0),
+        Check("static depth within 5 cm", _finite(result.aligned.median_fit), "share", 0.6, 0.35, "higher"),
         Check("appearance of frames and renderings", result.appearance, "share", 0.5, None, "higher"),
         Check("camera confidence", float(result.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(result.roots.visible.mean()), "share of frames", 0.4, None, "higher"),

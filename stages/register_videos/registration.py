@@ -96,7 +96,11 @@ def register(
 ) -> Registered | Rejected:
     """Register one recording, or reject it with a reason; ``features`` are the session's, at stride 8."""
     motion = _odometry(clip, masks, config, rng)
-    match config.initialization:
+    match "map" if clip.mapped else config.initialization:
+        case "map":
+            assert clip.odometry_from_camera is not None, "its cameras come from the map"
+            votes = voting.none_cast()
+            start = _Start(clip.odometry_from_camera, np.zeros(0, bool), np.ones(len(clip), bool))
         case "votes":
             votes = voting.collect(clip, masks, maps.scene_localizer, config.vote)
             start = _initialize(clip, votes, motion, config.vote)
@@ -112,23 +116,32 @@ def register(
     scene = None
     if maps.scene_features is not None and features is not None:
         scene = FeatureMap(caster, maps.scene_features, features)
-    aligned = alignment.align(
-        clip,
-        masks,
-        caster,
-        scene,
-        start.world_from_camera,
-        motion.relative_poses,
-        votes,
-        start.supports,
-        config.alignment,
-    )
+    if clip.mapped:
+        aligned = alignment.keep(
+            clip, masks, caster, start.world_from_camera, motion.relative_poses, config.alignment
+        )
+    else:
+        aligned = alignment.align(
+            clip,
+            masks,
+            caster,
+            scene,
+            start.world_from_camera,
+            motion.relative_poses,
+            votes,
+            start.supports,
+            config.alignment,
+        )
     measured = f"{int(np.isfinite(aligned.fit).sum())} of {len(clip)} frames"
     gap = f"{aligned.median_gap_m * 100:.1f} cm from the template, {aligned.median_fit:.0%} within 5 cm"
     log(f"static depth of {measured}: {gap}")
     scores = score_appearance(clip, masks, caster, aligned.world_from_camera, config.confidence, rng)
     appearance = appearance_probability(clip.timestamp_s, scores)
-    if config.initialization == "votes":
+    if clip.mapped:
+        if appearance.mean() < config.gate.least_appearance:
+            alike = f"only {appearance.mean():.0%} of the frames"
+            return Rejected(f"{alike} look more like the room than like wrong places in it", votes)
+    elif config.initialization == "votes":
         reason = rejection_reason(aligned.fit, float(appearance.mean()), votes, start.supports, config)
         if reason is not None:
             return Rejected(reason, votes)

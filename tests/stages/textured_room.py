@@ -71,6 +71,7 @@ class MemoryClip:
     depth_size: tuple[int, int] = SIZE
     cache: dict = field(default_factory=dict)
     scale: str = "measured"
+    mapped: bool = False
 
     def __len__(self) -> int:
         return len(self.truth)

@@ -128,3 +128,59 @@ def grounding_dino(folder: Path) -> Path:
 
     GroundingDinoImageProcessorPil(size={"shortest_edge": 64, "longest_edge": 100}).save_pretrained(folder)
     return folder
+
+
+def depth_anything(folder: Path, kind: str) -> Path:
+    """Depth Anything V2 that answers in inverse depth (`relative`) or metres (`metric`)."""
+    transformers = library()
+    import torch
+
+    torch.manual_seed(0)
+    backbone = transformers.Dinov2Config(
+        hidden_size=24,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        patch_size=14,
+        image_size=70,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+        apply_layernorm=True,
+    )
+    config = transformers.DepthAnythingConfig(
+        backbone_config=backbone,
+        patch_size=14,
+        reassemble_hidden_size=24,
+        neck_hidden_sizes=[8, 8, 12, 12],
+        fusion_hidden_size=8,
+        head_hidden_size=8,
+        depth_estimation_type=kind,
+        max_depth=20 if kind == "metric" else 1,
+    )
+    transformers.DepthAnythingForDepthEstimation(config).save_pretrained(folder)
+    return folder
+
+
+def depth_pro(folder: Path) -> Path:
+    transformers = library()
+    import torch
+
+    torch.manual_seed(0)
+    vit = transformers.Dinov2Config(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, patch_size=4, image_size=32
+    )
+    config = transformers.DepthProConfig(
+        fusion_hidden_size=16,
+        patch_size=32,
+        initializer_range=0.1,
+        intermediate_hook_ids=[1, 0],
+        intermediate_feature_dims=[16, 16],
+        scaled_images_ratios=[0.25, 0.5, 1.0],
+        scaled_images_overlap_ratios=[0.0, 0.5, 0.2],
+        scaled_images_feature_dims=[16, 16, 16],
+        use_fov_model=False,
+        image_model_config=vit.to_dict(),
+        patch_model_config=vit.to_dict(),
+        fov_model_config=vit.to_dict(),
+    )
+    transformers.DepthProForDepthEstimation(config).save_pretrained(folder)
+    return folder

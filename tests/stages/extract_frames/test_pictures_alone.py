@@ -3,7 +3,6 @@
 Path and lens by COLMAP, depth from pictures, metres from elsewhere.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,9 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.geometry import align, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.mapping import plane_sweep
 from pipeline.recordings.recording import Recording
-from stages.extract_frames import photogrammetry, structure, sweep
+from stages.extract_frames import photogrammetry, structure
 from stages.extract_frames.config import Config, PhotogrammetryConfig
 from tests.stages import textured_room
 
@@ -101,14 +101,13 @@ def test_depth_of_known_cameras_is_right_where_others_agree(room):
     path = textured_room.walk(60)[10:19:3]
     pictures = [_seen(room, camera) for camera in path]
     views = [
-        sweep.SweepView(color.mean(-1).astype(np.float32), INTRINSICS, camera)
+        plane_sweep.SweepView(color.mean(-1).astype(np.float32), INTRINSICS, camera)
         for (color, _), camera in zip(pictures, path, strict=True)
     ]
-    config = replace(CONFIG, depth_planes=48)
     depth = [
-        sweep.sweep(views[i], [views[j] for j in range(3) if j != i], (0.5, 4.0), config) for i in range(3)
+        plane_sweep.sweep(views[i], [views[j] for j in range(3) if j != i], (0.5, 4.0), 48) for i in range(3)
     ]
-    agree = sweep.agreement(depth[1], views[1], [(depth[i], views[i]) for i in (0, 2)])
+    agree = plane_sweep.agreement(depth[1], views[1], [(depth[i], views[i]) for i in (0, 2)])
     off = np.abs(depth[1] / np.maximum(pictures[1][1], 1e-3) - 1)
     assert (agree == 2).mean() > 0.15
     assert np.median(off[agree == 2]) < 0.02

@@ -13,7 +13,6 @@ from numba import njit
 
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping.sparse_model import SparseModel
-from stages.extract_frames.config import PhotogrammetryConfig
 
 PATHS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
@@ -47,8 +46,8 @@ class SweepView:
     world_from_camera: Float[np.ndarray, "4 4"]
 
 
-def neighbours(sparse: SparseModel, config: PhotogrammetryConfig) -> list[Int[np.ndarray, "source"]]:
-    """Pick for each key the others that share the most points under a good angle, best first."""
+def neighbours(sparse: SparseModel, most: int) -> list[Int[np.ndarray, "source"]]:
+    """Pick for each key at most so many others that share the most points under a good angle, best first."""
     count = len(sparse.frame)
     seen = np.zeros((count, len(sparse.points_model)), bool)
     seen[sparse.observed_key, sparse.observed_point] = True
@@ -64,7 +63,7 @@ def neighbours(sparse: SparseModel, config: PhotogrammetryConfig) -> list[Int[np
                 angle = _angle_deg(centres[key] - points, centres[other] - points)
                 score[other] = np.clip(np.minimum(angle / low, high / np.maximum(angle, 1e-6)), 0, 1).sum()
         order = np.argsort(-score, kind="stable")
-        chosen.append(order[score[order] > 0][: config.depth_sources])
+        chosen.append(order[score[order] > 0][:most])
     return chosen
 
 
@@ -80,12 +79,12 @@ def depth_range(sparse: SparseModel, key: int) -> tuple[float, float]:
 
 
 def sweep(
-    view: SweepView, others: list[SweepView], reach: tuple[float, float], config: PhotogrammetryConfig
+    view: SweepView, others: list[SweepView], reach: tuple[float, float], planes: int
 ) -> Float[np.ndarray, "height width"]:
     """Return the depth at which the patches of a picture correlate best with the others, smooth but for
     edges.
     """
-    distances = 1 / np.linspace(1 / reach[1], 1 / reach[0], config.depth_planes)
+    distances = 1 / np.linspace(1 / reach[1], 1 / reach[0], planes)
     correlation = np.stack([_correlation(view, other, distances) for other in others])
     cost = _combined(correlation)
     total = np.zeros_like(cost)

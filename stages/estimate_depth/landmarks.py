@@ -1,0 +1,124 @@
+"""What the walk-through's pictures show, as points of the map: SIFT with their place in the world.
+
+`build` describes keyframes of the walk-through and casts each keypoint onto the scene's surface;
+`Landmarks.match` pairs the keypoints of another picture of the room with points of the world.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.core.progress import track
+from pipeline.data.clips import Clip
+from pipeline.data.templates import SceneCameras
+from pipeline.geometry import cameras, subsampling
+from pipeline.geometry.meshes import RayCaster
+
+KEYFRAMES, POINTS = 80, 1200
+"""Pictures of the walk-through that are described, and keypoints of every picture, at most."""
+PEAK_THRESHOLD = 0.02
+"""SIFT's contrast threshold; plain walls need a low one (OpenCV's default is 0.04)."""
+RATIO = 0.8
+"""Ratio test: the best match must be this much nearer than the second (Lowe 2004)."""
+RETRIEVED = 6
+"""Keyframes that a picture is matched with: those that hold the most of its nearest descriptors."""
+TREES, CHECKS = 4, 32
+"""k-d trees over all descriptors, and leaves that are searched in them."""
+INDEX_KDTREE = 1
+"""FLANN's name for randomized k-d trees."""
+LEAST_NORM = 1e-6
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Keypoints of one picture."""
+
+    pixel: Float[np.ndarray, "point 2"]
+    descriptors: Float[np.ndarray, "point 128"]
+    """RootSIFT (Arandjelovic and Zisserman 2012)."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Pixels of one picture and the points of the world that look the same."""
+
+    pixel: Float[np.ndarray, "match 2"]
+    points_world: Float[np.ndarray, "match 3"]
+
+
+def describe(color: UInt8[np.ndarray, "height width 3"]) -> Keypoints:
+    """Find and describe the strongest keypoints of a picture; pixel centres at +0.5."""
+    sift = cv2.SIFT.create(POINTS, contrastThreshold=PEAK_THRESHOLD)
+    found, descriptors = sift.detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
+    if not found:
+        return Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), LEAST_NORM))
+    return Keypoints(np.array([point.pt for point in found]) + 0.5, rooted.astype(np.float32))
+
+
+def match(first: Keypoints, second: Keypoints) -> Int[np.ndarray, "match 2"]:
+    """Return index pairs of distinctive descriptors by the ratio test."""
+    if len(first.pixel) == 0 or len(second.pixel) < 2:
+        return np.zeros((0, 2), int)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    good = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance]
+    return np.array(good, int).reshape(-1, 2)
+
+
+class Landmarks:
+    """Described keyframes of the walk-through, whose keypoints are points of the world."""
+
+    def __init__(self, keyframes: list[tuple[Keypoints, Float[np.ndarray, "point 3"]]]):
+        self.keyframes = keyframes
+        self._owner = np.repeat(np.arange(len(keyframes)), [len(each.pixel) for each, _ in keyframes])
+        cv2.setRNGSeed(0)
+        self._index = cv2.FlannBasedMatcher({"algorithm": INDEX_KDTREE, "trees": TREES}, {"checks": CHECKS})
+        self._index.add([np.concatenate([each.descriptors for each, _ in keyframes])])
+        self._index.train()
+
+    def match(self, keypoints: Keypoints) -> Matches:
+        """Match a picture with the keyframes that hold the most of its nearest descriptors."""
+        if not len(keypoints.pixel):
+            return Matches(np.zeros((0, 2)), np.zeros((0, 3)))
+        nearest = [each.trainIdx for each in self._index.match(keypoints.descriptors)]
+        held = np.bincount(self._owner[nearest], minlength=len(self.keyframes))
+        pixel, points = [], []
+        for keyframe in np.argsort(-held, kind="stable")[:RETRIEVED]:
+            known, points_world = self.keyframes[keyframe]
+            mine, theirs = match(keypoints, known).T
+            pixel.append(keypoints.pixel[mine])
+            points.append(points_world[theirs])
+        return Matches(np.concatenate(pixel), np.concatenate(points))
+
+
+def build(walk: Clip, walk_cameras: SceneCameras, caster: RayCaster) -> Landmarks:
+    """Describe keyframes spread over the walk-through, those that the template registered."""
+    keyframes = []
+    for frame in track(keyframe_numbers(walk_cameras).tolist(), "landmarks"):
+        found = describe(walk.color(frame))
+        pose = walk_cameras.world_from_camera[frame]
+        points = on_surface(found.pixel, walk.intrinsics[frame], pose, caster)
+        hit = np.isfinite(points[:, 0])
+        keyframes.append((Keypoints(found.pixel[hit], found.descriptors[hit]), points[hit]))
+    return Landmarks(keyframes)
+
+
+def keyframe_numbers(walk_cameras: SceneCameras) -> Int[np.ndarray, "keyframe"]:
+    """Choose the frames of the walk-through that stand for it."""
+    registered = np.flatnonzero(walk_cameras.registered)
+    return registered[subsampling.evenly(len(registered), KEYFRAMES)]
+
+
+def on_surface(
+    pixel: Float[np.ndarray, "point 2"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    world_from_camera: Float[np.ndarray, "4 4"],
+    caster: RayCaster,
+) -> Float[np.ndarray, "point 3"]:
+    """Return the points of the surface that pixels of a camera show, NaN where there is none."""
+    direction = cameras.unproject(pixel, intrinsics) @ world_from_camera[:3, :3].T
+    hits = caster.cast(world_from_camera[:3, 3], direction)
+    distance = np.where(hits.face >= 0, hits.distance, np.nan)
+    return world_from_camera[:3, 3] + direction * distance[:, None]

@@ -1,0 +1,165 @@
+"""The lens of a plain video: focal length and radial distortion, from points of the map that it shows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pycolmap
+import scipy.optimize
+import scipy.sparse
+from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from pipeline.geometry import rigid
+from stages.estimate_depth.landmarks import Matches
+
+FOCAL_SHARE = 0.85
+"""Focal length that calibration begins from, share of the picture's longer side: a phone's main camera."""
+FRAMES = 40
+"""Frames that calibrate the lens, those with the most points of the map."""
+LEAST_MATCHES = 6
+"""Matches without which there is no camera: with fewer, three wrong ones may agree."""
+LEAST_INLIERS, LEAST_SHARE = 25, 0.25
+"""Matches that must agree on a pose, and their share of all, for a frame to be sure of its place."""
+PIXELS_SHARE = 0.008
+"""Share of the picture's longer side within which a match agrees: the noise of a map of centimetres."""
+LOSS_PX = 1.0
+"""Residual from which on a match counts less in the calibration, pixels."""
+RADIAL_SIGMA = 0.05
+"""Deviation of the distortion from none, in units of a match's: phones straighten their videos."""
+LEAST_BEND_PX = 0.5
+"""Distortion at the corner below which pictures stay as they are, pixels."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole in the middle of the picture, and its first radial distortion coefficient (COLMAP's k1)."""
+
+    focal_px: float
+    radial: float
+    size: tuple[int, int]
+    """(height, width) of the pictures."""
+
+    def resized(self, size: tuple[int, int]) -> "Lens":
+        """Return the lens for pictures of another (height, width), straightened ones."""
+        return Lens(self.focal_px * size[1] / self.size[1], 0.0, size)
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, "3 3"]:
+        """Return the pinhole."""
+        height, width = self.size
+        return np.array([[self.focal_px, 0, width / 2], [0, self.focal_px, height / 2], [0, 0, 1]])
+
+    @property
+    def camera(self) -> pycolmap.Camera:
+        """Return it as COLMAP's camera."""
+        height, width = self.size
+        parameters = [self.focal_px, width / 2, height / 2, self.radial]
+        return pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=parameters)
+
+    @property
+    def bends(self) -> bool:
+        """Tell whether pictures must be undistorted."""
+        corner = np.hypot(*self.size) / 2 / self.focal_px
+        return abs(self.radial) * corner**3 * self.focal_px > LEAST_BEND_PX
+
+    def straightened(self, color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Return a picture as the pinhole alone would have taken it."""
+        if not self.bends:
+            return color
+        centred = self.intrinsics
+        centred[:2, 2] -= 0.5
+        return cv2.undistort(color, centred, np.array([self.radial, 0, 0, 0]))
+
+
+@dataclass(frozen=True)
+class Located:
+    """One frame's camera, by the matches that agree."""
+
+    world_from_camera: Float[np.ndarray, "4 4"]
+    matches: Matches
+    """Those that agree."""
+    share: float
+    """Of all matches."""
+    focal_px: float
+
+    @property
+    def sure(self) -> bool:
+        """Tell whether enough matches agree to believe it without neighbours."""
+        return len(self.matches.pixel) >= LEAST_INLIERS and self.share >= LEAST_SHARE
+
+
+def locate(
+    matches: Matches, lens: Lens, seed: int, *, within_px: float | None = None, calibrate: bool = False
+) -> Located | None:
+    """Return a frame's camera by PnP with LO-RANSAC and refinement, its focal length too if it is to be
+    found; None where too few matches agree on any.
+    """
+    if len(matches.pixel) < LEAST_MATCHES:
+        return None
+    estimation, refinement = (
+        pycolmap.AbsolutePoseEstimationOptions(),
+        pycolmap.AbsolutePoseRefinementOptions(),
+    )
+    estimation.ransac.random_seed = seed
+    estimation.ransac.max_error = within_px or PIXELS_SHARE * max(lens.size)
+    estimation.estimate_focal_length = refinement.refine_focal_length = calibrate
+    camera = lens.camera
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        matches.pixel, matches.points_world, camera, estimation, refinement
+    )
+    if found is None:
+        return None
+    inlier = np.asarray(found["inlier_mask"], bool)
+    camera_from_world = np.eye(4)
+    camera_from_world[:3] = found["cam_from_world"].matrix()
+    agreeing = Matches(matches.pixel[inlier], matches.points_world[inlier])
+    return Located(rigid.inverse(camera_from_world), agreeing, float(inlier.mean()), camera.focal_length)
+
+
+def calibrate(matches: Sequence[Matches], size: tuple[int, int], seed: int) -> Lens | None:
+    """Find the lens by all frames together; None where no frame is sure of its place."""
+    most = np.argsort([-len(each.pixel) for each in matches], kind="stable")[:FRAMES]
+    nominal = Lens(FOCAL_SHARE * max(size), 0.0, size)
+    free = [locate(matches[frame], nominal, seed, calibrate=True) for frame in most]
+    focal = [(each.focal_px, len(each.matches.pixel)) for each in filter(None, free) if each.sure]
+    if not focal:
+        return None
+    px, weight = np.array(sorted(focal)).T
+    first = Lens(float(px[np.searchsorted(np.cumsum(weight), 0.5 * weight.sum())]), 0.0, size)
+    located = [locate(matches[frame], first, seed) for frame in most]
+    sure = [each for each in filter(None, located) if each.sure]
+    return adjusted(first, sure) if sure else first
+
+
+def adjusted(lens: Lens, located: Sequence[Located], *, bend: bool = True) -> Lens:
+    """Adjust focal length, all cameras and, if it may ``bend``, distortion together; the map is fixed."""
+    camera_from_world = np.stack([rigid.inverse(each.world_from_camera) for each in located])
+    count = [len(each.matches.pixel) for each in located]
+    frame = np.repeat(np.arange(len(located)), count)
+    pixel = np.concatenate([each.matches.pixel for each in located])
+    points = np.concatenate([each.matches.points_world for each in located])
+    centre = np.array(lens.size[::-1]) / 2
+
+    def residuals(values):
+        (scale, radial), twist = values[:2], values[2:].reshape(-1, 6)
+        rotation = Rotation.from_rotvec(twist[:, :3]).as_matrix() @ camera_from_world[:, :3, :3]
+        moved = np.einsum("mij,mj->mi", rotation[frame], points)
+        moved += (camera_from_world[:, :3, 3] + twist[:, 3:])[frame]
+        flat = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
+        bent = flat * (1 + radial * (flat**2).sum(1, keepdims=True))
+        off_px = (scale * lens.focal_px * bent + centre - pixel).ravel()
+        return np.append(
+            off_px, (radial - lens.radial) * np.sqrt(len(pixel)) / (RADIAL_SIGMA if bend else 1e-6)
+        )
+
+    sparsity = scipy.sparse.lil_matrix((2 * len(pixel) + 1, 2 + 6 * len(located)), dtype=int)
+    sparsity[:, :2] = 1
+    for number, own in enumerate(np.split(np.arange(2 * len(pixel)), 2 * np.cumsum(count)[:-1])):
+        sparsity[own[0] : own[-1] + 1, 2 + 6 * number : 8 + 6 * number] = 1
+    start = np.r_[1.0, lens.radial, np.zeros(6 * len(located))]
+    fitted = scipy.optimize.least_squares(
+        residuals, start, jac_sparsity=sparsity, loss="soft_l1", f_scale=LOSS_PX, x_scale="jac", max_nfev=30
+    )
+    return Lens(float(fitted.x[0] * lens.focal_px), float(fitted.x[1]), lens.size)

@@ -1,0 +1,141 @@
+"""The stage: pictures of a plain video and the map -> frames with cameras and depth, and the quality page."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, assert_never
+
+import cv2
+import numpy as np
+
+from pipeline.backends.monocular_depth import MonocularDepth
+from pipeline.core import devices
+from pipeline.core.errors import InputError
+from pipeline.core.progress import log, track
+from pipeline.core.videos import Video
+from pipeline.data import ply
+from pipeline.data.clips import Clip, Pictures
+from pipeline.data.templates import SceneCameras
+from pipeline.geometry import cameras
+from pipeline.geometry.meshes import RayCaster
+from stages.estimate_depth import depth, foreground, landmarks, lens, monocular, tracking, views, writing
+from stages.estimate_depth.config import Config
+from stages.estimate_depth.foreground import ColorView
+from stages.estimate_depth.landmarks import Keypoints
+from stages.estimate_depth.lens import Lens
+from stages.estimate_depth.tracking import Footage, Room, Tracked
+
+LEAST_PLACED, LEAST_FRAMES = 0.3, 10
+"""Share of the frames, and their number, that must find a place in the map."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the stage reads."""
+
+    pictures: Path
+    """`pictures/<id>` of the recording."""
+    frames: Mapping[str, Path]
+    """The walk-through that the map was made from, by recording."""
+    scene_template: Path
+    """The map."""
+
+
+def run(
+    inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", video: Video | None = None
+) -> writing.Estimated:
+    """Estimate cameras and depth of one recording into `out`. Raises InputError MAP-007 where the map
+    does not show what the recording does, MOD-001 to MOD-003 for a network's checkpoint.
+    """
+    pictures, walk = Pictures.open(inputs.pictures), Clip.open(next(iter(inputs.frames.values())))
+    walk_cameras = SceneCameras.open(inputs.scene_template)
+    caster = RayCaster(ply.read_ply(inputs.scene_template / "mesh.ply"))
+    network = None if config.backend == "contact" else MonocularDepth(config.backend, config.weights, device)
+    known = landmarks.build(walk, walk_cameras, caster)
+    walked = [
+        _walk_view(walk, walk_cameras, int(frame), caster)
+        for frame in landmarks.keyframe_numbers(walk_cameras)
+    ]
+    room = Room(caster, [each.view for each in walked])
+    found, tracked = _placed(pictures, known, room, config)
+    placed = np.flatnonzero(tracked.placed)
+    if len(placed) < max(LEAST_FRAMES, LEAST_PLACED * len(pictures)):
+        raise _strange(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
+    log(f"focal length {found.focal_px:.1f} px; {len(placed)} of {len(pictures)} frames placed")
+    shown = []
+    for frame in track(placed.tolist(), "looking at the map"):
+        color = found.straightened(pictures.color(frame))
+        pose, gray = tracked.world_from_camera[frame], views.small_gray(color)
+        shown.append(foreground.color_view(color, views.view_of(gray, tracked.lens.intrinsics, pose, caster)))
+    match _role(config, video):
+        case "turnaround":
+            depths = depth.of_turnaround(shown, room, walked)
+        case "session":
+            time_s = pictures.timestamp_s[placed]
+            learned = None
+            if network is not None:
+                learned = _learned(network, pictures, placed, found)
+            depths = depth.of_session(shown, time_s, room, walked, config.length_m, learned)
+        case role:
+            assert_never(role)
+    kept = [number for number, each in enumerate(depths) if each is not None]
+    known = [each for each in depths if each is not None]
+    if len(kept) < LEAST_FRAMES:
+        raise _strange(pictures, "its pictures differ from what the map shows nearly everywhere")
+    log(f"{len(placed) - len(kept)} frames left out that differ from the map nearly everywhere")
+    estimated = writing.Estimated(placed[kept], tracked, found, known)
+    writing.write(out, pictures, estimated, config.jpeg_quality)
+    writing.report_quality(out, pictures, estimated)
+    return estimated
+
+
+def _role(config: Config, video: Video | None) -> Literal["turnaround", "session"]:
+    if video is None:
+        return config.role
+    return "turnaround" if video.role == "turnaround" else "session"
+
+
+def _walk_view(walk: Clip, walk_cameras: SceneCameras, frame: int, caster: RayCaster) -> ColorView:
+    color = walk.color(frame)
+    gray = views.small_gray(color)
+    intrinsics = cameras.scale_intrinsics(walk.intrinsics[frame], walk.color_size, gray.shape)
+    pose = walk_cameras.world_from_camera[frame]
+    return foreground.color_view(color, views.view_of(gray, intrinsics, pose, caster))
+
+
+def _placed(
+    pictures: Pictures, known: landmarks.Landmarks, room: Room, config: Config
+) -> tuple[Lens, Tracked]:
+    """Calibrate the lens and place the frames."""
+    keypoints, gray = [], []
+    for frame in track(range(len(pictures)), "describing pictures"):
+        keypoints.append(landmarks.describe(pictures.color(frame)))
+    matches = [known.match(each) for each in track(keypoints, "recognizing the room")]
+    found = lens.calibrate(matches, pictures.color_size, config.seed)
+    if found is None:
+        raise _strange(pictures, "no frame shows anything that the walk-through shows as well")
+    located = [lens.locate(each, found, config.seed) for each in matches]
+    for frame in range(len(pictures)):
+        gray.append(views.small_gray(found.straightened(pictures.color(frame))))
+    scale = gray[0].shape[1] / pictures.color_size[1]
+    small = [Keypoints(each.pixel * scale, each.descriptors) for each in keypoints]
+    footage = Footage(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
+    tracked = tracking.place(footage, located, room, config.seed)
+    return Lens(tracked.lens.focal_px / scale, found.radial, pictures.color_size), tracked
+
+
+def _learned(network: MonocularDepth, pictures: Pictures, placed: np.ndarray, found: Lens) -> depth.Learned:
+    def learned(number: int, mapped: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        color = found.straightened(pictures.color(int(placed[number])))
+        inverse = cv2.resize(network.inverse_depth(color), mapped.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        return monocular.aligned(inverse, mapped, counts & (mapped > 0))
+
+    return learned
+
+
+def _strange(pictures: Pictures, what: str) -> InputError:
+    remedy = (
+        "film it in the room of the walk-through, with furniture in view and little moved since; "
+        "or record it with depth; or take it out of the captures"
+    )
+    return InputError("MAP-007", what, str(pictures.folder), remedy)

@@ -1,0 +1,100 @@
+"""Write frames whose depth was estimated as the ``frames/<id>`` artifact, and check their quality."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+
+from pipeline.data import images, plots, qa
+from pipeline.data.clips import FRAMES, MAPPED, Pictures
+from pipeline.geometry import cameras
+from stages.estimate_depth.depth import FrameDepth
+from stages.estimate_depth.lens import Lens
+from stages.estimate_depth.tracking import Tracked
+
+SHOWN = 10
+"""Frames on the contact sheet."""
+DARK = 0.15
+"""Mean brightness (0..1) below which a picture loses quality."""
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """What was found of a recording."""
+
+    placed: Int[np.ndarray, "kept"]
+    """Frames that are kept."""
+    tracked: Tracked
+    lens: Lens
+    depths: Sequence[FrameDepth]
+    """Of the kept frames."""
+
+
+def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: int) -> None:
+    """Write pictures, depth, confidence and the table of the kept frames."""
+    for name in ("color", "depth", "confidence"):
+        (folder / name).mkdir()
+    kept, lens = estimated.placed, estimated.lens
+    for number, (frame, found) in enumerate(zip(kept.tolist(), estimated.depths, strict=True)):
+        color = folder / "color" / f"{number:06d}.jpg"
+        if lens.bends:
+            images.write_color(color, lens.straightened(pictures.color(frame)), jpeg_quality)
+        else:
+            color.write_bytes(pictures.file(frame).read_bytes())
+        images.write_depth(folder / "depth" / f"{number:06d}.exr", found.depth)
+        images.write_gray(folder / "confidence" / f"{number:06d}.png", found.confidence)
+    valid = np.array([(each.depth > 0).mean() for each in estimated.depths])
+    sharp = np.minimum(pictures.sharpness / max(float(np.median(pictures.sharpness)), 1e-6), 1)[kept]
+    small = cameras.scale_intrinsics(lens.intrinsics, lens.size, estimated.depths[0].depth.shape)
+    FRAMES.save(
+        folder / "frames.npz",
+        timestamp_s=pictures.timestamp_s[kept],
+        intrinsics=np.repeat(lens.intrinsics[None], len(kept), axis=0),
+        depth_intrinsics=np.repeat(small[None], len(kept), axis=0),
+        odometry_from_camera=estimated.tracked.world_from_camera[kept],
+        gravity_known=np.array(True),
+        scale=np.array(MAPPED),
+        source_index=pictures.source_index[kept],
+        quarter_turns=np.array(pictures.quarter_turns),
+        sharpness=pictures.sharpness[kept],
+        brightness=pictures.brightness[kept],
+        depth_valid=valid.astype(np.float32),
+        quality=(sharp * np.minimum(pictures.brightness[kept] / DARK, 1) * valid).astype(np.float32),
+    )
+
+
+def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> None:
+    """Write the stage's own judgement: what is measured, what inferred."""
+    kept, depths = estimated.placed, estimated.depths
+    alone = float(estimated.tracked.by_landmarks[kept].mean())
+    known = np.mean([(each.depth > 0).mean() for each in depths])
+    certain = np.mean([(each.confidence == 2).mean() for each in depths])
+    checks = [
+        qa.Check(
+            "frames placed in the map", 100 * len(kept) / len(pictures), "%", warn=80.0, better="higher"
+        ),
+        qa.Check(
+            "placed by landmarks alone, the others tracked", 100 * alone, "%", warn=30.0, better="higher"
+        ),
+        qa.Check("focal length, calibrated", estimated.lens.focal_px, "px"),
+        qa.Check("radial distortion, calibrated", estimated.lens.radial),
+        qa.Check("known depth", 100 * float(known), "%", warn=50.0, better="higher"),
+        qa.Check("depth of the map, or confirmed by several views", 100 * float(certain), "%"),
+        qa.Check("frames with inferred depth", 100 * float(np.mean([each.inferred for each in depths])), "%"),
+    ]
+    shown = plots.sample(len(kept), SHOWN)
+    size = depths[0].depth.shape
+    sheet = plots.grid(
+        [plots.resized(pictures.color(int(kept[number])), size) for number in shown]
+        + [plots.depth_colors(depths[number].depth) for number in shown],
+        len(shown),
+    )
+    qa.write(
+        folder,
+        good="depth follows the pictures' edges; the animal stands out of it on its feet",
+        bad="edges of furniture beside those of the picture, blotches where nothing moves, no animal",
+        checks=checks,
+        pictures=[qa.Picture("depth", sheet, "frames, and their depth: black is unknown")],
+    )

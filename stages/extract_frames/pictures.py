@@ -1,0 +1,76 @@
+"""Pictures of a recording without depth, upright at a steady rate; `estimate_depth` gives them the rest."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.core.progress import log, track
+from pipeline.data import images, qa
+from pipeline.data.clips import PICTURES
+from pipeline.geometry import cameras
+from pipeline.recordings import extraction
+from pipeline.recordings.recording import Recording, damaged
+from stages.extract_frames.config import Config
+from stages.extract_frames.writing import LEAST_FRAMES, MOST_LOST
+
+SHEET_FRAMES, SHEET_HEIGHT_PX = 12, 200
+
+
+def write(folder: Path, recording: Recording, config: Config) -> None:
+    """Write the pictures of one recording. Raises InputError CAP-001 where most are damaged, CAP-007 where
+    hardly any are left.
+    """
+    rows = extraction.choose_frames(recording.timestamp_s, config.rate_hz)
+    size, kept, statistics, strip = (
+        extraction.reduced_size(recording.color_size, config.max_side_px),
+        [],
+        [],
+        [],
+    )
+    shown = set(rows[np.linspace(0, len(rows) - 1, SHEET_FRAMES).astype(int)].tolist())
+    (folder / "color").mkdir()
+    for row in track(rows.tolist(), "pictures"):
+        stored = recording.read_color(int(recording.index[row]))
+        if stored is None:
+            continue
+        color = images.decode_color(stored, recording.where) if isinstance(stored, bytes) else stored
+        if color.shape[:2] != size:
+            color = cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
+        color = cameras.turn_image(color, recording.quarter_turns)
+        images.write_color(folder / "color" / f"{len(kept):06d}.jpg", color, config.jpeg_quality)
+        kept.append(row)
+        statistics.append(extraction.picture_statistics(color))
+        if row in shown:
+            width = round(color.shape[1] * SHEET_HEIGHT_PX / color.shape[0])
+            strip.append(cv2.resize(color, (width, SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA))
+    if len(rows) - len(kept) > MOST_LOST * len(rows):
+        raise damaged(recording.where, f"{len(rows) - len(kept)} of {len(rows)} pictures cannot be decoded")
+    if len(kept) < LEAST_FRAMES:
+        what = f"{len(kept)} pictures, {LEAST_FRAMES} are the least"
+        raise InputError("CAP-007", what, recording.where, "record some seconds at least")
+    sharpness, brightness = np.array(statistics, np.float32).T
+    time_s = recording.timestamp_s[kept]
+    PICTURES.save(
+        folder / "pictures.npz",
+        timestamp_s=time_s,
+        source_index=recording.index[kept],
+        quarter_turns=np.array(recording.quarter_turns),
+        sharpness=sharpness,
+        brightness=brightness,
+    )
+    log(f"{recording.where}: {recording.kind}, {len(kept)} pictures; cameras and depth come from the map")
+    blurred = float((sharpness < 0.4 * max(float(np.median(sharpness)), 1e-6)).mean())
+    qa.write(
+        folder,
+        good="upright, sharp pictures",
+        bad="sideways, dark or blurred pictures",
+        checks=[
+            qa.Check("duration", float(time_s[-1] - time_s[0]), "s", warn=5.0, better="higher"),
+            qa.Check("pictures", float(len(kept)), "", warn=50, better="higher"),
+            qa.Check("dark pictures", 100 * float((brightness < extraction.DARK).mean()), "%", warn=20.0),
+            qa.Check("blurred pictures", 100 * blurred, "%", warn=25.0),
+        ],
+        pictures=[qa.Picture("contact_sheet", np.concatenate(strip, axis=1), "frames spread over the video")],
+    )

@@ -1,0 +1,55 @@
+import numpy as np
+import trimesh
+
+from pipeline.geometry import contact, rigid
+from pipeline.geometry.meshes import Mesh, RayCaster
+
+SIZE = (120, 160)
+INTRINSICS = np.array([[120.0, 0, 80], [0, 120.0, 60], [0, 0, 1]])
+EYE = np.array([0.0, 1.2, 2.0])
+CAMERA = rigid.look_at(EYE, np.array([0.0, 0.2, 0.0]), np.array([0.0, 1.0, 0.0]))
+BOX = trimesh.creation.box((0.3, 0.3, 0.2), rigid.make(np.eye(3), np.array([0.0, 0.15, 0.0])))
+
+
+def caster(*meshes: trimesh.Trimesh) -> RayCaster:
+    floor = trimesh.creation.box((6, 0.02, 6), rigid.make(np.eye(3), np.array([0.0, -0.01, 0.0])))
+    both = trimesh.util.concatenate([floor, *meshes])
+    return RayCaster(Mesh(np.asarray(both.vertices, np.float32), np.asarray(both.faces)))
+
+
+def render(scene: RayCaster) -> np.ndarray:
+    from pipeline.geometry.meshes import render_view
+
+    return render_view(scene, CAMERA, INTRINSICS, *SIZE)[0]
+
+
+def test_a_box_on_the_floor_has_the_depth_of_a_box_on_the_floor():
+    true, floor = render(caster(BOX)), render(caster())
+    mask = true < floor - 1e-3
+    touched = contact.find(mask, INTRINSICS, CAMERA, caster())
+    assert touched.certain and abs(touched.point_world[1]) < 1e-3
+    assert abs(touched.point_world[2] - 0.1) < 0.04, "its front stands at z = 0.1 m"
+    depth = contact.depth_of(mask, touched.point_world, 0.3, INTRINSICS, CAMERA)
+    assert ((depth > 0) == mask).all()
+    assert np.abs(depth - true)[mask].max() < 0.06
+    assert np.median(np.abs(depth - true)[mask]) < 0.03
+
+
+def test_a_part_that_goes_on_beyond_the_picture_or_stands_before_a_wall_touches_nothing():
+    cut = np.zeros(SIZE, bool)
+    cut[80:, 70:90] = True
+    assert not contact.find(cut, INTRINSICS, CAMERA, caster()).certain
+    wall = trimesh.creation.box((6, 3, 0.02), rigid.make(np.eye(3), np.array([0.0, 1.5, -0.5])))
+    high = np.zeros(SIZE, bool)
+    high[5:20, 70:90] = True
+    assert not contact.find(high, INTRINSICS, CAMERA, caster(wall)).certain
+
+
+def test_contacts_are_carried_on_for_a_while_only():
+    seen = contact.Contact(np.array([1.0, 0, 0]), True)
+    later = contact.Contact(np.array([2.0, 0, 0]), True)
+    hidden = contact.Contact(np.array([9.0, 0, 0]), False)
+    time_s = np.array([0.0, 0.5, 1.0, 9.0])
+    points = contact.between(time_s, [seen, hidden, later, None], 2.0)
+    assert np.allclose(points[1], [1.5, 0, 0])
+    assert np.isnan(points[3]).all()
