@@ -1,9 +1,15 @@
 """What tests share: the long ones come last, and the toy is built once."""
 
+import importlib.util
 import subprocess
 from pathlib import Path
 
 import pytest
+
+if importlib.util.find_spec("beartype"):  # from `make dev`; continuous integration has it
+    import tests.array_checks
+
+    tests.array_checks.install(["pipeline", "stages"])
 
 ROOT = Path(__file__).parent.parent
 

@@ -87,12 +87,13 @@ def test_imports_go_downstairs_only(path):
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_sizes(path):
-    lines = path.read_text().count("\n")
-    assert lines <= (80 if path.name == "__main__.py" else 406), f"{lines} lines"
+    lines, ground_floor = path.read_text().count("\n"), path.is_relative_to(ROOT / "pipeline")
+    longest_file, longest_function = (400, 60) if ground_floor else (400, 69)
+    assert lines <= (80 if path.name == "__main__.py" else longest_file), f"{lines} lines"
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             length = node.end_lineno - node.lineno + 1
-            assert length <= 69, f"{node.name} has {length} lines"
+            assert length <= longest_function, f"{node.name} has {length} lines"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)

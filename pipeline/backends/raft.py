@@ -110,7 +110,7 @@ def flow_between(
 def correlation_pyramid(
     here: Float[Tensor, "batch channel rows columns"], there: Float[Tensor, "batch channel rows columns"]
 ) -> list[Float[Tensor, "cell 1 _ _"]]:
-    """Correlate every cell with every other; each level averages two by two of the targets."""
+    """Correlate every cell with every other; each level averages two by two of the targets (RAFT, Eq. 1)."""
     batch, channels, rows, columns = here.shape
     all_pairs = here.flatten(2).transpose(1, 2) @ there.flatten(2) / math.sqrt(channels)
     pyramid = [all_pairs.reshape(batch * rows * columns, 1, rows, columns)]
@@ -122,7 +122,7 @@ def correlation_pyramid(
 def look_up(
     pyramid: list[Float[Tensor, "cell 1 _ _"]], target: Float[Tensor, "batch 2 rows columns"]
 ) -> Float[Tensor, "batch channel rows columns"]:
-    """Read the correlations in a window around each cell's target, on every level."""
+    """Read the correlations in a window around each cell's target, in cells, on every level (RAFT, Eq. 2)."""
     batch, _, rows, columns = target.shape
     reach = torch.linspace(-RADIUS, RADIUS, 2 * RADIUS + 1, device=target.device)
     window = torch.stack(

@@ -103,7 +103,7 @@ def horizontal_forward(root: Float[Tensor, "batch 6 frame"]) -> Float[Tensor, "b
 def rotated_to_heading(
     root: Float[Tensor, "batch 6 frame"], heading: Float[Tensor, "batch 2 frame"]
 ) -> Float[Tensor, "batch 6 frame"]:
-    """Turn rotations about the vertical so that they look along ``heading``."""
+    """Turn rotations (x and y axis, ego frame) about the vertical so that they look along ``heading``."""
     now = soft_unit(horizontal_forward(root))
     cosine = (now * heading).sum(1, keepdim=True)
     sine = (heading[:, 0] * now[:, 1] - heading[:, 1] * now[:, 0])[:, None]

@@ -43,7 +43,7 @@ class Schedule:
 
     @property
     def beta(self) -> Float[np.ndarray, "step"]:
-        """Variance added at each step."""
+        """Variance added at each step (beta_t of Ho et al. 2020)."""
         return np.linspace(self.beta_first, self.beta_last, self.steps)
 
     @property

@@ -130,9 +130,9 @@ class Scaling:
     """What turns ego-frame metres and radians into the unit-variance numbers that are diffused, and back."""
 
     goal_std: Float[np.ndarray, "3"]
-    velocity_std: Float[np.ndarray, "#frame 4"]
+    velocity_std: Float[np.ndarray, "*each 4"]
     """of strides, see `pipeline.behavior.path_encoding`: of all frames alike, or of each on its own"""
-    path_std: Float[np.ndarray, "3 56"]
+    path_std: Float[np.ndarray, "3 frame"]
     """of places, as they condition the body, metres"""
     body_mean: Float[np.ndarray, "channel"]
     body_std: Float[np.ndarray, "channel"]

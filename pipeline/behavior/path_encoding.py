@@ -70,7 +70,7 @@ def warped_path(
     start: Float[np.ndarray, "*batch 3"],
     path: Float[np.ndarray, "*batch frame 3"],
 ) -> Float[np.ndarray, "*batch frame 4"]:
-    """Return strides that lead along another path, as far as they move."""
+    """Return strides that lead along another path, metres in the same frame, as far as they move."""
     velocity = np.diff(path, axis=-2, prepend=start[..., None, :]) * RATE_HZ
     root = with_powered_length(velocity, VELOCITY_POWER) / np.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
     return np.concatenate([root, strides[..., 3:]], axis=-1)

@@ -363,7 +363,7 @@ class PerceptionEnsemble(nn.Module):
     def condition(
         self, readings: list[PerceptionCode], now: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch condition"]:
-        """Put the encodings of all members and the current state side by side."""
+        """Put the encodings of all members and the current state side by side (omega, Eq. 11-13)."""
         maps, codes = zip(*readings, strict=True)
         return torch.cat([*maps, *codes, now], dim=-1)
 

@@ -112,12 +112,12 @@ class SampledPlan:
     """Sampled futures in the ego frame."""
 
     goal: Float[np.ndarray, "batch 3"]
-    path: Float[np.ndarray, "batch 56 3"]
-    body: Float[np.ndarray, "batch 56 channel"]
+    path: Float[np.ndarray, "batch frame 3"]
+    body: Float[np.ndarray, "batch frame channel"]
 
     def world_from_agent(
         self, world_from_ego: Float[np.ndarray, "batch 4 4"]
-    ) -> Float[np.ndarray, "batch 56 4 4"]:
+    ) -> Float[np.ndarray, "batch frame 4 4"]:
         """Return the root's poses."""
         ego_from_agent = rigid.make(rigid.rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
         return world_from_ego[:, None] @ ego_from_agent
@@ -184,7 +184,7 @@ class Sampler:
         *,
         count: int = 1,
         goal: Float[np.ndarray, "plan 3"] | None = None,
-        path: Float[np.ndarray, "plan 56 3"] | None = None,
+        path: Float[np.ndarray, "plan frame 3"] | None = None,
     ) -> SampledPlan:
         """Draw ``count`` plans for each row, those of a row together; a given goal or path replaces its
         level.
@@ -199,7 +199,7 @@ class Sampler:
         *,
         count: int = 1,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw goals and paths as `plan` does and spare the body."""
+        """Draw goals and paths as `plan` does, metres in the ego frame, and spare the body."""
         return self.draw_courses(self.codes(observation, sampling, count), sampling, rng)
 
     def draw_plans(
@@ -267,7 +267,7 @@ class Sampler:
         goal: Float[np.ndarray, "plan 3"],
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
-    ) -> Float[np.ndarray, "plan 56 3"]:
+    ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to goals, and others for those that do not get there although the goal is all that
         guidance follows.
         """
@@ -288,8 +288,10 @@ class Sampler:
         goal: Float[np.ndarray, "plan 3"],
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
-    ) -> Float[np.ndarray, "plan 56 3"]:
-        """Draw a path towards each goal; the reference of the guidance sees neither observer nor goal."""
+    ) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw a path towards each goal (Eq. 8), metres, ego frame; the reference of guidance sees neither
+        observer nor goal.
+        """
         control = self.scaling.scaled_goal(goal)
 
         def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
@@ -308,10 +310,10 @@ class Sampler:
     def bodies(
         self,
         codes: PlanCondition,
-        path: Float[np.ndarray, "plan 56 3"],
+        path: Float[np.ndarray, "plan frame 3"],
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
-    ) -> Float[np.ndarray, "plan 56 channel"]:
+    ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths, which guidance never takes away."""
         control = self.scaling.scaled_path(path)
 

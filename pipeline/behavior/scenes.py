@@ -73,7 +73,7 @@ class Scenes:
     def around(
         self, ego: Float[np.ndarray, "window 4 4"], video: Int[np.ndarray, "window"] | None
     ) -> Float[np.ndarray, "window channel 64 8 64"]:
-        """Sample the ego grid of every window in its own scene."""
+        """Sample the ego grid (`world_from_ego`, metres) of every window in its own scene (Eq. 11)."""
         number = self.number(video, len(ego))
         if (number == number[:1]).all() and len(number):
             return self.volumes[number[0]].around(ego)

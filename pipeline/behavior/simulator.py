@@ -199,11 +199,11 @@ class AnimalBatch:
 
     def _around_observer(
         self,
-        path: Float[np.ndarray, "some 56 3"],
+        path: Float[np.ndarray, "some frame 3"],
         frame: Float[np.ndarray, "some 4 4"],
         start_world: Float[np.ndarray, "some 3"],
         some: Int[np.ndarray, "some"],
-    ) -> Float[np.ndarray, "some 56 3"]:
+    ) -> Float[np.ndarray, "some frame 3"]:
         """Lead paths in ego frames around the body of the observer, whatever the guidance is."""
         video = None if self.video is None else self.video[some]
 
@@ -220,7 +220,7 @@ class AnimalBatch:
         video: Int[np.ndarray, "some"] | None,
         count: int,
         commanded: Float[np.ndarray, "some 3"],
-    ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some 56 3"], Float[np.ndarray, "some"]]:
+    ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some frame 3"], Float[np.ndarray, "some"]]:
         """Return the least blocked of ``count`` goals and paths for each observation, and how much of it is
         blocked.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Integer
 
 from pipeline.core.errors import InputError
 from pipeline.data import npz
@@ -55,8 +55,8 @@ class Context:
 class Future:
     """The 56 future frames of windows in the world frame; the goal is the root's last position."""
 
-    world_from_agent: Float[np.ndarray, "window 56 4 4"]
-    agent_from_bone: Float[np.ndarray, "window 56 bone 4 4"]
+    world_from_agent: Float[np.ndarray, "window frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "window frame bone 4 4"]
 
     @property
     def goal_world(self) -> Float[np.ndarray, "window 3"]:
@@ -64,7 +64,7 @@ class Future:
         return self.world_from_agent[:, -1, :3, 3]
 
     @property
-    def path_world(self) -> Float[np.ndarray, "window 56 3"]:
+    def path_world(self) -> Float[np.ndarray, "window frame 3"]:
         """The root's positions (P of the paper)."""
         return self.world_from_agent[:, :, :3, 3]
 
@@ -99,7 +99,7 @@ class BehaviorData:
     """index into ``videos``"""
     start: Int[np.ndarray, "window"]
     """first of the 64 frames"""
-    split: UInt8[np.ndarray, "window"]
+    split: Integer[np.ndarray, "window"]
     """0 train, 1 test"""
     videos: tuple[str, ...]
     future: int = FUTURE

@@ -30,7 +30,7 @@ def open_flow(folder: Path, gap: int, *, backward: bool = False) -> Float[np.nda
 def open_confidence(
     folder: Path, gap: int, *, backward: bool = False
 ) -> UInt8[np.ndarray, "frame height width"]:
-    """Map the confidence of one gap, 255 = certain."""
+    """Map the confidence of one gap from disk, 0..255, 255 = certain."""
     return npz.open_lazily(path_of(folder, gap, backward=backward), "confidence")
 
 

@@ -46,7 +46,7 @@ def decode_color(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
 
 
 def read_color(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an RGB picture."""
+    """Read an RGB picture, 0..255."""
     return decode_color(Path(path).read_bytes(), str(path))
 
 

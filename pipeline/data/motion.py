@@ -159,5 +159,5 @@ class MotionTable(nn.Module):
         return self.initial_agent[frame] @ rigid_torch.se3_exp(self.root[frame])
 
     def agent_from_bone(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch bone 4 4"]:
-        """Return posed bones."""
+        """Return posed bones, metres, agent frame."""
         return self.agent_from_bone_rest @ rigid_torch.se3_exp(self.bone[frame])

@@ -86,9 +86,9 @@ class AgentCameras:
 class SkinTable:
     """Skinning of `agent.ply`: blend weights, bones at rest and the sizes of their Gaussians."""
 
-    weights: Float32[np.ndarray, "vertex bone"]
-    agent_from_bone_rest: Float32[np.ndarray, "bone 4 4"]
-    bone_scale_m: Float32[np.ndarray, "bone 3"]
+    weights: Float[np.ndarray, "vertex bone"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+    bone_scale_m: Float[np.ndarray, "bone 3"]
 
     @classmethod
     def open(cls, folder: Path) -> "SkinTable":

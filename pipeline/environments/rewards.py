@@ -42,7 +42,7 @@ def approach(outcome: StepOutcome) -> Float[np.ndarray, "person"]:
 
 
 def follow(outcome: StepOutcome) -> Float[np.ndarray, "person"]:
-    """Reward keeping a distance of 1.2 m."""
+    """Reward keeping a distance of 1.2 m, 0..1."""
     return -np.abs(outcome.distance_m - FOLLOW_M)
 
 

@@ -126,7 +126,7 @@ class AnimalWorld:
         self.animals.begin(context, rng)
 
     def restart(self, some: Int[np.ndarray, "some"], split: str = "train") -> None:
-        """Begin some pairs anew."""
+        """Begin some pairs of person and animal anew, by their indices."""
         self.animals.restart(some, self._drawn(some, split))
 
     def step(self, action: Float[np.ndarray, "person command"]) -> StepOutcome:

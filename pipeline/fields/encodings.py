@@ -42,7 +42,7 @@ class DenseGrid(nn.Module):
         self.channels = channels * len(voxel_m)
 
     def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
-        """Interpolate at points; outside the box the border's values hold."""
+        """Interpolate at points, metres, in the field's frame; outside the box the border's values hold."""
         found = []
         for extent, level in zip(self.extents, self.levels, strict=True):
             place = ((points - self.low) / extent * 2 - 1).view(1, 1, 1, -1, 3)

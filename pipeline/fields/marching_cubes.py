@@ -112,5 +112,5 @@ def keep_vertices(mesh: Mesh, keep: Bool[np.ndarray, "vertex"]) -> Mesh:
 
 
 def _box(field: Field) -> tuple[Tensor, Tensor]:
-    device = field.log_beta.device
-    return torch.tensor(field.shape.low_m, device=device), torch.tensor(field.shape.high_m, device=device)
+    like = field.log_beta.detach()
+    return like.new_tensor(field.shape.low_m), like.new_tensor(field.shape.high_m)

@@ -175,7 +175,7 @@ def blend_tiles(
     height: int,
     width: int,
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
-    """Blend Gaussians near to far, as `pipeline.fields.rasterize.blend_dense` does, in tiles."""
+    """Blend Gaussians near to far, as `pipeline.fields.rasterize.blend_dense` does, in tiles of pixels."""
     return _Blend.apply(
         footprints.pixel,
         footprints.conic,

@@ -95,6 +95,6 @@ def blend(
 def move(
     target_from_source: Float[Tensor, "*#batch point 4 4"], points_source: Float[Tensor, "*#batch point 3"]
 ) -> Float[Tensor, "*#batch point 3"]:
-    """Apply one transform a point."""
+    """Apply one transform a point, metres."""
     turned = (target_from_source[..., :3, :3] * points_source[..., None, :]).sum(-1)
     return turned + target_from_source[..., :3, 3]

@@ -72,7 +72,7 @@ def read_depth(
 def scale_intrinsics(
     intrinsics: Float[np.ndarray, "*batch 3 3"], from_size: tuple[int, int], to_size: tuple[int, int]
 ) -> Float[np.ndarray, "*batch 3 3"]:
-    """Adapt intrinsics to a resized image; sizes are (height, width)."""
+    """Adapt intrinsics to a resized image; sizes are (height, width), pixels."""
     scaled = np.array(intrinsics, float)
     scaled[..., 0, :] *= to_size[1] / from_size[1]
     scaled[..., 1, :] *= to_size[0] / from_size[0]
@@ -89,7 +89,7 @@ def opencv_from_opengl(
 def turn_intrinsics(
     intrinsics: Float[np.ndarray, "*batch 3 3"], size: tuple[int, int], quarter_turns: int
 ) -> Float[np.ndarray, "*batch 3 3"]:
-    """Adapt intrinsics to an image of (height, width) ``size`` turned clockwise by quarter turns."""
+    """Adapt intrinsics, pixels, to an image of (height, width) ``size`` turned clockwise by quarter turns."""
     turned = np.array(intrinsics, float)
     height, width = size
     for _ in range(quarter_turns % 4):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 def make(
     rotation: Float[np.ndarray, "*#batch 3 3"], translation: Float[np.ndarray, "*#batch 3"]
 ) -> Float[np.ndarray, "*#batch 4 4"]:
-    """Assemble transforms from rotations and translations (broadcast over the batch)."""
+    """Assemble transforms from rotations and translations, metres (broadcast over the batch)."""
     rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     a_from_b = np.zeros((*batch, 4, 4))
@@ -37,19 +37,19 @@ def apply(
 
 
 def rotation_from_vector(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Turn rotation vectors (axis times angle) into matrices."""
+    """Turn rotation vectors (axis times angle, radians) into matrices: Rodrigues' formula."""
     vector = np.asarray(vector, float)
     return Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix().reshape(*vector.shape[:-1], 3, 3)
 
 
 def vector_from_rotation(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Turn rotation matrices into rotation vectors of length <= pi."""
+    """Turn rotation matrices into rotation vectors of length <= pi, radians."""
     rotation = np.asarray(rotation, float)
     return Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(*rotation.shape[:-2], 3)
 
 
 def exp(twist: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
-    """Make a transform from (rotation vector, translation); rotation and translation are decoupled."""
+    """Make a transform from (rotation vector in radians, translation in metres), decoupled: SO(3) x R^3."""
     return make(rotation_from_vector(twist[..., :3]), twist[..., 3:])
 
 
@@ -87,7 +87,7 @@ def wrap(angle_rad: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
 def rotation_angle(
     first: Float[np.ndarray, "*#batch 3 3"], second: Float[np.ndarray, "*#batch 3 3"]
 ) -> Float[np.ndarray, "*#batch"]:
-    """Return the geodesic angle between rotations, exact at zero and at pi (atan2 form)."""
+    """Return the geodesic angle between rotations, radians, exact at zero and at pi (atan2 form)."""
     relative = np.swapaxes(first, -1, -2) @ second
     axis = np.stack(
         [
@@ -115,7 +115,7 @@ def rotation_from_quaternion(quaternion: Float[np.ndarray, "*batch 4"]) -> Float
 
 
 def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 6"]:
-    """Return the first two columns (x axis, then y axis)."""
+    """Return the first two columns, x axis, then y axis (Zhou et al. 2019)."""
     return np.concatenate([rotation[..., 0], rotation[..., 1]], axis=-1)
 
 

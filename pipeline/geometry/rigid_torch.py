@@ -18,7 +18,7 @@ def so3_exp(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 def make(
     rotation: Float[Tensor, "*#batch 3 3"], translation: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*#batch 4 4"]:
-    """Assemble transforms from rotations and translations."""
+    """Assemble transforms from rotations and translations, metres."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=rotation.dtype, device=rotation.device).expand(
         *top.shape[:-2], 1, 4
@@ -64,7 +64,7 @@ def rotation_from_6d(columns: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batc
 
 
 def rotation_to_6d(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
-    """Return the first two columns of rotations; undone by `rotation_from_6d`."""
+    """Return the first two columns of rotations (Zhou et al. 2019); undone by `rotation_from_6d`."""
     return torch.cat([rotation[..., 0], rotation[..., 1]], dim=-1)
 
 

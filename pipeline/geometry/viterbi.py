@@ -7,7 +7,8 @@ from jaxtyping import Float, Int
 
 
 def viterbi_decode(
-    cost: Sequence[Float[np.ndarray, "_"]], change: Callable[[int], Float[np.ndarray, "_ _"]]
+    cost: Sequence[Float[np.ndarray, "_"]] | Float[np.ndarray, "step state"],
+    change: Callable[[int], Float[np.ndarray, "_ _"]],
 ) -> Int[np.ndarray, "step"]:
     """Return the state of each step whose costs, those of changes included, are least in sum; of equal ones
     the first.

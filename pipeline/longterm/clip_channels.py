@@ -55,7 +55,7 @@ def root_channels(a_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[Tensor
 def pose_channels(
     agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], poses: PoseSpace
 ) -> Float[Tensor, "*batch pose"]:
-    """Return p."""
+    """Return p of LTM 3.2: numbers of the pose, without unit."""
     rest = poses.rest.double().numpy()
     return poses.encode(
         torch.from_numpy(channels_from_bones(np.asarray(agent_from_bone, np.float64), rest)).float()

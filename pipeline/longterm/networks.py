@@ -175,7 +175,7 @@ class CoarseToFine(nn.Module):
         seen: LocalScene,
         extra: Float[Tensor, "batch frame extra"] | None = None,
     ) -> list[Float[Tensor, "batch frame channel"]]:
-        """Return the draft and what it becomes, with r orthonormal."""
+        """Return the draft and what it becomes, t in metres and r orthonormal, in the clip's frame."""
         coarse = orthonormalized(self.coarse(start, end, seen.points, extra))
         still = coarse.detach()
         read = (
@@ -280,7 +280,7 @@ class GaitPhase(nn.Module):
         end: Float[Tensor, "batch pose"],
         route: Float[Tensor, "batch frame 9"],
     ) -> Float[Tensor, "batch frame channel"]:
-        """Return start turned forward and end turned backward."""
+        """Return the codes of start turned forward and of end turned backward."""
         phase = gait_progress(route) @ self.rate.T
         return torch.cat([self._turned(start, phase), self._turned(end, phase - phase[:, -1:])], dim=-1)
 

@@ -106,7 +106,7 @@ class WalkableFloor:
         )
 
     def cell(self, position: Float[np.ndarray, "3"]) -> tuple[int, int]:
-        """Return the free cell nearest to a position."""
+        """Return the free cell (x, z) nearest to a world position, metres."""
         return self._nearest(self.free, position)
 
     def nearest_turning_place(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -161,7 +161,7 @@ class WalkableFloor:
         return bool(np.all(place >= 0) and np.all(place <= self.free.shape) and within)
 
     def refuse_outside(self, position: Float[np.ndarray, "3"]) -> None:
-        """Raise SIM-003 for a position beyond the scene's edges."""
+        """Raise SIM-003 for a world position, metres, beyond the scene's edges."""
         if not self.contains(position):
             low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
             heights = f"y {self.lowest_m:.1f} .. {self.highest_m:.1f} m (floor {self.height_m:.1f} m)"

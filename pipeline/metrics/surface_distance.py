@@ -29,7 +29,7 @@ class TriangleSurface:
         self._centres = KDTree(centre)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:
-        """Draw points uniformly over the surface."""
+        """Draw points uniformly over the surface, metres."""
         area = triangles.area(self.corners)
         face = rng.choice(len(area), count, p=area / area.sum())
         return (rng.dirichlet((1, 1, 1), count)[..., None] * self.corners[face]).sum(1)

@@ -32,10 +32,10 @@ class Samples:
     """Sampled futures in the world frame; None where a method does not predict it."""
 
     goal: Float[np.ndarray, "window sample 3"]
-    path: Float[np.ndarray, "window sample 56 3"] | None = None
-    rotation: Float[np.ndarray, "window sample 56 3 3"] | None = None
+    path: Float[np.ndarray, "window sample frame 3"] | None = None
+    rotation: Float[np.ndarray, "window sample frame 3 3"] | None = None
     """of ``world_from_agent``"""
-    agent_from_bone: Float[np.ndarray, "window sample 56 bone 4 4"] | None = None
+    agent_from_bone: Float[np.ndarray, "window sample frame bone 4 4"] | None = None
 
 
 class Predictor(Protocol):
@@ -76,7 +76,7 @@ class LocationPrior:
 class StandStill:
     """The animal stays where it is, in its posture, up to Gaussian noise that grows as it did in training."""
 
-    std: Float[np.ndarray, "56 3"]
+    std: Float[np.ndarray, "frame 3"]
 
     @classmethod
     def fit(cls, context: Context, future: Future) -> "StandStill":
@@ -92,7 +92,7 @@ class StandStill:
 class ConstantVelocity:
     """The animal goes on at the velocity of its last 0.7 s, in its posture, up to Gaussian noise."""
 
-    std: Float[np.ndarray, "56 3"]
+    std: Float[np.ndarray, "frame 3"]
 
     @classmethod
     def fit(cls, context: Context, future: Future) -> "ConstantVelocity":
@@ -104,17 +104,17 @@ class ConstantVelocity:
         return _straight(context, _coasting(context), self.std, count, rng)
 
 
-def _held(context: Context) -> Float[np.ndarray, "window 56 3"]:
+def _held(context: Context) -> Float[np.ndarray, "window frame 3"]:
     return np.repeat(context.world_from_agent[:, -1:, :3, 3], FUTURE, axis=1)
 
 
-def _coasting(context: Context) -> Float[np.ndarray, "window 56 3"]:
+def _coasting(context: Context) -> Float[np.ndarray, "window frame 3"]:
     position = context.world_from_agent[..., :3, 3]
     velocity = (position[:, -1] - position[:, 0]) * (RATE_HZ / (PAST - 1))
     return _held(context) + velocity[:, None] * (STEPS * FUTURE / RATE_HZ)[:, None]
 
 
-def _spread(residual: Float[np.ndarray, "window 56 3"]) -> Float[np.ndarray, "56 3"]:
+def _spread(residual: Float[np.ndarray, "window frame 3"]) -> Float[np.ndarray, "frame 3"]:
     """Return the root mean square per frame: horizontal axes together, height apart."""
     level = np.sqrt((residual[..., ::2] ** 2).mean((0, 2)))
     return np.stack([level, np.sqrt((residual[..., 1] ** 2).mean(0)), level], axis=-1)
@@ -122,8 +122,8 @@ def _spread(residual: Float[np.ndarray, "window 56 3"]) -> Float[np.ndarray, "56
 
 def _straight(
     context: Context,
-    mean: Float[np.ndarray, "window 56 3"],
-    std: Float[np.ndarray, "56 3"],
+    mean: Float[np.ndarray, "window frame 3"],
+    std: Float[np.ndarray, "frame 3"],
     count: int,
     rng: np.random.Generator,
 ) -> Samples:

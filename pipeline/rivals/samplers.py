@@ -63,7 +63,7 @@ class GaussianSampler(Sampler):
     def draw_courses(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw paths to the mean goal."""
+        """Draw paths to the mean goal, metres, ego frame."""
         return self.paths(codes, self.scaling.goal(self._goal(codes)[0]), sampling, rng)
 
     def goals(
@@ -79,7 +79,7 @@ class GaussianSampler(Sampler):
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw a path towards each goal."""
+        """Draw a path towards each goal, metres, ego frame."""
         return self.finished_paths(
             codes, self._drawn_from(self._path(codes, goal, sampling), rng), goal, sampling
         )
@@ -91,7 +91,7 @@ class GaussianSampler(Sampler):
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame channel"]:
-        """Draw bodies along paths."""
+        """Draw bodies along paths, metres and radians, ego frame."""
         control = self.scaling.scaled_path(path)
         nothing = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         outputs = [
@@ -147,7 +147,7 @@ class OneStageSampler(Sampler):
     def draw_courses(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw whole plans and keep the paths."""
+        """Draw whole plans and keep the paths, metres, ego frame."""
         return self.draw_plans(codes, sampling, rng, None, None).path
 
     def goals(

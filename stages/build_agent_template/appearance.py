@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Num, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.geometry import cameras, rigid
@@ -57,7 +57,8 @@ def gather(
     vertices: Float[np.ndarray, "vertex 3"],
     weight: Float[np.ndarray, "view vertex"],
     pixel: Float[np.ndarray, "view vertex 2"],
-    pictures: Sequence[Float[np.ndarray, "height width channel"]],
+    pictures: Sequence[Num[np.ndarray, "height width channel"]]
+    | Num[np.ndarray, "view height width channel"],
     stride_px: int,
 ) -> Float[np.ndarray, "vertex channel"]:
     """Average pictures (one cell per ``stride_px`` color pixels) over the views; unseen vertices take the
@@ -75,7 +76,7 @@ def gather(
 
 
 def _sample(
-    picture: Float[np.ndarray, "height width channel"], position: Float[np.ndarray, "point 2"]
+    picture: Num[np.ndarray, "height width channel"], position: Float[np.ndarray, "point 2"]
 ) -> Float[np.ndarray, "point channel"]:
     """Blend bilinearly at positions in cells; a cell's centre lies in the middle of its square."""
     height, width = picture.shape[:2]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Int
+from jaxtyping import Float, Num
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, rigid
@@ -73,7 +73,7 @@ def confirm(clip: Clip, database: Path, rng: np.random.Generator) -> tuple[int, 
     return kept, len(pairs)
 
 
-def _confirmed(clip, first, second, points_first, points_second, matches, rng) -> Int[np.ndarray, "match 2"]:
+def _confirmed(clip, first, second, points_first, points_second, matches, rng) -> Num[np.ndarray, "match 2"]:
     """Return the matches of a pair that depth confirms, none where the pair as a whole is not believed."""
     if len(matches) == 0:
         return matches[:0]

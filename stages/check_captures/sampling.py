@@ -30,7 +30,7 @@ class SampledFrame:
     timestamp_s: float
     gray: UInt8[np.ndarray, "height width"]
     intrinsics: Float[np.ndarray, "3 3"]
-    depth: Float[np.ndarray, "height width"]
+    depth: Float[np.ndarray, "depth_height depth_width"]
     """metres, 0 = unknown"""
     depth_intrinsics: Float[np.ndarray, "3 3"]
     odometry_from_camera: Float[np.ndarray, "4 4"] | None

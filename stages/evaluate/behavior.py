@@ -96,7 +96,7 @@ def _judged(
     method: Predictor,
     data: BehaviorData,
     test: Int[np.ndarray, "window"],
-    chosen: Int[np.ndarray, "window"],
+    chosen: Int[np.ndarray, "chosen"],
     config: Config,
 ) -> _Judged:
     """Judge one method: its goals on all test windows, its plans on the chosen ones."""

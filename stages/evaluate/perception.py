@@ -67,7 +67,7 @@ class FlowPair:
 
 
 def flow_pairs(
-    ours: Float[np.ndarray, "frame height width 2"],
+    ours: Float[np.ndarray, "pair height width 2"],
     true: TrueFlow,
     masks: Bool[np.ndarray, "frame row column"],
 ) -> list[FlowPair]:

@@ -121,7 +121,7 @@ def filmed_together(folders: Reconstructed, phone: Video) -> Int[np.ndarray, "fr
     return np.flatnonzero((when >= session_s[0]) & (when <= session_s[-1]))
 
 
-def subsampled(frames: Int[np.ndarray, "frame"], count: int) -> Int[np.ndarray, "frame"]:
+def subsampled(frames: Int[np.ndarray, "frame"], count: int) -> Int[np.ndarray, "chosen"]:
     """Return up to ``count`` of the frames, evenly spread."""
     return frames[plots.sample(len(frames), count)]
 

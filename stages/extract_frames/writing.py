@@ -179,14 +179,14 @@ def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
     )
 
 
-def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
     scale = SHEET_HEIGHT_PX / image.shape[0]
     return cv2.resize(
         image, (max(round(image.shape[1] * scale), 1), SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA
     )
 
 
-def _colored_depth(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:
+def _colored_depth(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "_ _ 3"]:
     nearness = np.clip(255 * (1 - depth / max(float(depth.max()), 1e-3)), 0, 255).astype(np.uint8)
     colored = cv2.applyColorMap(nearness, cv2.COLORMAP_INFERNO)[..., ::-1]
     return np.ascontiguousarray(np.where(depth[..., None] > 0, colored, 0).astype(np.uint8))

@@ -44,7 +44,7 @@ def absent_observer(frames: int) -> Float[np.ndarray, "frame 4 4"]:
     return poses
 
 
-def concatenated_times(times: list[Float[np.ndarray, "frame"]]) -> Float[np.ndarray, "frame"]:
+def concatenated_times(times: list[Float[np.ndarray, "_"]]) -> Float[np.ndarray, "frame"]:
     """Put clips on one clock, in order, far enough apart."""
     placed, begin = [], 0.0
     for time in times:

@@ -49,7 +49,7 @@ class Problem:
     surface: "TemplateSurface"
     joints: "Joints"
     tree: KinematicTree
-    agent_frames: Int[Tensor, "frame"]
+    agent_frames: Int[Tensor, "agent_frame"]
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
     trust: Float[Tensor, "frame"]

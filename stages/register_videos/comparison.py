@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Num, UInt8
 
 from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import cameras
@@ -48,7 +48,7 @@ def compare(
 
 
 def local_contrast_normalization(
-    color: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]
+    color: Num[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
     """Remove differences of light: grey minus its local mean over its local deviation (Jarrett et al.
     2009)."""

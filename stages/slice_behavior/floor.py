@@ -5,7 +5,7 @@ the home.
 from typing import cast
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, UInt8
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
@@ -22,8 +22,10 @@ MARGIN_VOXELS = 1
 
 
 def with_filled_floor(
-    marks: Int[np.ndarray, "x y z"], occupancy: Int[np.ndarray, "x y z"], visited: Bool[np.ndarray, "x y z"]
-) -> Int[np.ndarray, "x y z"]:
+    marks: UInt8[np.ndarray, "x y z"],
+    occupancy: UInt8[np.ndarray, "x y z"],
+    visited: Bool[np.ndarray, "x y z"],
+) -> UInt8[np.ndarray, "x y z"]:
     """Return the marks of where the root may be with a floor beneath all of them, and none outside of the
     home.
 

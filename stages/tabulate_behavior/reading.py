@@ -14,12 +14,12 @@ from pipeline.data import npz
 class MethodScores:
     """The scores of one method."""
 
-    goal_window: Int[np.ndarray, "window 2"]
+    goal_window: Int[np.ndarray, "goal_window 2"]
     """recording and first frame of the windows on which goals are judged"""
-    plan_window: Int[np.ndarray, "window 2"]
+    plan_window: Int[np.ndarray, "plan_window 2"]
     """the same of paths and bodies"""
-    values: dict[str, Float[np.ndarray, "seed window"]]
-    """by `<protocol>/<score>`, `recorded/solid` and `flees/<condition>`; the last per approach"""
+    values: dict[str, Float[np.ndarray, "_ _"]]
+    """[seed window] of `<protocol>/<score>`, `recorded/solid`; `flees/<condition>`, which is per approach"""
 
     def windows_of(self, name: str) -> Int[np.ndarray, "window 2"]:
         """Return the windows that a score belongs to; every approach is an episode of its own."""

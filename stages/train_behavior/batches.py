@@ -100,13 +100,13 @@ class TrainingBatch:
     oversampled: Bool[Tensor, "batch"]
     """drawn for their observer, who is always perceived then: without, the odds would be wrong"""
     goal: Float[Tensor, "batch 3"]
-    track: Float[Tensor, "batch 3 56"]
+    track: Float[Tensor, "batch 3 frame"]
     """where the animal is in each frame, encoded as a goal is"""
-    path: Float[Tensor, "batch 4 56"]
+    path: Float[Tensor, "batch 4 frame"]
     """its strides"""
-    places: Float[Tensor, "batch 3 56"]
+    places: Float[Tensor, "batch 3 frame"]
     """the path as it conditions a body"""
-    body: Float[Tensor, "batch channel 56"]
+    body: Float[Tensor, "batch channel frame"]
 
     def to(self, device: torch.device) -> "TrainingBatch":
         """Return the batch on a device."""
@@ -251,7 +251,7 @@ def _spread(way: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
 
 def body_statistics(
     rotation: Float[Tensor, "window frame 3 3"], bones: Float[Tensor, "row channel"], turn_rad: float
-) -> tuple[Float[np.ndarray, "channel"], Float[np.ndarray, "channel"]]:
+) -> tuple[Float[np.ndarray, "body_channel"], Float[np.ndarray, "body_channel"]]:
     """Return mean and standard deviation, with floors, of root rotation and bones."""
     turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, turn_rad, 0])
     root = rigid.rotation_to_6d(turns[:, None, None] @ rotation[::4, ::4].double().numpy()).reshape(-1, 6)

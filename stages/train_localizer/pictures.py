@@ -58,7 +58,7 @@ def pictures(held: HeldOut, localizer: Localizer, target: Target) -> list[Pictur
     ]
 
 
-def _shown(picture: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.ndarray, "height width 3"]:
+def _shown(picture: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.ndarray, "_ _ 3"]:
     """Bring a picture's longer side to 240 pixels and write below it."""
     scale = EDGE_PX / max(picture.shape[:2])
     size = (round(picture.shape[0] * scale), round(picture.shape[1] * scale))

@@ -119,10 +119,10 @@ def test_persons_keep_out_of_walls_and_walk_as_told():
 
 
 def test_frames_of_persons():
-    np.testing.assert_allclose(to_world(np.array([0.0, 1.0]), np.pi / 2), [1, 0], atol=1e-9)
-    np.testing.assert_allclose(to_world(np.array([1.0, 0.0]), 0.0), [1, 0], atol=1e-9)
+    np.testing.assert_allclose(to_world(np.array([0.0, 1.0]), np.array(np.pi / 2)), [1, 0], atol=1e-9)
+    np.testing.assert_allclose(to_world(np.array([1.0, 0.0]), np.array(0.0)), [1, 0], atol=1e-9)
     point = np.array([0.3, -0.7])
-    np.testing.assert_allclose(to_local(to_world(point, 0.4), 0.4), point)
+    np.testing.assert_allclose(to_local(to_world(point, np.array(0.4)), np.array(0.4)), point)
 
 
 def test_a_commanded_animal_goes_there():

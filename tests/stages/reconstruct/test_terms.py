@@ -13,7 +13,7 @@ from stages.reconstruct.config import RayBatches
 
 
 def layer(value: torch.Tensor, color: tuple[float, float, float]) -> Layer:
-    tint = torch.tensor(color).expand(*value.shape, 3)
+    tint = torch.tensor(color, dtype=torch.float32).expand(*value.shape, 3)
     return Layer(value, tint, torch.zeros(*value.shape, 16))
 
 
