@@ -87,9 +87,9 @@ def test_imports_go_downstairs_only(path):
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_sizes(path):
-    lines, ground_floor = path.read_text().count("\n"), path.is_relative_to(ROOT / "pipeline")
-    longest_file, longest_function = (400, 60) if ground_floor else (400, 69)
-    assert lines <= (80 if path.name == "__main__.py" else longest_file), f"{lines} lines"
+    lines = path.read_text().count("\n")
+    assert lines <= (80 if path.name == "__main__.py" else 400), f"{lines} lines"
+    longest_function = 60 if path.is_relative_to(ROOT / "pipeline") else 69
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             length = node.end_lineno - node.lineno + 1
@@ -103,6 +103,8 @@ def test_docstrings(path):
         assert ast.get_docstring(tree), "the module has no docstring"
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            if any(ast.unparse(each) == "overload" for each in node.decorator_list):
+                continue  # the implementation has the docstring
             assert ast.get_docstring(node), f"{node.name} has no docstring"
 
 

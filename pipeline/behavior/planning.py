@@ -55,17 +55,9 @@ class TorchNetworks:
         self.nets, self.device = nets.eval().to(device), device
 
     def _run(self, module: nn.Module, *arguments: Array) -> Array:
+        tensors = [torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device) for a in arguments]
         with torch.inference_mode():
-            return (
-                module(
-                    *(
-                        torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(self.device)
-                        for a in arguments
-                    )
-                )
-                .cpu()
-                .numpy()
-            )
+            return module(*tensors).cpu().numpy()
 
     def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
         return self._run(self.nets.perception, scene_grid, observer_past, past, keep)
@@ -385,16 +377,8 @@ class Sampler:
         def draw() -> Array:
             return (spread * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
 
-        denoise = guided(full, blind, sampling.guidance)
-        x = sample(
-            denoise,
-            draw(),
-            self.schedule,
-            method=sampling.method or self.schedule.method,
-            count=count,
-            draw=draw,
-            correct=correct,
-        )
+        denoise, method = guided(full, blind, sampling.guidance), sampling.method or self.schedule.method
+        x = sample(denoise, draw(), self.schedule, method=method, count=count, draw=draw, correct=correct)
         return x.astype(np.float32)
 
 

@@ -60,11 +60,14 @@ class DepthPicture:
     intrinsics: Float[np.ndarray, "3 3"]
 
 
+Verdict = Literal["documented", "other", "untested", "unusable"]
+
+
 @dataclass(frozen=True)
 class PoseCheck:
     """Result of comparing device poses with the depth."""
 
-    verdict: Literal["documented", "other", "untested", "unusable"]
+    verdict: Verdict
     convention: Convention
     pairs: int
     """pairs of frames with enough motion between them"""
@@ -106,15 +109,8 @@ def check_poses(
         return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
     chosen = _moving_pairs(odometry_from_pose(pose, documented), timestamp_s, pairs)
     if len(chosen) == 0:
-        return PoseCheck(
-            "untested",
-            documented,
-            0,
-            np.nan,
-            np.nan,
-            TOLERANCE_M,
-            "the phone moved too little to test its poses",
-        )
+        reason = "the phone moved too little to test its poses"
+        return PoseCheck("untested", documented, 0, np.nan, np.nan, TOLERANCE_M, reason)
     frames, position = np.unique(chosen, return_inverse=True)
     pairs_of_views, views = position.reshape(chosen.shape), [depth_view(frame) for frame in frames.tolist()]
     scores = {
@@ -214,39 +210,19 @@ def compare(
 
 def _judge(scores: dict[Convention, _Score], documented: Convention, pairs: int) -> PoseCheck:
     """Keep the documented convention unless it is refuted and another one is clearly right."""
-    documented_score = scores[documented]
-    best = min(scores, key=lambda convention: scores[convention].cost)
-    if documented_score.accepted:
-        return _checked(
-            "documented", documented, documented_score, pairs, "the documented convention explains the depth"
-        )
-    if scores[best].accepted and scores[best].cost < 0.5 * documented_score.cost:
-        return _checked(
-            "other",
-            best,
-            scores[best],
-            pairs,
-            f"the documented convention is refuted by the depth; {best} explains it",
-        )
-    if (
-        documented_score.residual_m < UNUSABLE_FACTOR * documented_score.tolerance_m
-        and documented_score.overlap > MIN_OVERLAP
-    ):
-        return _checked(
-            "documented",
-            documented,
-            documented_score,
-            pairs,
-            "device poses explain the depth only roughly: they drift",
-        )
-    return _checked(
-        "unusable",
-        documented,
-        documented_score,
-        pairs,
-        "device poses do not explain the depth under any convention",
-    )
-
-
-def _checked(verdict, convention: Convention, score: _Score, pairs: int, reason: str) -> PoseCheck:
-    return PoseCheck(verdict, convention, pairs, score.residual_m, score.overlap, score.tolerance_m, reason)
+    score, best = scores[documented], min(scores, key=lambda convention: scores[convention].cost)
+    verdict: Verdict = "documented"
+    chosen = documented
+    if score.accepted:
+        reason = "the documented convention explains the depth"
+    elif scores[best].accepted and scores[best].cost < 0.5 * score.cost:
+        verdict = "other"
+        chosen = best
+        reason = f"the documented convention is refuted by the depth; {best} explains it"
+    elif score.residual_m < UNUSABLE_FACTOR * score.tolerance_m and score.overlap > MIN_OVERLAP:
+        reason = "device poses explain the depth only roughly: they drift"
+    else:
+        verdict = "unusable"
+        reason = "device poses do not explain the depth under any convention"
+    score = scores[chosen]
+    return PoseCheck(verdict, chosen, pairs, score.residual_m, score.overlap, score.tolerance_m, reason)

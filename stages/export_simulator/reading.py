@@ -36,9 +36,9 @@ class CanonicalAgent:
 class SplatClouds:
     """Room (world frame) and animal (agent frame, at rest) as standard rows of 3D Gaussians."""
 
-    scene: Float[np.ndarray, "point 62"]
-    agent: Float[np.ndarray, "point 62"]
-    agent_weights: Float[np.ndarray, "point bone"]
+    scene: Float[np.ndarray, "scene_point 62"]
+    agent: Float[np.ndarray, "agent_point 62"]
+    agent_weights: Float[np.ndarray, "agent_point bone"]
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class TrainingBatch:
     scene: Float[Tensor, "batch channel x y z"]
     observer_past: Float[Tensor, "batch observer_past"]
     past: Float[Tensor, "batch past"]
-    held: Float[Tensor, "batch frame channel"]
+    held: Float[Tensor, "batch held_frame held_channel"]
     """root and bones of the frames that give velocity and posture, as they were"""
     bones_keep: Float[Tensor, "batch"]
     mirrored: Bool[Tensor, "batch"]
@@ -106,7 +106,7 @@ class TrainingBatch:
     """its strides"""
     places: Float[Tensor, "batch 3 frame"]
     """the path as it conditions a body"""
-    body: Float[Tensor, "batch channel frame"]
+    body: Float[Tensor, "batch body_channel frame"]
 
     def to(self, device: torch.device) -> "TrainingBatch":
         """Return the batch on a device."""

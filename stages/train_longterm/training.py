@@ -124,7 +124,7 @@ def fit_route(
 
 
 def _summed_route_errors(
-    made: Sequence[Float[Tensor, "clip frame channel"]], truth: Float[Tensor, "clip frame channel"]
+    made: Sequence[Float[Tensor, "clip frame channel"]], truth: Float[Tensor, "clip frame known"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return translation and rotation error of a route, its draft's added."""
     errors = [objectives.route_error(each, truth) for each in made]
