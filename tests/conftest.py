@@ -4,11 +4,13 @@ import importlib.util
 import subprocess
 from pathlib import Path
 
+import jaxtyping
 import pytest
 
-# From `make dev`; continuous integration has it. Of stages' own signatures none is checked: to prepare those of
-# `pipeline` takes 4 s once, and checking them a fifth of the time of short tests, as much as is worth it.
-if importlib.util.find_spec("beartype"):
+# From `make dev`; continuous integration has it. To prepare the signatures of `pipeline` takes 4 s once, and
+# checking them a fifth of the time of short tests, so that only the tests of `pipeline` itself do.
+CHECKED = importlib.util.find_spec("beartype") is not None
+if CHECKED:
     import tests.array_checks
 
     tests.array_checks.install(["pipeline"])
@@ -19,6 +21,14 @@ ROOT = Path(__file__).parent.parent
 def pytest_collection_modifyitems(items):
     """Run unit and house tests first, then the builds of the toy."""
     items.sort(key=lambda item: item.get_closest_marker("toy") is not None)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Check arrays in signatures in the tests of `pipeline`."""
+    jaxtyping.config.update(
+        "jaxtyping_disable", not (CHECKED and item.path.is_relative_to(ROOT / "tests/pipeline"))
+    )
 
 
 @pytest.fixture(scope="session")
