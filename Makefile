@@ -12,7 +12,7 @@ endif
 PYTHON := .venv/bin/python
 PLAN   := $(PYTHON) -SE -m pipeline.workflow.plan
 RUN    := $(PYTHON) -SE -m pipeline.workflow.run $(if $(PROCESSES),--processes $(PROCESSES))
-COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras dev types test test-fast fuzz reproduce verify doctor clean
+COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras dev types test test-fast test-slurm fuzz reproduce verify doctor clean
 AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/*.toml)))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
@@ -109,6 +109,10 @@ test: .venv/.ok
 # The inner loop: what takes seconds; `slow` and `toy` are left to `make test`.
 test-fast: .venv/.ok
 	@$(PYTHON) -m pytest tests -m 'not slow and not toy'
+
+# A flow on a Slurm that the test starts on this machine; skipped where slurmctld, slurmd, munge or Snakemake's plugin lack.
+test-slurm: .venv/.ok
+	@$(PYTHON) -m pytest tests/pipeline/workflow/test_slurm.py -rs
 
 # Mutated files for every reader of user files, a minute each; what fails is kept in build/fuzz.
 fuzz: .venv/.ok
