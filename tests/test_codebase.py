@@ -5,14 +5,14 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 54_500,
+    "lines": 55_000,
     "lines over 110 columns": 0,
     "recipe keys": 350,
     "packages over 16 modules": 0,
-    "private words in identifiers": 210,
-    "tell, told": 12,
+    "private words in identifiers": 220,
+    "tell, told": 20,
     "class names used twice": 3,
-    "unnamed numbers": 625,
+    "unnamed numbers": 640,
     "unshaped public functions": 0,
     "modules in import cycles": 0,
 }
