@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float
 from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
 
-LOWEST_SHARE = 0.04
-"""Share of a mask's height, from below, that touches what carries it."""
+LOWEST_SHARE = 0.03
+"""Share of a mask's pixels, from below, that are as likely shadow and soft outline as paws: where the others
+end, the animal stands."""
 LEVEL_COSINE = 0.8
 """Surface that carries is level above this cosine of its slope."""
 BORDER_PX = 2
@@ -39,8 +40,8 @@ def find(
     rows, columns = np.nonzero(mask)
     if len(rows) < LEAST_AREA_PX:
         return None
-    low = rows >= rows.max() - LOWEST_SHARE * np.ptp(rows)
-    pixel = np.array([np.median(columns[low]) + 0.5, rows.max() + 1.0])
+    lowest = float(np.quantile(rows, 1 - LOWEST_SHARE))
+    pixel = np.array([np.median(columns[rows >= lowest]) + 0.5, lowest + 1.0])
     ray = cameras.unproject(pixel, intrinsics) @ world_from_camera[:3, :3].T
     hit = caster.cast(world_from_camera[:3, 3], ray[None])
     if hit.face[0] < 0:

@@ -177,14 +177,17 @@ def _standing_depth(
     model: AgentModel,
     standing: StandingSurface,
 ) -> Float[np.ndarray, "height width"]:
-    """Return the depth of an animal that no sensor measured: where its mask's lowest pixels touch the map;
-    what was inferred before it was segmented where they touch nothing level.
+    """Return depth with that of an animal that no sensor measured: where its mask's lowest pixels touch the
+    map; what was inferred before it was segmented where they touch nothing level.
+
+    Beside the mask it stays as it is: the template must not stand where the picture shows the room.
     """
     touched = contact.find(inside, intrinsics, world_from_camera, standing.caster)
     if touched is None or not touched.certain:
         return inferred
     back_m = model.stand_m + float(np.quantile(model.points_agent[:, 1], BACK_QUANTILE))
-    return contact.depth_of(inside, touched.point_world, back_m, intrinsics, world_from_camera)
+    own = contact.depth_of(inside, touched.point_world, back_m, intrinsics, world_from_camera)
+    return np.where(inside, own, inferred)
 
 
 def initial_poses(

@@ -291,3 +291,20 @@ def test_names_given_to_make_are_never_executed(house, variable, value):
         assert made.returncode == 2
         assert f"REC-004 {variable} is no plain name" in made.stderr
     assert not (house.folder / "hacked").exists()
+
+
+def test_a_session_without_depth_is_read_through_what_stands_in_for_its_frames(house):
+    for name in ("walkthrough.r3d", "turnaround.mp4", "a.mp4", "b.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.python("pipeline.workflow.plan", "plan", "toy")
+    jobs = {job["id"]: job for job in json.loads((house.folder / "build/toy/plan/dag.json").read_text())}
+    made = {name for name in jobs if name.split(".")[0] in ("frames", "pictures", "estimated_frames")}
+    assert made == {
+        "frames.v000", "frames.v003", "pictures.v001", "pictures.v002",
+        "estimated_frames.v001", "estimated_frames.v002",
+    }  # fmt: skip
+    read = {name: {each["name"] for each in job["inputs"]} for name, job in jobs.items()}
+    assert {"pictures/v002", "frames/v000", "scene_template"} == read["estimated_frames.v002"]
+    assert "estimated_frames/v002" in read["masks.v002"] and "frames/v003" in read["masks.v003"]
+    assert not any(name.startswith("estimated") for name in read["feature_basis"]), "the map needs features"
+    assert {"frames/v000", "estimated_frames/v001", "estimated_frames/v002"} <= read["reconstruction"]

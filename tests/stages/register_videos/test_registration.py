@@ -64,6 +64,20 @@ def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
     assert distance.max() < 0.05, "metres; the jump is 0.6 m"
 
 
+def test_cameras_that_come_from_the_map_are_kept_and_only_believed_where_pictures_agree(maps):
+    """Depth that was cast from a camera fits the map wherever the camera is, and must not confirm it."""
+    truth = walk(40, seed=7)
+    clip = MemoryClip(RayCaster(maps.scene), truth, truth, mapped=True)
+    found = registration.register(clip, NoAgent(40), maps, RegistrationConfig(), np.random.default_rng(0))
+    assert (found.aligned.world_from_camera == truth).all()
+    assert np.isnan(found.aligned.median_fit), "no depth was measured"
+    assert found.appearance > 0.8
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ truth
+    wrong = MemoryClip(RayCaster(maps.scene), truth, turned, mapped=True)
+    refused = registration.register(wrong, NoAgent(40), maps, RegistrationConfig(), np.random.default_rng(0))
+    assert isinstance(refused, registration.Rejected)
+
+
 def test_foreign_room_is_refused(maps):
     truth = walk(40, seed=7)
     other = textured_room(seed=99)
