@@ -379,9 +379,7 @@ def table_of(node: Node) -> str:
 
 
 def nodes_of(flow: Flow, *, trials: bool = False) -> tuple[Node, ...]:
-    """Return the nodes of one flow, in declared order, without those that are made for tables only, or with
-    them.
-    """
+    """Return the nodes of one flow, in declared order; those made for tables only if ``trials``."""
     return tuple(node for node in FLOW if flow in node.flows and (trials or node.trials == "none"))
 
 
@@ -400,22 +398,3 @@ def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
 def trial_ids(methods: Sequence[str], seeds: int) -> tuple[str, ...]:
     """Return the ids of the trials that the tables are made of: `<method>-<seed>`."""
     return tuple(f"{method}-{seed}" for method in methods for seed in range(seeds))
-
-
-def check() -> None:
-    """Assert that every input is declared before it is used and exists for every recording that asks for
-    it.
-    """
-    declared: dict[str, Node] = {}
-    for node in FLOW:
-        for need in needs_of(node):
-            assert need.artifact in declared, (
-                f"{node.artifact} needs {need.artifact}, declared later or not at all"
-            )
-            source = declared[need.artifact]
-            if node.roles and source.roles:
-                assert set(need.roles or node.roles) <= set(source.roles), (
-                    f"{node.artifact}: no {need.artifact} for every role"
-                )
-        assert node.artifact not in declared, f"{node.artifact} is declared twice"
-        declared[node.artifact] = node

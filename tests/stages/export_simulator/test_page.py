@@ -102,7 +102,7 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
         _check_it_reacts_as_python_does(page, simulator.parent)
         page.evaluate("ats.play()")
         _check_the_person_is_carried(page)
-        page.wait_for_function(f"ats.state().tick > {before['tick'] + 5}", timeout=30_000)
+        page.wait_for_function(f"ats.state().tick > {before['tick'] + 5}", timeout=120_000)
         after = page.evaluate("ats.state()")
         assert np.linalg.norm(np.subtract(after["animal"], before["animal"])[:3]) > 0.01, (
             "metres within half a second"
@@ -136,12 +136,11 @@ def test_the_animal_walks_around_a_person_in_its_way(simulator: Path, chromium: 
         gaps = []
         for goal in goals:
             page.evaluate("goal => ats.visit([goal])", goal)
-            for _ in range(120):
-                page.wait_for_timeout(250)
+            begin = state = page.evaluate("ats.state()")
+            while state["aim"] and state["tick"] < begin["tick"] + 300:  # ticks: slow machines show fewer
+                page.wait_for_timeout(100)
                 state = page.evaluate("ats.state()")
                 gaps.append(np.hypot(state["animal"][0] - person[0], state["animal"][2] - person[1]))
-                if state["aim"] is None:
-                    break
             assert state["aim"] is None, f"half a minute, and it stands at {state['animal'][:3]}"
         assert min(gaps[4:]) > 0.36, "metres: a body's 0.4, less what two plans that fade into each other cut"
         assert wrong == []
@@ -221,7 +220,7 @@ def _check_a_clicked_goal(page: Page) -> None:
     assert np.allclose(page.evaluate("ats.state().aim"), goal, atol=0.05), "metres"
     assert "aim=" in page.evaluate("location.hash")
     page.wait_for_function(
-        "Math.hypot(ats.state().animal[0] + 0.6, ats.state().animal[2] + 0.5) < 0.3", timeout=30_000
+        "Math.hypot(ats.state().animal[0] + 0.6, ats.state().animal[2] + 0.5) < 0.3", timeout=120_000
     )
     page.wait_for_function("ats.state().aim === null", timeout=10_000)
 
@@ -252,7 +251,7 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
     ), "metres: it begins where it was"
     np.testing.assert_allclose([stop.position_world[[0, 2]] for stop in journey[1:]], goals, atol=0.05)
     for left in (2, 1, 0):
-        page.wait_for_function(f"ats.state().stops.length === {left}", timeout=30_000)
+        page.wait_for_function(f"ats.state().stops.length === {left}", timeout=120_000)
         place = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
         assert np.linalg.norm(place - goals[2 - left]) < 0.6, "metres: it is at the stop that is next in turn"
 
@@ -260,10 +259,10 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
 def _check_a_goal_in_a_cupboard(page: Page) -> None:
     """Where the animal cannot be it gets as near as it can, and goes on to the next goal."""
     page.evaluate("ats.visit([[1.8, -1.8], [0.3, -0.2]])")
-    page.wait_for_function("ats.state().stops.length === 1", timeout=30_000)
+    page.wait_for_function("ats.state().stops.length === 1", timeout=120_000)
     place = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
     assert np.linalg.norm(place - [1.8, -1.8]) < 1.0, "metres: beside the cupboard, which is 0.7 m wide"
-    page.wait_for_function("ats.state().aim === null", timeout=30_000)
+    page.wait_for_function("ats.state().aim === null", timeout=120_000)
 
 
 def _check_a_drawn_path(page: Page) -> None:
@@ -404,7 +403,7 @@ def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, 
         assert np.linalg.norm(np.subtract(page.evaluate("ats.state().observer"), 1.2)) > 0.3, (
             "metres, while the first plan is awaited"
         )
-        page.wait_for_function("ats.state().take_s > 0.5 && told.length > 1", timeout=30_000)
+        page.wait_for_function("ats.state().take_s > 0.5 && told.length > 1", timeout=120_000)
         page.keyboard.up("w")
         with page.expect_download() as download:
             page.evaluate("document.querySelector('#csv').click()")
@@ -534,7 +533,7 @@ def test_splats_that_cannot_be_read_leave_the_mesh(
     (folder / "assets/splats.gz").write_bytes(b"no splats")
     with served(folder) as address, browser.shown(chromium, f"{address}?splats") as (page, wrong):
         page.wait_for_function(
-            "document.querySelector('#status').textContent.includes('drawn as a mesh')", timeout=30_000
+            "document.querySelector('#status').textContent.includes('drawn as a mesh')", timeout=120_000
         )
         assert page.evaluate("document.querySelector('#splash').classList.contains('gone')")
         assert [line for line in wrong if "favicon" not in line] == []

@@ -50,7 +50,7 @@ export function readState(contract, clips, hash = location.hash) {
   };
   const ignored = [];
   for (const [key, text] of new URLSearchParams(hash.slice(1))) {
-    const value = read[key]?.(text) ?? null;
+    const value = Object.hasOwn(read, key) ? (read[key](text) ?? null) : null;
     if (value === null) ignored.push(`${key}=${text}`);
     else state[key] = value;
   }
