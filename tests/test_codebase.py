@@ -5,7 +5,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 55_000,
+    "lines": 56_000,
     "lines over 110 columns": 0,
     "recipe keys": 350,
     "packages over 16 modules": 0,

@@ -286,5 +286,5 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
         if video.role in roles and video.split in need.splits and not (need.measured and video.mapped)
     ]
     for video in [part] if isinstance(part, Video) and not need.roles else several:
-        kept = dag.folder_of(need.artifact, video)
-        yield Input(f"{kept}/{video.id}", str(plan.home_of(kept).folder / kept / video.id), need.part)
+        made = dag.folder_of(need.artifact, video)
+        yield Input(f"{made}/{video.id}", str(plan.home_of(made).folder / made / video.id), need.part)

@@ -13,7 +13,7 @@ from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
 from stages.estimate_depth import foreground, tracking
 from stages.estimate_depth.foreground import ColorView
-from stages.estimate_depth.tracking import Room
+from stages.estimate_depth.tracking import MapViews
 
 EDGE_SHARE = 0.06
 """Depth that changes by more than this share within 3 pixels is an edge of the map, which is less certain."""
@@ -63,7 +63,7 @@ def of_map(target: ColorView) -> FrameDepth:
 def of_session(
     shown: Sequence[ColorView],
     timestamp_s: Float[np.ndarray, "frame"],
-    room: Room,
+    room: MapViews,
     walk: Sequence[ColorView],
     length_m: float,
     learned: Learned | None,
@@ -130,7 +130,7 @@ def _with_animal(frame, target: ColorView, parts, touched, carried, length_m, le
     return FrameDepth(depth, confidence, inferred)
 
 
-def of_turnaround(shown: Sequence[ColorView], room: Room, walk: Sequence[ColorView]) -> list[FrameDepth]:
+def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[ColorView]) -> list[FrameDepth]:
     """Return the depth of frames that circle an animal at rest: by several views, and of the map where they
     do not tell and nothing stands before it.
     """

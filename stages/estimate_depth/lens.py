@@ -148,8 +148,8 @@ def adjusted(lens: Lens, located: Sequence[Located], *, bend: bool = True) -> Le
         moved = np.einsum("mij,mj->mi", rotation[frame], points)
         moved += (camera_from_world[:, :3, 3] + twist[:, 3:])[frame]
         flat = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
-        bent = flat * (1 + radial * (flat**2).sum(1, keepdims=True))
-        off_px = (scale * lens.focal_px * bent + centre - pixel).ravel()
+        distorted = flat * (1 + radial * (flat**2).sum(1, keepdims=True))
+        off_px = (scale * lens.focal_px * distorted + centre - pixel).ravel()
         return np.append(
             off_px, (radial - lens.radial) * np.sqrt(len(pixel)) / (RADIAL_SIGMA if bend else 1e-6)
         )

@@ -23,7 +23,7 @@ from stages.estimate_depth.config import Config
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.landmarks import Keypoints
 from stages.estimate_depth.lens import Lens
-from stages.estimate_depth.tracking import Footage, Room, Tracked
+from stages.estimate_depth.tracking import MapViews, Tracked, TrackingInput
 
 LEAST_PLACED, LEAST_FRAMES = 0.3, 10
 """Share of the frames, and their number, that must find a place in the map."""
@@ -56,11 +56,11 @@ def run(
         _walk_view(walk, walk_cameras, int(frame), caster)
         for frame in landmarks.keyframe_numbers(walk_cameras)
     ]
-    room = Room(caster, [each.view for each in walked])
+    room = MapViews(caster, [each.view for each in walked])
     found, tracked = _placed(pictures, known, room, config)
     placed = np.flatnonzero(tracked.placed)
     if len(placed) < max(LEAST_FRAMES, LEAST_PLACED * len(pictures)):
-        raise _strange(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
+        raise _unrecognized(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
     log(f"focal length {found.focal_px:.1f} px; {len(placed)} of {len(pictures)} frames placed")
     shown = []
     for frame in track(placed.tolist(), "looking at the map"):
@@ -78,12 +78,12 @@ def run(
             depths = depth.of_session(shown, time_s, room, walked, config.length_m, learned)
         case role:
             assert_never(role)
-    kept = [number for number, each in enumerate(depths) if each is not None]
+    chosen = [number for number, each in enumerate(depths) if each is not None]
     known = [each for each in depths if each is not None]
-    if len(kept) < LEAST_FRAMES:
-        raise _strange(pictures, "its pictures differ from what the map shows nearly everywhere")
-    log(f"{len(placed) - len(kept)} frames left out that differ from the map nearly everywhere")
-    estimated = writing.Estimated(placed[kept], tracked, found, known)
+    if len(chosen) < LEAST_FRAMES:
+        raise _unrecognized(pictures, "its pictures differ from what the map shows nearly everywhere")
+    log(f"{len(placed) - len(chosen)} frames left out that differ from the map nearly everywhere")
+    estimated = writing.Estimated(placed[chosen], tracked, found, known)
     writing.write(out, pictures, estimated, config.jpeg_quality)
     writing.report_quality(out, pictures, estimated)
     return estimated
@@ -104,7 +104,7 @@ def _walk_view(walk: Clip, walk_cameras: SceneCameras, frame: int, caster: RayCa
 
 
 def _placed(
-    pictures: Pictures, known: landmarks.Landmarks, room: Room, config: Config
+    pictures: Pictures, known: landmarks.Landmarks, room: MapViews, config: Config
 ) -> tuple[Lens, Tracked]:
     """Calibrate the lens and place the frames."""
     keypoints, gray = [], []
@@ -113,13 +113,13 @@ def _placed(
     matches = [known.match(each) for each in track(keypoints, "recognizing the room")]
     found = lens.calibrate(matches, pictures.color_size, config.seed)
     if found is None:
-        raise _strange(pictures, "no frame shows anything that the walk-through shows as well")
+        raise _unrecognized(pictures, "no frame shows anything that the walk-through shows as well")
     located = [lens.locate(each, found, config.seed) for each in matches]
     for frame in range(len(pictures)):
         gray.append(views.small_gray(found.straightened(pictures.color(frame))))
     scale = gray[0].shape[1] / pictures.color_size[1]
     small = [Keypoints(each.pixel * scale, each.descriptors) for each in keypoints]
-    footage = Footage(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
+    footage = TrackingInput(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
     tracked = tracking.place(footage, located, room, config.seed)
     return Lens(tracked.lens.focal_px / scale, found.radial, pictures.color_size), tracked
 
@@ -133,7 +133,7 @@ def _learned(network: MonocularDepth, pictures: Pictures, placed: np.ndarray, fo
     return learned
 
 
-def _strange(pictures: Pictures, what: str) -> InputError:
+def _unrecognized(pictures: Pictures, what: str) -> InputError:
     remedy = (
         "film it in the room of the walk-through, with furniture in view and little moved since; "
         "or record it with depth; or take it out of the captures"

@@ -59,7 +59,7 @@ class Tracked:
 
 
 @dataclass(frozen=True)
-class Footage:
+class TrackingInput:
     """What tracking reads of a video."""
 
     timestamp_s: Float[np.ndarray, "frame"]
@@ -72,14 +72,14 @@ class Footage:
 
 
 @dataclass(frozen=True)
-class Room:
+class MapViews:
     """The map as pictures see it."""
 
     caster: RayCaster
     walk: Sequence[View]
 
 
-def place(footage: Footage, located: Sequence[Located | None], room: Room, seed: int) -> Tracked:
+def place(footage: TrackingInput, located: Sequence[Located | None], room: MapViews, seed: int) -> Tracked:
     """Place all frames that can be; ``located`` are those that landmarks place."""
     poses = np.full((len(located), 4, 4), np.nan)
     for frame, each in enumerate(located):
@@ -126,11 +126,11 @@ def forget_strays(
     poses[known[(held < min(LEAST_SURE, held.max()))[piece]]] = np.nan
 
 
-def _view(frame: int, footage: Footage, pose, room: Room) -> View:
+def _view(frame: int, footage: TrackingInput, pose, room: MapViews) -> View:
     return views.view_of(footage.gray[frame], footage.lens.intrinsics, pose, room.caster)
 
 
-def _track_one(frame, footage: Footage, poses, room: Room, seed) -> None:
+def _track_one(frame, footage: TrackingInput, poses, room: MapViews, seed) -> None:
     """Place one frame beside its nearest placed neighbour, in place, from the guess that explains most."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     other = int(known[np.abs(known - frame).argmin()])
@@ -146,7 +146,7 @@ def _track_one(frame, footage: Footage, poses, room: Room, seed) -> None:
         poses[frame] = best.world_from_camera
 
 
-def _guesses(frame, other, footage: Footage, poses, room: Room, seed) -> Iterator[np.ndarray]:
+def _guesses(frame, other, footage: TrackingInput, poses, room: MapViews, seed) -> Iterator[np.ndarray]:
     """Yield where a frame may be: moved on as before, by matched keypoints, and where its neighbour is."""
     beyond = 2 * other - frame
     if 0 <= beyond < len(poses) and np.isfinite(poses[beyond, 0, 0]):
@@ -161,7 +161,7 @@ def _guesses(frame, other, footage: Footage, poses, room: Room, seed) -> Iterato
     yield poses[other]
 
 
-def walk_views(target: View, room: Room) -> list[View]:
+def walk_views(target: View, room: MapViews) -> list[View]:
     """Return the pictures of the walk-through that see the most of what a view shows, at a like distance."""
     rows, columns = np.nonzero(target.depth > 0)
     chosen = np.linspace(0, len(rows) - 1, PROBES).astype(int) if len(rows) else np.zeros(0, int)
@@ -196,7 +196,7 @@ class _Tie:
 
 
 def _adjusted(
-    frames, footage: Footage, poses, room: Room, seed
+    frames, footage: TrackingInput, poses, room: MapViews, seed
 ) -> tuple[Float[np.ndarray, "placed 4 4"], Lens]:
     """Optimize the placed frames together, by what pictures show from where they are now; then the lens."""
     seen = [_view(int(frame), footage, pose, room) for frame, pose in zip(frames, poses, strict=True)]

@@ -24,20 +24,20 @@ DARK = 0.15
 class Estimated:
     """What was found of a recording."""
 
-    placed: Int[np.ndarray, "kept"]
-    """Frames that are kept."""
+    placed: Int[np.ndarray, "chosen"]
+    """Frames that are chosen."""
     tracked: Tracked
     lens: Lens
     depths: Sequence[FrameDepth]
-    """Of the kept frames."""
+    """Of the chosen frames."""
 
 
 def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: int) -> None:
-    """Write pictures, depth, confidence and the table of the kept frames."""
+    """Write pictures, depth, confidence and the table of the chosen frames."""
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir()
-    kept, lens = estimated.placed, estimated.lens
-    for number, (frame, found) in enumerate(zip(kept.tolist(), estimated.depths, strict=True)):
+    chosen, lens = estimated.placed, estimated.lens
+    for number, (frame, found) in enumerate(zip(chosen.tolist(), estimated.depths, strict=True)):
         color = folder / "color" / f"{number:06d}.jpg"
         if lens.bends:
             images.write_color(color, lens.straightened(pictures.color(frame)), jpeg_quality)
@@ -46,34 +46,34 @@ def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: 
         images.write_depth(folder / "depth" / f"{number:06d}.exr", found.depth)
         images.write_gray(folder / "confidence" / f"{number:06d}.png", found.confidence)
     valid = np.array([(each.depth > 0).mean() for each in estimated.depths])
-    sharp = np.minimum(pictures.sharpness / max(float(np.median(pictures.sharpness)), 1e-6), 1)[kept]
+    sharp = np.minimum(pictures.sharpness / max(float(np.median(pictures.sharpness)), 1e-6), 1)[chosen]
     small = cameras.scale_intrinsics(lens.intrinsics, lens.size, estimated.depths[0].depth.shape)
     FRAMES.save(
         folder / "frames.npz",
-        timestamp_s=pictures.timestamp_s[kept],
-        intrinsics=np.repeat(lens.intrinsics[None], len(kept), axis=0),
-        depth_intrinsics=np.repeat(small[None], len(kept), axis=0),
-        odometry_from_camera=estimated.tracked.world_from_camera[kept],
+        timestamp_s=pictures.timestamp_s[chosen],
+        intrinsics=np.repeat(lens.intrinsics[None], len(chosen), axis=0),
+        depth_intrinsics=np.repeat(small[None], len(chosen), axis=0),
+        odometry_from_camera=estimated.tracked.world_from_camera[chosen],
         gravity_known=np.array(True),
         scale=np.array(MAPPED),
-        source_index=pictures.source_index[kept],
+        source_index=pictures.source_index[chosen],
         quarter_turns=np.array(pictures.quarter_turns),
-        sharpness=pictures.sharpness[kept],
-        brightness=pictures.brightness[kept],
+        sharpness=pictures.sharpness[chosen],
+        brightness=pictures.brightness[chosen],
         depth_valid=valid.astype(np.float32),
-        quality=(sharp * np.minimum(pictures.brightness[kept] / DARK, 1) * valid).astype(np.float32),
+        quality=(sharp * np.minimum(pictures.brightness[chosen] / DARK, 1) * valid).astype(np.float32),
     )
 
 
 def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> None:
     """Write the stage's own judgement: what is measured, what inferred."""
-    kept, depths = estimated.placed, estimated.depths
-    alone = float(estimated.tracked.by_landmarks[kept].mean())
+    chosen, depths = estimated.placed, estimated.depths
+    alone = float(estimated.tracked.by_landmarks[chosen].mean())
     known = np.mean([(each.depth > 0).mean() for each in depths])
     certain = np.mean([(each.confidence == 2).mean() for each in depths])
     checks = [
         qa.Check(
-            "frames placed in the map", 100 * len(kept) / len(pictures), "%", warn=80.0, better="higher"
+            "frames placed in the map", 100 * len(chosen) / len(pictures), "%", warn=80.0, better="higher"
         ),
         qa.Check(
             "placed by landmarks alone, the others tracked", 100 * alone, "%", warn=30.0, better="higher"
@@ -84,10 +84,10 @@ def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> No
         qa.Check("depth of the map, or confirmed by several views", 100 * float(certain), "%"),
         qa.Check("frames with inferred depth", 100 * float(np.mean([each.inferred for each in depths])), "%"),
     ]
-    shown = plots.sample(len(kept), SHOWN)
+    shown = plots.sample(len(chosen), SHOWN)
     size = depths[0].depth.shape
     sheet = plots.grid(
-        [plots.resized(pictures.color(int(kept[number])), size) for number in shown]
+        [plots.resized(pictures.color(int(chosen[number])), size) for number in shown]
         + [plots.depth_colors(depths[number].depth) for number in shown],
         len(shown),
     )

@@ -23,7 +23,7 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
     hardly any are left.
     """
     rows = extraction.choose_frames(recording.timestamp_s, config.rate_hz)
-    size, kept, statistics, strip = (
+    size, chosen, statistics, strip = (
         extraction.reduced_size(recording.color_size, config.max_side_px),
         [],
         [],
@@ -39,28 +39,28 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         if color.shape[:2] != size:
             color = cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
         color = cameras.turn_image(color, recording.quarter_turns)
-        images.write_color(folder / "color" / f"{len(kept):06d}.jpg", color, config.jpeg_quality)
-        kept.append(row)
+        images.write_color(folder / "color" / f"{len(chosen):06d}.jpg", color, config.jpeg_quality)
+        chosen.append(row)
         statistics.append(extraction.picture_statistics(color))
         if row in shown:
             width = round(color.shape[1] * SHEET_HEIGHT_PX / color.shape[0])
             strip.append(cv2.resize(color, (width, SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA))
-    if len(rows) - len(kept) > MOST_LOST * len(rows):
-        raise damaged(recording.where, f"{len(rows) - len(kept)} of {len(rows)} pictures cannot be decoded")
-    if len(kept) < LEAST_FRAMES:
-        what = f"{len(kept)} pictures, {LEAST_FRAMES} are the least"
+    if len(rows) - len(chosen) > MOST_LOST * len(rows):
+        raise damaged(recording.where, f"{len(rows) - len(chosen)} of {len(rows)} pictures cannot be decoded")
+    if len(chosen) < LEAST_FRAMES:
+        what = f"{len(chosen)} pictures, {LEAST_FRAMES} are the least"
         raise InputError("CAP-007", what, recording.where, "record some seconds at least")
     sharpness, brightness = np.array(statistics, np.float32).T
-    time_s = recording.timestamp_s[kept]
+    time_s = recording.timestamp_s[chosen]
     PICTURES.save(
         folder / "pictures.npz",
         timestamp_s=time_s,
-        source_index=recording.index[kept],
+        source_index=recording.index[chosen],
         quarter_turns=np.array(recording.quarter_turns),
         sharpness=sharpness,
         brightness=brightness,
     )
-    log(f"{recording.where}: {recording.kind}, {len(kept)} pictures; cameras and depth come from the map")
+    log(f"{recording.where}: {recording.kind}, {len(chosen)} pictures; cameras and depth come from the map")
     blurred = float((sharpness < 0.4 * max(float(np.median(sharpness)), 1e-6)).mean())
     qa.write(
         folder,
@@ -68,7 +68,7 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         bad="sideways, dark or blurred pictures",
         checks=[
             qa.Check("duration", float(time_s[-1] - time_s[0]), "s", warn=5.0, better="higher"),
-            qa.Check("pictures", float(len(kept)), "", warn=50, better="higher"),
+            qa.Check("pictures", float(len(chosen)), "", warn=50, better="higher"),
             qa.Check("dark pictures", 100 * float((brightness < extraction.DARK).mean()), "%", warn=20.0),
             qa.Check("blurred pictures", 100 * blurred, "%", warn=25.0),
         ],
