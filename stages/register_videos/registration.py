@@ -116,22 +116,7 @@ def register(
     scene = None
     if maps.scene_features is not None and features is not None:
         scene = FeatureMap(caster, maps.scene_features, features)
-    if clip.mapped:
-        aligned = alignment.keep(
-            clip, masks, caster, start.world_from_camera, motion.relative_poses, config.alignment
-        )
-    else:
-        aligned = alignment.align(
-            clip,
-            masks,
-            caster,
-            scene,
-            start.world_from_camera,
-            motion.relative_poses,
-            votes,
-            start.supports,
-            config.alignment,
-        )
+    aligned = _aligned(clip, masks, caster, scene, start, motion, votes, config)
     measured = f"{int(np.isfinite(aligned.fit).sum())} of {len(clip)} frames"
     gap = f"{aligned.median_gap_m * 100:.1f} cm from the template, {aligned.median_fit:.0%} within 5 cm"
     log(f"static depth of {measured}: {gap}")
@@ -166,6 +151,25 @@ class _Start:
     supports: Bool[np.ndarray, "vote"]
     anchored: Bool[np.ndarray, "frame"]
     """False: no vote holds this frame or the unbroken odometry around it."""
+
+
+def _aligned(
+    clip: Clip,
+    masks: Masks,
+    caster: RayCaster,
+    scene: FeatureMap | None,
+    start: _Start,
+    motion: Odometry,
+    votes: Votes,
+    config: Config,
+) -> AlignedCameras:
+    """Align the cameras with the scene; where they come from the map, keep them."""
+    cameras, relative = start.world_from_camera, motion.relative_poses
+    if clip.mapped:
+        return alignment.keep(clip, masks, caster, cameras, relative, config.alignment)
+    return alignment.align(
+        clip, masks, caster, scene, cameras, relative, votes, start.supports, config.alignment
+    )
 
 
 def _odometry(clip, masks, config, rng) -> Odometry:
