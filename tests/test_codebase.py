@@ -7,16 +7,19 @@ from benchmarks import codebase_counts
 BARS = {
     "lines": 56_000,
     "lines over 110 columns": 0,
-    "recipe keys": 350,
+    "recipe keys": 313,
     "packages over 16 modules": 0,
-    "private words in identifiers": 220,
-    "tell, told": 20,
+    "private words in identifiers": 133,
+    "tell, told": 13,
     "class names used twice": 3,
-    "unnamed numbers": 640,
+    "unnamed numbers": 639,
     "unshaped public functions": 0,
     "modules in import cycles": 0,
 }
-"""Today's counts, rounded up. Lower a bar when a count has gone down; never raise one."""
+"""Today's counts, rounded up. Lower a bar when a count has gone down; never raise one.
+
+That of lines has been raised all the same: it was 55,000 before recordings without depth came in.
+"""
 
 
 def test_every_count_has_a_bar():

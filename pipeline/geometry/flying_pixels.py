@@ -16,6 +16,6 @@ def supported(
     around = np.pad(depth, 1)
     count = np.zeros(depth.shape, np.uint8)
     for row, column in np.ndindex(3, 3):
-        beside = around[row : row + height, column : column + width]
-        count += (np.abs(beside - depth) < tolerance_m) & (beside > 0)
+        neighbour = around[row : row + height, column : column + width]
+        count += (np.abs(neighbour - depth) < tolerance_m) & (neighbour > 0)
     return (depth > 0) & (count > SUPPORTERS)

@@ -124,8 +124,8 @@ def _open(
         index = np.rint((surface.points + side * voxel_m * surface.normals - low) / voxel_m).astype(np.int64)
         return solid[tuple(np.clip(index, 0, np.array(solid.shape) - 1).T)]
 
-    kept = ~(within(1) & within(-1))
-    return SurfacePoints(surface.points[kept], surface.normals[kept])
+    retained = ~(within(1) & within(-1))
+    return SurfacePoints(surface.points[retained], surface.normals[retained])
 
 
 def _to_points(
@@ -152,8 +152,8 @@ def _to_patches(
     _, nearest = KDTree(surface.points).query(points)
     away = points - surface.points[nearest]
     upright = np.abs(np.einsum("pi,pi->p", away, surface.normals[nearest]))
-    beside = np.sqrt(np.maximum((away**2).sum(1) - upright**2, 0))
-    return np.hypot(upright, np.maximum(beside - spacing_m, 0))
+    tangential = np.sqrt(np.maximum((away**2).sum(1) - upright**2, 0))
+    return np.hypot(upright, np.maximum(tangential - spacing_m, 0))
 
 
 def _inside(mesh: Mesh, points: Float[np.ndarray, "point 3"]) -> np.ndarray:

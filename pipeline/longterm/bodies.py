@@ -114,13 +114,13 @@ class PoseSpace(nn.Module):
         scale = np.tile([LEVER_M] * 3 + [1.0] * 3, agent_from_bone.shape[1])
         mean = channels.mean(0)
         _, spread, rows = np.linalg.svd((channels - mean) * scale, full_matrices=False)
-        kept = min(self.components, len(spread))
-        std = np.maximum(spread[:kept] / np.sqrt(len(channels)), 1e-6)
+        retained = min(self.components, len(spread))
+        std = np.maximum(spread[:retained] / np.sqrt(len(channels)), 1e-6)
         rows = rows * np.sign(rows[np.arange(len(rows)), np.abs(rows).argmax(1)])[:, None]
         self.mean[:] = torch.from_numpy(mean)
-        self.basis[:kept] = torch.from_numpy(rows[:kept] * std[:, None] / scale)
-        self.inverse[:, :kept] = torch.from_numpy((rows[:kept] / std[:, None]).T * scale[:, None])
-        self.explained.fill_(float((spread[:kept] ** 2).sum() / (spread**2).sum()))
+        self.basis[:retained] = torch.from_numpy(rows[:retained] * std[:, None] / scale)
+        self.inverse[:, :retained] = torch.from_numpy((rows[:retained] / std[:, None]).T * scale[:, None])
+        self.explained.fill_(float((spread[:retained] ** 2).sum() / (spread**2).sum()))
         return self
 
     def encode(self, channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch component"]:

@@ -122,10 +122,10 @@ def understand(
     if pose is None or check.verdict == "unusable":
         used = np.arange(len(recording.index))
         pose, check = None, dataclasses.replace(check, reason="; ".join(filter(None, (check.reason, lost))))
-    kept = choose_frames(recording.timestamp_s[used], rate_hz)
-    chosen = used[kept]
+    selected = choose_frames(recording.timestamp_s[used], rate_hz)
+    chosen = used[selected]
     odometry_from_camera, turns = _upright(
-        recording, None if pose is None else pose[kept], check, chosen, view
+        recording, None if pose is None else pose[selected], check, chosen, view
     )
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)

@@ -64,11 +64,11 @@ def open_recording(path: Path) -> Recording:
     }
     if not depth:
         raise no_depth(container.where, "the folder depth/ is empty")
-    kept = np.array([number < len(movie) and int(number) in depth for number in rows.frame], bool)
-    if not kept.any():
+    valid = np.array([number < len(movie) and int(number) in depth for number in rows.frame], bool)
+    if not valid.any():
         raise no_frames(container.where, "none has colour, depth and odometry")
-    index = rows.frame[kept]
-    timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[kept]
+    index = rows.frame[valid]
+    timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[valid]
     size = _depth(container, depth[int(index[0])], None).shape
     _refuse_constant_rows(container, [depth[int(number)] for number in index[:: max(1, len(index) // 5)]])
     known = all(f"confidence/{int(number):06d}.png" in container.names for number in index)
@@ -77,8 +77,8 @@ def open_recording(path: Path) -> Recording:
         kind="Stray Scanner",
         index=index,
         timestamp_s=timestamp_s - timestamp_s[0],
-        intrinsics=_intrinsics(container, rows, kept, movie.size),
-        pose=rows.pose[kept],
+        intrinsics=_intrinsics(container, rows, valid, movie.size),
+        pose=rows.pose[valid],
         color_size=movie.size,
         depth_size=size,
         read_color=movie.read,
@@ -132,14 +132,14 @@ def read_odometry(text: str, where: str) -> Odometry:
 
 
 def _intrinsics(
-    container: FolderContainer, rows: Odometry, kept: np.ndarray, size: tuple[int, int]
+    container: FolderContainer, rows: Odometry, valid: np.ndarray, size: tuple[int, int]
 ) -> Float[np.ndarray, "frame 3 3"]:
     """Return per-frame intrinsics in the video's pixels.
 
     `camera_matrix.csv` (the last frame's) where the rows have none.
     """
     if rows.coefficients is not None:
-        coefficients = rows.coefficients[kept]
+        coefficients = rows.coefficients[valid]
     else:
         text = _text(container, "camera_matrix.csv")
         try:
@@ -148,7 +148,7 @@ def _intrinsics(
             ).reshape(3, 3)
         except ValueError as error:
             raise broken_metadata(f"{container.where}/camera_matrix.csv", "it is no 3 x 3 matrix") from error
-        coefficients = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (int(kept.sum()), 1))
+        coefficients = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (int(valid.sum()), 1))
     height, width = (size[0] / INTRINSICS_SIZE[0], size[1] / INTRINSICS_SIZE[1])
     return intrinsics_from_coefficients(coefficients * [width, height, width, height], container.where)
 

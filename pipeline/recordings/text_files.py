@@ -31,14 +31,14 @@ def lines(container: Container, name: str) -> list[str]:
 
 def table(text: str, columns: int, where: str, rows: int | None = None) -> Float[np.ndarray, "row column"]:
     """Read numbers in columns separated by blanks or commas; raises CAP-004 when they are no such table."""
-    kept = [
+    data_lines = [
         line
         for line in text.replace(",", " ").splitlines()
         if line.strip() and not line.lstrip().startswith("#")
     ]
     try:
-        read = np.array([[_number(cell) for cell in line.split()] for line in kept], float).reshape(
-            len(kept), columns
+        read = np.array([[_number(cell) for cell in line.split()] for line in data_lines], float).reshape(
+            len(data_lines), columns
         )
     except ValueError as error:
         raise broken_metadata(where, f"not a table of {columns} columns of numbers") from error

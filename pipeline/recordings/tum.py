@@ -46,10 +46,10 @@ def open_recording(path: Path) -> Recording:
         raise no_frames(container.where, "rgb.txt lists nothing")
     times = np.array([time for time, _ in color])
     partner = nearest(times, np.array([time for time, _ in depth_files]), NEAREST_S)
-    kept = np.flatnonzero(partner >= 0)
-    pairs = [(color[i][1], depth_files[partner[i]][1]) for i in kept]
+    paired = np.flatnonzero(partner >= 0)
+    pairs = [(color[i][1], depth_files[partner[i]][1]) for i in paired]
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
-    kept, pairs = kept[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
+    paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     if not pairs:
         raise no_frames(container.where, "no colour picture has depth within 20 ms")
     color_size = images.decode_color(container.read(pairs[0][0], MAX_PICTURE_BYTES), container.where).shape[
@@ -61,7 +61,7 @@ def open_recording(path: Path) -> Recording:
     )
     intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(pairs), 1)), container.where)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (color_size, depth_size))
-    pose = _poses(container, times[kept])
+    pose = _poses(container, times[paired])
 
     def depth(number: int, per_meter: float) -> np.ndarray:
         name = pairs[number][1]
@@ -74,12 +74,12 @@ def open_recording(path: Path) -> Recording:
             depth(number, per_meter), cameras.scale_intrinsics(intrinsics[number], color_size, depth_size)
         )
 
-    per_meter, scale_remarks = _units_per_meter(container, pose, times[kept], view)
+    per_meter, scale_remarks = _units_per_meter(container, pose, times[paired], view)
     return Recording(
         where=container.where,
         kind="TUM RGB-D",
         index=np.arange(len(pairs)),
-        timestamp_s=times[kept] - times[kept[0]],
+        timestamp_s=times[paired] - times[paired[0]],
         intrinsics=intrinsics,
         pose=pose,
         color_size=color_size,

@@ -95,7 +95,7 @@ class GaussianSampler(Sampler):
         control = self.scaling.scaled_path(path)
         nothing = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         outputs = [
-            self.networks.body(nothing, _step(nothing, t), codes.full, control, _kept(nothing, 1.0))
+            self.networks.body(nothing, _step(nothing, t), codes.full, control, _keep_mask(nothing, 1.0))
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
         return (
@@ -112,7 +112,7 @@ class GaussianSampler(Sampler):
     ) -> list[Array]:
         control = self.scaling.scaled_goal(goal)
         nothing = np.zeros((len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]), np.float32)
-        keep = _kept(nothing, float(sampling.goal))
+        keep = _keep_mask(nothing, float(sampling.goal))
         return [
             self.networks.path(nothing, _step(nothing, t), codes.full, control, keep)
             for t in (MEAN_STEP, LOG_STD_STEP)
@@ -164,7 +164,7 @@ class OneStageSampler(Sampler):
         control = np.zeros((len(codes.full), 3, frames), np.float32)
 
         def denoise(code: Array):
-            return lambda x, t: self.networks.body(x, _step(x, t), code, control, _kept(x, 0.0))
+            return lambda x, t: self.networks.body(x, _step(x, t), code, control, _keep_mask(x, 0.0))
 
         def correct(x: Array) -> Array:
             return np.concatenate(
@@ -191,5 +191,5 @@ def _step(x: Array, t: float) -> Array:
     return np.full(len(x), t, np.float32)
 
 
-def _kept(x: Array, keep: float) -> Array:
+def _keep_mask(x: Array, keep: float) -> Array:
     return np.full((len(x), 1), keep, np.float32)

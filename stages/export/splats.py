@@ -18,10 +18,10 @@ def write(folder: Path, clouds: dict[str, Float[np.ndarray, "point 62"]]) -> Exp
     """
     for name, rows in clouds.items():
         opacity = 1 / (1 + np.exp(-rows[:, _OPACITY].astype(np.float64)))
-        kept = rows[np.isfinite(rows).all(1) & (opacity >= 1 / 255)].copy()
-        kept[:, _ROTATION] /= np.linalg.norm(kept[:, _ROTATION], axis=1, keepdims=True)
-        gaussian_ply.write(folder / f"{name}.ply", kept)
-        assert len(gaussians.load_ply(folder / f"{name}.ply")) == len(kept)
+        valid = rows[np.isfinite(rows).all(1) & (opacity >= 1 / 255)].copy()
+        valid[:, _ROTATION] /= np.linalg.norm(valid[:, _ROTATION], axis=1, keepdims=True)
+        gaussian_ply.write(folder / f"{name}.ply", valid)
+        assert len(gaussians.load_ply(folder / f"{name}.ply")) == len(valid)
     return ExportRecord(
         "own writer",
         {},

@@ -86,18 +86,18 @@ def skinned_splats(
     gaussians: Float[np.ndarray, "point 62"], weights: Float[np.ndarray, "point bone"], max_points: int
 ) -> SkinnedSplats:
     """Shrink the animal's Gaussians likewise and keep each one's four heaviest bones."""
-    kept = _weightiest(gaussians, max_points)
-    joints = np.argsort(-weights[kept], axis=1, kind="stable")[:, :4]
-    heaviest = np.take_along_axis(weights[kept], joints, 1)
+    selected = _weightiest(gaussians, max_points)
+    joints = np.argsort(-weights[selected], axis=1, kind="stable")[:, :4]
+    heaviest = np.take_along_axis(weights[selected], joints, 1)
     padding = ((0, 0), (0, 4 - joints.shape[1]))
     shares = _bytes(255 * heaviest / heaviest.sum(1, keepdims=True))
     return SkinnedSplats(
-        _packed(gaussians[kept]),
+        _packed(gaussians[selected]),
         np.concatenate([np.pad(joints, padding), np.pad(shares, padding)], 1).astype(np.uint8).tobytes(),
     )
 
 
-def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> Int[np.ndarray, " kept"]:
+def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> Int[np.ndarray, " selected"]:
     """Choose the sound Gaussians that cover most, heaviest first."""
     opacity, size = _opacity(gaussians), np.exp(gaussians[:, 55:58].astype(np.float64))
     sound = np.isfinite(gaussians).all(1) & (opacity >= 1 / 255)

@@ -107,10 +107,10 @@ def recolored(
     now = cv2.GaussianBlur(window.color, (5, 5), 1.2).astype(np.float32)
     before = votes.color * np.median((now[settled] + 4) / (votes.color[settled] + 4), axis=0)
     scale = np.clip((now * before).sum(-1) / np.maximum((before**2).sum(-1), 1), 0.5, 1.0)
-    then, beside = scale[..., None] * before, np.ones((2 * ASKEW_PX + 1, 2 * ASKEW_PX + 1), np.uint8)
+    then, kernel = scale[..., None] * before, np.ones((2 * ASKEW_PX + 1, 2 * ASKEW_PX + 1), np.uint8)
     known = settled[..., None]
-    low = np.minimum(cv2.erode(np.where(known, then, np.float32(np.inf)), beside), then)
-    high = np.maximum(cv2.dilate(np.where(known, then, np.float32(-np.inf)), beside), then)
+    low = np.minimum(cv2.erode(np.where(known, then, np.float32(np.inf)), kernel), then)
+    high = np.maximum(cv2.dilate(np.where(known, then, np.float32(-np.inf)), kernel), then)
     difference = np.linalg.norm(np.maximum(np.maximum(low - now, now - high), 0), axis=-1)
     noise = max(float(np.median(difference[settled])), 3.0)
     return np.where(settled, np.clip(difference / noise - 3, 0, 6), 0)

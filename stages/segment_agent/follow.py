@@ -178,12 +178,12 @@ def _followed(
                 0 if lost else np.clip(prior, -carried, carried)
             )
             log_odds[~near] = -SURE
-            kept = _kept(log_odds > 0, prior > 0, least_px=0.3 * size if lost else 0.0)
-            before = np.where(kept, np.clip(log_odds, 1, SURE), np.clip(log_odds, -SURE, -1)).astype(
+            retained = _retained_parts(log_odds > 0, prior > 0, least_px=0.3 * size if lost else 0.0)
+            before = np.where(retained, np.clip(log_odds, 1, SURE), np.clip(log_odds, -SURE, -1)).astype(
                 np.float32
             )
-            size = int(kept.sum()) or size
-            found[frame] = _packed(kept)
+            size = int(retained.sum()) or size
+            found[frame] = _packed(retained)
     return found
 
 
@@ -204,7 +204,7 @@ def _carried(
     )
 
 
-def _kept(
+def _retained_parts(
     inside: Bool[np.ndarray, "height width"], prior: Bool[np.ndarray, "height width"], least_px: float
 ) -> Bool[np.ndarray, "height width"]:
     """Keep the parts that meet the carried mask; with none carried, the largest one if large enough."""

@@ -87,8 +87,8 @@ def inner_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     nothing.
     """
     depth = steady_depth(clip, frame)
-    beside = np.ones((2 * (depth.shape[1] // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
-    low, high = cv2.erode(depth, beside), cv2.dilate(depth, beside)
+    kernel = np.ones((2 * (depth.shape[1] // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
+    low, high = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
     return np.where((low > 0) & (high - low < INNER_STEP_SHARE * depth), depth, 0).astype(np.float32)
 
 

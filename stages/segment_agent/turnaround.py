@@ -184,8 +184,8 @@ def judge_standing(cluster: Cluster, ground: GroundPlane, whole: bool = True) ->
         certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), 0.05)
         if not whole:
             near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
-            beside = near & ~held & (height > CLEARANCE_M)
-            log_odds[beside], certainty[beside] = 0.0, 0.05
+            uncertain = near & ~held & (height > CLEARANCE_M)
+            log_odds[uncertain], certainty[uncertain] = 0.0, 0.05
         sure = window.trusted & (log_odds > 2)
         return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)
 

@@ -39,16 +39,16 @@ def with_filled_floor(
         return marks
     floor = (marks == SUPPORTED)[:, max(level - 1, 0) : level + 2].any(1)
     home = hull(connected(floor) | visited.any(1))
-    kept = np.where(home[:, None], marks, 0)
-    carried, solid = kept >= SUPPORTED, occupancy == 1
-    bare = (kept > 0).any(1) & ~carried[:, : level + 2].any(1) & ~solid[:, : level + 2].any(1)
-    bare &= (kept[:, level] > 0) | ~carried.any(
+    masked = np.where(home[:, None], marks, 0)
+    carried, solid = masked >= SUPPORTED, occupancy == 1
+    unsupported = (masked > 0).any(1) & ~carried[:, : level + 2].any(1) & ~solid[:, : level + 2].any(1)
+    unsupported &= (masked[:, level] > 0) | ~carried.any(
         1
     )  # under a seat that nobody saw from below there is no floor
-    kept[:, level][bare] = FILLED
-    carried = np.any(kept >= SUPPORTED, axis=1, keepdims=True)
-    kept[np.broadcast_to(~carried, kept.shape)] = 0
-    return kept
+    masked[:, level][unsupported] = FILLED
+    carried = np.any(masked >= SUPPORTED, axis=1, keepdims=True)
+    masked[np.broadcast_to(~carried, masked.shape)] = 0
+    return masked
 
 
 def floor_level(carries: Bool[np.ndarray, "x y z"]) -> int | None:
