@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from safetensors import SafetensorError
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
@@ -103,7 +104,7 @@ class AnimalWorld:
                 )
         try:
             architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
             what = f"is no model as this version writes it ({type(error).__name__})"
             raise InputError(
                 "ART-007", what, str(build / "behavior"), "build it again: make <agent>.behavior.redo"
