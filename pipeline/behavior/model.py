@@ -52,6 +52,7 @@ from pipeline.behavior.perception import (
 )
 from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ
+from pipeline.core.errors import other_versions_refused
 from pipeline.geometry import rigid
 
 ROOT_CHANNELS = 6
@@ -283,12 +284,27 @@ def contract(
 
 
 def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, Float[np.ndarray, "bone 4 4"]]:
-    """Read a trained model: its shape, networks, scaling, schedule, and the bones at rest."""
-    document = json.loads((folder / "behavior.json").read_text())
-    shape = document["architecture"]
-    architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
-    scaling = Scaling(**{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()})
-    schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
-    nets = BehaviorNets(architecture, schedule)
-    nets.load_state_dict(load_file(folder / "behavior.safetensors"))
-    return architecture, nets, scaling, schedule, np.asarray(document["agent_from_bone_rest"])
+    """Read a trained model: its shape, networks, scaling, schedule, and the bones at rest.
+
+    Raises InputError ART-007 for files or a contract of another version.
+    """
+    with other_versions_refused("behavior model", str(folder)):
+        document = json.loads((folder / "behavior.json").read_text())
+        shape = document["architecture"]
+        architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
+        scaling = Scaling(
+            **{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()}
+        )
+        schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
+        rest = np.asarray(document["agent_from_bone_rest"], np.float64)
+        expected = json.loads(json.dumps(contract(architecture, scaling, schedule, rest)))
+        other = sorted(
+            name
+            for name in (expected.keys() | document.keys()) - {"sampling"}  # decided by who samples
+            if expected.get(name) != document.get(name)
+        )
+        if other:
+            raise ValueError(f"behavior.json says otherwise about {', '.join(other)}")
+        nets = BehaviorNets(architecture, schedule)
+        nets.load_state_dict(load_file(folder / "behavior.safetensors"))
+    return architecture, nets, scaling, schedule, rest

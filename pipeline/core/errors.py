@@ -14,6 +14,8 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """No space, a quota, or a limit of the shell (`ulimit -f`)."""
 _OF_RUST = re.compile(r"\(os error (\d+)\)")
 """How safetensors' messages name the system's error."""
+MAKE_AGAIN = "build it again with this version: make <agent>.<artifact>.redo"
+"""What to do about what another version wrote."""
 
 
 class InputError(Exception):
@@ -60,6 +62,23 @@ def coded_disk_errors(where: str) -> Iterator[None]:
             remedy = "look at who owns it and whether the disk is mounted read-only, then run the same again"
             raise InputError("SYS-003", f"cannot be used: {cause.strerror}", place, remedy) from error
         raise
+
+
+@contextlib.contextmanager
+def other_versions_refused(what: str, where: str) -> Iterator[None]:
+    """Turn what reading a file of another version raises into an `InputError` ART-007.
+
+    By hand any artifact may be given. ``what`` is expected (`behavior model`), at ``where``.
+    """
+    try:
+        yield
+    except (InputError, PermissionError):
+        raise
+    except Exception as error:  # a parser's own errors have no common base
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+        raise InputError(
+            "ART-007", f"is no {what} as this version writes it ({reason})", where, MAKE_AGAIN
+        ) from error
 
 
 def _of_the_system(error: Exception) -> OSError | None:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from safetensors import SafetensorError
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
@@ -25,6 +24,7 @@ from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.rewards import StepOutcome
 from pipeline.metrics.flight import WITHIN_FRAMES, flees
+from pipeline.workflow import artifact
 
 EYE_M = 1.4
 """Height of a person's phone above the floor, metres."""
@@ -94,21 +94,14 @@ class AnimalWorld:
 
     @classmethod
     def load(cls, build: Path, config: EnvironmentConfig, *, device: str = "cpu") -> "AnimalWorld":
-        """Open a finished build. Raises ART-003 where it lacks the model, SIM-006 for models
-        without goals.
+        """Open a finished build. Raises ART-003 where it lacks the model, ART-007 where another
+        version wrote it, SIM-006 for models without goals.
         """
-        for artifact in ("behavior", "behavior_data"):
-            if not (build / artifact).is_dir():
-                raise InputError(
-                    "ART-003", f"has no {artifact}", str(build), "make it: make <agent>.behavior"
-                )
-        try:
-            architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
-        except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
-            what = f"is no model as this version writes it ({type(error).__name__})"
-            raise InputError(
-                "ART-007", what, str(build / "behavior"), "build it again: make <agent>.behavior.redo"
-            ) from error
+        for name in ("behavior", "behavior_data"):
+            if not (build / name).is_dir():
+                raise InputError("ART-003", f"has no {name}", str(build), "make it: make <agent>.behavior")
+            artifact.refuse_other_version(build / name)
+        architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
         if architecture.family != "diffusion":
             what = f"plans of the family {architecture.family} cannot be chained"
             raise InputError("SIM-006", what, str(build), "give a build of the family diffusion")

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from pipeline.core.errors import other_versions_refused
 from pipeline.geometry import rigid
 from pipeline.longterm.bodies import PoseSpace, SkinnedBody
 from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
@@ -36,6 +37,8 @@ from pipeline.longterm.short_motions import (
 from pipeline.longterm.surroundings import MotionScene
 
 NETWORKS = ("static", "route", "pose")
+CONVENTIONS = {"units": "metres, radians, seconds", "up": [0, 1, 0], "rate_hz": RATE_HZ, "frames": STEPS + 1}
+"""What the networks' numbers mean; a model that says otherwise is another version's."""
 JUMP_M = 0.1
 """A leg between places whose levels differ by more than this is leapt."""
 SWEEPS = 2
@@ -77,10 +80,7 @@ class LongTerm:
             {name: value.contiguous() for name, value in state.items()}, folder / "longterm.safetensors"
         )
         document = {
-            "units": "metres, radians, seconds",
-            "up": [0, 1, 0],
-            "rate_hz": RATE_HZ,
-            "frames": STEPS + 1,
+            **CONVENTIONS,
             "bones": len(self.poses.rest),
             "sizes": asdict(self.sizes),
             "sees_scene": self.route.sees_scene,
@@ -92,8 +92,15 @@ class LongTerm:
 
     @classmethod
     def load(cls, folder: Path) -> "LongTerm":
-        """Read a trained model."""
+        """Read a trained model. Raises InputError ART-007 for one of another version."""
+        with other_versions_refused("model of long-term motion", str(folder)):
+            return cls._read(folder)
+
+    @classmethod
+    def _read(cls, folder: Path) -> "LongTerm":
         document = json.loads((folder / "longterm.json").read_text())
+        if other := [name for name, value in CONVENTIONS.items() if document[name] != value]:
+            raise ValueError(f"longterm.json says otherwise about {', '.join(other)}")
         state, sizes = load_file(folder / "longterm.safetensors"), LongTermSizes(**document["sizes"])
         poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
         static = StaticBody(sizes)

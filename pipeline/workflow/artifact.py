@@ -19,7 +19,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import MAKE_AGAIN, InputError
+from pipeline.workflow import dag
 
 MANIFEST = "manifest.json"
 STAMP = ".ok"
@@ -45,6 +46,8 @@ class Manifest:
     """Python and the libraries that decide numbers."""
     files: dict[str, str]
     """sha256 per file, by path inside the folder."""
+    version: int = 1
+    """Of its stage's files and their meaning, see `dag.Node.version`."""
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -64,6 +67,7 @@ def _is_sound(manifest: Manifest) -> bool:
         and isinstance(manifest.content, str)
         and isinstance(manifest.key, str | None)
         and isinstance(manifest.config, dict)
+        and isinstance(manifest.version, int)
         and all(
             isinstance(table, dict) and all(isinstance(v, str) for v in table.values()) for table in tables
         )
@@ -72,14 +76,28 @@ def _is_sound(manifest: Manifest) -> bool:
 
 def opened(folder: Path, name: str) -> Manifest:
     """Return the manifest of the finished artifact at `folder`; raise `InputError` ART-001 where there is
-    none.
+    none, ART-007 where another version wrote it.
     """
     manifest = read_manifest(folder)
     if manifest is None:
         raise InputError(
             "ART-001", f"{name} is missing or unfinished", str(folder), "build it first with `make`"
         )
+    refuse_other_version(folder)
     return manifest
+
+
+def version_of(stage: str) -> int:
+    """Return the present version of a stage's files and their meaning."""
+    return max((node.version for node in dag.FLOW if node.stage.rpartition(".")[2] == stage), default=1)
+
+
+def refuse_other_version(folder: Path) -> None:
+    """Raise `InputError` ART-007 where `folder` is a finished artifact of another version."""
+    made = read_manifest(folder)
+    if made is not None and made.version != version_of(made.stage):
+        what = f"{made.stage} wrote it in version {made.version}; this is version {version_of(made.stage)}"
+        raise InputError("ART-007", what, str(folder), MAKE_AGAIN)
 
 
 @contextlib.contextmanager
@@ -102,7 +120,14 @@ def create(
                 "ART-002", f"{stage} wrote nothing", str(out), "this is a fault of the stage: report it"
             )
         manifest = Manifest(
-            stage, key, content_of(files), dict(sorted(inputs.items())), dict(config), versions(), files
+            stage,
+            key,
+            content_of(files),
+            dict(sorted(inputs.items())),
+            dict(config),
+            versions(),
+            files,
+            version_of(stage),
         )
         (temporary / MANIFEST).write_text(json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
         sync_disk(temporary)

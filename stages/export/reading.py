@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.core.errors import other_versions_refused
 from pipeline.data import gaussian_ply, images, npz
 from pipeline.data import glb as gltf
 from pipeline.data.glb import Action, Skin
@@ -90,22 +91,23 @@ def agent(simulator: Path, take: Path | None, rate_hz: float, influences: Influe
     """Read the animal from `agent.glb`; a generated take becomes one motion more. Keys are resampled to
     `rate_hz`.
     """
-    mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
+    with other_versions_refused("simulator", str(simulator)):
+        mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
+        residual_mm = json.loads((simulator / "simulator.json").read_bytes())["agent"]
+        loss_mm = residual_mm["skinning_residual_8_mm" if influences == "8" else "skinning_residual_mm"]
     if take:
         names = ("timestamp_s", "world_from_agent", "agent_from_bone")
         made = npz.load(take, names)
         actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in names))]
-    loss = "skinning_residual_mm"
     if influences == "8":
         skin = replace(skin, **npz.load(simulator / "skin_8.npz", ("joints", "weights")))
-        loss = "skinning_residual_8_mm"
-    about = json.loads((simulator / "simulator.json").read_bytes())
-    return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], about["agent"][loss])
+    return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], loss_mm)
 
 
 def room(simulator: Path) -> Mesh:
     """Read the room's surface, world frame."""
-    return gltf.read_static((simulator / "scene.glb").read_bytes())
+    with other_versions_refused("simulator", str(simulator)):
+        return gltf.read_static((simulator / "scene.glb").read_bytes())
 
 
 def sessions(reconstruction: Path) -> list[Session]:

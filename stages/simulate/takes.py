@@ -3,10 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-from safetensors import SafetensorError
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
@@ -15,7 +13,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.core import progress
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.data import glb, ply
 from pipeline.longterm import journeys
 from pipeline.longterm.bodies import load_body
@@ -33,7 +31,6 @@ from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import UNKNOWN_OBSERVER_M, Observer, scripted
 from stages.simulate.rollout import rollout, write_take
 
-T = TypeVar("T")
 MOVED_M = 0.25
 """A sub-goal that is met further off than this counts as moved."""
 DEFAULT_OBSERVER_OFFSET_M = np.array([1.0, 1.4, 0.0])
@@ -112,8 +109,9 @@ def live(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     """Let the animal live in a browser until interrupted."""
     data, shown = BehaviorData.load(_required(inputs, "behavior_data")), _required(inputs, "simulator")
     simulator = _simulator(inputs, data, c, ReplanningConfig(), device)
-    mesh, skin, _ = glb.read_skinned((shown / "agent.glb").read_bytes())
-    look = LiveAppearance(mesh, skin, (shown / "scene.glb").read_bytes())
+    with other_versions_refused("simulator", str(shown)):
+        mesh, skin, _ = glb.read_skinned((shown / "agent.glb").read_bytes())
+        look = LiveAppearance(mesh, skin, (shown / "scene.glb").read_bytes())
     seen = np.concatenate([t.world_from_camera[t.valid, :3, 3] for t in data.trajectories.values()])
     here = LiveView(simulator, look, np.median(seen, axis=0), seed=c.seed, port=c.port)
     progress.log(f"open http://127.0.0.1:{here.port} and drag the person; Ctrl-C ends it and keeps the take")
@@ -162,7 +160,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
 
 
 def _world(inputs: Inputs, data: BehaviorData) -> LongTermWorld:
-    model = _loaded(LongTerm.load, _required(inputs, "longterm"))
+    model = LongTerm.load(_required(inputs, "longterm"))
     reconstruction = _required(inputs, "reconstruction")
     roots = np.concatenate(
         [trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in data.trajectories.values()]
@@ -174,7 +172,7 @@ def _world(inputs: Inputs, data: BehaviorData) -> LongTermWorld:
 def _simulator(
     inputs: Inputs, data: BehaviorData, c: Config, chaining: ReplanningConfig, device: str
 ) -> Simulator:
-    architecture, nets, scaling, schedule, _ = _loaded(behavior.load, _required(inputs, "behavior"))
+    architecture, nets, scaling, schedule, _ = behavior.load(_required(inputs, "behavior"))
     if architecture.family != "diffusion":
         what = f"plans of the family {architecture.family} cannot be chained"
         raise InputError("SIM-006", what, str(inputs.behavior), "give a model of the family diffusion")
@@ -190,20 +188,6 @@ def _simulator(
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
     scenes = Scenes.load(inputs.behavior_data, data.videos)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)
-
-
-def _loaded(load: Callable[[Path], T], folder: Path) -> T:
-    """Load a trained model; by hand any may be given, so one that another version wrote is
-    reported as such.
-    """
-    try:
-        return load(folder)
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
-        what = f"is no model as this version writes it ({reason})"
-        raise InputError(
-            "ART-007", what, str(folder), "build it again with this version: make <agent>.<artifact>.redo"
-        ) from error
 
 
 def _observer(simulator: Simulator, c: Config) -> Observer:

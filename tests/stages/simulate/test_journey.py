@@ -15,7 +15,7 @@ from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
 from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
 from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.subgoals import Subgoal
-from stages.simulate import journey_files, subgoal_file, takes
+from stages.simulate import journey_files, subgoal_file
 from tests.pipeline.longterm import strider
 
 SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
@@ -151,7 +151,7 @@ def test_recorded_motion_becomes_physical(world, tmp_path):
 def test_a_model_of_another_version_is_told(world, tmp_path):
     world.model.save(tmp_path)
     document = json.loads((tmp_path / "longterm.json").read_text())
-    assert takes._loaded(LongTerm.load, tmp_path).motion_prior == world.model.motion_prior
+    assert LongTerm.load(tmp_path).motion_prior == world.model.motion_prior
     (tmp_path / "longterm.json").write_text(json.dumps({**document, "motion_prior": {"gait_m": 1}}))
     with pytest.raises(InputError, match="ART-007.*(gait_m|clearance_m)"):
-        takes._loaded(LongTerm.load, tmp_path)
+        LongTerm.load(tmp_path)

@@ -1,0 +1,166 @@
+"""What another version wrote is refused with one code: neither a traceback nor a misreading."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.torch import load_file, save_file
+
+from pipeline.behavior import model as behavior
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import BehaviorNets
+from pipeline.core.errors import InputError
+from pipeline.data import glb, npz
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.world import AnimalWorld
+from pipeline.longterm.motion_synthesis import LongTerm
+from pipeline.workflow import artifact
+from stages.export import reading
+from stages.simulate import takes
+from stages.simulate.config import Config
+from stages.simulate.inputs import Inputs
+from stages.train_behavior.export import write_contract
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.stages.export import moving_tube
+from tests.stages.simulate.test_simulator import scaling
+
+QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
+
+
+@pytest.fixture
+def build(tmp_path):
+    """Model and data of an animal, and its glTF, as this version writes them."""
+    for name in ("behavior", "behavior_data", "simulator"):
+        (tmp_path / name).mkdir()
+    wandering().save(tmp_path / "behavior_data")
+    volume = room()
+    known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
+    npz.save(tmp_path / "behavior_data/volume.npz", **vars(volume), **known)
+    nets = BehaviorNets(ARCHITECTURE)
+    write_contract(tmp_path / "behavior", nets, ARCHITECTURE, scaling(), Schedule(), REST)
+    data, _ = moving_tube.model()
+    (tmp_path / "simulator/agent.glb").write_bytes(data)
+    mesh, _, _ = glb.read_skinned(data)
+    (tmp_path / "simulator/scene.glb").write_bytes(glb.static(mesh, "scene"))
+    about = {"agent": {"skinning_residual_mm": {}, "skinning_residual_8_mm": {}}}
+    (tmp_path / "simulator/simulator.json").write_text(json.dumps(about))
+    return tmp_path
+
+
+def with_json(path, *keys, value=None):
+    """Set the entry at ``keys`` of a JSON file; None removes it."""
+    document = json.loads(path.read_text())
+    inner = document
+    for key in keys[:-1]:
+        inner = inner[key]
+    if value is None:
+        del inner[keys[-1]]
+    else:
+        inner[keys[-1]] = value
+    path.write_text(json.dumps(document))
+
+
+CHANGES = {
+    "another exponent": (("path_encoding", "velocity_power"), 0.9),
+    "another grid": (("grid", "cell_m"), 0.3),
+    "another rate": (("rate_hz",), 30),
+    "channels in another order": (("channels", "goal"), ["z", "y", "x"]),
+    "another schedule": (("schedule", "alpha_bar"), [1.0, 0.5]),
+    "a setting of its own": (("architecture", "memory"), 4),
+    "a setting less": (("architecture", "map_lookup"), None),
+    "a scale less": (("scaling", "goal_std"), None),
+    "a part less": (("path_encoding",), None),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_behavior_model_with_another_contract_is_refused(build, change):
+    keys, value = CHANGES[change]
+    with_json(build / "behavior/behavior.json", *keys, value=value)
+    for load in (
+        lambda: behavior.load(build / "behavior"),
+        lambda: AnimalWorld.load(build, QUICK),
+        lambda: takes.of_behavior(
+            Inputs(build / "behavior_data", build / "behavior"), Config(seconds=0.1), "cpu"
+        ),
+    ):
+        with pytest.raises(InputError, match="ART-007") as raised:
+            load()
+        assert keys[0] in str(raised.value) or keys[-1] in str(raised.value)
+        assert "make" in raised.value.remedy
+
+
+def test_weights_of_another_network_are_refused(build):
+    path = build / "behavior/behavior.safetensors"
+    weights = load_file(path)
+    save_file(dict(list(weights.items())[1:]), path)
+    with pytest.raises(InputError, match="ART-007"):
+        behavior.load(build / "behavior")
+    path.unlink()
+    with pytest.raises(InputError, match="ART-007"):
+        behavior.load(build / "behavior")
+
+
+def test_how_plans_are_drawn_is_no_part_of_the_model(build):
+    with_json(build / "behavior/behavior.json", "sampling", "goal_steps", value=3)
+    behavior.load(build / "behavior")
+
+
+@pytest.mark.parametrize("key", ["rate_hz", "frames", "sizes", "motion_prior", "sees_scene", "units"])
+def test_a_long_term_model_with_another_document_is_refused(key, tmp_path):
+    sizes = {"pose": 3}
+    document = {
+        "units": "metres, radians, seconds", "up": [0, 1, 0], "rate_hz": 10, "frames": 21, "bones": 3,
+        "sizes": sizes, "sees_scene": True, "motion_prior": {}, "contact_vertices": [],
+        "foot_of_contact_vertex": [],
+    }  # fmt: skip
+    save_file({}, tmp_path / "longterm.safetensors")
+    (tmp_path / "longterm.json").write_text(json.dumps({k: v for k, v in document.items() if k != key}))
+    with pytest.raises(InputError, match="ART-007"):
+        LongTerm.load(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["agent.glb", "scene.glb", "simulator.json"])
+@pytest.mark.parametrize("content", [b"", b"{}", b"glTF" + bytes(40), None])
+def test_a_simulator_of_another_version_is_refused(build, name, content):
+    path = build / "simulator" / name
+    if content is None:
+        path.unlink()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match="ART-007") as raised:
+        reading.agent(build / "simulator", None, 30.0)
+        reading.room(build / "simulator")
+    assert "make" in raised.value.remedy
+
+
+def test_a_skin_without_what_this_version_writes_is_refused(build):
+    path = build / "simulator/agent.glb"
+    path.write_bytes((build / "simulator/scene.glb").read_bytes())  # a surface without a skin
+    with pytest.raises(InputError, match="ART-007"):
+        reading.agent(build / "simulator", None, 30.0)
+    inputs = Inputs(build / "behavior_data", build / "behavior", build / "simulator")
+    with pytest.raises(InputError, match="ART-007"):
+        takes.live(inputs, Config(), "cpu")
+
+
+def test_artifacts_name_their_version(build, monkeypatch):
+    """Files that look right, but mean something else, are known by the number of their stage."""
+    with artifact.create(build / "made", stage="train_behavior", config={}, inputs={}) as folder:
+        (folder / "a.txt").write_text("a")
+    assert artifact.opened(build / "made", "behavior").version == artifact.version_of("train_behavior")
+    with_json(build / "made/manifest.json", "version", value=99)
+    with pytest.raises(InputError, match=re.compile("ART-007.*version 99.*make", re.DOTALL)):
+        artifact.opened(build / "made", "behavior")
+    (build / "behavior/manifest.json").write_bytes((build / "made/manifest.json").read_bytes())
+    with pytest.raises(InputError, match="ART-007"):
+        AnimalWorld.load(build, QUICK)
+
+
+def test_models_that_differ_in_nothing_but_their_numbers_are_read(build):
+    again = replace(scaling(), goal_std=np.array([0.2, 0.2, 0.2]))
+    write_contract(build / "behavior", BehaviorNets(ARCHITECTURE), ARCHITECTURE, again, Schedule(), REST)
+    np.testing.assert_array_equal(behavior.load(build / "behavior")[2].goal_std, again.goal_std)
+    AnimalWorld.load(build, QUICK)
