@@ -58,6 +58,16 @@ def total(values: Shaped[Tensor, "*any"]) -> Shaped[Tensor, "*any"]:
     return there.to(values.device)
 
 
+def mean(values: Shaped[Tensor, "*any"]) -> Shaped[Tensor, "*any"]:
+    """Return the mean over all processes, without gradients: what a shared loss divides by."""
+    return total(values) / size()
+
+
+def share(batch: int) -> int:
+    """Return how many of a batch's examples are this process's: each has as many, one at least."""
+    return max(batch // size(), 1)
+
+
 def wait() -> None:
     """Go on when all have come here."""
     if size() > 1:

@@ -33,15 +33,9 @@ RECONSTRUCTION_VARIANTS = (
 """Variants of an agent that Table 3 compares its reconstruction with."""
 VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}
 PLUMBING = (
-    "core.errors",
-    "core.config",
-    "core.processes",
-    "core.progress",
-    "core.videos",
-    "workflow.artifact",
-    "workflow.cli",
-    "workflow.dag",
-)
+    "core.errors", "core.config", "core.processes", "core.progress", "core.videos",
+    "workflow.artifact", "workflow.cli", "workflow.dag",
+)  # fmt: skip
 """Files of `pipeline/` whose change cannot change what a stage computes."""
 
 
@@ -81,7 +75,7 @@ class Node:
     fixed: dict[str, object] = field(default_factory=dict)
     """Keys of the configuration that distinguish two nodes of one program."""
     version: int = 1
-    """Raise it when results change although no code of the stage does."""
+    """Raise it when results change although no code does, or what files mean: readers refuse others."""
     threads: int = 1
     gpu: int = 0
     memory_mb: int = 3000
@@ -240,8 +234,10 @@ FLOW: tuple[Node, ...] = (
         role_dependencies=("session",),
         flows=BOTH,
     ),
-    Node("behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True, flows=BOTH),
-    Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True),
+    Node(
+        "behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True, distributed=True, flows=BOTH
+    ),
+    Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True, distributed=True),
     Node("longterm_world", "synthesize_capture.motions", on_demand=True),
     Node(
         "longterm_ablations",

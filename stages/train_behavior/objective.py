@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from pipeline.behavior.diffusion import Schedule, noised
 from pipeline.behavior.model import ROOT_CHANNELS, BehaviorNets
+from pipeline.core import distributed
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig, Weighting
 
@@ -93,10 +94,10 @@ def sequence_rows(
 
 def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor, "row"]) -> Float[Tensor, ""]:
     """Return the mean over the rows that are known (0 where none is), in which root and bones count for a
-    half each.
+    half each; over those of all processes.
     """
     each = (error[:, :ROOT_CHANNELS].mean((1, 2)) + error[:, ROOT_CHANNELS:].mean((1, 2))) / 2
-    return (each * known).sum() / known.sum().clamp_min(1)
+    return (each * known).sum() / distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
 
 
 def perceive(

@@ -9,6 +9,7 @@ from torch import Tensor
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.path_encoding import PATH_CHANNELS
+from pipeline.core import distributed
 from pipeline.rivals.samplers import LOG_STD_BOUNDS, LOG_STD_STEP, MEAN_STEP
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig
@@ -70,7 +71,5 @@ def one_stage_losses(
         lambda x, t: nets.body(x, t, code, *nothing), whole, schedule, objective.weighting, generator
     )
     body = error[:, PATH_CHANNELS:] * known[:, None, None]
-    return {
-        "path": error[:, :PATH_CHANNELS].mean(),
-        "body": body.sum() / max(int(known.sum()) * body[0].numel(), 1),
-    }
+    rows = distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
+    return {"path": error[:, :PATH_CHANNELS].mean(), "body": body.sum() / (rows * body[0].numel())}

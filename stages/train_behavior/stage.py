@@ -6,7 +6,7 @@ from pathlib import Path
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, frames_from_seconds
-from pipeline.core import devices, progress
+from pipeline.core import devices, distributed, progress
 from stages.train_behavior import outcome
 from stages.train_behavior.config import Config
 from stages.train_behavior.refusals import check_settings
@@ -24,7 +24,11 @@ class Inputs:
 def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", resume: Path | None = None
 ) -> None:
-    """Train, export and judge the model. Raises BEH-001, BEH-003, REC-002, ART-010."""
+    """Train, export and judge the model; of several processes the first writes.
+
+    Raises BEH-001, BEH-003, REC-002, ART-010.
+    """
+    distributed.join(device)
     data = BehaviorData.load(inputs.behavior_data).with_horizon(frames_from_seconds(config.horizon_s))
     scenes = Scenes.load(inputs.behavior_data, data.videos)
     architecture, schedule = outcome.architecture_for(config, data, scenes), Schedule(course=config.schedule)
@@ -33,6 +37,8 @@ def run(
     fitted = train(
         data, scenes, architecture, schedule, config.training, seed=config.seed, resume=resume, device=device
     )
+    if not distributed.leave():
+        return
     outcome.write_trained(out, fitted, architecture, schedule, data.agent_from_bone_rest)
     if config.export:
         outcome.write_exported(out, fitted, architecture, schedule, data, scenes, seed=config.seed)

@@ -12,6 +12,7 @@ from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, S
 from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
+from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from stages.train_behavior.batches import (
     SceneSampler,
@@ -60,7 +61,10 @@ def train(
     resume: Path | None = None,
     device: str = "cpu",
 ) -> TrainedBehavior:
-    """Fit the networks to the training windows of the data."""
+    """Fit the networks to the training windows of the data.
+
+    Several processes (`pipeline.core.distributed`) share each step's batch; all hold the same networks.
+    """
     minimised = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}[
         architecture.family
     ]
@@ -85,6 +89,7 @@ def train(
         phase: TrainingPhase = "all" if goal_steps == 0 else "goals" if step < goal_steps else "sequences"
         size = optimization.goal_batch if phase == "goals" else optimization.batch
         how = of_paths if phase == "sequences" else drawn
+        size = distributed.share(size)
         batch = draw_batch(windows, scene, statistics, how, size, generator, bodies=phase != "goals")
         return minimised(nets, batch, schedule, settings.objective, generator, phase=phase)
 
@@ -100,6 +105,7 @@ def train(
         label="behaviour",
         clip_norm=CLIP_NORM,
         after_step=lambda step: _average(average, nets, step, goal_steps, optimization.average),
+        shared=True,
     )
     return TrainedBehavior(rounded(average.eval()), statistics.scaling, record)
 

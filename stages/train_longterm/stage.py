@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.core import progress
+from pipeline.core import distributed, progress
 from pipeline.data import qa
 from pipeline.longterm.short_motions import RATE_HZ
 from stages.train_longterm import learning, pictures, sources
@@ -23,15 +23,19 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, resume: Path | None = None) -> TrainedLongTerm:
-    """Train every network and write `longterm.safetensors`, `longterm.json` and `ablations/` into ``out``.
+    """Train every network and write `longterm.safetensors`, `longterm.json` and `ablations/` into ``out``;
+    of several processes the first writes.
 
     Raises InputError LTM-001 to LTM-004 where motion, weights or SMPL-X are missing.
     """
+    distributed.join("cpu")
     split = _read(inputs, config)
     frames = sum(map(len, split.train.stretches))
     minutes = frames / RATE_HZ / SECONDS_PER_MINUTE
     progress.log(f"{len(split.train.stretches)} stretches of motion, {minutes:.1f} min at {RATE_HZ} fps")
     trained = learning.train_networks(split.train, config, resume=resume)
+    if not distributed.leave():
+        return trained
     report = pictures.evaluate_held_out(trained, split, config.seed)
     trained.model.save(out)
     learning.write_ablations(out, trained)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor, nn
 
+from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from pipeline.longterm.bodies import PosedSurface, PoseSpace
 from pipeline.longterm.clip_channels import Clips
@@ -79,11 +80,12 @@ class NetworkTrainer:
         loss: Callable[[Int[Tensor, "batch"]], dict[str, Float[Tensor, ""]]],
         examples: int,
     ) -> FitRecord:
-        """Fit one network in place to random batches of examples."""
+        """Fit one network in place to random batches of examples, which several processes share."""
         optimizer = torch.optim.Adam(net.parameters(), lr=optimizer_config.rate)
 
         def step_loss(step: int, generator: torch.Generator) -> dict[str, Tensor]:
-            return loss(torch.randint(examples, (optimizer_config.batch,), generator=generator))
+            batch = distributed.share(optimizer_config.batch)
+            return loss(torch.randint(examples, (batch,), generator=generator))
 
         folder = self.resume / name if self.resume else None
         record = fit(
@@ -97,6 +99,7 @@ class NetworkTrainer:
             schedule=cosine,
             label=name,
             clip_norm=GRADIENT_NORM,
+            shared=True,
         )
         net.eval()
         return record

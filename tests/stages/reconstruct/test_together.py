@@ -2,9 +2,6 @@
 alike.
 """
 
-import os
-import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,9 +15,9 @@ from stages.reconstruct import losses, optimise
 from stages.reconstruct.config import LossWeights
 from stages.reconstruct.joint import JointLoss
 from stages.reconstruct.problem import Problem
+from tests import two_processes
 from tests.stages.reconstruct.test_optimise import UPRIGHT, WIDE, film, plan, problem
 
-TORCHRUN = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RUN_ID")
 STEPS = 3
 
 
@@ -58,9 +55,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor
     """Do what one process of two does; the same steps, and then a whole run, whose weights it leaves in a
     file.
     """
-    torch.set_num_threads(1)
-    os.environ.update(zip(TORCHRUN, (str(rank), str(rank), "2", "127.0.0.1", port, "test"), strict=True))
-    distributed.join("cpu")
+    two_processes.join(rank, port)
     found, whole = three_videos(), three_videos()
     weights, total = fitted(found, loss_of(found, rank), shared=True)
     optimise.optimise(whole, plan(folder / "resume", template=2, scene=3, body=2, joint=3, save_every=2))
@@ -71,16 +66,8 @@ def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor
 
 
 def test_two_processes_do_what_one_does_with_the_same_batch(tmp_path, monkeypatch):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    other = subprocess.Popen([sys.executable, "-m", __name__, port, str(tmp_path)])
-    for name in TORCHRUN:
-        monkeypatch.setenv(name, "")
-    try:
+    with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         whole, weights, total = side(0, port, tmp_path)
-    finally:
-        other.kill()
     alone = three_videos()
     shares, weighted = [loss_of(alone, rank) for rank in range(2)], losses.weighted
 

@@ -1,0 +1,75 @@
+"""Two processes that share each batch learn what one learns from the whole of it."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.core import distributed
+from pipeline.core.training import generator_for
+from pipeline.longterm.config import LongTermOptimizerConfig
+from stages.train_longterm import learning, training
+from stages.train_longterm.config import Config
+from tests import two_processes
+from tests.pipeline.longterm import strider
+from tests.stages.train_longterm.test_training import SIZES
+
+NETWORKS = ("static", "route", "pose")
+
+
+def trained(batch: int) -> learning.TrainedLongTerm:
+    short = LongTermOptimizerConfig(steps=4, batch=batch)
+    config = Config(body=short, route=short, pose=short, clip_stride=40, most_bodies=60)
+    return learning.train_networks(strider.dataset(count=2, seconds=4.0), config, sizes=SIZES)
+
+
+def weights(found: learning.TrainedLongTerm) -> torch.Tensor:
+    nets = [getattr(found.model, name) for name in NETWORKS]
+    return torch.cat([value.detach().flatten() for net in nets for value in net.parameters()])
+
+
+def side(rank: int, port: str, folder: Path) -> learning.TrainedLongTerm:
+    """Do what one process of two does, and leave the weights in a file."""
+    two_processes.join(rank, port)
+    found = trained(16)
+    torch.save(weights(found), folder / f"rank{rank}.pt")
+    distributed.wait()
+    assert distributed.leave() == (rank == 0)
+    return found
+
+
+def alone(monkeypatch: pytest.MonkeyPatch) -> learning.TrainedLongTerm:
+    """Train in one process on both processes' halves of each batch."""
+    fit = training.fit
+
+    def fit_both(*, loss, **rest):
+        def of_both(step: int, _: torch.Generator) -> dict[str, torch.Tensor]:
+            parts = []
+            for rank in range(2):
+                generator = generator_for(0, step, rank)
+                torch.manual_seed(generator.initial_seed())
+                parts.append(loss(step, generator))
+            return {name: (parts[0][name] + parts[1][name]) / 2 for name in parts[0]}
+
+        return fit(loss=of_both, **rest)
+
+    monkeypatch.setattr(training, "fit", fit_both)
+    return trained(8)
+
+
+def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkeypatch):
+    with two_processes.started(__name__, tmp_path, monkeypatch) as port:
+        together = side(0, port, tmp_path)
+    expected = alone(monkeypatch)
+    for name in NETWORKS:
+        losses = (found.records[name].total() for found in (together, expected))
+        np.testing.assert_allclose(*losses, rtol=2e-5, err_msg=name)
+    off = (weights(together) - weights(expected)).abs()  # Adam makes much of gradients that are nearly 0
+    assert (off > 2e-5).float().mean() < 1e-2 and off.mean() < 1e-5
+    assert torch.equal(weights(together), torch.load(tmp_path / "rank1.pt", weights_only=True))
+
+
+if __name__ == "__main__":
+    side(1, sys.argv[1], Path(sys.argv[2]))
