@@ -16,6 +16,8 @@ from stages.segment_agent.evidence import Evidence
 from stages.segment_agent.free_space import DepthNoise, References
 from stages.segment_agent.movers import Candidate
 from stages.segment_agent.painting import Painter
+from stages.segment_agent.refine import Edges
+from stages.segment_agent.windows import Window
 from stages.segment_agent.writing import Summary
 
 INTRINSICS = np.array([[80.0, 0, 50], [0, 80.0, 40], [0, 0, 1]])
@@ -101,3 +103,20 @@ def test_wrong_masks_are_reported():
     flashing = replace(good, visible=(rng.random(count) < 0.5).tolist())
     for wrong in (furniture, unsure, jumping, flashing):
         assert "fail" in {check.status for check in pictures.checks_of(wrong, 0.01)}
+
+
+def test_appearance_decides_where_geometry_knows_nothing():
+    """An animal that stands where no other frame looked, and clearly looks like one, has a mask."""
+    shape, unknown = (60, 80), np.zeros((60, 80), bool)
+    animal = np.zeros(shape, bool)
+    animal[20:40, 20:60] = True
+    like = np.where(animal, 2.4, -4.0)
+    evidence = Evidence(np.zeros(shape), np.full(shape, 0.05), unknown, unknown, unknown)
+    window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
+    painter = cast(Painter, SimpleNamespace(edges=Edges()))
+    labels, _ = Painter._by_appearance(painter, window, evidence, like)
+    assert ((labels == 255) & animal).sum() > 0.9 * animal.sum()
+    assert not (labels == 255)[~animal].any()
+    settled = Evidence(np.full(shape, -3.0), np.ones(shape), unknown, unknown, ~unknown)
+    labels, _ = Painter._by_appearance(painter, window, settled, like)
+    assert not (labels == 255).any()
