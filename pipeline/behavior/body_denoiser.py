@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.behavior.diffusion import STANDARD, Schedule
+from pipeline.behavior.path_encoding import PATH_CHANNELS, expected_steps
 from pipeline.behavior.trajectories import RATE_HZ
 
 CONTROL_CHANNELS = 8
@@ -59,7 +60,7 @@ class BodyDenoiser(nn.Module):
     ) -> Float[Tensor, "batch channel frame"]:
         held = condition[:, -self.posture :, None].expand(-1, -1, x.shape[-1])
         root = held[:, :ROOT_CHANNELS] * self.root_std[:, None] + self.root_mean[:, None]
-        step = self.steps(control)
+        step = self.steps(x, t, control)
         heading = self.headings(step, root)
         root = (rotated_to_heading(root, heading) - self.root_mean[:, None]) / self.root_std[:, None]
         held = nn.functional.pad(
@@ -68,9 +69,15 @@ class BodyDenoiser(nn.Module):
         unet_control = torch.cat([control, step * RATE_HZ, heading], dim=1)
         return self.unet(x - self.share[t.long()][:, None, None] * held, t, condition, unet_control, keep)
 
-    def steps(self, scaled: Float[Tensor, "batch 3 frame"]) -> Float[Tensor, "batch 3 frame"]:
-        """Return how far a path goes in each frame, metres; in the first as in the second."""
-        step = (scaled * self.path_std).diff(dim=-1)
+    def steps(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        control: Float[Tensor, "batch 3 frame"],
+    ) -> Float[Tensor, "batch 3 frame"]:
+        """Return how far the path goes in each frame, metres; in the first as in the second."""
+        del x, t
+        step = (control * self.path_std).diff(dim=-1)
         return torch.cat([step[..., :1], step], dim=-1)
 
     def headings(
@@ -91,6 +98,29 @@ class BodyDenoiser(nn.Module):
         return soft_unit(
             gone + HEADING_MEMORY_M * torch.exp(-way / HEADING_MEMORY_M)[:, None] * horizontal_forward(root)
         )
+
+
+class OneStageDenoiser(BodyDenoiser):
+    """Denoise path and body as one sequence, path first; the heading is that of the path, as far as noise
+    leaves it known.
+    """
+
+    velocity_std: Tensor
+
+    def __init__(self, unet: nn.Module, posture: int, frames: int, schedule: Schedule = STANDARD):
+        super().__init__(unet, posture, frames, schedule)
+        self.register_buffer("velocity_std", torch.ones(PATH_CHANNELS))
+
+    def steps(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        control: Float[Tensor, "batch 3 frame"],
+    ) -> Float[Tensor, "batch 3 frame"]:
+        """Return how far the noisy path is expected to go in each frame, metres."""
+        del control
+        strides = (self.share[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).mT * self.velocity_std
+        return expected_steps(strides).mT
 
 
 def horizontal_forward(root: Float[Tensor, "batch 6 frame"]) -> Float[Tensor, "batch 2 frame"]:

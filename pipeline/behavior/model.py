@@ -15,18 +15,24 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
-from pipeline.behavior.body_denoiser import CONTROL_CHANNELS, BodyDenoiser
-from pipeline.behavior.concatenation import ConcatenationUNet
+from pipeline.behavior.body_denoiser import CONTROL_CHANNELS, BodyDenoiser, OneStageDenoiser
 from pipeline.behavior.config import (
     AblatedInput,
     Control,
     Ego,
     Family,
     MapLookup,
+    ObservedPast,
     PlanSamplingConfig,
     SceneEncoder,
 )
-from pipeline.behavior.denoisers import EMBEDDING, ControlUNet, TrailingLinear, UncontrolledUNet
+from pipeline.behavior.denoisers import (
+    EMBEDDING,
+    ConcatenationUNet,
+    ControlUNet,
+    TrailingLinear,
+    UncontrolledUNet,
+)
 from pipeline.behavior.diffusion import STANDARD, Schedule
 from pipeline.behavior.goal_denoiser import GoalMLP
 from pipeline.behavior.path_encoding import (
@@ -66,6 +72,7 @@ class Architecture:
     bones: int
     ego: Ego = "yaw"
     scene: SceneEncoder = "pillars"
+    observed_past: ObservedPast = "positions"
     scene_width: int = 32
     scene_block: int = 4
     scene_channels: int = 16
@@ -113,6 +120,7 @@ class Architecture:
         """Return the sizes of the perception network."""
         return PerceptionConfig(
             self.scene,
+            self.observed_past,
             self.scene_width,
             self.scene_block,
             self.scene_channels,
@@ -200,7 +208,9 @@ class BehaviorNets(nn.Module):
         if a.family == "one_stage":  # one network for path and body, which nothing steers
             read = TrailingLinear(a.code_length, EMBEDDING)
             along = UncontrolledUNet(PATH_CHANNELS + a.body_channels, read, *sizes[1:])
-        self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
+            self.body = OneStageDenoiser(along, a.body_channels, a.future, schedule)
+        else:
+            self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
 
 
 def channels_from_bones(
@@ -222,6 +232,15 @@ def bones_from_channels(
     return rigid.make(
         rigid.rotation_from_vector(twist[..., :3]) @ rest[..., :3, :3], rest[..., :3, 3] + twist[..., 3:]
     )
+
+
+def observer_channels(
+    ego_from_observer: Float[np.ndarray, "batch 8 4 4"],
+) -> Float[np.ndarray, "batch observer_past"]:
+    """Return per past frame the observer's position and rotation (6), oldest frame first (Eq. 12)."""
+    rotation = rigid.rotation_to_6d(ego_from_observer[..., :3, :3])
+    pose = np.concatenate([ego_from_observer[..., :3, 3], rotation], axis=-1)
+    return pose.reshape(len(pose), -1).astype(np.float32)
 
 
 def past_channels(
@@ -250,7 +269,7 @@ def contract(
         "bones": [f"bone_{number:02d}" for number in range(architecture.bones)],
         "agent_from_bone_rest": np.asarray(rest, float).tolist(),
         "channels": {
-            "observer_past": {"per_frame": ["x", "y", "z"], "order": "frame, channel; oldest first"},
+            "observer_past": {"per_frame": ["x", "y", "z", *root], "order": "frame, channel; oldest first"},
             "past": {
                 "per_frame": ["root_x", "root_y", "root_z", *root],
                 "per_bone": bone,

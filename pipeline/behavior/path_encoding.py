@@ -65,6 +65,12 @@ def path_from_velocity_channels(
     return start[..., None, :] + (with_powered_length(root, 1 / VELOCITY_POWER) / RATE_HZ).cumsum(-2)
 
 
+def expected_steps(strides: Float[Tensor, "batch frame 4"]) -> Float[Tensor, "batch frame 3"]:
+    """Return how far the animal goes in each frame, metres, along strides in the units of the channels."""
+    root = strides[..., :3] * torch.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
+    return with_powered_length(root, 1 / VELOCITY_POWER) / RATE_HZ
+
+
 def warped_path(
     strides: Float[np.ndarray, "*batch frame 4"],
     start: Float[np.ndarray, "*batch 3"],

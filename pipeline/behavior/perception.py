@@ -8,7 +8,6 @@ by side.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import assert_never, cast
 
@@ -17,7 +16,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from pipeline.behavior.config import AblatedInput, Ego, SceneEncoder
+from pipeline.behavior.config import AblatedInput, Ego, ObservedPast, SceneEncoder
+from pipeline.behavior.encoders import ObserverEncoder, ObserverPoseEncoder, PastEncoder
 from pipeline.behavior.path_encoding import VELOCITY_POWER, with_powered_length
 from pipeline.data import npz
 from pipeline.geometry import rigid
@@ -31,9 +31,6 @@ POSITION = 3
 """leading channels of a past frame, the root's position; root rotation and bones follow"""
 VELOCITY_CHANNELS = 3
 """numbers of a code for the velocity"""
-CLOSE_RANGE_M, EDGE_SHARPNESS = 1.5, 4.0
-"""distance around which an observer's is encoded, metres, and the inverse width, in radii, of the soft edge
-at the radius"""
 MIN_HORIZONTAL = 0.2
 """shortest horizontal part of the head's direction that still defines the heading"""
 
@@ -111,14 +108,6 @@ def grid_points_ego(stride: int = 1) -> Float[np.ndarray, "width height length 3
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
-def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
-    """Return linear layers of these sizes with SiLU (and dropout) between them."""
-    layers: list[nn.Module] = []
-    for inner, outer in pairwise(sizes):
-        layers += [nn.Linear(inner, outer), nn.SiLU(), nn.Dropout(dropout)]
-    return nn.Sequential(*layers[:-2])
-
-
 SceneEncoding = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code"]]
 """A map's channels, cell after cell (z, then x; none where there is no map), and a code"""
 PerceptionCode = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code_of_all"]]
@@ -179,75 +168,12 @@ class VolumeScene(nn.Module):
     encode = forward
 
 
-class ObserverEncoder(nn.Module):
-    """Encode the observer's past positions (Eq. 12) through features that vanish towards ``radius_m``.
-
-    Distance and approach speed are encoded frame by frame in metres and m/s, well inside the radius undamped:
-    whether the animal minds hangs on them, and to learn them from positions takes thousands of steps. Beyond
-    the radius all features are zero, so that a far observer and none at all are the same to the agent: the
-    code of zero features is also the learned null.
-    """
-
-    def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
-        super().__init__()
-        self.frames, self.radius_m, self.rate_hz = frames, radius_m, rate_hz
-        self.layers = mlp((frames * 5 + 2, hidden, hidden, code))
-
-    def forward(
-        self, observer_past: Float[Tensor, "batch observer_past"], keep: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch code"]:
-        position = observer_past.unflatten(1, (self.frames, 3))[:, :, ::2]
-        distance = (position.square().sum(-1) + 1e-6).sqrt()
-        nearness = (1 - distance / self.radius_m).clamp_min(0)
-        direction = position / (distance[..., None] + 0.1)
-        velocity = (position[:, -1] - position[:, 0]) * (self.rate_hz / (self.frames - 1))
-        closing = -(velocity * direction[:, -1]).sum(-1, keepdim=True)
-        seen = torch.cat([direction * nearness[..., None], nearness[..., None]], dim=-1).flatten(1)
-        moving = torch.cat([velocity, closing], dim=-1) * nearness[:, -1:]
-        inside = (nearness * EDGE_SHARPNESS).clamp_max(1)
-        close = (CLOSE_RANGE_M - distance).clamp_min(-CLOSE_RANGE_M) * (2 * inside)
-        coming = -(position.diff(dim=1) * self.rate_hz * direction[:, 1:]).sum(-1).clamp(-2, 2) * (
-            1.5 * inside[:, 1:]
-        )
-        return self.layers(torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1) * keep[:, None])
-
-
-class PastEncoder(nn.Module):
-    """Encode the agent's own past: root poses in the ego frame, their changes, and bones (Eq. 13), normalised
-    inside.
-    """
-
-    CHANGE = 3.0
-    """scale of changes from frame to frame, and their bound"""
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, frames: int, channels: int, hidden: int, code: int):
-        super().__init__()
-        self.frames = frames
-        self.register_buffer("mean", torch.zeros(channels))
-        self.register_buffer("std", torch.ones(channels))
-        self.bones = nn.Linear(frames * (channels - 9), 32)
-        self.layers = mlp(((2 * frames - 1) * 9 + 32, hidden, hidden, code))
-
-    def forward(
-        self, past: Float[Tensor, "batch past"], bones_keep: Float[Tensor, "batch"] | None = None
-    ) -> Float[Tensor, "batch code"]:
-        """``bones_keep`` is for training: 0 hides the bones of a sample (they take their mean)."""
-        past = (past.unflatten(1, (self.frames, -1)) - self.mean) / self.std
-        bones = past[:, :, 9:].flatten(1)
-        if bones_keep is not None:
-            bones = bones * bones_keep[:, None]
-        root = past[:, :, :9]
-        change = (root.diff(dim=1) * self.CHANGE).clamp(-self.CHANGE, self.CHANGE)
-        return self.layers(torch.cat([root.flatten(1), change.flatten(1), self.bones(bones)], dim=-1))
-
-
 @dataclass(frozen=True)
 class PerceptionConfig:
     """Sizes of the perception network."""
 
     scene: SceneEncoder
+    observed_past: ObservedPast
     scene_width: int
     scene_block: int
     """cells that pillars average along each axis"""
@@ -277,9 +203,15 @@ class Perception(nn.Module):
                 self.scene = VolumeScene(size.scene_channels, size.scene_width, size.code)
             case _:
                 assert_never(size.scene)
-        self.observer = ObserverEncoder(
-            size.past_frames, size.hidden, size.code, size.observer_radius_m, size.rate_hz
-        )
+        sizes = size.past_frames, size.hidden, size.code
+        match size.observed_past:
+            case "positions":
+                self.observer = ObserverEncoder(*sizes, size.observer_radius_m, size.rate_hz)
+            case "poses":
+                self.observer = ObserverPoseEncoder(*sizes)
+            case _:
+                assert_never(size.observed_past)
+        self.rate_hz = size.rate_hz
         self.past = PastEncoder(size.past_frames, size.past_channels, size.hidden, size.code)
         condition_mask = torch.tensor([float(condition != size.ablated_input) for condition in CONDITIONS])
         self.register_buffer("condition_mask", condition_mask, persistent=False)
@@ -375,7 +307,7 @@ class PerceptionEnsemble(nn.Module):
         """
         member = self.first
         velocity = (frames[:, -1, :POSITION] - frames[:, 0, :POSITION]) * (
-            member.observer.rate_hz / (self.POSTURE_FRAMES - 1)
+            member.rate_hz / (self.POSTURE_FRAMES - 1)
         )
         posture = ((frames.mean(1) - member.past.mean) / member.past.std)[:, POSITION:]
         return (

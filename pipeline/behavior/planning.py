@@ -16,7 +16,14 @@ from torch import nn
 
 from pipeline.behavior.config import Ego, PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule, guided, sample
-from pipeline.behavior.model import ROOT_CHANNELS, BehaviorNets, Scaling, channels_from_bones, past_channels
+from pipeline.behavior.model import (
+    ROOT_CHANNELS,
+    BehaviorNets,
+    Scaling,
+    channels_from_bones,
+    observer_channels,
+    past_channels,
+)
 from pipeline.behavior.path_encoding import PATH_CHANNELS, goal_error, snapped_to_goal
 from pipeline.behavior.perception import POSITION, FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
@@ -121,7 +128,7 @@ def observe(
     """Encode contexts as network inputs (Eq. 11, 12, 13)."""
     frame = world_from_ego(context.world_from_agent[:, -1], ego)
     ego_from_world = rigid.inverse(frame)
-    observer = rigid.apply(ego_from_world, context.observer_world).reshape(len(frame), -1).astype(np.float32)
+    observer = observer_channels(ego_from_world[:, None] @ context.world_from_observer)
     past = past_channels(
         ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
     )
@@ -138,7 +145,7 @@ class PlanCondition:
     full: Float[np.ndarray, "plan condition"]
     """of everything that is kept"""
     blind: Float[np.ndarray, "plan condition"]
-    """of the same without the observer"""
+    """of the same without the observer, or of nothing: the reference of guidance"""
     start: Float[np.ndarray, "plan 3"]
     """where the animal is now, in the ego frame"""
     constraint: SceneConstraint | None
@@ -214,16 +221,14 @@ class Sampler:
         return self.paths(codes, self.goals(codes, sampling, rng), sampling, rng)
 
     def codes(self, observation: Observation, sampling: PlanSamplingConfig, count: int = 1) -> PlanCondition:
-        """Encode what is perceived, with all that ``sampling`` keeps and without the observer, ``count``
-        times.
-        """
+        """Encode what ``sampling`` keeps of it, and the reference of guidance, ``count`` times."""
         keep = np.tile(
             np.array([sampling.scene, sampling.observer, sampling.past], np.float32), (len(observation), 1)
         )
         inputs = (observation.scene_grid, observation.observer_past, observation.past)
         full = blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
         if sampling.guidance != 1:
-            keep[:, 1] = 0
+            keep[:, 1 if sampling.guided == "observer" else slice(None)] = 0
             blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
         start = np.repeat(observation.past.reshape(len(observation), PAST, -1)[:, -1, :3], count, axis=0)
         return PlanCondition(
@@ -281,9 +286,7 @@ class Sampler:
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw a path towards each goal (Eq. 8), metres, ego frame; the reference of guidance sees neither
-        observer nor goal.
-        """
+        """Draw a path towards each goal (Eq. 8), metres, ego frame; guidance acts on it."""
         control = self.scaling.scaled_goal(goal)
 
         def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
@@ -306,16 +309,16 @@ class Sampler:
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame channel"]:
-        """Draw bodies along paths, which guidance never takes away."""
+        """Draw bodies along paths, which are among what is guided where all conditions are."""
         control = self.scaling.scaled_path(path)
 
-        def denoise(code: Array) -> Callable[[Array, float], Array]:
+        def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
             return lambda x, t: self.networks.body(
-                x, _filled(len(x), t), code, control, _filled((len(x), 1), 1.0)
+                x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
             )
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
-        pair = denoise(codes.full), denoise(codes.blind)
+        pair = denoise(codes.full, 1.0), denoise(codes.blind, float(sampling.guided == "observer"))
         body = self._drawn(
             *pair,
             shape,

@@ -14,12 +14,10 @@ from pipeline.behavior.diffusion import STANDARD, Schedule
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
     PATH_CHANNELS,
-    REST_DAMPING,
-    VELOCITY_POWER,
+    expected_steps,
     with_powered_length,
 )
 from pipeline.behavior.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY_CHANNELS
-from pipeline.behavior.trajectories import RATE_HZ
 
 HALF_M = GRID_SHAPE[0] * GRID_CELL_M / 2
 """from the middle of a map to its edge"""
@@ -102,5 +100,4 @@ class WaypointUNet(ControlUNet):
     ) -> Float[Tensor, "batch frame 3"]:
         """Return where noisy strides are expected to lead, metres from the animal."""
         strides = (self.share[t.long()][:, None, None] * x).mT * self.velocity_std
-        root = strides[..., :3] * torch.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
-        return (with_powered_length(root, 1 / VELOCITY_POWER) / RATE_HZ).cumsum(1)
+        return expected_steps(strides).cumsum(1)

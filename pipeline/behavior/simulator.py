@@ -262,7 +262,7 @@ class Simulator:
         seen = (
             context.observer_world if observer is None else np.tile(np.asarray(observer, float), (1, PAST, 1))
         )
-        self.flock.begin(replace(context, observer_world=seen), rng)
+        self.flock.begin(replace(context, observer_world=seen, observer_rotation=None), rng)
         self.frame = 0
         return self._state(self.flock.past[-1])
 

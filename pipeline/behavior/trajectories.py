@@ -12,11 +12,13 @@ from jaxtyping import Bool, Float, Int, Integer
 
 from pipeline.core.errors import InputError
 from pipeline.data import npz
+from pipeline.geometry import rigid
 
 RATE_HZ = 10
 PAST = 8
 FUTURE = 56
 TRAIN, TEST = 0, 1
+UP = np.array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -39,16 +41,30 @@ class Context:
     observer_world: Float[np.ndarray, "window 8 3"]
     video: Int[np.ndarray, "window"] | None = None
     """number of the recording, which names the scene; None where there is one scene"""
+    observer_rotation: Float[np.ndarray, "window 8 3 3"] | None = None
+    """of ``world_from_camera``; None where only positions are known"""
 
     def __getitem__(self, index: slice | np.ndarray) -> "Context":
         """Return some of the windows."""
         video = None if self.video is None else self.video[index]
+        rotation = None if self.observer_rotation is None else self.observer_rotation[index]
         return Context(
-            self.world_from_agent[index], self.agent_from_bone[index], self.observer_world[index], video
+            self.world_from_agent[index],
+            self.agent_from_bone[index],
+            self.observer_world[index],
+            video,
+            rotation,
         )
 
     def __len__(self) -> int:
         return len(self.world_from_agent)
+
+    @property
+    def world_from_observer(self) -> Float[np.ndarray, "window 8 4 4"]:
+        """The observer's poses (OpenCV axes); one whose rotation is not known looks at the agent, upright."""
+        if self.observer_rotation is not None:
+            return rigid.make(self.observer_rotation, self.observer_world)
+        return rigid.look_at(self.observer_world, self.world_from_agent[..., :3, 3], UP)
 
 
 @dataclass(frozen=True)
@@ -176,5 +192,8 @@ class BehaviorData:
 
         agent, camera = gathered("world_from_agent"), gathered("world_from_camera")
         bone = gathered("agent_from_bone", slice(None) if bones else slice(0, 0))
-        context = Context(agent[:, :PAST], bone[:, :PAST], camera[:, :PAST, :3, 3], self.video[index])
+        observer = camera[:, :PAST]
+        context = Context(
+            agent[:, :PAST], bone[:, :PAST], observer[..., :3, 3], self.video[index], observer[..., :3, :3]
+        )
         return context, Future(agent[:, PAST:], bone[:, PAST:])

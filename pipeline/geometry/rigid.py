@@ -172,11 +172,12 @@ def mean_rotation(
 
 
 def look_at(
-    eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """Return ``world_from_camera`` (OpenCV axes) of an upright camera at ``eye`` that looks at ``target``."""
-    forward = np.asarray(target, float) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
+    eye: Float[np.ndarray, "*batch 3"], target: Float[np.ndarray, "*batch 3"], up: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Return ``world_from_camera`` (OpenCV axes) of upright cameras at ``eye`` that look at ``target``.
+
+    No target may be straight above or below its camera.
+    """
+    forward = _normalized(np.asarray(target, float) - eye)
+    right = _normalized(np.cross(forward, up))
     return make(np.stack([right, np.cross(forward, right), forward], axis=-1), np.asarray(eye, float))

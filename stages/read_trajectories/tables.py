@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.behavior.trajectories import UP
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
 from stages.read_trajectories.motion import ABSENT_OBSERVER_M, CLIP_GAP_S, absent_observer, concatenated_times
@@ -68,7 +69,7 @@ def motion_from_csv(
     path: Path,
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame 4 4"]]:
     """Return times, ``world_from_agent`` and ``world_from_camera``; ids follow each other on one clock, as do
-    stretches of one id that lie further apart than clips are put.
+    stretches of one id that lie further apart than clips are put. The observer looks at the animal.
 
     Rows without a position are frames in which the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
     """
@@ -104,6 +105,8 @@ def motion_from_csv(
     camera = absent_observer(len(order))
     if observed:
         seen = np.stack([value[name][order] for name in OBSERVER_COLUMNS], axis=-1)
+        both = np.isfinite(seen).all(1) & np.isfinite(agent).all((1, 2))
+        camera[both] = rigid.look_at(seen[both], agent[both, :3, 3], UP)
         camera[:, :3, 3] = np.where(np.isfinite(seen), seen, ABSENT_OBSERVER_M)
     return concatenated_times([value["time"][mine] for mine in rows]), agent, camera
 

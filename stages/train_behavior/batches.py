@@ -47,7 +47,7 @@ class EgoTracks:
 
     root: Float[Tensor, "window 64 3"]
     rotation: Float[Tensor, "window 64 3 3"]
-    observer: Float[Tensor, "window 8 3"]
+    ego_from_observer: Float[Tensor, "window 8 4 4"]
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class TrainingWindows:
     """All training windows: every frame once, and which frames each window holds."""
 
     world_from_agent: Float[Tensor, "frame 4 4"]
-    observer_world: Float[Tensor, "frame 3"]
+    world_from_observer: Float[Tensor, "frame 4 4"]
     bones: Float[Tensor, "frame channel"]
     world_from_ego: Float[Tensor, "window 4 4"]
     frame: Int[Tensor, "window 64"]
@@ -71,8 +71,8 @@ class TrainingWindows:
         """Express some windows in the ego frames of their current times."""
         ego_from_world = rigid_torch.inverse(self.world_from_ego[index])
         ego_from_agent = ego_from_world[:, None] @ self.world_from_agent[self.frame[index]]
-        observer = rigid_torch.apply(ego_from_world, self.observer_world[self.frame[index, :PAST]])
-        return EgoTracks(ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], observer)
+        ego_from_observer = ego_from_world[:, None] @ self.world_from_observer[self.frame[index, :PAST]]
+        return EgoTracks(ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], ego_from_observer)
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def windows_from_data(
     """Put the frames of all recordings in one row and index each window in it."""
     tracks = [data.trajectories[video] for video in data.videos]
     agent = np.concatenate([track.world_from_agent for track in tracks])
-    observer = np.concatenate([track.world_from_camera[:, :3, 3] for track in tracks])
+    observer = np.concatenate([track.world_from_camera for track in tracks])
     bones = np.concatenate(
         [channels_from_bones(track.agent_from_bone, data.agent_from_bone_rest) for track in tracks]
     )
@@ -181,7 +181,7 @@ def windows_from_data(
     frame = world_from_ego(agent[rows[:, PAST - 1]], architecture.ego)
     number = scenes.number(data.video[index], len(index))
     tables = (torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, bones, frame))
-    met = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST]])
+    met = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST], :3, 3])
     met = met[:0] if architecture.ablated_input == "observer" else met
     indices = (torch.from_numpy(index) for index in (rows, number, met))
     return TrainingWindows(*tables, *indices)
@@ -213,15 +213,12 @@ def largest_turn_rad(augmentation: AugmentationConfig) -> float:
     return math.pi if augmentation.turn > 0 else 0.0
 
 
-def statistics_from_windows(
-    windows: TrainingWindows, turn_rad: float, *, per_frame: bool = False
-) -> WindowStatistics:
+def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> WindowStatistics:
     """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past to at most 8,192
     windows.
 
-    Strides are scaled in all frames alike or, with ``per_frame``, in each on its own, as the released code
-    scales. The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way.
-    What is remembered of a body is scaled as the body is.
+    The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is
+    remembered of a body is scaled as the body is.
     """
     some = torch.arange(0, len(windows), -(-len(windows) // MAX_STATISTICS_WINDOWS))
     tracks, rows = windows.tracks(some), windows.frame[some]
@@ -233,8 +230,7 @@ def statistics_from_windows(
     strides = (
         velocity_channels_from_path(tracks.root[:, PAST:], tracks.root[:, PAST - 1])[..., :3].double().numpy()
     )
-    each = np.swapaxes(strides, 0, 1) if per_frame else strides.reshape(1, -1, 3)
-    velocity_std = np.array([[*_spread(frame), 1.0] for frame in each])
+    velocity_std = np.array([[*_spread(strides.reshape(-1, 3)), 1.0]])
     scaling = Scaling(
         _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER)), velocity_std, path_std, *whole
     )
@@ -337,7 +333,8 @@ def draw_batch(
     shift = torch.randn(size, 1, 3, generator=generator) * (
         OBSERVER_SHIFT_M if augmentation.past > 0 else 0.0
     )
-    observer = (tracks.observer + shift) @ new_from_old.mT
+    observer = (tracks.ego_from_observer[..., :3, 3] + shift) @ new_from_old.mT
+    facing = new_from_old[:, None] @ tracks.ego_from_observer[..., :3, :3] @ flip[:, None]
     frames = windows.frame[index]
     remembered = body_channels(
         *with_posture_noise(
@@ -360,7 +357,7 @@ def draw_batch(
     )
     return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
-        observer.flatten(1),
+        torch.cat([observer, rigid_torch.rotation_to_6d(facing)], dim=-1).flatten(1),
         past.flatten(1),
         held,
         ((torch.rand(size, generator=generator) >= augmentation.hide_bones) & (side > 0)).float(),

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipeline.behavior.config import AblatedInput, Control, Ego, Family, MapLookup, NoiseCourse, SceneEncoder
+from pipeline.behavior.config import AblatedInput, Control, Ego, Family, MapLookup, ObservedPast, SceneEncoder
 
 Weighting = Literal["noise", "velocity", "flow"]
 """Which error has equal weight at all noise levels, see `objective.squared_error`."""
@@ -64,10 +64,13 @@ class ObjectiveConfig:
 
     code_dropout: float = 0.1
     """Dropout on the perception code."""
+    joint_dropout: float = 0.0
+    """Probability that scene, observer, past and goal or path are dropped together, so that guidance may act
+    on all of them at once; each is also dropped on its own with probability 0.1."""
     weighting: Weighting = "velocity"
     """Error with equal weight at all noise levels: of the noise, as in the paper; of the velocity, which
-    gives noisy steps, where the outline is decided, their share; or of the straight line of rectified flow.
-    """
+    gives noisy steps, where the outline is decided, their share; or of the straight line of rectified flow,
+    with its noise levels in place of the 50 linear ones of the paper."""
     path_share: float = 0.5
     """Share of a batch's windows that paths, whose network is costly, are trained on in a step."""
     body_share: float = 0.5
@@ -89,9 +92,6 @@ class BehaviorTrainingConfig:
     """Augmentation of the windows."""
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     """Losses."""
-    per_frame: bool = False
-    """Scale paths in each frame of the horizon on its own, as the released code does, not in all frames
-    alike."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,9 @@ class Config:
     scene: SceneEncoder = "pillars"
     """Scene encoder: 2.5-D with height in 32 channels, or the six 3-D convolutions of 128 channels of the
     paper."""
+    observed_past: ObservedPast = "positions"
+    """What is read of the observer's past: positions, from which distance and approach are computed, or SE(3)
+    poses as in the paper; where rotations are not known, the observer looks at the agent."""
     ensemble_size: int = 3
     """Perception and goal networks that are trained side by side and whose predictions are averaged, against
     overfitting."""
@@ -126,9 +129,6 @@ class Config:
     map_lookup: MapLookup = "attention"
     """How goals read the map of the 2.5-D encoder: by attention, or, as in the released code, at the noisy
     point itself; then paths read it too, at each noisy waypoint."""
-    schedule: NoiseCourse = "linear"
-    """Noise levels: 50 linear ones as in the paper, or those of rectified flow (train it with `weighting =
-    "flow"`)."""
     training: BehaviorTrainingConfig = field(default_factory=BehaviorTrainingConfig)
     """Length of training, augmentation, losses."""
     seed: int = 0

@@ -17,11 +17,13 @@ from safetensors.torch import save_file
 
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contract
+from pipeline.behavior.encoders import POSE_CHANNELS
+from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contract, observer_channels
 from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
-from pipeline.behavior.trajectories import PAST
+from pipeline.behavior.trajectories import PAST, UP
+from pipeline.geometry import rigid
 
 NETWORKS = ("perception", "goal", "path", "body")
 
@@ -114,7 +116,7 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
         case "perception":
             grid = {
                 "scene_grid": (a.scene_channels, *GRID_SHAPE),
-                "observer_past": (PAST * 3,),
+                "observer_past": (PAST * POSE_CHANNELS,),
                 "past": (PAST * (9 + 6 * a.bones),),
             }
             return grid | {"keep": (3,)}, "condition"
@@ -141,10 +143,11 @@ def golden_observation(a: Architecture) -> Observation:
 
     observer = np.stack(
         [np.linspace(0.5, 0.2, PAST), np.full(PAST, 1.2), np.linspace(1.8, 1.1, PAST)], axis=-1
-    ).reshape(1, -1)
+    )
+    facing = rigid.look_at(observer, np.zeros(3), UP)
     scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
     return Observation(
-        scene, observer.astype(np.float32), wave(PAST * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
+        scene, observer_channels(facing[None]), wave(PAST * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
     )
 
 

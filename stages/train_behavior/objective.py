@@ -59,13 +59,14 @@ def level_losses(
     """Return the mean error of goal, path and body, each given the level above it; ``goal`` takes the
     perception code.
     """
+    joint = joint_mask(batch, objective, generator)
     with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
-        code = perceive(nets, batch, objective, generator)
+        code = perceive(nets, batch, objective, generator, joint)
     goal_loss = {} if phase == "sequences" else {"goal": goal(code).mean()}
     if phase == "goals":
         return goal_loss
     path_rows, body_rows, known = sequence_rows(batch, objective)
-    steered = keep_mask(len(code), 1, generator).to(code.device)
+    steered = keep_mask(len(code), 1, generator).to(code.device) * joint
     towards, along = batch.goal[path_rows], batch.places[body_rows]
     path = error(
         lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows]
@@ -101,10 +102,17 @@ def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor,
 
 
 def perceive(
-    nets: BehaviorNets, batch: TrainingBatch, objective: ObjectiveConfig, generator: torch.Generator
+    nets: BehaviorNets,
+    batch: TrainingBatch,
+    objective: ObjectiveConfig,
+    generator: torch.Generator,
+    joint: Float[Tensor, "batch 1"],
 ) -> Float[Tensor, "batch condition"]:
-    """Encode a batch, dropping scene, observer and past independently, for every member alike."""
-    keep = keep_mask(len(batch.goal), 3, generator).to(batch.goal.device)
+    """Encode a batch, dropping scene, observer and past independently, and all where ``joint`` is 0.
+
+    What is dropped is so for every member alike.
+    """
+    keep = keep_mask(len(batch.goal), 3, generator).to(batch.goal.device) * joint
     keep[:, 1] = torch.maximum(keep[:, 1], batch.oversampled.float())
     readings = [
         member.encode_training(batch.scene, batch.observer_past, batch.past, keep, batch.bones_keep)
@@ -144,6 +152,16 @@ def goal_error(
 def keep_mask(size: int, count: int, generator: torch.Generator) -> Float[Tensor, "batch count"]:
     """Draw 1 with probability ``1 - drop``, else 0."""
     return (torch.rand(size, count, generator=generator) >= CONDITION_DROPOUT).float()
+
+
+def joint_mask(
+    batch: TrainingBatch, objective: ObjectiveConfig, generator: torch.Generator
+) -> Float[Tensor, "batch 1"]:
+    """Draw 0 where all conditions are dropped together, else 1; draws nothing where none are."""
+    size, device = len(batch.goal), batch.goal.device
+    if objective.joint_dropout == 0:
+        return torch.ones(size, 1, device=device)
+    return (torch.rand(size, 1, generator=generator) >= objective.joint_dropout).float().to(device)
 
 
 def squared_error(

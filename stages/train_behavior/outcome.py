@@ -30,6 +30,7 @@ def architecture_for(config: Config, data: BehaviorData, scenes: Scenes) -> Arch
         bones=len(data.agent_from_bone_rest),
         ego=config.ego,
         scene=config.scene,
+        observed_past=config.observed_past,
         scene_width=SCENE_CHANNELS[config.scene],
         scene_channels=scenes.channels,
         observer_radius_m=config.observer_radius_m,

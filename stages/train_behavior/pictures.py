@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.encoders import POSE_CHANNELS
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.planning import Observation, Sampler
 from pipeline.behavior.scenes import Scenes
@@ -92,9 +93,8 @@ def fans(
         )
         goals = goals.reshape(len(frame), count, 3)
         for column, axis in enumerate(row):
-            rooms[column].window(
-                axis, frame[column], observation.observer_past[column].reshape(-1, 3), goals[column]
-            )
+            seen = observation.observer_past[column].reshape(-1, POSE_CHANNELS)[:, :3]
+            rooms[column].window(axis, frame[column], seen, goals[column])
             if lines is not None:
                 rooms[column].lines(axis, frame[column], lines[column])
         row[0].set_ylabel(name)

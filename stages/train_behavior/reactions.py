@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.behavior.config import PlanSamplingConfig
-from pipeline.behavior.model import Architecture
+from pipeline.behavior.model import Architecture, observer_channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, UP, BehaviorData
+from pipeline.geometry import rigid
 
 SAMPLES = 16
 SIDES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -64,9 +65,12 @@ def moments(
 def approach(
     side: Float[np.ndarray, "3"], distance_m: float, speed_m_s: float
 ) -> Float[np.ndarray, "observer_past"]:
-    """Return an observer's past in the ego frame: walking up from ``side``, now ``distance_m`` away."""
+    """Return an observer's past in the ego frame: it walks up from ``side``, is now ``distance_m`` away, and
+    looks at the animal.
+    """
     before_s = np.arange(PAST - 1, -1, -1)[:, None] / RATE_HZ
-    return ((distance_m + speed_m_s * before_s) * side + [0.0, 1.0, 0.0]).ravel().astype(np.float32)
+    eye = (distance_m + speed_m_s * before_s) * side + UP
+    return observer_channels(rigid.look_at(eye, np.zeros(3), UP)[None])[0]
 
 
 def measure(

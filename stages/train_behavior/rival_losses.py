@@ -13,7 +13,14 @@ from pipeline.core import distributed
 from pipeline.rivals.samplers import LOG_STD_BOUNDS, LOG_STD_STEP, MEAN_STEP
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig
-from stages.train_behavior.objective import Denoise, TrainingPhase, level_losses, perceive, squared_error
+from stages.train_behavior.objective import (
+    Denoise,
+    TrainingPhase,
+    joint_mask,
+    level_losses,
+    perceive,
+    squared_error,
+)
 
 
 def gaussian_losses(
@@ -62,7 +69,7 @@ def one_stage_losses(
     them.
     """
     assert phase == "all", "a model of one stage has no goals that could learn before"
-    code = perceive(nets, batch, objective, generator)
+    code = perceive(nets, batch, objective, generator, joint_mask(batch, objective, generator))
     known = ~batch.mirrored
     seen = torch.where(known[:, None, None], batch.body, torch.zeros_like(batch.body))
     whole = torch.cat([batch.path, seen], dim=1)

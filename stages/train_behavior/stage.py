@@ -31,7 +31,9 @@ def run(
     distributed.join(device)
     data = BehaviorData.load(inputs.behavior_data).with_horizon(frames_from_seconds(config.horizon_s))
     scenes = Scenes.load(inputs.behavior_data, data.videos)
-    architecture, schedule = outcome.architecture_for(config, data, scenes), Schedule(course=config.schedule)
+    architecture = outcome.architecture_for(config, data, scenes)
+    weighting = config.training.objective.weighting
+    schedule = Schedule(course="rectified" if weighting == "flow" else "linear")
     check_settings(config, data, architecture, str(inputs.behavior_data))
     progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
     fitted = train(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
 from pipeline.behavior.pointwise import WaypointUNet
@@ -69,9 +70,7 @@ def train(
         architecture.family
     ]
     windows = windows_from_data(data, data.indices(TRAIN), architecture, scenes)
-    statistics = statistics_from_windows(
-        windows, largest_turn_rad(settings.augmentation), per_frame=settings.per_frame
-    )
+    statistics = statistics_from_windows(windows, largest_turn_rad(settings.augmentation))
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(scenes, architecture.scene_stride, device)
@@ -168,8 +167,9 @@ def initial_nets(
         buffer[:] = torch.from_numpy(numbers)
     if nets.goal.map is not None:
         nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
-    if isinstance(nets.path, WaypointUNet):
-        nets.path.velocity_std[:] = torch.from_numpy(scaling.velocity_std)
+    for net in (nets.path, nets.body):
+        if isinstance(net, WaypointUNet | OneStageDenoiser):
+            net.velocity_std[:] = torch.from_numpy(scaling.velocity_std)
     return nets
 
 

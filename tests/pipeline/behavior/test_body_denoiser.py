@@ -1,8 +1,9 @@
 import numpy as np
 import torch
 
-from pipeline.behavior.body_denoiser import BodyDenoiser, rotated_to_heading
+from pipeline.behavior.body_denoiser import BodyDenoiser, OneStageDenoiser, rotated_to_heading
 from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.path_encoding import velocity_channels_from_path
 from pipeline.geometry import rigid_torch
 
 FRAMES = 40
@@ -25,13 +26,29 @@ def test_a_body_is_held_to_look_where_it_goes_and_to_stay_as_it_is():
     for first, speed in ((0.4, 0.8), (0.4, 0.0)):
         path, yaw = walk(torch.full((FRAMES,), 0.03), speed)
         held = columns(torch.full((FRAMES,), first))
-        looks = rotated_to_heading(held, net.headings(net.steps(path), held))
+        looks = rotated_to_heading(held, net.headings(net.steps(path, torch.zeros(1), path), held))
         told = torch.atan2(-looks[0, 2], looks[0, 0])  # of the x axis
         if speed:
             assert (told - yaw)[10:30].abs().max() < 0.1
             assert (told[30:] - told[29]).abs().max() < 1e-4
         else:
             assert (told - first).abs().max() < 1e-4
+
+
+def test_a_one_stage_body_has_the_heading_of_its_own_path():
+    """The same steps, whether the path is given or denoised along with the body; none where noise hides it."""
+    net, std = OneStageDenoiser(torch.nn.Identity(), 6, FRAMES), torch.tensor([0.4, 0.1, 0.4, 1.0])
+    net.velocity_std[:] = std
+    path, _ = walk(torch.full((FRAMES,), 0.03), 0.8)
+    given = BodyDenoiser(torch.nn.Identity(), 6, FRAMES).steps(path, torch.zeros(1), path)
+    strides = velocity_channels_from_path(path.mT, path[..., 0] - given[..., 0]) / std
+    whole = torch.cat([strides.mT, torch.randn(1, 6, FRAMES)], dim=1)
+    clean, noisy = (
+        net.steps(Schedule().alpha_bar[t] ** 0.5 * whole, torch.tensor([float(t)]), path * 0) for t in (0, 49)
+    )
+    torch.testing.assert_close(clean[..., :30], given[..., :30], atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(clean[..., 31:], torch.zeros(1, 3, FRAMES - 31), atol=1e-4, rtol=0)
+    assert (noisy.norm(dim=1) < given.norm(dim=1))[..., :30].all()
 
 
 def test_what_is_denoised_is_the_departure_from_the_posture():

@@ -66,6 +66,8 @@ def test_same_noise_gives_the_same_plan_and_conditions_can_be_switched_off(ats, 
     np.testing.assert_array_equal(plan().goal, plan().goal)
     ignoring = plan(guidance=0.0).goal
     np.testing.assert_allclose(ignoring, plan(observer=False).goal, atol=1e-6)
+    nothing = plan(scene=False, observer=False, past=False, avoid_solid=False).goal
+    np.testing.assert_allclose(plan(guidance=0.0, guided="all", avoid_solid=False).goal, nothing, atol=1e-6)
     full, half = plan(guidance=1.0).goal, plan(guidance=0.5).goal
     assert np.abs(full - ignoring).max() > np.abs(half - ignoring).max() > 0
 

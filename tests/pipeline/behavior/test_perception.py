@@ -51,6 +51,7 @@ def test_turning_and_moving_the_world_changes_no_observation():
         quarter @ context.world_from_agent,
         context.agent_from_bone,
         rigid.apply(quarter, context.observer_world),
+        observer_rotation=quarter[:3, :3] @ context.observer_rotation,
     )
     before, after = observe(context, volume, REST, "yaw"), observe(turned, turned_volume, REST, "yaw")
     np.testing.assert_allclose(after.observer_past, before.observer_past, atol=1e-5)
@@ -66,11 +67,45 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
     track = torch.linspace(1, 0, 8)[:, None] * torch.tensor([[0.5, 0.0, 0.5]]) + torch.tensor(
         [[0.0, 1.3, 1.0]]
     )
-    near, far = track.reshape(1, -1), (track + torch.tensor([0.0, 0.0, 3.5])).reshape(1, -1)
+    facing = torch.tensor([1.0, 0, 0, 0, -1, 0]).expand(8, 6)
+    near, far = (
+        torch.cat([track + torch.tensor([0.0, 0.0, away]), facing], dim=1).reshape(1, -1)
+        for away in (0.0, 3.5)
+    )
     none = encode(near, torch.zeros(1))
     torch.testing.assert_close(encode(far, torch.ones(1)), none)
     torch.testing.assert_close(encode(far * 2, torch.ones(1)), none)
     assert (encode(near, torch.ones(1)) - none).abs().max() > 1e-3
+
+
+def test_where_an_observer_looks_counts_only_where_poses_are_read():
+    context, _ = wandering().windows(np.array([3]))
+    known = replace(context, observer_world=context.world_from_agent[..., :3, 3] + [0.8, 1.0, 0.3])
+    unknown = replace(known, observer_rotation=None)
+    codes = {}
+    for kind in ("positions", "poses"):
+        encode = next(iter(BehaviorNets(replace(ARCHITECTURE, observed_past=kind)).perception)).observer
+        turned, looking = (
+            torch.from_numpy(observe(each, room(), REST, "yaw").observer_past) for each in (known, unknown)
+        )
+        codes[kind] = [encode(past, torch.ones(1)) for past in (turned, looking)]
+        none = encode(turned, torch.zeros(1))
+        nobody = turned.clone().unflatten(1, (8, 9))
+        nobody[..., 0] = 1000.0
+        torch.testing.assert_close(encode(nobody.flatten(1), torch.ones(1)), none)
+        assert not torch.equal(codes[kind][0], none)
+    torch.testing.assert_close(*codes["positions"], atol=1e-6, rtol=0)
+    assert (codes["poses"][0] - codes["poses"][1]).abs().max() > 1e-3
+
+
+def test_an_observer_of_unknown_rotation_looks_at_the_agent():
+    context, _ = wandering().windows(np.array([3, 50]))
+    unknown = replace(context, observer_rotation=None)
+    pose, agent = unknown.world_from_observer, context.world_from_agent[..., :3, 3]
+    seen = rigid.apply(rigid.inverse(pose), agent[..., None, :])[..., 0, :]
+    np.testing.assert_allclose(seen[..., :2], 0, atol=1e-9)
+    np.testing.assert_allclose(seen[..., 2], np.linalg.norm(agent - context.observer_world, axis=-1))
+    assert (pose[..., 1, 1] < 0).all(), "the camera's y axis points down"
 
 
 def alike(code: torch.Tensor) -> list[bool]:
@@ -90,7 +125,7 @@ def alike(code: torch.Tensor) -> list[bool]:
 def test_a_blind_model_never_sees_its_condition():
     inputs = [
         torch.randn(2, 16, 64, 8, 64),
-        torch.rand(2, 24),
+        torch.rand(2, 72),
         torch.randn(2, 8 * (9 + 18)),
         torch.ones(2, 3),
     ]
@@ -101,7 +136,7 @@ def test_a_blind_model_never_sees_its_condition():
 
 def test_dropped_conditions_do_not_reach_the_code():
     nets = BehaviorNets(ARCHITECTURE).eval()
-    inputs = [torch.randn(2, 16, 64, 8, 64), torch.rand(2, 24), torch.randn(2, 8 * (9 + 18))]
+    inputs = [torch.randn(2, 16, 64, 8, 64), torch.rand(2, 72), torch.randn(2, 8 * (9 + 18))]
     nothing = nets.perception(*inputs, torch.zeros(2, 3))
     torch.testing.assert_close(nothing[0], nothing[1])
     for number in range(3):

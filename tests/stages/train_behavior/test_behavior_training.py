@@ -8,13 +8,13 @@ import torch
 from pipeline.behavior import model
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.path_encoding import velocity_channels_from_path
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import PAST, TRAIN, frames_from_seconds
 from pipeline.core import training as fit
 from pipeline.core.errors import InputError
+from pipeline.geometry import rigid_torch
 from stages.train_behavior import objective, outcome, training
 from stages.train_behavior.batches import (
     MAX_REPEATS,
@@ -41,7 +41,7 @@ from stages.train_behavior.export import (
     write_contract,
     write_networks,
 )
-from stages.train_behavior.objective import goal_error, losses, perceive, squared_error
+from stages.train_behavior.objective import goal_error, joint_mask, losses, perceive, squared_error
 from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.refusals import check_settings
 from stages.train_behavior.training import initial_nets, train, two_cosines
@@ -100,11 +100,20 @@ def test_turning_and_mirroring_move_everything_together(windows):
             )
             torch.testing.assert_close(ours[:, 1], theirs[:, 1])
         between = [
-            b.observer_past[:, -3:]
+            b.observer_past[:, -9:-6]
             - torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal(b.goal.numpy())).float()
             for b in (plain, moved)
         ]
         torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
+        facing = [
+            rigid_torch.rotation_from_6d(b.observer_past.unflatten(1, (8, 9))[..., 3:])
+            for b in (plain, moved)
+        ]
+        turned = [each[:, 0].mT @ each[:, -1] for each in facing]
+        for each in turned:
+            torch.testing.assert_close(each @ each.mT, torch.eye(3).expand(16, 3, 3), atol=1e-4, rtol=0)
+        trace = [each.diagonal(dim1=1, dim2=2).sum(1) for each in turned]
+        torch.testing.assert_close(*trace, atol=1e-4, rtol=0)
 
 
 def test_approaches_are_drawn_more_often_and_then_perceived(windows, monkeypatch):
@@ -119,6 +128,7 @@ def test_approaches_are_drawn_more_often_and_then_perceived(windows, monkeypatch
             replace(batch, oversampled=chosen),
             ObjectiveConfig(code_dropout=0.0),
             torch.Generator().manual_seed(0),
+            torch.ones(len(batch.goal), 1),
         )
         for chosen in (batch.oversampled, ~batch.oversampled)
     )
@@ -126,6 +136,22 @@ def test_approaches_are_drawn_more_often_and_then_perceived(windows, monkeypatch
     assert not drawn(replace(windows, approached=torch.zeros(0, dtype=torch.long)), PLAIN)[
         0
     ].oversampled.any()
+
+
+def test_all_conditions_are_dropped_together_as_often_as_asked(windows, monkeypatch):
+    monkeypatch.setattr(objective, "CONDITION_DROPOUT", 0.0)
+    batch, _ = drawn(windows, replace(PLAIN, approached=0.0))
+    nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval()
+    settings, generator = (
+        ObjectiveConfig(code_dropout=0.0, joint_dropout=0.5),
+        torch.Generator().manual_seed(0),
+    )
+    joint = joint_mask(batch, settings, generator)
+    assert 0 < joint.mean() < 1
+    code = perceive(nets, batch, settings, generator, joint)
+    dropped = torch.isclose(code, code[joint[:, 0].argmin()], atol=1e-6).all(1)
+    assert (dropped == (joint[:, 0] == 0)).all()
+    assert (joint_mask(batch, ObjectiveConfig(), generator) == 1).all()
 
 
 def test_only_who_comes_up_and_is_near_approaches():
@@ -205,17 +231,6 @@ def test_the_error_of_rectified_flow_is_that_of_noise_less_clean_sample():
     torch.testing.assert_close(error, (predicted - true) ** 2, atol=1e-4, rtol=1e-3)
 
 
-def test_strides_are_scaled_frame_by_frame_where_asked(windows):
-    alike, each = (
-        statistics_from_windows(windows, 0.0, per_frame=per_frame).scaling.velocity_std
-        for per_frame in (False, True)
-    )
-    assert alike.shape == (1, 4) and each.shape == (56, 4)
-    root = windows.tracks(torch.arange(len(windows))).root
-    level = velocity_channels_from_path(root[:, PAST:], root[:, PAST - 1])[:, :, [0, 2]]
-    np.testing.assert_allclose(each[:, 0], level.square().mean((0, 2)).sqrt().clamp_min(0.05), rtol=1e-3)
-
-
 def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=3, goal_steps=1, batch=8))
     half = replace(settings, optimization=replace(settings.optimization, precision="bfloat16"))
@@ -233,7 +248,7 @@ def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
 
 def test_a_model_that_reads_pointwise_is_written_and_read(data, tmp_path):
     shape = replace(ARCHITECTURE, map_lookup="pointwise")
-    settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8), per_frame=True)
+    settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8))
     fitted = train(data, Scenes.of(room()), shape, Schedule(course="rectified"), settings, seed=0)
     outcome.write_trained(tmp_path, fitted, shape, Schedule(course="rectified"), REST)
     architecture, nets, scaling, schedule, _ = model.load(tmp_path)
@@ -347,7 +362,7 @@ class Timid:
     """
 
     def perceive(self, scene_grid, observer_past, past, keep):
-        position = observer_past[:, [-3, -1]] * keep[:, 1:2]
+        position = observer_past[:, [-9, -7]] * keep[:, 1:2]
         distance = np.linalg.norm(position, axis=1, keepdims=True)
         return np.where((distance > 0) & (distance < 4), -position / np.maximum(distance, 1e-6), 0).astype(
             np.float32

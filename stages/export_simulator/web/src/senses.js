@@ -6,7 +6,6 @@ import { nearestAllowed } from './clearing.js';
 import { Support } from './support.js';
 import {
   ROW,
-  apply,
   compose,
   conjugate,
   inverse,
@@ -43,7 +42,7 @@ export class Senses {
     return {
       frame,
       sceneGrid: this.around(frame),
-      observerPast: Float32Array.from(observer.flatMap((row) => apply(egoFromWorld, place(row)))),
+      observerPast: Float32Array.from(observer.flatMap((row) => poseChannels(compose(egoFromWorld, row)))),
       past: Float32Array.from(past.flatMap((rows) => this.pastChannels(egoFromWorld, rows))),
     };
   }
@@ -131,7 +130,7 @@ export class Senses {
 
   pastChannels(egoFromWorld, rows) {
     const root = compose(egoFromWorld, Array.from(rows.slice(0, ROW)));
-    const channels = [...place(root), ...sixFromTurn(turn(root))];
+    const channels = poseChannels(root);
     this.rest.forEach((rest, bone) => {
       const row = Array.from(rows.slice((bone + 1) * ROW, (bone + 2) * ROW));
       channels.push(
@@ -164,6 +163,10 @@ function rowFromMatrix(m) {
     m[2][3],
     ...turnFromMatrix([...m[0].slice(0, 3), ...m[1].slice(0, 3), ...m[2].slice(0, 3)]),
   ];
+}
+
+function poseChannels(row) {
+  return [...place(row), ...sixFromTurn(turn(row))];
 }
 
 // First two columns of the rotation.
