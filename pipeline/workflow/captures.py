@@ -17,6 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.videos import ROLES, SPLITS, Role, Split, Video
 from pipeline.recordings.formats import UNDERSTOOD, format_of, has_depth
 from pipeline.workflow import dag
+from pipeline.workflow.artifact import MANIFEST
 from pipeline.workflow.dag import Flow
 
 SIDECAR = ".toml"
@@ -106,9 +107,10 @@ def refuse_strangers(folder: Path, flow: Flow = "recordings") -> None:
         )
 
 
-def extra_inputs(agent: str, names: Sequence[str]) -> list[Path]:
-    """Return those files of these names beside an agent's recordings that exist."""
-    return [path for path in (Path("captures", agent, name) for name in names) if path.is_file()]
+def extra_inputs(agent: str, names: Sequence[str], *, artifacts: bool = True) -> list[Path]:
+    """Return those files of these names beside an agent's recordings that exist, and finished artifacts."""
+    paths = (Path("captures", agent, name) for name in names)
+    return [path for path in paths if path.is_file() or (artifacts and (path / MANIFEST).is_file())]
 
 
 def sidecars(agent: str, file: str, names: Sequence[str]) -> dict[str, Path]:

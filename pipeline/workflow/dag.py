@@ -23,13 +23,8 @@ BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
 REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only")
 """Variants of an agent that Table 1 compares its registration with."""
 RECONSTRUCTION_VARIANTS = (
-    "no_localizer",
-    "no_feature_loss",
-    "no_annealing",
-    "mlp_fields",
-    "totalrecon",
-    "totalrecon_single",
-)
+    "no_localizer", "no_feature_loss", "no_annealing", "mlp_fields", "totalrecon", "totalrecon_single",
+)  # fmt: skip
 """Variants of an agent that Table 3 compares its reconstruction with."""
 VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}
 PLUMBING = (
@@ -89,7 +84,8 @@ class Node:
     distributed: bool = False
     """Several processes, each with a GPU of its own, can do it together."""
     extra_inputs: tuple[str, ...] = ()
-    """Files in the capture folder that it reads where they exist, each as `--<stem>`."""
+    """Files in the capture folder that it reads where they exist, each as `--<stem>`; artifacts likewise, but
+    not for variants, which are compared with what begins from nothing."""
     sidecars: tuple[str, ...] = ()
     """The same per recording: `<recording>.<name>.toml`, as `--<name>`."""
     flows: tuple[Flow, ...] = ("recordings",)
@@ -166,6 +162,7 @@ FLOW: tuple[Node, ...] = (
         ("feature_basis", "scene_template", *merging("frames", roles=("walkthrough",))),
         fixed={"target": "scene"},
         gpu=1,
+        distributed=True,
     ),
     Node(
         "agent_localizer",
@@ -173,6 +170,7 @@ FLOW: tuple[Node, ...] = (
         ("feature_basis", "agent_template"),
         fixed={"target": "agent"},
         gpu=1,
+        distributed=True,
     ),
     Node(
         "video_poses",
@@ -209,6 +207,7 @@ FLOW: tuple[Node, ...] = (
         seconds_per_frame=0.1,
         resumable=True,
         distributed=True,
+        extra_inputs=("former",),
     ),
     Node(
         "splats",
@@ -217,6 +216,7 @@ FLOW: tuple[Node, ...] = (
         gpu=1,
         memory_mb_per_1000_frames=300,
         resumable=True,
+        distributed=True,
         seconds_per_frame=0.03,
     ),
     Node("synthetic_lives", "synthesize_capture.lives", flows=("trajectories",)),

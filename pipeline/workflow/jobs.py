@@ -207,7 +207,8 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
         str(home.plan / f"keys/{named}.json"),
         *(str(keys_folder / f"video.{id}.json") for id in deciding),
     ]
-    for file in captures.extra_inputs(plan.home.agent, node.extra_inputs):
+    own = home.variant is None
+    for file in captures.extra_inputs(plan.home.agent, node.extra_inputs, artifacts=own):
         keys.append(str(keys_folder / f"extra.{file.name}"))
         arguments += [f"--{file.stem}", str(file)]
     if video:

@@ -83,7 +83,9 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     for file in (
         file for node in dag.FLOW for file in captures.extra_inputs(plan.home.agent, node.extra_inputs)
     ):
-        _write(base / f"keys/extra.{file.name}", _json({"sha256": cache.get(file, artifact.digest_of_file)}))
+        digested = file / artifact.MANIFEST if file.is_dir() else file
+        digest = cache.get(digested, artifact.digest_of_file)
+        _write(base / f"keys/extra.{file.name}", _json({"sha256": digest}))
     with_sidecars = [node for node in dag.FLOW if node.sidecars]
     for node, video in ((node, video) for node in with_sidecars for video in plan.videos):
         for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items():

@@ -18,6 +18,7 @@ from pipeline.core import distributed, progress, threads
 from pipeline.core.training import FitRecord, fit, generator_for, termination
 from stages.reconstruct import stances
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
+from stages.reconstruct.former import KnownMotion
 from stages.reconstruct.joint import JointLoss, TemplateLoss
 from stages.reconstruct.posing import Chunk, ChunkLoss
 from stages.reconstruct.problem import Problem
@@ -53,6 +54,8 @@ class OptimizationPlan:
     """folder for checkpoints"""
     workers: int = 1
     """segments that are posed at once, each by one thread"""
+    known: KnownMotion | None = None
+    """of the agent, after a warm start; its frames are not posed again"""
     rendered: bool = False
     """losses of scene and agent by differentiable rendering alone (`Config.supervision`)"""
 
@@ -80,13 +83,19 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     loss = SceneLoss(problem, plan.weights, plan.batches, steps.scene, plan.rendered)
     records["scene"] = _run(problem, plan, "scene", loss, steps.scene, scene)
     if len(everything.agent_frames):
-        segments = list(chunks(everything, SEGMENT_FRAMES))
-        if steps.stance:
+        segments = [
+            frame
+            for frame in chunks(everything, SEGMENT_FRAMES)
+            if plan.known is None or not torch.isin(frame, plan.known.frame.to(frame)).any()
+        ]
+        if steps.stance and segments:
             _choose_stances(problem, plan, segments)
         if steps.body:
             _pose(problem, plan, segments)
         for corrections in (problem.motion.root, problem.motion.bone):
             corrections.data.copy_(distributed.total(corrections))
+        if plan.known:
+            plan.known.write(problem)
         loss = JointLoss(problem, plan.weights, plan.batches, steps.joint, plan.rendered)
         records["joint"] = _run(problem, plan, "joint", loss, steps.joint, joint_groups(problem, rates))
     return records

@@ -30,6 +30,8 @@ class Inputs:
     registration: Path
     scene_template: Path
     agent_template: Path
+    former: Path | None = None
+    """a reconstruction of the same home to start from"""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.core import devices, distributed, progress
 from pipeline.core.videos import Video
 from pipeline.fields.fields import Reconstruction
-from stages.reconstruct import assemble, fuse, optimise, pictures, reading, results, writing
+from stages.reconstruct import assemble, former, fuse, optimise, pictures, reading, results, writing
 from stages.reconstruct.config import Config
 from stages.reconstruct.reading import Inputs
 
@@ -43,8 +43,12 @@ def run(
     )
     rays = problem.store
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(rays.scene)} + {len(rays.agent)} rays")
+    known, steps = None, config.steps
+    if inputs.former is not None:
+        known, steps = former.begin(problem, registered, inputs.former), former.shorter(steps)
+        progress.log(f"reconstruct: {len(known.frame)} frames begin as in {inputs.former}")
     plan = optimise.OptimizationPlan(
-        config.steps, config.weights, config.batches, config.rates, config.seed, resume, workers, rendered
+        steps, config.weights, config.batches, config.rates, config.seed, resume, workers, known, rendered
     )
     records = optimise.optimise(problem, plan)
     if not distributed.leave():

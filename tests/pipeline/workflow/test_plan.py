@@ -266,6 +266,27 @@ def test_clicks_are_read_by_the_evaluation_alone(house):
     assert all("extra.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)
 
 
+def test_a_former_reconstruction_is_begun_from_but_not_by_variants(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.write("captures/toy/former/motion.npz", "unfinished")
+    assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    before = key_files(house)
+    assert not any("former" in name for name in before), "no artifact"
+    house.write("captures/toy/former/manifest.json", "{}")
+    house.write("agents/variants/longer.toml", "[reconstruct]\nseed = 7\n")
+    for home in ("toy", "toy/variants/longer"):
+        assert house.python("pipeline.workflow.plan", "plan", home).returncode == 0
+    after = key_files(house)
+    assert {name for name in after if before.get(name) != after[name]} == {"extra.former"}
+    plans = [house.folder / "build/toy" / inside / "plan/dag.json" for inside in (".", "variants/longer")]
+    for plan, readers in zip(plans, (["reconstruction"], []), strict=True):
+        assert [
+            job["id"] for job in json.loads(plan.read_text()) if "--former" in job["arguments"]
+        ] == readers
+    assert captures.not_understood(house.folder / "captures/toy") == []
+
+
 def test_a_prompt_beside_a_recording_reaches_its_masks_alone(house):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
         house.write(f"captures/toy/{name}", name)

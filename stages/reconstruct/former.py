@@ -1,0 +1,149 @@
+"""Start from a former reconstruction of the same home: its fields, body, and the motion of its recordings.
+
+A recording that was added is posed from its registration, as ever; the others keep their poses, and all are
+optimized together for `SHARE` of the usual steps.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from pipeline.core.errors import InputError, other_versions_refused
+from pipeline.data import motion
+from pipeline.data.motion import Motion
+from pipeline.fields import fields
+from pipeline.fields.encodings import DenseGrid
+from pipeline.fields.fields import Field, Reconstruction
+from pipeline.geometry import rigid
+from stages.reconstruct.assemble import KNOT_FRAMES, RegisteredVideo, scene_first, scene_ids
+from stages.reconstruct.config import PhaseSteps
+from stages.reconstruct.problem import Problem
+
+SHARE = 0.3
+"""Of the steps of the phases in which everything is optimized: the fields are nearly right."""
+
+OWN = ("grid.levels.", "codes.", "fused.")
+"""Parts of the scene's field whose size depends on the recordings: box, codes, fused depth."""
+
+
+@dataclass(frozen=True)
+class KnownMotion:
+    """The agent's motion in frames of recordings that the former reconstruction had."""
+
+    frame: Int[Tensor, "known"]
+    root: Float[Tensor, "known 6"]
+    bone: Float[Tensor, "known bone 6"]
+
+    @torch.no_grad()
+    def write(self, problem: Problem) -> None:
+        """Write root and bones into the motion table, as corrections of its initial poses."""
+        table = problem.motion
+        table.root[self.frame] = self.root.to(table.root)
+        table.bone[self.frame] = self.bone.to(table.bone)
+
+
+def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> KnownMotion:
+    """Let the problem's fields, body and cameras start as they ended in the reconstruction at ``folder``.
+
+    Returns the motion of the recordings that it had. Raises InputError RCN-003 where its fields have other
+    sizes, ART-007 where another version wrote it.
+    """
+    with other_versions_refused("reconstruction", str(folder)):
+        made = fields.load(folder)
+    former = {video.id: found for video in videos if (found := _motion_of(folder, video)) is not None}
+    try:
+        _begin_fields(problem, made, scene_ids(videos))
+    except (RuntimeError, AssertionError) as error:
+        what = "its fields have other sizes than this recipe's"
+        raise InputError("RCN-003", what, str(folder), "take it away to start from nothing") from error
+    frames, roots, bones = [], [], []
+    for index, video in enumerate(scene_first(videos)):
+        if video.id in former:
+            frame = torch.nonzero(problem.video.cpu() == index)[:, 0]
+            _begin_cameras(problem, frame, former[video.id])
+            frames.append(frame)
+            roots.append(_twists(problem.motion.initial_agent[frame], former[video.id].world_from_agent))
+            rest = problem.motion.agent_from_bone_rest.expand(len(frame), -1, -1, -1)
+            bones.append(_twists(rest, former[video.id].agent_from_bone))
+    count = len(problem.motion.agent_from_bone_rest)
+    nothing = torch.zeros(0, dtype=torch.long), torch.zeros(0, 6), torch.zeros(0, count, 6)
+    return KnownMotion(
+        *(torch.cat([empty, *parts]) for empty, parts in zip(nothing, (frames, roots, bones), strict=True))
+    )
+
+
+def shorter(steps: PhaseSteps) -> PhaseSteps:
+    """Return the steps after a warm start: the agent's field needs no copy of the template."""
+    return replace(steps, template=0, scene=round(SHARE * steps.scene), joint=round(SHARE * steps.joint))
+
+
+def _motion_of(folder: Path, video: RegisteredVideo) -> Motion | None:
+    """Return a recording's former motion; None where the recording is another one, or was not there."""
+    for path in (folder / video.id / "motion.npz", folder / "templates" / f"{video.id}.npz"):
+        if path.is_file():
+            found = motion.load(path)
+            if np.array_equal(found.timestamp_s, video.timestamp_s):
+                return found
+    return None
+
+
+@torch.no_grad()
+def _begin_fields(problem: Problem, made: Reconstruction, ids: Sequence[str]) -> None:
+    problem.agent.load_state_dict(made.agent.state_dict())
+    problem.body.load_state_dict(made.body.state_dict())
+    scene, former = problem.scene, made.scene
+    own, before = (
+        {name: value for name, value in field.state_dict().items() if name.startswith(OWN) == is_own}
+        for field, is_own in ((scene, True), (former, False))
+    )
+    scene.load_state_dict(before | own)
+    _begin_grid(scene, former)
+    if scene.codes is not None and former.codes is not None:
+        scene.codes.weight[:] = former.codes.weight.mean(0)
+        for index, id in enumerate(ids):
+            if id in made.videos:
+                scene.codes.weight[index] = former.codes.weight[made.video_code(id)]
+
+
+def _begin_grid(scene: Field, former: Field) -> None:
+    """Interpolate the former grids at the nodes of the present ones, whose box may be another."""
+    grid, before = scene.grid, former.grid
+    if not (isinstance(grid, DenseGrid) and isinstance(before, DenseGrid)):
+        raise AssertionError("an MLP is tied to its box")
+    assert scene.shape.voxel_m == former.shape.voxel_m, (scene.shape, former.shape)
+    for level, extent, then, its_extent in zip(
+        grid.levels, grid.extents, before.levels, before.extents, strict=True
+    ):
+        z, y, x = (torch.linspace(0, 1, count) for count in level.shape[2:])
+        nodes = torch.stack(torch.meshgrid(z, y, x, indexing="ij")[::-1], dim=-1).to(level)
+        place = (grid.low + nodes * extent - before.low.to(level)) / its_extent.to(level) * 2 - 1
+        level.copy_(
+            nn.functional.grid_sample(then.to(level), place[None], padding_mode="border", align_corners=True)
+        )
+
+
+@torch.no_grad()
+def _begin_cameras(problem: Problem, frame: Int[Tensor, "frame"], former: Motion) -> None:
+    """Set the knots of one recording's cameras, where they are known at both ends of a knot's frames."""
+    table = problem.motion
+    known = np.flatnonzero(np.isfinite(former.world_from_camera).all((1, 2)))
+    if not len(known):
+        return
+    twist = _twists(table.initial_camera[frame[known]], former.world_from_camera[known])
+    first = int(table.knot[frame[0]])
+    for knot in range(-(-len(frame) // KNOT_FRAMES) + 1):
+        nearest = int(np.abs(known - knot * KNOT_FRAMES).argmin())
+        table.camera[first + knot] = twist[nearest].to(table.camera)
+
+
+def _twists(a_from_b: Float[Tensor, "*batch 4 4"], a_from_c: Float[np.ndarray, "*batch 4 4"]) -> Tensor:
+    """Return the twists of ``b_from_c``; 0 where it is unknown."""
+    made = rigid.inverse(a_from_b.double().cpu().numpy()) @ a_from_c
+    known = np.isfinite(made).all((-1, -2))
+    made[~known] = np.eye(4)
+    return torch.from_numpy(rigid.log(made)).float()
