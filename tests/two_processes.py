@@ -5,13 +5,15 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from pipeline.core import distributed
+from pipeline.core.training import FitRecord, Loss, generator_for
 
 TORCHRUN = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RUN_ID")
 
@@ -37,3 +39,22 @@ def started(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
         assert other.wait(60) == 0
     finally:
         other.kill()
+
+
+def fit_both(fit: Callable[..., FitRecord]) -> Callable[..., FitRecord]:
+    """Return `training.fit` in one process on what two would draw: the mean of their losses."""
+
+    def fitted(*, loss: Loss, seed: int, **rest: Any) -> FitRecord:
+        def of_both(step: int, _: torch.Generator) -> dict[str, torch.Tensor]:
+            parts = []
+            for rank in range(2):
+                generator = generator_for(seed, step, rank)
+                torch.manual_seed(generator.initial_seed())
+                terms = loss(step, generator)
+                parts.append({"loss": terms} if isinstance(terms, torch.Tensor) else terms)
+            names = dict.fromkeys([*parts[0], *parts[1]])
+            return {name: sum(part.get(name, torch.zeros(())) for part in parts) / 2 for name in names}
+
+        return fit(loss=of_both, seed=seed, **rest)
+
+    return fitted

@@ -1,4 +1,7 @@
-"""Refine Gaussians and motion: draw one frame a step, compare color, depth, silhouette and flow."""
+"""Refine Gaussians and motion: draw one frame a step, compare color, depth, silhouette and flow.
+
+Of several processes (`pipeline.core.distributed`) each draws a frame of its own, in as many fewer steps.
+"""
 
 import math
 from collections.abc import Sequence
@@ -11,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
+from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from pipeline.data.motion import Motion
 from pipeline.fields.footprints import REACH
@@ -108,6 +112,8 @@ class FrameLoss:
             terms["flow"] = weights.flow * self._flow_errors(
                 sequence, target, view.extra, view.coverage, everywhere
             )
+        elif distributed.size() > 1:  # all processes have the same terms
+            terms["flow"] = torch.zeros(1, device=self.device)
         index = sequence.first + frame
         correction = torch.cat([self.deltas.root[index : index + 1], self.deltas.bone[index]])
         terms["motion"] = weights.motion * (correction / MOTION_UNIT).square()
@@ -214,7 +220,7 @@ def usable_frames(sequence: Sequence4D) -> list[int]:
 
 
 def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_every: int) -> FitRecord:
-    """Optimize Gaussians, exposure and motion in place."""
+    """Optimize Gaussians, exposure and motion in place, on ``steps`` frames in all."""
     splats, deltas = loss.splats, loss.deltas
     groups = [{"params": [splats.appearance], "lr": EXPOSURE_RATE}]
     for gaussians in (splats.scene, splats.agent):
@@ -224,13 +230,14 @@ def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_eve
         modules={"splats": splats, "motion": deltas},
         optimizer=torch.optim.Adam(groups, lr=1.0, fused=True),
         loss=loss,
-        steps=steps,
+        steps=-(-steps // distributed.size()),
         seed=seed,
         resume=resume,
         save_every=save_every,
         schedule=lambda progress: LAST_RATE**progress,
         label="gaussians",
         clip_norm=math.inf,
+        shared=True,
     )
 
 

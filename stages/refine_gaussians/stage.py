@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core import devices
+from pipeline.core import devices, distributed
 from stages.refine_gaussians import pictures, reading, refine, writing
 from stages.refine_gaussians.config import Config
 
@@ -25,7 +25,8 @@ class Inputs:
 def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", resume: Path | None = None
 ) -> None:
-    """Refine one reconstruction into `out`."""
+    """Refine one reconstruction into `out`; of several processes the first writes."""
+    distributed.join(device)
     backend = config.backend
     if backend == "auto":
         backend = "gsplat" if device == "cuda" else "tiles"
@@ -38,5 +39,7 @@ def run(
     deltas = refine.MotionDeltas(total, len(splats.agent_from_bone_rest)).to(device)
     loss = refine.FrameLoss(splats, deltas, sequences, config.weights, config.long_side_px, backend)
     record = refine.refine(loss, config.steps, config.seed, resume, config.save_every)
+    if not distributed.leave():
+        return
     writing.write(out, splats, deltas, sequences)
     pictures.report_quality(out, loss, sequences, record)

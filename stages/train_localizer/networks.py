@@ -1,4 +1,6 @@
-"""Train the kinds of localizers that are networks, on the views that the bank would hold or on fresh ones."""
+"""Train the kinds of localizers that are networks, on the views that the bank would hold or on fresh ones.
+
+Several processes (`pipeline.core.distributed`) share each batch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.core import distributed
 from pipeline.core.training import fit
 from pipeline.localization.patches import Patches, PcaBasis, Target
 from pipeline.localization.pose_regressor import PoseRegressor, on_grid, pose_loss
@@ -38,7 +41,9 @@ def train_coordinates(described: DescribedViews, config: NetworkConfig, seed: in
     _set_extent(net, points)
 
     def loss(_: int, generator: torch.Generator):
-        chosen = torch.randint(len(descriptors), (config.batch_patches,), generator=generator)
+        chosen = torch.randint(
+            len(descriptors), (distributed.share(config.batch_patches),), generator=generator
+        )
         predicted, log_m = net(descriptors[chosen])
         return coordinate_loss(predicted, log_m, points[chosen]).mean()
 
@@ -94,7 +99,9 @@ def train_regressor(
             rng = np.random.default_rng((seed, step))
             for _ in range(config.fresh_views):
                 samples.replace(described.basis, draw, target, rng)
-        chosen = torch.randint(len(samples.grids), (config.batch_views,), generator=generator)
+        chosen = torch.randint(
+            len(samples.grids), (distributed.share(config.batch_views),), generator=generator
+        )
         grids = samples.grids[chosen]
         visible = torch.rand(len(chosen), 1, *grids.shape[2:], generator=generator) > PATCH_DROPOUT
         rotation, position, log_error = net(grids * visible)
@@ -136,6 +143,6 @@ def _train(net, loss, config, seed):
 
     fit(
         modules={"net": net}, optimizer=optimizer, loss=loss, steps=config.steps, seed=seed,
-        label="localizer", clip_norm=CLIP_NORM, schedule=schedule,
+        label="localizer", clip_norm=CLIP_NORM, schedule=schedule, shared=True,
     )  # fmt: skip
     return net.eval()

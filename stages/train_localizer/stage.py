@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from pipeline.backends.descriptors import Describer
+from pipeline.core import distributed
 from pipeline.core.devices import Device
 from pipeline.core.errors import InputError
 from pipeline.data import ply, qa
@@ -35,9 +36,15 @@ class Inputs:
     """Target agent."""
 
 
-def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") -> localizers.Localizer:
-    """Train, measure and write the localizer. Raises InputError MAP-006 where the map fills hardly any
-    view."""
+def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") -> localizers.Localizer | None:
+    """Train, measure and write the localizer; of several processes the first does, None for the others.
+
+    A bank is not trained: the first makes it alone. Raises InputError MAP-006 where the map fills hardly any
+    view.
+    """
+    distributed.join(device)
+    if config.kind == "bank" and not distributed.leave():
+        return None
     rng = np.random.default_rng(config.seed)
     describer = Describer() if inputs.feature_basis is None else Describer.load(inputs.feature_basis)
     match config.target:
@@ -47,6 +54,8 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
             mesh = ply.read_ply(_needed(inputs.agent_template, "agent_template") / "agent.ply")
             views = training.agent_views(mesh, config.agent, rng)
     localizer, held = training.train(views, config, describer, device, rng)
+    if not distributed.leave():
+        return None
     localizers.save(out, localizer, pictures.report(held, config.target))
     qa.write(
         out,

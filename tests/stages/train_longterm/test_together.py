@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from pipeline.core import distributed
-from pipeline.core.training import generator_for
 from pipeline.longterm.config import LongTermOptimizerConfig
 from stages.train_longterm import learning, training
 from stages.train_longterm.config import Config
@@ -42,20 +41,7 @@ def side(rank: int, port: str, folder: Path) -> learning.TrainedLongTerm:
 
 def alone(monkeypatch: pytest.MonkeyPatch) -> learning.TrainedLongTerm:
     """Train in one process on both processes' halves of each batch."""
-    fit = training.fit
-
-    def fit_both(*, loss, **rest):
-        def of_both(step: int, _: torch.Generator) -> dict[str, torch.Tensor]:
-            parts = []
-            for rank in range(2):
-                generator = generator_for(0, step, rank)
-                torch.manual_seed(generator.initial_seed())
-                parts.append(loss(step, generator))
-            return {name: (parts[0][name] + parts[1][name]) / 2 for name in parts[0]}
-
-        return fit(loss=of_both, **rest)
-
-    monkeypatch.setattr(training, "fit", fit_both)
+    monkeypatch.setattr(training, "fit", two_processes.fit_both(training.fit))
     return trained(8)
 
 
