@@ -18,6 +18,9 @@ SceneEncoder = Literal["pillars", "volume"]
 """2.5-D encoder with height in channels, or the six 3-D convolutions of the paper."""
 ObservedPast = Literal["positions", "poses"]
 """What is read of the observer's past: where it was, or, as in the paper, its SE(3) poses."""
+Guided = Literal["observer", "all"]
+"""What the reference of guidance does without: observer and goal; or all conditions, as in the paper, which a
+model learns by `joint_dropout`."""
 MapLookup = Literal["attention", "pointwise"]
 """How denoisers read the map: by attention, or, as in the released code, at the noisy point itself."""
 AblatedInput = Literal["nothing", "scene", "observer", "past"]
@@ -39,9 +42,8 @@ class PlanSamplingConfig:
     """Denoising steps of path and body."""
     guidance: float = 1.0
     """Scale s of classifier-free guidance ("interactivity")."""
-    guided: Literal["observer", "all"] = "observer"
-    """What the reference of guidance does without: observer and goal; or all conditions, as in the paper,
-    which a model learns by `joint_dropout`."""
+    guided: Guided = "observer"
+    """What the guidance acts on."""
     scene: bool = True
     """Condition on the scene."""
     observer: bool = True

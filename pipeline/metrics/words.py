@@ -67,6 +67,7 @@ STEMS = {
     "zero_flow_epe": "end-point error of predicting no motion",
 }  # fmt: skip
 METHODS = {
+    "rendered_": "volume rendering",
     "retrieval_only_": "image retrieval",
     "sift_only_": "SIFT and PnP",
     "agent_confidence_": "animal's root",

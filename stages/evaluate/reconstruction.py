@@ -1,6 +1,7 @@
 """The 4D reconstruction against truth: held-out views, agent roots, followed points, surfaces."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from pipeline.data import gaussian_ply, plots, ply
 from pipeline.data.motion import TRACKS, Motion
 from pipeline.data.templates import SkinTable, bones_at_rest
 from pipeline.fields import fields, gaussians
-from pipeline.fields.render import Renderer
+from pipeline.fields.render import Renderer, render_depth
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.metrics.lpips import Lpips
@@ -31,6 +32,8 @@ from stages.evaluate.truth import read_depth
 CAMERAS_FOR_SEEN = 40
 SEEN_M = 0.1
 """longest edge of the pieces of the true room, each of which is seen or not"""
+FARTHEST_M = 1.2 * heldout.RANGE_M
+"""z at which rendered rays end: a wall at the end of the measured range is behind nothing"""
 SCENE_POINTS, AGENT_POINTS = 20_000, 1_000
 """on each surface, whose distance from the other is measured; of the agent's in every frame"""
 SURFACE_NAMES = tuple(
@@ -94,10 +97,12 @@ def held_out_metrics(
 
     Where that session was refused nothing is drawn, which is wrong everywhere.
     """
-    metrics, by_fields, by_splats, drawn = Metrics(), [], [], 0
+    metrics, by_fields, by_splats, rendered, drawn = Metrics(), [], [], [], 0
+    few = iter(heldout.thinned([shot for _, shots in seen for shot in shots], heldout.RENDERED_PIXELS))
     for session, shots in seen:
         motion = reading.read_motion(folders.reconstruction, session)
         by_fields += drawn_by_fields(folders, session, motion, shots, device)
+        rendered += rendered_by_fields(folders, session, motion, list(islice(few, len(shots))), device)
         by_splats += _drawn_by_splats(
             folders, session, reading.read_motion(folders.splats, session) or motion, shots
         )
@@ -108,6 +113,7 @@ def held_out_metrics(
     if by_fields:
         lpips = Lpips.load(Path(lpips_weights), device) if lpips_weights else None
         metrics.add(heldout.view_metrics(by_fields, lpips))
+        metrics.add(heldout.depth_metrics("reconstruction/rendered_depth_acc", rendered))
         metrics.add(heldout.picture_metrics("splats", by_splats))
         for name, views in (("fields", by_fields), ("splats", by_splats)):
             caption = f"held-out phone: truth, ours ({name}), true depth, our depth"
@@ -171,6 +177,24 @@ def drawn_by_fields(
             shot.world_from_camera, shot.intrinsics, height, width, *motion.at(shot.time_s)
         )
         views.append(HeldoutView(picture.color, picture.depth, shot))
+    return views
+
+
+def rendered_by_fields(
+    folders: Reconstructed,
+    session: str,
+    motion: Motion | None,
+    shots: Sequence[HeldoutShot],
+    device: devices.Device,
+) -> list[HeldoutView]:
+    """Render depth by integrating the fields along rays, as the paper measures it; colours are not drawn."""
+    if motion is None:
+        return [HeldoutView.empty(shot) for shot in shots]
+    reconstruction, views = fields.load(folders.reconstruction, device), []
+    for shot in shots:
+        camera = (shot.world_from_camera, shot.intrinsics, *shot.depth.shape)
+        depth, _ = render_depth(reconstruction, *camera, FARTHEST_M, session, *motion.at(shot.time_s))
+        views.append(HeldoutView(np.zeros_like(shot.color), depth, shot))
     return views
 
 

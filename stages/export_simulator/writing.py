@@ -93,6 +93,8 @@ def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> d
     residual_mm = parts.residual_m * 1000
     visits = pictures.visits(parts.scene, parts.setting.floor_m, parts.motions)
     about = "the room from above: where the animal (amber) and the person (blue) have been"
+    heat = pictures.heat_maps(parts.scene, parts.setting.floor_m, parts.motions)
+    about_heat = "trajectories of animal and person (left, right), and how long each was where, in space"
     return {
         "good": "the page opens within seconds; the skin of `agent.glb` is within 2 mm of the reconstruction",
         "bad": "limbs of `agent.glb` that thin out at the joints, or a page too big to send",
@@ -106,5 +108,5 @@ def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> d
             ),
             Check("sessions to replay", len(parts.motions), "", warn=1, better="higher"),
         ],
-        "pictures": [Picture("visits", visits, about)],
+        "pictures": [Picture("visits", visits, about), Picture("heat_maps", heat, about_heat)],
     }

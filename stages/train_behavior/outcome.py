@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import SceneEncoder
+from pipeline.behavior.config import Guided, SceneEncoder
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture
 from pipeline.behavior.planning import TorchNetworks
@@ -64,6 +64,7 @@ def write_exported(
     schedule: Schedule,
     data: BehaviorData,
     scenes: Scenes,
+    guided: Guided,
     *,
     seed: int,
 ) -> None:
@@ -82,5 +83,5 @@ def write_exported(
         good="goals that spread over where the animal could go and shift away from a close observer",
         bad="goals inside furniture, goals that ignore an approach, or an animal that shies at a far person",
         checks=pictures.checks(fitted.record, reaction, difference),
-        pictures=pictures.pictures(sampler, moments, scenes, fitted.record, seed=seed),
+        pictures=pictures.pictures(sampler, moments, scenes, fitted.record, guided, seed=seed),
     )

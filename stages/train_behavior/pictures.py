@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
+from matplotlib.figure import Figure
 
-from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.config import Guided, PlanSamplingConfig
 from pipeline.behavior.encoders import POSE_CHANNELS
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.planning import Observation, Sampler
@@ -18,17 +19,21 @@ from stages.train_behavior.reactions import SIDES, Reactions, SampledMoments, ap
 
 FAN_GOALS = 64
 SHOWN_WINDOWS = 4
+GUIDED_PATHS = 12
+PANEL_IN = 2.6, 2.3
 WINDOW_HALF_M = 3.0
 CAPTIONS = {
     "goals": "Sampled goals (orange) with conditions removed; animal blue, observer green.",
     "guidance": "The same with an observer who walks up from ahead; same noise at each interactivity.",
     "paths": "Sampled paths with and without the scene.",
+    "guided_paths": "Paths to a given goal (blue dot), from dark to light in time, by scale of guidance "
+    "(Fig. 14); 0 is the reference, which knows no goal.",
     "losses": "Squared error of the predicted noise, smoothed.",
 }
 
 
 def pictures(
-    sampler: Sampler, moments: SampledMoments, scenes: Scenes, record: FitRecord, *, seed: int
+    sampler: Sampler, moments: SampledMoments, scenes: Scenes, record: FitRecord, guided: Guided, *, seed: int
 ) -> list[Picture]:
     """Draw a few training windows, sampled under different conditions."""
     chosen = np.linspace(0, len(moments.observation) - 1, SHOWN_WINDOWS + 2).astype(int)[1:-1]
@@ -49,6 +54,7 @@ def pictures(
         goals=fans(rooms, sampler, some, frame, removed, seed),
         guidance=fans(rooms, sampler, close, frame, strength, seed),
         paths=fans(rooms, sampler, some, frame, with_scene, seed, paths=True),
+        guided_paths=guided_paths(rooms, sampler, some, frame, guided, seed),
         losses=plots.loss_curves({"training": record.terms}),
     )
 
@@ -82,8 +88,7 @@ def fans(
     paths: bool = False,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw one row per way of sampling, one column per window."""
-    size = (2.6 * len(frame), 2.3 * len(samplings))
-    figure, grid = plots.panels(len(samplings), len(frame), width_in=size[0], height_in=size[1])
+    figure, grid = windows_panels(len(samplings), len(frame))
     count = 12 if paths else FAN_GOALS
     for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
         rng, codes = np.random.default_rng(seed), sampler.codes(observation, sampling, count)
@@ -101,6 +106,41 @@ def fans(
     return plots.pixels(figure)
 
 
+def windows_panels(rows: int, columns: int) -> tuple[Figure, Shaped[np.ndarray, "rows columns"]]:
+    """Return a figure with a room in every panel."""
+    width_in, height_in = PANEL_IN
+    return plots.panels(rows, columns, width_in=width_in * columns, height_in=height_in * rows)
+
+
+def guided_paths(
+    rooms: "list[RoomMap]",
+    sampler: Sampler,
+    observation: Observation,
+    frame: Float[np.ndarray, "window 4 4"],
+    guided: Guided,
+    seed: int,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw paths to one goal per window, the farthest of a few sampled ones, by scale of guidance."""
+    windows, scales = len(frame), (1, 0.5, 0)
+    figure, grid = windows_panels(len(scales), windows)
+    plain = PlanSamplingConfig(guided=guided, max_path_draws=1)
+    sampled = sampler.goals(
+        sampler.codes(observation, plain, GUIDED_PATHS), plain, np.random.default_rng(seed)
+    )
+    sampled = sampled.reshape(windows, GUIDED_PATHS, 3)
+    goal = sampled[np.arange(windows), np.linalg.norm(sampled, axis=-1).argmax(1)]
+    for row, scale in zip(grid, scales, strict=True):
+        sampling = replace(plain, guidance=scale)
+        codes = sampler.codes(observation, sampling, GUIDED_PATHS)
+        each = np.repeat(goal, GUIDED_PATHS, axis=0)
+        paths = sampler.paths(codes, each, sampling, np.random.default_rng(seed))
+        for column, axis in enumerate(row):
+            some = paths.reshape(windows, GUIDED_PATHS, -1, 3)[column]
+            rooms[column].steered(axis, frame[column], goal[column], some)
+        row[0].set_ylabel(f"guidance {scale:g}")
+    return plots.pixels(figure)
+
+
 class RoomMap:
     """The room from above, to draw on."""
 
@@ -115,7 +155,6 @@ class RoomMap:
         observer: Float[np.ndarray, "frame 3"],
         goals: Float[np.ndarray, "sample 3"],
     ) -> None:
-        plots.floor_plan(axis, self.solid, self.low, self.voxel_m)
         goal, seen = rigid.apply(frame, goals), rigid.apply(frame, observer)
         axis.scatter(goal[:, 0], goal[:, 2], s=5, color=plots.ORANGE, alpha=0.7)
         axis.plot(seen[:, 0], seen[:, 2], color=plots.GREEN, linewidth=2)
@@ -128,6 +167,23 @@ class RoomMap:
             scale=8,
             width=0.02,
         )
+        self.base(axis, frame)
+
+    def steered(
+        self,
+        axis,
+        frame: Float[np.ndarray, "4 4"],
+        goal: Float[np.ndarray, "3"],
+        paths: Float[np.ndarray, "sample frame 3"],
+    ) -> None:
+        for path in rigid.apply(frame, paths):
+            axis.scatter(path[:, 0], path[:, 2], c=np.arange(len(path)), s=2, cmap="viridis")
+        end = rigid.apply(frame, goal[None])[0]
+        axis.scatter(end[0], end[2], color=plots.BLUE, s=32, edgecolors="white", zorder=3)
+        self.base(axis, frame)
+
+    def base(self, axis, frame: Float[np.ndarray, "4 4"]) -> None:
+        plots.floor_plan(axis, self.solid, self.low, self.voxel_m)
         axis.set(xticks=[], yticks=[])
         if self.solid.size > 1:
             high = self.low + np.array(self.solid.shape) * self.voxel_m

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.behavior.config import Guided
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, frames_from_seconds
@@ -43,4 +44,5 @@ def run(
         return
     outcome.write_trained(out, fitted, architecture, schedule, data.agent_from_bone_rest)
     if config.export:
-        outcome.write_exported(out, fitted, architecture, schedule, data, scenes, seed=config.seed)
+        guided: Guided = "all" if config.training.objective.joint_dropout > 0 else "observer"
+        outcome.write_exported(out, fitted, architecture, schedule, data, scenes, guided, seed=config.seed)

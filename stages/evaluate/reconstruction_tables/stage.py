@@ -39,7 +39,7 @@ def run(
     metrics = table.metrics(folders, inputs, videos, config.heldout_frames, rng, device)
     metrics.write(out, "tables.json")
     (out / "tables.txt").write_text(table.text(metrics.values, tuple(folders)))
-    shown = table.pictures(metrics).items()
+    shown = (table.pictures(metrics) | table.rooms(folders)).items()
     qa.write(
         out,
         good="ours is ahead of every rival, for the animal and the room",

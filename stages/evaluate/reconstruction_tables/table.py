@@ -9,7 +9,9 @@ from jaxtyping import Float, UInt8
 
 from pipeline.core import devices
 from pipeline.core.videos import Video
+from pipeline.data import plots, ply
 from pipeline.data.qa import Check
+from pipeline.geometry import views
 from pipeline.metrics.intervals import aligned, bootstrapped, episodes, formatted_interval
 from pipeline.metrics.metrics import Metrics, formatted
 from stages.evaluate import heldout, reading, reconstruction, surfaces
@@ -31,7 +33,12 @@ NAMES = {
     "totalrecon": "TotalRecon, all videos",
     "totalrecon_single": "TotalRecon, one video",
 }
-COLUMNS = {"depth_acc": "DepthAcc@0.1m", "psnr": "PSNR, dB", "ssim": "SSIM"}
+COLUMNS = {
+    "depth_acc": "DepthAcc@0.1m",
+    "rendered_depth_acc": "of rendered depth",
+    "psnr": "PSNR, dB",
+    "ssim": "SSIM",
+}
 TITLE = (
     "Table 3: seen by the held-out phone (all / agent / scene); roots and followed points in the sessions it "
     "filmed too"
@@ -41,6 +48,10 @@ FOOTNOTE = (
     "what was refused counts as wrong. Same steps and seed for all."
 )
 NO_TRUTH = "what the held-out phone truly saw is not known for this capture"
+FLOOR_QUANTILE = 0.02
+"""of the heights of vertices: the floor, whatever few lie beneath it"""
+ROOM_PX = 320
+"""Width of a room in the comparison."""
 EPISODE_FRAMES = 3
 """Rendered frames that are resampled together: neighbours look alike."""
 BOOTSTRAP_DRAWS = 2000
@@ -77,6 +88,8 @@ def metrics(
         for phone in of_role["heldout"]
         if phone.video.synchronized_with
     ]
+    pixels = heldout.RENDERED_PIXELS // max(len(shots), 1)
+    few = [(session, heldout.thinned(seen, pixels)) for session, seen in shots]
     right: dict[str, Float[np.ndarray, "view part"]] = {}
     for variant, folder in folders.items():
         here = replace(places, reconstruction=folder)
@@ -88,6 +101,13 @@ def metrics(
         ]
         one = Metrics()
         one.add(heldout.view_metrics(views) if views else _nothing())
+        rendered = [
+            view
+            for session, seen in few
+            for view in reconstruction.rendered_by_fields(here, session, motions.get(session), seen, device)
+        ]
+        if rendered:
+            one.add(heldout.depth_metrics("reconstruction/rendered_depth_acc", rendered))
         one.add(reconstruction.agent_roots(sessions, motions, frames))
         followed = reconstruction.track_distances(here, sessions, motions, of_role["turnaround"][0], frames)
         one.add(surfaces.track_metrics(followed))
@@ -156,6 +176,22 @@ def pictures(found: Metrics) -> dict[str, tuple[UInt8[np.ndarray, "height width 
     return {
         variant: (image, f"{NAMES.get(variant, variant)}: truth, drawn, true depth, drawn depth")
         for variant, image in found.pictures.items()
+    }
+
+
+def rooms(folders: Mapping[str, Path]) -> dict[str, tuple[UInt8[np.ndarray, "height width 3"], str]]:
+    """Return the rooms of all variants from above, beside each other (Fig. 4), with a caption."""
+    drawn = []
+    for variant, folder in folders.items():
+        mesh = ply.read_ply(folder / "scene.ply")
+        floor_m = float(np.quantile(mesh.vertices[:, 1], FLOOR_QUANTILE))
+        image = views.bird_view(mesh, floor_m=floor_m, width_px=ROOM_PX).image
+        drawn.append(plots.labelled(image, NAMES.get(variant, variant)))
+    return {
+        "rooms": (
+            plots.grid(drawn, min(len(drawn), 3)),
+            "the reconstructed room from above, by method (Fig. 4)",
+        )
     }
 
 

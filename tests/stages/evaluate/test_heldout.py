@@ -8,7 +8,8 @@ import pytest
 
 from pipeline.core.videos import Video
 from pipeline.data import images, npz
-from stages.evaluate import reading, real_phone, reconstruction
+from pipeline.geometry import cameras
+from stages.evaluate import heldout, reading, real_phone, reconstruction
 from stages.evaluate.heldout import HeldoutShot
 from stages.evaluate.reading import BuildFolders
 
@@ -38,12 +39,12 @@ def folders(tmp_path: Path) -> BuildFolders:
 
 def test_only_what_is_filmed_while_the_session_is_counts(folders: BuildFolders):
     assert reading.filmed_together(folders, PHONE).tolist() == [0, 1, 2, 3, 4, 5, 6]
-    cameras = np.tile(np.eye(4), (11, 1, 1))
-    cameras[0] = np.nan
-    shots = real_phone.shots(folders, PHONE, cameras, 3)
+    known = np.tile(np.eye(4), (11, 1, 1))
+    known[0] = np.nan
+    shots = real_phone.shots(folders, PHONE, known, 3)
     np.testing.assert_allclose([shot.time_s for shot in shots], [0.45, 0.65, 0.95])
     before = Video("v002", "heldout.r3d", "heldout", "none", None, "v001", -5.0)
-    assert len(real_phone.shots(folders, before, cameras, 3)) == 0
+    assert len(real_phone.shots(folders, before, known, 3)) == 0
 
 
 def test_a_refused_session_is_wrong_everywhere(folders: BuildFolders):
@@ -52,11 +53,25 @@ def test_a_refused_session_is_wrong_everywhere(folders: BuildFolders):
         np.eye(4), np.eye(3), 0.0, np.full((9, 7, 3), 99, np.uint8), np.full((9, 7), 2.0, np.float32), agent
     )
     values = reconstruction.held_out_metrics(folders, [("v001", [shot, shot]), ("v001", [])], "cpu").values
-    assert [values[f"reconstruction/depth_acc_{part}"] for part in ("all", "agent", "scene")] == [0, 0, 0]
+    for kind in ("depth_acc", "rendered_depth_acc"):
+        assert [values[f"reconstruction/{kind}_{part}"] for part in ("all", "agent", "scene")] == [0, 0, 0]
     assert values["reconstruction/psnr_all"] < 10 and values["splats/psnr_all"] < 10
     assert [
         values[f"reconstruction/heldout_{what}"] for what in ("phones_drawn", "phones_total", "frames")
     ] == [0, 2, 2]
+
+
+def test_thinned_shots_look_along_the_same_rays():
+    rng, lens = np.random.default_rng(0), np.array([[50.0, 0, 31.0], [0, 52.0, 19.0], [0, 0, 1]])
+    depth = rng.uniform(1, 3, (40, 61)).astype(np.float32)
+    color = rng.integers(0, 255, (40, 61, 3), dtype=np.uint8)
+    shot = HeldoutShot(np.eye(4), lens, 0.0, color, depth, depth > 2)
+    points = cameras.back_project(depth, lens)
+    (few,) = heldout.thinned([shot], 100)
+    assert few.depth.size <= 120 and len(few.color) == len(few.agent) == len(few.depth)
+    lifted = cameras.back_project(few.depth, few.intrinsics)
+    np.testing.assert_allclose(lifted, points[2::5, 2::5], atol=1e-6)
+    assert (heldout.thinned([shot], 10_000)[0].depth == depth).all()
 
 
 def test_without_a_phone_nothing_is_claimed(folders: BuildFolders):

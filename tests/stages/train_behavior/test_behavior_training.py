@@ -15,7 +15,7 @@ from pipeline.behavior.trajectories import PAST, TRAIN, frames_from_seconds
 from pipeline.core import training as fit
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid_torch
-from stages.train_behavior import objective, outcome, training
+from stages.train_behavior import objective, outcome, pictures, training
 from stages.train_behavior.batches import (
     MAX_REPEATS,
     SceneSampler,
@@ -383,6 +383,20 @@ def test_reactions_measure_a_known_animal(data, windows):
     expected = Reactions(away_m=1.0, away_share=1.0, reversal_m=2.0, far_m=0.0, farther_m=0.0)
     for name, value in vars(expected).items():
         assert getattr(measured, name) == pytest.approx(value, abs=0.05), name
+
+
+def test_paths_are_drawn_by_scale_of_guidance_for_every_window(data, windows):
+    seen = moments(data, Scenes.of(room()), ARCHITECTURE, 2)
+    statistics = statistics_from_windows(windows, 0.0)
+    sampler = Sampler(
+        TorchNetworks(initial_nets(ARCHITECTURE, Schedule(), statistics, 0)), Schedule(), statistics.scaling
+    )
+    rooms = [pictures.RoomMap(room())] * 2
+    for guided in ("observer", "all"):
+        image = pictures.guided_paths(rooms, sampler, seen.observation, seen.world_from_ego, guided, 0)
+        rows = np.array_split(image.astype(int), 3)
+        assert all(row.std() > 1 for row in rows)
+        assert np.abs(rows[0] - rows[2]).max() > 50, "guidance changes the paths"
 
 
 def test_learning_rate_falls_twice():
