@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 GUIDE = (ROOT / "docs/adding_a_stage.md").read_text()
 BLOCKS = re.findall(r"^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
+CONTRACTS = re.findall(r"^```markdown\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture(scope="module")
@@ -22,10 +23,15 @@ def copy(tmp_path_factory) -> Path:
     skip = shutil.ignore_patterns("__pycache__", "node_modules", "dist")
     for name in ("pipeline", "stages", "agents"):
         shutil.copytree(ROOT / name, folder / name, ignore=skip)
-    for name in ("pyproject.toml", "ERRORS.md"):
-        shutil.copy(ROOT / name, folder)
+    for name in ("pyproject.toml", "ERRORS.md", "data_layout.md", "envs/setup"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, folder / name)
+    for page, contract in zip(("data_layout.md", "ERRORS.md"), CONTRACTS, strict=True):
+        with (folder / page).open("a") as file:
+            file.write(contract if contract.startswith("|") else f"\n{contract}")
     (folder / "tests").mkdir()
-    shutil.copy(ROOT / "tests/test_house.py", folder / "tests")
+    for name in ("test_house.py", "test_data_layout.py"):
+        shutil.copy(ROOT / "tests" / name, folder / "tests")
     declaration, *files = BLOCKS
     for text in files:
         path, _, body = text.removeprefix("# ").partition("\n")
@@ -60,8 +66,10 @@ def test_the_planner_knows_it(copy):
 
 
 def test_it_keeps_the_rules(copy):
-    """All but the catalogue of error codes, which section 7 of the guide has the reader extend."""
-    done = python(copy, "-m", "pytest", "tests/test_house.py", "-k", "map_visits or visits")
+    """Those of its own files, of the declaration, and the contracts of section 8."""
+    chosen = "visits or dag.py or in_the_catalogue or room_is_in_the_flow or artifact_is_told"
+    files = ("tests/test_house.py", "tests/test_data_layout.py")
+    done = python(copy, "-m", "pytest", "-m", "not toy", *files, "-k", chosen)
     assert " passed" in done
 
 

@@ -27,11 +27,8 @@ RECONSTRUCTION_VARIANTS = (
 )  # fmt: skip
 """Variants of an agent that Table 3 compares its reconstruction with."""
 VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}
-PLUMBING = (
-    "core.errors", "core.config", "core.processes", "core.progress", "core.videos",
-    "workflow.artifact", "workflow.cli", "workflow.dag",
-)  # fmt: skip
-"""Files of `pipeline/` whose change cannot change what a stage computes."""
+TEMPLATES = ("scene_template", "agent_template")
+LOCALIZERS = ("scene_localizer", "agent_localizer")
 
 
 @dataclass(frozen=True)
@@ -175,15 +172,7 @@ FLOW: tuple[Node, ...] = (
     Node(
         "video_poses",
         "register_videos",
-        (
-            "frames",
-            "masks",
-            "features",
-            "scene_template",
-            "agent_template",
-            "scene_localizer",
-            "agent_localizer",
-        ),
+        ("frames", "masks", "features", *TEMPLATES, *LOCALIZERS),
         roles=("session",),
         gpu=1,
         seconds_per_frame=0.08,
@@ -192,17 +181,10 @@ FLOW: tuple[Node, ...] = (
     Node(
         "reconstruction",
         "reconstruct",
-        (
-            "registration",
-            *merging("frames", roles=VIEWED),
-            *merging("masks", "flow", "features"),
-            "scene_template",
-            "agent_template",
-        ),
+        ("registration", *merging("frames", roles=VIEWED), *merging("masks", "flow", "features"), *TEMPLATES),
         role_dependencies=("heldout",),
         threads=2,
         gpu=1,
-        memory_mb=3000,
         memory_mb_per_1000_frames=500,
         seconds_per_frame=0.1,
         resumable=True,
@@ -303,8 +285,7 @@ FLOW: tuple[Node, ...] = (
         "evaluate",
         (
             *merging("frames", "masks", "flow"),
-            "scene_template",
-            "agent_template",
+            *TEMPLATES,
             "scene_localizer",
             "registration",
             "reconstruction",
@@ -333,8 +314,7 @@ FLOW: tuple[Node, ...] = (
         "evaluate.reconstruction_tables",
         (
             Need("reconstruction", variants=RECONSTRUCTION_VARIANTS),
-            "scene_template",
-            "agent_template",
+            *TEMPLATES,
             *merging("frames"),
             Need("synthetic_capture", part="truth", option="truth"),
         ),
@@ -347,10 +327,8 @@ FLOW: tuple[Node, ...] = (
             *merging("frames", "flow", "masks"),
             "feature_basis",
             *merging("features"),
-            "scene_template",
-            "agent_template",
-            "scene_localizer",
-            "agent_localizer",
+            *TEMPLATES,
+            *LOCALIZERS,
             *merging("video_poses"),
             "registration",
             "reconstruction",

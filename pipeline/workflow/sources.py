@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pipeline.workflow import artifact, dag
+from pipeline.workflow import artifact
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,17 @@ class Source:
 
 CODE = Path(__file__).parents[2]
 """What `pipeline` and `stages` stand in: the checkout, or where the package was installed."""
+PLUMBING = (
+    "core.errors",
+    "core.config",
+    "core.processes",
+    "core.progress",
+    "core.videos",
+    "workflow.artifact",
+    "workflow.cli",
+    "workflow.dag",
+)
+"""Files of `pipeline/` whose change cannot change what a stage computes."""
 READER = 4
 """Raise it when more is read of a file, so that what was read before is read again."""
 
@@ -115,7 +126,7 @@ def _path_of(module: str) -> Path | None:
 
 
 def _is_plumbing(module: str) -> bool:
-    return module.removeprefix("pipeline.") in dag.PLUMBING
+    return module.removeprefix("pipeline.") in PLUMBING
 
 
 def _assets(room: Path, cache: Cache) -> dict[str, str]:
