@@ -14,6 +14,7 @@ import io
 import re
 import tokenize
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -25,8 +26,10 @@ PRIVATE_WORDS = frozenset(
 )
 """Words that this project once used for terms that the field has other names for; see docs/glossary.md."""
 PLAIN_NUMBERS = frozenset((10, 60, 90, 100, 180, 255, 360, 1000, 0.5, 0.25, 0.1, 0.01, 1e-3))
-"""Numbers that explain themselves; so do integers below 10, powers of two, and what only keeps a quotient
-finite."""
+"""Numbers that explain themselves; so do 1.0, integers below 10, powers of two, the largest values of integer
+types (127, 65535), and what only keeps a quotient finite."""
+NAMED_BY_CALL = ("Check", "qa.Check")
+"""Calls whose numbers have their name and unit beside them: the thresholds of a quality check."""
 DRAWN = ("stages/synthesize_capture",)
 """Where numbers are the measures of a drawn world."""
 ARRAYS = re.compile(r"\b(ndarray|Tensor)\b")
@@ -139,27 +142,42 @@ def repeated_classes() -> list[str]:
     ]
 
 
-def unnamed_numbers() -> list[str]:
-    """Numeric literals in function bodies that neither explain themselves nor have a name."""
+def numbers_in(tree: ast.AST) -> list[ast.Constant]:
+    """Return the numeric literals in a tree's functions that neither explain themselves nor have a name."""
 
     def plain(value: float) -> bool:
         whole = isinstance(value, int) and (value < 10 or value.bit_count() == 1)
-        return whole or value in PLAIN_NUMBERS or abs(value) <= 1e-5
+        largest = isinstance(value, int) and value >= 127 and (value + 1).bit_count() == 1
+        return whole or largest or value == 1 or value in PLAIN_NUMBERS or abs(value) <= 1e-5
 
-    found = []
-    for path in sources("pipeline", "stages"):
-        drawn = path.relative_to(ROOT).as_posix().startswith(DRAWN)
-        for function in ast.walk(tree_of(path)) if not drawn else ():
-            if isinstance(function, ast.FunctionDef):
-                found += [
-                    f"{place(path, node.lineno)} {node.value}"
-                    for statement in function.body
-                    for node in ast.walk(statement)
-                    if isinstance(node, ast.Constant)
-                    and type(node.value) in (int, float)
-                    and not plain(node.value)
-                ]
-    return sorted(set(found))
+    def walk(node: ast.AST) -> Iterator[ast.AST]:
+        yield node
+        for child in ast.iter_child_nodes(node):
+            own = isinstance(node, ast.Call) and ast.unparse(node.func) in NAMED_BY_CALL
+            threshold = child.value if isinstance(child, ast.keyword) else child
+            if not (own and isinstance(threshold, ast.Constant)):
+                yield from walk(child)
+
+    return [
+        node
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef)
+        for statement in function.body
+        for node in walk(statement)
+        if isinstance(node, ast.Constant) and type(node.value) in (int, float) and not plain(node.value)
+    ]
+
+
+def unnamed_numbers() -> list[str]:
+    """Numeric literals in function bodies that neither explain themselves nor have a name."""
+    return sorted(
+        {
+            f"{place(path, node.lineno)} {node.value}"
+            for path in sources("pipeline", "stages")
+            if not path.relative_to(ROOT).as_posix().startswith(DRAWN)
+            for node in numbers_in(tree_of(path))
+        }
+    )
 
 
 def public_array_functions() -> list[tuple[str, bool]]:

@@ -70,7 +70,7 @@ class PositionalMLP(nn.Module):
         self.register_buffer("middle", (low + high) / 2, persistent=False)
         longest = float((high - low).max())
         octaves = max(1, math.ceil(math.log2(longest / finest_m)))
-        self.register_buffer("frequency", math.pi / longest * 2.0 ** torch.arange(octaves), persistent=False)
+        self.register_buffer("frequency", math.pi / longest * 2 ** torch.arange(octaves), persistent=False)
         sizes = [3 + 6 * octaves] + [width] * layers
         self.network = nn.Sequential(
             *(part for pair in pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU()))

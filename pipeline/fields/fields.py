@@ -34,6 +34,12 @@ limbs"""
 START_SOFTNESS_M, START_RANGE_M = 0.1, (0.004, 0.2)
 """beta and its range where rendering alone has to find surfaces: samples lie about a decimetre apart at
 first"""
+START_SATURATION = 0.9
+"""share of the truncation that an untrained distance stays below: at 1 its tanh has no gradient"""
+START_LOG_BETA = -4.0
+"""of fields supervised by distances: 18 mm, the upper end of the range"""
+LEAST_FEATURE = 1e-4
+"""shorter features are not brought to unit length: their gradient would explode"""
 CODE_STD = 0.1
 """standard deviation of untrained codes"""
 LATTICE_M = 0.05
@@ -111,7 +117,9 @@ class Field(nn.Module):
                 nn.init.zeros_(last.weight)
                 nn.init.zeros_(last.bias)
             elif limit:
-                nn.init.constant_(last.bias, torch.atanh(torch.tensor(min(free_m / limit, 0.9))).item())
+                nn.init.constant_(
+                    last.bias, torch.atanh(torch.tensor(min(free_m / limit, START_SATURATION))).item()
+                )
             else:
                 nn.init.constant_(last.bias, free_m)
         self.appearance, last = _head(inputs, shape.width, 3 + FEATURE_CHANNELS)
@@ -119,7 +127,7 @@ class Field(nn.Module):
             nn.init.zeros_(last.weight.data[:3])
             nn.init.zeros_(last.bias.data[:3])
         self.log_beta = nn.Parameter(
-            torch.tensor(math.log(START_SOFTNESS_M) if shape.starts_as_box else -4.0)
+            torch.tensor(math.log(START_SOFTNESS_M) if shape.starts_as_box else START_LOG_BETA)
         )
         if self.codes:
             nn.init.normal_(self.codes.weight, std=CODE_STD)
@@ -175,7 +183,7 @@ class Field(nn.Module):
         color, feature = self.appearance(encoded).split([3, FEATURE_CHANNELS], dim=-1)
         if self.fused:
             color = color + encoded[:, 1 - FUSED_CHANNELS : -1].logit(LEAST_PROBABILITY)
-        return color.sigmoid(), functional.normalize(feature, dim=-1, eps=1e-4)
+        return color.sigmoid(), functional.normalize(feature, dim=-1, eps=LEAST_FEATURE)
 
     def forward(
         self,

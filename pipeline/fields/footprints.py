@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+BLUR_PX2 = 0.3
+"""added to the variance of every footprint, so that none falls between pixels"""
 NEAREST_M = 0.1
 """Gaussians nearer than this to the camera are not drawn"""
 ALPHA_LEAST, ALPHA_MOST = 1 / 255, 0.99

@@ -23,6 +23,17 @@ from pipeline.geometry.meshes import Mesh
 
 BAND0 = 0.28209479177387814
 """value of the constant spherical harmonic"""
+FOOTPRINT = 0.7
+"""standard deviation of a surface's Gaussians, in spacings of its points: neighbours overlap"""
+START_OPACITY = 0.9
+"""of a surface's Gaussians; nearer to 1 the logit has no gradient"""
+OPACITY_MARGIN = 1e-4
+"""opacities are kept this far from 0 and 1 for their logit"""
+OPACITY = gaussian_ply.COLUMNS.index("opacity")
+SCALE = slice(OPACITY + 1, OPACITY + 4)
+ROTATION = slice(SCALE.stop, SCALE.stop + 4)
+HIGHER_BANDS = sum(name.startswith("f_rest") for name in gaussian_ply.COLUMNS)
+"""columns of a file of Gaussians; the higher bands are 0 here"""
 THICKEST_M = 0.004
 """a surface's Gaussians are no thicker, or wide ones would stand out of it"""
 
@@ -58,7 +69,7 @@ class Gaussians(nn.Module):
             nn.Parameter(rotation),
             nn.Parameter(log_scale),
         )
-        self.opacity_logit = nn.Parameter(torch.logit(opacity.clamp(1e-4, 1 - 1e-4)))
+        self.opacity_logit = nn.Parameter(torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)))
         self.band0 = nn.Parameter((color - 0.5) / BAND0)
 
     def __len__(self) -> int:
@@ -126,11 +137,11 @@ def surface_gaussians(
     spacing_m: float | Float[np.ndarray, "point"],
 ) -> Gaussians:
     """Lay a flat Gaussian on each point of a surface, as wide as the points lie apart; colors in 0..1."""
-    size = np.log(0.7 * np.broadcast_to(spacing_m, len(points)))
+    size = np.log(FOOTPRINT * np.broadcast_to(spacing_m, len(points)))
     log_scale = np.stack([size, size, np.minimum(size - np.log(5), np.log(THICKEST_M))], axis=-1)
     parts = (
         torch.from_numpy(part).float()
-        for part in (points, _facing(normal), log_scale, np.full(len(points), 0.9), color)
+        for part in (points, _facing(normal), log_scale, np.full(len(points), START_OPACITY), color)
     )
     return Gaussians(*parts)
 
@@ -263,7 +274,7 @@ def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> 
     """Write some Gaussians as a standard 3D Gaussian PLY; others than `drawable` no reader could draw."""
     with torch.no_grad():
         rotation = functional.normalize(gaussians.rotation, dim=-1)
-        rest = torch.zeros(len(gaussians), 45, device=rotation.device)
+        rest = torch.zeros(len(gaussians), HIGHER_BANDS, device=rotation.device)
         normals = torch.zeros_like(gaussians.means)
         table = torch.cat(
             [
@@ -296,7 +307,11 @@ def load_ply(path: Path) -> Gaussians:
     """Read what `save_ply` wrote. Raises `InputError` ART-021 for any other file."""
     table = torch.from_numpy(gaussian_ply.read(path).copy())
     return Gaussians(
-        table[:, :3], table[:, 58:62], table[:, 55:58], table[:, 54].sigmoid(), table[:, 6:9] * BAND0 + 0.5
+        table[:, :3],
+        table[:, ROTATION],
+        table[:, SCALE],
+        table[:, OPACITY].sigmoid(),
+        table[:, 6:9] * BAND0 + 0.5,
     )
 
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.fields.footprints import ALPHA_LEAST, ALPHA_MOST, NEAREST_M, REACH, Footprints
+from pipeline.fields.footprints import ALPHA_LEAST, ALPHA_MOST, BLUR_PX2, NEAREST_M, REACH, Footprints
 from pipeline.geometry import rigid_torch
 
 Backend = Literal["tiles", "dense", "gsplat"]
-BLUR_PX2 = 0.3
-"""added to the variance of every footprint, so that none falls between pixels"""
+BEYOND = 0.15
+"""footprints are linearised at most this share of the picture beyond its edges, as in 3DGS"""
 
 
 def project(
@@ -36,8 +36,8 @@ def project(
     z = depth.clamp_min(NEAREST_M)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     zero = torch.zeros_like(z)
-    right = (x / z).clamp(-(0.15 * width + cx) / fx, (1.15 * width - cx) / fx)
-    down = (y / z).clamp(-(0.15 * height + cy) / fy, (1.15 * height - cy) / fy)
+    right = (x / z).clamp(-(BEYOND * width + cx) / fx, ((1 + BEYOND) * width - cx) / fx)
+    down = (y / z).clamp(-(BEYOND * height + cy) / fy, ((1 + BEYOND) * height - cy) / fy)
     affine = torch.stack(
         [torch.stack([fx / z, zero, -fx * right / z], -1), torch.stack([zero, fy / z, -fy * down / z], -1)],
         dim=1,

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.core.errors import InputError
+from pipeline.fields.footprints import BLUR_PX2
 
 
 class Gsplat:
@@ -47,6 +48,6 @@ class Gsplat:
         """Draw one view, metres; see `pipeline.fields.rasterize.draw`."""
         image, coverage, _ = self._rasterization(
             means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
-            camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=0.3,
+            camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=BLUR_PX2,
         )  # fmt: skip
         return image[0], coverage[0, ..., 0]

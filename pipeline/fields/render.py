@@ -20,6 +20,8 @@ from pipeline.geometry.meshes import Mesh, RayCaster
 
 LEAST_OPACITY = 0.5
 """rendered depth is known where the fields are at least this opaque"""
+LEAST_TOTAL = 1e-4
+"""opacity below which depth is not divided by it: keeps the quotient finite"""
 RAYS_AT_ONCE = 4096
 """rays rendered together, for memory"""
 NEAREST_M = 0.1
@@ -115,7 +117,7 @@ def composite(
         feature = feature + share[..., None] * (agent.feature - feature)
     weight = ray_weights(depth_m, length, density)
     opacity = weight.sum(-1)
-    depth = (weight * depth_m).sum(-1) / opacity.clamp_min(1e-4)
+    depth = (weight * depth_m).sum(-1) / opacity.clamp_min(LEAST_TOTAL)
     color, feature = ((weight[..., None] * values).sum(-2) for values in (color, feature))
     return Rendered(color, feature, depth, (weight * share).sum(-1), opacity, weight, share)
 

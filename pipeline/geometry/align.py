@@ -8,6 +8,9 @@ from jaxtyping import Bool, Float
 
 from pipeline.geometry import rigid
 
+SIDE_TOLERANCE = 2.5
+"""sides of corresponding triangles differ by at most so many thresholds: each end errs by one"""
+
 
 def kabsch(
     source: Float[np.ndarray, "*batch point 3"],
@@ -57,7 +60,7 @@ def ransac_rigid(
     triplets = rng.choice(count, (iterations, 3), p=probability)
     sides_source = np.linalg.norm(source[triplets] - source[np.roll(triplets, 1, axis=1)], axis=-1)
     sides_target = np.linalg.norm(target[triplets] - target[np.roll(triplets, 1, axis=1)], axis=-1)
-    plausible = (np.abs(sides_source - sides_target).max(1) < 2.5 * threshold_m) & (
+    plausible = (np.abs(sides_source - sides_target).max(1) < SIDE_TOLERANCE * threshold_m) & (
         sides_source.min(1) > least_side_m
     )
     if plausible.sum() < 4:

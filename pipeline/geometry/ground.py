@@ -12,6 +12,14 @@ VOTERS, CANDIDATES = 2000, 1500
 """surface directions that vote, and directions that they vote on"""
 VOTE_DEG = 6.0
 """a surface votes for directions that it is square to or along within about this, degrees"""
+FOCUS_MARGIN_M = 0.05
+"""points up to this far above the focus count as below it"""
+BIN_M = 0.02
+"""heights are counted in bins of this size"""
+BANDS_M = (0.05, 0.03, 0.02)
+"""a plane is refitted to points within these distances, one after the other"""
+AXIS_LIMITS_DEG = (6.0, 4.0)
+"""directions are refitted to surfaces that are square to or along them within these angles, likewise"""
 
 
 @dataclass(frozen=True)
@@ -33,12 +41,12 @@ def fit_ground(
     aside counts."""
     aside = np.linalg.norm((points_world - focus)[:, [0, 2]], axis=1)
     height = points_world[:, 1]
-    weight = np.exp(-((aside / reach_m) ** 2)) * (height < focus[1] + 0.05)
+    weight = np.exp(-((aside / reach_m) ** 2)) * (height < focus[1] + FOCUS_MARGIN_M)
     counts, edges = np.histogram(
-        height, np.arange(height.min() - 0.02, height.max() + 0.04, 0.02), weights=weight
+        height, np.arange(height.min() - BIN_M, height.max() + 2 * BIN_M, BIN_M), weights=weight
     )
-    offset, slope = edges[counts.argmax()] + 0.01, np.zeros(2)
-    for band in (0.05, 0.03, 0.02):
+    offset, slope = edges[counts.argmax()] + BIN_M / 2, np.zeros(2)
+    for band in BANDS_M:
         close = np.abs(height - offset - points_world[:, [0, 2]] @ slope) < band
         design = np.column_stack([points_world[close][:, [0, 2]], np.ones(close.sum())]) * weight[close, None]
         solution = np.linalg.lstsq(design, height[close] * weight[close], rcond=None)[0]
@@ -60,7 +68,7 @@ def floor_direction(
     width2 = np.sin(np.deg2rad(VOTE_DEG)) ** 2
     votes = np.exp((cosine2 - 1) / width2).sum(0) + 0.5 * np.exp(-cosine2 / width2).sum(0)
     up = candidates[votes.argmax()]
-    for limit_deg in (6.0, 4.0):
+    for limit_deg in AXIS_LIMITS_DEG:
         cosine = normals_world @ up
         along = np.abs(cosine) > np.cos(np.deg2rad(limit_deg))
         across = np.abs(cosine) < np.sin(np.deg2rad(limit_deg))

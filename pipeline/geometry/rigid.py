@@ -9,6 +9,11 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
+PARALLEL = 1e-4
+"""columns of a 6D rotation that stand out by less than this from one another are parallel"""
+ANY_OTHER = np.array([0.3, 0.2, 0.1])
+"""added to a turned direction, so that it is never parallel to the direction itself"""
+
 
 def make(
     rotation: Float[np.ndarray, "*#batch 3 3"], translation: Float[np.ndarray, "*#batch 3"]
@@ -124,10 +129,8 @@ def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray
     many."""
     first = _normalized(columns[..., :3])
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
-    parallel = np.linalg.norm(second, axis=-1, keepdims=True) < 1e-4
-    second = _normalized(
-        np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + np.array([0.3, 0.2, 0.1])), second)
-    )
+    parallel = np.linalg.norm(second, axis=-1, keepdims=True) < PARALLEL
+    second = _normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + ANY_OTHER), second))
     return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 

@@ -16,6 +16,8 @@ from torch.nn import functional
 
 from pipeline.geometry.meshes import Mesh, RayCaster
 
+R2_SEQUENCE = (0.7548776662466927, 0.5698402909980532)
+"""1 / g and 1 / g^2 of the plastic number g: multiples of them, modulo 1, are even and repeatable"""
 RAYS = np.array(
     [
         [np.sin(turn + rise), rise, np.cos(turn + rise)]
@@ -66,10 +68,7 @@ def surface_points(mesh: Mesh, spacing_m: float) -> SurfacePoints:
     ends = np.floor(np.cumsum(wanted) + 0.5).astype(np.int64)
     face = np.repeat(np.arange(len(ends)), np.diff(ends, prepend=0))
     index = np.arange(len(face))
-    u, v = (
-        (index * 0.7548776662466927) % 1,
-        (index * 0.5698402909980532) % 1,
-    )  # the R2 sequence: even and repeatable
+    u, v = ((index * step) % 1 for step in R2_SEQUENCE)
     fold = u + v > 1
     u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
     edges = corner[face, 1] - corner[face, 0], corner[face, 2] - corner[face, 0]

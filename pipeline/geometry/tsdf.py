@@ -13,6 +13,8 @@ from skimage import measure
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 
+CORNER_SHARE = 1e-4
+"""added to the trilinear shares of corners: a point on one that has no color takes its neighbors'"""
 FREE_GAIN = 0.2
 """Weight of a ray that passes far in front of what it met, against one that ends here: rims and thin legs
 would be carved away.
@@ -87,7 +89,7 @@ class Volume:
         part = grid_points - low
         color, total = np.zeros((len(low), 3)), np.full((len(low), 1), 1e-9)
         for corner in np.ndindex(2, 2, 2):
-            share = np.prod(np.where(corner, part, 1 - part), axis=1) + 1e-4
+            share = np.prod(np.where(corner, part, 1 - part), axis=1) + CORNER_SHARE
             index = tuple((low + corner).T)
             weight = (share * (self.color_weight[index] > 0))[:, None]
             color += weight * self.color[index]

@@ -9,6 +9,10 @@ from jaxtyping import Float, UInt8
 
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 
+EXTENT, MARGIN_M = (0.002, 0.998), 0.2
+"""quantiles of a mesh that a picture shows, to leave out stray vertices, and what it shows beyond them"""
+UNCOLORED = 170
+"""grey value of a surface without colors"""
 BACKGROUND = 245
 
 
@@ -41,8 +45,8 @@ class Overview:
 def bird_view(mesh: Mesh, *, floor_m: float, height_m: float = 1.7, width_px: int = 480) -> Overview:
     """Look straight down at a mesh (+y up) from ``height_m`` above the floor, so that ceilings do not hide
     the room."""
-    low, high = np.quantile(mesh.vertices[:, [0, 2]], [0.002, 0.998], axis=0)
-    low, high = low - 0.2, high + 0.2
+    low, high = np.quantile(mesh.vertices[:, [0, 2]], EXTENT, axis=0)
+    low, high = low - MARGIN_M, high + MARGIN_M
     meter_px = width_px / (high[0] - low[0])
     height_px = int(np.clip((high[1] - low[1]) * meter_px, 64, 4 * width_px))
     x, z = np.meshgrid(
@@ -67,6 +71,6 @@ def view(
 
 def shade(mesh: Mesh, hits) -> UInt8[np.ndarray, "ray 3"]:
     """Return the vertex colours at the hits, light grey where nothing was hit."""
-    color = np.full((len(mesh.vertices), 3), 170, np.uint8) if mesh.color is None else mesh.color
+    color = np.full((len(mesh.vertices), 3), UNCOLORED, np.uint8) if mesh.color is None else mesh.color
     painted = np.clip(np.round(hits.interpolate(mesh, color)), 0, 255).astype(np.uint8)
     return np.where((hits.face >= 0)[:, None], painted, np.uint8(BACKGROUND))

@@ -33,6 +33,12 @@ SWING_M_S2 = 15.0
 """Acceleration that a swinging foot may need: a step of 10 cm takes 0.2 s."""
 STRIDE_M = 0.25
 """A foot that glides further than this in one phase should stand more than once."""
+GROUND_PERCENTILE, GROUND_ERROR_M = 20, 0.02
+"""a foot's lowest heights are its ground; the reconstruction's floor is right within so much"""
+STANCE_SPEED, STANCE_SPEED_M_S = 0.4, 0.08
+"""a foot slower than this, as a share of the body's speed or in meters per second, stands"""
+SLOWEST_FOOT, SLOWEST_FOOT_LIFTED = 0.8, 0.6
+"""so does the slowest foot, below these shares: where feet should stand, and where they may not"""
 SHORTEST_PHASE_FRAMES = 3
 """Frames that a phase has at least."""
 
@@ -122,11 +128,21 @@ def detect_stance(
     foot = _speed(centres_world, rate_hz)
     body = _speed(root_world[:, None], rate_hz)
     even = ndimage.uniform_filter1d(foot, max(1, round(rate_hz / 6)), axis=0, mode="nearest")
-    low = height_m < np.percentile(height_m, 20, axis=0, keepdims=True).clip(-0.02, 0.02) + lifted_m
+    low = (
+        height_m
+        < np.percentile(height_m, GROUND_PERCENTILE, axis=0, keepdims=True).clip(
+            -GROUND_ERROR_M, GROUND_ERROR_M
+        )
+        + lifted_m
+    )
     least = np.where(low, even, np.inf)
     least = least == least.min(axis=1, keepdims=True)
-    slow = foot < np.maximum(0.4 * body, 0.08)
-    slow |= (least | (even < 0.8 * body)) if should_stand else (least & (even < 0.6 * body))
+    slow = foot < np.maximum(STANCE_SPEED * body, STANCE_SPEED_M_S)
+    slow |= (
+        (least | (even < SLOWEST_FOOT * body))
+        if should_stand
+        else (least & (even < SLOWEST_FOOT_LIFTED * body))
+    )
     both = ndimage.binary_closing(slow & low, np.ones((3, 1)))
     stands = ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
     return enforce_swing_time(stands, centres_world, rate_hz) if should_stand else stands

@@ -25,6 +25,8 @@ from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
 LEARNING_RATE = 0.004
 """Of Adam, metres and radians a step; it falls to a tenth over the optimisation."""
+RATE_FALL = 0.9
+"""Share of the learning rate that is lost over the optimisation, linearly."""
 LIFT_FRAMES = 4
 """Frames before and after one that must be lifted in which the motion rises and sinks."""
 HIGHEST_LIFT_M = 0.2
@@ -159,7 +161,7 @@ def _minimize(
     optimizer = torch.optim.Adam(correction.parameters(), lr=LEARNING_RATE)
     for step in range(settings.steps):
         for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * (1 - 0.9 * step / settings.steps)  # to a tenth
+            group["lr"] = LEARNING_RATE * (1 - RATE_FALL * step / settings.steps)
         if step in (settings.steps // 2, 3 * settings.steps // 4):
             inside = _penetrating_vertices(body, correction, scene, both)
             surface = PosedSurface(body, np.concatenate([watched, inside]))

@@ -41,6 +41,8 @@ CONVENTIONS = {"units": "metres, radians, seconds", "up": [0, 1, 0], "rate_hz": 
 """What the networks' numbers mean; a model that says otherwise is another version's."""
 JUMP_M = 0.1
 """A leg between places whose levels differ by more than this is leapt."""
+TURN_PERCENTILE = 99
+"""The prior's fastest turn: jumps of the reconstruction are left out."""
 SWEEPS = 2
 """How often bodies in passing are made again from what is before and after them."""
 
@@ -266,7 +268,7 @@ def measure_motion_prior(
     kept = kept if kept.any() else ~kept
     found = (float(np.median(np.concatenate(each)[kept])) for each in (clearance, pace, above))
     clearance_m, pace_m, above_m = found
-    turn_rad = max(float(np.percentile(np.concatenate(turn), 99)), np.pi / RATE_HZ)
+    turn_rad = max(float(np.percentile(np.concatenate(turn), TURN_PERCENTILE)), np.pi / RATE_HZ)
     return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)
 
 

@@ -27,6 +27,10 @@ REACH_M = 1.5
 """scene points of a clip come from this far around the middle between start and end"""
 BODY_REACH_M = 0.8
 """scene points of a static body come from this far around it"""
+LEAK = 0.2
+"""slope of LeakyReLU below 0"""
+FEWEST_TURNS = 0.4
+"""untrained gait phases turn at least so often per meter and per second on the move, and up to 2 more"""
 
 IDLE_M_S = 0.1
 """a body slower than this hardly counts as on the move"""
@@ -58,7 +62,7 @@ class ResidualBlock(nn.Module):
     def __init__(self, width: int):
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(width, width), nn.LeakyReLU(0.2), nn.Linear(width, width), nn.LeakyReLU(0.2)
+            nn.Linear(width, width), nn.LeakyReLU(LEAK), nn.Linear(width, width), nn.LeakyReLU(LEAK)
         )
 
     def forward(self, x: Float[Tensor, "batch width"]) -> Float[Tensor, "batch width"]:
@@ -75,11 +79,11 @@ class StaticBody(nn.Module):
         self.sizes = sizes
         body, width = ROOT_CHANNELS + sizes.pose, sizes.width
         self.point_net = PointNet(sizes.scene)
-        self.condition = nn.Sequential(nn.Linear(sizes.scene + sizes.shape + 7, width), nn.LeakyReLU(0.2))
+        self.condition = nn.Sequential(nn.Linear(sizes.scene + sizes.shape + 7, width), nn.LeakyReLU(LEAK))
         self.encoder_in = nn.Linear(body, width)
         self.encoder = nn.Sequential(ResidualBlock(width), ResidualBlock(width))
         self.encoder_out = nn.Sequential(
-            nn.Linear(2 * width, width), nn.LeakyReLU(0.2), nn.Linear(width, 2 * sizes.latent)
+            nn.Linear(2 * width, width), nn.LeakyReLU(LEAK), nn.Linear(width, 2 * sizes.latent)
         )
         self.decoder_in = nn.Linear(sizes.latent + width, width)
         self.decoder = nn.Sequential(ResidualBlock(width), ResidualBlock(width))
@@ -266,7 +270,9 @@ class GaitPhase(nn.Module):
         self.code = nn.Linear(pose, 2 * waves)
         step = torch.linspace(0, 1, waves)
         self.rate = nn.Parameter(
-            2 * torch.pi * torch.stack([0.4 + 2 * step, 0.4 + 2 * ((7 * step) % 1), 0 * step], dim=-1)
+            2
+            * torch.pi
+            * torch.stack([FEWEST_TURNS + 2 * step, FEWEST_TURNS + 2 * ((7 * step) % 1), 0 * step], dim=-1)
         )
 
     @property
@@ -339,7 +345,7 @@ class PoseNet(nn.Module):
 
 def with_velocity(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 18"]:
     """Return a route with its change per tenth of a second, the velocity in the body's own axes."""
-    rate = functional.pad(route[:, 1:] - route[:, :-1], (0, 0, 0, 1), mode="replicate") * (STEPS / 20)
+    rate = functional.pad(route[:, 1:] - route[:, :-1], (0, 0, 0, 1), mode="replicate") * (RATE_HZ / 10)
     own = rigid_torch.rotation_from_6d(route[..., 3:]).transpose(-1, -2)
     return torch.cat([route, (own @ rate[..., :3, None])[..., 0], rate[..., 3:]], dim=-1)
 

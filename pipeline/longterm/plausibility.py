@@ -16,6 +16,8 @@ from pipeline.longterm.bodies import PosedSurface, SkinnedBody
 from pipeline.longterm.contacts import ContactVertices, detect_stance, motion_tensors
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
+FRAMES_AT_ONCE = 200
+"""Frames whose vertices are held at a time, for memory."""
 SOLID_M = 0.005
 """A vertex deeper than this inside the scene collides: half a centimetre is what grid and fur leave open."""
 CONTACT_M = 0.02
@@ -84,8 +86,8 @@ class PlausibilityMeter:
     ) -> Plausibility:
         """Measure a motion on all vertices of the body."""
         distance, points = [], []
-        for start in range(0, len(motion), 200):
-            vertices = self.surface(*motion_tensors(motion[start : start + 200]))
+        for start in range(0, len(motion), FRAMES_AT_ONCE):
+            vertices = self.surface(*motion_tensors(motion[start : start + FRAMES_AT_ONCE]))
             distance.append(self.scene.at(vertices))
             points.append(vertices[:, self.contacts.vertices])
         depth, touching = torch.cat(distance), torch.cat(points)

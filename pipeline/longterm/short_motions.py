@@ -19,6 +19,8 @@ from pipeline.geometry import rigid
 RATE_HZ = 30
 STEPS = 60
 """k of the paper: a short motion has k + 1 frames, the first and the last of which are given"""
+EARLY, LATE = (0.2, 0.55), (0.45, 0.8)
+"""shares of a leap in which it rises and goes across, or goes across and comes down"""
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,13 @@ def jump_between_levels(motion: BodyMotion, hop_m: float = 0.08) -> BodyMotion:
     go through the edge.
     """
     share, (start, end) = np.linspace(0, 1, len(motion)), motion.world_from_agent[[0, -1], :3, 3]
-    early, late = (_smoothstep(share, *span) for span in ((0.2, 0.55), (0.45, 0.8)))
+    early, late = (_smoothstep(share, *span) for span in (EARLY, LATE))
     upward, across = (early, late) if end[1] > start[1] else (late, early)
     roots = motion.world_from_agent.copy()
     roots[:, :3, 3] = start + np.stack([across, upward, across], axis=-1) * (end - start)
-    roots[:, 1, 3] += hop_m * _smoothstep(share, 0.2, 0.45) * (1 - _smoothstep(share, 0.55, 0.8))
+    roots[:, 1, 3] += (
+        hop_m * _smoothstep(share, EARLY[0], LATE[0]) * (1 - _smoothstep(share, EARLY[1], LATE[1]))
+    )
     return BodyMotion(roots, motion.agent_from_bone)
 
 

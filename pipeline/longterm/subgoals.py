@@ -28,6 +28,16 @@ LEG_LENGTH_SLACK = 1.35
 """How much longer than the usual pace a leg may be before another one is needed."""
 SUPPORT_SEARCH_M = 0.3
 """How far above or below a raised sub-goal what carries a body there is looked for."""
+LOWEST_ROOT = 0.7
+"""A root that travels is free from this share of its usual height upwards."""
+NARROW = 0.6
+"""A broad body may come this close to the scene, in heights of its root."""
+NEAR_FURNITURE_M, BLOCKED_COST = 0.12, 80.0
+"""Free ground costs five times as much at furniture, falling off over this, and blocked ground so much."""
+WAY_SMOOTHING_CELLS = 3.0
+"""Deviation of the Gaussian that rounds the corners of a way on the grid."""
+SHORTEST_WAY_M = 0.05
+"""A shorter way has no direction: the heading before it stays."""
 BEYOND_M = 1.0
 """No root is further above or below all surfaces of a scene."""
 TURN_M = 0.2
@@ -88,11 +98,13 @@ class WalkableFloor:
         low, span = grid.origin.double().numpy(), (np.array(grid.values.shape) - 1) * grid.voxel_m
         count = np.floor(span[[0, 2]] / CELL_M).astype(int) + 1
         x, z = (low[axis] + CELL_M * np.arange(n) for axis, n in zip((0, 2), count, strict=True))
-        levels = floor + np.linspace(0.7 * root_m, root_m + max(motion_prior.above_m, 0.5 * root_m), 5)
+        levels = floor + np.linspace(
+            LOWEST_ROOT * root_m, root_m + max(motion_prior.above_m, 0.5 * root_m), 5
+        )
         points = np.stack(np.meshgrid(x, levels, z, indexing="ij"), axis=-1)
         above = grid.at(torch.from_numpy(points).float()).numpy()
         beneath = grid.at(torch.from_numpy(points[:, 0] * [1, 0, 1] + [0, floor, 0]).float()).numpy()
-        free = (above.min(1) > np.minimum(breadth_m / 2, 0.6 * root_m)) & (np.abs(beneath) < 0.1)
+        free = (above.min(1) > np.minimum(breadth_m / 2, NARROW * root_m)) & (np.abs(beneath) < 0.1)
         _, area = cv2.connectedComponents(free.astype(np.uint8))
         free &= area == np.bincount(area[free], minlength=1).argmax()
         heights = np.asarray(scene.mesh.vertices)[:, 1]
@@ -179,12 +191,12 @@ class WalkableFloor:
         """Return a way over the ground from near one position to near another, smooth, away from
         furniture.
         """
-        cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / 0.12), 80.0)
+        cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / NEAR_FURNITURE_M), BLOCKED_COST)
         cells, _ = route_through_array(
             cost, self.cell(start), self.cell(end), fully_connected=True, geometric=True
         )
         way = self.corner + CELL_M * np.array(cells, float)
-        return gaussian_filter1d(way, 3.0, axis=0, mode="nearest") if len(way) > 2 else way
+        return gaussian_filter1d(way, WAY_SMOOTHING_CELLS, axis=0, mode="nearest") if len(way) > 2 else way
 
 
 def plan_waypoints(
@@ -352,7 +364,7 @@ def _poses_along_path(
     turned = []
     for index, given in enumerate(headings):
         way = points[min(index + 1, len(points) - 1)] - points[max(index - 1, 0)]
-        if given is None and np.linalg.norm(way[[0, 2]]) < 0.05:
+        if given is None and np.linalg.norm(way[[0, 2]]) < SHORTEST_WAY_M:
             given = turned[-1] if turned else 0.0
         turned.append(float(np.arctan2(way[0], way[2])) if given is None else given)
     for index in range(2, len(turned)):

@@ -16,6 +16,12 @@ from pipeline.geometry.signed_distance import SignedDistance, SurfacePoints
 SPACING_M = 0.07
 VERTICAL_SURFACE = 0.7
 """A surface whose normal has a smaller vertical part stands; half of the points are drawn from such."""
+MARGIN_M = 0.15
+"""Distances are known this far beyond the mesh."""
+LEVEL_SURFACE = 0.9
+"""A surface whose normal has a larger vertical part lies."""
+BIN_M, FLOOR_BAND_M = 0.02, 0.03
+"""Levels are counted in bins of this size; the floor is the median of what lies this close to its bin."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,7 @@ class MotionScene:
         cls, mesh: Mesh, roots_world: Float[np.ndarray, "frame 3"], reach_m: float = 0.7
     ) -> "MotionScene":
         """Take the whole breadth of a mesh, at the heights where a body has been."""
-        low, high = np.asarray(mesh.vertices).min(0) - 0.15, np.asarray(mesh.vertices).max(0) + 0.15
+        low, high = np.asarray(mesh.vertices).min(0) - MARGIN_M, np.asarray(mesh.vertices).max(0) + MARGIN_M
         low[1] = max(low[1], roots_world[:, 1].min() - reach_m)
         high[1] = min(high[1], roots_world[:, 1].max() + reach_m)
         return cls(mesh, low, high)
@@ -53,12 +59,12 @@ class MotionScene:
     @property
     def floor_m(self) -> float:
         """Height of the floor: the lowest level with a fair share of the surface that lies facing up."""
-        level = self.surface.points[self.surface.normals[:, 1] > 0.9, 1]
+        level = self.surface.points[self.surface.normals[:, 1] > LEVEL_SURFACE, 1]
         if not len(level):
             return float(self.surface.points[:, 1].min())
-        count, edges = np.histogram(level, np.arange(level.min() - 0.02, level.max() + 0.06, 0.02))
-        lowest = edges[np.flatnonzero(count > 0.25 * count.max())[0]] + 0.01
-        return float(np.median(level[np.abs(level - lowest) < 0.03]))
+        count, edges = np.histogram(level, np.arange(level.min() - BIN_M, level.max() + 3 * BIN_M, BIN_M))
+        lowest = edges[np.flatnonzero(count > 0.25 * count.max())[0]] + BIN_M / 2
+        return float(np.median(level[np.abs(level - lowest) < FLOOR_BAND_M]))
 
     def around(
         self,

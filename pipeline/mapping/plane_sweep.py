@@ -32,6 +32,8 @@ SMALL_STEP, LARGE_STEP = np.float32(0.04), np.float32(0.5)
 
 A step of one plane between neighbours, and a larger one
 """
+EDGE_GRAY = 12
+"""difference of grey values at which a jump of depth costs half as much"""
 AGREE_SHARE = 0.03
 """relative difference of depth within which another picture agrees"""
 
@@ -179,7 +181,9 @@ def _add_path(cost, total, down, right, small, large, gray):
             else:
                 before = path[before_row, before_column]
                 least = before.min()
-                jump = least + large / (1 + abs(gray[row, column] - gray[before_row, before_column]) / 12)
+                jump = least + large / (
+                    1 + abs(gray[row, column] - gray[before_row, before_column]) / EDGE_GRAY
+                )
                 for plane in range(planes):
                     value = min(before[plane], jump)
                     if plane > 0:

@@ -93,8 +93,8 @@ def _solve(
     rows, columns, blocks = np.concatenate(rows), np.concatenate(columns), np.concatenate(blocks)
     inner = np.arange(6)
     at = (
-        np.repeat(rows * 6, 36) + np.tile(np.repeat(inner, 6), len(rows)),
-        np.repeat(columns * 6, 36) + np.tile(inner, 6 * len(rows)),
+        np.repeat(rows * 6, 6 * 6) + np.tile(np.repeat(inner, 6), len(rows)),
+        np.repeat(columns * 6, 6 * 6) + np.tile(inner, 6 * len(rows)),
     )
     hessian = scipy.sparse.coo_matrix((blocks.reshape(-1), at), shape=(6 * count, 6 * count))
     held = scipy.sparse.diags(np.r_[np.full(6, FIXED_PRECISION), np.full(6 * (count - 1), FREE_PRECISION)])

@@ -25,7 +25,8 @@ MEMBERS_PER_FRAME, MEMBERS_BESIDE = 4, 1000
 
 And others
 """
-MAX_TOTAL_BYTES = 256 << 30
+GIB = 1 << 30
+MAX_TOTAL_BYTES = 256 * GIB
 MAX_RATIO = 200
 """unpacked over packed size beyond which a member is no picture but a bomb"""
 SMALL_BYTES = 1 << 16
@@ -35,6 +36,8 @@ MAX_DIGITS = 18
 DIRECTORY_ENTRY_BYTES = 47
 """least size of a member's entry in a ZIP's directory"""
 _END_OF_DIRECTORY, _END_OF_DIRECTORY_64 = b"PK\x05\x06", b"PK\x06\x06"
+_SIZE_AT, _COUNT_AT, _SIZES_64_AT = 12, 10, 32
+"""offsets in the end of the directory: its size, the number of its entries; both in the 64-bit record"""
 _TAIL_BYTES = (1 << 16) + 22 + 20 + 56
 """longest end of a ZIP: comment, end of directory, its 64-bit locator and record"""
 _UNREADABLE = (
@@ -128,12 +131,12 @@ def _declared_members(path: Path) -> int:
         file.seek(max(path.stat().st_size - _TAIL_BYTES, 0))
         tail = file.read()
     end, end_64 = tail.rfind(_END_OF_DIRECTORY), tail.rfind(_END_OF_DIRECTORY_64)
-    if end < 0 or len(tail) < end + 12:
+    if end < 0 or len(tail) < end + _SIZE_AT:
         raise zipfile.BadZipFile("it has no directory")
-    count = struct.unpack_from("<H", tail, end + 10)[0]
-    directory = struct.unpack_from("<I", tail, end + 12)[0] if len(tail) >= end + 16 else 0
-    if end_64 >= 0 and len(tail) >= end_64 + 48:
-        count, directory = struct.unpack_from("<2Q", tail, end_64 + 32)
+    count = struct.unpack_from("<H", tail, end + _COUNT_AT)[0]
+    directory = struct.unpack_from("<I", tail, end + _SIZE_AT)[0] if len(tail) >= end + _SIZE_AT + 4 else 0
+    if end_64 >= 0 and len(tail) >= end_64 + _SIZES_64_AT + 16:
+        count, directory = struct.unpack_from("<2Q", tail, end_64 + _SIZES_64_AT)
     return max(count, directory // DIRECTORY_ENTRY_BYTES)
 
 
@@ -157,7 +160,7 @@ def _refuse_unsafe(members: list[zipfile.ZipInfo], where: str) -> None:
     if len(members) > MAX_MEMBERS:
         raise _unsafe(where, f"{len(members)} members, at most {MAX_MEMBERS} are read")
     if sum(info.file_size for info in members) > MAX_TOTAL_BYTES:
-        raise _unsafe(where, f"it unpacks to more than {MAX_TOTAL_BYTES >> 30} GiB")
+        raise _unsafe(where, f"it unpacks to more than {MAX_TOTAL_BYTES // GIB} GiB")
     if len({info.filename for info in members}) != len(members):
         raise _unsafe(where, "two members share one name")
     for info in members:

@@ -25,6 +25,14 @@ MIN_SHIFT_M = 0.05
 POSE_PAIRS = 6
 """pairs of frames on which device poses are checked against depth"""
 GAP_S = (0.33, 1.5)
+GAP_FRAMES = 2.5
+"""pairs may lie this many frames apart where frames are rare"""
+NEAREST_M = 0.05
+"""points nearer to the second camera are not compared"""
+LEAST_COMPARED = 50
+"""points that a pair must share to be judged"""
+UNIT_TOLERANCE = 0.05
+"""quaternions as lengths: what rounding to a few digits leaves"""
 STRIDE_PX, POINTS_A_SIDE = 3, 80
 """every third pixel of the first picture is enough, and so are 80 along its longer side"""
 
@@ -136,7 +144,7 @@ def _fault_of(pose: Float[np.ndarray, "frame 7"]) -> str:
     """Name what makes poses meaningless without looking at depth; nothing where they may mean something."""
     if not np.isfinite(pose).all():
         return "device poses are not finite"
-    if np.any(np.abs(np.linalg.norm(pose[:, :4], axis=1) - 1) > 0.05):
+    if np.any(np.abs(np.linalg.norm(pose[:, :4], axis=1) - 1) > UNIT_TOLERANCE):
         return "device poses hold quaternions that are not of unit length"
     if len(pose) > 1 and np.ptp(pose, axis=0).max() < 1e-6:
         return "all device poses are the same"
@@ -155,7 +163,9 @@ def _moving_pairs(
         np.linalg.norm(relative[:, :3, 3], axis=1) > MIN_SHIFT_M
     )
     longest_s = (
-        max(GAP_S[1], 2.5 * float(np.median(np.diff(timestamp_s)))) if len(timestamp_s) > 1 else GAP_S[1]
+        max(GAP_S[1], GAP_FRAMES * float(np.median(np.diff(timestamp_s))))
+        if len(timestamp_s) > 1
+        else GAP_S[1]
     )
     usable = np.stack([first, second], axis=1)[
         moved & (timestamp_s[second] - timestamp_s[first] <= longest_s)
@@ -194,11 +204,11 @@ def compare(
     points_first = cameras.back_project(first.depth, first.intrinsics)[every][first.depth[every] > 0]
     pixel, depth = cameras.project(rigid.apply(second_from_first, points_first), second.intrinsics)
     height, width = second.depth.shape
-    inside = (depth > 0.05) & (pixel >= 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+    inside = (depth > NEAREST_M) & (pixel >= 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
     column, row = np.floor(pixel[inside]).astype(int).T
     measured = second.depth[row, column]
     difference = np.abs(depth[inside] - measured)[measured > 0]
-    if len(difference) < 50:
+    if len(difference) < LEAST_COMPARED:
         return np.inf, 0.0, TOLERANCE_M
     typical_m = float(np.median(measured[measured > 0]))
     return (

@@ -45,6 +45,8 @@ LEAST_TIMED = 0.5
 """share of frames whose times increase below which the times are not used"""
 
 
+LZVN_HEADER_BYTES, LZFSE_V1_HEADER_BYTES, LZFSE_FIELD_BITS = 12, 772, 20
+"""sizes of block headers, and of a field in the packed header of version 2"""
 LZFSE_END = b"bvx$"
 """marks the end of an LZFSE stream"""
 
@@ -349,13 +351,16 @@ def _block(data: bytes, at: int) -> tuple[int, int]:
                 return raw, 8 + raw
             case b"bvxn":
                 raw, payload = struct.unpack_from("<2I", data, at + 4)
-                return raw, 12 + payload
+                return raw, LZVN_HEADER_BYTES + payload
             case b"bvx1":
                 raw, payload = struct.unpack_from("<2I", data, at + 4)
-                return raw, 772 + payload
+                return raw, LZFSE_V1_HEADER_BYTES + payload
             case b"bvx2":
                 raw, first, second, third = struct.unpack_from("<I3Q", data, at + 4)
-                literals, matches = first >> 20 & 0xFFFFF, second >> 40 & 0xFFFFF
+                literals, matches = (
+                    first >> LZFSE_FIELD_BITS & 0xFFFFF,
+                    second >> 2 * LZFSE_FIELD_BITS & 0xFFFFF,
+                )
                 return raw, (third & 0xFFFFFFFF) + literals + matches
     except struct.error as error:
         raise BrokenBlockError("cut short") from error

@@ -21,6 +21,8 @@ from pipeline.recordings.depth_camera import DepthCamera
 MAX_PICTURE_BYTES = 64 << 20
 MAX_TEXT_BYTES = 64 << 20
 Y_UP = (0.0, 1.0, 0.0)
+ORTHONORMAL = 0.02
+"""largest entry by which a rotation, times itself transposed, may differ from the identity"""
 Picture = bytes | UInt8[np.ndarray, "height width 3"]
 """an encoded JPEG or PNG, or decoded RGB"""
 
@@ -124,7 +126,7 @@ def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float
         off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
         good = (
             np.isfinite(world_from_camera).all((1, 2))
-            & (off < 0.02)
+            & (off < ORTHONORMAL)
             & (np.linalg.det(np.nan_to_num(rotation)) > 0)
         )
     if good.any():

@@ -26,6 +26,10 @@ from pipeline.recordings.recording import (  # fmt: skip
     no_frames,
 )
 
+DEFAULT_SIZE = (480, 640)
+"""height and width of such pictures"""
+QUOTED = 40
+"""characters of a line that an error shows"""
 PER_METER, MILLIMETERS = 5000.0, 1000.0
 """units per metre of the set, and of most other cameras"""
 CLEARLY = 0.5
@@ -57,7 +61,7 @@ def open_recording(path: Path) -> Recording:
     ]
     depth_size = meters_from_png(container.read(pairs[0][1], MAX_PICTURE_BYTES), None, container.where).shape
     coefficients, remarks = text_files.coefficients(
-        container, default=DEFAULT if color_size == (480, 640) else None
+        container, default=DEFAULT if color_size == DEFAULT_SIZE else None
     )
     intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(pairs), 1)), container.where)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (color_size, depth_size))
@@ -117,7 +121,7 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
             found.append((time_s, cells[1]))
         except (ValueError, IndexError) as error:
             raise broken_metadata(
-                f"{container.where}/{name}", f"{line[:40]!r} is no time and file name"
+                f"{container.where}/{name}", f"{line[:QUOTED]!r} is no time and file name"
             ) from error
     return sorted(dict(found).items())
 

@@ -16,6 +16,10 @@ ROLL = 4.0
 """what a mean squared sine of roll counts against a share of level surface"""
 MARGIN = 0.15
 """by which the best of the four directions must be ahead of the others"""
+NEAR_GUESS_DEG = 35.0
+"""up is looked for within this angle of where the phone's upright pose puts it: phones are held tilted"""
+LEVEL_COSINE = 0.95
+"""surfaces within 18 degrees of level are floor (facing up) or ceiling"""
 SIDE_PX = 200
 """longer side that depth is thinned to: directions over fewer pixels than that are noise"""
 LEAST_POINTS = 100
@@ -65,11 +69,11 @@ def up_from_room(
     for turns in range(4):
         turned = cameras.turn_camera(odometry_from_camera, turns)
         guess = -turned[:, :3, 1].mean(0)
-        up = floor_direction(towards_camera, guess / np.linalg.norm(guess), within_deg=35.0)
+        up = floor_direction(towards_camera, guess / np.linalg.norm(guess), within_deg=NEAR_GUESS_DEG)
         facing = towards_camera @ up
         roll = float(((turned[:, :3, 0] @ up) ** 2).mean())
         directions.append(up)
-        scores.append(float((facing > 0.95).mean() - (facing < -0.95).mean()) - ROLL * roll)
+        scores.append(float((facing > LEVEL_COSINE).mean() - (facing < -LEVEL_COSINE).mean()) - ROLL * roll)
     best, second = np.argsort(scores)[::-1][:2]
     return directions[best] if scores[best] > scores[second] + MARGIN else None
 

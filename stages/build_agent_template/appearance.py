@@ -9,6 +9,11 @@ from scipy.spatial import KDTree
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 
+SEEN_WEIGHT = 0.05
+"""total weight of its views above which a vertex counts as seen"""
+LAST_CELL = 1.001
+"""positions are clamped this far inside the picture, so that a cell follows to blend with"""
+
 
 def visibility(
     mesh_agent: Mesh,
@@ -68,7 +73,7 @@ def gather(
         w[:, None] * _sample(picture, at / stride_px)
         for w, at, picture in zip(weight, pixel, pictures, strict=True)
     )
-    seen = weight.sum(0) > 0.05
+    seen = weight.sum(0) > SEEN_WEIGHT
     mean = total / np.maximum(weight.sum(0), 1e-9)[:, None]
     if seen.any() and not seen.all():
         mean[~seen] = mean[seen][KDTree(vertices[seen]).query(vertices[~seen])[1]]
@@ -80,7 +85,7 @@ def _sample(
 ) -> Float[np.ndarray, "point channel"]:
     """Blend bilinearly at positions in cells; a cell's centre lies in the middle of its square."""
     height, width = picture.shape[:2]
-    grid = np.clip(position - 0.5, 0, [width - 1.001, height - 1.001])
+    grid = np.clip(position - 0.5, 0, [width - LAST_CELL, height - LAST_CELL])
     low = np.floor(grid).astype(int)
     part = grid - low
     picture = picture.astype(np.float32)

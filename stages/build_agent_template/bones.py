@@ -58,7 +58,7 @@ def body_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sp
     """Connect cells nearer than two spacings, weighted by distance; loose parts are tied to the rest at their
     nearest points.
     """
-    pairs = KDTree(cells).query_pairs(2.0 * spacing_m, output_type="ndarray")
+    pairs = KDTree(cells).query_pairs(2 * spacing_m, output_type="ndarray")
     length = np.linalg.norm(cells[pairs[:, 0]] - cells[pairs[:, 1]], axis=1)
     graph = scipy.sparse.coo_matrix((length, pairs.T), shape=(len(cells),) * 2).tocsr()
     while (found := connected_components(graph, directed=False))[0] > 1:

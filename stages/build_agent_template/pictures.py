@@ -12,19 +12,24 @@ from pipeline.geometry import views as overview
 from pipeline.geometry.meshes import Mesh, RayCaster
 from stages.build_agent_template.template import CanonicalTemplate
 
+FOCAL, LIFTS_RAD, DISTANCE = 1.4, (0.25, 0.9), 3.2
+"""the turntable's focal length in picture widths, its heights of view, its distance in radii of the mesh"""
+SATURATION, VALUES = 0.75, (0.7, 0.95)
+"""of a bone's colour; neighbours alternate in value"""
+
 
 def turntable(mesh: Mesh, views: int = 8, size_px: int = 220) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the mesh (agent frame) from around, the head's side first; the rows look from the side and from
     above.
     """
     caster, radius = RayCaster(mesh), float(np.linalg.norm(mesh.vertices, axis=1).max())
-    focal, up = 1.4 * size_px, np.array([0.0, 1.0, 0.0])
+    focal, up = FOCAL * size_px, np.array([0.0, 1.0, 0.0])
     intrinsics = np.array([[focal, 0, size_px / 2], [0, focal, size_px / 2], [0, 0, 1]])
     shown = []
-    for lift in (0.25, 0.9):
+    for lift in LIFTS_RAD:
         for turn in 2 * np.pi * np.arange(views) / views:
             toward = np.array([np.cos(lift) * np.sin(turn), np.sin(lift), np.cos(lift) * np.cos(turn)])
-            camera = rigid.look_at(3.2 * radius * toward, np.zeros(3), up)
+            camera = rigid.look_at(DISTANCE * radius * toward, np.zeros(3), up)
             shown.append(overview.view(caster, camera, intrinsics, size_px, size_px))
     return plots.grid(shown, views)
 
@@ -32,8 +37,8 @@ def turntable(mesh: Mesh, views: int = 8, size_px: int = 220) -> UInt8[np.ndarra
 def bone_colors(weights: Float[np.ndarray, "vertex bone"]) -> UInt8[np.ndarray, "vertex 3"]:
     """Mix one hue per bone by the skinning weights."""
     bone = np.arange(weights.shape[1])
-    hue, value = (7 * bone % len(bone)) / len(bone), np.where(bone % 2, 0.95, 0.7)
-    color = hsv_to_rgb(np.stack([hue, np.full(len(bone), 0.75), value], axis=1))
+    hue, value = (7 * bone % len(bone)) / len(bone), np.where(bone % 2, VALUES[1], VALUES[0])
+    color = hsv_to_rgb(np.stack([hue, np.full(len(bone), SATURATION), value], axis=1))
     return np.round(255 * weights @ color).astype(np.uint8)
 
 

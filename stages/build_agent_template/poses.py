@@ -15,6 +15,10 @@ from pipeline.mapping.odometry import CorrectedOdometry, align_gravity, chain_al
 STRIDE = 2
 LOOPS = 5
 """Earlier views each keyframe is aligned to: a circle around one animal sees the same place often."""
+GROUND_FRAMES, REACH_M = 40, 0.4
+"""frames that show the ground, and how far from the animal it counts"""
+LEVEL_COSINE = 0.9
+"""surfaces within 26 degrees of level are ground"""
 LEAST_POINTS = 200
 """points of depth, over some 40 frames at that stride, without which no template is built"""
 
@@ -47,7 +51,7 @@ def walk_around(clip: Clip, masks: Masks) -> Circle:
     if clip.odometry_from_camera is None or not clip.gravity_known:
         poses = align_gravity(view, poses)
     animal, floor = [], []
-    for frame in np.flatnonzero(masks.visible)[:: max(1, int(masks.visible.sum()) // 40)]:
+    for frame in np.flatnonzero(masks.visible)[:: max(1, int(masks.visible.sum()) // GROUND_FRAMES)]:
         seen = view(frame)
         label = depth_labels(masks[frame], clip.depth_size)[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
         points = rigid.apply(poses[frame], seen.points.reshape(-1, 3).astype(float)).reshape(
@@ -56,7 +60,7 @@ def walk_around(clip: Clip, masks: Masks) -> Circle:
         up = seen.normals @ poses[frame, 1, :3]
         known = seen.points[..., 2] > 0
         animal.append(points[known & (label == 255)])
-        floor.append(points[known & (label == 0) & (up > 0.9)])
+        floor.append(points[known & (label == 0) & (up > LEVEL_COSINE)])
     on_animal, on_floor = np.concatenate(animal), np.concatenate(floor)
     if min(len(on_animal), len(on_floor)) < LEAST_POINTS:
         what = f"only {len(on_animal)} depth points lie on the animal and {len(on_floor)} on level ground"
@@ -64,7 +68,7 @@ def walk_around(clip: Clip, masks: Masks) -> Circle:
             "circle it from about 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
         )
         raise InputError("AGT-001", what, str(masks.folder), remedy)
-    return Circle(poses, fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=0.4), odometry_fit)
+    return Circle(poses, fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=REACH_M), odometry_fit)
 
 
 def depth_labels(

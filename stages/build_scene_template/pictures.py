@@ -12,6 +12,13 @@ from pipeline.geometry.meshes import RayCaster
 from stages.build_scene_template.template import SceneTemplate
 
 UP = np.array([0.0, 1.0, 0.0])
+FOCAL_PX, HEIGHT_PX, WIDTH_PX = 300.0, 240, 320
+"""of the turntable's pictures"""
+EXTENT, REACH = (0.01, 0.99), 0.95
+"""quantiles of the mesh that the turntable goes around, and its radius in diagonals of that extent"""
+EYE_ASIDE, EYE_ABOVE = 0.75, 0.65
+"""where the turntable's camera stands, in its radii"""
+PATH_COLOR = (220, 40, 40)
 CAPTIONS = {
     "turntable": "The fused mesh from four sides, seen through its walls' backs.",
     "coverage": "From above: the seen surface and the walk-through's path.",
@@ -28,20 +35,20 @@ def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
 
 def turntable(template: SceneTemplate, caster: RayCaster) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the mesh from four raised corners."""
-    low, high = np.quantile(template.mesh.vertices, [0.01, 0.99], axis=0)
-    centre, reach = (low + high) / 2, np.linalg.norm(high - low) * 0.95
-    intrinsics = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    low, high = np.quantile(template.mesh.vertices, EXTENT, axis=0)
+    centre, reach = (low + high) / 2, np.linalg.norm(high - low) * REACH
+    intrinsics = np.array([[FOCAL_PX, 0, WIDTH_PX // 2], [0, FOCAL_PX, HEIGHT_PX // 2], [0, 0, 1]])
     views = []
     for angle in np.pi * (np.arange(4) / 2 + 0.25):
-        eye = centre + reach * np.array([np.cos(angle) * 0.75, 0.65, np.sin(angle) * 0.75])
-        views.append(overview.view(caster, rigid.look_at(eye, centre, UP), intrinsics, 240, 320))
+        eye = centre + reach * np.array([np.cos(angle) * EYE_ASIDE, EYE_ABOVE, np.sin(angle) * EYE_ASIDE])
+        views.append(overview.view(caster, rigid.look_at(eye, centre, UP), intrinsics, HEIGHT_PX, WIDTH_PX))
     return plots.grid(views, 2)
 
 
 def coverage(template: SceneTemplate) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the path of the walk-through over the seen surface."""
     picture = overview.bird_view(template.mesh, floor_m=template.floor_m)
-    picture.draw(template.world_from_camera[:, :3, 3], (220, 40, 40))
+    picture.draw(template.world_from_camera[:, :3, 3], PATH_COLOR)
     return picture.image
 
 

@@ -33,6 +33,8 @@ RING_PX = 10
 """left out around the agent's mask, color pixels"""
 LEAST_WEIGHT = 0.1
 """evidence below which a voxel counts as unseen: one frame from one metre is 1"""
+MOST_WEIGHT = 6e4
+"""evidence is cut here, just below the largest half float"""
 MOVED = (0.3, 0.7)
 """a video goes over from the shared scene to its own between these differences, in units of the truncation"""
 MOVED_VOXELS = 8
@@ -119,7 +121,7 @@ class SceneFuser:
             total += gain
             share = gain / np.maximum(total, 1e-9)
             mean += (new - mean) * (share if mean.ndim == 3 else share[..., None])
-        packed = volume.distance.astype(np.float16), np.minimum(volume.weight, 6e4).astype(np.float16)
+        packed = volume.distance.astype(np.float16), np.minimum(volume.weight, MOST_WEIGHT).astype(np.float16)
         packed += (volume.color + 0.5).astype(np.uint8), volume.color_weight > 0
         self.videos.append(_PackedVolume(*(npz.Column(self.scratch).append(part).array() for part in packed)))
 

@@ -24,6 +24,10 @@ from stages.reconstruct.posing import Chunk, ChunkLoss
 from stages.reconstruct.problem import Problem
 from stages.reconstruct.scene import SceneLoss
 
+BETA1, BETA2 = 0.9, 0.99
+"""Adam's betas: of the gradient, where a parameter learns in every step, and of its square"""
+HEAD_DECAY = 1e-4
+"""weight decay of networks; grids and poses have none"""
 SEGMENT_FRAMES = 100
 """frames that are posed together"""
 LAST_RATE = 0.05
@@ -78,7 +82,7 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
         plan = replace(plan, batches=plan.batches.share(distributed.size()))
     records, agent = {}, field_groups(problem.agent, rates)
     records["template"] = _run(problem, plan, "template", TemplateLoss(problem), steps.template, agent)
-    cameras = _motion_group([problem.motion.camera], rates.camera, momentum=0.9)
+    cameras = _motion_group([problem.motion.camera], rates.camera, momentum=BETA1)
     scene = [*field_groups(problem.scene, rates), cameras]
     loss = SceneLoss(problem, plan.weights, plan.batches, steps.scene, plan.rendered)
     records["scene"] = _run(problem, plan, "scene", loss, steps.scene, scene)
@@ -216,14 +220,14 @@ def field_groups(field: nn.Module, rates: LearningRates) -> list[dict]:
     heads = [parameter for name, parameter in field.named_parameters() if not name.startswith("grid.levels.")]
     grid = [parameter for name, parameter in field.named_parameters() if name.startswith("grid.levels.")]
     return [
-        {"params": grid, "lr": rates.grid, "weight_decay": 0.0, "betas": (0.9, 0.99)},
-        {"params": heads, "lr": rates.heads, "weight_decay": 1e-4},
+        {"params": grid, "lr": rates.grid, "weight_decay": 0.0, "betas": (BETA1, BETA2)},
+        {"params": heads, "lr": rates.heads, "weight_decay": HEAD_DECAY},
     ]
 
 
 def _motion_group(parameters: list[nn.Parameter], rate: float, momentum: float = 0.0) -> dict:
     """Return a parameter group, by default without momentum: frames outside the batch must not move."""
-    return {"params": parameters, "lr": rate, "weight_decay": 0.0, "betas": (momentum, 0.99)}
+    return {"params": parameters, "lr": rate, "weight_decay": 0.0, "betas": (momentum, BETA2)}
 
 
 def joint_groups(problem: Problem, rates: LearningRates) -> list[dict]:
@@ -236,7 +240,7 @@ def joint_groups(problem: Problem, rates: LearningRates) -> list[dict]:
         for group in field_groups(field, rates)
     ]
     groups += [
-        _motion_group([motion.camera], rates.camera * JOINT_CAMERA, momentum=0.9),
+        _motion_group([motion.camera], rates.camera * JOINT_CAMERA, momentum=BETA1),
         _motion_group([motion.root, motion.bone], MOTION_RATE),
     ]
     return [*groups, {"params": list(problem.body.parameters()), "lr": SKIN_RATE, "weight_decay": 0.0}]

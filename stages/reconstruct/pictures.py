@@ -17,6 +17,12 @@ from pipeline.geometry import cameras, rigid
 
 LONG_SIDE_PX = 320
 """of each drawn picture"""
+ACROSS_M, ABOVE_M = 0.8, 0.6
+"""how far beyond the agent, and above it at most, the camera of the opposite view stands: no wall between"""
+AXIS_M = 0.03
+"""length of a bone's drawn axes"""
+FARTHEST_PX = 1 << 20
+"""drawn points are clamped here, in sixteenths of a pixel: OpenCV's integers end"""
 SESSIONS, FRAMES = 4, 4
 """sessions that are compared, and frames of each"""
 
@@ -117,8 +123,8 @@ def _opposite(
     """
     target, eye = world_from_agent[:3, 3], world_from_camera[:3, 3]
     beyond = (target - eye)[[0, 2]]
-    beyond *= min(1.0, 0.8 / max(np.linalg.norm(beyond), 1e-6))
-    across = np.array([target[0] + beyond[0], min(eye[1], target[1] + 0.6), target[2] + beyond[1]])
+    beyond *= min(1.0, ACROSS_M / max(np.linalg.norm(beyond), 1e-6))
+    across = np.array([target[0] + beyond[0], min(eye[1], target[1] + ABOVE_M), target[2] + beyond[1]])
     return rigid.look_at(across, target, np.array([0.0, 1.0, 0.0]))
 
 
@@ -129,12 +135,12 @@ def draw_bones(
 ) -> UInt8[np.ndarray, "height width 3"]:  # fmt: skip
     """Draw each bone's axes (x red, y green, z blue) over a picture."""
     camera_from_bone = rigid.inverse(world_from_camera) @ world_from_agent @ agent_from_bone
-    tips = np.concatenate([np.zeros((1, 3)), 0.03 * np.eye(3)])
+    tips = np.concatenate([np.zeros((1, 3)), AXIS_M * np.eye(3)])
     pixel = np.rint(cameras.project(rigid.apply(camera_from_bone, tips[None]), intrinsics)[0] * 16).astype(
         int
     )
     drawn = np.ascontiguousarray(image)
-    for bone in np.clip(pixel, -(1 << 20), 1 << 20):
+    for bone in np.clip(pixel, -FARTHEST_PX, FARTHEST_PX):
         for axis in range(3):
             cv2.line(
                 drawn,

@@ -29,6 +29,8 @@ RATES = {"means": 5e-4, "rotation": 2e-3, "log_scale": 1e-2, "opacity_logit": 3e
 harmonic; all fall to a tenth"""
 EXPOSURE_RATE, MOTION_RATE = 2e-3, 3e-4
 """of each video's exposure, and of root and bones, metres and radians"""
+BETA2 = 0.99
+"""Adam's second beta for motion, which has no momentum: frames outside the step must not move"""
 LAST_RATE = 0.1
 """learning rates fall to this share"""
 DEPTH_UNIT_M, MOTION_UNIT = 0.2, 0.1
@@ -225,7 +227,7 @@ def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_eve
     groups = [{"params": [splats.appearance], "lr": EXPOSURE_RATE}]
     for gaussians in (splats.scene, splats.agent):
         groups += [{"params": [getattr(gaussians, name)], "lr": rate} for name, rate in RATES.items()]
-    groups.append({"params": list(deltas.parameters()), "lr": MOTION_RATE, "betas": (0.0, 0.99)})
+    groups.append({"params": list(deltas.parameters()), "lr": MOTION_RATE, "betas": (0.0, BETA2)})
     return fit(
         modules={"splats": splats, "motion": deltas},
         optimizer=torch.optim.Adam(groups, lr=1.0, fused=True),

@@ -13,6 +13,15 @@ from pipeline.mapping.depth_scans import SurfaceMap
 from stages.register_videos.registration import Maps, Registered, Rejected
 
 EDGE, PHONE, ANIMAL, HEAD = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
+FAR, CLOSE = (210, 50, 40), (50, 170, 80)
+"""colors of poses further from the others than `SAME_M`, and of poses as near"""
+SAME_M = 0.05
+DEPTH_EDGE_M, OUTLINE = 0.08, 1.0
+"""steps that are drawn as edges: of depth, and of the animal's silhouette (any step is larger)"""
+HEADING_M = 0.2
+"""length of the line that shows where the animal faces"""
+FLOOR_QUANTILE = 0.02
+"""of the heights of the scene's vertices"""
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
@@ -98,11 +107,11 @@ def outlined(
     camera = result.aligned.world_from_camera[frame]
     picture = clip.color(frame).copy()
     depth, _ = render_view(scene, camera, clip.intrinsics[frame], height, width)
-    picture[_edges(depth, 0.08)] = EDGE
+    picture[_edges(depth, DEPTH_EDGE_M)] = EDGE
     root = result.roots.world_from_agent[frame]
     if np.isfinite(root).all():
         body, _ = render_view(agent, rigid.inverse(root) @ camera, clip.intrinsics[frame], height, width)
-        picture[_edges((body > 0).astype(np.float32) * 9, 1.0)] = ANIMAL
+        picture[_edges((body > 0).astype(np.float32) * 9, OUTLINE)] = ANIMAL
     return picture
 
 
@@ -118,7 +127,9 @@ def paths(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]
     picture.draw(result.aligned.world_from_camera[:, :3, 3], PHONE)
     picture.draw(root[:, :3, 3], ANIMAL)
     for frame in np.flatnonzero(result.roots.visible)[::10]:
-        picture.draw(np.stack([root[frame, :3, 3], root[frame, :3, 3] + 0.2 * root[frame, :3, 2]]), HEAD)
+        picture.draw(
+            np.stack([root[frame, :3, 3], root[frame, :3, 3] + HEADING_M * root[frame, :3, 2]]), HEAD
+        )
     return picture.image
 
 
@@ -133,17 +144,13 @@ def depth_on_map(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height wi
         distance = np.abs(surface.distance(points))
         for pixel, far in zip(np.round(picture.pixel(points)).astype(int), distance, strict=True):
             cv2.circle(
-                picture.image,
-                tuple(int(value) for value in pixel),
-                1,
-                (210, 50, 40) if far > 0.05 else (50, 170, 80),
-                -1,
+                picture.image, tuple(int(value) for value in pixel), 1, FAR if far > SAME_M else CLOSE, -1
             )
     return picture.image
 
 
 def _floor(maps):
-    return float(np.quantile(maps.scene.vertices[:, 1], 0.02))
+    return float(np.quantile(maps.scene.vertices[:, 1], FLOOR_QUANTILE))
 
 
 def _refused(result, clip, maps):

@@ -22,6 +22,12 @@ from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
 FOCAL = 0.9
 """Focal length of the frames in units of their width."""
+SMOOTHED_FRAMES, TURNED_FRAMES = 12.0, 20.0
+"""Deviations of the Gaussians that smooth what the camera follows, and the side it follows from."""
+ASIDE_M, ABOVE_M, OFF_CENTER_M = 1.3, [0.0, 1.4, 0.05], 0.3
+"""Where the camera stands from the animal; nearer to the room's centre than the last, sides fade."""
+AMBIENT, DIFFUSE = 0.45, 0.55
+"""Shares of light on the animal's fur."""
 FITTED_POSES = 60
 """Poses of a take that the four weights of its surface are fitted to."""
 
@@ -87,12 +93,15 @@ def following(
     roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Return a camera that looks down at the animal from the side of the room's centre, moving smoothly."""
-    target = np.asarray(gaussian_filter1d(roots_world, 12.0, axis=0, mode="nearest"))
+    target = np.asarray(gaussian_filter1d(roots_world, SMOOTHED_FRAMES, axis=0, mode="nearest"))
     away = (centre - target) * [1.0, 0.0, 1.0]
     away = gaussian_filter1d(
-        away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 0.3), 20.0, axis=0, mode="nearest"
+        away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), OFF_CENTER_M),
+        TURNED_FRAMES,
+        axis=0,
+        mode="nearest",
     )
-    eyes = target + 1.3 * away + [0.0, 1.4, 0.05]
+    eyes = target + ASIDE_M * away + ABOVE_M
     up = np.array([0.0, 1.0, 0.0])
     return np.stack([rigid.look_at(eye, at, up) for eye, at in zip(eyes, target, strict=True)])
 
@@ -112,7 +121,7 @@ def drawn(
     front, touched = render_view(RayCaster(animal), world_from_camera, intrinsics, height, width)
     nearer = (front > 0) & ((back == 0) | (front < back))
     facing = np.abs(touched.interpolate(animal, animal.vertex_normals()) @ world_from_camera[:3, 2])
-    fur = views.shade(animal, touched) * (0.45 + 0.55 * facing[:, None])
+    fur = views.shade(animal, touched) * (AMBIENT + DIFFUSE * facing[:, None])
     picture = views.shade(scene.mesh, hits).reshape(height, width, 3)
     return np.where(nearer[..., None], fur.reshape(height, width, 3).astype(np.uint8), picture)
 

@@ -8,6 +8,7 @@ The server listens on this machine alone and answers its own page only. One visi
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from http import HTTPStatus
 from threading import Event
 from typing import Any
 
@@ -22,6 +23,12 @@ from pipeline.data.glb import Skin
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from stages.simulate.rollout import Take, take_of
+
+PERSON, GOAL, FUR = (47, 111, 159), (200, 114, 43), (150, 120, 90)
+"""Colours; the last of an animal that has none."""
+PERSON_M, GOAL_M = 0.12, 0.06
+"""Radii of the balls that show the person and the goal."""
+SLIDER_STEP = 0.05
 
 
 @dataclass(frozen=True)
@@ -65,8 +72,8 @@ class LiveView:
             disable_rotations=True,
             position=tuple(observer),
         )
-        self.server.scene.add_icosphere("/person/head", 0.12, (47, 111, 159))
-        self.goal = self.server.scene.add_icosphere("/goal", 0.06, (200, 114, 43))
+        self.server.scene.add_icosphere("/person/head", PERSON_M, PERSON)
+        self.goal = self.server.scene.add_icosphere("/goal", GOAL_M, GOAL)
         self.animal = self._add_animal(look)
         self._add_controls()
         self.reset()
@@ -125,7 +132,7 @@ class LiveView:
         weights = np.zeros((len(look.mesh.vertices), len(look.skin.bone_names)), np.float32)
         np.add.at(weights, (np.arange(len(weights))[:, None], look.skin.joints), look.skin.weights)
         rest = look.skin.agent_from_bone_rest
-        red, green, blue = (150, 120, 90) if look.mesh.color is None else look.mesh.color.mean(0).astype(int)
+        red, green, blue = FUR if look.mesh.color is None else look.mesh.color.mean(0).astype(int)
         return self.server.scene.add_mesh_skinned(
             "/animal",
             look.mesh.vertices.astype(np.float32),
@@ -140,7 +147,11 @@ class LiveView:
     def _add_controls(self) -> None:
         gui = self.server.gui
         self.interactivity = gui.add_slider(
-            "interactivity", 0.0, 1.0, 0.05, float(np.clip(self.simulator.flock.sampling.guidance, 0, 1))
+            "interactivity",
+            0.0,
+            1.0,
+            SLIDER_STEP,
+            float(np.clip(self.simulator.flock.sampling.guidance, 0, 1)),
         )
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
@@ -160,7 +171,7 @@ def _serving_own_page_only(start: Callable[..., Any], port: int) -> Any:
         def process(connection: Any, request: Any) -> Any:
             headers, own_port = request.headers, connection.local_address[1]
             if not loopback.is_own(own_port, headers.get_all("Host"), headers.get_all("Origin")):
-                return connection.respond(403, "")
+                return connection.respond(HTTPStatus.FORBIDDEN, "")
             return process_request(connection, request)
 
         checked.append(process)

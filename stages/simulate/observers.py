@@ -11,6 +11,10 @@ from stages.simulate.config import ObserverScript
 
 Observer = Callable[[float, Float[np.ndarray, "3"]], Float[np.ndarray, "3"]]
 """From time in seconds and the animal's position to the observer's position, world metres"""
+CIRCLE_M = 1.2
+"""Radius of the circle."""
+ROUND_S, TOWARDS_S = 8.0, 4.0
+"""An approach and the way back, and the approach alone."""
 UNKNOWN_OBSERVER_M = 100.0
 """From here on nobody perceives an observer: one who was recorded further off is one of whom nothing is
 known."""
@@ -30,7 +34,10 @@ def scripted(script: ObserverScript, *, center: Float[np.ndarray, "3"], speed_m_
         case "circle":
             return lambda time_s, animal: (
                 center
-                + 1.2 * np.array([np.cos(time_s * speed_m_s / 1.2), 0.0, np.sin(time_s * speed_m_s / 1.2)])
+                + CIRCLE_M
+                * np.array(
+                    [np.cos(time_s * speed_m_s / CIRCLE_M), 0.0, np.sin(time_s * speed_m_s / CIRCLE_M)]
+                )
             )
         case "approach":
             return ApproachingObserver(center, speed_m_s)
@@ -47,10 +54,12 @@ class ApproachingObserver:
         self.stride = speed_m_s / RATE_HZ
 
     def __call__(self, time_s: float, animal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        target = np.array([animal[0], self.center[1], animal[2]]) if time_s % 8.0 < 4.0 else self.center
+        target = (
+            np.array([animal[0], self.center[1], animal[2]]) if time_s % ROUND_S < TOWARDS_S else self.center
+        )
         away = target - self.position
         distance = float(np.linalg.norm(away))
-        keep = 0.5 if time_s % 8.0 < 4.0 else 0.0
+        keep = 0.5 if time_s % ROUND_S < TOWARDS_S else 0.0
         self.position = self.position + away / max(distance, 1e-6) * np.clip(
             distance - keep, 0.0, self.stride
         )

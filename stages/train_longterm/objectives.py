@@ -13,6 +13,9 @@ from pipeline.longterm.contacts import ContactVertices
 from pipeline.longterm.motion_optimization import collision_error, contact_error
 from pipeline.longterm.networks import ROOT_CHANNELS
 
+TOUCHING_M = 0.02
+"""contact vertices nearer to the scene than this touch it"""
+
 
 def route_error(
     made: Float[Tensor, "*batch channel"], truth: Float[Tensor, "*batch known"]
@@ -76,4 +79,4 @@ def scene_errors(
         rows = torch.nonzero(scene == index)[:, 0]
         if len(rows):
             distance = distance.index_put((rows,), each.at(vertices[rows]))
-    return collision_error(distance, 0.0).mean(), contact_error(distance[:, count:], 0.02).mean()
+    return collision_error(distance, 0.0).mean(), contact_error(distance[:, count:], TOUCHING_M).mean()

@@ -28,6 +28,11 @@ STILLS = 12
 """Places at which a body is drawn."""
 CANDIDATES = 4
 """Bodies drawn at each of them, of which the best counts."""
+HEIGHT_IN, LINE_WIDTH = 5.4, 0.8
+SHOWN_M, SLICE_M = 1.2, (-0.12, 0.2)
+"""What is drawn of the scene around a clip: so far aside, and between these heights from its root."""
+ARROW_M, ARROW_FRAMES = 0.15, 15
+"""Length of the lines that show the heading, and the frames between them."""
 CAPTIONS = {
     "losses": "Loss of each network over its training, smoothed.",
     "routes": "Held-out routes from above: true (blue), made (orange), what stands nearby (grey).",
@@ -81,21 +86,27 @@ def routes(
     clips: Clips, made: Float[torch.Tensor, "clip frame channel"], where: MotionDataset
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw some clips from above, in their own frames."""
-    figure, axes = plots.panels(2, SHOWN // 2, width_in=10, height_in=5.4)
+    figure, axes = plots.panels(2, SHOWN // 2, width_in=10, height_in=HEIGHT_IN)
     for axis, index in zip(axes.ravel(), np.linspace(0, len(clips) - 1, SHOWN).astype(int), strict=True):
         points = where.scenes[clips.scene[index]].surface.points
         local = rigid.apply(rigid.inverse(clips.world_from_clip[index]), points)
-        near = (np.abs(local[:, [0, 2]]) < 1.2).all(1) & (local[:, 1] > -0.12) & (local[:, 1] < 0.2)
+        near = (
+            (np.abs(local[:, [0, 2]]) < SHOWN_M).all(1)
+            & (local[:, 1] > SLICE_M[0])
+            & (local[:, 1] < SLICE_M[1])
+        )
         axis.plot(*local[near][:, [0, 2]].T, ".", color=plots.GREY, markersize=1)
         for channels, color in ((clips.channels[index], plots.BLUE), (made[index], plots.ORANGE)):
             axis.plot(*channels[:, [0, 2]].T.numpy(), color=color)
-            head = channels[::15, :3] + 0.15 * torch.linalg.cross(
-                channels[::15, 3:6], channels[::15, 6:ROOT_CHANNELS]
+            head = channels[::ARROW_FRAMES, :3] + ARROW_M * torch.linalg.cross(
+                channels[::ARROW_FRAMES, 3:6], channels[::ARROW_FRAMES, 6:ROOT_CHANNELS]
             )
             axis.plot(
-                *np.stack([channels[::15, [0, 2]].numpy(), head[:, [0, 2]].numpy()]).transpose(2, 0, 1),
+                *np.stack([channels[::ARROW_FRAMES, [0, 2]].numpy(), head[:, [0, 2]].numpy()]).transpose(
+                    2, 0, 1
+                ),
                 color=color,
-                linewidth=0.8,
+                linewidth=LINE_WIDTH,
             )
-        axis.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), xticks=[], yticks=[], aspect="equal")
+        axis.set(xlim=(-SHOWN_M, SHOWN_M), ylim=(-SHOWN_M, SHOWN_M), xticks=[], yticks=[], aspect="equal")
     return plots.pixels(figure)

@@ -14,6 +14,9 @@ from pipeline.longterm.short_motions import resample_motion
 from pipeline.longterm.smplx_bodies import motion_from_parameters, smplx_body
 from pipeline.longterm.surroundings import MotionScene
 
+STUDY_REACH_M = 1.5
+"""heights of the synthetic study's scene that are used, above and below where bodies have been"""
+
 
 @dataclass(frozen=True)
 class DatasetSplit:
@@ -73,7 +76,7 @@ def people(model: Path, folder: Path) -> DatasetSplit:
         resample_motion(each["timestamp_s"], motion) for each, motion in zip(loaded, moved, strict=True)
     )
     roots = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
-    scene = MotionScene.for_motion(ply.read_ply(folder / "scene.ply"), roots, reach_m=1.5)
+    scene = MotionScene.for_motion(ply.read_ply(folder / "scene.ply"), roots, reach_m=STUDY_REACH_M)
     dataset = MotionDataset(person.body, motions, (0,) * len(motions), (scene,))
     last = len(motions) - 1
     return DatasetSplit(dataset.subset(list(range(max(last, 1)))), dataset.subset([last]) if last else None)
