@@ -7,10 +7,6 @@ from dataclasses import dataclass, field
 class SfmConfig:
     """How keyframes are chosen and matched."""
 
-    keyframe_m: float = 0.12
-    """A keyframe follows the last one after this much motion, metres (odometry)."""
-    keyframe_deg: float = 9.0
-    """... or after this much turning, degrees."""
     most_keyframes: int = 90
     """Upper bound; steps are widened until it holds."""
     features: int = 1500
@@ -29,10 +25,6 @@ class RefinementConfig:
     """Keyframes that each keyframe's depth is compared with."""
     rounds: int = 10
     """Gauss-Newton steps of the keyframe graph."""
-    drift_deg_s: float = 0.5
-    """Rotational drift of the odometry, degrees per second."""
-    drift_m_s: float = 0.02
-    """Translational drift of the odometry, metres per second."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from pipeline.data.clips import Clip
 from pipeline.geometry import cameras, rigid, subsampling, tsdf
 from pipeline.geometry.meshes import Mesh
 from pipeline.mapping import depth_scans, pose_optimization
-from stages.build_scene_template.config import FusionConfig, RefinementConfig
+from stages.build_scene_template.config import FusionConfig
 from stages.build_scene_template.refine import DEPTH_INFLATION, odometry_factors
 
 MOST_VOXELS = 150_000_000
@@ -88,11 +88,7 @@ def fuse(
 
 
 def align_frames(
-    clip: Clip,
-    mesh: Mesh,
-    world_from_camera: Float[np.ndarray, "frame 4 4"],
-    config: FusionConfig,
-    refinement: RefinementConfig,
+    clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], config: FusionConfig
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
     """Optimize every frame against the surface and the odometry; also return each frame's median gap,
     metres."""
@@ -114,7 +110,7 @@ def align_frames(
 
     reach = tuple(np.geomspace(*ALIGN_REACH_M, config.align_rounds))
     optimized = pose_optimization.optimize_poses(
-        world_from_camera, find, odometry_factors(clip, frames, refinement), reach_m=reach
+        world_from_camera, find, odometry_factors(clip, frames), reach_m=reach
     )
     gap = np.full(len(clip), np.nan)
     for frame in range(len(clip)):

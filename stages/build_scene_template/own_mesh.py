@@ -50,9 +50,7 @@ def build(
         fine.color,
     )
     scale, agree = depth_against(clip, fine, upright_from_world @ odometry, SEEN_WITHIN_M)
-    poses, gap = fuse.align_frames(
-        clip, fine, upright_from_world @ odometry, config.fusion, config.refinement
-    )
+    poses, gap = fuse.align_frames(clip, fine, upright_from_world @ odometry, config.fusion)
     off_m = float(np.nanmedian(gap)) if np.isfinite(gap).any() else np.inf
     if not abs(scale - 1) < MOST_SCALE_ERROR or agree < LEAST_AGREE or off_m > MOST_GAP_M:
         measured = f"depth / mesh {scale:.3f}, {agree:.0%} of depth agrees"

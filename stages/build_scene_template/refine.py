@@ -18,6 +18,8 @@ from pipeline.mapping.sparse_model import SparseModel
 from stages.build_scene_template.config import RefinementConfig
 from stages.build_scene_template.matches import points_under
 
+DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.5), 0.02
+"""Drift of the odometry that the graph allows, several times that of phones: depth decides."""
 PIXEL_SIGMA_PX = 1.5
 """Standard deviation of a SIFT feature's position, colour pixels."""
 DEPTH_INFLATION = 4.0
@@ -192,20 +194,19 @@ def refine_keyframes(
     fixed = np.arange(len(frames)) == 0
     reach = tuple(np.geomspace(*REACH_M, config.rounds))
     return pose_optimization.optimize_poses(
-        world_from_camera, find, odometry_factors(clip, frames, config), reach_m=reach, fixed=fixed
+        world_from_camera, find, odometry_factors(clip, frames), reach_m=reach, fixed=fixed
     ).world_from_camera
 
 
 def odometry_factors(
-    clip: Clip, frames: Int[np.ndarray, "key"], config: RefinementConfig
+    clip: Clip, frames: Int[np.ndarray, "key"]
 ) -> pose_optimization.RelativePoseFactors | None:
     """Return the odometry between neighbouring frames of a selection, None where there is none."""
     if clip.odometry_from_camera is None:
         return None
-    drift = np.deg2rad(config.drift_deg_s)
     return pose_optimization.odometry_factors(
         clip.timestamp_s[frames],
         clip.odometry_from_camera[frames],
-        drift_rad_s=drift,
-        drift_m_s=config.drift_m_s,
+        drift_rad_s=DRIFT_RAD_S,
+        drift_m_s=DRIFT_M_S,
     )

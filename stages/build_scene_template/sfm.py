@@ -19,6 +19,8 @@ from pipeline.mapping.sparse_model import SparseModel, read_sparse_model
 from stages.build_scene_template.config import SfmConfig
 from stages.build_scene_template.matches import confirm
 
+KEYFRAME_M, KEYFRAME_DEG = 0.12, 9.0
+"""A keyframe follows the last one after this much motion or turning, by odometry, metres and degrees."""
 KEYFRAME_S = 0.4
 """Time between keyframes where there is no odometry, seconds."""
 FIRST_OCTAVE = -1
@@ -41,8 +43,8 @@ def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
         progress = clip.timestamp_s / KEYFRAME_S
     else:
         pose = clip.odometry_from_camera
-        moved = np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1) / config.keyframe_m
-        rotated = np.rad2deg(rigid.rotation_angle(pose[:-1, :3, :3], pose[1:, :3, :3])) / config.keyframe_deg
+        moved = np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1) / KEYFRAME_M
+        rotated = np.rad2deg(rigid.rotation_angle(pose[:-1, :3, :3], pose[1:, :3, :3])) / KEYFRAME_DEG
         progress = np.concatenate([[0.0], np.cumsum(np.maximum(moved, rotated))])
     progress = progress * min(1.0, (config.most_keyframes - 2) / max(progress[-1], 1e-6))
     step = np.floor(progress).astype(int)

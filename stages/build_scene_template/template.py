@@ -79,7 +79,7 @@ def build(
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, config.fusion)
     if len(mesh.faces) < LEAST_POINTS:
         raise _no_surface(clip)
-    poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, config.refinement)
+    poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion)
     mesh = fuse.clean(
         fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion), workspace, config.fusion.island_faces
     )

@@ -23,6 +23,11 @@ HYPOTHESES, APART_DEG = 5, 25.0
 """Hypotheses per frame, at most, and least difference of their headings, degrees."""
 COST_SCALE_M = 0.004
 """A pose worse by this costs one unit, metres."""
+FINE_ROUNDS = 12
+"""Gauss-Newton steps of the hypotheses that remain."""
+LOCALIZER_EVERY_FRAMES, LOCALIZER_WEIGHT = 2, 8.0
+"""The agent's localizer is queried in one visible frame of so many; a certain pose of it is worth so many
+units of cost."""
 MOST_LOCALIZED, LOCALIZER_SIGMA_RAD = 2, float(np.deg2rad(30.0))
 """Poses of the localizer that become hypotheses, and spread of the bonus around their heading, radians."""
 SMOOTHING_PASSES, SMOOTHING_REACH = 2, 3
@@ -81,7 +86,7 @@ def find_roots(
         frame, observation = each.frame, observe(each.frame)
         assert observation is not None, frame
         start = each.world_from_agent[chosen][None]
-        pose = agent_fit.fit_fine(observation, model, start, rounds=config.fine_rounds, tilt=True)
+        pose = agent_fit.fit_fine(observation, model, start, rounds=FINE_ROUNDS, tilt=True)
         poses[frame], visible[frame], share[frame] = pose[0], True, observation.share
         cost[frame] = agent_fit.cost(observation, model, pose)[0]
     return Roots(smooth(clip.timestamp_s, poses, cost, share, config.smooth_s), visible, cost, share)
@@ -97,7 +102,7 @@ def _hypotheses(
 ) -> RootHypotheses:
     """Fit from all headings and from the localizer's poses; keep the best that differ."""
     start, answers = agent_fit.initial_poses(observation, model, config.headings), []
-    if index % config.localizer_every_frames == 0:
+    if index % LOCALIZER_EVERY_FRAMES == 0:
         frame = observation.frame
         answers = localizer.localize(
             clip.color(frame),
@@ -118,7 +123,7 @@ def _hypotheses(
         if (apart > np.deg2rad(APART_DEG)).all():
             distinct.append(int(candidate))
     poses = agent_fit.fit_fine(
-        observation, model, poses[distinct[:HYPOTHESES]], rounds=config.fine_rounds, tilt=False
+        observation, model, poses[distinct[:HYPOTHESES]], rounds=FINE_ROUNDS, tilt=False
     )
     cost = agent_fit.cost(observation, model, poses) / COST_SCALE_M
     bonus = np.zeros(len(poses))
@@ -129,7 +134,7 @@ def _hypotheses(
     return RootHypotheses(
         frame=observation.frame,
         world_from_agent=poses,
-        cost=cost - config.localizer_weight * bonus,
+        cost=cost - LOCALIZER_WEIGHT * bonus,
         least_misfit=float(cost.min()),
         share=observation.share,
         middle_world=np.median(observation.points_world, axis=0),

@@ -18,10 +18,6 @@ class VoteConfig:
     """... and this distance, metres; room for the odometry's drift."""
     most_tilt_deg: float = 10.0
     """Poses that contradict gravity by more than this do not vote, degrees."""
-    least_votes: int = 3
-    """A recording needs so many agreeing votes ..."""
-    least_share: float = 0.25
-    """... and this share of all votes."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +28,6 @@ class AlignmentConfig:
     """Gauss-Newton steps by depth and votes; 0: poses stay as votes and odometry give them."""
     stride_px: int = 11
     """One depth pixel in so many, each way, takes part."""
-    drift_deg_s: float = 0.15
-    """Rotational drift of the odometry, degrees per second."""
-    drift_m_s: float = 0.01
-    """Translational drift of the odometry, metres per second."""
     flow_every_frames: int = 5
     """One frame in so many is aligned by optical flow from the rendered template; 0: none."""
     feature_every_frames: int = 5
@@ -71,12 +63,6 @@ class RootConfig:
 
     headings: int = 12
     """Headings tried from scratch in every frame."""
-    fine_rounds: int = 12
-    """Gauss-Newton steps of the hypotheses that remain."""
-    localizer_every_frames: int = 2
-    """The agent's localizer is queried in one visible frame of so many."""
-    localizer_weight: float = 8.0
-    """Units of cost that a certain pose of the localizer is worth."""
     smooth_s: float = 0.15
     """Time constant of the smoothing, seconds."""
 

@@ -14,9 +14,11 @@ from pipeline.data.clips import Clip, Masks, usable_depth
 from pipeline.geometry import rigid
 from pipeline.mapping import pose_optimization, tracking_jumps, visual_odometry
 from pipeline.mapping.visual_odometry import JUMP_INFLATION, Odometry
-from stages.register_videos.config import AlignmentConfig, VoteConfig
+from stages.register_videos.config import VoteConfig
 from stages.register_videos.votes import Votes, close
 
+DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.15), 0.01
+"""Drift of a phone's odometry, radians and metres per second."""
 NEAR_S = 6.0
 """Votes of broken odometry must agree with others as near as this, seconds."""
 ACROSS_JUMP = 1e-3
@@ -39,13 +41,13 @@ def of_pictures(clip: Clip, masks: Masks, rng: np.random.Generator) -> Odometry:
     )
 
 
-def of_device(clip: Clip, config: AlignmentConfig) -> Odometry:
+def of_device(clip: Clip) -> Odometry:
     """Return the device's odometry, repaired at tracking jumps and hardly weighted there."""
     assert clip.odometry_from_camera is not None, "the recording has odometry"
     jumps = tracking_jumps.find_jumps(clip.timestamp_s, clip.odometry_from_camera)
     poses = tracking_jumps.repair(clip.timestamp_s, clip.odometry_from_camera, jumps)
     factors = pose_optimization.odometry_factors(
-        clip.timestamp_s, poses, drift_rad_s=np.deg2rad(config.drift_deg_s), drift_m_s=config.drift_m_s
+        clip.timestamp_s, poses, drift_rad_s=DRIFT_RAD_S, drift_m_s=DRIFT_M_S
     )
     inflation = np.where(jumps, JUMP_INFLATION, 1.0)[1:]
     return Odometry(

@@ -20,8 +20,6 @@ DEPTH_EDGE_M, OUTLINE = 0.08, 1.0
 """steps that are drawn as edges: of depth, and of the animal's silhouette (any step is larger)"""
 HEADING_M = 0.2
 """length of the line that shows where the animal faces"""
-FLOOR_QUANTILE = 0.02
-"""of the heights of the scene's vertices"""
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
@@ -122,7 +120,7 @@ def _edges(depth, jump_m):
 
 def paths(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]:
     """Draw both paths over the room."""
-    picture = views.bird_view(maps.scene, floor_m=_floor(maps))
+    picture = views.bird_view(maps.scene, floor_m=maps.floor_m)
     root = result.roots.world_from_agent
     picture.draw(result.aligned.world_from_camera[:, :3, 3], PHONE)
     picture.draw(root[:, :3, 3], ANIMAL)
@@ -135,7 +133,7 @@ def paths(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]
 
 def depth_on_map(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the static depth of some frames over the room, coloured by its distance from the surface."""
-    picture = views.bird_view(maps.scene, floor_m=_floor(maps))
+    picture = views.bird_view(maps.scene, floor_m=maps.floor_m)
     surface = SurfaceMap(maps.scene)
     for frame in range(0, len(result.aligned.scans), 10):
         points = rigid.apply(
@@ -147,10 +145,6 @@ def depth_on_map(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height wi
                 picture.image, tuple(int(value) for value in pixel), 1, FAR if far > SAME_M else CLOSE, -1
             )
     return picture.image
-
-
-def _floor(maps):
-    return float(np.quantile(maps.scene.vertices[:, 1], FLOOR_QUANTILE))
 
 
 def _refused(result, clip, maps):

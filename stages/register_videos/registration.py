@@ -27,7 +27,7 @@ from stages.register_videos.confidence import (
 )
 from stages.register_videos.config import Config
 from stages.register_videos.feature_alignment import FeatureMap
-from stages.register_videos.votes import Votes
+from stages.register_videos.votes import LEAST_VOTES, Votes
 
 LEAST_MEASURED = 0.2
 """Share of the frames that must have static depth."""
@@ -50,6 +50,11 @@ class Maps:
     agent_localizer: Localizer
     scene_features: Float[np.ndarray, "vertex channel"] | None = None
     """Features of the scene's vertices; None: no feature-metric alignment."""
+
+    @property
+    def floor_m(self) -> float:
+        """Height of the scene's floor, world."""
+        return float(np.quantile(self.scene.vertices[:, 1], FLOOR_QUANTILE))
 
 
 @dataclass(frozen=True)
@@ -104,7 +109,7 @@ def register(
         case "votes":
             votes = voting.collect(clip, masks, maps.scene_localizer, config.vote)
             start = _initialize(clip, votes, motion, config.vote)
-            reason = voting.rejection_reason(votes, start.supports if start else None, config.vote)
+            reason = voting.rejection_reason(votes, start.supports if start else None)
             if start is None or reason is not None:
                 return Rejected(reason or "no votes agree", votes)
         case "middle":
@@ -133,8 +138,7 @@ def register(
     confidence = camera_confidence(aligned.pose_covariance, appearance, start.anchored, rng)
     roots = Roots.unseen(len(clip))
     if config.animal:
-        floor_m = float(np.quantile(maps.scene.vertices[:, 1], FLOOR_QUANTILE))
-        standing = StandingSurface(caster, floor_m)
+        standing = StandingSurface(caster, maps.floor_m)
         cameras = aligned.world_from_camera
         roots = find_roots(clip, masks, maps.agent, standing, maps.agent_localizer, cameras, config.root, rng)
         log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
@@ -175,7 +179,7 @@ def _aligned(
 def _odometry(clip, masks, config, rng) -> Odometry:
     """Return the motions between neighbours: the device's, or visual odometry."""
     if config.odometry == "device" and clip.odometry_from_camera is not None:
-        device = odometry.of_device(clip, config.alignment)
+        device = odometry.of_device(clip)
         if device.jumps.any():
             jumps = f"{int(device.jumps.sum())} of {len(clip)} frames"
             log(f"tracking jumps before {jumps}: the pieces between are placed by their own votes")
@@ -217,7 +221,7 @@ def rejection_reason(
     if np.median(known) < config.gate.least_fit:
         share = f"only {np.median(known):.0%} of the static depth lies within 5 cm of the room"
         return f"{share}: it has changed too much, or the place was mistaken"
-    if (votes.probability[supports] >= config.gate.least_certainty).sum() >= config.vote.least_votes:
+    if (votes.probability[supports] >= config.gate.least_certainty).sum() >= LEAST_VOTES:
         return None
     if supports.sum() < LEAST_RECOGNIZED * votes.asked:
         evidence = f"only {supports.sum()} of {votes.asked} frames were recognised and agree"

@@ -15,6 +15,8 @@ from pipeline.geometry import rigid, subsampling
 from pipeline.localization.localizer import Localizer, PoseHypothesis
 from stages.register_videos.config import VoteConfig
 
+LEAST_VOTES, LEAST_SHARE = 3, 0.25
+"""Votes that must agree, and their share of all: two may agree by chance."""
 LEAST_LOCALIZED = 20
 """Short recordings are localized more often, so that so many frames may vote."""
 MOST_PROPOSALS = 400
@@ -137,14 +139,12 @@ def close(
     )
 
 
-def rejection_reason(
-    votes: Votes, supports: Bool[np.ndarray, "vote"] | None, config: VoteConfig
-) -> str | None:
+def rejection_reason(votes: Votes, supports: Bool[np.ndarray, "vote"] | None) -> str | None:
     """Return why the votes are not enough, None when they are."""
-    if len(votes.frame) < config.least_votes:
+    if len(votes.frame) < LEAST_VOTES:
         recognised = f"only {len(votes.frame)} of {votes.asked} frames were recognised"
         return f"{recognised}: the recording shows little of the walk-through's room"
     count = 0 if supports is None else int(supports.sum())
-    if count < config.least_votes or count < config.least_share * len(votes.frame):
+    if count < LEAST_VOTES or count < LEAST_SHARE * len(votes.frame):
         return f"only {count} of {len(votes.frame)} recognised frames agree on where the recording lies"
     return None

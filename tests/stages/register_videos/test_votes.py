@@ -45,9 +45,9 @@ def test_scattered_votes_are_refused():
     frames = np.arange(2, 60, 5)
     votes = cast(truth, frames, np.ones(len(frames), bool), rng)
     agreement = voting.agree(votes, drifting(truth, 4), True, options)
-    assert "agree" in voting.rejection_reason(votes, agreement.supports if agreement else None, options)
+    assert "agree" in voting.rejection_reason(votes, agreement.supports if agreement else None)
     few = voting.Votes(frames[:1], votes.answers[:1], 12, votes.nearest)
-    assert "recognised" in voting.rejection_reason(few, None, options)
+    assert "recognised" in voting.rejection_reason(few, None)
 
 
 def broken_odometry(truth, jump_at) -> Odometry:
