@@ -14,6 +14,8 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """No space, a quota, or a limit of the shell (`ulimit -f`)."""
 _OF_RUST = re.compile(r"\(os error (\d+)\)")
 """How safetensors' messages name the system's error."""
+QUOTED = 120
+"""Characters of a library's message that an error shows."""
 MAKE_AGAIN = "build it again with this version: make <agent>.<artifact>.redo"
 """What to do about what another version wrote."""
 
@@ -75,7 +77,7 @@ def other_versions_refused(what: str, where: str) -> Iterator[None]:
     except (InputError, PermissionError):
         raise
     except Exception as error:  # a parser's own errors have no common base
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:QUOTED]}"
         raise InputError(
             "ART-007", f"is no {what} as this version writes it ({reason})", where, MAKE_AGAIN
         ) from error
