@@ -9,6 +9,12 @@ endif
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
+# `HOME=other` on the command line names the build whose home the animal lives in; programs get the user's own.
+ifeq ($(origin HOME),command line)
+OTHER := $(HOME)
+override HOME := $(shell eval echo "~$$(id -un)")
+endif
+
 PYTHON := .venv/bin/python
 PLAN   := $(PYTHON) -SE -m pipeline.workflow.plan
 RUN    := $(PYTHON) -SE -m pipeline.workflow.run $(if $(PROCESSES),--processes $(PROCESSES))
@@ -20,7 +26,7 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 # What ends in a command line or a path holds plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
-$(foreach name,AGENT VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
+$(foreach name,AGENT OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
 # Where an agent's, or its variant's, own things stand; what a variant does not touch is its agent's (`INPUTS` knows).
 ANIMAL := $(or $(AGENT),cat)
@@ -79,15 +85,22 @@ export: .venv/.ok
 	  --videos build/$(ANIMAL)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
 	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); export.json lists what is lost'
 
-# The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live.
+# The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live. In another build's
+# home (HOME=other): a take, and a page that begins from it.
 JOURNEY = $(if $(SUBGOALS)$(PLACES),longterm) $(if $(SUBGOALS)$(filter-out behavior,$(PLACES)),,behavior)
 export SUBGOALS
+ELSEWHERE = $(HOME_OF)/homes/$(OTHER)
+MOVED = reconstruction splats behavior behavior_data
 simulate: .venv/.ok
 	@test -z "$$SUBGOALS" || test -f "$$SUBGOALS" || { { echo "error: SIM-004 $$SUBGOALS: there is no such file"; echo "  -> write it as docs/long_motion.md explains"; } >&2; exit 2; }
 	@$(if $(PLACES),$(PYTHON) -m stages.simulate --places '$(PLACES)' --help >/dev/null)
-	@$(MAKE) $(NESTING) $(JOURNEY:%=$(ANIMAL).%)
-	@$(call INPUTS,$(JOURNEY) $(if $(filter longterm,$(JOURNEY)),reconstruction) behavior_data) && \
-	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals "$$SUBGOALS") $(if $(PLACES),--places '$(PLACES)') --out $(HOME_OF)/take
+	@$(if $(OTHER),$(PLAN) plan $(OTHER))
+	@$(MAKE) $(NESTING) $(JOURNEY:%=$(ANIMAL).%) $(if $(OTHER),$(ANIMAL).splats $(OTHER).splats $(OTHER).behavior_data)
+	@$(call INPUTS,$(JOURNEY) $(if $(filter longterm,$(JOURNEY)),reconstruction) behavior_data $(if $(OTHER),feature_basis scene_template)) && \
+	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals "$$SUBGOALS") $(if $(PLACES),--places '$(PLACES)') $(if $(OTHER),--home build/$(OTHER)) \
+	  --out $(if $(OTHER),$(ELSEWHERE),$(HOME_OF))/take
+	@$(if $(OTHER),$(call INPUTS,$(MOVED)) && $(PYTHON) -m stages.export_simulator $$inputs --config $(HOME_OF)/plan/configs/simulator.json \
+	  --home build/$(OTHER) --take $(ELSEWHERE)/take --out $(ELSEWHERE)/simulator && echo '[$(HOME_OF)] open: $(ELSEWHERE)/simulator/index.html')
 
 serve: .venv/.ok
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator

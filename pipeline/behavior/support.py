@@ -19,6 +19,8 @@ HEIGHT_TAIL_PERCENT = (1.0, 5.0)
 the range of heights"""
 MIN_SUPPORTED_SHARE = 0.5
 """share of frames that must be above something solid"""
+FLOOR_SHARE = 0.25
+"""The floor is the lowest level with this share of the columns of the level that most columns have."""
 JUMP_KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
 """weights over 0.5 s that make a jump of a step"""
 
@@ -72,6 +74,12 @@ def mark_supported(
     beneath = np.zeros_like(allowed)
     beneath[:, 1:] = occupancy[:, :-1] == 1
     return allowed.astype(np.uint8) + (allowed & beneath & (occupancy != 1))
+
+
+def floor_level(carries: Bool[np.ndarray, "x y z"]) -> int | None:
+    """Return the index along y of the voxels right above the floor; None where nothing carries."""
+    count = carries.sum((0, 2))
+    return int(np.flatnonzero(count >= FLOOR_SHARE * count.max())[0]) if count.any() else None
 
 
 def height_ranges(

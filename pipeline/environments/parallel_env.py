@@ -19,7 +19,7 @@ from pipeline.environments.spaces import (
     person_observation,
     person_observation_space,
 )
-from pipeline.environments.world import AnimalWorld
+from pipeline.environments.world import AnimalWorld, checked
 
 PERSON, ANIMAL = "person", "animal"
 GOAL_M = 3.0
@@ -45,12 +45,16 @@ class PersonAnimalEnv(ParallelEnv):
         build: str | Path | AnimalWorld,
         *,
         render_mode: str | None = None,
+        home: str | Path | None = None,
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
         **settings: Any,
     ):
-        """Open a build (`build/<agent>`); ``settings`` replace fields of `EnvironmentConfig`."""
-        self.world = AnimalWorld.opened(build, config, settings, device=device)
+        """Open a build (`build/<agent>`), its animal in the home of another build where ``home`` names one.
+
+        ``settings`` replace fields of `EnvironmentConfig`.
+        """
+        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
         self.config, self.render_mode = self.world.config, render_mode
         self.possible_agents = [PERSON, ANIMAL]
         self.agents: list[str] = []
@@ -83,7 +87,8 @@ class PersonAnimalEnv(ParallelEnv):
         """Let 0.1 s pass; actions in -1..1 are parts of the highest speeds, or of the farthest goal."""
         root = self.world.animals.past[-1].root[0, 0]
         if ANIMAL in actions:
-            goal = to_world(GOAL_M * np.asarray(actions[ANIMAL], float)[None], self._animal_heading())[0]
+            wish = checked(np.asarray(actions[ANIMAL])[None], (1, 2))
+            goal = to_world(GOAL_M * wish, self._animal_heading())[0]
             self.world.animals.command((root[:3, 3] + [goal[0], 0.0, goal[1]])[None])
         outcome = self.world.step(np.asarray(actions[PERSON])[None])
         self.frame += 1

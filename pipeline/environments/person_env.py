@@ -29,12 +29,16 @@ class PersonEnv(gymnasium.Env):
         build: str | Path | AnimalWorld,
         *,
         render_mode: str | None = None,
+        home: str | Path | None = None,
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
         **settings: Any,
     ):
-        """Open a build (`build/<agent>`); ``settings`` replace fields of `EnvironmentConfig`."""
-        self.world = AnimalWorld.opened(build, config, settings, device=device)
+        """Open a build (`build/<agent>`), its animal in the home of another build where ``home`` names one.
+
+        ``settings`` replace fields of `EnvironmentConfig`.
+        """
+        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
         self.config, self.render_mode = self.world.config, render_mode
         self.observation_space = person_observation_space()
         self.action_space = person_action_space(self.world)
@@ -46,7 +50,8 @@ class PersonEnv(gymnasium.Env):
         self.frame = 0
         self.world.begin(1, self.np_random, (options or {}).get("split", "train"))
         self._show()
-        return self._observation(), {"distance_m": float(self.world.distance_m[0])}
+        info = {"distance_m": float(self.world.distance_m[0]), "share_known": self.world.share_known}
+        return self._observation(), info
 
     def step(self, action: Float[np.ndarray, "action"]):
         """Let 0.1 s pass; an action in -1..1 is a part of the highest speeds."""

@@ -29,12 +29,16 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         build: str | Path | AnimalWorld,
         num_envs: int = 1,
         *,
+        home: str | Path | None = None,
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
         **settings: Any,
     ):
-        """Open a build (`build/<agent>`); ``settings`` replace fields of `EnvironmentConfig`."""
-        self.world = AnimalWorld.opened(build, config, settings, device=device)
+        """Open a build (`build/<agent>`), its animal in the home of another build where ``home`` names one.
+
+        ``settings`` replace fields of `EnvironmentConfig`.
+        """
+        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
         self.config, self.num_envs, self.render_mode = self.world.config, num_envs, None
         self.single_observation_space = person_observation_space()
         self.single_action_space = person_action_space(self.world)
@@ -47,7 +51,11 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         self.split = (options or {}).get("split", "train")
         self.frame, self.ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         self.world.begin(self.num_envs, self.np_random, self.split)
-        return person_observation(self.world), {"distance_m": self.world.distance_m}
+        share_known = np.full(self.num_envs, self.world.share_known)
+        return person_observation(self.world), {
+            "distance_m": self.world.distance_m,
+            "share_known": share_known,
+        }
 
     def step(self, actions: Float[np.ndarray, "person action"]):
         """Let 0.1 s pass everywhere; where an episode had ended, another begins instead."""

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.other_home import ReconstructedHome, move_in
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
@@ -52,9 +53,17 @@ class AnimalWorld:
     """Pairs of a person and an animal, each pair in the scene of the animal's recording."""
 
     def __init__(
-        self, sampler: Sampler, data: BehaviorData, scenes: Scenes, ego: Ego, config: EnvironmentConfig
+        self,
+        sampler: Sampler,
+        data: BehaviorData,
+        scenes: Scenes,
+        ego: Ego,
+        config: EnvironmentConfig,
+        *,
+        share_known: float = 1.0,
     ):
-        self.data, self.scenes, self.config = data, scenes, config
+        """``share_known`` (0..1) is how much of the scene looks like the home that the animal knows."""
+        self.data, self.scenes, self.config, self.share_known = data, scenes, config, share_known
         sampling = PlanSamplingConfig(
             method="ddim",
             goal_steps=config.goal_steps,
@@ -86,16 +95,24 @@ class AnimalWorld:
         config: EnvironmentConfig | None,
         settings: Mapping[str, Any],
         *,
+        home: str | Path | None,
         device: str,
     ) -> "AnimalWorld":
         """Return the world of a build, or the one given; ``settings`` replace fields of ``config``."""
         config = replace(config or EnvironmentConfig(), **settings)
-        return build if isinstance(build, AnimalWorld) else cls.load(Path(build), config, device=device)
+        if isinstance(build, AnimalWorld):
+            assert home is None, "a world that is open has its home"
+            return build
+        return cls.load(Path(build), config, home=None if home is None else Path(home), device=device)
 
     @classmethod
-    def load(cls, build: Path, config: EnvironmentConfig, *, device: str = "cpu") -> "AnimalWorld":
-        """Open a finished build. Raises ART-003 where it lacks the model, ART-007 where another
-        version wrote it, SIM-006 for models without goals.
+    def load(
+        cls, build: Path, config: EnvironmentConfig, *, home: Path | None = None, device: str = "cpu"
+    ) -> "AnimalWorld":
+        """Open a finished build, its animal in the home of another one where ``home`` is given.
+
+        Raises ART-003 where it lacks the model, ART-007 where another version wrote it, SIM-006 for models
+        without goals, and what `pipeline.behavior.other_home` raises for homes that cannot be used.
         """
         for name in ("behavior", "behavior_data"):
             if not (build / name).is_dir():
@@ -106,9 +123,15 @@ class AnimalWorld:
             what = f"plans of the family {architecture.family} cannot be chained"
             raise InputError("SIM-006", what, str(build), "give a build of the family diffusion")
         data = BehaviorData.load(build / "behavior_data")
-        scenes = Scenes.load(build / "behavior_data", data.videos)
         sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
-        return cls(sampler, data, scenes, architecture.ego, config)
+        if home is None:
+            scenes = Scenes.load(build / "behavior_data", data.videos)
+            return cls(sampler, data, scenes, architecture.ego, config)
+        own, other = ReconstructedHome.of_build(build), ReconstructedHome.of_build(home)
+        moved = move_in(own, other, data)
+        return cls(
+            sampler, moved.data, moved.home.scenes(), architecture.ego, config, share_known=moved.share_known
+        )
 
     def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
         """Begin ``count`` pairs; ``rng`` draws windows, starts and all plans from here on."""
@@ -126,9 +149,11 @@ class AnimalWorld:
     def step(self, action: Float[np.ndarray, "person command"]) -> StepOutcome:
         """Move the persons by their actions (-1..1 of the highest speeds) and let the animals
         live for 0.1 s.
+
+        Raises SIM-012 for actions that are no finite numbers, or not as many as there are.
         """
         before = self.distance_m
-        self._walk(np.clip(np.asarray(action, float), -1, 1))
+        self._walk(np.clip(checked(action, (len(before), self.action_size)), -1, 1))
         last = self.animal_position.copy()
         self.animals.step(self.eyes)
         self.steps += len(before)
@@ -228,6 +253,22 @@ class AnimalWorld:
     def _scene_of_videos(self) -> Sequence[int]:
         count = len(self.data.videos)
         return self.scenes.number(np.arange(count), count).tolist()
+
+
+def checked(
+    action: Float[np.ndarray, "person command"], shape: tuple[int, int]
+) -> Float[np.ndarray, "person command"]:
+    """Return actions as numbers. Raises SIM-012 where they are not finite or of another shape."""
+    numbers = np.asarray(action, float)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        told = f"shape {numbers.shape}" if numbers.shape != shape else f"{numbers.tolist()}"
+        raise InputError(
+            "SIM-012",
+            f"actions are no {shape[0]} x {shape[1]} finite numbers: {told}",
+            "step",
+            "look for what made the policy diverge: learning rate, rewards, observations",
+        )
+    return numbers
 
 
 ANIMAL_NUMBERS = 7

@@ -68,11 +68,6 @@ def body(reconstruction: Path) -> CanonicalAgent:
     )
 
 
-def scene(reconstruction: Path) -> Mesh:
-    """Read the room's surface, world frame."""
-    return ply.read_ply(reconstruction / "scene.ply")
-
-
 def motions(behavior_data: Path) -> list[SessionClip]:
     """Read the longest unbroken stretch of every session. Raises InputError EXP-001 where none is long
     enough.
@@ -108,14 +103,15 @@ def support_contract(range_m: Float[np.ndarray, "2 2"]) -> dict[str, Any] | None
     return {"mark": SUPPORTED, "range_m": np.asarray(range_m, float).tolist(), "flight": JUMP_KERNEL.tolist()}
 
 
-def supported_share(volume: Mapping[str, Shaped[np.ndarray, "..."]], data: BehaviorData) -> float | None:
-    """Return the share (0..1) of recorded frames with a carrying voxel beneath the root; None where
+def supported_share(
+    volume: Mapping[str, Shaped[np.ndarray, "..."]], roots: Float[np.ndarray, "frame 3"]
+) -> float | None:
+    """Return the share (0..1) of roots (world, metres) with a carrying voxel beneath them; None where
     nothing carries. ``volume`` holds the arrays of a `volume.npz`.
     """
     carries = volume["allowed"] >= SUPPORTED
     if not carries.any():
         return None
-    roots = np.concatenate([t.world_from_agent[t.valid, :3, 3] for t in data.trajectories.values()])
     column = np.floor((roots - volume["origin"]) / volume["voxel_m"]).astype(int)
     inside = ((column >= 0) & (column < carries.shape)).all(1)
     x, y, z = column[inside].T
@@ -123,18 +119,19 @@ def supported_share(volume: Mapping[str, Shaped[np.ndarray, "..."]], data: Behav
     return float(beneath.sum() / max(len(roots), 1))
 
 
-def gaussians(splats: Path) -> SplatClouds:
-    """Read room and animal as Gaussians, and the animal's skin."""
+def gaussians(scene: Path, splats: Path) -> SplatClouds:
+    """Read room (a PLY) and animal (of the artifact `splats`) as Gaussians, and the animal's skin."""
     weights = gaussian_ply.SPLATS.load(splats / "splats.npz", "agent_weights")["agent_weights"]
-    return SplatClouds(
-        gaussian_ply.read(splats / "scene.ply"), gaussian_ply.read(splats / "agent.ply"), weights
-    )
+    return SplatClouds(gaussian_ply.read(scene), gaussian_ply.read(splats / "agent.ply"), weights)
 
 
-def behavior_assets(behavior: Path, behavior_data: Path) -> BehaviorAssets:
+def behavior_assets(
+    behavior: Path, volume: Path, roots_world: Float[np.ndarray, "frame 3"]
+) -> BehaviorAssets:
     """Read the sampler's contract, the four networks, and the scene's features that they perceive.
 
-    Raises InputError EXP-002 for a variant that the page's sampler does not know.
+    ``volume`` is a `volume.npz`, ``roots_world`` where the animal has been in it (metres). Raises InputError
+    EXP-002 for a variant that the page's sampler does not know.
     """
     contract = json.loads((behavior / "behavior.json").read_bytes())
     family, ego = (contract["architecture"][key] for key in ("family", "ego"))
@@ -143,10 +140,7 @@ def behavior_assets(behavior: Path, behavior_data: Path) -> BehaviorAssets:
         raise InputError(
             "EXP-002", what, str(behavior), "take another variant: family diffusion, ego yaw or full"
         )
-    table = npz.load(
-        behavior_data / "volume.npz", names=("features", "allowed", "origin", "voxel_m", "stands_m")
-    )
-    data = BehaviorData.load(behavior_data)
+    table = npz.load(volume, names=("features", "allowed", "origin", "voxel_m", "stands_m"))
     return BehaviorAssets(
         contract=contract,
         networks={name: (behavior / f"{name}.onnx").read_bytes() for name in NETWORKS},
@@ -157,6 +151,6 @@ def behavior_assets(behavior: Path, behavior_data: Path) -> BehaviorAssets:
             "support": support_contract(table["stands_m"]),
         },
         allowed=table["allowed"].astype(np.uint8).tobytes(),
-        supported=supported_share(table, data),
+        supported=supported_share(table, roots_world),
         features=table["features"].astype("<f2").tobytes(),
     )

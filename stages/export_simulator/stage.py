@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
-from pipeline.data import qa
-from stages.export_simulator import export, reading, writing
+from pipeline.data import ply, qa
+from stages.export_simulator import export, reading, surroundings, writing
 from stages.export_simulator.config import Config
 
 
@@ -17,6 +18,10 @@ class Inputs:
     splats: Path
     behavior: Path
     behavior_data: Path
+    home: Path | None = None
+    """Folder of another build, in whose home the animal lives; with `take`."""
+    take: Path | None = None
+    """What `simulate` wrote of the animal in that home."""
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> float:
@@ -24,17 +29,24 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     of the page.
 
     Raises InputError EXP-001 where no session is long enough, EXP-002 for a model that the page cannot
-    sample.
+    sample, EXP-003 for another home without a take in it, ART-003 where that home lacks its surfaces.
     """
+    if inputs.home is None and inputs.take is None:
+        place = surroundings.at_home(inputs.reconstruction, inputs.splats, inputs.behavior_data)
+    elif inputs.home is not None and inputs.take is not None:
+        place = surroundings.elsewhere(inputs.home, inputs.take, config.name)
+    else:
+        what = "a page of another home needs that build and a take in it"
+        raise InputError("EXP-003", what, "export_simulator", "give both --home and --take")
     parts = export.simulator(
         reading.body(inputs.reconstruction),
-        reading.scene(inputs.reconstruction),
-        reading.gaussians(inputs.splats),
-        reading.motions(inputs.behavior_data),
+        ply.read_ply(place.surface),
+        reading.gaussians(place.splats, inputs.splats),
+        place.motions,
         config,
     )
-    assets = reading.behavior_assets(inputs.behavior, inputs.behavior_data)
-    labels = {video.id: Path(video.file).stem for video in videos}
-    size_mb = writing.write_simulator(out, parts, assets, config.name, config.layout, labels)
+    assets = reading.behavior_assets(inputs.behavior, place.volume, place.roots_world)
+    labels = {video.id: Path(video.file).stem for video in videos} | place.labels
+    size_mb = writing.write_simulator(out, parts, assets, config, labels, place.remark)
     qa.write(out, **writing.quality(parts, size_mb, assets.supported))
     return size_mb

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.data import glb, npz
 from pipeline.data.qa import Check, Picture
 from stages.export_simulator import page, pictures
-from stages.export_simulator.config import Layout
+from stages.export_simulator.config import Config, Layout
 from stages.export_simulator.contract import contract
 from stages.export_simulator.export import SimulatorParts
 from stages.export_simulator.page import Asset
@@ -26,15 +26,18 @@ def write_simulator(
     folder: Path,
     parts: SimulatorParts,
     behavior: BehaviorAssets,
-    name: str,
-    layout: Layout,
+    config: Config,
     labels: Mapping[str, str],
+    remark: str | None,
 ) -> float:
     """Write the page, the animated agent, the scene and the contract; return megabytes that a
     visitor loads.
+
+    ``remark`` is what a visitor should know of the home beside what carries the animal.
     """
+    remarks = [text for text in (remark, support_warning(behavior.supported)) if text]
     about = contract(
-        name=name,
+        name=config.name,
         behavior=behavior.contract,
         setting=parts.setting,
         motions=parts.motions,
@@ -45,7 +48,7 @@ def write_simulator(
         },
         volume=behavior.volume,
         labels=labels,
-        warning=support_warning(behavior.supported),
+        warning=" ".join(remarks) or None,
     )
     room = glb.static(parts.scene, "scene")
     assets = {
@@ -59,7 +62,7 @@ def write_simulator(
         "allowed": Asset(behavior.allowed),
         **{name: Asset(network, 4) for name, network in behavior.networks.items()},
     }
-    size = _write_page(folder, about, assets, layout)
+    size = _write_page(folder, about, assets, config.layout)
     (folder / "agent.glb").write_bytes(glb.skinned(parts.agent, parts.skin, parts.actions))
     (folder / "scene.glb").write_bytes(room)
     npz.save(folder / "skin_8.npz", joints=parts.eight.joints, weights=parts.eight.weights)

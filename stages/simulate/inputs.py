@@ -18,5 +18,11 @@ class Inputs:
     """The model of long-term motion."""
     reconstruction: Path | None = None
     """The room's surface and the animal's body."""
+    home: Path | None = None
+    """Folder of another finished build, in whose home the animal is to live."""
+    feature_basis: Path | None = None
+    """What the animal's own features are made of; needed in another home."""
+    scene_template: Path | None = None
+    """The animal's own home, its scale; needed in another home."""
     subgoals: Path | None = None
     """A TOML file of sub-goals."""

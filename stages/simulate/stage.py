@@ -4,13 +4,14 @@ from pathlib import Path
 
 from pipeline.core import config as configuration
 from pipeline.core import devices, progress
+from pipeline.core.errors import InputError
 from stages.simulate import subgoal_file, takes
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu") -> None:
-    """Make one take. Raises SIM-002, SIM-004, SIM-005, SIM-006, SIM-010, ART-007."""
+    """Make one take. Raises SIM-002, SIM-004, SIM-005, SIM-006, SIM-010, SIM-011, ART-003, ART-007."""
     subgoals = None
     if inputs.subgoals is not None:
         path = inputs.subgoals
@@ -19,11 +20,15 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
             configuration.from_table(subgoal_file.SubgoalEntry, table, where=str(path)) for table in tables
         ]
         subgoals = subgoal_file.subgoals(entries, path)
+    of_behavior = not config.serve and config.recording is None and subgoals is None
+    if inputs.home is not None and not (of_behavior and config.places == "none"):
+        what = "sub-goals, recordings and the live view have the animal's own home"
+        raise InputError("SIM-011", what, str(inputs.home), "leave them out, or the other home")
     if config.serve:
         take = takes.live(inputs, config, device)
     elif config.recording is not None:
         take = takes.of_recording(inputs, config, config.recording)
-    elif subgoals is None and config.places == "none":
+    elif of_behavior and config.places == "none":
         take = takes.of_behavior(inputs, config, device)
     else:
         take = takes.through_subgoals(inputs, subgoals, config, device)

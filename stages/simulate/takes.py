@@ -1,5 +1,6 @@
 """Takes of both kinds, from finished artifacts to something that can be written."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,13 +9,14 @@ import numpy as np
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.other_home import ReconstructedHome, move_in
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.core import progress
 from pipeline.core.errors import InputError, other_versions_refused
-from pipeline.data import glb, ply
+from pipeline.data import glb, npz, ply
 from pipeline.longterm import journeys
 from pipeline.longterm.bodies import load_body
 from pipeline.longterm.config import MotionOptimizationConfig
@@ -54,7 +56,10 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     possible.
     """
     data = BehaviorData.load(_required(inputs, "behavior_data"))
-    simulator = _simulator(inputs, data, c, ReplanningConfig(), device)
+    if inputs.home is not None:
+        return _elsewhere(inputs, inputs.home, data, c, device)
+    scenes = Scenes.load(inputs.behavior_data, data.videos)
+    simulator = _simulator(inputs, data, scenes, c, ReplanningConfig(), device)
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
     summary = (
         f"{c.seconds:g} s, {float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space"
@@ -76,6 +81,35 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     def write(folder: Path) -> None:
         write_take(folder, take)
         journey_files.write_metrics(folder, before, after, seconds=c.seconds)
+
+    return FinishedTake(summary, write)
+
+
+def _elsewhere(inputs: Inputs, home: Path, data: BehaviorData, c: Config, device: str) -> FinishedTake:
+    """Let the animal live in the home of another build."""
+    artifacts = (_required(inputs, name) for name in ("behavior_data", "feature_basis", "scene_template"))
+    moved = move_in(ReconstructedHome.load(*artifacts), ReconstructedHome.of_build(home), data)
+    simulator = _simulator(inputs, moved.data, moved.home.scenes(), c, ReplanningConfig(), device)
+    take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
+    goals = np.unique(take.goal_world, axis=0)
+    in_solid = float(moved.home.scenes().inside_solid(goals[:, None], None).mean())
+    summary = f"{c.seconds:g} s in the home of {home.name}, of which {moved.share_known:.0%} of the surfaces "
+    summary += f"look like the known home's; {in_solid:.1%} of {len(goals)} goals in something solid, "
+    summary += f"{float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space"
+
+    def write(folder: Path) -> None:
+        write_take(folder, take)
+        volume, marks = moved.home.volume, moved.home.marks
+        npz.save(
+            folder / "volume.npz", compress=True, **vars(volume), allowed=marks, stands_m=moved.home.stands_m
+        )
+        about = {
+            "home": home.name,
+            "share_known": moved.share_known,
+            "goals": len(goals),
+            "goals_in_solid": in_solid,
+        }
+        (folder / "home.json").write_text(json.dumps(about, indent=1) + "\n")
 
     return FinishedTake(summary, write)
 
@@ -108,7 +142,8 @@ def of_recording(inputs: Inputs, c: Config, recording: str) -> FinishedTake:
 def live(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     """Let the animal live in a browser until interrupted."""
     data, shown = BehaviorData.load(_required(inputs, "behavior_data")), _required(inputs, "simulator")
-    simulator = _simulator(inputs, data, c, ReplanningConfig(), device)
+    scenes = Scenes.load(inputs.behavior_data, data.videos)
+    simulator = _simulator(inputs, data, scenes, c, ReplanningConfig(), device)
     with other_versions_refused("simulator", str(shown)):
         mesh, skin, _ = glb.read_skinned((shown / "agent.glb").read_bytes())
         look = LiveAppearance(mesh, skin, (shown / "scene.glb").read_bytes())
@@ -126,7 +161,8 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
     if written is not None:
         subgoals = written
     elif c.places == "behavior":
-        simulator = _simulator(inputs, data, c, UNINTERRUPTED, device)
+        scenes = Scenes.load(inputs.behavior_data, data.videos)
+        simulator = _simulator(inputs, data, scenes, c, UNINTERRUPTED, device)
         drawn = chained_goals(simulator, _observer(simulator, c), c.place_count, c.seed)
         subgoals = move_into_scene(drawn, world.scene, world.model.motion_prior)
     else:
@@ -170,7 +206,7 @@ def _world(inputs: Inputs, data: BehaviorData) -> LongTermWorld:
 
 
 def _simulator(
-    inputs: Inputs, data: BehaviorData, c: Config, chaining: ReplanningConfig, device: str
+    inputs: Inputs, data: BehaviorData, scenes: Scenes, c: Config, chaining: ReplanningConfig, device: str
 ) -> Simulator:
     architecture, nets, scaling, schedule, _ = behavior.load(_required(inputs, "behavior"))
     if architecture.family != "diffusion":
@@ -186,7 +222,6 @@ def _simulator(
         goal="goal" not in c.without,
     )
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
-    scenes = Scenes.load(inputs.behavior_data, data.videos)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)
 
 

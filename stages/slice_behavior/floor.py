@@ -9,12 +9,10 @@ from jaxtyping import Bool, UInt8
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
-from pipeline.behavior.support import SUPPORTED
+from pipeline.behavior.support import SUPPORTED, floor_level
 
 FILLED = 3
 """Mark of allowed voxels right above floor that was filled."""
-FLOOR_SHARE = 0.25
-"""The floor is the lowest level with this share of the columns of the level that most columns have."""
 JOINS_VOXELS = 3
 """Gaps in the seen floor that are no wider than twice this belong to the same home."""
 MARGIN_VOXELS = 1
@@ -49,12 +47,6 @@ def with_filled_floor(
     carried = np.any(masked >= SUPPORTED, axis=1, keepdims=True)
     masked[np.broadcast_to(~carried, masked.shape)] = 0
     return masked
-
-
-def floor_level(carries: Bool[np.ndarray, "x y z"]) -> int | None:
-    """Return the index along y of the voxels right above the floor; None where nothing carries."""
-    count = carries.sum((0, 2))
-    return int(np.flatnonzero(count >= FLOOR_SHARE * count.max())[0]) if count.any() else None
 
 
 def connected(floor: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:

@@ -2,6 +2,7 @@
 does.
 """
 
+import shutil
 import warnings
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
 from stages.train_behavior.export import write_contract
+from tests.pipeline.behavior.test_other_home import write
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 from tests.stages.simulate.test_simulator import scaling
 
@@ -96,6 +98,41 @@ def test_many_at_once_begin_again_and_seeds_decide(build):
         assert seen["animal"].shape == (4, 7) and (ends >= 2).all() and np.isfinite(reward).all()
         lives.append(seen["animal"])
     np.testing.assert_array_equal(*lives)
+
+
+def test_the_animal_lives_in_another_home(build, tmp_path):
+    import pipeline.environments.registration  # noqa: F401
+
+    own, other = write(tmp_path / "own"), write(tmp_path / "other")
+    shutil.copytree(build / "behavior", own / "behavior")
+    wandering().save(own / "behavior_data")
+    env = gymnasium.make("AgentToSim/Cat-v0", build=str(own), home=str(other), config=QUICK)
+    _, info = env.reset(seed=0, options={"split": "test"})
+    assert info["share_known"] == 1.0, "the same room"
+    for _ in range(15):
+        seen, *_ = env.step(env.action_space.sample())
+    assert env.observation_space.contains(seen)
+    with pytest.raises(InputError, match="ART-003.*nowhere"):
+        gymnasium.make("AgentToSim/Cat-v0", build=str(own), home="nowhere", config=QUICK)
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0]])
+def test_a_policy_that_sends_no_numbers_is_refused(action):
+    from pipeline.environments.person_env import PersonEnv
+
+    env = PersonEnv(small_world())
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="SIM-012"):
+        env.step(np.array(action, np.float32))
+
+
+def test_an_animal_is_not_steered_to_nowhere():
+    from pipeline.environments.parallel_env import PersonAnimalEnv
+
+    env = PersonAnimalEnv(small_world())
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="SIM-012"):
+        env.step({"person": np.zeros(3), "animal": np.array([np.nan, 0.0])})
 
 
 def test_plans_are_followed_and_not_drawn_at_every_step():

@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.behavior.model import Architecture
@@ -17,4 +18,4 @@ def test_variants_that_the_page_does_not_know_are_refused(tmp_path: Path, varian
         json.dumps({"architecture": asdict(Architecture(bones=3, **variant))})
     )
     with pytest.raises(InputError, match=f"EXP-002.*{next(iter(variant.values()))}"):
-        reading.behavior_assets(tmp_path, tmp_path)
+        reading.behavior_assets(tmp_path, tmp_path, np.zeros((0, 3)))

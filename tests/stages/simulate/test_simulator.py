@@ -1,4 +1,5 @@
 import http.client
+import json
 import socket
 import sys
 import urllib.request
@@ -17,13 +18,14 @@ from pipeline.core.errors import InputError
 from pipeline.data import glb, npz
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
-from stages.simulate import live, takes
+from stages.simulate import live, stage, takes
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
 from stages.train_behavior.export import write_contract
+from tests.pipeline.behavior import test_other_home
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 
 
@@ -211,6 +213,23 @@ def test_models_whose_plans_cannot_be_chained_are_refused(tmp_path):
         takes.of_behavior(
             homes(tmp_path, architecture=replace(ARCHITECTURE, family="gaussian")), Config(), "cpu"
         )
+
+
+def test_a_take_in_the_home_of_another_build(tmp_path):
+    own, other = test_other_home.write(tmp_path / "own"), test_other_home.write(tmp_path / "other")
+    (own / "behavior").mkdir()
+    wandering().save(own / "behavior_data")
+    write_contract(own / "behavior", BehaviorNets(ARCHITECTURE), ARCHITECTURE, scaling(), Schedule(), REST)
+    artifacts = ("behavior_data", "behavior", "feature_basis", "scene_template")
+    inputs = Inputs(**{name: own / name for name in artifacts}, home=other)
+    settings = Config(seconds=1.0, goal_steps=4, sequence_steps=2)
+    stage.run(inputs, settings, tmp_path)
+    told = json.loads((tmp_path / "home.json").read_text())
+    assert told["home"] == "other" and told["share_known"] == 1.0 and told["goals_in_solid"] == 0.0
+    take, volume = npz.load(tmp_path / "take.npz"), npz.load(tmp_path / "volume.npz")
+    assert len(take["timestamp_s"]) == 11 and volume["allowed"].shape == volume["occupancy"].shape
+    with pytest.raises(InputError, match="SIM-011"):
+        stage.run(inputs, replace(settings, places="visited"), tmp_path)
 
 
 def look():

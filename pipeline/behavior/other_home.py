@@ -1,0 +1,280 @@
+"""The animal of one build in the reconstruction of another: both homes in metres, features in its own terms.
+
+`ReconstructedHome.of_build` opens what a finished build knows of its home. `move_in` puts an animal into
+another one: features are expressed in the basis that its model learned, recorded moments are set down on the
+other floor, and `share_known` tells how much of the other home looks like the one it knows.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
+
+from pipeline.backends.daisy import FeatureBasis
+from pipeline.backends.descriptors import Describer
+from pipeline.behavior.path_encoding import REST_SPEED_M_S
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.support import SUPPORTED, Support, floor_level
+from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory
+from pipeline.core.errors import InputError
+from pipeline.data import npz
+from pipeline.geometry import rigid
+
+ARTIFACTS = ("behavior_data", "feature_basis", "scene_template")
+"""What of a build describes its home."""
+STARTS = {TRAIN: 64, TEST: 32}
+"""Recorded moments of each split that are set down, evenly chosen."""
+PLACE_DRAWS = 200
+"""Places that are tried for a moment before another moment takes its turn."""
+PRESENT_M = 20.0
+"""Observers further off than a home is wide were not there, and need no free place."""
+APART_M = 0.5
+"""Surface cells nearer to each other than this show the same thing and do not tell how alike a home is to
+itself."""
+KNOWN_PERCENT = 95.0
+"""Percent of the known home's own cells that count as known, judged by its cells elsewhere."""
+MOST_CELLS = 4000
+"""Surface cells of a home that are compared, evenly chosen."""
+
+
+@dataclass(frozen=True)
+class ReconstructedHome:
+    """The one home of a build as behaviour models perceive it, world frame of that build."""
+
+    volume: FeatureVolume
+    marks: UInt8[np.ndarray, "x y z"]
+    """Where a root may be, and where something carries it, see `pipeline.behavior.support`."""
+    stands_m: Float[np.ndarray, "2 2"]
+    """Of the build's own animal, see `Support.range_m`."""
+    basis: FeatureBasis
+    describer: Describer
+    floor_m: float
+    """World height of the floor."""
+
+    @classmethod
+    def of_build(cls, build: Path) -> "ReconstructedHome":
+        """Open the home of `build/<agent>`. Raises as `load` does, and ART-003 where an artifact is not
+        there.
+        """
+        for artifact in ARTIFACTS:
+            if not (build / artifact).is_dir():
+                remedy = f"make it: make <agent>.{artifact}, of an agent with recordings"
+                raise InputError("ART-003", f"has no {artifact}", str(build), remedy)
+        return cls.load(*(build / artifact for artifact in ARTIFACTS))
+
+    @classmethod
+    def load(cls, behavior_data: Path, feature_basis: Path, scene_template: Path) -> "ReconstructedHome":
+        """Read the artifacts. Raises ART-007 where another version wrote them, SIM-011 where they describe no
+        home that an animal can move into or out of.
+        """
+        path = behavior_data / "volume.npz"
+        if not path.is_file():
+            raise _unusable("has a home for each recording", behavior_data)
+        try:
+            table = npz.load(path, ("features", "occupancy", "origin", "voxel_m", "allowed", "stands_m"))
+            basis, describer = FeatureBasis.load(feature_basis), Describer.load(feature_basis)
+            scale = str(json.loads((scene_template / "world.json").read_text())["scale"])
+        except (InputError, OSError, ValueError, KeyError, TypeError) as error:
+            raise _other_version(f"is no home as this version writes it ({error})", behavior_data) from error
+        if scale.startswith("relative"):
+            raise _unusable("is not in metres: its scale comes from pictures alone", scene_template)
+        level = floor_level(table["allowed"] >= SUPPORTED)
+        if level is None or not np.isfinite(table["stands_m"]).all():
+            raise _unusable("shows no floor that carries an animal", behavior_data)
+        volume = FeatureVolume(
+            table["features"], table["occupancy"], table["origin"], float(table["voxel_m"])
+        )
+        floor_m = float(volume.origin[1] + level * volume.voxel_m)
+        return cls(volume, table["allowed"], table["stands_m"], basis, describer, floor_m)
+
+    def scenes(self) -> Scenes:
+        """Return it as the one scene of all recordings."""
+        support = Support.of(self.volume, self.marks, self.stands_m)
+        return Scenes((self.volume,), (self.marks > 0,), np.zeros(1, int), (support,))
+
+    def height_above_top(self, root_world: Float[np.ndarray, "3"], *, moves: bool) -> float:
+        """Return how high above what carries it a root is, metres, within what is usual."""
+        support = Support.of(self.volume, self.marks, self.stands_m)
+        assert support is not None, "checked by `load`"
+        column = np.floor((root_world[[0, 2]] - support.corner) / support.voxel_m).astype(int)
+        column = np.clip(column, 0, np.array(support.tops.shape[:2]) - 1)
+        tops = support.tops[tuple(column)]
+        beneath = tops[tops <= root_world[1]]
+        top = beneath.max() if len(beneath) else self.floor_m
+        return float(np.clip(root_world[1] - top, *self.stands_m[int(moves)]))
+
+
+@dataclass(frozen=True)
+class Moved:
+    """An animal in another home."""
+
+    home: ReconstructedHome
+    """The other home as its model perceives it, for its own body."""
+    data: BehaviorData
+    """Recorded moments as they would begin there: `PAST` valid frames each."""
+    share_known: float
+    """Share (0..1) of the other home's surface cells that look like the known home's."""
+
+
+def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData, *, seed: int = 0) -> Moved:
+    """Put the animal of ``own`` and ``data`` into the other home. Raises ART-007 where the volumes are not of
+    one kind, SIM-011 where features cannot be compared or no moment fits in.
+    """
+    if other.volume.voxel_m != own.volume.voxel_m or len(other.volume.features) != len(own.volume.features):
+        raise _other_version("has another kind of volume than the animal's own", Path("the other home"))
+    if other.describer != own.describer:
+        what = f"has features of {other.describer.backend}, the animal's own of {own.describer.backend}"
+        raise _unusable(what, Path("the other home"))
+    features = expressed(other.volume.features, other.basis, own.basis)
+    seen = replace(other, volume=replace(other.volume, features=features), stands_m=own.stands_m)
+    moved = set_down(data, own, seen, np.random.default_rng(seed))
+    return Moved(seen, moved, share_known(own, seen))
+
+
+def expressed(
+    features: Float[np.ndarray, "channel x y z"], written: FeatureBasis, read: FeatureBasis
+) -> Float[np.ndarray, "channel x y z"]:
+    """Return features of the basis ``written`` as the basis ``read`` would have them.
+
+    A projection of the median length is lifted back to descriptors by the pseudo-inverse and projected anew;
+    lengths stay. What descriptors hold outside of the axes ``written`` is lost.
+    """
+    if all(np.array_equal(getattr(written, name), getattr(read, name)) for name in ("mean", "components")):
+        return features
+    cells = np.moveaxis(features, 0, -1).astype(np.float64)
+    length = np.linalg.norm(cells, axis=-1, keepdims=True)
+    known = length[..., 0] > 0
+    unit = cells[known] / length[known]
+    raw = written.mean + (written.scale * unit) @ np.linalg.pinv(written.components).T
+    cells[known] = length[known] * read.project(raw)
+    return np.moveaxis(cells, -1, 0).astype(features.dtype)
+
+
+def share_known(own: ReconstructedHome, other: ReconstructedHome) -> float:
+    """Return the share of surface cells of ``other`` that look like cells of ``own``.
+
+    The nearest one is no less alike than `KNOWN_PERCENT` of the cells of ``own`` are to their nearest one
+    elsewhere in it.
+
+    Alike are feature, of unit length, and height above the floor, a metre of which counts as much as features
+    60 degrees apart.
+    """
+    known, place = _surface(own)
+    strange, _ = _surface(other)
+    if not len(known) or not len(strange):
+        return 0.0
+    gap = cdist(known, known)
+    gap[cdist(place, place) < APART_M] = np.inf
+    usual = gap.min(1)
+    limit = np.percentile(usual[np.isfinite(usual)], KNOWN_PERCENT) if np.isfinite(usual).any() else 0.0
+    return float((KDTree(known).query(strange)[0] <= limit).mean())
+
+
+def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Float[np.ndarray, "cell 3"]]:
+    """Return what surface cells look like, and where they are (metres)."""
+    volume = home.volume
+    length = np.linalg.norm(volume.features.astype(np.float32), axis=0)
+    index = np.argwhere((volume.occupancy == 1) & (length > 0))
+    index = index[np.linspace(0, len(index) - 1, min(len(index), MOST_CELLS)).astype(int)]
+    at = tuple(index.T)
+    place = volume.origin + (index + 0.5) * volume.voxel_m
+    look = volume.features[(slice(None), *at)].astype(np.float32) / length[at]
+    return np.concatenate([look.T, place[:, 1:2] - home.floor_m], axis=1).astype(np.float32), place
+
+
+def set_down(
+    data: BehaviorData, own: ReconstructedHome, other: ReconstructedHome, rng: np.random.Generator
+) -> BehaviorData:
+    """Return recorded moments on the floor of the other home, turned and shifted as a whole.
+
+    Each is a recording of its own, named `<recording>-<first frame>`, whose first `PAST` frames are valid.
+    The animal is as high above the floor as it was above what carried it; the observer keeps its height above
+    the floor and stands on it where it was there at all. Raises SIM-011 where no moment fits in.
+    """
+    tracks: dict[str, Trajectory] = {}
+    splits: list[int] = []
+    scenes, floor = other.scenes(), _floor_places(other)
+    for split, count in STARTS.items():
+        windows = data.indices(split)
+        some = windows[np.linspace(0, len(windows) - 1, min(len(windows), count)).astype(int)]
+        for window in some.tolist():
+            name, start = data.videos[data.video[window]], int(data.start[window])
+            moment = _cut(data.trajectories[name], start, PAST + data.future)
+            placed = _placed(moment, own, other, scenes, floor, rng)
+            if placed is not None:
+                tracks[f"{name}-{start}"] = placed
+                splits.append(split)
+    if TRAIN not in splits:
+        raise _unusable("has no free floor on which the animal can be set down", Path("the other home"))
+    number = np.arange(len(tracks), dtype=np.int32)
+    return BehaviorData(
+        tracks,
+        data.agent_from_bone_rest,
+        number,
+        np.zeros_like(number),
+        np.array(splits, np.uint8),
+        tuple(tracks),
+        data.future,
+    )
+
+
+def _floor_places(home: ReconstructedHome) -> Float[np.ndarray, "place 3"]:
+    """Return the centres of the floor's cells, metres."""
+    level = round((home.floor_m - home.volume.origin[1]) / home.volume.voxel_m)
+    column = np.argwhere(home.marks[:, level] >= SUPPORTED)
+    place = home.volume.origin[[0, 2]] + (column + 0.5) * home.volume.voxel_m
+    return np.stack([place[:, 0], np.full(len(place), home.floor_m), place[:, 1]], axis=-1)
+
+
+def _cut(track: Trajectory, start: int, frames: int) -> Trajectory:
+    part = slice(start, start + frames)
+    valid = np.arange(frames) < PAST
+    return Trajectory(
+        track.timestamp_s[part] - track.timestamp_s[start],
+        track.world_from_agent[part],
+        track.agent_from_bone[part],
+        track.world_from_camera[part],
+        valid,
+    )
+
+
+def _placed(
+    moment: Trajectory,
+    own: ReconstructedHome,
+    other: ReconstructedHome,
+    scenes: Scenes,
+    floor: Float[np.ndarray, "place 3"],
+    rng: np.random.Generator,
+) -> Trajectory | None:
+    """Turn and shift a moment to a place on the floor where its past is free; None where none is found."""
+    now = moment.world_from_agent[PAST - 1, :3, 3]
+    step = now - moment.world_from_agent[PAST - 2, :3, 3]
+    moves = bool(np.hypot(step[0], step[2]) * RATE_HZ > REST_SPEED_M_S)
+    height = own.height_above_top(now, moves=moves)
+    for _ in range(PLACE_DRAWS):
+        turn = rigid.rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
+        target = floor[rng.integers(len(floor))] + [0.0, height, 0.0]
+        other_from_own = rigid.make(turn, target - turn @ now)
+        roots = other_from_own @ moment.world_from_agent
+        if scenes.inside_solid(roots[None, :PAST, :3, 3], None).any():
+            continue
+        camera = other_from_own @ moment.world_from_camera
+        camera[:, 1, 3] = moment.world_from_camera[:, 1, 3] - own.floor_m + other.floor_m
+        eye = camera[PAST - 1, :3, 3]
+        on_floor = np.abs(floor[:, [0, 2]] - eye[[0, 2]]).max(1).min() <= other.volume.voxel_m / 2
+        if on_floor or np.linalg.norm(eye - target) > PRESENT_M:
+            return replace(moment, world_from_agent=roots, world_from_camera=camera)
+    return None
+
+
+def _unusable(what: str, where: Path) -> InputError:
+    return InputError("SIM-011", what, str(where), "give a build of recordings in one home, with a floor")
+
+
+def _other_version(what: str, where: Path) -> InputError:
+    return InputError("ART-007", what, str(where), "build it again: make <agent>.behavior_data.redo")

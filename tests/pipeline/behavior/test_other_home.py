@@ -1,0 +1,130 @@
+"""The animal of one build in another's home: features mean the same, moments fit in, what is strange is told."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.backends.daisy import FeatureBasis, fit_basis
+from pipeline.backends.descriptors import Describer
+from pipeline.behavior.other_home import ReconstructedHome, expressed, move_in, share_known
+from pipeline.behavior.support import mark_supported
+from pipeline.behavior.trajectories import PAST, TEST, TRAIN
+from pipeline.core.errors import InputError
+from pipeline.data import npz
+from tests.pipeline.behavior.wandering import room, wandering
+
+RAW = 40
+
+
+def descriptors(rng, samples=3000):
+    """Descriptors of 12 dimensions among 40, as those of any two homes have most of their dimensions in common."""
+    mixing = np.random.default_rng(5).standard_normal((12, RAW))
+    raw = rng.standard_normal((samples, 12)) * np.linspace(3, 1, 12) @ mixing + 2
+    return (raw / np.linalg.norm(raw, axis=1, keepdims=True)).astype(np.float32)
+
+
+def basis(seed):
+    return fit_basis(descriptors(np.random.default_rng(seed)))
+
+
+def home(volume=None, known=None, origin=(0.0, 0.0, 0.0)):
+    """A room of 4 m with a floor at the height of 0, shifted to ``origin``."""
+    volume = volume or room()
+    marks = mark_supported(volume.occupancy == 0, volume.occupancy)
+    volume = replace(volume, origin=volume.origin + np.array(origin))
+    stands = np.array([[0.1, 0.3], [0.1, 0.3]])
+    return ReconstructedHome(volume, marks, stands, known or basis(0), Describer(), origin[1])
+
+
+def write(build, scale="measured", **without):
+    """Write the artifacts of a home."""
+    for artifact in ("behavior_data", "feature_basis", "scene_template"):
+        (build / artifact).mkdir(parents=True)
+    made = home()
+    arrays = vars(made.volume) | {"allowed": made.marks, "stands_m": made.stands_m}
+    npz.save(
+        build / "behavior_data/volume.npz",
+        **{name: without.get(name, value) for name, value in arrays.items() if without.get(name, 0) is not None},
+    )
+    made.basis.save(build / "feature_basis")
+    made.describer.save(build / "feature_basis")
+    (build / "scene_template/world.json").write_text(json.dumps({"scale": scale}))
+    return build
+
+
+def test_features_mean_in_the_other_basis_what_they_meant():
+    written, read = basis(1), basis(2)
+    raw = descriptors(np.random.default_rng(9), 500)
+    there, here = written.project(raw), read.project(raw)
+    cells = np.moveaxis(there.reshape(5, 10, 10, 16), -1, 0).astype(np.float16)
+    got = np.moveaxis(expressed(cells, written, read), 0, -1).reshape(-1, 16).astype(np.float32)
+    as_they_were = np.median((there * here).sum(1))
+    assert np.median((got * here).sum(1)) > 0.95 > as_they_were
+    np.testing.assert_allclose(np.linalg.norm(got, axis=1), 1, atol=2e-3)
+    empty = expressed(np.zeros_like(cells), written, read)
+    assert not empty.any(), "free space stays empty"
+    assert expressed(cells, written, FeatureBasis(**vars(written))) is cells
+
+
+def test_moments_stand_on_the_other_floor_in_free_space():
+    own, other = home(), home(origin=(10.0, 2.0, -7.0))
+    data = wandering()
+    moved = move_in(own, other, data)
+    assert set(moved.data.split) == {TRAIN, TEST}
+    scenes = moved.home.scenes()
+    for name, track in moved.data.trajectories.items():
+        assert track.valid.sum() == PAST and len(track.valid) == PAST + data.future
+        roots = track.world_from_agent[:PAST, :3, 3]
+        assert not scenes.inside_solid(roots[None], None).any()
+        assert (np.abs(roots[-1] - [10, 2.2, -7])[[0, 2]] < 2.2).all()
+        assert 2.1 <= roots[-1, 1] <= 2.3, "as high above the floor as at home"
+        video, start = name.rsplit("-", 1)
+        before = data.trajectories[video].world_from_agent[int(start) :][:PAST, :3, 3]
+        np.testing.assert_allclose(
+            np.linalg.norm(np.diff(roots, axis=0), axis=1), np.linalg.norm(np.diff(before, axis=0), axis=1)
+        )
+    again = move_in(own, other, data)
+    np.testing.assert_array_equal(
+        again.data.windows(np.arange(5))[0].world_from_agent, moved.data.windows(np.arange(5))[0].world_from_agent
+    )
+
+
+def test_what_was_never_seen_lowers_the_share_of_known_cells():
+    own = home()
+    assert share_known(own, own) == 1.0
+    strange = room()
+    unlike = strange.features.copy()
+    half = np.arange(strange.occupancy.shape[0]) >= 22
+    noise = np.random.default_rng(0).standard_normal(unlike[:, half].shape)
+    solid = strange.occupancy[half] == 1
+    unlike[:, half] = np.where(solid, noise / np.linalg.norm(noise, axis=0), 0)
+    share = share_known(own, home(replace(strange, features=unlike)))
+    assert 0.3 < share < 0.7, "half of the room is as it was"
+
+
+@pytest.mark.parametrize(
+    ("fault", "code"),
+    [({"stands_m": None}, "ART-007"), ({"scale": "relative: from pictures"}, "SIM-011"),
+     ({"allowed": np.zeros((44, 12, 44), np.uint8)}, "SIM-011")],
+)  # fmt: skip
+def test_homes_that_cannot_be_used_are_named(tmp_path, fault, code):
+    with pytest.raises(InputError, match=code):
+        ReconstructedHome.of_build(write(tmp_path / "other", **fault))
+
+
+def test_homes_that_are_not_there_or_of_another_kind_are_named(tmp_path):
+    with pytest.raises(InputError, match="ART-003"):
+        ReconstructedHome.of_build(tmp_path / "nowhere")
+    build = write(tmp_path / "other")
+    other = ReconstructedHome.of_build(build)
+    np.testing.assert_array_equal(other.marks, home().marks)
+    (build / "behavior_data/volume.npz").unlink()
+    with pytest.raises(InputError, match="SIM-011.*each recording"):
+        ReconstructedHome.of_build(build)
+    with pytest.raises(InputError, match="SIM-011.*dinov2"):
+        move_in(home(), replace(other, describer=Describer("dinov2", "somewhere")), wandering())
+    coarse = replace(other, volume=replace(other.volume, voxel_m=0.2))
+    with pytest.raises(InputError, match="ART-007"):
+        move_in(home(), coarse, wandering())
