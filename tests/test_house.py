@@ -38,6 +38,7 @@ PACKAGES = (
     "rivals",
     "metrics",
     "environments",
+    "adapters",
 )
 """Packages of `pipeline/` in flow order: each imports itself and earlier ones."""
 FOR_FRONTS_ONLY = "workflow"

@@ -281,7 +281,11 @@ class Simulator:
     def _state(self, now: PoseFrames) -> SimulatorState:
         bones = bones_from_channels(now.bones[0, 0], self.rest)
         return SimulatorState(
-            self.frame / RATE_HZ, now.root[0, 0], bones, self.flock.goal[0], float(self.flock.blocked[0])
+            self.frame / RATE_HZ,
+            now.root[0, 0],
+            bones,
+            self.flock.goal[0].copy(),
+            float(self.flock.blocked[0]),
         )
 
 

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
-from pipeline.behavior.other_home import ReconstructedHome, move_in
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
@@ -23,6 +22,7 @@ from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorD
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
+from pipeline.environments.other_home import ReconstructedHome, move_in
 from pipeline.environments.rewards import StepOutcome
 from pipeline.metrics.flight import WITHIN_FRAMES, flees
 from pipeline.workflow import artifact
@@ -112,7 +112,7 @@ class AnimalWorld:
         """Open a finished build, its animal in the home of another one where ``home`` is given.
 
         Raises ART-003 where it lacks the model, ART-007 where another version wrote it, SIM-006 for models
-        without goals, and what `pipeline.behavior.other_home` raises for homes that cannot be used.
+        without goals, and what `pipeline.environments.other_home` raises for homes that cannot be used.
         """
         for name in ("behavior", "behavior_data"):
             if not (build / name).is_dir():
@@ -261,10 +261,10 @@ def checked(
     """Return actions as numbers. Raises SIM-012 where they are not finite or of another shape."""
     numbers = np.asarray(action, float)
     if numbers.shape != shape or not np.isfinite(numbers).all():
-        told = f"shape {numbers.shape}" if numbers.shape != shape else f"{numbers.tolist()}"
+        received = f"shape {numbers.shape}" if numbers.shape != shape else f"{numbers.tolist()}"
         raise InputError(
             "SIM-012",
-            f"actions are no {shape[0]} x {shape[1]} finite numbers: {told}",
+            f"actions are no {shape[0]} x {shape[1]} finite numbers: {received}",
             "step",
             "look for what made the policy diverge: learning rate, rewards, observations",
         )

@@ -62,10 +62,7 @@ def elsewhere(home: Path, take: Path, name: str) -> Surroundings:
         raise InputError("EXP-003", "is no take in another home", str(take), remedy)
     share = json.loads((take / "home.json").read_bytes())["share_known"]
     clip = _clip(take)
-    remark = (
-        f"This is another home, that of {home.name}. {share:.0%} of its surfaces look like the home that "
-        f"{name} knows; elsewhere its behavior is a guess."
-    )
+    remark = f"Home of {home.name}: {share:.0%} of it looks like the home that {name} knows."
     roots = clip.world_from_agent[:, :3, 3]
     labels = {_CLIP: f"a take in the home of {home.name}"}
     return Surroundings(surface, splats, take / "volume.npz", [clip], roots, labels, remark)

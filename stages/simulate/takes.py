@@ -9,7 +9,6 @@ import numpy as np
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
-from pipeline.behavior.other_home import ReconstructedHome, move_in
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import Simulator
@@ -17,6 +16,7 @@ from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.core import progress
 from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.data import glb, npz, ply
+from pipeline.environments.other_home import ReconstructedHome, move_in
 from pipeline.longterm import journeys
 from pipeline.longterm.bodies import load_body
 from pipeline.longterm.config import MotionOptimizationConfig

@@ -18,8 +18,8 @@ from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.test_other_home import write
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.environments.test_other_home import write
 from tests.stages.simulate.test_simulator import scaling
 
 gymnasium = pytest.importorskip("gymnasium")

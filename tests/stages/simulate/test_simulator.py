@@ -25,8 +25,8 @@ from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior import test_other_home
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.environments import test_other_home
 
 
 def scaling():
@@ -67,6 +67,12 @@ def test_same_seed_same_life_and_it_goes_on(simulator):
     assert states[-1].time_s == pytest.approx(2.5)
     np.testing.assert_allclose(np.linalg.det(lives[0][:, :3, :3]), 1, atol=1e-6)
     assert states[-1].agent_from_bone.shape == (3, 4, 4)
+
+
+def test_states_keep_the_goals_that_they_had(simulator):
+    person = np.array([0.5, 1.3, 0.5])
+    states = [simulator.reset(seed=4)] + [simulator.step(person) for _ in range(55)]
+    assert len({tuple(state.goal_world) for state in states}) == 2, "56 frames, of which 4 fade"
 
 
 def test_animals_of_a_flock_go_on_from_their_own_windows(simulator):

@@ -8,11 +8,11 @@ import pytest
 
 from pipeline.backends.daisy import FeatureBasis, fit_basis
 from pipeline.backends.descriptors import Describer
-from pipeline.behavior.other_home import ReconstructedHome, expressed, move_in, share_known
 from pipeline.behavior.support import mark_supported
 from pipeline.behavior.trajectories import PAST, TEST, TRAIN
 from pipeline.core.errors import InputError
 from pipeline.data import npz
+from pipeline.environments.other_home import ReconstructedHome, expressed, move_in, share_known
 from tests.pipeline.behavior.wandering import room, wandering
 
 RAW = 40
@@ -46,7 +46,11 @@ def write(build, scale="measured", **without):
     arrays = vars(made.volume) | {"allowed": made.marks, "stands_m": made.stands_m}
     npz.save(
         build / "behavior_data/volume.npz",
-        **{name: without.get(name, value) for name, value in arrays.items() if without.get(name, 0) is not None},
+        **{
+            name: without.get(name, value)
+            for name, value in arrays.items()
+            if without.get(name, 0) is not None
+        },
     )
     made.basis.save(build / "feature_basis")
     made.describer.save(build / "feature_basis")
@@ -87,7 +91,8 @@ def test_moments_stand_on_the_other_floor_in_free_space():
         )
     again = move_in(own, other, data)
     np.testing.assert_array_equal(
-        again.data.windows(np.arange(5))[0].world_from_agent, moved.data.windows(np.arange(5))[0].world_from_agent
+        again.data.windows(np.arange(5))[0].world_from_agent,
+        moved.data.windows(np.arange(5))[0].world_from_agent,
     )
 
 

@@ -2,7 +2,7 @@
 
 `ReconstructedHome.of_build` opens what a finished build knows of its home. `move_in` puts an animal into
 another one: features are expressed in the basis that its model learned, recorded moments are set down on the
-other floor, and `share_known` tells how much of the other home looks like the one it knows.
+other floor, and `share_known` is how much of the other home looks like the one it knows.
 """
 
 import json
@@ -24,6 +24,7 @@ from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorD
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.geometry import rigid
+from pipeline.workflow import artifact
 
 ARTIFACTS = ("behavior_data", "feature_basis", "scene_template")
 """What of a build describes its home."""
@@ -34,7 +35,7 @@ PLACE_DRAWS = 200
 PRESENT_M = 20.0
 """Observers further off than a home is wide were not there, and need no free place."""
 APART_M = 0.5
-"""Surface cells nearer to each other than this show the same thing and do not tell how alike a home is to
+"""Surface cells nearer to each other than this show the same thing and do not show how alike a home is to
 itself."""
 KNOWN_PERCENT = 95.0
 """Percent of the known home's own cells that count as known, judged by its cells elsewhere."""
@@ -58,14 +59,15 @@ class ReconstructedHome:
 
     @classmethod
     def of_build(cls, build: Path) -> "ReconstructedHome":
-        """Open the home of `build/<agent>`. Raises as `load` does, and ART-003 where an artifact is not
-        there.
+        """Open the home of `build/<agent>`. Raises as `load` does, ART-003 where an artifact is not there,
+        ART-007 where another version wrote it.
         """
-        for artifact in ARTIFACTS:
-            if not (build / artifact).is_dir():
-                remedy = f"make it: make <agent>.{artifact}, of an agent with recordings"
-                raise InputError("ART-003", f"has no {artifact}", str(build), remedy)
-        return cls.load(*(build / artifact for artifact in ARTIFACTS))
+        for name in ARTIFACTS:
+            if not (build / name).is_dir():
+                remedy = f"make it: make <agent>.{name}, of an agent with recordings"
+                raise InputError("ART-003", f"has no {name}", str(build), remedy)
+            artifact.refuse_other_version(build / name)
+        return cls.load(*(build / name for name in ARTIFACTS))
 
     @classmethod
     def load(cls, behavior_data: Path, feature_basis: Path, scene_template: Path) -> "ReconstructedHome":
@@ -165,14 +167,14 @@ def share_known(own: ReconstructedHome, other: ReconstructedHome) -> float:
     60 degrees apart.
     """
     known, place = _surface(own)
-    strange, _ = _surface(other)
-    if not len(known) or not len(strange):
+    visited, _ = _surface(other)
+    if not len(known) or not len(visited):
         return 0.0
     gap = cdist(known, known)
     gap[cdist(place, place) < APART_M] = np.inf
     usual = gap.min(1)
     limit = np.percentile(usual[np.isfinite(usual)], KNOWN_PERCENT) if np.isfinite(usual).any() else 0.0
-    return float((KDTree(known).query(strange)[0] <= limit).mean())
+    return float((KDTree(known).query(visited)[0] <= limit).mean())
 
 
 def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Float[np.ndarray, "cell 3"]]:

@@ -1,0 +1,100 @@
+"""One animal for programs that have a clock of their own: robot simulators, game engines, ROS.
+
+`LiveAnimal.open` opens a build; `advance` lets time pass with someone at a place, in steps of any length, and
+returns the pose of then. `pipeline.adapters.mujoco_animal`, `usd_animal` and `ros2_animal` are adapters
+of it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.behavior.simulator import Simulator
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core.errors import InputError
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.world import AnimalWorld
+from pipeline.geometry import rigid
+
+ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""From the world of a build (+y up) to that of programs with +z up; as in the export `mjcf`."""
+
+
+@dataclass(frozen=True)
+class AnimalPose:
+    """An animal at one time."""
+
+    time_s: float
+    world_from_agent: Float[np.ndarray, "4 4"]
+    agent_from_bone: Float[np.ndarray, "bone 4 4"]
+
+
+class LiveAnimal:
+    """An animal that perceives one observer and is asked for its pose at any times that do not go back."""
+
+    def __init__(self, simulator: Simulator, seed: int = 0):
+        """``seed`` decides the recorded moment that it begins in, and all its plans."""
+        self.simulator = simulator
+        self.reset(seed)
+
+    @classmethod
+    def open(
+        cls, build: Path, *, home: Path | None = None, seed: int = 0, device: str = "cpu"
+    ) -> "LiveAnimal":
+        """Open `build/<agent>`, in the home of another build where ``home`` is given; raises as
+        `AnimalWorld.load`.
+        """
+        world = AnimalWorld.load(build, EnvironmentConfig(), home=home, device=device)
+        animals = world.animals
+        simulator = Simulator(
+            animals.sampler,
+            world.data,
+            world.scenes,
+            animals.ego,
+            sampling=animals.sampling,
+            chaining=animals.chaining,
+        )
+        return cls(simulator, seed)
+
+    def reset(self, seed: int) -> None:
+        """Begin again at time 0."""
+        self.time_s = 0.0
+        self.before = self.after = self.simulator.reset(seed)
+
+    @property
+    def pose(self) -> AnimalPose:
+        """The pose of now, between the two frames of the simulator that enclose it."""
+        share = float(np.clip((self.time_s - self.before.time_s) * RATE_HZ, 0, 1))
+        bones = zip(self.before.agent_from_bone, self.after.agent_from_bone, strict=True)
+        return AnimalPose(
+            self.time_s,
+            _between(self.before.world_from_agent, self.after.world_from_agent, share),
+            np.stack([_between(first, last, share) for first, last in bones]),
+        )
+
+    def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> AnimalPose:
+        """Let time pass with the observer's eyes at a place (world, metres) and return the pose of then.
+
+        Raises SIM-012 where time or place are no finite numbers.
+        """
+        place = np.asarray(observer_world, float)
+        if not np.isfinite([seconds, *place]).all() or seconds < 0:
+            what = f"cannot let {seconds} s pass with an observer at {place.tolist()}"
+            raise InputError(
+                "SIM-012", what, "advance", "give seconds and a position of three finite numbers"
+            )
+        self.time_s += seconds
+        while self.after.time_s < self.time_s - 1e-9:
+            self.before, self.after = self.after, self.simulator.step(place)
+        return self.pose
+
+
+def _between(
+    first: Float[np.ndarray, "4 4"], last: Float[np.ndarray, "4 4"], share: float
+) -> Float[np.ndarray, "4 4"]:
+    """Return the rigid motion that is ``share`` (0..1) of the way from one to the other."""
+    turn = rigid.vector_from_rotation(first[:3, :3].T @ last[:3, :3])
+    place = first[:3, 3] * (1 - share) + last[:3, 3] * share
+    return rigid.make(first[:3, :3] @ rigid.rotation_from_vector(turn * share), place)

@@ -1,0 +1,104 @@
+"""Many persons beside many animals, for the algorithms of Stable-Baselines3 (extra `rl`).
+
+Gymnasium's vector interface begins an ended episode in the next step, Stable-Baselines3 in the same one; so
+it has an adapter of its own.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from stable_baselines3.common.vec_env import VecEnv
+
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.rewards import ENDING, REWARDS
+from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
+from pipeline.environments.world import AnimalWorld
+
+
+class PersonStableVecEnv(VecEnv):
+    """`PersonEnv` ``num_envs`` times in one process, as `stable_baselines3` wants it.
+
+    Each episode's last `info` holds `reached`, `flees`, `terminal_observation` and `TimeLimit.truncated`.
+    """
+
+    def __init__(
+        self,
+        build: str | Path | AnimalWorld,
+        num_envs: int,
+        *,
+        home: str | Path | None = None,
+        split: str = "train",
+        device: str = "cpu",
+        config: EnvironmentConfig | None = None,
+        **settings: Any,
+    ):
+        """Open a build (`build/<agent>`); episodes begin at moments of ``split``, train or test.
+
+        ``settings`` replace fields of `EnvironmentConfig`.
+        """
+        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
+        self.config, self.split, self.render_mode = self.world.config, split, None
+        super().__init__(num_envs, person_observation_space(), person_action_space(self.world))
+        self.rng = np.random.default_rng()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Let one seed decide all episodes from the next `reset` on."""
+        self.rng = np.random.default_rng(seed)
+        return [seed] * self.num_envs
+
+    def reset(self) -> dict[str, Float[np.ndarray, "person ..."]]:
+        """Begin all episodes."""
+        self.frame = np.zeros(self.num_envs, int)
+        self.world.begin(self.num_envs, self.rng, self.split)
+        return person_observation(self.world)
+
+    def step_async(self, actions: Float[np.ndarray, "person action"]) -> None:
+        """Keep the actions for `step_wait`."""
+        self.actions = actions
+
+    def step_wait(self):
+        """Let 0.1 s pass everywhere and begin ended episodes anew."""
+        outcome = self.world.step(self.actions)
+        self.frame += 1
+        over = (outcome.reached | outcome.flees) & (self.config.reward in ENDING)
+        late = ~over & (self.frame >= round(self.config.episode_s * RATE_HZ))
+        observation = person_observation(self.world)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = np.flatnonzero(over | late)
+        for row in ended:
+            infos[row] = {
+                "reached": bool(outcome.reached[row]),
+                "flees": bool(outcome.flees[row]),
+                "TimeLimit.truncated": bool(late[row]),
+                "terminal_observation": {name: value[row] for name, value in observation.items()},
+            }
+        if len(ended):
+            self.world.restart(ended, self.split)
+            self.frame[ended] = 0
+            observation = person_observation(self.world)
+        reward = REWARDS[self.config.reward](outcome).astype(np.float32)
+        return observation, reward, over | late, infos
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute, which all of the environments share."""
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of all."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **named: Any) -> list[Any]:
+        """Call a method, once for all."""
+        result = getattr(self, method_name)(*arguments, **named)
+        return [result] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """Return that no environment is wrapped."""
+        return [False] * len(list(self._get_indices(indices)))

@@ -1,0 +1,174 @@
+"""Adapters to programs with clocks of their own: time passes as they say, bodies are where the simulator has
+them.
+"""
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pipeline.adapters.live_animal import ZUP_FROM_WORLD, LiveAnimal
+from pipeline.adapters.ros2_animal import AnimalNode
+from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import Architecture, BehaviorNets
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import Simulator
+from pipeline.core.errors import InputError
+from pipeline.data.glb import Action, Skin
+from pipeline.geometry import rigid
+from stages.export import mjcf, reading, usd
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.stages.export_simulator import small_world
+from tests.stages.simulate.test_simulator import scaling
+
+PERSON = np.array([0.5, 1.3, 0.5])
+
+
+def simulator(architecture: Architecture = ARCHITECTURE) -> Simulator:
+    volume = room()
+    return Simulator(
+        Sampler(TorchNetworks(BehaviorNets(architecture)), Schedule(), scaling()),
+        wandering(),
+        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
+        "yaw",
+        sampling=PlanSamplingConfig(goal_steps=2, sequence_steps=2),
+        chaining=ReplanningConfig(candidates=1),
+    )
+
+
+@pytest.fixture(scope="module")
+def animal() -> LiveAnimal:
+    return LiveAnimal(simulator(), seed=3)
+
+
+def exported() -> reading.Agent:
+    """A tube on the three bones of the animal."""
+    mesh, _ = small_world.tube()
+    skin = Skin(
+        np.tile(np.arange(4, dtype=np.uint8) % 3, (len(mesh.vertices), 1)),
+        np.full((len(mesh.vertices), 4), 0.25, np.float32),
+        REST,
+        tuple(f"bone_{bone:02d}" for bone in range(len(REST))),
+    )
+    still = Action("still", np.arange(5) / 30, np.tile(np.eye(4), (5, 1, 1)), np.tile(REST, (5, 1, 1, 1)))
+    return reading.Agent(mesh, skin, [still], {})
+
+
+def test_time_passes_in_steps_of_any_length(animal):
+    animal.reset(3)
+    frames = [animal.simulator.reset(3)] + [animal.simulator.step(PERSON) for _ in range(10)]
+    animal.reset(3)
+    fine = [animal.advance(0.02, PERSON) for _ in range(50)]
+    for number in (5, 10):
+        np.testing.assert_allclose(
+            fine[5 * number - 1].world_from_agent, frames[number].world_from_agent, atol=1e-9
+        )
+    middle = 0.5 * (frames[4].world_from_agent + frames[5].world_from_agent)[:3, 3]
+    animal.reset(3)
+    np.testing.assert_allclose(animal.advance(0.45, PERSON).world_from_agent[:3, 3], middle, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(animal.pose.agent_from_bone[:, :3, :3]), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize(("seconds", "place"), [(np.nan, PERSON), (0.1, PERSON * np.nan), (-0.1, PERSON)])
+def test_what_is_no_time_or_place_is_refused(animal, seconds, place):
+    with pytest.raises(InputError, match="SIM-012"):
+        animal.advance(seconds, place)
+
+
+def test_mujoco_steps_with_a_robot_that_the_animal_sees(animal, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    from pipeline.adapters.mujoco_animal import MujocoAnimal
+
+    occupancy = reading.Occupancy(np.pad(np.ones((40, 1, 40), bool), ((0, 0), (0, 5), (0, 0))), np.array([-2.0, -0.1, -2]), 0.1)  # fmt: skip
+    mjcf.write(tmp_path, exported(), occupancy)
+    home = mujoco.MjSpec.from_file(str(tmp_path / "agent.xml"))
+    ball = home.worldbody.add_body(name="robot", pos=[1.0, 0.5, 0.4])
+    ball.add_freejoint()
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    model = home.compile()
+    model.opt.timestep = 0.005
+    data = mujoco.MjData(model)
+    animal.reset(3)
+    moving = MujocoAnimal(model, data, animal, observer="robot")
+    np.testing.assert_allclose(moving.observer_world, [1.0, 0.4, -0.5])
+    pose = moving.step(100)
+    assert data.time == pytest.approx(0.5) and pose.time_s == pytest.approx(0.5)
+    assert data.body("robot").xpos[2] == pytest.approx(0.1, abs=0.02), (
+        "it fell onto the floor, which carries it"
+    )
+    mujoco.mj_forward(model, data)
+    bone = ZUP_FROM_WORLD @ pose.world_from_agent @ pose.agent_from_bone[1]
+    np.testing.assert_allclose(data.body("bone_01").xpos, bone[:3, 3], atol=1e-9)
+
+
+def test_usd_has_the_pose_of_now(animal, tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdSkel
+
+    from pipeline.adapters.usd_animal import UsdAnimal
+
+    usd.write(tmp_path, exported(), small_world.room())
+    stage = Usd.Stage.Open(str(tmp_path / "agent_still.usdc"))
+    animal.reset(3)
+    pose = UsdAnimal(stage, animal).step(0.25, PERSON)
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(stage.GetPrimAtPath("/agent")), Usd.PrimDefaultPredicate)
+    query = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/agent/skeleton")))
+    found = np.array([np.array(matrix).T for matrix in query.ComputeJointSkelTransforms(7)])[1:]
+    np.testing.assert_allclose(found, pose.world_from_agent @ pose.agent_from_bone, atol=1e-4)
+
+
+@dataclass
+class Message:
+    """A message of ROS with the fields that the node fills."""
+
+    pose: object = None
+    poses: object = None
+    header: SimpleNamespace = field(default_factory=SimpleNamespace)
+
+
+class Topics:
+    """What a node of ROS offers, as far as the adapter asks for it."""
+
+    def __init__(self):
+        self.sent, self.heard, self.period_s = {}, {}, None
+
+    def create_publisher(self, kind, topic, depth):
+        return SimpleNamespace(publish=lambda message: self.sent.setdefault(topic, []).append(message))
+
+    def create_subscription(self, kind, topic, callback, depth):
+        self.heard[topic] = callback
+
+    def create_timer(self, period_s, callback):
+        self.period_s, self.tick = period_s, callback
+
+    def get_clock(self):
+        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+
+
+def test_ros_messages_have_the_axes_of_rep_103(animal):
+    """ROS itself is no wheel; its messages are plain records."""
+    animal.reset(3)
+    messages = SimpleNamespace(
+        PoseStamped=Message,
+        PoseArray=Message,
+        Point=SimpleNamespace,
+        Pose=SimpleNamespace,
+        Quaternion=SimpleNamespace,
+    )
+    topics = Topics()
+    node = AnimalNode(topics, messages, animal)
+    topics.heard["observer"](Message(pose=SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=1.4))))
+    np.testing.assert_allclose(node.observer_world, [1.0, 1.4, -2.0])
+    assert topics.period_s == pytest.approx(0.1)
+    topics.tick()
+    (root,), (bones,) = topics.sent["animal"], topics.sent["bones"]
+    assert root.header.frame_id == "map" and root.header.stamp == "now" and len(bones.poses) == len(REST)
+    turn = root.pose.orientation
+    axes = rigid.rotation_from_quaternion(np.array([turn.w, turn.x, turn.y, turn.z]))
+    agent = ZUP_FROM_WORLD[:3, :3] @ animal.pose.world_from_agent[:3, :3]
+    np.testing.assert_allclose(axes[:, 0], agent[:, 2], atol=1e-6, err_msg="x is ahead")
+    np.testing.assert_allclose(axes[:, 2], agent[:, 1], atol=1e-6, err_msg="z is up")
