@@ -30,9 +30,11 @@ from pipeline.environments.stable_baselines import PersonStableVecEnv
 from pipeline.environments.world import CLOSE_M, AnimalWorld
 from pipeline.metrics.flight import flees
 
-ENVIRONMENTS = 32
+ENVIRONMENTS = 64
+EPISODE_S = 12.0
+"""Five times as long as the longest straight walk takes."""
 PPO_SETTINGS = {
-    "n_steps": 32, "batch_size": 256, "n_epochs": 6, "learning_rate": 1e-3, "gamma": 0.98, "gae_lambda": 0.95,
+    "n_steps": 16, "batch_size": 256, "n_epochs": 6, "learning_rate": 1e-3, "gamma": 0.98, "gae_lambda": 0.95,
     "policy_kwargs": {"log_std_init": -0.7, "net_arch": [64, 64]},
 }  # fmt: skip
 """Small batches' usual values; a second is ten steps, so that 0.98 looks five seconds ahead."""
@@ -194,7 +196,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    world, begin = AnimalWorld.load(asked.build, EnvironmentConfig()), time.process_time()
+    world, begin = AnimalWorld.load(asked.build, EnvironmentConfig(episode_s=EPISODE_S)), time.process_time()
     for name, split in (("training", TRAIN), ("test", TEST)):
         recorded, planned, moments = flights(world, split)
         log(

@@ -1,0 +1,38 @@
+"""Stable-Baselines3 accepts the environment; ended episodes begin anew in the same step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.pipeline.environments.test_environments import QUICK, small_world
+
+pytest.importorskip("stable_baselines3")
+
+
+def test_ppo_takes_its_steps():
+    from stable_baselines3 import PPO
+
+    from pipeline.environments.stable_baselines import PersonStableVecEnv
+
+    env = PersonStableVecEnv(small_world(replace(QUICK, episode_s=1.0)), 4)
+    model = PPO("MultiInputPolicy", env, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu")
+    model.learn(64)
+    action, _ = model.predict(env.reset(), deterministic=True)
+    assert action.shape == (4, 3) and np.isfinite(action).all()
+
+
+def test_episodes_end_with_their_last_observation_and_begin_anew():
+    from pipeline.environments.stable_baselines import PersonStableVecEnv
+
+    env = PersonStableVecEnv(small_world(replace(QUICK, episode_s=0.5, reward="calm")), 3)
+    env.seed(0)
+    env.reset()
+    for frame in range(5):
+        before = env.world.persons.position.copy()
+        seen, _, done, info = env.step(np.zeros((3, 3)))
+        assert done.tolist() == [frame == 4] * 3
+    assert all(each["TimeLimit.truncated"] for each in info)
+    assert np.abs(env.world.persons.position - before).max() > 0.1, "other starts"
+    for row, each in enumerate(info):
+        assert not np.allclose(each["terminal_observation"]["animal"], seen["animal"][row])
