@@ -237,7 +237,7 @@ class AnimalWorld:
             self.persons.heading[row] = np.arctan2(ahead[0], ahead[1])
             self.persons.velocity[row] = 0.0
         observer = np.repeat(self.eyes[some][:, None], PAST, axis=1)
-        return replace(context, observer_world=observer)
+        return replace(context, observer_world=observer, observer_rotation=None)
 
     def _start(self, animal: Float[np.ndarray, "2"], floor: PersonFloor) -> Float[np.ndarray, "2"]:
         """Draw a free place around the animal, the last one drawn where none is free."""

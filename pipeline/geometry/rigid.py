@@ -175,7 +175,7 @@ def mean_rotation(
 
 
 def look_at(
-    eye: Float[np.ndarray, "*batch 3"], target: Float[np.ndarray, "*batch 3"], up: Float[np.ndarray, "3"]
+    eye: Float[np.ndarray, "*#batch 3"], target: Float[np.ndarray, "*#batch 3"], up: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "*batch 4 4"]:
     """Return ``world_from_camera`` (OpenCV axes) of upright cameras at ``eye`` that look at ``target``.
 
