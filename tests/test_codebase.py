@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 56_600,
+    "lines": 57_700,
     "lines over 110 columns": 0,
     "recipe keys": 302,
     "packages over 16 modules": 0,
