@@ -33,7 +33,7 @@ FULL_BYTES = 1 << 20
 """A full disk leaves at most this much."""
 FARTHEST_S = 400 * 24 * 3600
 """The clock is moved by up to this."""
-SHARE = 0.3
+SHARE = 0.1
 """Of an undisturbed build's time within which a fault comes."""
 RECIPES = {
     "filmed": """[synthesize_capture]
