@@ -192,7 +192,8 @@ def rendered_by_fields(
         return [HeldoutView.empty(shot) for shot in shots]
     reconstruction, views = fields.load(folders.reconstruction, device), []
     for shot in shots:
-        camera = (shot.world_from_camera, shot.intrinsics, *shot.depth.shape)
+        height, width = shot.depth.shape
+        camera = shot.world_from_camera, shot.intrinsics, height, width
         depth, _ = render_depth(reconstruction, *camera, FARTHEST_M, session, *motion.at(shot.time_s))
         views.append(HeldoutView(np.zeros_like(shot.color), depth, shot))
     return views
