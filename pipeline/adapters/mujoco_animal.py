@@ -4,14 +4,16 @@ A model is the export's `agent.xml`, alone or attached to one with a robot (`muj
 animal perceives. Needs the extra `mujoco`.
 """
 
+from importlib import import_module
 from typing import Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.adapters.live_animal import ZUP_FROM_WORLD, AnimalPose, LiveAnimal
 from pipeline.geometry import rigid
+
+mujoco: Any = import_module("mujoco")  # compiled: type checkers see no functions in it
 
 
 class MujocoAnimal:

@@ -5,14 +5,20 @@ Any program with the libraries of `pxr` will do; what lets time pass calls `step
 Isaac Sim's own Python.
 """
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from pxr import Gf, Usd, UsdSkel, Vt
 
 from pipeline.adapters.live_animal import AnimalPose, LiveAnimal
 from pipeline.geometry import rigid
+
+Gf: Any
+Usd: Any
+UsdSkel: Any
+Vt: Any
+Gf, Usd, UsdSkel, Vt = (import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdSkel", "Vt"))
 
 
 class UsdAnimal:
