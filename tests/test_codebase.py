@@ -7,11 +7,11 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 57_700,
+    "lines": 58_200,
     "lines over 110 columns": 0,
-    "recipe keys": 302,
+    "recipe keys": 304,
     "packages over 16 modules": 0,
-    "private words in identifiers": 133,
+    "private words in identifiers": 131,
     "tell, told": 13,
     "class names used twice": 3,
     "unnamed numbers": 219,

@@ -41,9 +41,16 @@ class BodyDenoiser(nn.Module):
     share: Tensor
     past: Tensor
 
-    def __init__(self, unet: nn.Module, posture: int, frames: int, schedule: Schedule = STANDARD):
+    def __init__(
+        self,
+        unet: nn.Module,
+        posture: int,
+        frames: int,
+        schedule: Schedule = STANDARD,
+        rate_hz: float = RATE_HZ,
+    ):
         super().__init__()
-        self.unet, self.posture = unet, posture
+        self.unet, self.posture, self.rate_hz = unet, posture, rate_hz
         self.register_buffer("path_std", torch.ones(3, frames))
         self.register_buffer("root_mean", torch.zeros(ROOT_CHANNELS))
         self.register_buffer("root_std", torch.ones(ROOT_CHANNELS))
@@ -66,7 +73,7 @@ class BodyDenoiser(nn.Module):
         held = nn.functional.pad(
             torch.cat([root, held[:, ROOT_CHANNELS:]], dim=1), (0, 0, x.shape[1] - self.posture, 0)
         )
-        unet_control = torch.cat([control, step * RATE_HZ, heading], dim=1)
+        unet_control = torch.cat([control, step * self.rate_hz, heading], dim=1)
         return self.unet(x - self.share[t.long()][:, None, None] * held, t, condition, unet_control, keep)
 
     def steps(
@@ -107,8 +114,15 @@ class OneStageDenoiser(BodyDenoiser):
 
     velocity_std: Tensor
 
-    def __init__(self, unet: nn.Module, posture: int, frames: int, schedule: Schedule = STANDARD):
-        super().__init__(unet, posture, frames, schedule)
+    def __init__(
+        self,
+        unet: nn.Module,
+        posture: int,
+        frames: int,
+        schedule: Schedule = STANDARD,
+        rate_hz: float = RATE_HZ,
+    ):
+        super().__init__(unet, posture, frames, schedule, rate_hz)
         self.register_buffer("velocity_std", torch.ones(PATH_CHANNELS))
 
     def steps(
@@ -120,7 +134,7 @@ class OneStageDenoiser(BodyDenoiser):
         """Return how far the noisy path is expected to go in each frame, metres."""
         del control
         strides = (self.share[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).mT * self.velocity_std
-        return expected_steps(strides).mT
+        return expected_steps(strides, self.rate_hz).mT
 
 
 def horizontal_forward(root: Float[Tensor, "batch 6 frame"]) -> Float[Tensor, "batch 2 frame"]:

@@ -44,6 +44,8 @@ class PlanSamplingConfig:
     """Scale s of classifier-free guidance ("interactivity")."""
     guided: Guided = "observer"
     """What the guidance acts on."""
+    companions_guidance: float = 1.0
+    """The scale for all others but the observer, where the reference has all other conditions."""
     scene: bool = True
     """Condition on the scene."""
     observer: bool = True

@@ -4,7 +4,7 @@ Arithmetic only, on NumPy arrays and torch tensors alike: `sample` takes any fun
 be it a torch module, an ONNX session, or a guided pair of calls.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar, assert_never
 
@@ -75,19 +75,21 @@ def noised(clean: Array, noise: Array, alpha_bar: Array) -> Array:
 
 
 def guided(
-    with_condition: Callable[[Array, float], Array], without: Callable[[Array, float], Array], scale: float
+    denoisers: Sequence[Callable[[Array, float], Array]], scales: Sequence[float]
 ) -> Callable[[Array, float], Array]:
-    """Return e = e_without + scale (e_with - e_without); only one network call where the scale is 0 or 1."""
-    if scale == 1.0:
-        return with_condition
-    if scale == 0.0:
-        return without
+    """Return e_n + sum over i of scale_i (e_i - e_i+1), where each denoiser knows one thing less than the
+    one before it; those that cancel out are not called.
+    """
+    known = (*scales[: len(denoisers) - 1], 1.0)
+    weights = np.diff(known, prepend=0.0)
+    called = [(float(w), each) for w, each in zip(weights, denoisers, strict=True) if w]
 
-    def both(x: Array, t: float) -> Array:
-        reference = without(x, t)
-        return reference + scale * (with_condition(x, t) - reference)
+    def mixed(x: Array, t: float) -> Array:
+        *others, (_, last) = called
+        reference = last(x, t)
+        return sum((weight * (each(x, t) - reference) for weight, each in others), start=reference)
 
-    return both
+    return mixed
 
 
 def sample(

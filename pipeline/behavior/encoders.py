@@ -1,4 +1,4 @@
-"""Encoders of the last 0.8 s of motion: the observer's (Eq. 12), and the agent's own (Eq. 13)."""
+"""Encoders of past motion: that of others, people and animals (Eq. 12), and the agent's own (Eq. 13)."""
 
 from itertools import pairwise
 
@@ -6,13 +6,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pipeline.geometry import rigid_torch
+
 POSE_CHANNELS = 9
-"""numbers of an observer's pose in the ego frame: position, and the first two columns of its rotation"""
+"""numbers of a pose in the ego frame: position, and the first two columns of the rotation; a kind follows"""
 NOBODY_M = 100.0
-"""an observer further away is none: recordings without one put it 1 km off"""
+"""somebody further away is not there: recordings put who is absent 1 km off"""
 CLOSE_RANGE_M, EDGE_SHARPNESS = 1.5, 4.0
-"""distance around which an observer's is encoded, metres, and the inverse width, in radii, of the soft edge
+"""distance around which another's is encoded, metres, and the inverse width, in radii, of the soft edge
 at the radius"""
+HEADS = 4
+"""attention weights of a being, each for its part of the code"""
+LEAST_WEIGHT = 1e-6
+"""of somebody beyond the radius, so that weights can be normalised where nobody is near"""
 
 
 def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
@@ -23,53 +29,96 @@ def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
     return nn.Sequential(*layers[:-2])
 
 
-class ObserverEncoder(nn.Module):
-    """Encode the observer's past positions (Eq. 12) through features that vanish towards ``radius_m``.
+def beings(
+    position: Float[Tensor, "batch past_frame 3"],
+    rotation: Float[Tensor, "batch past_frame 3 3"],
+    companions: Float[Tensor, "batch companion past_frame 4"],
+    new_from_ego: Float[Tensor, "batch 3 3"],
+) -> Float[Tensor, "batch other past_frame 10"]:
+    """Return what encoders read of an observer, whose pose is given, and of companions turned alike; zeros
+    stand for rotations that are not known.
+    """
+    first = nn.functional.pad(torch.cat([position, rigid_torch.rotation_to_6d(rotation)], dim=-1), (0, 1))
+    place = companions[..., :3] @ new_from_ego.mT[:, None]
+    unknown = place.new_zeros(*place.shape[:3], POSE_CHANNELS - 3)
+    return torch.cat([first[:, None], torch.cat([place, unknown, companions[..., 3:]], dim=-1)], dim=1)
+
+
+class SetEncoder(nn.Module):
+    """The code of a set of beings: each has one of the same layers, and the set their mean by attention (Ilse
+    et al. 2018) times nearness, in which order plays no part and somebody who leaves fades out.
+
+    The code of zero features is the learned null.
+    """
+
+    def __init__(self, numbers: int, hidden: int, code: int):
+        super().__init__()
+        self.layers = mlp((numbers, hidden, hidden, code))
+        self.animal = nn.Parameter(torch.zeros(hidden))
+        self.attention = nn.Parameter(torch.zeros(HEADS, code))
+
+    def code_of_set(
+        self,
+        features: Float[Tensor, "batch other number"],
+        kind: Float[Tensor, "batch other 1"],
+        inside: Float[Tensor, "batch other 1"],
+        keep: Float[Tensor, "batch"],
+    ) -> Float[Tensor, "batch code"]:
+        """Encode features that are zero where ``inside`` is 0; the code of one being is its own."""
+        present = keep[:, None, None]
+        hidden = self.layers[0](features * present) + kind * inside * present * self.animal
+        codes = self.layers[1:](hidden)
+        if codes.shape[1] == 1:
+            return codes[:, 0]
+        weight = (codes @ self.attention.mT + (inside + LEAST_WEIGHT).log()).softmax(1)
+        return (codes.unflatten(-1, (HEADS, -1)) * weight[..., None]).sum(1).flatten(1)
+
+
+class OthersEncoder(SetEncoder):
+    """Encode the past positions of others through features that vanish towards ``radius_m``.
 
     Distance and approach speed are encoded frame by frame in metres and m/s, well inside the radius undamped:
     whether the animal minds hangs on them, and to learn them from positions takes thousands of steps. Beyond
-    the radius all features are zero, so that a far observer and none at all are the same to the agent: the
+    the radius all features are zero, so that a far being and none at all are the same to the agent: the
     code of zero features is also the learned null.
     """
 
     def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
-        super().__init__()
+        super().__init__(frames * 5 + 2, hidden, code)
         self.frames, self.radius_m, self.rate_hz = frames, radius_m, rate_hz
-        self.layers = mlp((frames * 5 + 2, hidden, hidden, code))
 
     def forward(
-        self, observer_past: Float[Tensor, "batch observer_past"], keep: Float[Tensor, "batch"]
+        self, others: Float[Tensor, "batch other past_frame 10"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch code"]:
-        position = observer_past.unflatten(1, (self.frames, POSE_CHANNELS))[:, :, 0:3:2]
+        position = others[..., :3:2]
         distance = (position.square().sum(-1) + 1e-6).sqrt()
         nearness = (1 - distance / self.radius_m).clamp_min(0)
         direction = position / (distance[..., None] + 0.1)
-        velocity = (position[:, -1] - position[:, 0]) * (self.rate_hz / (self.frames - 1))
-        closing = -(velocity * direction[:, -1]).sum(-1, keepdim=True)
-        seen = torch.cat([direction * nearness[..., None], nearness[..., None]], dim=-1).flatten(1)
-        moving = torch.cat([velocity, closing], dim=-1) * nearness[:, -1:]
+        velocity = (position[..., -1, :] - position[..., 0, :]) * (self.rate_hz / (self.frames - 1))
+        closing = -(velocity * direction[..., -1, :]).sum(-1, keepdim=True)
+        seen = torch.cat([direction * nearness[..., None], nearness[..., None]], dim=-1).flatten(-2)
+        moving = torch.cat([velocity, closing], dim=-1) * nearness[..., -1:]
         inside = (nearness * EDGE_SHARPNESS).clamp_max(1)
         close = (CLOSE_RANGE_M - distance).clamp_min(-CLOSE_RANGE_M) * (2 * inside)
-        coming = -(position.diff(dim=1) * self.rate_hz * direction[:, 1:]).sum(-1).clamp(-2, 2) * (
-            1.5 * inside[:, 1:]
+        coming = -(position.diff(dim=-2) * self.rate_hz * direction[..., 1:, :]).sum(-1).clamp(-2, 2) * (
+            1.5 * inside[..., 1:]
         )
-        return self.layers(torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1) * keep[:, None])
+        features = torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1)
+        return self.code_of_set(features, others[..., -1, -1:], inside[..., -1:], keep)
 
 
-class ObserverPoseEncoder(nn.Module):
-    """Encode the observer's past poses, without a radius (Eq. 12); the null is the code of zeros."""
+class OtherPosesEncoder(SetEncoder):
+    """Encode the past poses of others, without a radius (Eq. 12)."""
 
     def __init__(self, frames: int, hidden: int, code: int):
-        super().__init__()
-        self.frames = frames
-        self.layers = mlp((frames * POSE_CHANNELS, hidden, hidden, code))
+        super().__init__(frames * POSE_CHANNELS, hidden, code)
 
     def forward(
-        self, observer_past: Float[Tensor, "batch observer_past"], keep: Float[Tensor, "batch"]
+        self, others: Float[Tensor, "batch other past_frame 10"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch code"]:
-        position = observer_past.unflatten(1, (self.frames, POSE_CHANNELS))[:, :, :3]
-        near = (position.square().sum(-1) < NOBODY_M**2).all(1)
-        return self.layers(torch.where(near[:, None], observer_past, 0) * keep[:, None])
+        near = (others[..., :3].square().sum(-1) < NOBODY_M**2).all(-1, keepdim=True)
+        features = torch.where(near, others[..., :POSE_CHANNELS].flatten(-2), 0)
+        return self.code_of_set(features, others[..., -1, -1:], near.to(features), keep)
 
 
 class PastEncoder(nn.Module):

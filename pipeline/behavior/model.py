@@ -57,8 +57,8 @@ from pipeline.behavior.perception import (
     PerceptionEnsemble,
 )
 from pipeline.behavior.pointwise import WaypointUNet
-from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ
-from pipeline.core.errors import other_versions_refused
+from pipeline.behavior.trajectories import ABSENT_M, FUTURE, KINDS, PAST, RATE_HZ
+from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.geometry import rigid
 
 ROOT_CHANNELS = 6
@@ -86,7 +86,9 @@ class Architecture:
     goal_layers: int = 6
     family: Family = "diffusion"
     control: Control = "unet"
+    past: int = PAST
     future: int = FUTURE
+    rate_hz: float = RATE_HZ
     ensemble_size: int = 3
     map_lookup: MapLookup = "attention"
 
@@ -126,10 +128,10 @@ class Architecture:
             self.scene_channels,
             self.hidden,
             self.code,
-            PAST,
+            self.past,
             9 + 6 * self.bones,
             self.observer_radius_m,
-            RATE_HZ,
+            self.rate_hz,
             self.ablated_input,
         )
 
@@ -145,6 +147,8 @@ class Scaling:
     """of places, as they condition the body, metres"""
     body_mean: Float[np.ndarray, "channel"]
     body_std: Float[np.ndarray, "channel"]
+    rate_hz: float = RATE_HZ
+    """frames per second"""
 
     def scaled_goal(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Return goals in metres as they are diffused, and as they control a path."""
@@ -158,7 +162,7 @@ class Scaling:
         self, scaled: Float[np.ndarray, "plan 4 frame"], start: Float[np.ndarray, "plan 3"]
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Return the paths in metres, from ``start`` on, that scaled strides lead along."""
-        return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.velocity_std, start)
+        return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, self.rate_hz)
 
     def warped_path(
         self,
@@ -168,7 +172,10 @@ class Scaling:
     ) -> Float[np.ndarray, "plan 4 frame"]:
         """Return scaled strides that lead along other paths."""
         return np.swapaxes(
-            warped_path(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, path) / self.velocity_std, 1, 2
+            warped_path(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, path, self.rate_hz)
+            / self.velocity_std,
+            1,
+            2,
         )
 
     def scaled_path(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan 3 frame"]:
@@ -196,7 +203,9 @@ class BehaviorNets(nn.Module):
         match a.control:
             case "unet":
                 if a.map_cells and a.map_lookup == "pointwise":
-                    self.path = WaypointUNet(a.ensemble_size, a.map_cells, a.future, 3, *sizes)
+                    self.path = WaypointUNet(
+                        a.ensemble_size, a.map_cells, a.future, 3, *sizes, rate_hz=a.rate_hz
+                    )
                 else:
                     self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
                 along = ControlUNet(a.body_channels, CONTROL_CHANNELS, *sizes)
@@ -208,9 +217,9 @@ class BehaviorNets(nn.Module):
         if a.family == "one_stage":  # one network for path and body, which nothing steers
             read = TrailingLinear(a.code_length, EMBEDDING)
             along = UncontrolledUNet(PATH_CHANNELS + a.body_channels, read, *sizes[1:])
-            self.body = OneStageDenoiser(along, a.body_channels, a.future, schedule)
+            self.body = OneStageDenoiser(along, a.body_channels, a.future, schedule, a.rate_hz)
         else:
-            self.body = BodyDenoiser(along, a.body_channels, a.future, schedule)
+            self.body = BodyDenoiser(along, a.body_channels, a.future, schedule, a.rate_hz)
 
 
 def channels_from_bones(
@@ -234,17 +243,27 @@ def bones_from_channels(
     )
 
 
-def observer_channels(
-    ego_from_observer: Float[np.ndarray, "batch 8 4 4"],
-) -> Float[np.ndarray, "batch observer_past"]:
-    """Return per past frame the observer's position and rotation (6), oldest frame first (Eq. 12)."""
-    rotation = rigid.rotation_to_6d(ego_from_observer[..., :3, :3])
-    pose = np.concatenate([ego_from_observer[..., :3, 3], rotation], axis=-1)
-    return pose.reshape(len(pose), -1).astype(np.float32)
+def other_channels(
+    ego_from_observer: Float[np.ndarray, "batch past_frame 4 4"],
+    companions_ego: Float[np.ndarray, "batch companion past_frame 4"] | None = None,
+) -> Float[np.ndarray, "batch other past_frame 10"]:
+    """Return position, rotation (6) and kind of observer and companions, oldest frame first (Eq. 12).
+
+    Of companions (position, kind) no rotation is known: zeros.
+    """
+    position, rotation = ego_from_observer[..., :3, 3], ego_from_observer[..., :3, :3]
+    kind = np.zeros((*position.shape[:2], 1))
+    others = np.concatenate([position, rigid.rotation_to_6d(rotation), kind], axis=-1)[:, None]
+    if companions_ego is not None:
+        unknown = np.zeros((*companions_ego.shape[:3], 6))
+        parts = [companions_ego[..., :3], unknown, companions_ego[..., 3:]]
+        others = np.concatenate([others, np.concatenate(parts, axis=-1)], axis=1)
+    return others.astype(np.float32)
 
 
 def past_channels(
-    ego_from_agent: Float[np.ndarray, "batch 8 4 4"], bones: Float[np.ndarray, "batch 8 channel"]
+    ego_from_agent: Float[np.ndarray, "batch past_frame 4 4"],
+    bones: Float[np.ndarray, "batch past_frame channel"],
 ) -> Float[np.ndarray, "batch past"]:
     """Return per past frame: root position, root rotation (6), bones; oldest frame first."""
     root = np.concatenate(
@@ -262,14 +281,19 @@ def contract(
     return {
         "units": "metres, radians, seconds",
         "up": [0, 1, 0],
-        "rate_hz": RATE_HZ,
-        "past_frames": PAST,
+        "rate_hz": architecture.rate_hz,
+        "past_frames": architecture.past,
         "future_frames": architecture.future,
         "architecture": asdict(architecture),
         "bones": [f"bone_{number:02d}" for number in range(architecture.bones)],
         "agent_from_bone_rest": np.asarray(rest, float).tolist(),
         "channels": {
-            "observer_past": {"per_frame": ["x", "y", "z", *root], "order": "frame, channel; oldest first"},
+            "others": {
+                "per_frame": ["x", "y", "z", *root, "kind"],
+                "kinds": list(KINDS),
+                "absent_m": ABSENT_M,
+                "order": "other, frame, channel; the observer first, oldest frame first",
+            },
             "past": {
                 "per_frame": ["root_x", "root_y", "root_z", *root],
                 "per_bone": bone,
@@ -302,6 +326,16 @@ def contract(
     }
 
 
+def refuse_unplayable(architecture: Architecture, where: str) -> None:
+    """Raise InputError SIM-006 for models whose plans cannot be chained, or not at the players' rate."""
+    if architecture.family != "diffusion":
+        what = f"plans of the family {architecture.family} cannot be chained"
+        raise InputError("SIM-006", what, where, "give a model of the family diffusion")
+    if architecture.rate_hz != RATE_HZ:
+        what = f"plans of {architecture.rate_hz:g} frames a second cannot be played"
+        raise InputError("SIM-006", what, where, f"give a model of {RATE_HZ} frames a second")
+
+
 def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, Float[np.ndarray, "bone 4 4"]]:
     """Read a trained model: its shape, networks, scaling, schedule, and the bones at rest.
 
@@ -313,6 +347,7 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
         architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
         scaling = Scaling(
             **{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()}
+            | {"rate_hz": document["rate_hz"]}
         )
         schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
         rest = np.asarray(document["agent_from_bone_rest"], np.float64)

@@ -49,35 +49,40 @@ def with_powered_length(
 
 
 def velocity_channels_from_path(
-    path: Float[Tensor, "*batch frame 3"], start: Float[Tensor, "*batch 3"]
+    path: Float[Tensor, "*batch frame 3"], start: Float[Tensor, "*batch 3"], rate_hz: float = RATE_HZ
 ) -> Float[Tensor, "*batch frame 4"]:
     """Return the strides along a path in metres that begins a frame after ``start``."""
-    velocity = torch.diff(path, dim=-2, prepend=start[..., None, :]) * RATE_HZ
+    velocity = torch.diff(path, dim=-2, prepend=start[..., None, :]) * rate_hz
     moves = torch.where((velocity**2).sum(-1, keepdim=True) > REST_SPEED_M_S**2, 1.0, -1.0)
     return torch.cat([with_powered_length(velocity, VELOCITY_POWER), moves.to(velocity)], dim=-1)
 
 
 def path_from_velocity_channels(
-    strides: Float[np.ndarray, "*batch frame 4"], start: Float[np.ndarray, "*batch 3"]
+    strides: Float[np.ndarray, "*batch frame 4"],
+    start: Float[np.ndarray, "*batch 3"],
+    rate_hz: float = RATE_HZ,
 ) -> Float[np.ndarray, "*batch frame 3"]:
     """Return the path in metres that sampled strides lead along."""
     root = strides[..., :3] * np.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
-    return start[..., None, :] + (with_powered_length(root, 1 / VELOCITY_POWER) / RATE_HZ).cumsum(-2)
+    return start[..., None, :] + (with_powered_length(root, 1 / VELOCITY_POWER) / rate_hz).cumsum(-2)
 
 
-def expected_steps(strides: Float[Tensor, "batch frame 4"]) -> Float[Tensor, "batch frame 3"]:
+def expected_steps(
+    strides: Float[Tensor, "batch frame 4"], rate_hz: float = RATE_HZ
+) -> Float[Tensor, "batch frame 3"]:
     """Return how far the animal goes in each frame, metres, along strides in the units of the channels."""
     root = strides[..., :3] * torch.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
-    return with_powered_length(root, 1 / VELOCITY_POWER) / RATE_HZ
+    return with_powered_length(root, 1 / VELOCITY_POWER) / rate_hz
 
 
 def warped_path(
     strides: Float[np.ndarray, "*batch frame 4"],
     start: Float[np.ndarray, "*batch 3"],
     path: Float[np.ndarray, "*batch frame 3"],
+    rate_hz: float = RATE_HZ,
 ) -> Float[np.ndarray, "*batch frame 4"]:
     """Return strides that lead along another path, metres in the same frame, as far as they move."""
-    velocity = np.diff(path, axis=-2, prepend=start[..., None, :]) * RATE_HZ
+    velocity = np.diff(path, axis=-2, prepend=start[..., None, :]) * rate_hz
     root = with_powered_length(velocity, VELOCITY_POWER) / np.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
     return np.concatenate([root, strides[..., 3:]], axis=-1)
 

@@ -1,4 +1,4 @@
-"""What the agent perceives (omega of the paper): scene, observer's and own last 0.8 s, as one code.
+"""What the agent perceives (omega of the paper): scene, others' and own past, as one code.
 
 `world_from_ego` gives the frame of all inputs, `FeatureVolume.around` samples the scene in it, and
 `Perception` turns the three raw inputs (metres, ego frame) into a code of 3 x 64 numbers. Normalisation
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from pipeline.behavior.config import AblatedInput, Ego, ObservedPast, SceneEncoder
-from pipeline.behavior.encoders import ObserverEncoder, ObserverPoseEncoder, PastEncoder
+from pipeline.behavior.encoders import OtherPosesEncoder, OthersEncoder, PastEncoder
 from pipeline.behavior.path_encoding import VELOCITY_POWER, with_powered_length
 from pipeline.data import npz
 from pipeline.geometry import rigid
@@ -111,7 +111,7 @@ def grid_points_ego(stride: int = 1) -> Float[np.ndarray, "width height length 3
 SceneEncoding = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code"]]
 """A map's channels, cell after cell (z, then x; none where there is no map), and a code"""
 PerceptionCode = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code_of_all"]]
-"""The same of scene, observer and past together"""
+"""The same of scene, others and past together"""
 
 
 class PillarScene(nn.Module):
@@ -188,7 +188,7 @@ class PerceptionConfig:
 
 
 class Perception(nn.Module):
-    """The perception code: scene, observer and past, each of which ``keep`` can replace by its
+    """The perception code: scene, others and past, each of which ``keep`` can replace by its
     learned null.
     """
 
@@ -206,9 +206,9 @@ class Perception(nn.Module):
         sizes = size.past_frames, size.hidden, size.code
         match size.observed_past:
             case "positions":
-                self.observer = ObserverEncoder(*sizes, size.observer_radius_m, size.rate_hz)
+                self.others = OthersEncoder(*sizes, size.observer_radius_m, size.rate_hz)
             case "poses":
-                self.observer = ObserverPoseEncoder(*sizes)
+                self.others = OtherPosesEncoder(*sizes)
             case _:
                 assert_never(size.observed_past)
         self.rate_hz = size.rate_hz
@@ -221,17 +221,17 @@ class Perception(nn.Module):
     def forward(
         self,
         scene_grid: Float[Tensor, "batch channel 64 8 64"],
-        observer_past: Float[Tensor, "batch observer_past"],
+        others: Float[Tensor, "batch other past_frame 10"],
         past: Float[Tensor, "batch past"],
         keep: Float[Tensor, "batch 3"],
     ) -> PerceptionCode:
-        """``keep`` holds 1 or 0 for scene, observer and past."""
-        return self.join(self.scene(scene_grid), observer_past, self.past(past), keep)
+        """``keep`` holds 1 or 0 for scene, others and past."""
+        return self.join(self.scene(scene_grid), others, self.past(past), keep)
 
     def encode_training(
         self,
         pooled: Float[Tensor, "batch channel x y z"],
-        observer_past: Float[Tensor, "batch observer_past"],
+        others: Float[Tensor, "batch other past_frame 10"],
         past: Float[Tensor, "batch past"],
         keep: Float[Tensor, "batch 3"],
         bones_keep: Float[Tensor, "batch"],
@@ -239,12 +239,12 @@ class Perception(nn.Module):
         """Return map and code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides
         remembered bones.
         """
-        return self.join(self.scene.encode(pooled), observer_past, self.past(past, bones_keep), keep)
+        return self.join(self.scene.encode(pooled), others, self.past(past, bones_keep), keep)
 
     def join(
         self,
         map_lookup: SceneEncoding,
-        observer_past: Float[Tensor, "batch observer_past"],
+        others: Float[Tensor, "batch other past_frame 10"],
         past: Float[Tensor, "batch code"],
         keep: Float[Tensor, "batch 3"],
     ) -> PerceptionCode:
@@ -253,10 +253,10 @@ class Perception(nn.Module):
         """
         chart, scene = map_lookup
         keep = keep * self.condition_mask
-        observer = self.observer(observer_past, keep[:, 1])
+        set_code = self.others(others, keep[:, 1])
         scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
         past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
-        return chart * keep[:, :1], torch.cat([scene, observer, past], dim=-1)
+        return chart * keep[:, :1], torch.cat([scene, set_code, past], dim=-1)
 
 
 class PerceptionEnsemble(nn.Module):
@@ -276,20 +276,20 @@ class PerceptionEnsemble(nn.Module):
 
     @property
     def first(self) -> Perception:
-        """The first member: sizes and scaling of past and observer are the same in all."""
+        """The first member: sizes and scaling of past and others are the same in all."""
         return next(iter(self))
 
     def forward(
         self,
         scene_grid: Float[Tensor, "batch channel 64 8 64"],
-        observer_past: Float[Tensor, "batch observer_past"],
+        others: Float[Tensor, "batch other past_frame 10"],
         past: Float[Tensor, "batch past"],
         keep: Float[Tensor, "batch 3"],
     ) -> Float[Tensor, "batch condition"]:
-        """``keep`` holds 1 or 0 for scene, observer and past."""
+        """``keep`` holds 1 or 0 for scene, others and past."""
         frames = past.unflatten(1, (self.first.past.frames, -1))[:, -self.POSTURE_FRAMES :]
         return self.condition(
-            [member(scene_grid, observer_past, past, keep) for member in self], self.now(frames, keep[:, 2])
+            [member(scene_grid, others, past, keep) for member in self], self.now(frames, keep[:, 2])
         )
 
     def condition(

@@ -21,22 +21,24 @@ from pipeline.behavior.model import (
     BehaviorNets,
     Scaling,
     channels_from_bones,
-    observer_channels,
+    other_channels,
     past_channels,
 )
 from pipeline.behavior.path_encoding import PATH_CHANNELS, goal_error, snapped_to_goal
 from pipeline.behavior.perception import POSITION, FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
-from pipeline.behavior.trajectories import PAST, Context
+from pipeline.behavior.trajectories import ABSENT_M, Context, nearest
 from pipeline.geometry import rigid
 
 Array = np.ndarray
+Denoise = Callable[[Array, float], Array]
+"""from noisy samples and a step to the noise in them"""
 
 
 class Networks(Protocol):
     """The four networks on NumPy arrays of float32, batch first."""
 
-    def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
+    def perceive(self, scene_grid: Array, others: Array, past: Array, keep: Array) -> Array:
         """Return the perception code."""
         ...
 
@@ -66,8 +68,8 @@ class TorchNetworks:
         with torch.inference_mode():
             return module(*tensors).cpu().numpy()
 
-    def perceive(self, scene_grid: Array, observer_past: Array, past: Array, keep: Array) -> Array:
-        return self._run(self.nets.perception, scene_grid, observer_past, past, keep)
+    def perceive(self, scene_grid: Array, others: Array, past: Array, keep: Array) -> Array:
+        return self._run(self.nets.perception, scene_grid, others, past, keep)
 
     def goal(self, x: Array, t: Array, condition: Array) -> Array:
         return self._run(self.nets.goal, x, t, condition)
@@ -84,7 +86,8 @@ class Observation:
     """The inputs of perception, in metres and the ego frame."""
 
     scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
-    observer_past: Float[np.ndarray, "batch observer_past"]
+    others: Float[np.ndarray, "batch other past_frame 10"]
+    """poses and kinds; the observer first"""
     past: Float[np.ndarray, "batch past"]
     constraint: SceneConstraint | None = None
     """where the agents may be, for samplers that keep to it"""
@@ -92,16 +95,22 @@ class Observation:
     def __getitem__(self, index: slice | np.ndarray) -> "Observation":
         """Return some of the batch."""
         constraint = None if self.constraint is None else self.constraint[index]
-        return Observation(self.scene_grid[index], self.observer_past[index], self.past[index], constraint)
+        return Observation(self.scene_grid[index], self.others[index], self.past[index], constraint)
 
     def __len__(self) -> int:
         return len(self.past)
+
+    def without_observer(self) -> "Observation":
+        """Return the same with the observer, the first of the others, out of sight."""
+        others = self.others.copy()
+        others[:, 0, :, 0] = ABSENT_M
+        return replace(self, others=others)
 
     def boneless(self, mean: Float[np.ndarray, "body"]) -> "Observation":
         """Return the same with the bones of a mean body, of which goals and paths make no more than of hidden
         ones.
         """
-        past = self.past.reshape(len(self), PAST, -1).copy()
+        past = self.past.reshape(len(self), self.others.shape[2], -1).copy()
         past[..., POSITION + ROOT_CHANNELS :] = mean[ROOT_CHANNELS:]
         return replace(self, past=past.reshape(len(self), -1))
 
@@ -128,13 +137,17 @@ def observe(
     """Encode contexts as network inputs (Eq. 11, 12, 13)."""
     frame = world_from_ego(context.world_from_agent[:, -1], ego)
     ego_from_world = rigid.inverse(frame)
-    observer = observer_channels(ego_from_world[:, None] @ context.world_from_observer)
+    companions = context.companions
+    if companions is not None:
+        companions = nearest(companions, context.world_from_agent[:, -1, :3, 3])
+        companions[..., :3] = rigid.apply(ego_from_world[:, None], companions[..., :3])
+    others = other_channels(ego_from_world[:, None] @ context.world_from_observer, companions)
     past = past_channels(
         ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
     )
     scenes = scenes if isinstance(scenes, Scenes) else Scenes.of(scenes)
     return Observation(
-        scenes.around(frame, context.video), observer, past, SceneConstraint(scenes, frame, context.video)
+        scenes.around(frame, context.video), others, past, SceneConstraint(scenes, frame, context.video)
     )
 
 
@@ -144,8 +157,8 @@ class PlanCondition:
 
     full: Float[np.ndarray, "plan condition"]
     """of everything that is kept"""
-    blind: Float[np.ndarray, "plan condition"]
-    """of the same without the observer, or of nothing: the reference of guidance"""
+    less: tuple[Float[np.ndarray, "plan condition"], ...]
+    """of the same without the observer, then without anybody where companions are guided; or of nothing"""
     start: Float[np.ndarray, "plan 3"]
     """where the animal is now, in the ego frame"""
     constraint: SceneConstraint | None
@@ -156,15 +169,15 @@ class PlanCondition:
     def __getitem__(self, some: Int[np.ndarray, "some"]) -> "PlanCondition":
         """Return some of the rows, each on its own."""
         constraint = None if self.constraint is None else self.constraint[some // self.count]
-        return PlanCondition(self.full[some], self.blind[some], self.start[some], constraint)
+        less = tuple(code[some] for code in self.less)
+        return PlanCondition(self.full[some], less, self.start[some], constraint)
 
-    def constrained(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan frame 3"]:
+    def constrained(
+        self, path: Float[np.ndarray, "plan frame 3"], rate_hz: float
+    ) -> Float[np.ndarray, "plan frame 3"]:
         """Keep paths in metres where the agent may be, and on what carries it."""
-        return (
-            path
-            if self.constraint is None
-            else self.constraint.on_support(self.constraint.out_of_solid(path), self.start)
-        )
+        limit = self.constraint
+        return path if limit is None else limit.on_support(limit.out_of_solid(path), self.start, rate_hz)
 
 
 @dataclass(frozen=True)
@@ -221,35 +234,34 @@ class Sampler:
         return self.paths(codes, self.goals(codes, sampling, rng), sampling, rng)
 
     def codes(self, observation: Observation, sampling: PlanSamplingConfig, count: int = 1) -> PlanCondition:
-        """Encode what ``sampling`` keeps of it, and the reference of guidance, ``count`` times."""
-        keep = np.tile(
-            np.array([sampling.scene, sampling.observer, sampling.past], np.float32), (len(observation), 1)
-        )
-        inputs = (observation.scene_grid, observation.observer_past, observation.past)
-        full = blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
-        if sampling.guidance != 1:
-            keep[:, 1 if sampling.guided == "observer" else slice(None)] = 0
-            blind = np.repeat(self.networks.perceive(*inputs, keep), count, axis=0)
-        start = np.repeat(observation.past.reshape(len(observation), PAST, -1)[:, -1, :3], count, axis=0)
-        return PlanCondition(
-            full,
-            blind,
-            start,
-            observation.constraint if sampling.avoid_solid and sampling.scene else None,
-            count,
-        )
+        """Encode what ``sampling`` keeps of it, and the references of guidance, ``count`` times."""
+        conditions = [[sampling.scene, sampling.observer, sampling.past]]
+        keep = np.repeat(np.array(conditions, np.float32), len(observation), axis=0)
+
+        def code(seen: Observation) -> Array:
+            return self.networks.perceive(seen.scene_grid, seen.others, seen.past, keep).repeat(count, axis=0)
+
+        full, less, each = code(observation), [], sampling.guided == "observer"
+        accompanied = each and observation.others.shape[1] > 1 and sampling.companions_guidance != 1
+        if each and (sampling.guidance != 1 or accompanied):
+            less.append(code(observation.without_observer()))
+        keep[:, 1 if each else slice(None)] = 0
+        less += [code(observation)] if accompanied or (not each and sampling.guidance != 1) else []
+        past = observation.past.reshape(len(observation), observation.others.shape[2], -1)
+        start = np.repeat(past[:, -1, :3], count, axis=0)
+        constraint = observation.constraint if sampling.avoid_solid and sampling.scene else None
+        return PlanCondition(full, tuple(less), start, constraint, count)
 
     def goals(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
 
-        def denoise(code: Array) -> Callable[[Array, float], Array]:
+        def denoise(code: Array) -> Denoise:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
-        pair = denoise(codes.full[:: codes.count]), denoise(codes.blind[:: codes.count])
         x = self._drawn(
-            *pair,
+            [denoise(code[:: codes.count]) for code in (codes.full, *codes.less)],
             (len(codes.full), 3),
             sampling,
             sampling.goal_steps,
@@ -289,16 +301,16 @@ class Sampler:
         """Draw a path towards each goal (Eq. 8), metres, ego frame; guidance acts on it."""
         control = self.scaling.scaled_goal(goal)
 
-        def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
+        def denoise(code: Array, keep: float = 0.0) -> Denoise:
             return lambda x, t: self.networks.path(
                 x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
             )
 
-        pair = denoise(codes.full, float(sampling.goal)), denoise(codes.blind, 0.0)
+        towards = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.less)]
         shape = len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]
         drawn = replace(sampling, method="ddim")
         path = self._drawn(
-            *pair, shape, drawn, sampling.sequence_steps, rng, lambda x: self.paths_out_of_solid(codes, x)
+            towards, shape, drawn, sampling.sequence_steps, rng, lambda x: self.paths_out_of_solid(codes, x)
         )
         return self.finished_paths(codes, path, goal, sampling)
 
@@ -312,15 +324,14 @@ class Sampler:
         """Draw bodies along paths, which are among what is guided where all conditions are."""
         control = self.scaling.scaled_path(path)
 
-        def denoise(code: Array, keep: float) -> Callable[[Array, float], Array]:
+        def denoise(code: Array, keep: float = float(sampling.guided == "observer")) -> Denoise:
             return lambda x, t: self.networks.body(
                 x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
             )
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
-        pair = denoise(codes.full, 1.0), denoise(codes.blind, float(sampling.guided == "observer"))
         body = self._drawn(
-            *pair,
+            [denoise(codes.full, 1.0), *map(denoise, codes.less)],
             shape,
             replace(sampling, method="ddim"),
             sampling.sequence_steps,
@@ -364,12 +375,11 @@ class Sampler:
             goal,
             float(sampling.goal) * min(sampling.guidance, 1.0),
         )
-        return codes.constrained(path)
+        return codes.constrained(path, self.scaling.rate_hz)
 
     def _drawn(
         self,
-        full: Callable[[Array, float], Array],
-        blind: Callable[[Array, float], Array],
+        denoisers: list[Denoise],
         shape: tuple[int, ...],
         sampling: PlanSamplingConfig,
         count: int,
@@ -380,7 +390,8 @@ class Sampler:
         def draw() -> Array:
             return (spread * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
 
-        denoise, method = guided(full, blind, sampling.guidance), sampling.method or self.schedule.method
+        denoise = guided(denoisers, (sampling.guidance, sampling.companions_guidance))
+        method = sampling.method or self.schedule.method
         x = sample(denoise, draw(), self.schedule, method=method, count=count, draw=draw, correct=correct)
         return x.astype(np.float32)
 

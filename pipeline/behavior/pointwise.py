@@ -18,6 +18,7 @@ from pipeline.behavior.path_encoding import (
     with_powered_length,
 )
 from pipeline.behavior.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY_CHANNELS
+from pipeline.behavior.trajectories import RATE_HZ
 
 HALF_M = GRID_SHAPE[0] * GRID_CELL_M / 2
 """from the middle of a map to its edge"""
@@ -77,9 +78,11 @@ class WaypointUNet(ControlUNet):
         width: int = 32,
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
+        rate_hz: float = RATE_HZ,
     ):
         super().__init__(PATH_CHANNELS, control, condition, width, multipliers, schedule)
         self.ensemble_size, self.map_numbers = ensemble_size, READ * map_cells**2
+        self.rate_hz = rate_hz
         self.main.enter = nn.Conv1d(PATH_CHANNELS + ensemble_size * READ, self.main.block_widths[0], 1)
         self.register_buffer("share", torch.from_numpy(schedule.alpha_bar).float().sqrt(), persistent=False)
         self.register_buffer("velocity_std", torch.ones(frames, PATH_CHANNELS))
@@ -100,4 +103,4 @@ class WaypointUNet(ControlUNet):
     ) -> Float[Tensor, "batch frame 3"]:
         """Return where noisy strides are expected to lead, metres from the animal."""
         strides = (self.share[t.long()][:, None, None] * x).mT * self.velocity_std
-        return expected_steps(strides).cumsum(1)
+        return expected_steps(strides, self.rate_hz).cumsum(1)

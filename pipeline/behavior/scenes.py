@@ -177,7 +177,10 @@ class SceneConstraint:
         return rigid.apply(rigid.inverse(frame), goals)[:, 0]
 
     def on_support(
-        self, path_ego: Float[np.ndarray, "plan frame 3"], start_ego: Float[np.ndarray, "plan 3"]
+        self,
+        path_ego: Float[np.ndarray, "plan frame 3"],
+        start_ego: Float[np.ndarray, "plan 3"],
+        rate_hz: float = RATE_HZ,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Put paths, which begin a frame after ``start_ego``, on what carries the agent; steps
         become jumps.
@@ -185,7 +188,7 @@ class SceneConstraint:
         frame, video = self._of_plans(len(path_ego))
         start, path = rigid.apply(frame, start_ego[:, None]), rigid.apply(frame, path_ego)
         step = np.diff(path[..., [0, 2]], axis=1, prepend=start[..., [0, 2]])
-        moves = np.linalg.norm(step, axis=-1) * RATE_HZ > REST_SPEED_M_S
+        moves = np.linalg.norm(step, axis=-1) * rate_hz > REST_SPEED_M_S
         path[..., 1] = smoothed_jumps(self.scenes.support_heights(path, moves, video), start[:, 0, 1])
         return rigid.apply(rigid.inverse(frame), path)
 

@@ -20,7 +20,7 @@ from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels, channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData, Context, Trajectory
+from pipeline.behavior.trajectories import ABSENT_M, KINDS, TRAIN, BehaviorData, Context, Trajectory
 from pipeline.geometry import rigid
 
 
@@ -54,10 +54,11 @@ GOAL_CHANGE_M = 0.3
 
 
 class AnimalBatch:
-    """Animals that live at once, each in the scene of its recording; they do not perceive each other.
+    """Animals that live at once, each in the scene of its recording.
 
-    Plans are drawn for all animals that need one in one batch, and followed until they end, the observer
-    moves, or a commanded goal changes. ``plans_drawn`` counts them.
+    Those of one life perceive each other and keep clear of each other's bodies. Plans are drawn for all
+    animals that need one in one batch, and followed until they end, somebody who is perceived moves, or a
+    commanded goal changes. ``plans_drawn`` counts them.
     """
 
     def __init__(
@@ -74,32 +75,37 @@ class AnimalBatch:
         self.ego: Ego = ego
         self.sampling, self.chaining = sampling, chaining
 
-    def begin(self, context: Context, rng: np.random.Generator) -> None:
-        """Continue from these windows, one animal per window."""
+    def begin(
+        self, context: Context, rng: np.random.Generator, life: Int[np.ndarray, "animal"] | None = None
+    ) -> None:
+        """Continue from these windows, one animal per window; animals of the same ``life`` are together, and
+        each is alone where none is given.
+        """
         bones = channels_from_bones(context.agent_from_bone, self.rest)
         self.video = None if context.video is None else np.array(context.video)
-        self.rng, self.plans_drawn = rng, 0
+        self.rng, self.plans_drawn, self.life = rng, 0, life
         root, observer = np.array(context.world_from_agent, float), np.array(context.observer_world, float)
-        frames = (slice(frame, frame + 1) for frame in range(PAST))
-        self.past = deque((PoseFrames(root[:, each], bones[:, each]) for each in frames), PAST)
-        self.observer = deque((observer[:, frame] for frame in range(PAST)), PAST)
+        count = root.shape[1]
+        frames = (slice(frame, frame + 1) for frame in range(count))
+        self.past = deque((PoseFrames(root[:, each], bones[:, each]) for each in frames), count)
+        self.observer = deque((observer[:, frame] for frame in range(count)), count)
         self.goal_command = np.full((len(root), 3), np.nan)
         self.plan, self.goal, self.blocked = self._planned(np.arange(len(root)))
-        self.played, self.planned_observer = np.zeros(len(root), int), self.observer[-1].copy()
+        self.played, self.planned_others = np.zeros(len(root), int), self._others_now()
 
     def restart(self, some: Int[np.ndarray, "some"], context: Context) -> None:
         """Let some of the animals begin again, each from a window of its own."""
         bones = channels_from_bones(context.agent_from_bone, self.rest)
         if self.video is not None and context.video is not None:
             self.video[some] = context.video
-        for frame in range(PAST):
+        for frame in range(len(self.past)):
             self.past[frame].root[some] = context.world_from_agent[:, frame : frame + 1]
             self.past[frame].bones[some] = bones[:, frame : frame + 1]
             self.observer[frame][some] = context.observer_world[:, frame]
         self.goal_command[some] = np.nan
         plan, self.goal[some], self.blocked[some] = self._planned(some)
         self.plan.root[some], self.plan.bones[some] = plan.root, plan.bones
-        self.played[some], self.planned_observer[some] = 0, self.observer[-1][some]
+        self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
     def command(self, goal_world: Float[np.ndarray, "animal 3"]) -> None:
         """Steer animals to goals (metres, world); rows of NaN leave an animal to its own goals."""
@@ -127,16 +133,38 @@ class AnimalBatch:
 
     def invalidate_plans(self) -> None:
         """Let every plan be dropped as soon as another one may follow it."""
-        self.planned_observer = np.full_like(self.planned_observer, np.inf)
+        self.planned_others = np.full_like(self.planned_others, np.inf)
+
+    def _companions(
+        self, some: Int[np.ndarray, "some"]
+    ) -> Float[np.ndarray, "some animal past_frame 4"] | None:
+        """Return past positions of all animals, NaN those that are not in the life of ``some``."""
+        if self.life is None:
+            return None
+        together = (self.life[some][:, None] == self.life) & (some[:, None] != np.arange(len(self.life)))
+        root = np.concatenate([frame.root[..., :3, 3] for frame in self.past], axis=1)
+        beings = np.pad(root, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
+        return np.where(together[..., None, None], beings, np.nan)
+
+    def _others_now(self) -> Float[np.ndarray, "animal other 3"]:
+        """Return where the others are, the observer first; NaN those that are not there."""
+        observer = self.observer[-1][:, None]
+        companions = self._companions(np.arange(len(observer)))
+        return (
+            observer if companions is None else np.concatenate([observer, companions[:, :, -1, :3]], axis=1)
+        )
 
     def _due(self) -> Bool[np.ndarray, "animal"]:
-        """Return whose plan ends, or was made before the observer moved noticeably, where it is perceived."""
-        moved = np.linalg.norm(self.observer[-1] - self.planned_observer, axis=-1)
-        away = np.linalg.norm(self.observer[-1] - self.past[-1].root[:, 0, :3, 3], axis=-1)
+        """Return whose plan ends, or was made before one of the others moved noticeably, where these are
+        perceived.
+        """
+        others = self._others_now()
+        moved = np.linalg.norm(others - self.planned_others, axis=-1)
+        away = np.linalg.norm(others - self.past[-1].root[:, :1, :3, 3], axis=-1)
         dropped = (
             self.sampling.observer
             & (self.played >= self.chaining.reaction_frames)
-            & (moved > self.chaining.observer_motion_ratio * away)
+            & (moved > self.chaining.observer_motion_ratio * away).any(1)
         )
         changed = np.linalg.norm(np.nan_to_num(self.goal_command - self.goal), axis=-1) > GOAL_CHANGE_M
         redirected = changed & (self.played >= self.chaining.reaction_frames)
@@ -153,7 +181,7 @@ class AnimalBatch:
                 left, PoseFrames(plan.root[mine], plan.bones[mine]), self.chaining.blend_frames
             )
             self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
-        self.played[some], self.planned_observer[some] = 0, self.observer[-1][some]
+        self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
     def _planned(
         self, some: Int[np.ndarray, "some"]
@@ -167,7 +195,9 @@ class AnimalBatch:
         )
         video = None if self.video is None else self.video[some]
         observation = observe(
-            Context(root, bones, np.stack(self.observer, axis=1)[some], video),
+            Context(
+                root, bones, np.stack(self.observer, axis=1)[some], video, companions=self._companions(some)
+            ),
             self.scenes,
             self.rest,
             self.ego,
@@ -189,7 +219,7 @@ class AnimalBatch:
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]
-        path = self._around_observer(path, frame, root[:, -1, :3, 3], some)
+        path = self._around_others(path, frame, root[:, -1, :3, 3], some)
         plan = self.sampler.plan(observation, self.sampling, self.rng, goal=goal, path=path)
         return (
             PoseFrames(plan.world_from_agent(frame), plan.body[..., ROOT_CHANNELS:]),
@@ -197,21 +227,31 @@ class AnimalBatch:
             blocked,
         )
 
-    def _around_observer(
+    def _around_others(
         self,
         path: Float[np.ndarray, "some frame 3"],
         frame: Float[np.ndarray, "some 4 4"],
         start_world: Float[np.ndarray, "some 3"],
         some: Int[np.ndarray, "some"],
     ) -> Float[np.ndarray, "some frame 3"]:
-        """Lead paths in ego frames around the body of the observer, whatever the guidance is."""
+        """Lead paths in ego frames around the bodies of the others, one after the other, the observer last,
+        whatever the guidance is.
+        """
         video = None if self.video is None else self.video[some]
 
         def clear(points: Float[np.ndarray, "some 3"]) -> Float[np.ndarray, "some 3"]:
             return self.scenes.out_of_solid(points[:, None], video)[:, 0]
 
-        led = around_person(rigid.apply(frame, path), start_world, self.observer[-1][some], clear)
-        return rigid.apply(rigid.inverse(frame), led)
+        others, clear_world = self._others_now()[some], rigid.apply(frame, path)
+        for column in reversed(range(others.shape[1])):
+            being = others[:, column]
+            near = np.isfinite(being).all(1)
+            if near.any():
+                far = start_world + np.array([ABSENT_M, 0.0, 0.0])
+                clear_world = around_person(
+                    clear_world, start_world, np.where(near[:, None], being, far), clear
+                )
+        return rigid.apply(rigid.inverse(frame), clear_world)
 
     def _courses(
         self,
@@ -260,7 +300,9 @@ class Simulator:
         rng = np.random.default_rng(seed)
         context, _ = self.data.windows(rng.choice(self.data.indices(TRAIN), 1))
         seen = (
-            context.observer_world if observer is None else np.tile(np.asarray(observer, float), (1, PAST, 1))
+            context.observer_world
+            if observer is None
+            else np.tile(np.asarray(observer, float), (1, self.data.past, 1))
         )
         self.flock.begin(replace(context, observer_world=seen, observer_rotation=None), rng)
         self.frame = 0
@@ -281,7 +323,7 @@ class Simulator:
     def _state(self, now: PoseFrames) -> SimulatorState:
         bones = bones_from_channels(now.bones[0, 0], self.rest)
         return SimulatorState(
-            self.frame / RATE_HZ,
+            self.frame / self.data.rate_hz,
             now.root[0, 0],
             bones,
             self.flock.goal[0].copy(),

@@ -4,7 +4,7 @@
 windows as a `Context` (the past, all that a predictor may see) and a `Future` (what it must predict).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,46 +15,56 @@ from pipeline.data import npz
 from pipeline.geometry import rigid
 
 RATE_HZ = 10
+"""Frames per second, unless `slice_behavior` sets another rate; that of the page and of long-term motion."""
 PAST = 8
+"""Frames of the past, unless `slice_behavior` sets another past."""
 FUTURE = 56
+"""Frames of the future, unless `train_behavior` sets another horizon."""
 TRAIN, TEST = 0, 1
 UP = np.array([0.0, 1.0, 0.0])
+KINDS = ("person", "animal")
+"""what the last of the four numbers of a companion counts; the first three are its position"""
+ABSENT_M = 1000.0
+"""where somebody is put of whom nothing is known, metres"""
+MOST_COMPANIONS = 15
+"""companions that are perceived at most, the nearest ones: more hardly fit into the radius, and crowds would
+not fit into memory"""
+WINDOWS_AT_ONCE = 8192
+"""bounds the memory of companions who are far"""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One recording on the 10 Hz grid; transforms hold finite numbers wherever ``valid``."""
+    """One recording on an even grid of times; transforms hold finite numbers wherever ``valid``."""
 
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_agent: Float[np.ndarray, "frame 4 4"]
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     valid: Bool[np.ndarray, "frame"]
+    companions: Float[np.ndarray, "frame companion 4"] | None = None
+    """others beside the one who films: world position, and kind as a number of `KINDS`; NaN in frames without
+    them"""
 
 
 @dataclass(frozen=True)
 class Context:
-    """The 8 past frames of windows, the current one last, in the world frame."""
+    """The past frames of windows (8 at first), the current one last, in the world frame."""
 
-    world_from_agent: Float[np.ndarray, "window 8 4 4"]
-    agent_from_bone: Float[np.ndarray, "window 8 bone 4 4"]
-    observer_world: Float[np.ndarray, "window 8 3"]
+    world_from_agent: Float[np.ndarray, "window past_frame 4 4"]
+    agent_from_bone: Float[np.ndarray, "window past_frame bone 4 4"]
+    observer_world: Float[np.ndarray, "window past_frame 3"]
     video: Int[np.ndarray, "window"] | None = None
     """number of the recording, which names the scene; None where there is one scene"""
-    observer_rotation: Float[np.ndarray, "window 8 3 3"] | None = None
+    observer_rotation: Float[np.ndarray, "window past_frame 3 3"] | None = None
     """of ``world_from_camera``; None where only positions are known"""
+    companions: Float[np.ndarray, "window companion past_frame 4"] | None = None
+    """others beside the observer, as in a `Trajectory`; None where there are none"""
 
     def __getitem__(self, index: slice | np.ndarray) -> "Context":
         """Return some of the windows."""
-        video = None if self.video is None else self.video[index]
-        rotation = None if self.observer_rotation is None else self.observer_rotation[index]
-        return Context(
-            self.world_from_agent[index],
-            self.agent_from_bone[index],
-            self.observer_world[index],
-            video,
-            rotation,
-        )
+        arrays = (getattr(self, field.name) for field in fields(self))
+        return Context(*(None if array is None else array[index] for array in arrays))
 
     def __len__(self) -> int:
         return len(self.world_from_agent)
@@ -69,14 +79,14 @@ class Context:
 
 @dataclass(frozen=True)
 class Future:
-    """The 56 future frames of windows in the world frame; the goal is the root's last position."""
+    """The future frames of windows in the world frame; the goal is the root's last position."""
 
     world_from_agent: Float[np.ndarray, "window frame 4 4"]
     agent_from_bone: Float[np.ndarray, "window frame bone 4 4"]
 
     @property
     def goal_world(self) -> Float[np.ndarray, "window 3"]:
-        """The root's position after 5.6 s (Z of the paper)."""
+        """The root's position at the horizon (Z of the paper)."""
         return self.world_from_agent[:, -1, :3, 3]
 
     @property
@@ -85,13 +95,12 @@ class Future:
         return self.world_from_agent[:, :, :3, 3]
 
 
-def frames_from_seconds(seconds: float) -> int:
+def frames_from_seconds(seconds: float, rate_hz: float = RATE_HZ) -> int:
     """Return the frames of a horizon. Raises InputError BEH-003 where the UNets could not halve it twice."""
-    frames = round(seconds * RATE_HZ)
+    frames = round(seconds * rate_hz)
     if frames <= 0 or frames % 4:
-        raise InputError(
-            "BEH-003", f"cannot predict {seconds:g} s", "horizon_s", "take a multiple of 0.4 s: 4.0, 5.6, 7.2"
-        )
+        remedy = f"take a multiple of four frames: {4 / rate_hz:g} s"
+        raise InputError("BEH-003", f"cannot predict {seconds:g} s", "horizon_s", remedy)
     return frames
 
 
@@ -114,12 +123,16 @@ class BehaviorData:
     video: Int[np.ndarray, "window"]
     """index into ``videos``"""
     start: Int[np.ndarray, "window"]
-    """first of the 64 frames"""
+    """its first frame"""
     split: Integer[np.ndarray, "window"]
     """0 train, 1 test"""
     videos: tuple[str, ...]
     future: int = FUTURE
     """frames that are predicted"""
+    past: int = PAST
+    """frames that are known"""
+    rate_hz: float = RATE_HZ
+    """frames per second"""
 
     @classmethod
     def load(cls, folder: Path) -> "BehaviorData":
@@ -127,7 +140,12 @@ class BehaviorData:
         tracks, windows = npz.load(folder / "trajectories.npz"), npz.load(folder / "windows.npz")
         videos = tuple(str(video) for video in windows["videos"])
         names = ("timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "valid")
-        trajectories = {video: Trajectory(*(tracks[f"{video}/{name}"] for name in names)) for video in videos}
+        trajectories = {
+            video: Trajectory(
+                *(tracks[f"{video}/{name}"] for name in names), tracks.get(f"{video}/companions")
+            )
+            for video in videos
+        }
         return cls(
             trajectories,
             tracks["agent_from_bone_rest"],
@@ -135,6 +153,9 @@ class BehaviorData:
             windows["start"],
             windows["split"],
             videos,
+            int(windows["future"]),
+            int(windows["past"]),
+            float(windows["rate_hz"]),
         )
 
     def save(self, folder: Path) -> None:
@@ -143,6 +164,7 @@ class BehaviorData:
             f"{video}/{name}": value
             for video, trajectory in self.trajectories.items()
             for name, value in vars(trajectory).items()
+            if value is not None
         }
         npz.save(folder / "trajectories.npz", agent_from_bone_rest=self.agent_from_bone_rest, **tracks)
         npz.save(
@@ -151,6 +173,9 @@ class BehaviorData:
             start=self.start,
             split=self.split,
             videos=np.array(self.videos, np.str_),
+            future=np.int64(self.future),
+            past=np.int64(self.past),
+            rate_hz=np.float64(self.rate_hz),
         )
 
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
@@ -169,7 +194,7 @@ class BehaviorData:
         valid = [
             self.trajectories[name].valid & (number in split_of) for number, name in enumerate(self.videos)
         ]
-        starts = [window_starts(frames, PAST + future) for frames in valid]
+        starts = [window_starts(frames, self.past + future) for frames in valid]
         video = np.repeat(np.arange(len(starts)), [len(mine) for mine in starts]).astype(np.int32)
         split = np.array([split_of[number] for number in video.tolist()], np.uint8)
         return replace(
@@ -180,7 +205,7 @@ class BehaviorData:
         """Gather windows by their number in the list; without ``bones``, which take most of the memory, there
         are none.
         """
-        frames = self.start[index][:, None] + np.arange(PAST + self.future)
+        frames = self.start[index][:, None] + np.arange(self.past + self.future)
 
         def gathered(name: str, part: slice = slice(None)) -> np.ndarray:
             first = getattr(self.trajectories[self.videos[0]], name)[0][part]
@@ -192,8 +217,66 @@ class BehaviorData:
 
         agent, camera = gathered("world_from_agent"), gathered("world_from_camera")
         bone = gathered("agent_from_bone", slice(None) if bones else slice(0, 0))
-        observer = camera[:, :PAST]
+        observer, companions = camera[:, : self.past], self._companions(index, frames[:, : self.past])
         context = Context(
-            agent[:, :PAST], bone[:, :PAST], observer[..., :3, 3], self.video[index], observer[..., :3, :3]
+            agent[:, : self.past],
+            bone[:, : self.past],
+            observer[..., :3, 3],
+            self.video[index],
+            observer[..., :3, :3],
+            companions,
         )
-        return context, Future(agent[:, PAST:], bone[:, PAST:])
+        return context, Future(agent[:, self.past :], bone[:, self.past :])
+
+    def _companions(
+        self, index: Int[np.ndarray, "window"], frames: Int[np.ndarray, "window past_frame"]
+    ) -> Float[np.ndarray, "window companion past_frame 4"] | None:
+        tracks = [self.trajectories[name].companions for name in self.videos]
+        most = max((track.shape[1] for track in tracks if track is not None), default=0)
+        if not most:
+            return None
+        whole = np.full((len(frames), most, frames.shape[1], 4), np.nan)
+        for video in np.unique(self.video[index]):
+            track, mine = tracks[video], self.video[index] == video
+            if track is not None:
+                whole[mine, : track.shape[1]] = np.swapaxes(track[frames[mine]], 1, 2)
+        return whole
+
+    def nearest_companions(
+        self, index: Int[np.ndarray, "window"], agent: Float[np.ndarray, "window 3"]
+    ) -> Float[np.ndarray, "window some past_frame 4"]:
+        """Return the companions that are perceived in some windows; ``agent`` is where the animal is then."""
+        parts = []
+        for begin in range(0, len(index), WINDOWS_AT_ONCE):
+            some = slice(begin, begin + WINDOWS_AT_ONCE)
+            there = self._companions(index[some], self.start[index[some]][:, None] + np.arange(self.past))
+            if there is not None:
+                parts.append(nearest(there, agent[some]))
+        most = max((part.shape[1] for part in parts), default=0)
+        whole = np.zeros((len(index), most, self.past, 4), np.float32)
+        whole[..., :3] = agent[:, None, None] + np.array([ABSENT_M, 0.0, 0.0])
+        for number, part in enumerate(parts):
+            begin = number * WINDOWS_AT_ONCE
+            whole[begin : begin + len(part), : part.shape[1]] = part
+        return whole
+
+
+def nearest(
+    companions: Float[np.ndarray, "window companion past_frame 4"], agent: Float[np.ndarray, "window 3"]
+) -> Float[np.ndarray, "window some past_frame 4"]:
+    """Return the companions that the agent, now at ``agent``, perceives: the nearest, as many as there are.
+
+    Positions are metres in one frame. Somebody who is not there now (NaN in the last frame) is absent; who
+    came during the past has been where it was first seen, so that nothing of the future is needed.
+    """
+    level = [0, 2]
+    distance = np.linalg.norm(companions[:, :, -1, level] - agent[:, None, level], axis=-1)
+    count = min(int(np.isfinite(distance).sum(1).max(initial=0)), MOST_COMPANIONS)
+    order = np.argsort(np.nan_to_num(distance, nan=np.inf), axis=1, kind="stable")[:, :count]
+    some = np.take_along_axis(companions, order[..., None, None], axis=1)
+    for frame in range(some.shape[2] - 2, -1, -1):
+        unknown = np.isnan(some[:, :, frame]).any(-1)
+        some[:, :, frame][unknown] = some[:, :, frame + 1][unknown]
+    absent = np.isnan(some[:, :, -1]).any(-1)
+    far = np.pad(agent + np.array([ABSENT_M, 0.0, 0.0]), ((0, 0), (0, 1)))
+    return np.where(absent[..., None, None], far[:, None, None], some)

@@ -119,9 +119,7 @@ class AnimalWorld:
                 raise InputError("ART-003", f"has no {name}", str(build), "make it: make <agent>.behavior")
             artifact.refuse_other_version(build / name)
         architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
-        if architecture.family != "diffusion":
-            what = f"plans of the family {architecture.family} cannot be chained"
-            raise InputError("SIM-006", what, str(build), "give a build of the family diffusion")
+        behavior.refuse_unplayable(architecture, str(build))
         data = BehaviorData.load(build / "behavior_data")
         sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
         if home is None:

@@ -18,11 +18,10 @@ from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import FeatureVolume, world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, Context, Future
+from pipeline.behavior.trajectories import Context, Future
 from pipeline.geometry import rigid
 from pipeline.rivals.samplers import sampler_of
 
-STEPS = np.arange(1, FUTURE + 1) / FUTURE
 WINDOWS_AT_ONCE = 32
 """bounds the memory of scene grids and bones"""
 
@@ -39,7 +38,7 @@ class Samples:
 
 
 class Predictor(Protocol):
-    """Anything that predicts the next 5.6 s."""
+    """Anything that predicts the frames up to the horizon."""
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` futures for each window of the context."""
@@ -81,37 +80,37 @@ class StandStill:
     @classmethod
     def fit(cls, context: Context, future: Future) -> "StandStill":
         """Fit the noise to the displacements of training windows."""
-        return cls(_spread(future.path_world - _held(context)))
+        return cls(_spread(future.path_world - _held(context, future.path_world.shape[1])))
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw one deviation per sample and let it grow with time."""
-        return _straight(context, _held(context), self.std, count, rng)
+        return _straight(context, _held(context, len(self.std)), self.std, count, rng)
 
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """The animal goes on at the velocity of its last 0.7 s, in its posture, up to Gaussian noise."""
+    """The animal goes on at the velocity of its past, in its posture, up to Gaussian noise."""
 
     std: Float[np.ndarray, "frame 3"]
 
     @classmethod
     def fit(cls, context: Context, future: Future) -> "ConstantVelocity":
         """Fit the noise to the residuals of training windows."""
-        return cls(_spread(future.path_world - _coasting(context)))
+        return cls(_spread(future.path_world - _coasting(context, future.path_world.shape[1])))
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw one deviation per sample and let it grow with time."""
-        return _straight(context, _coasting(context), self.std, count, rng)
+        return _straight(context, _coasting(context, len(self.std)), self.std, count, rng)
 
 
-def _held(context: Context) -> Float[np.ndarray, "window frame 3"]:
-    return np.repeat(context.world_from_agent[:, -1:, :3, 3], FUTURE, axis=1)
+def _held(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
+    return np.repeat(context.world_from_agent[:, -1:, :3, 3], frames, axis=1)
 
 
-def _coasting(context: Context) -> Float[np.ndarray, "window frame 3"]:
+def _coasting(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
     position = context.world_from_agent[..., :3, 3]
-    velocity = (position[:, -1] - position[:, 0]) * (RATE_HZ / (PAST - 1))
-    return _held(context) + velocity[:, None] * (STEPS * FUTURE / RATE_HZ)[:, None]
+    step = (position[:, -1] - position[:, 0]) / (position.shape[1] - 1)
+    return _held(context, frames) + step[:, None] * np.arange(1, frames + 1)[:, None]
 
 
 def _spread(residual: Float[np.ndarray, "window frame 3"]) -> Float[np.ndarray, "frame 3"]:
@@ -128,7 +127,7 @@ def _straight(
     rng: np.random.Generator,
 ) -> Samples:
     path = mean[:, None] + rng.standard_normal((len(context), count, 1, 3)) * std
-    shape = (len(context), count, FUTURE)
+    shape = (len(context), count, mean.shape[1])
     rotation = np.broadcast_to(context.world_from_agent[:, -1, :3, :3][:, None, None], (*shape, 3, 3))
     bones = context.agent_from_bone[:, -1]
     return Samples(

@@ -157,7 +157,8 @@ class OneStageSampler(Sampler):
         return self._path(codes, self._whole(codes, sampling, rng))[:, -1]
 
     def _path(self, codes: PlanCondition, whole: Array) -> Float[np.ndarray, "plan frame 3"]:
-        return codes.constrained(self.scaling.path(whole[:, :PATH_CHANNELS], codes.start))
+        path = self.scaling.path(whole[:, :PATH_CHANNELS], codes.start)
+        return codes.constrained(path, self.scaling.rate_hz)
 
     def _whole(self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator) -> Array:
         frames = self.scaling.path_std.shape[1]
@@ -176,8 +177,7 @@ class OneStageSampler(Sampler):
             :, None
         ]
         return self._drawn(
-            denoise(codes.full),
-            denoise(codes.blind),
+            [denoise(code) for code in (codes.full, *codes.less)],
             shape,
             sampling,
             sampling.sequence_steps,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.behavior.trajectories import FUTURE, PAST, TEST, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.data import plots
 from pipeline.metrics.intervals import Interval, bootstrapped, episodes
 from pipeline.metrics.metrics import Metrics
@@ -62,7 +62,7 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
     plans = plots.sample(len(test), config.plan_windows)
     metrics.put("behavior/plan_windows", len(plans))
     metrics.put("behavior/plan_trials", 1)
-    episode = episodes(data.start[test], data.video[test], PAST + FUTURE)
+    episode = episodes(data.start[test], data.video[test], data.past + data.future)
     judged = {
         name: _judged(method, data, test, test[plans], config)
         for name, method in ({OURS: ours} | rivals(data)).items()

@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.trajectories import ABSENT_M
 
-ABSENT_OBSERVER_M = 1000.0
-"""Where an observer stands of whom nothing is known: beyond every radius of perception."""
 CLIP_GAP_S = 5.0
 """Between two clips of one recording, so that no window spans them."""
 
@@ -23,6 +22,8 @@ class MeasuredMotion:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     volume: FeatureVolume
+    companions: Float[np.ndarray, "frame companion 4"] | None = None
+    """others beside the observer: world position, and kind as a number of `KINDS`; NaN where absent"""
 
     def arrays(self) -> dict[str, Float[np.ndarray, "..."] | Bool[np.ndarray, "frame"]]:
         """Return the arrays of a ``motion.npz``."""
@@ -34,13 +35,13 @@ class MeasuredMotion:
             "agent_from_bone": self.agent_from_bone.astype("f4"),
             "confidence": known.astype("f4"),
             "agent_visible": known,
-        }
+        } | ({} if self.companions is None else {"companions": self.companions.astype("f4")})
 
 
 def absent_observer(frames: int) -> Float[np.ndarray, "frame 4 4"]:
     """Return an observer who is not there."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, 0, 3] = ABSENT_OBSERVER_M
+    poses[:, 0, 3] = ABSENT_M
     return poses
 
 

@@ -53,7 +53,7 @@ def _read(path: Path, config: Config) -> MeasuredMotion:
 
 
 def _from_csv(path: Path, map_path: Path | None, config: Config) -> MeasuredMotion:
-    time, agent, camera = tables.motion_from_csv(path)
+    time, agent, camera, companions = tables.motion_from_csv(path)
     seen = agent[np.isfinite(agent).all((1, 2)), :3, 3]
     if not len(seen):
         raise InputError("TRJ-002", "holds no position of the animal", str(path), "fill x, y, z and heading")
@@ -61,13 +61,15 @@ def _from_csv(path: Path, map_path: Path | None, config: Config) -> MeasuredMoti
     if map_path is not None and map_path.is_file():
         volume = obstacles.volume_from_csv(map_path, seen, config.cell_m)
     bones = np.tile(np.eye(4), (len(time), 1, 1, 1))
-    return MeasuredMotion(time, agent, bones, camera, np.eye(4, dtype=np.float32)[None], volume)
+    rest = np.eye(4, dtype=np.float32)[None]
+    return MeasuredMotion(time, agent, bones, camera, rest, volume, companions)
 
 
 def _from_life(stored: dict[str, np.ndarray]) -> MeasuredMotion:
     features, occupancy, origin = (stored[f"volume/{name}"] for name in ("features", "occupancy", "origin"))
     volume = FeatureVolume(features, occupancy, origin, float(stored["volume/voxel_m"]))
-    return MeasuredMotion(**{name: stored[name] for name in MOTION_KEYS}, volume=volume)
+    motion = {name: stored[name] for name in MOTION_KEYS}
+    return MeasuredMotion(**motion, volume=volume, companions=stored.get("companions"))
 
 
 def _from_joints(path: Path, stored: dict[str, np.ndarray], config: Config) -> MeasuredMotion:

@@ -4,12 +4,12 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 
-from pipeline.behavior.trajectories import UP
+from pipeline.behavior.trajectories import ABSENT_M, KINDS, UP
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
-from stages.read_trajectories.motion import ABSENT_OBSERVER_M, CLIP_GAP_S, absent_observer, concatenated_times
+from stages.read_trajectories.motion import CLIP_GAP_S, absent_observer, concatenated_times
 
 REQUIRED_COLUMNS = ("time", "x", "y", "z", "heading")
 OBSERVER_COLUMNS = ("observer_x", "observer_y", "observer_z")
@@ -67,11 +67,19 @@ def numbers(path: Path, table: dict[str, list[str]], name: str) -> Float[np.ndar
 
 def motion_from_csv(
     path: Path,
-) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame 4 4"]]:
-    """Return times, ``world_from_agent`` and ``world_from_camera``; ids follow each other on one clock, as do
-    stretches of one id that lie further apart than clips are put. The observer looks at the animal.
+) -> tuple[
+    Float[np.ndarray, "frame"],
+    Float[np.ndarray, "frame 4 4"],
+    Float[np.ndarray, "frame 4 4"],
+    Float[np.ndarray, "frame companion 4"] | None,
+]:
+    """Return times, ``world_from_agent``, ``world_from_camera`` and companions; ids follow each other on one
+    clock, as do stretches of one id that lie further apart than clips are put. The observer looks at the
+    animal.
 
-    Rows without a position are frames in which the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
+    In a table with a column ``kind``, ids share the clock of the table and perceive each other. Those of kind
+    animal are the agents, people only where there are no animals. Rows without a position are frames in which
+    the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
     """
     table = columns(path, REQUIRED_COLUMNS)
     observed = any(name in table for name in OBSERVER_COLUMNS)
@@ -94,6 +102,13 @@ def motion_from_csv(
         for mine in rows
         for clip in np.split(mine, 1 + np.flatnonzero(np.diff(value["time"][mine]) > CLIP_GAP_S))
     ]
+    kinds = being_kinds(path, table, names)
+    companions = None
+    if kinds is not None:
+        agents = rows if not kinds.any() else [mine for mine in rows if kinds[mine[0]]]
+        beings = np.stack([*(value[axis] for axis in "xyz"), kinds], axis=-1)
+        companions = companions_of(agents, rows, np.array(names), value["time"], beings)
+        rows = agents
     order = np.concatenate(rows)
     turn = np.zeros((len(order), 3))
     turn[:, 1] = value["heading"][order]
@@ -107,8 +122,76 @@ def motion_from_csv(
         seen = np.stack([value[name][order] for name in OBSERVER_COLUMNS], axis=-1)
         both = np.isfinite(seen).all(1) & np.isfinite(agent).all((1, 2))
         camera[both] = rigid.look_at(seen[both], agent[both, :3, 3], UP)
-        camera[:, :3, 3] = np.where(np.isfinite(seen), seen, ABSENT_OBSERVER_M)
-    return concatenated_times([value["time"][mine] for mine in rows]), agent, camera
+        camera[:, :3, 3] = np.where(np.isfinite(seen), seen, ABSENT_M)
+    return concatenated_times([value["time"][mine] for mine in rows]), agent, camera, companions
+
+
+def being_kinds(path: Path, table: dict[str, list[str]], names: list[str]) -> Int[np.ndarray, "row"] | None:
+    """Return the number in `KINDS` of each row's being; None where the table does not name kinds.
+
+    Raises TRJ-001 for other kinds, and for an id of two.
+    """
+    if "kind" not in table:
+        return None
+    kind_of = dict(zip(names, table["kind"], strict=True))
+    wrong = [kind for name, kind in zip(names, table["kind"], strict=True) if kind != kind_of[name]]
+    wrong += [kind for kind in kind_of.values() if kind not in KINDS]
+    if wrong:
+        what = f"column kind holds {wrong[0]!r}"
+        raise InputError(
+            "TRJ-001", what, str(path), f"one of {', '.join(KINDS)}, the same in all rows of an id"
+        )
+    return np.array([KINDS.index(kind_of[name]) for name in names])
+
+
+def companions_of(
+    agents: list[Int[np.ndarray, "_"]],
+    clips: list[Int[np.ndarray, "_"]],
+    names: Shaped[np.ndarray, "row"],
+    time: Float[np.ndarray, "row"],
+    beings: Float[np.ndarray, "row 4"],
+) -> Float[np.ndarray, "frame companion 4"]:
+    """Return where everybody else is at the times of the agents' clips, one clip after the other.
+
+    A column belongs to one being at a time, and to the next one `CLIP_GAP_S` after it has gone at the
+    earliest, so that no window holds both.
+    """
+    parts = []
+    for mine in agents:
+        columns: list[np.ndarray] = []
+        free_from: list[float] = []
+        for other in sorted(clips, key=lambda rows: time[rows[0]]):
+            known = other[np.isfinite(beings[other]).all(1)]
+            if names[other[0]] == names[mine[0]] or not len(known):
+                continue
+            track = interpolated(time[known], beings[known], time[mine])
+            here = np.flatnonzero(np.isfinite(track[:, 0]))
+            if not len(here):
+                continue
+            begin, end = time[mine][here[[0, -1]]]
+            free = next((n for n, since in enumerate(free_from) if since <= begin), len(columns))
+            if free == len(columns):
+                columns.append(np.full_like(track, np.nan))
+                free_from.append(0.0)
+            columns[free][here], free_from[free] = track[here], end + CLIP_GAP_S
+        parts.append(np.stack(columns, axis=1) if columns else np.zeros((len(mine), 0, beings.shape[1])))
+    most = max(part.shape[1] for part in parts)
+    whole = np.full((sum(map(len, parts)), most, beings.shape[1]), np.nan)
+    for begin, part in zip(np.cumsum([0, *map(len, parts)]), parts, strict=False):
+        whole[begin : begin + len(part), : part.shape[1]] = part
+    return whole
+
+
+def interpolated(
+    time: Float[np.ndarray, "known"], beings: Float[np.ndarray, "known 4"], query: Float[np.ndarray, "frame"]
+) -> Float[np.ndarray, "frame 4"]:
+    """Return rows between known ones at most `MAX_STEP_S` apart; NaN elsewhere."""
+    after = np.searchsorted(time, query).clip(0, len(time) - 1)
+    before = (np.searchsorted(time, query, side="right") - 1).clip(0)
+    within = (time[before] <= query) & (query <= time[after]) & (time[after] - time[before] <= MAX_STEP_S)
+    found = np.stack([np.interp(query, time, column) for column in beings.T], axis=-1)
+    found[~within] = np.nan
+    return found
 
 
 def _refuse_impossible_times(path: Path, clips: list[Float[np.ndarray, "row"]]) -> None:

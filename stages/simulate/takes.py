@@ -209,9 +209,7 @@ def _simulator(
     inputs: Inputs, data: BehaviorData, scenes: Scenes, c: Config, chaining: ReplanningConfig, device: str
 ) -> Simulator:
     architecture, nets, scaling, schedule, _ = behavior.load(_required(inputs, "behavior"))
-    if architecture.family != "diffusion":
-        what = f"plans of the family {architecture.family} cannot be chained"
-        raise InputError("SIM-006", what, str(inputs.behavior), "give a model of the family diffusion")
+    behavior.refuse_unplayable(architecture, str(inputs.behavior))
     sampling = PlanSamplingConfig(
         goal_steps=c.goal_steps,
         sequence_steps=c.sequence_steps,

@@ -1,6 +1,6 @@
-"""Turn reconstructed motion into trajectories on a 10 Hz grid and windows of 6.4 s for the behaviour model.
+"""Turn reconstructed motion into trajectories on an even grid and windows for the behaviour model.
 
-A window is 0.8 s of past and 5.6 s of future, all of it valid; the split is by recording. Motion comes from
+A window is past (0.8 s) and future (5.6 s), all of it valid; the split is by recording. Motion comes from
 the reconstruction or from tables. Writes also the scenes' feature volumes, with the voxels in which the
 animal may be.
 """

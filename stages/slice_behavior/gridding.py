@@ -19,13 +19,20 @@ class ReconstructedMotion:
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
     confidence: Float[np.ndarray, "frame"]
     agent_visible: Bool[np.ndarray, "frame"]
+    companions: Float[np.ndarray, "frame companion 4"] | None = None
+    """others beside the one who films, as in a `Trajectory`"""
 
 
 def trajectory_from_motion(
-    motion: ReconstructedMotion, *, min_confidence: float, max_gap_s: float, smooth_s: float
+    motion: ReconstructedMotion,
+    *,
+    min_confidence: float,
+    max_gap_s: float,
+    smooth_s: float,
+    rate_hz: float = RATE_HZ,
 ) -> Trajectory:
-    """Resample to 10 Hz. A grid time is valid where trusted frames no more than ``max_gap_s`` apart enclose
-    it.
+    """Resample to an even rate. A grid time is valid where trusted frames no more than ``max_gap_s`` apart
+    enclose it.
 
     Trusted are those that show the agent from a camera whose pose is known.
 
@@ -38,31 +45,58 @@ def trajectory_from_motion(
     camera_known = np.isfinite(motion.world_from_camera).all((1, 2)) & (motion.confidence >= min_confidence)
     trusted = finite & camera_known & motion.agent_visible
     time = motion.timestamp_s
-    grid = np.arange(np.floor(time[-1] * RATE_HZ + 1e-6) + 1) / RATE_HZ
-    grid = grid[grid >= time[0] - 0.5 / RATE_HZ]
+    grid = np.arange(np.floor(time[-1] * rate_hz + 1e-6) + 1) / rate_hz
+    grid = grid[grid >= time[0] - 0.5 / rate_hz]
     bones = motion.agent_from_bone.shape[1]
+    companions = motion.companions
+    if companions is not None:
+        companions = resampled(time, companions, grid, max_gap_s, rate_hz)
     if not trusted.any():
         still = np.broadcast_to(np.eye(4), (len(grid), 4, 4))
         rest = np.broadcast_to(np.eye(4, dtype=np.float32), (len(grid), bones, 4, 4))
-        return Trajectory(grid, still.copy(), rest.copy(), still.copy(), np.zeros(len(grid), bool))
+        nowhere = np.zeros(len(grid), bool)
+        return Trajectory(grid, still.copy(), rest.copy(), still.copy(), nowhere, companions)
     good = time[trusted]
     agent = rigid.smoothed(
-        rigid.interpolate(good, motion.world_from_agent[trusted], grid), smooth_s * RATE_HZ
+        rigid.interpolate(good, motion.world_from_agent[trusted], grid), smooth_s * rate_hz
     )
     bone = [rigid.interpolate(good, motion.agent_from_bone[trusted, b], grid) for b in range(bones)]
     camera = rigid.interpolate(good, motion.world_from_camera[trusted], grid)
-    return Trajectory(
-        grid, agent, np.stack(bone, 1).astype(np.float32), camera, within_short_gaps(good, grid, max_gap_s)
-    )
+    valid = within_short_gaps(good, grid, max_gap_s, rate_hz)
+    return Trajectory(grid, agent, np.stack(bone, 1).astype(np.float32), camera, valid, companions)
+
+
+def resampled(
+    time: Float[np.ndarray, "frame"],
+    companions: Float[np.ndarray, "frame companion 4"],
+    grid: Float[np.ndarray, "sample"],
+    max_gap_s: float,
+    rate_hz: float,
+) -> Float[np.ndarray, "sample companion 4"]:
+    """Resample who is not always there: NaN at times that known frames at most ``max_gap_s`` apart do not
+    enclose.
+    """
+    found = np.full((len(grid), *companions.shape[1:]), np.nan, np.float32)
+    for number in range(companions.shape[1]):
+        known = np.isfinite(companions[:, number]).all(-1)
+        if known.any():
+            here = within_short_gaps(time[known], grid, max_gap_s, rate_hz)
+            being = companions[known, number]
+            for channel in range(being.shape[1]):
+                found[here, number, channel] = np.interp(grid[here], time[known], being[:, channel])
+    return found
 
 
 def within_short_gaps(
-    good: Float[np.ndarray, "frame"], grid: Float[np.ndarray, "sample"], max_gap_s: float
+    good: Float[np.ndarray, "frame"],
+    grid: Float[np.ndarray, "sample"],
+    max_gap_s: float,
+    rate_hz: float = RATE_HZ,
 ) -> Bool[np.ndarray, "sample"]:
     """Tell which grid times lie between (or within half a grid step of) good times at most ``max_gap_s``
     apart.
     """
-    near = 0.5 / RATE_HZ
+    near = 0.5 / rate_hz
     after = np.searchsorted(good, grid, side="left").clip(0, len(good) - 1)
     before = (np.searchsorted(good, grid, side="right") - 1).clip(0)
     on_frame = np.minimum(np.abs(good[after] - grid), np.abs(good[before] - grid)) <= near

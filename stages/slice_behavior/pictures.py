@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from pipeline.behavior.perception import FeatureVolume
-from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, TEST, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.data import plots
 from pipeline.data.qa import Check, Picture, captioned
 
@@ -15,7 +15,7 @@ VISIT_M = 0.1
 """Edge of the cells in which visits are counted."""
 CAPTIONS = {
     "visitation": "Where animal (left) and observer (right) have been in training, from above.",
-    "histograms": "The animal's speed, distance to the observer, and how far it gets in 5.6 s (training).",
+    "histograms": "The animal's speed, distance to the observer, and how far it gets (training).",
     "windows": "Valid times of every recording, and how many windows start there.",
 }
 MOST_WINDOWS = 8192
@@ -79,13 +79,17 @@ def histograms(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
     """Draw speed, distance and displacement."""
     context, future = data.windows(some(data.indices(TRAIN)), bones=False)
     position = future.path_world
-    speed = np.linalg.norm(np.diff(position, axis=1), axis=-1)[:, ::7] * RATE_HZ
+    speed = np.linalg.norm(np.diff(position, axis=1), axis=-1)[:, ::7] * data.rate_hz
     distance = np.linalg.norm(
         (context.observer_world - context.world_from_agent[..., :3, 3])[:, -1][:, ::2], axis=-1
     )
     moved = np.linalg.norm(future.goal_world - context.world_from_agent[:, -1, :3, 3], axis=-1)
     return plots.histograms(
-        {"speed [m/s]": speed, "distance to the observer [m]": distance, "displacement in 5.6 s [m]": moved}
+        {
+            "speed [m/s]": speed,
+            "distance to the observer [m]": distance,
+            f"displacement in {data.future / data.rate_hz:g} s [m]": moved,
+        }
     )
 
 
@@ -110,5 +114,5 @@ def validity(data: BehaviorData, test: Collection[str]) -> UInt8[np.ndarray, "he
         for row, video in enumerate(data.videos)
     ]
     axis.set_yticks(range(len(names)), names)
-    axis.set_xlabel(f"time [s]: valid (blue), starts of windows of {PAST + FUTURE} frames (red)")
+    axis.set_xlabel(f"time [s]: valid (blue), starts of windows of {data.past + data.future} frames (red)")
     return plots.pixels(figure)

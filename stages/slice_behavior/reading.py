@@ -54,9 +54,10 @@ def read_tables(folders: Mapping[str, Path]) -> BehaviorSource:
 def read_motion(folder: Path) -> ReconstructedMotion:
     """Read the motion of one recording. Raises InputError ART-010 when damaged."""
     numbers = ("timestamp_s", "world_from_camera", "world_from_agent", "agent_from_bone", "confidence")
-    loaded = npz.load(folder / "motion.npz", (*numbers, "agent_visible"))
+    loaded = npz.load(folder / "motion.npz", (*numbers, "agent_visible"), ("companions",))
     arrays = (np.asarray(loaded[name], np.float64) for name in numbers)
-    return ReconstructedMotion(*arrays, agent_visible=loaded["agent_visible"].astype(bool))
+    visible = loaded["agent_visible"].astype(bool)
+    return ReconstructedMotion(*arrays, agent_visible=visible, companions=loaded.get("companions"))
 
 
 def _rest(folder: Path) -> Float[np.ndarray, "bone 4 4"]:

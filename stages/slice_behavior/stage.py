@@ -14,6 +14,9 @@ from stages.slice_behavior.config import Config
 from stages.slice_behavior.gridding import trajectory_from_motion
 from stages.slice_behavior.windows import slice_windows
 
+LEAST_PAST = 3
+"""Frames that a posture and a velocity are taken from."""
+
 
 @dataclass(frozen=True)
 class Inputs:
@@ -39,21 +42,29 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     else:
         raise InputError("ART-003", "no motion was given", "slice_behavior", "give --reconstruction")
     gaps = asdict(config)
-    stride = gaps.pop("stride")
+    stride, past_s = gaps.pop("stride"), gaps.pop("past_s")
+    past = max(round(past_s * config.rate_hz), LEAST_PAST)
     trajectories = {id: trajectory_from_motion(motion, **gaps) for id, motion in source.motions.items()}
     test = frozenset(id for id in trajectories if sessions[id].split == "test")
-    data = slice_windows(trajectories, test, source.agent_from_bone_rest, stride=stride)
+    data = slice_windows(
+        trajectories, test, source.agent_from_bone_rest, stride=stride, past=past, rate_hz=config.rate_hz
+    )
     training = len(data.indices(TRAIN))
     if not training:
         remedy = (
             "record longer sessions in which the animal stays in view, lower min_confidence, "
             "or raise max_gap_s where rows are further apart"
         )
-        raise InputError("BEH-001", "no 6.4 s of uninterrupted motion to learn from", source.where, remedy)
+        raise InputError(
+            "BEH-001",
+            f"no {(data.past + data.future) / data.rate_hz:.1f} s of uninterrupted motion to learn from",
+            source.where,
+            remedy,
+        )
     progress.log(f"{training} training windows, {len(data.start) - training} test windows")
     data.save(out)
     training_tracks = {id: trajectory for id, trajectory in trajectories.items() if id not in test}
-    writing.write_volumes(out, source.volumes, training_tracks, tuple(source.motions))
+    writing.write_volumes(out, source.volumes, training_tracks, tuple(source.motions), config.rate_hz)
     qa.write(
         out,
         good="hundreds of windows, an animal that covers the room, and an observer at many distances",

@@ -28,18 +28,30 @@ def slice_windows(
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
     *,
     stride: int,
+    past: int = PAST,
+    rate_hz: float = RATE_HZ,
 ) -> BehaviorData:
     """List the windows of every recording: with ``stride`` in training recordings, every one in test
-    recordings.
+    recordings. They have ``past`` known frames and as many seconds ahead as `FUTURE` is at `RATE_HZ`, in
+    multiples of four frames.
     """
+    future = 4 * max(round(FUTURE / RATE_HZ * rate_hz / 4), 1)
     videos = tuple(sorted(trajectories))
-    starts = [window_starts(trajectories[v].valid, PAST + FUTURE, 1 if v in test else stride) for v in videos]
+    starts = [window_starts(trajectories[v].valid, past + future, 1 if v in test else stride) for v in videos]
     video = np.repeat(np.arange(len(videos)), [len(s) for s in starts]).astype(np.int32)
     tested = np.array([v in test for v in videos])
     split = np.where(tested[video], TEST, TRAIN).astype(np.uint8)
     start = np.concatenate(starts).astype(np.int32)
     return BehaviorData(
-        {v: trajectories[v] for v in videos}, agent_from_bone_rest, video, start, split, videos
+        {v: trajectories[v] for v in videos},
+        agent_from_bone_rest,
+        video,
+        start,
+        split,
+        videos,
+        future,
+        past,
+        rate_hz,
     )
 
 
@@ -59,13 +71,15 @@ def allowed_voxels(
     return with_filled_floor(marks, volume.occupancy, visited)
 
 
-def standing_heights(pairs: Iterable[tuple[FeatureVolume, Trajectory]]) -> Float[np.ndarray, "2 2"]:
+def standing_heights(
+    pairs: Iterable[tuple[FeatureVolume, Trajectory]], rate_hz: float = RATE_HZ
+) -> Float[np.ndarray, "2 2"]:
     """Return how high above what carries it the root is, see `Support.range_m`, of recordings in their
     scenes.
     """
     seen = []
     for volume, trajectory in pairs:
         root = trajectory.world_from_agent[:, :3, 3]
-        speed = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0, prepend=root[:1, [0, 2]]), axis=-1) * RATE_HZ
+        speed = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0, prepend=root[:1, [0, 2]]), axis=-1) * rate_hz
         seen.append((volume, root[trajectory.valid], (speed > REST_SPEED_M_S)[trajectory.valid]))
     return height_ranges(seen)

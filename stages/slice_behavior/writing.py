@@ -14,14 +14,18 @@ REACH_VOXELS = 2
 
 
 def write_volumes(
-    folder: Path, volumes: tuple[FeatureVolume, ...], seen: Mapping[str, Trajectory], videos: tuple[str, ...]
+    folder: Path,
+    volumes: tuple[FeatureVolume, ...],
+    seen: Mapping[str, Trajectory],
+    videos: tuple[str, ...],
+    rate_hz: float,
 ) -> None:
     """Write `volume.npz`, or `volumes/<id>.npz` where each recording has its own scene.
 
     ``seen`` are the training recordings: only where they went counts as visited.
     """
     scene = dict(zip(videos, volumes if len(volumes) > 1 else volumes * len(videos), strict=True))
-    stands_m = standing_heights((scene[id], trajectory) for id, trajectory in seen.items())
+    stands_m = standing_heights(((scene[id], trajectory) for id, trajectory in seen.items()), rate_hz)
     if len(volumes) == 1:
         allowed = allowed_voxels(volumes[0], dict(seen), reach_voxels=REACH_VOXELS)
         npz.save(folder / "volume.npz", compress=True, **vars(volumes[0]), allowed=allowed, stands_m=stands_m)

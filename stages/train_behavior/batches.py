@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import convolve1d
 from torch import Tensor
 
+from pipeline.behavior.encoders import beings
 from pipeline.behavior.model import Architecture, Scaling, channels_from_bones
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
@@ -22,7 +23,7 @@ from pipeline.behavior.path_encoding import (
 )
 from pipeline.behavior.perception import FeatureVolume, PerceptionEnsemble, grid_points_ego, world_from_ego
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, RATE_HZ, BehaviorData
+from pipeline.behavior.trajectories import RATE_HZ, BehaviorData
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
 
@@ -43,11 +44,12 @@ MAX_STATISTICS_WINDOWS = 8192
 
 @dataclass(frozen=True)
 class EgoTracks:
-    """What animal and observer do in some windows, each in its own ego frame."""
+    """What animal and others do in some windows, each in its own ego frame."""
 
-    root: Float[Tensor, "window 64 3"]
-    rotation: Float[Tensor, "window 64 3 3"]
-    ego_from_observer: Float[Tensor, "window 8 4 4"]
+    root: Float[Tensor, "window frame 3"]
+    rotation: Float[Tensor, "window frame 3 3"]
+    ego_from_observer: Float[Tensor, "window past_frame 4 4"]
+    companions: Float[Tensor, "window companion past_frame 4"]
 
 
 @dataclass(frozen=True)
@@ -56,13 +58,21 @@ class TrainingWindows:
 
     world_from_agent: Float[Tensor, "frame 4 4"]
     world_from_observer: Float[Tensor, "frame 4 4"]
+    companions_world: Float[Tensor, "window companion past_frame 4"]
     bones: Float[Tensor, "frame channel"]
     world_from_ego: Float[Tensor, "window 4 4"]
-    frame: Int[Tensor, "window 64"]
+    frame: Int[Tensor, "window window_frame"]
     scene: Int[Tensor, "window"]
     """number of the window's feature volume"""
     approached: Int[Tensor, "some"]
     """windows that begin with a person coming up, those at rare distances several times"""
+    rate_hz: float = RATE_HZ
+    """frames per second"""
+
+    @property
+    def past(self) -> int:
+        """Return how many frames of a window are known."""
+        return self.companions_world.shape[2]
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -71,8 +81,13 @@ class TrainingWindows:
         """Express some windows in the ego frames of their current times."""
         ego_from_world = rigid_torch.inverse(self.world_from_ego[index])
         ego_from_agent = ego_from_world[:, None] @ self.world_from_agent[self.frame[index]]
-        ego_from_observer = ego_from_world[:, None] @ self.world_from_observer[self.frame[index, :PAST]]
-        return EgoTracks(ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], ego_from_observer)
+        ego_from_observer = ego_from_world[:, None] @ self.world_from_observer[self.frame[index, : self.past]]
+        companions = self.companions_world[index]
+        place = rigid_torch.apply(ego_from_world[:, None], companions[..., :3])
+        companions = torch.cat([place, companions[..., 3:]], dim=-1)
+        return EgoTracks(
+            ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], ego_from_observer, companions
+        )
 
 
 @dataclass(frozen=True)
@@ -91,7 +106,7 @@ class TrainingBatch:
     """One augmented batch: inputs of perception, and clean targets in scaled units."""
 
     scene: Float[Tensor, "batch channel x y z"]
-    observer_past: Float[Tensor, "batch observer_past"]
+    others: Float[Tensor, "batch other past_frame 10"]
     past: Float[Tensor, "batch past"]
     held: Float[Tensor, "batch held_frame held_channel"]
     """root and bones of the frames that give velocity and posture, as they were"""
@@ -177,18 +192,24 @@ def windows_from_data(
         [channels_from_bones(track.agent_from_bone, data.agent_from_bone_rest) for track in tracks]
     )
     first = np.cumsum([0, *(len(track.timestamp_s) for track in tracks[:-1])])
-    rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(PAST + data.future)
-    frame = world_from_ego(agent[rows[:, PAST - 1]], architecture.ego)
+    rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(data.past + data.future)
+    frame = world_from_ego(agent[rows[:, data.past - 1]], architecture.ego)
     number = scenes.number(data.video[index], len(index))
-    tables = (torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, bones, frame))
-    met = approached(agent[rows[:, PAST - 1], :3, 3], observer[rows[:, :PAST], :3, 3])
+    now = agent[rows[:, data.past - 1], :3, 3]
+    companions = data.nearest_companions(index, now)
+    tables = (
+        torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, companions, bones, frame)
+    )
+    met = approached(now, observer[rows[:, : data.past], :3, 3], data.rate_hz)
     met = met[:0] if architecture.ablated_input == "observer" else met
     indices = (torch.from_numpy(index) for index in (rows, number, met))
-    return TrainingWindows(*tables, *indices)
+    return TrainingWindows(*tables, *indices, rate_hz=data.rate_hz)
 
 
 def approached(
-    agent: Float[np.ndarray, "window 3"], observer: Float[np.ndarray, "window 8 3"]
+    agent: Float[np.ndarray, "window 3"],
+    observer: Float[np.ndarray, "window past_frame 3"],
+    rate_hz: float = RATE_HZ,
 ) -> Int[np.ndarray, "some"]:
     """Return the windows in which the observer, at most `APPROACH_DISTANCE_M` from the animal, comes up at
     `APPROACH_SPEED_M_S` or more.
@@ -198,7 +219,7 @@ def approached(
     """
     away = (agent[:, None] - observer)[..., [0, 2]]
     distance = np.linalg.norm(away[:, -1], axis=-1)
-    walked = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (RATE_HZ / (PAST - 1))
+    walked = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (rate_hz / (observer.shape[1] - 1))
     met = np.flatnonzero(
         (distance < APPROACH_DISTANCE_M) & ((walked * away[:, -1]).sum(-1) > APPROACH_SPEED_M_S * distance)
     )
@@ -222,20 +243,27 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     """
     some = torch.arange(0, len(windows), -(-len(windows) // MAX_STATISTICS_WINDOWS))
     tracks, rows = windows.tracks(some), windows.frame[some]
-    future = tracks.root[:, PAST:].double().numpy()
+    past, rate_hz = windows.past, windows.rate_hz
+    future = tracks.root[:, past:].double().numpy()
     level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(0.02)
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
-    whole = body_statistics(tracks.rotation[:, PAST:], windows.bones[rows[:, PAST:].unique()], turn_rad)
+    whole = body_statistics(tracks.rotation[:, past:], windows.bones[rows[:, past:].unique()], turn_rad)
     strides = (
-        velocity_channels_from_path(tracks.root[:, PAST:], tracks.root[:, PAST - 1])[..., :3].double().numpy()
+        velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)[..., :3]
+        .double()
+        .numpy()
     )
     velocity_std = np.array([[*_spread(strides.reshape(-1, 3)), 1.0]])
     scaling = Scaling(
-        _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER)), velocity_std, path_std, *whole
+        _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER)),
+        velocity_std,
+        path_std,
+        *whole,
+        rate_hz,
     )
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
-    position = tracks.root[:, :PAST].std().clip(0.05).expand(3)
+    position = tracks.root[:, :past].std().clip(0.05).expand(3)
     return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 
@@ -265,12 +293,12 @@ def body_channels(
 
 
 def with_posture_noise(
-    rotation: Float[Tensor, "batch 8 3 3"],
-    bones: Float[Tensor, "batch 8 channel"],
+    rotation: Float[Tensor, "batch past_frame 3 3"],
+    bones: Float[Tensor, "batch past_frame channel"],
     statistics: WindowStatistics,
     augmentation: AugmentationConfig,
     generator: torch.Generator,
-) -> tuple[Float[Tensor, "batch 8 3 3"], Float[Tensor, "batch 8 channel"]]:
+) -> tuple[Float[Tensor, "batch past_frame 3 3"], Float[Tensor, "batch past_frame channel"]]:
     """Tilt the roots and bend the bones of some samples, in all frames alike."""
     size, channels = len(bones), bones.shape[-1]
     some = (torch.rand(size, 1, generator=generator) < augmentation.posture_offset).float()
@@ -322,7 +350,8 @@ def draw_batch(
 
     Without ``bodies``, which take the longest, those have no frames.
     """
-    scaling, posed = statistics.scaling, slice(PAST, None if bodies else PAST)
+    scaling, count = statistics.scaling, windows.past
+    posed = slice(count, None if bodies else count)
     index, chosen = _drawn_windows(windows, augmentation, size, generator)
     side, turn = _drawn_turns(augmentation, size, generator)
     flip = torch.diag_embed(torch.stack([side, torch.ones(size), torch.ones(size)], dim=-1))
@@ -338,10 +367,10 @@ def draw_batch(
     frames = windows.frame[index]
     remembered = body_channels(
         *with_posture_noise(
-            rotation[:, :PAST], windows.bones[frames[:, :PAST]], statistics, augmentation, generator
+            rotation[:, :count], windows.bones[frames[:, :count]], statistics, augmentation, generator
         )
     )
-    past = torch.cat([root[:, :PAST], remembered], dim=-1)
+    past = torch.cat([root[:, :count], remembered], dim=-1)
     held = past[:, -PerceptionEnsemble.POSTURE_FRAMES :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
@@ -349,15 +378,15 @@ def draw_batch(
         body_channels(rotation[:, posed], windows.bones[frames[:, posed]])
         - torch.from_numpy(scaling.body_mean).float()
     )
-    device, future = scene.points.device, root[:, PAST:]
+    device, future = scene.points.device, root[:, count:]
     track = with_powered_length(future, GOAL_LENGTH_POWER) / torch.from_numpy(scaling.goal_std).float()
     strides = (
-        velocity_channels_from_path(future, root[:, PAST - 1])
+        velocity_channels_from_path(future, root[:, count - 1], windows.rate_hz)
         / torch.from_numpy(scaling.velocity_std).float()
     )
     return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
-        torch.cat([observer, rigid_torch.rotation_to_6d(facing)], dim=-1).flatten(1),
+        beings(observer, facing, tracks.companions, new_from_old),
         past.flatten(1),
         held,
         ((torch.rand(size, generator=generator) >= augmentation.hide_bones) & (side > 0)).float(),

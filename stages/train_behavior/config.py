@@ -108,7 +108,7 @@ class Config:
     """How goal and path condition: by a second UNet, or, as an ablation, as one more part of the perception
     code."""
     horizon_s: float = 5.6
-    """Seconds that are predicted; a multiple of 0.4 s. The page needs 5.6 s."""
+    """Seconds that are predicted; a multiple of four frames (0.4 s at 10 Hz). The page needs 5.6 s."""
     export: bool = True
     """Write what the simulator needs (ONNX, golden plan, pictures); off for the trials of the tables."""
     scene: SceneEncoder = "pillars"

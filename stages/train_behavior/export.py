@@ -18,11 +18,11 @@ from safetensors.torch import save_file
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.encoders import POSE_CHANNELS
-from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contract, observer_channels
+from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contract, other_channels
 from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
-from pipeline.behavior.trajectories import PAST, UP
+from pipeline.behavior.trajectories import UP
 from pipeline.geometry import rigid
 
 NETWORKS = ("perception", "goal", "path", "body")
@@ -116,8 +116,8 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
         case "perception":
             grid = {
                 "scene_grid": (a.scene_channels, *GRID_SHAPE),
-                "observer_past": (PAST * POSE_CHANNELS,),
-                "past": (PAST * (9 + 6 * a.bones),),
+                "others": (1, a.past, POSE_CHANNELS + 1),
+                "past": (a.past * (9 + 6 * a.bones),),
             }
             return grid | {"keep": (3,)}, "condition"
         case "goal":
@@ -142,13 +142,12 @@ def golden_observation(a: Architecture) -> Observation:
         )
 
     observer = np.stack(
-        [np.linspace(0.5, 0.2, PAST), np.full(PAST, 1.2), np.linspace(1.8, 1.1, PAST)], axis=-1
+        [np.linspace(0.5, 0.2, a.past), np.full(a.past, 1.2), np.linspace(1.8, 1.1, a.past)], axis=-1
     )
     facing = rigid.look_at(observer, np.zeros(3), UP)
     scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
-    return Observation(
-        scene, observer_channels(facing[None]), wave(PAST * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
-    )
+    past = wave(a.past * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
+    return Observation(scene, other_channels(facing[None]), past)
 
 
 def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
@@ -170,7 +169,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
         "input": {
             "scene_grid": "scene_grid.flat[i] = 0.25 sin(0.01 i)",
             "past": "past.flat[i] = 0.1 sin(0.1 i)",
-            "observer_past": _plain(observation.observer_past),
+            "others": _plain(observation.others),
             "keep": [1, 1, 1],
         },
         "sampling": {
@@ -196,8 +195,9 @@ def difference(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int,
     """
     rng = np.random.default_rng(0)
     drawn = {name: rng.standard_normal((4, *shape), dtype=np.float32) for name, shape in inputs.items()}
-    for name in {"past", "observer_past"} & drawn.keys():
-        drawn[name][-1] = np.tile(drawn[name][-1].reshape(PAST, -1)[0], PAST)
+    for name in {"past", "others"} & drawn.keys():
+        still = drawn[name][-1].reshape(inputs["others"][1], -1)
+        drawn[name][-1] = np.broadcast_to(still[:1], still.shape).reshape(drawn[name][-1].shape)
     if "keep" in drawn:
         drawn["keep"][-1] = 1
     session = onnxruntime.InferenceSession(path, _one_thread(), providers=["CPUExecutionProvider"])

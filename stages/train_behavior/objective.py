@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from pipeline.behavior.diffusion import Schedule, noised
 from pipeline.behavior.model import ROOT_CHANNELS, BehaviorNets
+from pipeline.behavior.trajectories import ABSENT_M
 from pipeline.core import distributed
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig, Weighting
@@ -108,18 +109,35 @@ def perceive(
     generator: torch.Generator,
     joint: Float[Tensor, "batch 1"],
 ) -> Float[Tensor, "batch condition"]:
-    """Encode a batch, dropping scene, observer and past independently, and all where ``joint`` is 0.
+    """Encode a batch, dropping scene, others and past independently, and all where ``joint`` is 0.
 
     What is dropped is so for every member alike.
     """
     keep = keep_mask(len(batch.goal), 3, generator).to(batch.goal.device) * joint
     keep[:, 1] = torch.maximum(keep[:, 1], batch.oversampled.float())
+    others = with_some_absent(batch.others, batch.oversampled, generator)
     readings = [
-        member.encode_training(batch.scene, batch.observer_past, batch.past, keep, batch.bones_keep)
+        member.encode_training(batch.scene, others, batch.past, keep, batch.bones_keep)
         for member in nets.perception
     ]
     readings = [(chart, nn.functional.dropout(code, objective.code_dropout)) for chart, code in readings]
     return nets.perception.condition(readings, nets.perception.now(batch.held, keep[:, 2]))
+
+
+def with_some_absent(
+    others: Float[Tensor, "batch other past_frame 10"],
+    oversampled: Bool[Tensor, "batch"],
+    generator: torch.Generator,
+) -> Float[Tensor, "batch other past_frame 10"]:
+    """Return the others with each of several left out at times, so that each can be guided on its own."""
+    size, count = others.shape[:2]
+    if count == 1:  # who is left out with the condition as a whole
+        return others
+    present = keep_mask(size, count, generator).to(others.device)
+    present[:, 0] = torch.maximum(present[:, 0], oversampled.float())
+    absent = torch.zeros_like(others[0, 0, 0])
+    absent[0] = ABSENT_M
+    return torch.where(present[..., None, None] > 0, others, absent)
 
 
 def goal_error(

@@ -38,7 +38,9 @@ def architecture_for(config: Config, data: BehaviorData, scenes: Scenes) -> Arch
         unet_width=config.unet_width,
         family=config.family,
         control=config.control,
+        past=data.past,
         future=data.future,
+        rate_hz=data.rate_hz,
         ensemble_size=config.ensemble_size,
         map_lookup=config.map_lookup,
     )

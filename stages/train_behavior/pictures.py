@@ -7,7 +7,6 @@ from jaxtyping import Float, Shaped, UInt8
 from matplotlib.figure import Figure
 
 from pipeline.behavior.config import Guided, PlanSamplingConfig
-from pipeline.behavior.encoders import POSE_CHANNELS
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.planning import Observation, Sampler
 from pipeline.behavior.scenes import Scenes
@@ -23,7 +22,7 @@ GUIDED_PATHS = 12
 PANEL_IN = 2.6, 2.3
 WINDOW_HALF_M = 3.0
 CAPTIONS = {
-    "goals": "Sampled goals (orange) with conditions removed; animal blue, observer green.",
+    "goals": "Sampled goals (orange) with conditions removed; animal blue, others green.",
     "guidance": "The same with an observer who walks up from ahead; same noise at each interactivity.",
     "paths": "Sampled paths with and without the scene.",
     "guided_paths": "Paths to a given goal (blue dot), from dark to light in time, by scale of guidance "
@@ -48,7 +47,8 @@ def pictures(
     }
     strength = {f"interactivity {s:g}": PlanSamplingConfig(guidance=s) for s in (0.0, 0.5, 1.0)}
     with_scene = {name: removed[name] for name in ("all", "no scene")}
-    close = replace(some, observer_past=np.tile(approach(SIDES[0], 0.8, 1.0), (len(chosen), 1)))
+    coming = approach(SIDES[0], 0.8, 1.0, frames=some.others.shape[2], rate_hz=sampler.scaling.rate_hz)
+    close = replace(some, others=np.tile(coming, (len(chosen), 1, 1, 1)))
     return captioned(
         CAPTIONS,
         goals=fans(rooms, sampler, some, frame, removed, seed),
@@ -98,8 +98,7 @@ def fans(
         )
         goals = goals.reshape(len(frame), count, 3)
         for column, axis in enumerate(row):
-            seen = observation.observer_past[column].reshape(-1, POSE_CHANNELS)[:, :3]
-            rooms[column].window(axis, frame[column], seen, goals[column])
+            rooms[column].window(axis, frame[column], observation.others[column, :, :, :3], goals[column])
             if lines is not None:
                 rooms[column].lines(axis, frame[column], lines[column])
         row[0].set_ylabel(name)
@@ -152,13 +151,14 @@ class RoomMap:
         self,
         axis,
         frame: Float[np.ndarray, "4 4"],
-        observer: Float[np.ndarray, "frame 3"],
+        others: Float[np.ndarray, "other frame 3"],
         goals: Float[np.ndarray, "sample 3"],
     ) -> None:
-        goal, seen = rigid.apply(frame, goals), rigid.apply(frame, observer)
+        goal = rigid.apply(frame, goals)
         axis.scatter(goal[:, 0], goal[:, 2], s=5, color=plots.ORANGE, alpha=0.7)
-        axis.plot(seen[:, 0], seen[:, 2], color=plots.GREEN, linewidth=2)
-        axis.scatter(*seen[-1, [0, 2]], color=plots.GREEN, s=25)
+        for seen in rigid.apply(frame, others):
+            axis.plot(seen[:, 0], seen[:, 2], color=plots.GREEN, linewidth=2)
+            axis.scatter(*seen[-1, [0, 2]], color=plots.GREEN, s=25)
         axis.quiver(
             *frame[[0, 2], 3],
             *(frame[[0, 2], 2] * [1, 1]),

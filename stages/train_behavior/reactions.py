@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.behavior.config import PlanSamplingConfig
-from pipeline.behavior.model import Architecture, observer_channels
+from pipeline.behavior.model import Architecture, other_channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, observe
 from pipeline.behavior.scenes import Scenes
@@ -63,14 +63,19 @@ def moments(
 
 
 def approach(
-    side: Float[np.ndarray, "3"], distance_m: float, speed_m_s: float
-) -> Float[np.ndarray, "observer_past"]:
+    side: Float[np.ndarray, "3"],
+    distance_m: float,
+    speed_m_s: float,
+    *,
+    frames: int = PAST,
+    rate_hz: float = RATE_HZ,
+) -> Float[np.ndarray, "1 past_frame 10"]:
     """Return an observer's past in the ego frame: it walks up from ``side``, is now ``distance_m`` away, and
     looks at the animal.
     """
-    before_s = np.arange(PAST - 1, -1, -1)[:, None] / RATE_HZ
+    before_s = np.arange(frames - 1, -1, -1)[:, None] / rate_hz
     eye = (distance_m + speed_m_s * before_s) * side + UP
-    return observer_channels(rigid.look_at(eye, np.zeros(3), UP)[None])[0]
+    return other_channels(rigid.look_at(eye, np.zeros(3), UP)[None])[0]
 
 
 def measure(
@@ -85,20 +90,24 @@ def measure(
     """Sample goals of some windows under scripted observers, always with the same noise."""
     sampling = PlanSamplingConfig(avoid_solid=False)
 
+    how = {"frames": observation.others.shape[2], "rate_hz": sampler.scaling.rate_hz}
+
     def mean_goals(
-        observer: Float[np.ndarray, "observer_past"], sampling: PlanSamplingConfig
+        observer: Float[np.ndarray, "1 past_frame 10"], sampling: PlanSamplingConfig
     ) -> Float[np.ndarray, "window 3"]:
-        seen = replace(observation, observer_past=np.tile(observer, (len(observation), 1)))
+        seen = replace(observation, others=np.tile(observer, (len(observation), 1, 1, 1)))
         goals = sampler.goals(sampler.codes(seen, sampling, SAMPLES), sampling, np.random.default_rng(seed))
         return goals.reshape(len(observation), SAMPLES, 3).mean(1)
 
-    none = mean_goals(approach(SIDES[0], 1.0, 0.0), replace(sampling, observer=False))
-    shift = np.stack([mean_goals(approach(side, distance_m, speed_m_s), sampling) - none for side in SIDES])
+    none = mean_goals(approach(SIDES[0], 1.0, 0.0, **how), replace(sampling, observer=False))
+    shift = np.stack(
+        [mean_goals(approach(side, distance_m, speed_m_s, **how), sampling) - none for side in SIDES]
+    )
     away = -np.einsum("swc,sc->sw", shift, SIDES)
     opposite = np.roll(shift, -2, axis=0)
     reversal = -np.einsum("swc,sc->sw", shift - opposite, SIDES)
-    far = mean_goals(approach(SIDES[0], radius_m, 0.0), sampling)
-    farther = mean_goals(approach(SIDES[0], 2 * radius_m, 0.0), sampling)
+    far = mean_goals(approach(SIDES[0], radius_m, 0.0, **how), sampling)
+    farther = mean_goals(approach(SIDES[0], 2 * radius_m, 0.0, **how), sampling)
     return Reactions(
         away_m=float(away.mean()),
         away_share=float((away > 0).mean()),

@@ -1,7 +1,7 @@
 """Refuse at once what training would find out too late."""
 
 from pipeline.behavior.model import Architecture
-from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData
 from pipeline.core.errors import InputError
 from stages.train_behavior.config import Config
 
@@ -31,6 +31,13 @@ def check_settings(config: Config, data: BehaviorData, architecture: Architectur
             "[train_behavior]: export",
             "set it to false; `make behavior-tables` judges such models",
         )
+    if config.export and data.rate_hz != RATE_HZ:
+        raise InputError(
+            "REC-002",
+            f"plans of {data.rate_hz:g} frames a second cannot be played: page and simulator have {RATE_HZ}",
+            "[train_behavior]: export",
+            "set it to false, or leave out `rate_hz` of [slice_behavior]",
+        )
     if staged and optimization.steps <= optimization.goal_steps:
         what = (
             f"{optimization.goal_steps} steps of goals leave none of {optimization.steps} to paths and bodies"
@@ -42,7 +49,7 @@ def check_settings(config: Config, data: BehaviorData, architecture: Architectur
             "take more steps, or fewer `goal_steps`",
         )
     if not len(data.indices(TRAIN)):
-        what = f"no {(PAST + data.future) / RATE_HZ:.1f} s of uninterrupted motion to learn from"
+        what = f"no {(data.past + data.future) / data.rate_hz:.1f} s of uninterrupted motion to learn from"
         raise InputError(
             "BEH-001",
             what,

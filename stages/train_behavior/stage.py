@@ -30,7 +30,8 @@ def run(
     Raises BEH-001, BEH-003, REC-002, ART-010.
     """
     distributed.join(device)
-    data = BehaviorData.load(inputs.behavior_data).with_horizon(frames_from_seconds(config.horizon_s))
+    data = BehaviorData.load(inputs.behavior_data)
+    data = data.with_horizon(frames_from_seconds(config.horizon_s, data.rate_hz))
     scenes = Scenes.load(inputs.behavior_data, data.videos)
     architecture = outcome.architecture_for(config, data, scenes)
     weighting = config.training.objective.weighting

@@ -72,10 +72,10 @@ def test_ddim_follows_rectified_flow_in_eulers_steps():
 
 
 def test_guidance_is_linear_in_its_scale():
-    blend = guided(lambda x, t: x + 3, lambda x, t: x + 1, 0.5)
+    blend = guided((lambda x, t: x + 3, lambda x, t: x + 1), (0.5,))
     assert blend(0.0, 0) == 2.0
-    assert guided(lambda x, t: 3.0, lambda x, t: 1.0, 1.0)(0.0, 0) == 3.0
-    assert guided(lambda x, t: 3.0, lambda x, t: 1.0, 0.0)(0.0, 0) == 1.0
+    assert guided((lambda x, t: 3.0, lambda x, t: 1.0), (1.0,))(0.0, 0) == 3.0
+    assert guided((lambda x, t: 3.0, lambda x, t: 1.0), (0.0,))(0.0, 0) == 1.0
 
 
 def test_control_enters_every_block_and_can_be_dropped():

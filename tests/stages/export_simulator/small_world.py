@@ -120,7 +120,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
     torch.manual_seed(0)
     nets, schedule = BehaviorNets(architecture), Schedule()
     (mind,) = nets.perception
-    optimizer = torch.optim.Adam([*mind.observer.parameters(), *nets.goal.parameters()], 3e-3)
+    optimizer = torch.optim.Adam([*mind.others.parameters(), *nets.goal.parameters()], 3e-3)
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
         place = (torch.rand(128, 1, 3) * 2 - 1) * torch.tensor([3.0, 0.3, 3.0]) + torch.tensor(
@@ -132,12 +132,13 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
         observer = (
             place + level[:, None] / distance[:, None] * pace_m_s * torch.arange(0.7, -0.05, -0.1)[:, None]
         )
+        person = torch.nn.functional.pad(observer, (0, 7))
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
         chart = torch.randn(128, architecture.condition_length - architecture.code_length)
         condition = torch.cat(
-            [chart, elsewhere[0], mind.observer(observer.flatten(1), torch.ones(128)), elsewhere[1]], dim=-1
+            [chart, elsewhere[0], mind.others(person[:, None], torch.ones(128)), elsewhere[1]], dim=-1
         )
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)

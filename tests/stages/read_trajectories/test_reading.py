@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from pipeline.behavior.trajectories import ABSENT_M
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
 from stages.read_trajectories import captured, pictures
 from stages.read_trajectories.config import Config
-from stages.read_trajectories.motion import ABSENT_OBSERVER_M, CLIP_GAP_S
+from stages.read_trajectories.motion import CLIP_GAP_S
 from stages.read_trajectories.reading import read
 
 READING = Config(root_joint=0, front_joint=2)
@@ -25,7 +26,7 @@ def test_a_table_becomes_poses_id_by_id(tmp_path):
     assert motion.timestamp_s[5] - motion.timestamp_s[4] == pytest.approx(CLIP_GAP_S)
     np.testing.assert_allclose(motion.world_from_agent[4, :3, 3], [0.04, 0.2, -0.08])
     np.testing.assert_allclose(motion.world_from_agent[4, :3, 2], [np.sin(0.4), 0, np.cos(0.4)], atol=1e-12)
-    assert (motion.world_from_camera[:, 0, 3] == ABSENT_OBSERVER_M).all()
+    assert (motion.world_from_camera[:, 0, 3] == ABSENT_M).all()
 
 
 def test_stretches_days_apart_become_clips_of_one_recording(tmp_path):
@@ -44,7 +45,29 @@ def test_unseen_rows_and_observers_are_kept_apart(tmp_path):
     )
     assert motion.arrays()["agent_visible"].tolist() == [True, False, True]
     np.testing.assert_allclose(motion.world_from_camera[0, :3, 3], [3, 1, 4])
-    assert motion.world_from_camera[2, 0, 3] == ABSENT_OBSERVER_M
+    assert motion.world_from_camera[2, 0, 3] == ABSENT_M
+
+
+def test_beings_of_a_table_with_kinds_share_its_clock(tmp_path):
+    def rows(name, kind, begin, end, x):
+        return [f"{name},{kind},{0.1 * i:.1f},{x},0,{0.01 * i:.2f},0" for i in range(begin, end)]
+
+    lines = rows("cat", "animal", 0, 100, 0) + rows("dog", "animal", 20, 60, 1)
+    lines += rows("ann", "person", 0, 30, 2) + rows("bob", "person", 90, 100, 3)
+    motion = read(table(tmp_path / "t.csv", lines, "id,kind,time,x,y,z,heading"), READING)
+    assert len(motion.timestamp_s) == 140, "people are not learned from"
+    cat, dog = motion.companions[:100], motion.companions[100:]
+    assert cat.shape[1] == 2, "bob comes long after ann has gone and takes her column"
+    present = {float(x): np.flatnonzero((cat[..., 0] == x).any(1)) for x in (1, 2, 3)}
+    assert [(frames[0], frames[-1]) for frames in present.values()] == [(20, 59), (0, 29), (90, 99)]
+    ann = cat[:30][cat[:30, :, 0] == 2]
+    np.testing.assert_allclose(ann[:, 2], 0.01 * np.arange(30), atol=1e-6)
+    assert (ann[:, 3] == 0).all() and (cat[cat[..., 0] == 1][:, 3] == 1).all()
+    assert np.isfinite(dog[:, 0]).all() and (dog[:, :, 0] == 0).any(1).all()
+    people = read(table(tmp_path / "p.csv", lines[140:], "id,kind,time,x,y,z,heading"), READING)
+    assert len(people.timestamp_s) == 40, "of people alone, people are learned from"
+    with pytest.raises(InputError, match="kind"):
+        read(table(tmp_path / "w.csv", ["a,tree,0,0,0,0,0"], "id,kind,time,x,y,z,heading"), READING)
 
 
 def test_an_obstacle_map_stands_where_it_says(tmp_path):

@@ -121,7 +121,7 @@ def test_flight_is_counted_as_the_animal_does_it():
 
 def test_a_gaussian_draws_what_its_networks_tell():
     class Told:
-        def perceive(self, grid, observer, past, keep):
+        def perceive(self, grid, others, past, keep):
             return np.zeros((len(past), 1), np.float32)
 
         def goal(self, x, t, condition):
@@ -145,5 +145,7 @@ def test_a_gaussian_draws_what_its_networks_tell():
 
 def behavior_observation():
     return Observation(
-        np.zeros((1, 16, 64, 8, 64), np.float32), np.zeros((1, 24), np.float32), np.zeros((1, 72), np.float32)
+        np.zeros((1, 16, 64, 8, 64), np.float32),
+        np.zeros((1, 1, 8, 10), np.float32),
+        np.zeros((1, 72), np.float32),
     )

@@ -43,6 +43,18 @@ def test_uneven_times_become_even_without_error():
     )
 
 
+def test_companions_are_resampled_where_they_are():
+    motion = jittered(np.random.default_rng(0))
+    being = np.full((len(motion.timestamp_s), 2, 4), np.nan)
+    being[50:100, 1] = np.stack([0.3 * motion.timestamp_s[50:100], *np.ones((3, 50))], -1)
+    trajectory = trajectory_from_motion(replace(motion, companions=being), **OPTIONS)
+    there = np.isfinite(trajectory.companions).all(-1)
+    assert not there[:, 0].any() and there[51:99, 1].all() and there[:, 1].sum() <= 51
+    found = trajectory.companions[there[:, 1], 1]
+    np.testing.assert_allclose(found[1:-1, 0], 0.3 * trajectory.timestamp_s[there[:, 1]][1:-1], atol=1e-5)
+    assert (found[:, 3] == 1).all()
+
+
 def test_only_short_gaps_are_bridged_and_doubtful_frames_are_gaps():
     motion = jittered(np.random.default_rng(0))
     agent, confidence, visible = (

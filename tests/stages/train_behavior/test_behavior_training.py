@@ -100,15 +100,12 @@ def test_turning_and_mirroring_move_everything_together(windows):
             )
             torch.testing.assert_close(ours[:, 1], theirs[:, 1])
         between = [
-            b.observer_past[:, -9:-6]
+            b.others[:, 0, -1, :3]
             - torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal(b.goal.numpy())).float()
             for b in (plain, moved)
         ]
         torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
-        facing = [
-            rigid_torch.rotation_from_6d(b.observer_past.unflatten(1, (8, 9))[..., 3:])
-            for b in (plain, moved)
-        ]
+        facing = [rigid_torch.rotation_from_6d(b.others[:, 0, :, 3:9]) for b in (plain, moved)]
         turned = [each[:, 0].mT @ each[:, -1] for each in facing]
         for each in turned:
             torch.testing.assert_close(each @ each.mT, torch.eye(3).expand(16, 3, 3), atol=1e-4, rtol=0)
@@ -174,7 +171,7 @@ def test_a_lapse_tilts_and_bends_what_is_remembered_and_nothing_else(windows):
     (plain, _), (with_posture_noise, _) = (
         drawn(windows, replace(PLAIN, posture_offset=share)) for share in (0.0, 1.0)
     )
-    for name in ("scene", "observer_past", "goal", "path", "body"):
+    for name in ("scene", "others", "goal", "path", "body"):
         torch.testing.assert_close(getattr(with_posture_noise, name), getattr(plain, name))
     before, after = (batch.past.unflatten(1, (PAST, -1)) for batch in (plain, with_posture_noise))
     torch.testing.assert_close(after[:, -3:], with_posture_noise.held)
@@ -361,8 +358,8 @@ class Timid:
     spread.
     """
 
-    def perceive(self, scene_grid, observer_past, past, keep):
-        position = observer_past[:, [-9, -7]] * keep[:, 1:2]
+    def perceive(self, scene_grid, others, past, keep):
+        position = others[:, 0, -1, :3:2] * keep[:, 1:2]
         distance = np.linalg.norm(position, axis=1, keepdims=True)
         return np.where((distance > 0) & (distance < 4), -position / np.maximum(distance, 1e-6), 0).astype(
             np.float32

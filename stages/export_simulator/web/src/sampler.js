@@ -42,7 +42,7 @@ export class Sampler {
           observation.sceneGrid,
           [1, this.contract.architecture.scene_channels, ...this.contract.grid.shape],
         ],
-        observer_past: [observation.observerPast, [1, observation.observerPast.length]],
+        others: [observation.others, [1, 1, this.contract.past_frames, 10]],
         past: [observation.past, [1, observation.past.length]],
         keep: [Float32Array.of(keep.scene, observer, keep.past), [1, 3]],
       });
@@ -423,7 +423,7 @@ export class Sampler {
     const observation = {
       sceneGrid: wave(architecture.scene_channels * grid.shape.reduce((a, b) => a * b), 0.25, 0.01),
       past: wave(count * (9 + 6 * architecture.bones), 0.1, 0.1),
-      observerPast: Float32Array.from(golden.input.observer_past),
+      others: Float32Array.from(golden.input.others.flat(Infinity)),
     };
     const [scene, observer, past] = golden.input.keep;
     const noise = (name) => Float32Array.from(golden.noise[name].flat());

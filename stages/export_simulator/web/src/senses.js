@@ -19,6 +19,7 @@ import {
 } from './rigid.js';
 
 const UPRIGHT = 0.2;
+const PERSON = 0; // kind of the only other that the page has
 const ROOT_CHANNELS = 6;
 const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
@@ -42,7 +43,9 @@ export class Senses {
     return {
       frame,
       sceneGrid: this.around(frame),
-      observerPast: Float32Array.from(observer.flatMap((row) => poseChannels(compose(egoFromWorld, row)))),
+      others: Float32Array.from(
+        observer.flatMap((row) => [...poseChannels(compose(egoFromWorld, row)), PERSON]),
+      ),
       past: Float32Array.from(past.flatMap((rows) => this.pastChannels(egoFromWorld, rows))),
     };
   }

@@ -1,0 +1,177 @@
+"""A set of others: order plays no part, nobody is as good as somebody far away, and nothing is known early."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.diffusion import Schedule, guided
+from pipeline.behavior.encoders import OthersEncoder
+from pipeline.behavior.model import BehaviorNets
+from pipeline.behavior.planning import Sampler, TorchNetworks, observe
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.trajectories import ABSENT_M, KINDS, MOST_COMPANIONS, PAST, BehaviorData, nearest
+from stages.train_behavior.objective import with_some_absent
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.stages.simulate.test_simulator import scaling
+
+ANIMAL = float(KINDS.index("animal"))
+
+
+@pytest.fixture
+def encoder():
+    torch.manual_seed(0)
+    net = OthersEncoder(8, 16, 8, 4.0, 10.0)
+    for parameter in (net.animal, net.attention):
+        torch.nn.init.normal_(parameter)
+    return net.eval()
+
+
+def beings(count, seed=0):
+    """Beings within two metres of the agent, every other one an animal."""
+    drawn = torch.randn(2, count, 8, 10, generator=torch.Generator().manual_seed(seed)) * 0.5
+    drawn[..., 9] = torch.arange(count)[:, None] % 2
+    return drawn
+
+
+def test_order_plays_no_part_and_everybody_counts(encoder):
+    set_of_four, keep = beings(4), torch.ones(2)
+    code = encoder(set_of_four, keep)
+    torch.testing.assert_close(encoder(set_of_four[:, [2, 0, 3, 1]], keep), code)
+    for gone in range(4):
+        left = [number for number in range(4) if number != gone]
+        assert (encoder(set_of_four[:, left], keep) - code).abs().max() > 1e-3
+
+
+def test_somebody_absent_is_as_good_as_nobody(encoder):
+    alone, keep = beings(1), torch.ones(2)
+    absent = torch.zeros(2, 3, 8, 10)
+    absent[..., 0], absent[:, 1:, :, 9] = ABSENT_M, ANIMAL
+    torch.testing.assert_close(encoder(torch.cat([alone, absent], 1), keep), encoder(alone, keep))
+    torch.testing.assert_close(encoder(absent, keep), encoder(alone, torch.zeros(2)))
+    torch.testing.assert_close(encoder(beings(3), torch.zeros(2)), encoder(alone, torch.zeros(2)))
+
+
+def test_who_leaves_fades_out(encoder):
+    pair, keep = beings(2), torch.ones(2)
+    pair[:, 1, :, :3] = torch.tensor([0.0, 0.0, 1.0])
+    inside, outside = pair.clone(), pair.clone()
+    inside[:, 1, :, 2], outside[:, 1, :, 2] = 3.999, 4.001
+    assert (encoder(pair, keep) - encoder(outside, keep)).abs().max() > 1e-2
+    torch.testing.assert_close(encoder(inside, keep), encoder(outside, keep), atol=2e-3, rtol=0)
+
+
+def test_an_animal_is_not_a_person(encoder):
+    person = beings(1)
+    animal = person.clone()
+    animal[..., 9] = ANIMAL
+    assert (encoder(person, torch.ones(2)) - encoder(animal, torch.ones(2))).abs().max() > 1e-2
+
+
+def test_the_nearest_are_perceived():
+    rng = np.random.default_rng(0)
+    others = rng.uniform(-5, 5, (3, MOST_COMPANIONS + 5, PAST, 4))
+    others[0] = np.nan
+    others[1, 3, -1] = np.nan  # has gone
+    others[2, 4, :-1] = np.nan  # has just come
+    others[2, 4, -1, :3] = 0.1
+    agent = np.zeros((3, 3))
+    some = nearest(others, agent)
+    assert some.shape[1] == MOST_COMPANIONS and np.isfinite(some).all()
+    assert (some[0, :, :, 0] == ABSENT_M).all()
+    assert not (some[1] == others[1, 3, 0]).all(-1).any()
+    np.testing.assert_array_equal(some[2, 0], np.repeat(others[2, 4, -1:], PAST, 0))
+    away = np.linalg.norm(some[2, :, -1][:, [0, 2]], axis=1)
+    assert (np.diff(away) >= 0).all()
+
+
+def with_companions(data: BehaviorData) -> BehaviorData:
+    """Give each recording the animal of the next one as a companion, and one who is there now and then."""
+    tracks = list(data.trajectories.values())
+    trajectories = {}
+    for number, (name, track) in enumerate(data.trajectories.items()):
+        place = tracks[(number + 1) % len(tracks)].world_from_agent[:, None, :3, 3].repeat(2, axis=1)
+        kind = np.full((*place.shape[:2], 1), ANIMAL)
+        being = np.concatenate([place, kind], axis=-1)
+        being[::3, 1] = np.nan
+        trajectories[name] = replace(track, companions=being.astype(np.float32))
+    return replace(data, trajectories=trajectories)
+
+
+def test_companions_are_read_back_and_put_into_the_ego_frame(tmp_path):
+    data = with_companions(wandering())
+    data.save(tmp_path)
+    again = BehaviorData.load(tmp_path)
+    context, _ = again.windows(np.array([3, 50, 90]))
+    assert context.companions.shape == (3, 2, PAST, 4)
+    seen = observe(context, room(), REST, "yaw").others
+    between = context.companions[:, 0, -1, :3] - context.world_from_agent[:, -1, :3, 3]
+    companion = (
+        np.abs(np.linalg.norm(seen[:, 1:, -1, :3], axis=-1) - np.linalg.norm(between, axis=-1)[:, None])
+        < 1e-5
+    )
+    assert companion.any(1).all() and (seen[:, 1:, :, 9] <= ANIMAL).all()
+
+
+def test_several_are_left_out_one_by_one_but_not_an_oversampled_observer():
+    others = beings(3).repeat(200, 1, 1, 1)
+    left = with_some_absent(others, torch.ones(400, dtype=torch.bool), torch.Generator().manual_seed(0))
+    absent = left[:, :, -1, 0] == ABSENT_M
+    assert not absent[:, 0].any()
+    assert absent[:, 1:].float().mean() == pytest.approx(0.1, abs=0.03)
+    one = others[:, :1]
+    assert with_some_absent(one, torch.zeros(400, dtype=torch.bool), torch.Generator()) is one
+
+
+def test_each_of_two_kinds_of_others_has_a_scale_of_its_own():
+    denoisers = [lambda x, t, e=e: x + e for e in (7.0, 3.0, 1.0)]  # observer +4, companions +2, alone 1
+    for observer, companions in ((1.0, 1.0), (0.5, 1.0), (1.0, 0.0), (0.3, 0.7), (0.0, 0.0)):
+        expected = 1 + 2 * companions + 4 * observer
+        assert guided(denoisers, (observer, companions))(0.0, 0) == pytest.approx(expected)
+
+
+@pytest.fixture(scope="module")
+def sampler():
+    torch.manual_seed(0)
+    nets = BehaviorNets(ARCHITECTURE)
+    attentive = [parameter for member in nets.perception for parameter in member.others.parameters()]
+    for parameter in (*attentive, *nets.goal.parameters()):
+        torch.nn.init.normal_(parameter, std=0.3)
+    return Sampler(TorchNetworks(nets), Schedule(), scaling())
+
+
+def test_guidance_of_companions_changes_plans(sampler):
+    context, _ = with_companions(wandering()).windows(np.array([3, 50]))
+    seen = observe(context, room(), REST, "yaw")
+    plain = PlanSamplingConfig(goal_steps=4, sequence_steps=2, avoid_solid=False)
+    goals = [
+        sampler.goals(sampler.codes(seen, how), how, np.random.default_rng(0))
+        for how in (plain, replace(plain, companions_guidance=0.0), replace(plain, guidance=0.0))
+    ]
+    assert np.abs(goals[0] - goals[1]).max() > 1e-4
+    assert np.abs(goals[0] - goals[2]).max() > 1e-4
+
+
+def test_animals_of_one_life_perceive_each_other_and_keep_clear(sampler):
+    volume = room()
+    scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
+    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
+    flock = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    context, _ = wandering().windows(np.array([0, 40, 0, 40]))
+    context = replace(context, video=None)
+    far = np.full((4, 3), ABSENT_M)
+    context = replace(context, observer_world=np.repeat(far[:, None], PAST, 1))
+    plans = []
+    for life in (None, np.array([0, 1, 2, 3]), np.array([0, 0, 1, 1])):
+        flock.begin(context, np.random.default_rng(0), life)
+        plans.append(flock.plan.root.copy())
+    np.testing.assert_array_equal(plans[0], plans[1])
+    assert np.abs(plans[0] - plans[2]).max() > 1e-3
+    start = np.linalg.norm(context.world_from_agent[0, -1, :3, 3] - context.world_from_agent[1, -1, :3, 3])
+    assert start > 0.4
+    for _ in range(60):
+        flock.step(far)
+    assert flock.plans_drawn > 4
