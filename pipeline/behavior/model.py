@@ -346,8 +346,8 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
         shape = document["architecture"]
         architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
         scaling = Scaling(
-            **{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()}
-            | {"rate_hz": document["rate_hz"]}
+            **{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()},
+            rate_hz=float(document["rate_hz"]),
         )
         schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
         rest = np.asarray(document["agent_from_bone_rest"], np.float64)

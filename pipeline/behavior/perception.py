@@ -163,7 +163,7 @@ class VolumeScene(nn.Module):
     def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> SceneEncoding:
         for convolution, shortcut in zip(self.convolutions, self.shortcuts, strict=True):
             grid = nn.functional.silu(convolution(grid)) + shortcut(grid)
-        return grid.new_zeros(len(grid), 0), self.out(grid.mean((2, 3, 4)))
+        return grid.new_zeros(grid.shape[0], 0), self.out(grid.mean((2, 3, 4)))
 
     encode = forward
 

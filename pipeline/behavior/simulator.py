@@ -245,7 +245,7 @@ class AnimalBatch:
         others, clear_world = self._others_now()[some], rigid.apply(frame, path)
         for column in reversed(range(others.shape[1])):
             being = others[:, column]
-            near = np.isfinite(being).all(1)
+            near = np.asarray(np.isfinite(being).all(1))
             if near.any():
                 far = start_world + np.array([ABSENT_M, 0.0, 0.0])
                 clear_world = around_person(

@@ -63,8 +63,8 @@ class Context:
 
     def __getitem__(self, index: slice | np.ndarray) -> "Context":
         """Return some of the windows."""
-        arrays = (getattr(self, field.name) for field in fields(self))
-        return Context(*(None if array is None else array[index] for array in arrays))
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: array[index] for name, array in arrays.items() if array is not None})
 
     def __len__(self) -> int:
         return len(self.world_from_agent)
@@ -142,7 +142,8 @@ class BehaviorData:
         names = ("timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "valid")
         trajectories = {
             video: Trajectory(
-                *(tracks[f"{video}/{name}"] for name in names), tracks.get(f"{video}/companions")
+                **{name: tracks[f"{video}/{name}"] for name in names},
+                companions=tracks.get(f"{video}/companions"),
             )
             for video in videos
         }
@@ -173,9 +174,9 @@ class BehaviorData:
             start=self.start,
             split=self.split,
             videos=np.array(self.videos, np.str_),
-            future=np.int64(self.future),
-            past=np.int64(self.past),
-            rate_hz=np.float64(self.rate_hz),
+            future=np.array(self.future, np.int64),
+            past=np.array(self.past, np.int64),
+            rate_hz=np.array(self.rate_hz),
         )
 
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
@@ -277,6 +278,6 @@ def nearest(
     for frame in range(some.shape[2] - 2, -1, -1):
         unknown = np.isnan(some[:, :, frame]).any(-1)
         some[:, :, frame][unknown] = some[:, :, frame + 1][unknown]
-    absent = np.isnan(some[:, :, -1]).any(-1)
+    absent = np.asarray(np.isnan(some[:, :, -1]).any(-1))
     far = np.pad(agent + np.array([ABSENT_M, 0.0, 0.0]), ((0, 0), (0, 1)))
     return np.where(absent[..., None, None], far[:, None, None], some)

@@ -243,8 +243,15 @@ def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
     }
 
 
-def test_a_model_that_reads_pointwise_is_written_and_read(data, tmp_path):
-    shape = replace(ARCHITECTURE, map_lookup="pointwise")
+@pytest.mark.parametrize(
+    "shape",
+    [
+        replace(ARCHITECTURE, map_lookup="pointwise"),
+        replace(ARCHITECTURE, scene="volume", observed_past="poses"),
+    ],
+    ids=["pointwise", "paper"],
+)
+def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shape):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8))
     fitted = train(data, Scenes.of(room()), shape, Schedule(course="rectified"), settings, seed=0)
     outcome.write_trained(tmp_path, fitted, shape, Schedule(course="rectified"), REST)
