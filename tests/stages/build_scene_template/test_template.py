@@ -58,7 +58,7 @@ def test_frames_are_aligned_with_as_many_points_as_memory_may_hold(clip, monkeyp
     monkeypatch.setattr(fuse.depth_scans.SurfaceMap, "correspondences", counted)
     start = clip.truth @ rigid.exp(np.random.default_rng(0).normal(0, 0.01, (len(clip), 6)))
     monkeypatch.setattr(fuse, "ALIGN_POINTS", 48 * 60)
-    _, gap = fuse.align_frames(clip, clip.caster.mesh, start, FusionConfig(), RefinementConfig())
+    _, gap = fuse.align_frames(clip, clip.caster.mesh, start, FusionConfig())
     assert max(taken) <= 48 * 60
     assert np.nanmedian(gap) < 0.006, "metres; the depth noise is 4 mm, the cameras began 1.6 cm off"
 
