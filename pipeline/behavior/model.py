@@ -346,7 +346,11 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
         shape = document["architecture"]
         architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
         scaling = Scaling(
-            **{name: np.asarray(value, np.float64) for name, value in document["scaling"].items()},
+            **{
+                name: np.asarray(value, np.float64)
+                for name, value in document["scaling"].items()
+                if name != "rate_hz"
+            },
             rate_hz=float(document["rate_hz"]),
         )
         schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
