@@ -135,24 +135,30 @@ class AnimalBatch:
         """Let every plan be dropped as soon as another one may follow it."""
         self.planned_others = np.full_like(self.planned_others, np.inf)
 
+    def _together(self, some: Int[np.ndarray, "some"]) -> Bool[np.ndarray, "some animal"] | None:
+        """Return which animals are in the life of ``some``, but themselves; None where each is alone."""
+        if self.life is None:
+            return None
+        return (self.life[some][:, None] == self.life) & (some[:, None] != np.arange(len(self.life)))
+
     def _companions(
         self, some: Int[np.ndarray, "some"]
     ) -> Float[np.ndarray, "some animal past_frame 4"] | None:
         """Return past positions of all animals, NaN those that are not in the life of ``some``."""
-        if self.life is None:
+        together = self._together(some)
+        if together is None:
             return None
-        together = (self.life[some][:, None] == self.life) & (some[:, None] != np.arange(len(self.life)))
         root = np.concatenate([frame.root[..., :3, 3] for frame in self.past], axis=1)
         beings = np.pad(root, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
         return np.where(together[..., None, None], beings, np.nan)
 
     def _others_now(self) -> Float[np.ndarray, "animal other 3"]:
         """Return where the others are, the observer first; NaN those that are not there."""
-        observer = self.observer[-1][:, None]
-        companions = self._companions(np.arange(len(observer)))
-        return (
-            observer if companions is None else np.concatenate([observer, companions[:, :, -1, :3]], axis=1)
-        )
+        observer, root = self.observer[-1][:, None], self.past[-1].root[:, 0, :3, 3]
+        together = self._together(np.arange(len(root)))
+        if together is None:
+            return observer
+        return np.concatenate([observer, np.where(together[..., None], root, np.nan)], axis=1)
 
     def _due(self) -> Bool[np.ndarray, "animal"]:
         """Return whose plan ends, or was made before one of the others moved noticeably, where these are

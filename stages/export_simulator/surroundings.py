@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.trajectories import BehaviorData
+from pipeline.behavior.trajectories import UP, BehaviorData
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.geometry import rigid
@@ -15,7 +15,6 @@ from stages.export_simulator import reading
 from stages.export_simulator.actions import SessionClip
 
 _CLIP = "take"
-_UP = np.array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -72,5 +71,5 @@ def _clip(take: Path) -> SessionClip:
     """Return a take as a motion; its observer looks at the animal."""
     names = ("timestamp_s", "world_from_agent", "agent_from_bone", "observer_world")
     time_s, agent, bones, eyes = (npz.load(take / "take.npz", names)[name] for name in names)
-    camera = [rigid.look_at(eye, at, _UP) for eye, at in zip(eyes, agent[:, :3, 3], strict=True)]
-    return SessionClip(_CLIP, time_s, agent, bones.astype(np.float64), np.stack(camera))
+    camera = rigid.look_at(eyes, agent[:, :3, 3], UP)
+    return SessionClip(_CLIP, time_s, agent, bones.astype(np.float64), camera)

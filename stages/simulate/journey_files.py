@@ -103,7 +103,7 @@ def following(
     )
     eyes = target + ASIDE_M * away + ABOVE_M
     up = np.array([0.0, 1.0, 0.0])
-    return np.stack([rigid.look_at(eye, at, up) for eye, at in zip(eyes, target, strict=True)])
+    return rigid.look_at(eyes, target, up)
 
 
 def drawn(
