@@ -62,11 +62,7 @@ class ReconstructedHome:
         """Open the home of `build/<agent>`. Raises as `load` does, ART-003 where an artifact is not there,
         ART-007 where another version wrote it.
         """
-        for name in ARTIFACTS:
-            if not (build / name).is_dir():
-                remedy = f"make it: make <agent>.{name}, of an agent with recordings"
-                raise InputError("ART-003", f"has no {name}", str(build), remedy)
-            artifact.refuse_other_version(build / name)
+        artifact.require(build, *ARTIFACTS, remedy="make <agent>.registration, of an agent with recordings")
         return cls.load(*(build / name for name in ARTIFACTS))
 
     @classmethod

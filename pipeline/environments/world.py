@@ -114,10 +114,7 @@ class AnimalWorld:
         Raises ART-003 where it lacks the model, ART-007 where another version wrote it, SIM-006 for models
         without goals, and what `pipeline.environments.other_home` raises for homes that cannot be used.
         """
-        for name in ("behavior", "behavior_data"):
-            if not (build / name).is_dir():
-                raise InputError("ART-003", f"has no {name}", str(build), "make it: make <agent>.behavior")
-            artifact.refuse_other_version(build / name)
+        artifact.require(build, "behavior", "behavior_data", remedy="make it: make <agent>.behavior")
         architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
         behavior.refuse_unplayable(architecture, str(build))
         data = BehaviorData.load(build / "behavior_data")

@@ -100,6 +100,16 @@ def refuse_other_version(folder: Path) -> None:
         raise InputError("ART-007", what, str(folder), MAKE_AGAIN)
 
 
+def require(build: Path, *names: str, remedy: str) -> None:
+    """Raise `InputError` ART-003 with ``remedy`` where the folder `build` lacks one of the artifacts
+    ``names``, ART-007 where another version wrote it.
+    """
+    for name in names:
+        if not (build / name).is_dir():
+            raise InputError("ART-003", f"has no {name}", str(build), remedy)
+        refuse_other_version(build / name)
+
+
 @contextlib.contextmanager
 def create(
     out: Path, *, stage: str, config: Mapping[str, Any], inputs: Mapping[str, str], key: str | None = None

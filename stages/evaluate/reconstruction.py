@@ -101,8 +101,9 @@ def held_out_metrics(
     few = iter(heldout.thinned([shot for _, shots in seen for shot in shots], heldout.RENDERED_PIXELS))
     for session, shots in seen:
         motion = reading.read_motion(folders.reconstruction, session)
-        by_fields += drawn_by_fields(folders, session, motion, shots, device)
-        rendered += rendered_by_fields(folders, session, motion, list(islice(few, len(shots))), device)
+        integrated = list(islice(few, len(shots)))
+        surfaces, depths = drawn_by_fields(folders, session, motion, shots, integrated, device)
+        by_fields, rendered = by_fields + surfaces, rendered + depths
         by_splats += _drawn_by_splats(
             folders, session, reading.read_motion(folders.splats, session) or motion, shots
         )
@@ -165,38 +166,28 @@ def drawn_by_fields(
     session: str,
     motion: Motion | None,
     shots: Sequence[HeldoutShot],
+    integrated: Sequence[HeldoutShot],
     device: devices.Device,
-) -> list[HeldoutView]:
-    """Draw the reconstruction as the synchronized session saw it; nothing where that was refused."""
+) -> tuple[list[HeldoutView], list[HeldoutView]]:
+    """Draw the reconstruction as the synchronized session saw it: ``shots`` on its surfaces, ``integrated``
+    by integrating the fields along rays, as the paper measures depth (without colour). Nothing where the
+    session was refused.
+    """
     if motion is None:
-        return [HeldoutView.empty(shot) for shot in shots]
-    renderer, views = Renderer(fields.load(folders.reconstruction, device), session), []
+        return [HeldoutView.empty(shot) for shot in shots], [HeldoutView.empty(shot) for shot in integrated]
+    reconstruction = fields.load(folders.reconstruction, device)
+    renderer, surfaces, depths = Renderer(reconstruction, session), [], []
     for shot in shots:
-        height, width = shot.depth.shape
-        picture = renderer.draw(
-            shot.world_from_camera, shot.intrinsics, height, width, *motion.at(shot.time_s)
-        )
-        views.append(HeldoutView(picture.color, picture.depth, shot))
-    return views
+        picture = renderer.draw(*_camera(shot), *motion.at(shot.time_s))
+        surfaces.append(HeldoutView(picture.color, picture.depth, shot))
+    for shot in integrated:
+        depth, _ = render_depth(reconstruction, *_camera(shot), FARTHEST_M, session, *motion.at(shot.time_s))
+        depths.append(HeldoutView(np.zeros_like(shot.color), depth, shot))
+    return surfaces, depths
 
 
-def rendered_by_fields(
-    folders: Reconstructed,
-    session: str,
-    motion: Motion | None,
-    shots: Sequence[HeldoutShot],
-    device: devices.Device,
-) -> list[HeldoutView]:
-    """Render depth by integrating the fields along rays, as the paper measures it; colours are not drawn."""
-    if motion is None:
-        return [HeldoutView.empty(shot) for shot in shots]
-    reconstruction, views = fields.load(folders.reconstruction, device), []
-    for shot in shots:
-        height, width = shot.depth.shape
-        camera = shot.world_from_camera, shot.intrinsics, height, width
-        depth, _ = render_depth(reconstruction, *camera, FARTHEST_M, session, *motion.at(shot.time_s))
-        views.append(HeldoutView(np.zeros_like(shot.color), depth, shot))
-    return views
+def _camera(shot: HeldoutShot) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3 3"], int, int]:
+    return shot.world_from_camera, shot.intrinsics, *shot.depth.shape
 
 
 def _drawn_by_splats(

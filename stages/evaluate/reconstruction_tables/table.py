@@ -89,23 +89,19 @@ def metrics(
         if phone.video.synchronized_with
     ]
     pixels = heldout.RENDERED_PIXELS // max(len(shots), 1)
-    few = [(session, heldout.thinned(seen, pixels)) for session, seen in shots]
     right: dict[str, Float[np.ndarray, "view part"]] = {}
     for variant, folder in folders.items():
         here = replace(places, reconstruction=folder)
         motions = {each.video.id: reading.read_motion(folder, each.video.id) for each in sessions}
-        views = [
-            view
-            for session, seen in shots
-            for view in reconstruction.drawn_by_fields(here, session, motions.get(session), seen, device)
-        ]
+        views, rendered = [], []
+        for session, seen in shots:
+            integrated = heldout.thinned(seen, pixels)
+            drawn = reconstruction.drawn_by_fields(
+                here, session, motions.get(session), seen, integrated, device
+            )
+            views, rendered = views + drawn[0], rendered + drawn[1]
         one = Metrics()
         one.add(heldout.view_metrics(views) if views else _nothing())
-        rendered = [
-            view
-            for session, seen in few
-            for view in reconstruction.rendered_by_fields(here, session, motions.get(session), seen, device)
-        ]
         if rendered:
             one.add(heldout.depth_metrics("reconstruction/rendered_depth_acc", rendered))
         one.add(reconstruction.agent_roots(sessions, motions, frames))
