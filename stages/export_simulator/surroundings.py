@@ -11,7 +11,6 @@ from pipeline.behavior.trajectories import UP, BehaviorData
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.geometry import rigid
-from pipeline.workflow import artifact
 from stages.export_simulator import reading
 from stages.export_simulator.actions import SessionClip
 
@@ -53,7 +52,10 @@ def elsewhere(home: Path, take: Path, name: str) -> Surroundings:
     EXP-003 for a take of the animal's own home.
     """
     surface, splats = home / "reconstruction/scene.ply", home / "splats/scene.ply"
-    artifact.require(home, "reconstruction", "splats", remedy="make it: make <agent>.splats")
+    for file in (surface, splats):
+        if not file.is_file():
+            remedy = f"make it: make <agent>.{file.parent.name}"
+            raise InputError("ART-003", f"has no {file.parent.name}", str(home), remedy)
     if not (take / "home.json").is_file():
         remedy = "make it: make simulate AGENT=... HOME=..."
         raise InputError("EXP-003", "is no take in another home", str(take), remedy)
