@@ -23,7 +23,8 @@ BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
 REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only")
 """Variants of an agent that Table 1 compares its registration with."""
 RECONSTRUCTION_VARIANTS = (
-    "no_localizer", "no_feature_loss", "no_annealing", "mlp_fields", "totalrecon", "totalrecon_single",
+    "no_localizer", "mlp_fields", "paper_small", "no_feature_loss", "no_annealing", "totalrecon",
+    "totalrecon_single",
 )  # fmt: skip
 """Variants of an agent that Table 3 compares its reconstruction with."""
 VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}

@@ -16,6 +16,8 @@ from pipeline.workflow import captures, dag, sources
 from pipeline.workflow.dag import Flow
 
 VIDEOS_TABLE, FLOW_TABLE, TABLES_STAGE, TRIED_TABLE = "videos", "flow", "tabulate_behavior", "train_behavior"
+BASE = "base"
+"""The key at the top of a variant that names the variant whose keys it starts from."""
 OURS = "ats"
 """The method that all others of the tables are compared with."""
 
@@ -31,8 +33,10 @@ class Trial:
 
 
 def read(path: Path) -> tuple[dict[str, Any], str]:
-    """Read a recipe or an overlay and refuse tables and keys that no stage knows, and values of a kind that
-    it does not want.
+    """Read a recipe, or the overlay of a variant merged onto its `base`.
+
+    Raises REC-005 for unknown recipes, REC-001 and REC-002 for tables and keys that no stage knows and values
+    of a kind that it does not want.
     """
     if not path.is_file():
         known = ", ".join(sorted(other.stem for other in path.parent.glob("*.toml"))) or "none"
@@ -41,6 +45,24 @@ def read(path: Path) -> tuple[dict[str, Any], str]:
         )
         raise InputError("REC-005", "there is no such recipe", str(path), remedy)
     recipe = config.read_table(path)
+    base = recipe.pop(BASE, None) if path.parent.name == "variants" else None
+    if base is not None:
+        return merged(_base(base, path), _checked(recipe, path)), str(path)
+    return _checked(recipe, path), str(path)
+
+
+def _base(name: object, path: Path) -> dict[str, Any]:
+    """Return the keys of the variant that the one at `path` starts from, which has no base itself."""
+    other = path.with_name(f"{name}.toml")
+    known = sorted(each.stem for each in path.parent.glob("*.toml") if BASE not in config.read_table(each))
+    if not isinstance(name, str) or other.stem not in known:
+        what = f"{BASE}: {config.shown(name)} is no variant without a {BASE} of its own"
+        raise InputError("REC-002", what, str(path), f"known: {', '.join(known)}")
+    return read(other)[0]
+
+
+def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return a recipe in which every table and key is known and every value possible."""
     stages = {dag.table_of(node): node for node in reversed(dag.FLOW)}
     config.refuse_unknown(recipe, {*stages, VIDEOS_TABLE, FLOW_TABLE}, where=str(path), kind="table")
     for name, table in recipe.items():
@@ -54,7 +76,7 @@ def read(path: Path) -> tuple[dict[str, Any], str]:
         keys = {field.name for field in fields(declared)} - stages[name].fixed.keys()
         config.refuse_unknown(table, keys, where=f"{path}: [{name}]")
         config.from_table(declared, table, where=f"{path}: [{name}]")
-    return recipe, str(path)
+    return recipe
 
 
 def _refuse_impossible_remarks(table: Mapping[str, Any], where: str) -> None:

@@ -75,6 +75,21 @@ def test_inner_tables_are_checked_before_anything_is_built(tmp_path, text, where
         recipes.read(tmp_path / "cat.toml")
 
 
+def test_a_variant_starts_from_its_base(tmp_path):
+    variants = tmp_path / "variants"
+    variants.mkdir()
+    (variants / "a.toml").write_text("[reconstruct.steps]\nscene = 9\njoint = 8\n")
+    (variants / "b.toml").write_text("base = 'a'\n[reconstruct.steps]\njoint = 7\n")
+    assert recipes.read(variants / "b.toml")[0] == {"reconstruct": {"steps": {"scene": 9, "joint": 7}}}
+    for wrong in ("'b'", "'c'", "3", "['a']"):
+        (variants / "c.toml").write_text(f"base = {wrong}\n")
+        with pytest.raises(InputError, match="(?s)REC-002 .*known: a"):
+            recipes.read(variants / "c.toml")
+    with pytest.raises(InputError, match="REC-001"):
+        (tmp_path / "cat.toml").write_text("base = 'a'\n")
+        recipes.read(tmp_path / "cat.toml")
+
+
 def test_tables_of_motion_need_no_recordings(tmp_path):
     house = checkout.create(tmp_path)
     house.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')

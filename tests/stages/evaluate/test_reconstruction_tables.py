@@ -30,10 +30,10 @@ def test_what_a_rival_lacks_is_told_with_an_interval():
     }
     found = Metrics()
     table._compare(found, "totalrecon", right["ours"] - right["totalrecon"], np.random.default_rng(0))
-    assert found.values["totalrecon/depth_acc_all_less_than_ours"] == pytest.approx(0.2)
-    assert found.values["totalrecon/depth_acc_scene_less_than_ours"] == pytest.approx(0.25)
-    assert found.values["totalrecon/depth_acc_agent_less_than_ours"] == 0
-    assert found.values["totalrecon/depth_acc_all_less_than_ours_ci95_low"] > 0.19
+    assert found.values["totalrecon/depth_acc_all_less_than_reference"] == pytest.approx(0.2)
+    assert found.values["totalrecon/depth_acc_scene_less_than_reference"] == pytest.approx(0.25)
+    assert found.values["totalrecon/depth_acc_agent_less_than_reference"] == 0
+    assert found.values["totalrecon/depth_acc_all_less_than_reference_ci95_low"] > 0.19
     told = table.text({"ours/depth_acc_all": 0.9, **found.values}, ("ours", "totalrecon"))
     assert "0.708 / 0.695 / 0.703" in told and "0.200 [0.200 0.200]" in told
 
