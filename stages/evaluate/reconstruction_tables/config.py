@@ -9,5 +9,7 @@ class Config:
 
     heldout_frames: int = 24
     """Frames of each held-out phone that are rendered."""
+    lpips_weights: str = ""
+    """Folder of LPIPS weights, as `[evaluate] lpips_weights`; empty: LPIPS is not measured."""
     seed: int = 0
     """Of the resampling."""

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.core import devices
 from pipeline.core.videos import Video
 from pipeline.data import qa
+from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.metrics import Metrics
 from stages.evaluate.reading import Reconstructed
 from stages.evaluate.reconstruction_tables import table
@@ -36,7 +37,8 @@ def run(
     """Measure every variant and write the tables."""
     folders = {"ours": inputs.reconstruction, **inputs.variants}
     rng = np.random.default_rng(config.seed)
-    metrics = table.metrics(folders, inputs, videos, config.heldout_frames, rng, device)
+    lpips = Lpips.load(Path(config.lpips_weights), device) if config.lpips_weights else None
+    metrics = table.metrics(folders, inputs, videos, config.heldout_frames, rng, device, lpips)
     metrics.write(out, "tables.json")
     (out / "tables.txt").write_text(table.text(metrics.values, tuple(folders)))
     shown = (table.pictures(metrics) | table.rooms(folders)).items()

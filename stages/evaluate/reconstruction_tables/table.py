@@ -13,6 +13,7 @@ from pipeline.data import plots, ply
 from pipeline.data.qa import Check
 from pipeline.geometry import views
 from pipeline.metrics.intervals import aligned, bootstrapped, episodes, formatted_interval
+from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.metrics import Metrics, formatted
 from stages.evaluate import heldout, reading, reconstruction, surfaces
 from stages.evaluate.heldout import PARTS, HeldoutView
@@ -41,6 +42,7 @@ COLUMNS = {
     "rendered_depth_acc": "of rendered depth",
     "psnr": "PSNR, dB",
     "ssim": "SSIM",
+    "lpips": "LPIPS",
 }
 TITLE = (
     "Table 3: seen by the held-out phone (all / agent / scene); roots and followed points in the sessions it "
@@ -68,6 +70,7 @@ def metrics(
     heldout_frames: int,
     rng: np.random.Generator,
     device: devices.Device,
+    lpips: Lpips | None = None,
 ) -> Metrics:
     """Return ``<variant>/<figure>`` of every variant, and what its DepthAcc lacks against its reference, with
     intervals.
@@ -105,7 +108,7 @@ def metrics(
             )
             views, rendered = views + drawn[0], rendered + drawn[1]
         one = Metrics()
-        one.add(heldout.view_metrics(views) if views else _nothing())
+        one.add(heldout.view_metrics(views, lpips) if views else _nothing())
         if rendered:
             one.add(heldout.depth_metrics("reconstruction/rendered_depth_acc", rendered))
         one.add(reconstruction.agent_roots(sessions, motions, frames))

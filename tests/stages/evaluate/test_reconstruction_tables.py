@@ -48,4 +48,4 @@ def test_without_truth_nothing_is_claimed():
     )
     found = table.metrics({"ours": Path("ours")}, places, (), 24, np.random.default_rng(0), "cpu")
     assert set(found.values.values()) == {None} and set(found.values) == set(found.reasons)
-    assert table.text(found.values, ("ours",)).count("- / - / -") == 4
+    assert table.text(found.values, ("ours",)).count("- / - / -") == 5
