@@ -20,7 +20,7 @@ VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
 AGENT: tuple[Role, ...] = ("turnaround", "session")
 """Roles in which the animal is meant to be seen."""
 BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
-REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only")
+REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only", "totalrecon")
 """Variants of an agent that Table 1 compares its registration with."""
 RECONSTRUCTION_VARIANTS = (
     "no_localizer", "mlp_fields", "paper_small", "no_feature_loss", "no_annealing", "totalrecon",
