@@ -6,11 +6,21 @@ animal comes and goes: in a good share of the frames there is none.
 
     python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 [--first 500 --step 3] [--registered]
     python -m benchmarks.semi_real score OUT [--masks masks]
+
+A whole build: the walk-through is another part of the sequence without the animal, the turnaround is the
+built-in capture's with the same coat; sessions come without their poses, so that registration has no odometry.
+
+    python -m benchmarks.semi_real draw SEQUENCE OUT --empty --last 499 --registered
+    python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 --coat 8 --first 500 --registered --no-poses
+    cp -r OUT/recordings/* build/toy/synthetic_capture/recordings/turnaround.r3d captures/kitchen/
+    cp agents/toy.toml agents/kitchen.toml && make kitchen.registration
+    python -m benchmarks.semi_real registration build/kitchen OUT/truth build/toy/synthetic_capture/truth
 """
 
 import argparse
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,14 +28,35 @@ import numpy as np
 
 from benchmarks.composited import Compositor, Sequence, course, measure_noise, surfaces
 from pipeline.core.progress import log
+from pipeline.core.videos import Video
+from pipeline.core.videos import read as read_videos
 from pipeline.data import images, npz
+from pipeline.data.poses import RegisteredPoses
+from pipeline.data.templates import AgentCameras, SceneCameras
+from pipeline.geometry import rigid
+from pipeline.metrics.pose_errors import constant_between, joined, pose_errors
+from stages.evaluate.registration import FLIPPED_DEG
 from stages.synthesize_capture import animal, gait
 
+SEEN_SHARE = 0.001
+"""Share of a picture above which it shows the animal."""
 RATE_HZ = 30.0
 """frames are numbered at this rate in 7-Scenes folders"""
 
 
-def draw(sequence: Sequence, out: Path, name: str, seed: int) -> None:
+@dataclass(frozen=True)
+class Drawing:
+    """What is drawn into a sequence, and how it is written."""
+
+    coat: int | None = None
+    """Seed of the animal's looks; None: that of its course."""
+    empty: bool = False
+    """Nothing is drawn: a walk-through."""
+    poses: bool = True
+    """Whether the recording has the sequence's poses."""
+
+
+def draw(sequence: Sequence, out: Path, name: str, seed: int, drawing: Drawing = Drawing()) -> None:
     """Draw one recording and its truth."""
     rng = np.random.default_rng([seed, 41])
     poses = sequence.poses()
@@ -34,8 +65,9 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int) -> None:
     grounds = surfaces(sequence, poses)
     log(f"{name}: noise {noise}, surfaces {[(round(s.height_m, 2), int(s.free.sum())) for s in grounds]}")
     lived, there = course(sequence, poses, timestamp_s, grounds, rng)
+    there = there & (not drawing.empty)
     motion = gait.poses(lived, timestamp_s)
-    creature = animal.grow(np.random.default_rng([seed, 2]))
+    creature = animal.grow(np.random.default_rng([seed if drawing.coat is None else drawing.coat, 2]))
     folder = out / "recordings" / name
     folder.mkdir(parents=True)
     (out / "truth").mkdir(exist_ok=True)
@@ -45,7 +77,8 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int) -> None:
         base = folder / f"frame-{round(timestamp_s[index] * RATE_HZ):06d}"
         cv2.imwrite(f"{base}.color.jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
         cv2.imwrite(f"{base}.depth.png", np.round(frame.depth * 1000).astype(np.uint16))
-        np.savetxt(f"{base}.pose.txt", poses[index])
+        if drawing.poses:
+            np.savetxt(f"{base}.pose.txt", poses[index])
         masks.append(frame.mask)
     packed = np.packbits(np.stack(masks), axis=-1)
     npz.save(
@@ -56,7 +89,7 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int) -> None:
     )  # fmt: skip
 
 
-def figures(labels: np.ndarray, truth: np.ndarray, seen_share: float = 0.001) -> dict[str, float]:
+def figures(labels: np.ndarray, truth: np.ndarray, seen_share: float = SEEN_SHARE) -> dict[str, float]:
     """Return the bars' figures of ``[frame height width]`` labels (255 animal, 128 unknown) and truth (bool).
 
     Unknown pixels count neither way. A frame shows the animal if more than ``seen_share`` of its pixels do;
@@ -83,6 +116,60 @@ def read_truth(path: Path, index: np.ndarray) -> np.ndarray:
     return np.unpackbits(table["packed"][row], axis=-1, count=int(table["shape"][2])).astype(bool)
 
 
+def registered(build: Path, truth: Path, turnaround: Path) -> dict[str, float]:
+    """Return medians and percentiles of camera and root errors over all frames of all sessions.
+
+    Roots are judged where more than 0.1 % of the picture shows the animal; `placed` is the share of these
+    frames that have a root, `root_where_empty` that of frames without the animal. Metres and degrees.
+    """
+    videos = {Path(v.file).stem: v for v in read_videos(build / "plan" / "videos.json")}
+    walk = _rows(build, videos["walkthrough"], npz.load(truth / "walkthrough.npz"))
+    ours = SceneCameras.open(build / "scene_template").world_from_registered
+    world_from_true = constant_between(ours, walk["world_from_camera"])
+    index = npz.load(build / "frames" / videos["turnaround"].id / "frames.npz")["source_index"]
+    around = {key: value[index] for key, value in npz.load(turnaround / "turnaround.npz").items()
+              if key in ("world_from_agent", "world_from_camera")}  # fmt: skip
+    true_agent_from_camera = rigid.inverse(around["world_from_agent"]) @ around["world_from_camera"]
+    agent_from_true = constant_between(
+        AgentCameras.open(build / "agent_template").agent_from_registered, true_agent_from_camera
+    )
+    cameras, roots, empty = [], [], []
+    for name, video in videos.items():
+        if video.role != "session":
+            continue
+        table = _rows(build, video, npz.load(truth / f"{name}.npz"))
+        poses = RegisteredPoses.open(build / "registration" / video.id) or RegisteredPoses.unknown(
+            table["timestamp_s"]
+        )
+        cameras.append(pose_errors(poses.world_from_camera, world_from_true @ table["world_from_camera"]))
+        true_roots = world_from_true @ table["world_from_agent"] @ rigid.inverse(agent_from_true)
+        share = np.unpackbits(table["packed"], axis=-1, count=int(table["shape"][2])).mean((1, 2))
+        roots.append(pose_errors(poses.world_from_agent, true_roots)[share > SEEN_SHARE])
+        empty.append(np.isfinite(poses.world_from_agent[share == 0, 0, 3]))
+    camera, root = joined(cameras), joined(roots)
+    placed = np.isfinite(root.meters)
+    return {
+        "frames": len(camera.meters), "camera_deg_median": float(np.median(camera.degrees)),
+        "camera_m_median": float(np.median(camera.meters)), "camera_deg_p95": _p95(camera.degrees),
+        "camera_m_p95": _p95(camera.meters), "root_frames": len(placed), "root_placed": float(placed.mean()),
+        "root_m_median": float(np.median(root.meters[placed])), "root_m_p95": _p95(root.meters[placed]),
+        "root_deg_median": float(np.median(root.degrees[placed])),
+        "root_flips": float((root.degrees[placed] > FLIPPED_DEG).mean()),
+        "root_where_empty": float(np.concatenate(empty).mean()),
+    }  # fmt: skip
+
+
+def _rows(build: Path, video: Video, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the rows of a truth table at the extracted frames of a recording."""
+    index = npz.load(build / "frames" / video.id / "frames.npz")["source_index"]
+    row = np.searchsorted(table["source_index"], index)
+    return {key: value if key == "shape" else value[row] for key, value in table.items()}
+
+
+def _p95(values: np.ndarray) -> float:
+    return float(np.percentile(np.nan_to_num(values, nan=np.inf), 95))
+
+
 def main() -> None:
     """Parse the command line."""
     parser = argparse.ArgumentParser(
@@ -97,15 +184,27 @@ def main() -> None:
     one.add_argument("--last", type=int, default=10**6)
     one.add_argument("--step", type=int, default=3, help="negative: played backwards")
     one.add_argument("--registered", action="store_true", help="bring depth into the colour camera first")
+    one.add_argument("--coat", type=int, help="seed of the animal's looks; otherwise each recording's own")
+    one.add_argument("--empty", action="store_true", help="draw nothing: a walk-through")
+    one.add_argument("--no-poses", action="store_true", help="leave the sequence's poses out")
     two = commands.add_parser("score", help="score masks/<name> by truth/<name>")
     two.add_argument("out", type=Path)
     two.add_argument("--masks", default="masks")
+    three = commands.add_parser("registration", help="cameras and roots of a build, against the truth")
+    three.add_argument("build", type=Path)
+    three.add_argument("truth", type=Path, help="OUT/truth")
+    three.add_argument("turnaround", type=Path, help="truth folder of the turnaround")
     task = parser.parse_args()
     if task.command == "draw":
         known = sorted(int(re.findall(r"\d+", p.name)[0]) for p in task.sequence.glob("frame-*.depth.png"))
         numbers = [n for n in known if task.first <= n <= task.last][:: task.step]
+        drawing = Drawing(task.coat, task.empty, not task.no_poses)
+        sequence = Sequence(task.sequence, tuple(numbers), task.registered)
         for seed in task.seeds:
-            draw(Sequence(task.sequence, tuple(numbers), task.registered), task.out, f"session-{seed}", seed)
+            draw(sequence, task.out, "walkthrough" if task.empty else f"session-{seed}", seed, drawing)
+    elif task.command == "registration":
+        for name, value in registered(task.build, task.truth, task.turnaround).items():
+            print(f"{name:50s} {value:.4g}")
     else:
         for folder in sorted((task.out / task.masks).iterdir()):
             index = npz.load(task.out / "frames" / folder.name / "frames.npz")["source_index"]
