@@ -19,11 +19,15 @@ from pipeline.behavior.trajectories import FUTURE, BehaviorData, Trajectory
 from pipeline.data import npz, ply
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+from stages.export_simulator import stage
+from stages.export_simulator.config import Config
 from stages.train_behavior.export import write_model
 
 BONES = 5
 HALF_ROOM_M = 2.0
 CUPBOARD_M = 1.3
+READS = ("reconstruction", "splats", "behavior", "behavior_data")
+NAMED = Config(name="tube")
 
 
 def rest() -> np.ndarray:
@@ -227,6 +231,13 @@ def write(build: Path) -> None:
     nets, scaling = networks_that_flee(architecture)
     write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
+
+
+def exported(raw: Path, out: Path, config: Config = NAMED) -> Path:
+    """Export a world into an empty folder; return the folder."""
+    out.mkdir(parents=True)
+    stage.run(stage.Inputs(**{name: raw / name for name in READS}), config, out)
+    return out
 
 
 def allowed(shape: tuple[int, int, int]) -> np.ndarray:

@@ -6,13 +6,11 @@ import base64
 import functools
 import gzip
 import http.server
-import itertools
 import json
 import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +24,6 @@ from pipeline.core import config
 from pipeline.data import npz, ply
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
-from stages.export_simulator import stage
-from stages.export_simulator.config import Config
 from stages.simulate.subgoal_file import SubgoalEntry, subgoals, tables
 from tests.stages.export_simulator import browser, reaction, small_world, twins
 
@@ -61,32 +57,6 @@ WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED = """
 SEES_ALL = (
     "points => points.map(ats.screen).every(([x, y]) => x > 0 && x < innerWidth && y > 0 && y < innerHeight)"
 )
-READS = ("reconstruction", "splats", "behavior", "behavior_data")
-NAMED = Config(name="tube")
-
-
-def exported(raw: Path, out: Path, config: Config = NAMED) -> Path:
-    """Export a world into an empty folder; return the folder."""
-    out.mkdir(parents=True)
-    stage.run(stage.Inputs(**{name: raw / name for name in READS}), config, out)
-    return out
-
-
-@pytest.fixture(scope="module")
-def simulator(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Export a small world, as one file and as a folder beside it."""
-    raw, build = tmp_path_factory.mktemp("raw"), tmp_path_factory.mktemp("build")
-    small_world.write(raw)
-    shutil.copytree(raw, build, dirs_exist_ok=True)
-    exported(raw, build / "light", replace(NAMED, layout="folder"))
-    shutil.copy(raw / "behavior/golden.json", build / "golden.json")
-    return exported(raw, build / "simulator")
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    with browser.chromium() as opened:
-        yield opened
 
 
 def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -> None:
@@ -435,7 +405,7 @@ def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp
         tmp_path / "reconstruction/scene.ply",
         Mesh(vertices.astype(np.float32), faces.astype(np.int32), color),
     )
-    out = exported(tmp_path, tmp_path / "build/simulator")
+    out = small_world.exported(tmp_path, tmp_path / "build/simulator")
     with browser.shown(chromium, (out / "index.html").as_uri()) as (page, wrong):
         shown_from = np.array(page.evaluate("ats.state().eye"))
         assert (
@@ -444,23 +414,6 @@ def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp
             < cast(shown_from, (animal - shown_from)[None]).distance[0]
         )
         assert wrong == []
-
-
-def test_nothing_covers_anything(simulator: Path, chromium: Browser) -> None:
-    parts = ("#panel-body", "#player", "#help", "#map", "#title")
-    with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(1280, 720)) as (page, _):
-        for width, height in ((1280, 720), (1000, 640), (900, 760), (768, 1024)):
-            page.set_viewport_size({"width": width, "height": height})
-            box = {part: page.locator(part).bounding_box() for part in parts}
-            for first, second in itertools.combinations(parts, 2):
-                a, b = box[first], box[second]
-                beside = a["x"] + a["width"] <= b["x"] or b["x"] + b["width"] <= a["x"]
-                assert beside or a["y"] + a["height"] <= b["y"] or b["y"] + b["height"] <= a["y"], (
-                    width,
-                    height,
-                    first,
-                    second,
-                )
 
 
 def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> None:

@@ -14,7 +14,8 @@ export function api(simulator) {
         animal: root,
         nose: rotate(root.slice(3), [0, 0, 1]),
         observer: [...observer.place],
-        eye: room.camera.position.toArray(),
+        eye: room.camera.getWorldPosition(room.camera.position.clone()).toArray(),
+        headset: simulator.headset.presenting,
         plans: simulator.turnNumber,
         milliseconds: simulator.milliseconds,
         aim: simulator.stops.next,
@@ -76,6 +77,8 @@ export function api(simulator) {
         .project(room.camera);
       return [((spot.x + 1) / 2) * innerWidth, ((1 - spot.y) / 2) * innerHeight];
     },
+    // What the view is turned about, world metres.
+    target: () => room.orbit.target.toArray(),
     frames: () => simulator.frames ?? 0,
   };
 }

@@ -3,7 +3,8 @@
 
 import * as THREE from 'three';
 
-export const BACKDROP_LAYER = 1;
+// three.js draws layers 1 and 2 for the left and the right eye of a headset alone
+export const BACKDROP_LAYER = 3;
 
 export class Backdrop {
   constructor(renderer) {

@@ -7,6 +7,7 @@ import { Clips } from './clips.js';
 import { Controls } from './controls.js';
 import { Film } from './film.js';
 import { filledFloor } from './floor.js';
+import { Headset } from './headset.js';
 import { Minimap } from './minimap.js';
 import { arrays } from './npz.js';
 import { Observer } from './observer.js';
@@ -120,6 +121,7 @@ class Simulator {
       toml: () => save(this.stops.toml, `${this.fileName}_subgoals.toml`),
       link: panel.copyLink,
       open: (file) => this.openTake(file),
+      headset: () => this.enterHeadset(),
     });
     panel.showFilm(false, Film.possible);
     this.controls = new Controls(this.room, this.observer, {
@@ -129,6 +131,7 @@ class Simulator {
       call: () => this.call(),
       hold: (tool) => this.hold(tool),
       how: panel.howTo,
+      tell: () => panel.say(this.whereabouts()),
       stroke: (points) => this.overlays.ask(points),
       drawn: (points) => this.follow(points),
       carry: (point) => {
@@ -150,7 +153,32 @@ class Simulator {
       this.changed('view');
       this.reset();
     });
+    this.headset = new Headset(this.room, this.observer, this.contract.scene.floor_m, {
+      aim: (surface) => this.aim(surface, false),
+      call: () => this.call(),
+      change: (presenting) => document.body.classList.toggle('headset', presenting),
+    });
+    Headset.possible().then(panel.showHeadset);
     this.changed('');
+  }
+
+  async enterHeadset() {
+    try {
+      await this.headset.start();
+    } catch (error) {
+      panel.help(`The headset cannot be used: ${error.message}.`, 6);
+    }
+  }
+
+  // Where the animal is, for those who do not see it.
+  whereabouts() {
+    const [x, , z] = this.observer.animal;
+    const [dx, dz] = [x - this.observer.place[0], z - this.observer.place[1]];
+    const turn = Math.atan2(dx, dz) - this.room.heading();
+    const sides = ['ahead', 'ahead to the left', 'left', 'behind to the left', 'behind'];
+    const eighth = Math.round(Math.atan2(Math.sin(turn), Math.cos(turn)) / (Math.PI / 4));
+    const side = eighth < 0 ? sides[-eighth].replace('left', 'right') : sides[eighth];
+    return `${this.contract.name} is ${Math.hypot(dx, dz).toFixed(1)} metres away, ${side}`;
   }
 
   play() {
@@ -335,17 +363,18 @@ class Simulator {
   frame() {
     const time = performance.now();
     const seconds = Math.min(0.25, (time - this.last) / 1000);
-    if (time - this.last < 1000) this.room.steadiness.note(time - this.last);
+    if (time - this.last < 1000 && !this.headset.presenting) this.room.steadiness.note(time - this.last);
     this.last = time;
     if (this.playing) {
       if (this.timeline.plans.length) this.advance(seconds * this.state.speed);
       // no time has passed: who has come since then has always stood here
       else if (this.walk(seconds)) this.observer.settle();
       this.plan();
-      this.room.attend(this.observer.animal, seconds, this.eyes());
+      if (!this.headset.presenting) this.room.attend(this.observer.animal, seconds, this.eyes());
     }
     const [turn, closer] = this.controls.turning();
-    if (turn || closer) this.room.turn(1.2 * turn * seconds, Math.exp(closer * seconds));
+    if ((turn || closer) && !this.headset.presenting)
+      this.room.turn(1.2 * turn * seconds, Math.exp(closer * seconds));
     this.draw();
   }
 
@@ -388,6 +417,7 @@ class Simulator {
       this.overlays.plan?.goals[this.overlays.plan.chosen],
     );
     if (this.stops.visit(this.observer.animal)) {
+      panel.say(`${this.contract.name} has arrived`);
       this.showCommands();
       this.urgent = true;
     }
@@ -396,7 +426,9 @@ class Simulator {
   }
 
   walk(seconds) {
-    const walked = this.observer.step(seconds, this.controls.direction(), this.room.heading());
+    const walked = this.headset.presenting
+      ? this.headset.step(seconds)
+      : this.observer.step(seconds, this.controls.direction(), this.room.heading());
     if (walked) this.moved = this.taken = true;
     return walked;
   }
@@ -450,8 +482,7 @@ class Simulator {
 
   async plan() {
     if (this.waiting || !this.due) return;
-    if (this.timeline.plans.length && this.state.interactivity > 0 && this.personMoved)
-      this.noticedAt = this.now;
+    if (this.timeline.plans.length && this.state.interactivity > 0 && this.personMoved) this.notice();
     this.waiting = true;
     this.urgent = false;
     const epoch = this.epoch;
@@ -481,6 +512,11 @@ class Simulator {
         `in ${(plan.milliseconds / 1000).toFixed(2)} s${this.remark ?? ''}`,
     );
     if (this.route?.finished) this.visit([]);
+  }
+
+  notice() {
+    if (!(this.now - this.noticedAt < NOTICE_TICKS)) panel.say(`${this.contract.name} notices you`);
+    this.noticedAt = this.now;
   }
 
   // What the planner gets: the shown past, the observer's past, and the visitor's settings.
@@ -527,13 +563,13 @@ class Simulator {
     const recorded = this.replaying && this.clips.frame(this.replaying, this.replayTick);
     this.recorded.visible = Boolean(recorded);
     if (recorded) this.recorded.pose(recorded, this.groundAt(recorded));
-    this.observer.figure.visible = this.state.view !== 'you';
+    this.observer.figure.visible = this.state.view !== 'you' && !this.headset.presenting;
     this.frames = (this.frames ?? 0) + 1;
     if (this.frames % (this.room.software ? 6 : 3) === 0) this.drawMap(root, recorded);
     this.room.reveal(root.slice(0, 3));
     this.room.render();
     if (this.frames === 1) performance.mark('animal');
-    this.drawTags(root, recorded);
+    if (!this.headset.presenting) this.drawTags(root, recorded);
   }
 
   // The height of the surface that carries an animal there: the floor's, or that of the furniture it is on.

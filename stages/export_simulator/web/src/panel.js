@@ -45,6 +45,7 @@ export function buildPanel(state, { clips, controls }, on) {
       const button = Object.assign(document.createElement('button'), {
         textContent: value,
         title: `${value} ${key}`,
+        ariaLabel: `${value} ${key === 'samples' ? 'goals' : key}`,
       });
       button.addEventListener('click', () => change(key, value));
       at(key).append(button);
@@ -88,6 +89,7 @@ export function buildPanel(state, { clips, controls }, on) {
   at('free').addEventListener('click', on.free);
   at('how').addEventListener('click', howTo);
   at('call').addEventListener('click', on.call);
+  at('headset').addEventListener('click', on.headset);
   at('slow').addEventListener('click', () =>
     change(
       'speed',
@@ -137,6 +139,15 @@ export function help(text, seconds = 0) {
   at('help').classList.toggle('asked', Boolean(text));
   clearTimeout(help.timer);
   if (seconds) help.timer = setTimeout(() => at('help').classList.add('gone'), 1000 * seconds);
+}
+
+// A sentence for those who hear the page; the same one again is spoken again.
+export function say(text) {
+  at('spoken').textContent = at('spoken').textContent === text ? `${text}\u00a0` : text;
+}
+
+export function showHeadset(possible) {
+  at('headset').hidden = !possible;
 }
 
 // How to use the page: shown at first for a while, then when it is asked for.

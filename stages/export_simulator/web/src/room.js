@@ -175,7 +175,7 @@ export class Room {
   }
 
   // Splats have no back: hide the walls between the camera and the room, and what hangs high.
-  openShell() {
+  openShell(eye) {
     const [low, high] = this.contract.scene.bounds_m.map((corner) => [...corner]);
     high[1] = this.contract.scene.floor_m + HEADROOM_M;
     low[1] -= 1;
@@ -183,7 +183,7 @@ export class Room {
       [0, 'x'],
       [2, 'z'],
     ]) {
-      const outside = this.camera.position[name];
+      const outside = eye[name];
       low[axis] += outside < low[axis] ? WALL_M : -1;
       high[axis] -= outside > high[axis] ? WALL_M : -1;
     }
@@ -289,11 +289,12 @@ export class Room {
   }
 
   resize() {
+    if (this.renderer.xr.isPresenting) return; // a headset has a size of its own
     const [width, height] = [innerWidth, innerHeight];
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     // Leave the panel's side free: look a little to the right of the middle.
-    const shift = width > 900 ? 120 : 0;
+    const shift = width > 900 && height > 620 ? 120 : 0;
     this.camera.setViewOffset(width, height, shift, 0, width, height);
     this.camera.updateProjectionMatrix();
   }
@@ -309,8 +310,12 @@ export class Room {
 
   // Where the pointer meets the floor, [x, z], or null outside the room.
   floorPoint(event) {
+    return this.floorAlong(this.aim(event));
+  }
+
+  floorAlong({ ray }) {
     const plane = new THREE.Plane(new THREE.Vector3(0, 1, 0), -this.contract.scene.floor_m);
-    const point = this.aim(event).ray.intersectPlane(plane, new THREE.Vector3());
+    const point = ray.intersectPlane(plane, new THREE.Vector3());
     const [low, high] = this.contract.scene.bounds_m;
     const inside = point && point.x > low[0] && point.x < high[0] && point.z > low[2] && point.z < high[2];
     return inside ? [point.x, point.z] : null;
@@ -319,9 +324,13 @@ export class Room {
   // What a click shows: {place: [x, z], up}, up being the height above the floor of the furniture that is
   // hit, or 0; null outside the room.
   surfacePoint(event) {
-    const floor = this.floorPoint(event);
+    return this.surfaceAlong(this.aim(event));
+  }
+
+  // The same for a ray of the scene.
+  surfaceAlong(ray) {
+    const floor = this.floorAlong(ray);
     if (!this.mesh) return floor && { place: floor, up: 0 };
-    const ray = this.aim(event);
     ray.layers.enableAll();
     this.mesh.updateWorldMatrix(true, false);
     const { floor_m: floorHeight } = this.contract.scene;
@@ -341,6 +350,7 @@ export class Room {
 
   // Cut away what hides the animal.
   reveal(animal) {
+    if (this.renderer.xr.isPresenting) return;
     const point = new THREE.Vector3(...animal);
     this.cutaway.follow(
       this.camera.position,
@@ -356,9 +366,10 @@ export class Room {
   }
 
   render() {
-    if (this.splats) this.openShell();
-    if (this.near && this.near.position.distanceTo(this.camera.position) > 0.05)
-      this.near.position.copy(this.camera.position);
+    const eye = this.camera.getWorldPosition(new THREE.Vector3());
+    if (this.splats) this.openShell(eye);
+    if (this.near && this.near.position.distanceTo(eye) > 0.05) this.near.position.copy(eye);
+    if (this.renderer.xr.isPresenting) return this.renderer.render(this.scene, this.camera);
     this.orbit.update();
     if (this.backdrop && !this.splats) this.backdrop.render(this.scene, this.camera, this.cutaway.key);
     else this.renderer.render(this.scene, this.camera);
