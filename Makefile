@@ -18,7 +18,7 @@ endif
 PYTHON := .venv/bin/python
 PLAN   := $(PYTHON) -SE -m pipeline.workflow.plan
 RUN    := $(PYTHON) -SE -m pipeline.workflow.run $(if $(PROCESSES),--processes $(PROCESSES))
-COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark export simulate serve extras dev types test test-fast test-slurm fuzz reproduce verify doctor clean
+COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark gallery export simulate serve extras dev types test test-fast test-slurm fuzz reproduce verify doctor clean
 AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/*.toml)))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
@@ -74,6 +74,10 @@ annotate: .venv/.ok
 
 capture-check: .venv/.ok
 	@$(PYTHON) -m stages.check_captures 'captures/$(ANIMAL)'
+
+# One page over everything in build/, with links to the simulators and reports.
+gallery: .venv/.ok
+	@$(PYTHON) -m stages.compile_gallery build
 
 # One format for another program, after the simulator; with a take of `make simulate` as one motion more.
 export: .venv/.ok

@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 58_200,
+    "lines": 58_550,
     "lines over 110 columns": 0,
     "recipe keys": 304,
     "packages over 16 modules": 0,

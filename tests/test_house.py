@@ -237,6 +237,7 @@ def test_every_room_is_in_the_flow():
         "simulate",
         "check_captures",
         "annotate",
+        "compile_gallery",
         "export",
     }
 

@@ -1,0 +1,1 @@
+"""Show all built animals on one page."""

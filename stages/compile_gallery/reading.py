@@ -1,0 +1,118 @@
+"""Read what the gallery shows of a build: name, picture, figures, links."""
+
+import base64
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from pipeline.data import qa
+from pipeline.metrics import words
+
+PICTURES = ("simulator/qa/visits.webp", "simulator/qa/heat_maps.webp", "splats/qa/frames.webp")
+"""Pictures that stand for a build, the best first; all of them are in its report."""
+METRICS = (
+    "behavior/ats/goal_minde_m",
+    "reconstruction/agent_root_m_median",
+    "registration/translation_m_median",
+)
+"""Keys of `metrics.json` that a visitor can picture."""
+_CHECKS = {"sessions to replay": "sessions to replay", "size of the page": "size of the page"}
+_QUALITY = 82
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number in words."""
+
+    words: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Link:
+    """A page beside the gallery."""
+
+    words: str
+    address: str
+    """relative to the gallery"""
+
+
+@dataclass(frozen=True)
+class Card:
+    """One animal."""
+
+    name: str
+    folder: str
+    thumbnail: str | None
+    """WebP as a data address"""
+    status: qa.Status | None
+    """worst light of its finished artifacts; None where none reported a check"""
+    figures: tuple[Figure, ...]
+    page: Link
+    links: tuple[Link, ...]
+
+
+def card(folder: Path, root: Path, thumbnail_px: int) -> Card:
+    """Read the build in `folder`, whose simulator is finished, for a gallery in `root`."""
+    contract = json.loads((folder / "simulator/simulator.json").read_bytes())
+    notes = [json.loads(file.read_bytes()) for file in _notes(folder)]
+    checks: list[dict[str, Any]] = [check for note in notes for check in note["checks"]]
+    pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
+    return Card(
+        name=str(contract["name"]),
+        folder=folder.relative_to(root).as_posix(),
+        thumbnail=_thumbnail(pictures[0], thumbnail_px) if pictures else None,
+        status=qa.worst([check["status"] for check in checks]) if checks else None,
+        figures=(*_checked(folder), *_measured(folder)),
+        page=_link("walk with it", folder / "simulator/index.html", root),
+        links=tuple(_links(folder, root)),
+    )
+
+
+def _notes(folder: Path) -> list[Path]:
+    return sorted([*folder.glob("*/qa.json"), *folder.glob("*/*/qa.json")])
+
+
+def _checked(folder: Path) -> list[Figure]:
+    """Return figures from the simulator's own checks."""
+    checks = json.loads((folder / "simulator/qa.json").read_bytes())["checks"]
+    return [
+        Figure(_CHECKS[each["name"]], each["value"], each["unit"])
+        for each in checks
+        if each["name"] in _CHECKS
+    ]
+
+
+def _measured(folder: Path) -> list[Figure]:
+    """Return figures from the evaluation, where there is one and it measured them."""
+    file = folder / "evaluation/metrics.json"
+    metrics = json.loads(file.read_bytes()) if file.is_file() else {}
+    known = [(words.describe(key), metrics[key]) for key in METRICS if metrics.get(key) is not None]
+    return [Figure(found.text, value, found.unit) for found, value in known]
+
+
+def _links(folder: Path, root: Path) -> list[Link]:
+    links = []
+    if (folder / "report/index.html").is_file():
+        links.append(_link("report", folder / "report/index.html", root))
+    for home in sorted(folder.glob("homes/*/simulator/index.html")):
+        links.append(_link(f"in the home of {home.parents[1].name}", home, root))
+    return links
+
+
+def _link(text: str, file: Path, root: Path) -> Link:
+    return Link(text, file.relative_to(root).as_posix())
+
+
+def _thumbnail(file: Path, longest_px: int) -> str:
+    with Image.open(file) as picture:
+        small = picture.convert("RGB")
+        small.thumbnail((longest_px, longest_px))
+        buffer = io.BytesIO()
+        small.save(buffer, "WEBP", quality=_QUALITY)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -1,0 +1,46 @@
+"""The stage: all finished builds -> one page that links to their simulators and reports."""
+
+import math
+from pathlib import Path
+
+import jinja2
+
+from pipeline.core.errors import InputError
+from stages.compile_gallery import reading
+from stages.compile_gallery.config import Config
+
+_MARKS = {"ok": "●", "warn": "▲", "fail": "■", None: "○"}
+_WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks failed", None: "no checks"}
+
+
+def run(root: Path, config: Config) -> str:
+    """Return the page for all builds in `root` (`build/`), variants beside their agents.
+
+    Raises InputError ART-003 where no simulator is finished.
+    """
+    folders = [
+        folder
+        for pattern in ("*", "*/variants/*")
+        for folder in root.glob(pattern)
+        if (folder / "simulator/manifest.json").is_file() and (folder / "simulator/index.html").is_file()
+    ]
+    if not folders:
+        raise InputError("ART-003", "has no finished simulator", str(root), "build one: make cat")
+    cards = [reading.card(folder, root, config.thumbnail_px) for folder in sorted(folders)]
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("stages.compile_gallery", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["number"] = number
+    return environment.get_template("gallery.html").render(cards=cards, marks=_MARKS, words=_WORDS)
+
+
+def number(value: float) -> str:
+    """Write a number with three significant digits; whole ones as they are."""
+    if value == round(value) or abs(value) >= 100:
+        return f"{value:.0f}"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    return f"{value:.{digits}f}"

@@ -1,0 +1,68 @@
+"""The gallery shows every finished simulator, links to files that are there, and asks nothing of the network."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.data import qa
+from stages.compile_gallery import __main__ as program
+from stages.compile_gallery import stage
+from stages.compile_gallery.config import Config
+
+
+def write_build(folder: Path, name: str, goal_m: float | None, megabytes: float) -> None:
+    """Write what the gallery reads of a finished build."""
+    simulator = folder / "simulator"
+    simulator.mkdir(parents=True)
+    (simulator / "index.html").write_text("page")
+    (simulator / "manifest.json").write_text("{}")
+    (simulator / "simulator.json").write_text(json.dumps({"name": name}))
+    picture = np.random.default_rng(0).integers(0, 255, (600, 900, 3), np.uint8)
+    qa.write(
+        simulator,
+        good="",
+        bad="",
+        checks=(
+            qa.Check("size of the page", megabytes, "MB", warn=25.0),
+            qa.Check("sessions to replay", 3, "", warn=1, better="higher"),
+        ),
+        pictures=(qa.Picture("visits", picture, ""),),
+    )
+    for page in ("report", "homes/other/simulator"):
+        (folder / page).mkdir(parents=True)
+        (folder / page / "index.html").write_text("page")
+    (folder / "evaluation").mkdir()
+    metrics = {"behavior/ats/goal_minde_m": goal_m, "registration/translation_m_median": None}
+    (folder / "evaluation/metrics.json").write_text(json.dumps(metrics))
+
+
+def test_a_card_for_every_finished_simulator(tmp_path: Path) -> None:
+    write_build(tmp_path / "luna", "luna & <co>", 0.4321, 30.0)
+    write_build(tmp_path / "cat", "cat", None, 12.3)
+    write_build(tmp_path / "cat/variants/no_scene", "cat without a scene", 0.5, 12.0)
+    (tmp_path / "toy/simulator").mkdir(parents=True)
+    (tmp_path / "toy/simulator/index.html").write_text("a build that was stopped")
+    page = stage.run(tmp_path, Config(thumbnail_px=120))
+    names = re.findall(r"<h2>(.*?)</h2>", page)
+    assert names == ["cat", "cat without a scene", "luna &amp; &lt;co&gt;"]
+    links = re.findall(r'href="([^"]*)"', page)
+    assert len(links) == 3 * 4 and all((tmp_path / link).is_file() for link in links)
+    assert "0.432 m" in page and "30 MB" in page and "12.3 MB" in page
+    lights = re.findall(r'class="light (\w+)"', page)
+    assert lights == ["ok", "ok", "warn"], "a page of 30 MB is to be looked at"
+    assert not re.search(r"https?://|src=\"(?!data:)", page), "nothing from the network"
+    assert len(page) < 100_000, "thumbnails are small"
+
+
+def test_the_program_writes_beside_the_builds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert program.main([str(tmp_path)]) == 2
+    assert "ART-003" in capsys.readouterr().err
+    with pytest.raises(InputError, match="ART-003"):
+        stage.run(tmp_path, Config())
+    write_build(tmp_path / "cat", "cat", 0.4, 12.3)
+    assert program.main([str(tmp_path)]) == 0
+    assert (tmp_path / "index.html").read_text().startswith("<!doctype html>")
