@@ -25,13 +25,18 @@ PRIVATE_WORDS = frozenset(
     "buried drafted bent missed led cheapest relax relatives alike likeness bore strayed shy bold".split()
 )
 """Words that this project once used for terms that the field has other names for; see docs/glossary.md."""
-PLAIN_NUMBERS = frozenset((10, 60, 90, 100, 180, 255, 360, 1000, 0.5, 0.25, 0.1, 0.01, 1e-3))
+PLAIN_NUMBERS = frozenset(
+    (10, 60, 90, 100, 180, 255, 360, 1000, 0.5, 0.25, 0.1, 0.01, 1e-3, 2.5, 97.5, 95, 99)
+)
 """Numbers that explain themselves; so do 1.0, integers below 10, powers of two, the largest values of integer
-types (127, 65535), and what only keeps a quotient finite."""
+types (127, 65535), the bounds of a 95 % interval, percentiles of the tail, and what only keeps a quotient
+finite."""
 NAMED_BY_CALL = ("Check", "qa.Check")
 """Calls whose numbers have their name and unit beside them: the thresholds of a quality check."""
 DRAWN = ("stages/synthesize_capture",)
 """Where numbers are the measures of a drawn world."""
+FIGURES = ("pictures.py", "plots.py")
+"""Modules in which numbers are sizes, line widths and colours of figures."""
 ARRAYS = re.compile(r"\b(ndarray|Tensor)\b")
 SHAPED = re.compile(r"\b(Float|Int|UInt8|UInt|Bool|Shaped|Num|Inexact|Real|Complex|Int64|Float32|Float64)\[")
 
@@ -174,7 +179,7 @@ def unnamed_numbers() -> list[str]:
         {
             f"{place(path, node.lineno)} {node.value}"
             for path in sources("pipeline", "stages")
-            if not path.relative_to(ROOT).as_posix().startswith(DRAWN)
+            if not path.relative_to(ROOT).as_posix().startswith(DRAWN) and path.name not in FIGURES
             for node in numbers_in(tree_of(path))
         }
     )

@@ -9,12 +9,12 @@ from benchmarks import codebase_counts
 BARS = {
     "lines": 58_550,
     "lines over 110 columns": 0,
-    "recipe keys": 304,
+    "recipe keys": 306,
     "packages over 16 modules": 0,
     "private words in identifiers": 131,
-    "tell, told": 13,
+    "tell, told": 12,
     "class names used twice": 3,
-    "unnamed numbers": 219,
+    "unnamed numbers": 136,
     "unshaped public functions": 0,
     "modules in import cycles": 0,
 }

@@ -13,6 +13,7 @@ import numpy as np
 import pygltflib as gltf
 from jaxtyping import Float, Float32, UInt8
 
+from pipeline.data import images
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 
@@ -189,7 +190,7 @@ def _unit_normals(mesh: Mesh) -> Float32[np.ndarray, "vertex 3"]:
 def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "vertex 4"]:
     """Undo the sRGB curve: glTF's vertex colours are linear."""
     srgb = color.astype(np.float32) / 255
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = images.linear_from_srgb(srgb)
     return np.concatenate([linear, np.ones_like(linear[:, :1])], 1).astype(np.float32)
 
 
@@ -256,10 +257,7 @@ class _Opened:
         color = None
         if primitive.attributes.COLOR_0 is not None:
             linear = self.values(primitive.attributes.COLOR_0)[:, :3].astype(np.float64)
-            srgb = np.where(
-                linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
-            )
-            color = np.rint(255 * srgb).astype(np.uint8)
+            color = np.rint(255 * images.srgb_from_linear(linear)).astype(np.uint8)
         faces = self.values(primitive.indices).reshape(-1, 3).astype(np.int32)
         return Mesh(self.values(primitive.attributes.POSITION).copy(), faces, color)
 

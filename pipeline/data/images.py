@@ -23,6 +23,8 @@ MAX_PIXELS = 32 << 20
 
 Of a depth picture, all channels together: 8K video, larger than any phone's picture
 """
+SRGB_SLOPE, SRGB_OFFSET, SRGB_GAMMA, SRGB_KNEE = 12.92, 0.055, 2.4, 0.0031308
+"""The transfer curve of sRGB (IEC 61966-2-1); the knee in linear intensity."""
 MAX_DEPTH_M = 1000.0
 """depth beyond this is no measurement, metres"""
 MAX_EXR_HEADER_BYTES = 1 << 16
@@ -216,3 +218,15 @@ def _exr_channels(listed: bytes) -> int:
         at = listed.index(b"\0", at) + 1 + _EXR_CHANNEL_BYTES
         count += 1
     return count
+
+
+def linear_from_srgb(srgb: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    """Return linear intensities of sRGB values, both 0..1 (IEC 61966-2-1)."""
+    low = srgb / SRGB_SLOPE
+    return np.where(low <= SRGB_KNEE, low, ((srgb + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** SRGB_GAMMA)
+
+
+def srgb_from_linear(linear: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    """Return sRGB values of linear intensities, both 0..1 (IEC 61966-2-1)."""
+    high = (1 + SRGB_OFFSET) * np.maximum(linear, 0) ** (1 / SRGB_GAMMA) - SRGB_OFFSET
+    return np.where(linear <= SRGB_KNEE, SRGB_SLOPE * linear, high)

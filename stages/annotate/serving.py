@@ -6,6 +6,7 @@ import re
 import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
@@ -116,21 +117,25 @@ class Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Serve the page, its state or a picture."""
         if not self._from_here():
-            return self._send(403, b"", "text/plain")
+            return self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
         match = PICTURE.match(self.path)
         if self.path == "/":
             page = resources.files("stages.annotate").joinpath("page.html").read_bytes()
-            return self._send(200, page, "text/html; charset=utf-8")
+            return self._send(HTTPStatus.OK, page, "text/html; charset=utf-8")
         if self.path == "/state":
             try:
                 return self._json(self.server.desk.state())
             except InputError as error:  # the file of clicks broke since the server began
-                return self._send(500, str(error).encode(), "text/plain")
+                return self._send(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode(), "text/plain")
         try:
             found = self.server.desk.picture(int(match[1]), int(match[2])) if match else b""
         except LookupError:
             found = b""
-        return self._send(200, found, "image/jpeg") if found else self._send(404, b"", "text/plain")
+        return (
+            self._send(HTTPStatus.OK, found, "image/jpeg")
+            if found
+            else self._send(HTTPStatus.NOT_FOUND, b"", "text/plain")
+        )
 
     def do_POST(self) -> None:
         """Keep the clicks and answer with their fits."""
@@ -141,15 +146,15 @@ class Handler(BaseHTTPRequestHandler):
             or self.path != "/clicks"
             or self.headers.get("Content-Type") != "application/json"
         ):
-            return self._send(403, b"", "text/plain")
+            return self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
         if not 0 < length <= clicks.MAX_BYTES:
-            return self._send(413, b"", "text/plain")
+            return self._send(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, b"", "text/plain")
         try:
             pairs = clicks.parse(json.loads(self.rfile.read(length)))
             with self.server.keeping:
                 self.server.desk.keep(pairs)
         except (ValueError, RecursionError, InputError, OSError) as error:
-            return self._send(400, str(error).encode(), "text/plain")
+            return self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain")
         return self._json({"fits": self.server.desk.fits(pairs)})
 
     def log_message(self, format: str, *arguments: Any) -> None:
@@ -160,7 +165,7 @@ class Handler(BaseHTTPRequestHandler):
         return loopback.is_own(self.server.server_port, hosts, origins)
 
     def _json(self, value: Any) -> None:
-        self._send(200, json.dumps(value).encode(), "application/json")
+        self._send(HTTPStatus.OK, json.dumps(value).encode(), "application/json")
 
     def _send(self, code: int, body: bytes, kind: str) -> None:
         self.send_response(code)

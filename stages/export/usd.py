@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.data import images
 from pipeline.data.glb import Action
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
@@ -55,9 +56,7 @@ def _mesh(pxr: Any, stage: Any, path: str, mesh: Mesh) -> Any:
     surface.CreateSubdivisionSchemeAttr("none")
     surface.CreateDoubleSidedAttr(True)
     if mesh.color is not None:
-        linear = np.where(
-            mesh.color <= 10, mesh.color / 255 / 12.92, ((mesh.color / 255 + 0.055) / 1.055) ** 2.4
-        )
+        linear = images.linear_from_srgb(mesh.color / 255)
         shown = surface.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex)
         shown.Set(pxr.Vt.Vec3fArray.FromNumpy(linear.astype(np.float32)))
     return surface

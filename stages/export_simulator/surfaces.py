@@ -14,6 +14,10 @@ from pipeline.geometry.meshes import Mesh
 _SPLAT_ROW = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
 )
+_POSITION, _DC, _LOGIT, _LOG_SCALE, _QUATERNION = (slice(0, 3), slice(6, 9), 54, slice(55, 58), slice(58, 62))
+"""Columns of a Gaussian as PLY files of splats order them: position, normal, spherical harmonics, ..."""
+_LEVEL_M, _UPRIGHT = 0.02, 0.9
+"""Thickness of the layers among which the floor is sought; least upward part of a floor's normal."""
 _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not compress
 _BAND_0 = 0.28209479177387814  # the constant spherical harmonic
 
@@ -38,13 +42,13 @@ def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1)
     height = corners[..., 1].mean(1)
-    level = (normals[:, 1] > 0.9 * area) & (height < np.median(agent_positions_world[:, 1]))
+    level = (normals[:, 1] > _UPRIGHT * area) & (height < np.median(agent_positions_world[:, 1]))
     if not level.any():
         return float(np.percentile(mesh.vertices[:, 1], 2))
-    edges = np.arange(height[level].min() - 0.02, height[level].max() + 0.04, 0.02)
+    edges = np.arange(height[level].min() - _LEVEL_M, height[level].max() + 2 * _LEVEL_M, _LEVEL_M)
     share, _ = np.histogram(height[level], edges, weights=area[level])
     lowest = np.flatnonzero(share > 0.25 * share.max())[0]
-    near = level & (np.abs(height - edges[lowest] - 0.01) < 0.03)
+    near = level & (np.abs(height - edges[lowest] - _LEVEL_M / 2) < 1.5 * _LEVEL_M)
     return float(np.average(height[near], weights=area[near]))
 
 
@@ -99,7 +103,7 @@ def skinned_splats(
 
 def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> Int[np.ndarray, " selected"]:
     """Choose the sound Gaussians that cover most, heaviest first."""
-    opacity, size = _opacity(gaussians), np.exp(gaussians[:, 55:58].astype(np.float64))
+    opacity, size = _opacity(gaussians), np.exp(gaussians[:, _LOG_SCALE].astype(np.float64))
     sound = np.isfinite(gaussians).all(1) & (opacity >= 1 / 255)
     weight = np.where(sound, opacity * np.sort(size, axis=1)[:, 1:].prod(1), -1)
     return np.argsort(-weight, kind="stable")[: min(max_points, int(sound.sum()))]
@@ -107,18 +111,20 @@ def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> In
 
 def _packed(gaussians: Float[np.ndarray, "point 62"]) -> bytes:
     rows = np.zeros(len(gaussians), _SPLAT_ROW)
-    rows["position"] = np.rint(gaussians[:, :3] * _STEPS) / _STEPS
-    rows["scale"] = np.maximum(np.rint(np.exp(gaussians[:, 55:58].astype(np.float64)) * _STEPS), 1) / _STEPS
-    rows["color"] = _bytes(
-        np.concatenate([gaussians[:, 6:9] * _BAND_0 + 0.5, _opacity(gaussians)[:, None]], 1) * 255
+    rows["position"] = np.rint(gaussians[:, _POSITION] * _STEPS) / _STEPS
+    rows["scale"] = (
+        np.maximum(np.rint(np.exp(gaussians[:, _LOG_SCALE].astype(np.float64)) * _STEPS), 1) / _STEPS
     )
-    rotation = gaussians[:, 58:62] / np.linalg.norm(gaussians[:, 58:62], axis=1, keepdims=True)
+    rows["color"] = _bytes(
+        np.concatenate([gaussians[:, _DC] * _BAND_0 + 0.5, _opacity(gaussians)[:, None]], 1) * 255
+    )
+    rotation = gaussians[:, _QUATERNION] / np.linalg.norm(gaussians[:, _QUATERNION], axis=1, keepdims=True)
     rows["rotation"] = _bytes(rotation * 128 + 128)
     return rows.tobytes()
 
 
 def _opacity(gaussians: Float[np.ndarray, "point 62"]) -> Float[np.ndarray, " point"]:
-    return 1 / (1 + np.exp(-gaussians[:, 54].astype(np.float64)))
+    return 1 / (1 + np.exp(-gaussians[:, _LOGIT].astype(np.float64)))
 
 
 def _bytes(values: np.ndarray) -> UInt8[np.ndarray, "*any"]:

@@ -111,3 +111,10 @@ def test_a_broken_mask_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"not a picture")
     with pytest.raises(InputError, match="CAP-021"):
         images.read_gray(tmp_path / "a.png")
+
+
+def test_srgb_and_linear_are_inverse_and_meet_at_the_knee():
+    srgb = np.linspace(0, 1, 256)
+    linear = images.linear_from_srgb(srgb)
+    assert np.allclose(images.srgb_from_linear(linear), srgb, atol=1e-6)
+    assert np.all(np.diff(linear) > 0) and linear[128] == pytest.approx(0.2158605, abs=1e-6)
