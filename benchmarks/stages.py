@@ -1,14 +1,14 @@
-"""Tell what a build cost: seconds, seconds per frame and peak memory of every stage, from the records beside
-its artifacts.
+"""Print what a build cost: wall and CPU seconds, seconds per frame and peak memory of every stage, from the
+records beside its artifacts.
 
     python -m benchmarks.stages cat
 
-Times are wall seconds of the job on the machine that ran it, other jobs beside it included; compare builds
-made alike.
+Wall seconds include what else ran on the machine; CPU seconds depend on it less.
 """
 
 import argparse
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ class Cost:
     artifact: str
     jobs: int
     seconds: float
+    cpu_seconds: float
     frames: int
     """Frames of the recordings whose jobs these are; 0 for an artifact made at once."""
     peak_memory_mb: int
@@ -39,6 +40,7 @@ def costs(build: Path) -> list[Cost]:
             artifact,
             len(done),
             sum(record["seconds"] for _, record in done),
+            sum(record.get("cpu_seconds", math.nan) for _, record in done),
             sum(frames.get(job["video"], 0) for job, _ in done if job["video"]),
             max(record["peak_memory_mb"] for _, record in done),
         )
@@ -48,15 +50,15 @@ def costs(build: Path) -> list[Cost]:
 
 def table(found: list[Cost]) -> str:
     """Lay the costs out as a Markdown table with a last line for the whole build."""
-    lines = ["| artifact | jobs | seconds | frames | s / frame | peak MB |", "|---|---|---|---|---|---|"]
+    lines = ["| artifact | jobs | seconds | CPU s | frames | CPU s / frame | peak MB |", "|---" * 7 + "|"]
     for cost in found:
-        per_frame = f"{cost.seconds / cost.frames:.3f}" if cost.frames else ""
+        per_frame = f"{cost.cpu_seconds / cost.frames:.3f}" if cost.frames else ""
         lines.append(
-            f"| {cost.artifact} | {cost.jobs} | {cost.seconds:.0f} | {cost.frames or ''} | {per_frame} | {cost.peak_memory_mb} |"
+            f"| {cost.artifact} | {cost.jobs} | {cost.seconds:.0f} | {cost.cpu_seconds:.0f} | {cost.frames or ''} | {per_frame} | {cost.peak_memory_mb} |"
         )
-    whole = sum(cost.seconds for cost in found)
+    whole, cpu = sum(cost.seconds for cost in found), sum(cost.cpu_seconds for cost in found)
     lines.append(
-        f"| all, one after another | {sum(cost.jobs for cost in found)} | {whole:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |"
+        f"| all, one after another | {sum(cost.jobs for cost in found)} | {whole:.0f} | {cpu:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |"
     )
     return "\n".join(lines)
 

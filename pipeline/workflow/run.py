@@ -26,6 +26,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from resource import struct_rusage
 from types import FrameType
 from typing import Any, TextIO
 
@@ -197,7 +198,7 @@ def _publish(job: dict[str, Any], key: str, command: list[str], log: TextIO) -> 
     """Run the stage program to its end and write the record of its artifact."""
     _say(job["id"], f"begins ({job['place']})", log)
     out, start = Path(job["out"]), time.time()
-    code, peak_mb = _spawn(job, command, log)
+    code, usage = _spawn(job, command, log)
     seconds = time.time() - start
     if code:
         _say(job["id"], EXPLAINED.get(code, f"failed with exit code {code}"), log)
@@ -209,14 +210,15 @@ def _publish(job: dict[str, Any], key: str, command: list[str], log: TextIO) -> 
     record = {
         "key": key,
         "seconds": round(seconds, 2),
-        "peak_memory_mb": round(peak_mb),
+        "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 2),
+        "peak_memory_mb": round(usage.ru_maxrss / 1024),
         "threads": job["threads"],
         "host": platform.node(),
         "commit": _commit(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
     _write_json(_record(job), record)
-    _say(job["id"], f"done in {seconds:.1f} s, peak {peak_mb:.0f} MB{_quality(out)}", log)
+    _say(job["id"], f"done in {seconds:.1f} s, peak {usage.ru_maxrss / 1024:.0f} MB{_quality(out)}", log)
     return 0
 
 
@@ -260,10 +262,8 @@ def _report_damage(job: dict[str, Any], log: TextIO) -> None:
                 _say(job["id"], line, log)
 
 
-def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, float]:
-    """Run `command` with its output forwarded line by line, and logged; return exit code and peak memory in
-    MB.
-    """
+def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, struct_rusage]:
+    """Run `command` with its output forwarded line by line, and logged; return exit code and usage."""
     child = subprocess.Popen(
         command,
         env=_environment(job["threads"]),
@@ -297,7 +297,7 @@ def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, f
     reader.join(timeout=2)
     code = os.waitstatus_to_exitcode(status)
     child.returncode = code
-    return (128 - code if code < 0 else code), usage.ru_maxrss / 1024
+    return (128 - code if code < 0 else code), usage
 
 
 def _bind_to_parent() -> None:

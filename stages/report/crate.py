@@ -87,7 +87,8 @@ def _artifact(name: str, manifest: Mapping[str, Any], record: Path, times: bool)
     if times and record.exists():
         known = json.loads(record.read_bytes())
         properties |= {
-            key: known.get(key) for key in ("seconds", "peak_memory_mb", "threads", "commit", "finished")
+            key: known.get(key)
+            for key in ("seconds", "cpu_seconds", "peak_memory_mb", "threads", "commit", "finished")
         }
     return {
         "@id": f"#artifact/{name}",
