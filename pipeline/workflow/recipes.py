@@ -144,9 +144,8 @@ def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], where: str) -> dict
     node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
     settings = {**_defaults(node.stage), **recipe.get(dag.table_of(node), {})}
     if begins == "recordings":
-        said = captures.builtin(
-            *(_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions"))
-        )
+        counts = (_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions"))
+        said = captures.builtin(*counts, companion=settings["companion"])
     else:
         said = captures.builtin_lives(
             *(

@@ -1,4 +1,4 @@
-"""The animal: one smooth watertight skinned cat with 25 bones and patterned fur.
+"""The animals: smooth watertight skinned surfaces with 25 bones and patterned fur, a cat and a dog.
 
 `grow` blends rounded cones along the bones into a signed distance, extracts one surface by marching cubes,
 and gives each vertex up to four bones. Frame: `agent`, origin at the body's centre, +y up, +z towards the
@@ -6,12 +6,16 @@ head, +x to its left, metres. At rest every bone's axes are the agent's; only it
 """
 
 from dataclasses import dataclass
+from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 from skimage.measure import marching_cubes
 
+Species = Literal["cat", "dog"]
+DOG_SIZE = 1.3
+"""Length of the dog's bones, in those of the cat."""
 STAND_HEIGHT_M = 0.235
 """Height of the body's centre above the ground when it stands at rest."""
 
@@ -97,17 +101,28 @@ class Animal:
     weight: Float[np.ndarray, "vertex 4"]
     fur: Float[np.ndarray, "vertex 4"]
     """Linear RGB albedo and how strongly the fine pattern shows."""
+    size: float = 1.0
+    """Its bones are so many times as long as `BONES`."""
 
 
-def grow(rng: np.random.Generator, *, cell_m: float = 0.013) -> Animal:
-    """Make the animal; the generator chooses its coat."""
+def grow(rng: np.random.Generator, *, cell_m: float = 0.013, species: Species = "cat") -> Animal:
+    """Make an animal; the generator chooses its coat."""
     axes = [np.arange(low, high, cell_m) for low, high in ((-0.13, 0.131), (-0.26, 0.19), (-0.54, 0.36))]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    distance = _body_distance(points.reshape(-1, 3)).reshape(points.shape[:3])
+    distance = _body_distance(points.reshape(-1, 3))
+    match species:
+        case "cat":
+            coat, size = _tabby, 1.0
+        case "dog":
+            distance, coat, size = _with_dogs_head(distance, points.reshape(-1, 3)), _patched, DOG_SIZE
+        case _:
+            assert_never(species)
+    distance = distance.reshape(points.shape[:3])
     vertices, faces, _, _ = marching_cubes(distance, 0.0, spacing=(cell_m,) * 3)
     vertices = vertices + np.array([axis[0] for axis in axes])
     bone, weight = _skin(vertices)
-    return Animal(vertices.astype(np.float32), faces.astype(np.int32), bone, weight, _coat(vertices, rng))
+    shown = (size * vertices).astype(np.float32)
+    return Animal(shown, faces.astype(np.int32), bone, weight, coat(vertices, rng), size)
 
 
 def _body_distance(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
@@ -167,7 +182,47 @@ def _skin(
     return bone.astype(np.int32), (weight / weight.sum(1, keepdims=True)).astype(np.float32)
 
 
-def _coat(vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator) -> Float[np.ndarray, "vertex 4"]:
+def _with_dogs_head(
+    distance: Float[np.ndarray, "point"], points: Float[np.ndarray, "point 3"]
+) -> Float[np.ndarray, "point"]:
+    """Add a long muzzle and hanging ears to a body, and fill the waist."""
+    parts = [(_cone(points, np.array([0, 0.07, 0.27]), np.array([0, 0.058, 0.312]), 0.034, 0.021), 0.014)]
+    parts += [(_cone(points, np.array([0, -0.012, -0.1]), np.array([0, -0.012, 0.09]), 0.085, 0.09), 0.03)]
+    for side in (-1, 1):
+        top, tip = np.array([side * 0.046, 0.128, 0.222]), np.array([side * 0.074, 0.045, 0.228])
+        parts.append((_cone(points, top, tip, 0.017, 0.024), 0.008))
+    for part, soft in parts:
+        mix = np.maximum(soft - np.abs(distance - part), 0) / soft
+        distance = np.minimum(distance, part) - mix * mix * soft / 4
+    return distance
+
+
+def _patched(
+    vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "vertex 4"]:
+    """Draw a white coat with large black patches, a black saddle and ears, and a brown face."""
+    x, y, z = vertices.T
+    white, black, brown = (
+        np.array([0.74, 0.72, 0.68]),
+        np.array([0.022, 0.02, 0.02]),
+        np.array([0.33, 0.15, 0.05]),
+    )
+    phase = rng.uniform(0, 2 * np.pi, 4)
+    patch = np.sin(z / 0.05 + phase[0]) + np.sin(y / 0.04 + phase[1]) * np.sin(x / 0.05 + phase[2])
+    saddle = 2.2 * np.clip((y - 0.01) / 0.05, -1, 1) * ((z > -0.2) & (z < 0.14))
+    dark = np.clip((0.6 * patch + saddle - 0.2) * 4, 0, 1) * (y > -0.12)
+    dark = np.maximum(dark, np.clip((np.abs(x) - 0.048) / 0.006, 0, 1) * (z > 0.19) * (y > 0.02))
+    dark = np.maximum(dark, (z < -0.23) * np.clip(np.sin(z / 0.03 + phase[3]) * 3, 0, 1))
+    color = white * (1 - dark[:, None]) + black * dark[:, None]
+    face = ((z > 0.2) & (np.abs(x) > 0.016) & (z < 0.29) & (dark < 0.5))[:, None]
+    color = np.where(face, brown, color)
+    color[(z > 0.325) & (y > 0.05)] = black
+    return np.concatenate([color, 0.35 * np.ones((len(vertices), 1))], axis=-1).astype(np.float32)
+
+
+def _tabby(
+    vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "vertex 4"]:
     """Draw a mackerel tabby: dark stripes across back, legs and tail, pale belly, muzzle and paws."""
     x, y, z = vertices.T
     ground = np.array([0.36, 0.22, 0.115]) * rng.uniform(0.8, 1.15)
@@ -205,7 +260,7 @@ def surface(animal: Animal, a_from_bone: Float[np.ndarray, "bone 4 4"]) -> Float
     heads).
     """
     a_from_rest = a_from_bone.copy()
-    a_from_rest[:, :3, 3] -= np.einsum("bij,bj->bi", a_from_bone[:, :3, :3], HEADS)
+    a_from_rest[:, :3, 3] -= np.einsum("bij,bj->bi", a_from_bone[:, :3, :3], animal.size * HEADS)
     return _blend(animal.vertices, animal.bone, animal.weight, a_from_rest)
 
 

@@ -1,6 +1,7 @@
 """Settings of the built-in capture."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -30,3 +31,7 @@ class Config:
     """Session (from 1) in low red sun from one side, overexposed, with another white balance; 0 = none."""
     foreign_sessions: int = 0
     """Additional sessions, each filmed in another home: registration is to refuse them."""
+    companion: Literal["none", "dog"] = "none"
+    """A second animal that lives with the cat: it follows it, plays with it and avoids it."""
+    alone_session: int = 0
+    """Session (from 1) in which the second animal is not at home; 0 = none."""

@@ -2,7 +2,7 @@
 recorded.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,35 +37,54 @@ class Frame:
     true_depth: Float[np.ndarray, "rows columns"]
     mask: Bool[np.ndarray, "height width"]
     vertices_world: Float[np.ndarray, "vertex 3"] | None
+    companion_mask: Bool[np.ndarray, "height width"]
+    companion_vertices_world: Float[np.ndarray, "vertex 3"] | None
+
+
+@dataclass(frozen=True)
+class Body:
+    """One animal in one frame."""
+
+    creature: Animal
+    world_from_bone: Float[np.ndarray, "bone 4 4"]
+    vertices_world: Float[np.ndarray, "vertex 3"]
+    second: bool
+    """Whether it is the companion."""
 
 
 class Stage:
-    """The lit set of one script: the room's mesh with its pictures, and the animal."""
+    """The lit set of one script: the room's mesh with its pictures, and the animals."""
 
-    def __init__(self, script: Script, creature: Animal):
-        self.script, self.creature = script, creature
+    def __init__(self, script: Script, creature: Animal, companion: Animal | None = None):
+        self.script, self.creature, self.companion = script, creature, companion
         self._rng = np.random.default_rng([script.seed, 7])
         lit = light.lit_sheets(script.room, script.light, self._rng)
         self.room = shade.backdrop(script.room.sheets(), lit)
         self.empty = creature.faces[:0]
 
-    def animal_world(self, index: int) -> Float[np.ndarray, "vertex 3"] | None:
-        """Return the animal's surface in the world in a frame, or None without animal."""
-        motion = self.script.motion
-        if motion is None:
-            return None
-        return animal.surface(self.creature, motion.world_from_agent[index] @ motion.agent_from_bone[index])
+    def bodies(self, index: int) -> list[Body]:
+        """Return the animals that are there in a frame, the companion last."""
+        script, found = self.script, []
+        for creature, motion, second in (
+            (self.creature, script.motion, False),
+            (self.companion, script.companion_motion, True),
+        ):
+            if creature is not None and motion is not None:
+                world_from_bone = motion.world_from_agent[index] @ motion.agent_from_bone[index]
+                found.append(
+                    Body(creature, world_from_bone, animal.surface(creature, world_from_bone), second)
+                )
+        return found
 
-    def mesh(
-        self, vertices_world: Float[np.ndarray, "vertex 3"] | None
-    ) -> tuple[Float[np.ndarray, "joined 3"], Int[np.ndarray, "face 3"]]:
-        """Return vertices (world, metres) and faces of room and animal together; the animal's faces come
+    def mesh(self, bodies: Sequence[Body]) -> tuple[Float[np.ndarray, "joined 3"], Int[np.ndarray, "face 3"]]:
+        """Return vertices (world, metres) and faces of room and animals together; the animals' faces come
         last.
         """
-        if vertices_world is None:
+        if not bodies:
             return self.room.vertices, self.room.faces
-        return np.concatenate([self.room.vertices, vertices_world]), np.concatenate(
-            [self.room.faces, self.creature.faces + len(self.room.vertices)]
+        vertices = np.concatenate([self.room.vertices, *(body.vertices_world for body in bodies)])
+        return vertices, np.concatenate(
+            [self.room.faces, _joined_faces(bodies, start=len(self.room.vertices))]
         )
 
     def frames(self) -> Iterator[Frame]:
@@ -84,12 +103,12 @@ class Stage:
         script = self.script
         (height, width), (rows, columns) = script.color_size, script.depth_size
         camera_from_world = rigid.inverse(script.world_from_camera[index])
-        body = self.animal_world(index)
-        vertices, faces = self.mesh(body)
+        bodies = self.bodies(index)
+        vertices, faces = self.mesh(bodies)
         fx, fy, cx, cy = script.intrinsics[index]
         doubled = np.array([[2 * fx, 0, 2 * cx], [0, 2 * fy, 2 * cy], [0, 0, 1]])
         view = raster.see(rigid.apply(camera_from_world, vertices), faces, doubled, 2 * height, 2 * width)
-        coat = self._coat(index, body, camera_from_world)
+        coat = self._coat(bodies, camera_from_world)
         linear = shade.shade(
             view.face, view.inverse_corners, (fx, fy, cx, cy), self.room, coat, camera_from_world
         )
@@ -101,12 +120,17 @@ class Stage:
             view.face, view.inverse_depth, view.inverse_corners, scaled, rows, columns
         )
         depth, confidence = sensor.lidar(true_depth, self._rng)
-        samples = _four_sums(view.face >= len(self.room.faces))
-        return Frame(color, depth, confidence, true_depth, samples >= 2, body)
+        masks = [np.zeros((height, width), bool) for _ in range(2)]
+        shown: list[np.ndarray | None] = [None, None]
+        start = len(self.room.faces)
+        for body in bodies:
+            stop = start + len(body.creature.faces)
+            masks[body.second] = _four_sums((view.face >= start) & (view.face < stop)) >= 2
+            shown[body.second], start = body.vertices_world, stop
+        return Frame(color, depth, confidence, true_depth, masks[0], shown[0], masks[1], shown[1])
 
-    def _coat(self, index: int, body: np.ndarray | None, camera_from_world: np.ndarray) -> shade.Coat:
-        motion = self.script.motion
-        if body is None or motion is None:
+    def _coat(self, bodies: Sequence[Body], camera_from_world: np.ndarray) -> shade.Coat:
+        if not bodies:
             return shade.Coat(
                 self.empty,
                 np.zeros((0, 3), np.float32),
@@ -114,15 +138,33 @@ class Stage:
                 np.zeros((0, 4), np.float32),
                 np.zeros((0, 4)),
             )
-        received = light.light_on_body(
-            body, animal.normals_of(body, self.creature.faces), self.script.room, self.script.light
+        received, balls = [], np.zeros((len(bodies) * len(SHADOW_BALLS), 4))
+        rows = iter(balls)
+        for body in bodies:
+            creature, points = body.creature, body.vertices_world
+            normals = animal.normals_of(points, creature.faces)
+            received.append(light.light_on_body(points, normals, self.script.room, self.script.light))
+            camera_from_bone = camera_from_world @ body.world_from_bone
+            for bone, rest, radius in SHADOW_BALLS:
+                local = creature.size * (np.asarray(rest) - animal.HEADS[INDEX[bone]])
+                middle = rigid.apply(camera_from_bone[INDEX[bone]], local[None])[0]
+                next(rows)[:] = *middle, creature.size * radius
+        return shade.Coat(
+            _joined_faces(bodies, start=0),
+            np.concatenate([body.creature.vertices for body in bodies]),
+            np.concatenate(received),
+            np.concatenate([body.creature.fur for body in bodies]),
+            balls,
         )
-        camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
-        balls = np.zeros((len(SHADOW_BALLS), 4))
-        for row, (bone, rest, radius) in enumerate(SHADOW_BALLS):
-            local = np.asarray(rest) - animal.HEADS[INDEX[bone]]
-            balls[row] = *rigid.apply(camera_from_bone[INDEX[bone]], local[None])[0], radius
-        return shade.Coat(self.creature.faces, self.creature.vertices, received, self.creature.fur, balls)
+
+
+def _joined_faces(bodies: Sequence[Body], start: int) -> Int[np.ndarray, "face 3"]:
+    """Return the faces of bodies whose vertices follow one another from number ``start`` on."""
+    found = []
+    for body in bodies:
+        found.append(body.creature.faces + np.int32(start))
+        start += len(body.vertices_world)
+    return np.concatenate(found)
 
 
 def true_flow(
@@ -139,7 +181,7 @@ def true_flow(
         matrices(script.intrinsics[[first, second]]), script.color_size, script.quarter_turns
     )
     height, width = script.color_size if script.quarter_turns % 2 == 0 else script.color_size[::-1]
-    here, there = (stage.mesh(stage.animal_world(index)) for index in (first, second))
+    here, there = (stage.mesh(stage.bodies(index)) for index in (first, second))
     cells = (height // stride, width // stride)
     coarse = cameras.scale_intrinsics(lenses[0], (height, width), cells)
     view = raster.see(rigid.apply(rigid.inverse(upright[0]), here[0]), here[1], coarse, *cells)

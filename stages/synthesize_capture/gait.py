@@ -5,7 +5,7 @@ move in the world. `poses` then places the body, reaches the feet with the legs,
 Everything is a closed function of time, vectorised over the queried times.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -33,8 +33,18 @@ class AnimalMotion:
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
 
 
-def poses(course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]) -> AnimalMotion:
-    """Return root and bones at the given times."""
+def poses(course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"], size: float = 1.0) -> AnimalMotion:
+    """Return root and bones at the given times, of an animal ``size`` times as large as the cat.
+
+    A larger one moves as the cat would over a course that is as much smaller.
+    """
+    if size != 1.0:
+        smaller = replace(course, position=course.position / size, gaze=course.gaze / size)
+        motion = poses(smaller, timestamp_s)
+        scaled = [each.copy() for each in (motion.world_from_agent, motion.agent_from_bone)]
+        for each in scaled:
+            each[..., :3, 3] *= size
+        return AnimalMotion(*scaled)
     state = _sampled(course, timestamp_s)
     world_from_agent = _root(state, timestamp_s)
     feet_world = footfalls(course, timestamp_s)

@@ -4,6 +4,7 @@ Each is a function of its script alone, so order and number of workers change no
 """
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.script import Script
 from stages.synthesize_capture.truth import TruthWriter, write_flow
 
+FIRST, SECOND = "cat", "dog"
+"""Names of the animals in a home of two."""
 FLOW_PAIRS = 40
 THUMBNAILS = 6
 
@@ -36,15 +39,25 @@ class FilmedRecording:
     visible_share: float
     thumbnails: UInt8[np.ndarray, "picture height width 3"]
     outlines: UInt8[np.ndarray, "picture height width"]
+    """255 where an animal is shown."""
     depths: np.ndarray
 
 
 def produce(
-    scripts: list[Script], creature: Animal, recordings: Path, truth: Path, *, workers: int
+    scripts: list[Script],
+    creature: Animal,
+    recordings: Path,
+    truth: Path,
+    *,
+    workers: int,
+    companion: Animal | None = None,
 ) -> list[FilmedRecording]:
-    """Make everything, longest recordings first; return in the order of the scripts."""
+    """Make everything, longest recordings first; return in the order of the scripts.
+
+    In a home of two each animal has a truth of its own, in a folder of its name.
+    """
     order = sorted(range(len(scripts)), key=lambda index: -len(scripts[index].timestamp_s))
-    jobs = [(scripts[index], creature, recordings, truth) for index in order]
+    jobs = [(scripts[index], creature, recordings, truth, companion) for index in order]
     if workers <= 1:
         done = ((number, record(*job)) for number, job in enumerate(jobs))
     else:
@@ -53,28 +66,42 @@ def produce(
     return [made[index] for index in range(len(scripts))]
 
 
-def record(script: Script, creature: Animal, recordings: Path, truth_folder: Path) -> FilmedRecording:
-    """Film one script into a `.r3d` file and its truth."""
-    stage = Stage(script, creature)
-    truth = TruthWriter(script, keep_depth=script.name == "heldout")
+def record(
+    script: Script, creature: Animal, recordings: Path, truth_folder: Path, companion: Animal | None = None
+) -> FilmedRecording:
+    """Film one script into a `.r3d` file and its truth, for each animal its own."""
+    stage = Stage(script, creature, companion)
+    keep_depth = script.name == "heldout"
+    truths = {truth_folder: TruthWriter(script, keep_depth)}
+    if companion is not None:
+        truths = {
+            truth_folder / name: TruthWriter(script, keep_depth, of_companion=name != FIRST)
+            for name in (FIRST, SECOND)
+        }
+    folders = list(truths)
     chosen = set(np.linspace(0, len(script.timestamp_s) - 1, THUMBNAILS).astype(int).tolist())
     thumbnails, outlines, depths = [], [], []
     with record3d.Writer(recordings / f"{script.name}.r3d") as writer:
         for index, frame in enumerate(stage.frames()):
             writer.add(frame.color, frame.depth, frame.confidence)
-            truth.add(frame, index)
+            for truth in truths.values():
+                truth.add(frame, index)
             if index in chosen:
                 thumbnails.append(frame.color)
-                outlines.append(frame.mask.astype(np.uint8) * 255)
+                outlines.append((frame.mask | frame.companion_mask).astype(np.uint8) * 255)
                 depths.append(np.nan_to_num(frame.depth))
         writer.finish(_header(script))
-    truth.write(truth_folder)
+    for folder, truth in truths.items():
+        folder.mkdir(exist_ok=True)
+        truth.write(folder)
     if script.session is not None:
-        write_flow(stage, truth_folder, pairs=FLOW_PAIRS)
+        write_flow(stage, folders[0], pairs=FLOW_PAIRS)
+        for folder in folders[1:]:
+            shutil.copy(folders[0] / f"{script.name}.flow.npz", folder)
     return FilmedRecording(
         script.name,
         len(script.timestamp_s),
-        float(truth.visible().mean()),
+        max(float(truth.visible().mean()) for truth in truths.values()),
         np.stack(thumbnails),
         np.stack(outlines),
         np.stack(depths),

@@ -101,7 +101,9 @@ def contact_sheet(made: list[FilmedRecording]) -> UInt8[np.ndarray, "height widt
 
 
 def birds_eye(scripts: list[Script]) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw each recording from above: furniture grey, the phone blue, the animal orange, its flights red."""
+    """Draw each recording from above: furniture grey, the phone blue, the animal orange, its flights red, a
+    second animal green.
+    """
     return np.hstack([_from_above(script) for script in scripts])
 
 
@@ -124,6 +126,9 @@ def _from_above(script: Script) -> UInt8[np.ndarray, "height width 3"]:
     if script.motion is not None:
         way = script.motion.world_from_agent[:, [0, 2], 3]
         cv2.polylines(canvas, [_pixels(way)], False, (240, 150, 40), 2, cv2.LINE_AA)
+    if script.companion_motion is not None:
+        way = script.companion_motion.world_from_agent[:, [0, 2], 3]
+        cv2.polylines(canvas, [_pixels(way)], False, (40, 150, 60), 2, cv2.LINE_AA)
     if script.session is not None:
         course = script.session.animal.position[:, [0, 2]]
         flights = script.session.reason == REASONS.index("flee")

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry import cameras, rigid
-from stages.synthesize_capture import camera_motion, dwellings, gait, light, sensor, session
+from stages.synthesize_capture import camera_motion, dwellings, gait, light, pair, sensor, session
+from stages.synthesize_capture.animal import DOG_SIZE
 from stages.synthesize_capture.config import Config
 from stages.synthesize_capture.gait import AnimalMotion
 from stages.synthesize_capture.light import Hour, Light
@@ -59,6 +60,9 @@ class Script:
     depth_size: tuple[int, int]
     fps: float
     session: SessionTrajectories | None = None
+    companion_motion: AnimalMotion | None = None
+    """Of the second animal, where it is there."""
+    companion_moving: np.ndarray | None = None
 
 
 MOVING_M_S = 0.15
@@ -77,9 +81,16 @@ def scripts(config: Config, room: Room, phone: PhoneFormat = PHONE) -> list[Scri
     rng, seconds = next(streams), config.turnaround_s
     course = session.standing_course(room, rng, seconds)
     path = camera_motion.turnaround(course, rng)
-    turnaround = _script(phone, rng, "turnaround", room, day, path, seconds, course=course)
+    name = "turnaround" if config.companion == "none" else "turnaround_cat"
+    turnarounds = [_script(phone, rng, name, room, day, path, seconds, course=course)]
+    if config.companion != "none":
+        rng = np.random.default_rng([config.seed, 4])
+        course = session.standing_course(room, rng, seconds)
+        path = camera_motion.turnaround(course, rng)
+        name = f"turnaround_{config.companion}"
+        turnarounds.append(_script(phone, rng, name, room, day, path, seconds, companion=course))
     sessions = _sessions(config, room, phone, streams)
-    return [walkthrough, turnaround, *sessions, *_foreign(config, phone, streams)]
+    return [walkthrough, *turnarounds, *sessions, *_foreign(config, phone, streams)]
 
 
 def _sessions(
@@ -92,9 +103,11 @@ def _sessions(
         seconds = config.test_session_s if number == config.session_count else config.session_s
         arranged = room.arranged(rng)
         lit = light.light_of_session(rng, hour)
-        lived = session.simulate_session(arranged, rng, seconds)
+        together = config.companion != "none" and number != config.alone_session
+        simulate = pair.simulate_pair if together else session.simulate_session
+        lived = simulate(arranged, rng, seconds)
         path, turns = camera_motion.filming(lived, rng), int(number == config.sideways_session)
-        seen = {"course": lived.animal, "hour": hour}
+        seen = {"course": lived.animal, "companion": lived.companion, "hour": hour}
         yield _script(phone, rng, name, arranged, lit, path, seconds, lived=lived, turns=turns, **seen)
         rng = next(streams)
         if number == config.heldout_of:
@@ -122,6 +135,7 @@ def _script(
     duration_s: float,
     *,
     course: AnimalCourse | None = None,
+    companion: AnimalCourse | None = None,
     lived: SessionTrajectories | None = None,
     hour: Hour = "day",
     turns: int = 0,
@@ -130,9 +144,6 @@ def _script(
     upright = rigid.interpolate(np.arange(len(path)) * session.STEP_S, path, timestamp_s)
     stored = cameras.turn_camera(upright, -turns)
     exposure = sensor.exposure_of_recording(rng, hour)
-    moving = np.zeros(len(timestamp_s), bool)
-    if course is not None:
-        moving = np.interp(timestamp_s, course.timestamp_s, course.speed()) > MOVING_M_S
     return Script(
         name=name,
         seed=int(rng.integers(2**31)),
@@ -145,10 +156,18 @@ def _script(
         odometry_from_camera=sensor.odometry(rng, timestamp_s, stored),
         gain=sensor.gains(rng, timestamp_s, exposure),
         motion=None if course is None else gait.poses(course, timestamp_s),
-        moving=moving,
+        moving=_moving(course, timestamp_s),
         quarter_turns=turns,
         color_size=phone.color_size,
         depth_size=phone.depth_size,
         fps=phone.fps,
         session=lived,
+        companion_motion=None if companion is None else gait.poses(companion, timestamp_s, DOG_SIZE),
+        companion_moving=None if companion is None else _moving(companion, timestamp_s),
     )
+
+
+def _moving(course: AnimalCourse | None, timestamp_s: np.ndarray) -> np.ndarray:
+    if course is None:
+        return np.zeros(len(timestamp_s), bool)
+    return np.interp(timestamp_s, course.timestamp_s, course.speed()) > MOVING_M_S

@@ -51,6 +51,8 @@ class SessionTrajectories:
     observer_looks_at: Float[np.ndarray, "sample 3"]
     reason: Int[np.ndarray, "sample"]
     """Index into `policy.REASONS`."""
+    companion: AnimalCourse | None = None
+    """The course of a second animal."""
 
 
 def simulate_session(

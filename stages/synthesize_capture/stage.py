@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import assert_never
 
 import numpy as np
 
@@ -24,6 +25,15 @@ def run(inputs: Inputs, config: Config, out: Path, *, threads: int = 1) -> None:
     recordings, truth = out / "recordings", out / "truth"
     recordings.mkdir()
     truth.mkdir()
-    made = produce.produce(scripts, creature, recordings, truth, workers=threads)
-    produce.write_world(home, creature, config.seed, truth)
+    match config.companion:
+        case "none":
+            second, worlds = None, {truth: creature}
+        case "dog":
+            second = animal.grow(np.random.default_rng([config.seed, 3]), species="dog")
+            worlds = {truth / produce.FIRST: creature, truth / produce.SECOND: second}
+        case _:
+            assert_never(config.companion)
+    made = produce.produce(scripts, creature, recordings, truth, workers=threads, companion=second)
+    for folder, each in worlds.items():
+        produce.write_world(home, each, config.seed, folder)
     review.report_quality(out, scripts, made)

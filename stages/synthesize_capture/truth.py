@@ -3,6 +3,7 @@
 Everything refers to the upright picture.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from jaxtyping import Bool
 from pipeline.data import npz
 from pipeline.geometry import cameras
 from stages.synthesize_capture.film import Frame, Stage, matrices, true_flow
+from stages.synthesize_capture.gait import AnimalMotion
 from stages.synthesize_capture.script import Script
 
 VISIBLE_SHARE = 0.001
@@ -25,19 +27,33 @@ class TruthWriter:
 
     script: Script
     keep_depth: bool
+    of_companion: bool = False
+    """Whether the second animal is the agent, and the first one the other."""
     masks: list[np.ndarray] = field(default_factory=list)
+    others: list[np.ndarray] = field(default_factory=list)
     depth: list[np.ndarray] = field(default_factory=list)
     vertices: list[np.ndarray] = field(default_factory=list)
 
     def add(self, frame: Frame, index: int) -> None:
         """Take over one frame."""
         turns = self.script.quarter_turns
-        self.masks.append(cameras.turn_image(frame.mask, turns))
+        own, other = frame.mask, frame.companion_mask
+        vertices_world = frame.vertices_world
+        if self.of_companion:
+            own, other, vertices_world = other, own, frame.companion_vertices_world
+        self.masks.append(cameras.turn_image(own, turns))
+        if self.script.companion_motion is not None:
+            self.others.append(cameras.turn_image(other, turns))
         if self.keep_depth:
             self.depth.append(cameras.turn_image(frame.true_depth, turns).astype(np.float16))
-        if frame.vertices_world is not None and self.script.motion is not None:
-            root = self.script.motion.world_from_agent[index, :3, 3]
-            self.vertices.append((frame.vertices_world - root).astype(np.float16))
+        if vertices_world is not None and self.motion is not None:
+            root = self.motion.world_from_agent[index, :3, 3]
+            self.vertices.append((vertices_world - root).astype(np.float16))
+
+    @property
+    def motion(self) -> AnimalMotion | None:
+        """Return the motion of the agent; None where it is not there."""
+        return self.script.companion_motion if self.of_companion else self.script.motion
 
     def visible(self) -> Bool[np.ndarray, "frame"]:
         """Return in which frames the animal can be seen."""
@@ -55,17 +71,16 @@ class TruthWriter:
             "agent_visible": self.visible(),
             "moving": script.moving,
         }
-        if script.motion is not None:
-            contents["world_from_agent"] = script.motion.world_from_agent
-            contents["agent_from_bone"] = script.motion.agent_from_bone.astype(np.float32)
+        if self.of_companion:
+            still = np.zeros(len(script.timestamp_s), bool)
+            contents["moving"] = still if script.companion_moving is None else script.companion_moving
+        if self.motion is not None:
+            contents["world_from_agent"] = self.motion.world_from_agent
+            contents["agent_from_bone"] = self.motion.agent_from_bone.astype(np.float32)
             contents["agent_vertices_world"] = np.stack(self.vertices)
-            masks = np.stack(self.masks)
-            npz.save(
-                folder / f"{name}.masks.npz",
-                compress=True,
-                packed=np.packbits(masks, axis=-1),
-                shape=np.array(masks.shape, np.int64),
-            )
+            _save_masks(folder / f"{name}.masks.npz", self.masks)
+        if self.others:
+            _save_masks(folder / f"{name}.others.npz", self.others)
         npz.save(folder / f"{name}.npz", compress=False, **contents)
         if self.keep_depth:
             stored = cameras.scale_intrinsics(
@@ -78,6 +93,11 @@ class TruthWriter:
                 depth=np.stack(self.depth),
                 depth_intrinsics=depth_intrinsics,
             )
+
+
+def _save_masks(path: Path, masks: Sequence[np.ndarray]) -> None:
+    shape = np.array((len(masks), *masks[0].shape), np.int64)
+    npz.save(path, compress=True, packed=np.packbits(np.stack(masks), axis=-1), shape=shape)
 
 
 def write_flow(stage: Stage, folder: Path, *, pairs: int) -> None:

@@ -29,6 +29,7 @@ WITHOUT = (
 SETTINGS = {
     "synthesize_capture": (
         "    session_count: int = 2\n    heldout_of: int = 1\n    foreign_sessions: int = 0\n"
+        "    companion: str = 'none'\n"
     ),
     "train_localizer": "    target: str = ''\n",
     "train_longterm": '    ablations: str = "none"\n',
@@ -138,7 +139,7 @@ def create(folder: Path) -> Checkout:
         made.write(name, "")
     shutil.copy(ROOT / "envs/parallel_jobs", folder / "envs")
     made.write("agents/variants/other.toml", "[train_behavior]\nseed = 7\n")
-    for stage in {node.stage for node in dag.nodes_of("recordings")}:
+    for stage in {node.stage for node in dag.nodes_of("recordings", several=True)}:
         folder = f"stages/{stage.replace('.', '/')}"
         made.write(f"{folder}/__init__.py", "")
         made.write(f"{folder}/config.py", CONFIG.format(settings=SETTINGS.get(stage, "")))

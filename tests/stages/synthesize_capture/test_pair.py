@@ -1,0 +1,95 @@
+"""A cat and a dog live together: near each other, never in each other, and both with a truth of their own."""
+
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from stages.synthesize_capture import animal, gait, pair, produce, room, script
+from stages.synthesize_capture.config import Config
+from stages.synthesize_capture.session import AnimalCourse
+
+HOME = room.furnish(np.random.default_rng(0))
+CAT = animal.grow(np.random.default_rng(0), cell_m=0.016)
+DOG = animal.grow(np.random.default_rng(0), cell_m=0.016, species="dog")
+PHONE = script.PhoneFormat(15.0, (160, 120), (128, 96))
+CONFIG = Config(
+    seed=8,
+    session_count=2,
+    session_s=0.6,
+    test_session_s=0.6,
+    walkthrough_s=0.5,
+    turnaround_s=0.5,
+    heldout_of=0,
+    dim_session=0,
+    sideways_session=0,
+    companion="dog",
+    alone_session=2,
+)
+
+
+def test_the_dog_follows_and_makes_way():
+    lived = [pair.simulate_pair(HOME, np.random.default_rng(seed), 40.0) for seed in (1, 2)]
+    for each in lived:
+        assert each.companion is not None
+        apart = np.linalg.norm((each.animal.position - each.companion.position)[:, [0, 2]], axis=-1)
+        level = (each.animal.position[:, 1] < 0.05) & (each.animal.airborne == 0)
+        assert apart[level].min() > 0.4, "metres between centres"
+        assert (each.companion.position[:, 1] == 0).all(), "on the floor"
+        assert each.companion.speed().max() < 4.0
+    near = [
+        (np.linalg.norm(one.animal.position - one.companion.position, axis=-1) < 1.3).mean() for one in lived
+    ]
+    assert np.mean(near) > 0.3, "share of the time"
+    again = pair.simulate_pair(HOME, np.random.default_rng(1), 40.0)
+    np.testing.assert_array_equal(again.companion.position, lived[0].companion.position)
+
+
+def test_a_dog_is_another_closed_surface_and_larger():
+    surface = trimesh.Trimesh(DOG.vertices, DOG.faces, process=False)
+    assert surface.is_watertight
+    assert surface.body_count == 1
+    assert np.ptp(DOG.vertices[:, 2]) > 1.2 * np.ptp(CAT.vertices[:, 2])
+
+
+def test_its_feet_stand_on_the_floor():
+    time = np.arange(0, 4, 1 / 30)
+    still = np.zeros(len(time))
+    position = np.stack([0 * time, 0 * time, 0.8 * time], axis=-1)
+    course = AnimalCourse(
+        time, position, still, np.zeros((len(time), 3)), still, position + np.array([0, 0.3, 1]), still
+    )
+    motion = gait.poses(course, np.linspace(1, 3, 30), animal.DOG_SIZE)
+    lowest = [
+        animal.surface(DOG, world_from_agent @ bones)[:, 1].min()
+        for world_from_agent, bones in zip(motion.world_from_agent, motion.agent_from_bone, strict=True)
+    ]
+    assert np.abs(lowest).max() < 0.035, "metres: soles sink in as those of the cat do, in proportion"
+
+
+def test_each_has_a_truth_of_its_own(tmp_path):
+    scripts = script.scripts(CONFIG, HOME, PHONE)
+    names = ["walkthrough", "turnaround_cat", "turnaround_dog", "session-1", "session-2"]
+    assert [part.name for part in scripts] == names
+    assert [part.companion_motion is not None for part in scripts] == [False, False, True, True, False]
+    assert [part.motion is not None for part in scripts] == [False, True, False, True, True]
+    produce.produce(scripts[2:4], CAT, tmp_path, tmp_path, workers=1, companion=DOG)
+    found = {}
+    for name in ("cat", "dog"):
+        truth = np.load(tmp_path / name / "session-1.npz")
+        assert truth["agent_vertices_world"].shape[1] == len({"cat": CAT, "dog": DOG}[name].vertices)
+        found[name] = [
+            np.unpackbits(packed["packed"], axis=-1, count=packed["shape"][2]).astype(bool)
+            for packed in (np.load(tmp_path / name / f"session-1.{kind}.npz") for kind in ("masks", "others"))
+        ]
+    np.testing.assert_array_equal(found["cat"][0], found["dog"][1])
+    np.testing.assert_array_equal(found["cat"][1], found["dog"][0])
+    assert not (found["cat"][0] & found["dog"][0]).any()
+    assert "world_from_agent" not in np.load(tmp_path / "cat/turnaround_dog.npz")
+
+
+def test_a_companion_changes_no_walkthrough():
+    both = script.scripts(CONFIG, HOME, PHONE)
+    alone = script.scripts(replace(CONFIG, companion="none"), HOME, PHONE)
+    np.testing.assert_array_equal(both[0].world_from_camera, alone[0].world_from_camera)
+    np.testing.assert_array_equal(both[1].world_from_camera, alone[1].world_from_camera)
