@@ -38,6 +38,8 @@ class Video:
     """Time in the other recording = time in this one + offset."""
     mapped: bool = False
     """A turnaround or session without depth: its cameras and depth come from the map of the walk-through."""
+    animal: str | None = None
+    """Whose turnaround it is, in a home of several animals."""
 
 
 def read(path: Path) -> tuple[Video, ...]:

@@ -7,6 +7,7 @@ written. User file names go into `videos.json` and nowhere else. Standard librar
 """
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ _NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
 }
 LONGEST_NAME_BYTES = 200
 """of a recording: file systems end at 255, and sidecars are named after it"""
+_ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
+_NAMED = re.compile(r"turnaround_([a-z][a-z0-9-]*)")
 TABLES = (".csv", ".npz")
 """Kinds of files that hold motion."""
 
@@ -51,6 +54,8 @@ class Remarks:
     """File name of the recording whose clock this one shares."""
     offset_s: float | None = None
     """Time in that recording = time in this one + offset, seconds."""
+    animal: str | None = None
+    """Whose turnaround it is, in a home of several animals; otherwise `turnaround_<name>` says it."""
 
 
 def find(folder: Path, flow: Flow = "recordings") -> list[str]:
@@ -150,7 +155,8 @@ def assign(
     """Give every recording its id, role, split and clock.
 
     `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another
-    file. Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be).
+    file. Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be), CAP-043 (two
+    turnarounds that do not name two animals).
     """
     roles: dict[str, Role] = {name: role_of(name, remark, where) for name, remark in said.items()}
     for role, what in missing_roles(list(roles.values()), flow):
@@ -158,6 +164,7 @@ def assign(
     order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
     splits = _splits([name for name in order if roles[name] == "session"], said, where)
     ids = _ids(order, known_ids)
+    animals = _animals([name for name in order if roles[name] == "turnaround"], said, where)
     return tuple(
         Video(
             id=ids[name],
@@ -167,6 +174,7 @@ def assign(
             sha256=hashes[name],
             synchronized_with=_partner(name, said, ids, where),
             offset_s=said[name].offset_s or 0.0,
+            animal=animals.get(name),
         )
         for name in sorted(said, key=ids.__getitem__)
     )
@@ -196,13 +204,17 @@ def missing_roles(roles: Sequence[Role], flow: Flow = "recordings") -> list[tupl
     return [(role, what) for role, what in _NEEDED[flow] if role not in roles]
 
 
-def builtin(session_count: int, heldout_of: int, foreign_sessions: int = 0) -> dict[str, Remarks]:
+def builtin(
+    session_count: int, heldout_of: int, foreign_sessions: int = 0, companion: str = "none"
+) -> dict[str, Remarks]:
     """Return the recordings that `synthesize_capture` writes.
 
-    `heldout_of` counts sessions from 1, 0 is none.
+    `heldout_of` counts sessions from 1, 0 is none; `companion` is the second animal's name.
     """
     sessions = [f"session-{i}.r3d" for i in range(1, session_count + foreign_sessions + 1)]
-    plain = dict.fromkeys(("walkthrough.r3d", "turnaround.r3d", *sessions), Remarks())
+    two = ("turnaround_cat.r3d", f"turnaround_{companion}.r3d")
+    turnarounds = ("turnaround.r3d",) if companion == "none" else two
+    plain = dict.fromkeys(("walkthrough.r3d", *turnarounds, *sessions), Remarks())
     if foreign_sessions:  # the test video stays the last one that is filmed at home
         plain |= {
             name: Remarks(split="test" if name == sessions[session_count - 1] else "train")
@@ -238,6 +250,27 @@ def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) ->
         name: wanted[name] or ("test" if name == sessions[-1] and not tested else "train")
         for name in sessions
     }
+
+
+def _animals(turnarounds: Sequence[str], said: Mapping[str, Remarks], where: str) -> dict[str, str]:
+    """Return whose turnarounds these are; nobody's in particular where there is only one."""
+    if len(turnarounds) < 2:
+        return {}
+    found: dict[str, str] = {}
+    for name in turnarounds:
+        named = _NAMED.match(name.lower().split(".")[0])
+        animal = said[name].animal or (named.group(1) if named else None)
+        if animal is None or not _ANIMAL.match(animal):
+            what = f"{name!r} does not say which animal it shows, and there is another turnaround"
+        elif animal in found.values():
+            other = next(file for file, whose in found.items() if whose == animal)
+            what = f"{other!r} and {name!r} are both turnarounds of {animal!r}"
+        else:
+            found[name] = animal
+            continue
+        remedy = "one animal: keep one turnaround; several: name each turnaround_<name>, a-z, 0-9 and -"
+        raise InputError("CAP-043", what, where, remedy)
+    return found
 
 
 def _ids(order: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:

@@ -51,6 +51,8 @@ class Need:
     """The flow in which it is an input; None: in all that the node is part of."""
     measured: bool = False
     """Only recordings with depth of their own, and the walk-through: what the map itself is made from."""
+    per_animal: bool = False
+    """In a home of several animals its part holds a folder per animal, of which one's own is read."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,10 @@ class Node:
     """Made only of recordings whose depth comes from the map."""
     stands_in_for: str | None = None
     """Artifact in whose place others read this one, of those recordings."""
+    of_several: bool = False
+    """Made, and read, only in a home of several animals, once for all of them."""
+    begins_animal: bool = False
+    """In a home of several animals each of them has its own, and its own of all that is made from it."""
 
 
 def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Need, ...]:
@@ -126,11 +132,19 @@ FLOW: tuple[Node, ...] = (
     ),
     Node("flow", "estimate_flow", ("frames",), roles=AGENT, seconds_per_frame=0.06),
     Node(
+        "identities",
+        "segment_agent.identities",
+        merging("frames", "flow", roles=("turnaround",)),
+        of_several=True,
+        seconds_per_frame=0.1,
+    ),
+    Node(
         "masks",
         "segment_agent",
-        ("frames", "flow"),
+        ("frames", "flow", "identities"),
         roles=AGENT,
         sidecars=("prompt",),
+        begins_animal=True,
         seconds_per_frame=0.11,
     ),
     Node(
@@ -293,7 +307,7 @@ FLOW: tuple[Node, ...] = (
             "splats",
             "behavior_data",
             "behavior",
-            Need("synthetic_capture", part="truth", option="truth"),
+            Need("synthetic_capture", part="truth", option="truth", per_animal=True),
         ),
         role_dependencies=("session", "heldout"),
         gpu=1,
@@ -306,7 +320,7 @@ FLOW: tuple[Node, ...] = (
             Need("registration", variants=REGISTRATION_VARIANTS),
             "scene_template",
             *merging("frames", roles=("walkthrough", "session")),
-            Need("synthetic_capture", part="truth", option="truth"),
+            Need("synthetic_capture", part="truth", option="truth", per_animal=True),
         ),
         on_demand=True,
     ),
@@ -317,7 +331,7 @@ FLOW: tuple[Node, ...] = (
             Need("reconstruction", variants=RECONSTRUCTION_VARIANTS),
             *TEMPLATES,
             *merging("frames"),
-            Need("synthetic_capture", part="truth", option="truth"),
+            Need("synthetic_capture", part="truth", option="truth", per_animal=True),
         ),
         on_demand=True,
     ),
@@ -353,9 +367,15 @@ def table_of(node: Node) -> str:
     return node.table or (node.artifact if shared or "." in node.stage else node.stage)
 
 
-def nodes_of(flow: Flow, *, trials: bool = False) -> tuple[Node, ...]:
-    """Return the nodes of one flow, in declared order; those made for tables only if ``trials``."""
-    return tuple(node for node in FLOW if flow in node.flows and (trials or node.trials == "none"))
+def nodes_of(flow: Flow, *, trials: bool = False, several: bool = False) -> tuple[Node, ...]:
+    """Return the nodes of one flow, in declared order; those made for tables only if ``trials``, those made
+    for ``several`` animals only if so.
+    """
+    return tuple(
+        node
+        for node in FLOW
+        if flow in node.flows and (trials or node.trials == "none") and (several or not node.of_several)
+    )
 
 
 def folder_of(name: str, video: Video) -> str:

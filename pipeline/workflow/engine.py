@@ -26,7 +26,7 @@ RUNTIME_FACTOR = 4
 """How much slower than the measured machine a node may be."""
 MEMORY_GROWTH = 1.5
 """Memory of each attempt, relative to the one before."""
-HOME = r"[a-z0-9][a-z0-9_-]*(?:/variants/[a-z0-9][a-z0-9_-]*)?"
+HOME = r"[a-z0-9][a-z0-9_-]*(?:/(?:variants|animals)/[a-z0-9][a-z0-9_-]*)?"
 """The homes that a rule's output may belong to."""
 
 

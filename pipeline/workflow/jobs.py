@@ -4,8 +4,8 @@ Standard library only, nothing is written here: `plan` writes it down, `run` doe
 """
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,29 +22,36 @@ NAME_RULE = "use a-z, 0-9, _ and -, beginning with a letter or digit, 63 at most
 
 @dataclass(frozen=True)
 class Home:
-    """Where artifacts stand: an agent's own folder or one of its variants'."""
+    """Where artifacts stand: an agent's own folder, one of its variants', or one of its animals' where it is
+    a home of several.
+    """
 
     agent: str
     variant: str | None = None
     tables: bool = False
     """A plan of its own, with the trials of `make behavior-tables`, whose artifacts stand among the
     agent's."""
+    animal: str | None = None
 
     @classmethod
     def parse(cls, text: str) -> "Home":
-        """Read `agent`, `agent/tables` or `agent/variants/name`; raises REC-004 for names that are no plain
-        names.
+        """Read `agent`, `agent/tables`, `agent/variants/name` or `agent/animals/name`; raises REC-004 for
+        names that are no plain names.
         """
-        agent, *rest = text.removesuffix("/tables").split("/variants/", 1)
+        kind = "animals" if "/animals/" in text else "variants"
+        agent, *rest = text.removesuffix("/tables").split(f"/{kind}/", 1)
         for name in (agent, *rest):
             if not NAME.match(name):
                 raise InputError(
                     "REC-004", f"{name!r} is no name for an agent or a variant", remedy=NAME_RULE
                 )
+        if kind == "animals":
+            return cls(agent, animal=rest[0])
         return cls(agent, *rest, tables=text.endswith("/tables"))
 
     def __str__(self) -> str:
         name = self.agent if self.variant is None else f"{self.agent}/variants/{self.variant}"
+        name = name if self.animal is None else f"{name}/animals/{self.animal}"
         return f"{name}/tables" if self.tables else name
 
     @property
@@ -119,16 +126,68 @@ class Plan:
     """Artifacts that the variant makes anew; all of them for an agent itself."""
     flow: Flow = "recordings"
     trials: tuple[Trial, ...] = ()
+    animals: tuple["Plan", ...] = ()
+    """Of a home of several animals: each one's plan, with its own turnaround alone."""
 
     @property
     def nodes(self) -> tuple[Node, ...]:
-        """Return what is to be made, in flow order."""
-        found = dag.nodes_of(self.flow, trials=self.home.tables)
-        return tuple(node for node in found if self.builtin or node.artifact not in dag.BUILTIN.values())
+        """Return what is to be made, in flow order; in a home of several animals what they share."""
+        several = bool(self.animals or self.home.animal)
+        found = dag.nodes_of(self.flow, trials=self.home.tables, several=several)
+        found = tuple(node for node in found if self.builtin or node.artifact not in dag.BUILTIN.values())
+        if self.animals:
+            return tuple(node for node in found if node.artifact not in of_animal())
+        if self.home.animal:
+            return tuple(node for node in found if not any(need.variants for need in dag.needs_of(node)))
+        return found
 
     def home_of(self, name: str) -> Home:
         """Return where the artifact `name` stands."""
         return self.home if name in self.touched else self.home.base
+
+
+def of_animal() -> frozenset[str]:
+    """Return the artifacts that each of several animals has of its own: where it begins, and all that is made
+    from that.
+    """
+    found: set[str] = set()
+    for node in dag.FLOW:
+        if node.begins_animal or any(need.artifact in found for need in dag.needs_of(node)):
+            found.add(node.artifact)
+    return frozenset(found)
+
+
+def touched_by(tables: Mapping[str, Any], changed: Mapping[str, Any], mapped: bool) -> frozenset[str]:
+    """Return what an overlay changes: the artifacts with another table, and all that is made from them; of
+    recordings that are ``mapped``, also what their artifacts stand in for, so that both lie in one home.
+    """
+    found: set[str] = set()
+    for _ in range(2 if mapped else 1):
+        for node in dag.FLOW:
+            from_touched = any(need.artifact in found for need in dag.needs_of(node))
+            if tables[node.artifact] != changed[node.artifact] or from_touched:
+                found.add(node.artifact)
+                if mapped and node.stands_in_for:
+                    found.add(node.stands_in_for)
+    return frozenset(found)
+
+
+def with_animals(plan: Plan) -> Plan:
+    """Add a plan per animal where there are several."""
+    names = [video.animal for video in plan.videos if video.animal]
+    if names and plan.home != plan.home.base:
+        what = f"{plan.home.agent} is a home of several animals, of which there are no variants and tables"
+        raise InputError("REC-008", what, str(plan.home), f"make {plan.home.agent}")
+    each = (
+        replace(
+            plan,
+            home=replace(plan.home, animal=name),
+            videos=tuple(video for video in plan.videos if video.animal in (None, name)),
+            touched=of_animal(),
+        )
+        for name in names
+    )
+    return replace(plan, animals=tuple(each))
 
 
 def jobs(plan: Plan) -> list[Job]:
@@ -144,7 +203,9 @@ def jobs(plan: Plan) -> list[Job]:
             return [video for video in shown if video.mapped]
         return [video for video in shown if dag.folder_of(node.artifact, video) == node.artifact]
 
-    return [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
+    shared = [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
+    own = [job for each in plan.animals for job in jobs(each) if job.home == str(each.home)]
+    return shared + own
 
 
 def followed(all_jobs: Sequence[Job]) -> dict[str, list[str]]:
@@ -201,13 +262,14 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     inputs, arguments, deciding = _needed(plan, node, part)
     named = f"{node.artifact}.{trial.id}" if trial else node.artifact
     arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
-    arguments += ["--videos", str(home.base.plan / "videos.json"), *(["--video", video.id] if video else [])]
+    listed = (home if home.animal else home.base).plan / "videos.json"
+    arguments += ["--videos", str(listed), *(["--video", video.id] if video else [])]
     keys_folder = home.base.plan / "keys"
     keys = [
         str(home.plan / f"keys/{named}.json"),
         *(str(keys_folder / f"video.{id}.json") for id in deciding),
     ]
-    own = home.variant is None
+    own = home.variant is None and home.animal is None
     for file in captures.extra_inputs(plan.home.agent, node.extra_inputs, artifacts=own):
         keys.append(str(keys_folder / f"extra.{file.name}"))
         arguments += [f"--{file.stem}", str(file)]
@@ -244,6 +306,8 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
     arguments: list[str] = []
     deciding = [video.id] if video else []
     for need in dag.needs_of(node, plan.flow):
+        if dag.NODES[need.artifact].of_several and not plan.home.animal:
+            continue
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:
                 scale_from = formats.scale_sources(folder, video, plan.videos)
@@ -268,6 +332,8 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
     """Yield the artifacts that one need of one job means."""
     source = dag.NODES[need.artifact]
     folder = plan.home_of(need.artifact).folder / need.artifact
+    if need.per_animal and plan.home.animal:
+        need = replace(need, part=f"{need.part}/{plan.home.animal}")
     if source.trials == "each":
         for trial in [part] if isinstance(part, Trial) else plan.trials:
             yield Input(f"{need.artifact}/{trial.id}", str(folder / trial.id), need.part)

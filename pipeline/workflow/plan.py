@@ -32,6 +32,8 @@ from pipeline.workflow.jobs import (
     jobs,
     lock_file,
     redo_mark,
+    touched_by,
+    with_animals,
 )
 
 CODE_CACHE = Path("build", "code-cache.json")
@@ -63,11 +65,11 @@ def read(home: Home, cache: sources.Cache) -> Plan:
     if names and flow == "recordings":
         videos = tuple(replace(video, mapped=captures.is_mapped(folder, video)) for video in videos)
     mapped = any(video.mapped for video in videos)
-    touched = _touched(tables, changed, mapped) if home.variant else frozenset(dag.NODES)
+    touched = touched_by(tables, changed, mapped) if home.variant else frozenset(dag.NODES)
     if home.tables:
         touched = frozenset(n.artifact for n in dag.FLOW if n.trials != "none")
     trials = tuple(recipes.trials(recipe.get(recipes.TABLES_STAGE, {}))) if home.tables else ()
-    return Plan(home, videos, not names, changed, touched, flow, trials)
+    return with_animals(Plan(home, videos, not names, changed, touched, flow, trials))
 
 
 def write(plan: Plan, cache: sources.Cache) -> None:
@@ -91,21 +93,28 @@ def write(plan: Plan, cache: sources.Cache) -> None:
         for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items():
             digest = cache.get(file, artifact.digest_of_file)
             _write(base / f"keys/{name}.{video.id}.json", _json({"sha256": digest}))
-    own = [job for job in all_jobs if job.home == str(plan.home)]
-    for name, trial in {(job.artifact, job.trial) for job in own}:
-        _write_key(plan, cache, name, trial)
+    for each in (plan, *plan.animals):
+        for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(each.home)}:
+            _write_key(each, cache, name, trial)
     for job in all_jobs:  # there from the start, so that a job that fails leaves no trace
         lock_file(job.home, job.id).parent.mkdir(parents=True, exist_ok=True)
         lock_file(job.home, job.id).touch()
-    after = followed(all_jobs)
+    after, homes = followed(all_jobs), {str(each.home) for each in (plan, *plan.animals)}
     for number, job in enumerate(all_jobs, start=1):
-        if job.home == str(plan.home):
+        if job.home in homes:
             one = job.as_dict() | {"place": f"{number} of {len(all_jobs)}", "after": after[job.stamp]}
             _write(job_file(job.home, job.id), json.dumps(one, sort_keys=True) + "\n")
-    lines = [json.dumps(job.as_dict(), sort_keys=True) for job in all_jobs]
-    _write(plan.home.plan / "dag.json", "[\n" + ",\n".join(lines) + "\n]\n")
+    _write_dag(plan.home, all_jobs)
+    for each in plan.animals:
+        _write(each.home.plan / "videos.json", _json([asdict(video) for video in each.videos]))
+        _write_dag(each.home, [job for job in all_jobs if job.home in (str(plan.home), str(each.home))])
     _write(plan.home.plan / "rules.mk", _rules(plan, all_jobs, after))
     stamps.remove_outdated(all_jobs)
+
+
+def _write_dag(home: Home, its_jobs: Sequence[Job]) -> None:
+    lines = [json.dumps(job.as_dict(), sort_keys=True) for job in its_jobs]
+    _write(home.plan / "dag.json", "[\n" + ",\n".join(lines) + "\n]\n")
 
 
 def _write(path: Path, text: str) -> None:
@@ -129,8 +138,13 @@ def _write_key(plan: Plan, cache: sources.Cache, name: str, trial: str | None) -
         "version": node.version,
         "code": sources.digest(node.stage, cache),
         "table": table,
-        "videos": [[v.id, v.role, v.split, v.synchronized_with, v.offset_s] for v in deciding],
+        "videos": [
+            [v.id, v.role, v.split, v.synchronized_with, v.offset_s, *([v.animal] if v.animal else [])]
+            for v in deciding
+        ],
     }
+    if plan.home.animal:
+        key["animal"] = plan.home.animal
     _write(plan.home.plan / f"keys/{name}.json", _json(key))
 
 
@@ -200,21 +214,6 @@ def _known_ids(base: Home) -> dict[str, str]:
     return known if sound else {}
 
 
-def _touched(tables: Mapping[str, Any], changed: Mapping[str, Any], mapped: bool) -> frozenset[str]:
-    """Return what an overlay changes: the artifacts with another table, and all that is made from them; of
-    recordings that are ``mapped``, also what their artifacts stand in for, so that both lie in one home.
-    """
-    touched: set[str] = set()
-    for _ in range(2 if mapped else 1):
-        for node in dag.FLOW:
-            from_touched = any(need.artifact in touched for need in dag.needs_of(node))
-            if tables[node.artifact] != changed[node.artifact] or from_touched:
-                touched.add(node.artifact)
-                if mapped and node.stands_in_for:
-                    touched.add(node.stands_in_for)
-    return frozenset(touched)
-
-
 def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) -> str:
     """Return the Make rules: one stamp per job, one target per artifact, and the agent's own."""
     name, home = plan.home.agent, plan.home
@@ -232,7 +231,8 @@ def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) 
         ]
     if not home.tables:
         pages = [
-            f"{plan.home_of(node).folder}/{node}/index.html"
+            f"{each.home_of(node).folder}/{node}/index.html"
+            for each in plan.animals or (plan,)
             for node in ("report", "simulator")
             if node in stamped
         ]
@@ -292,7 +292,8 @@ def _read_marks(home: Home) -> str:
 def _written_marks(home: Home) -> str:
     """Hash the times of a plan's files; of the folders with a file per job or key, their own."""
     found = []
-    for plan in dict.fromkeys((home.base.plan, home.plan)):
+    animals = (each.plan for each in _animal_homes(home.base))
+    for plan in dict.fromkeys((home.base.plan, home.plan, *animals)):
         names = (
             "dag.json",
             "rules.mk",
@@ -309,11 +310,18 @@ def _written_marks(home: Home) -> str:
     return artifact.digest_of(found)
 
 
+def _animal_homes(base: Home) -> list[Home]:
+    """Return the homes of the animals for which something was planned before."""
+    found = sorted((base.folder / "animals").glob("*/plan"))
+    return [replace(base, animal=path.parent.name) for path in found]
+
+
 def _plan(home: Home, cache: sources.Cache) -> None:
     """Plan `home`, unless nothing that a plan is made from has changed; a variant stands on a plan of its
     agent.
     """
-    for each in dict.fromkeys((home.base, home)):
+    home = home.base if home.animal else home
+    for each in dict.fromkeys((home.base, home, *_animal_homes(home.base))):
         stamps.remove_impossible(each)
     read_marks, state = _read_marks(home), home.plan / "state.json"
     try:

@@ -77,6 +77,12 @@ class Appearance(nn.Module):
 
     def forward(self, color: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch height width"]:
         """Return log-odds of pictures whose colours are -1..1 and whose sides are multiples of 16."""
+        return GAIN * self.out(self.trunk(color))[:, 0]
+
+    def trunk(
+        self, color: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch channel row column"]:
+        """Return what the last layer sees, at half the resolution."""
         levels = []
         for down in self.down:
             color = down(color)
@@ -90,7 +96,7 @@ class Appearance(nn.Module):
                     1,
                 )
             )
-        return GAIN * self.out(deep)[:, 0]
+        return deep
 
     def log_odds_within(
         self, color: UInt8[np.ndarray, "height width 3"], rows: slice, columns: slice
@@ -108,7 +114,7 @@ class Appearance(nn.Module):
         """Judge every pixel of a picture at working resolution, within +-8."""
         height, width = color.shape[:2]
         padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
-        found = self.eval()(_normalised(padded)[None])[0, :height, :width]
+        found = self.eval()(normalized(padded)[None])[0, :height, :width]
         return found.clamp(-LIMIT, LIMIT).numpy()
 
 
@@ -235,11 +241,12 @@ def _crop(
     color, labels = np.pad(color, [*short, (0, 0)], mode="edge"), np.pad(labels, short, constant_values=128)
     if rng.random() < 0.5:
         color, labels = color[:, ::-1], labels[:, ::-1]
-    shown = _normalised(color) * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
+    shown = normalized(color) * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
     return shown.float(), torch.from_numpy(labels.copy())
 
 
-def _normalised(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "3 height width"]:
+def normalized(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "3 height width"]:
+    """Return colours as -1..1, channels first."""
     return torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1))).float() / 127.5 - 1
 
 

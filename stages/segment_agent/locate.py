@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import cameras, rigid
-from stages.segment_agent import free_space, movers
+from stages.segment_agent import free_space, identity, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References
 from stages.segment_agent.movers import Candidate, Hint
@@ -34,15 +34,16 @@ def find_mover(
     animal: AnimalConfig,
     hint: Hint | None,
     appearance: AppearanceOf | None = None,
+    apart: AppearanceOf | None = None,
 ) -> list[Sphere | None]:
     """Track the animal of a session: a ball per frame, None where it is out of view.
 
     Without known appearance a hint holds only what hangs together with it; the rest of the track, which may
-    have gone over to another mover, is a guess.
+    have gone over to another mover, is a guess. ``apart`` are log-odds against a home's other animals.
     """
     for share in movers.SURE_SHARES if appearance is None else (0.0,):
         found = [
-            _candidates(clip, frame, world_from_camera[frame], references, animal, appearance, share)
+            _candidates(clip, frame, world_from_camera[frame], references, animal, (appearance, apart), share)
             for frame in range(len(clip))
         ]
         choice = movers.track(found, clip.timestamp_s, animal, hint)
@@ -93,15 +94,16 @@ def _candidates(
     world_from_camera: Float[np.ndarray, "4 4"],
     references: References,
     animal: AnimalConfig,
-    appearance: AppearanceOf | None,
+    known: tuple[AppearanceOf | None, AppearanceOf | None],
     share: float,
 ) -> list[Candidate]:
     """Group the points of one frame that move or, where its appearance is known, look more like the animal
     than like the room.
 
     A known appearance leaves few points to judge, so all of them are: an animal may show no more than a paw
-    or an ear.
+    or an ear. ``known`` are its appearance and what distinguishes it from other animals, if any.
     """
+    appearance, apart = known
     stride = max(
         1, round(math.sqrt(math.prod(clip.depth_size)) / (COARSE_PX if appearance is None else FINE_PX))
     )
@@ -119,12 +121,18 @@ def _candidates(
     if appearance is None:
         surely = movers.surely_moving(votes, share)
         solid = cv2.dilate(cv2.erode(surely.astype(np.uint8), SOLID), SOLID[::-1, ::-1], anchor=(0, 0)) > 0
-        return movers.candidates(solid & surely, np.ones(depth.shape), points, area, animal)
+        solid &= surely
+        if apart is None:
+            return movers.candidates(solid, np.ones(depth.shape), points, area, animal)
+        own, probability = identity.of_one(solid, _sampled(apart(frame), clip.depth_size, chosen))
+        return movers.candidates(own, probability, points, area, animal)
     motion = movers.motion(votes)
     settled = (votes.occupied > 0) & (motion == 0)
     both = (
         np.clip(like, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT) + motion - movers.SETTLED * settled
     )
+    if apart is not None:
+        both += np.minimum(_sampled(apart(frame), clip.depth_size, chosen), 0)
     both[depth == 0] = -movers.APPEARANCE_LIMIT
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal)
 

@@ -82,6 +82,11 @@ def segment(
     return painter.masks(range(len(clip))), path
 
 
+def painter_of_turnaround(clip: Clip, flow: Path, config: Config, rng: np.random.Generator) -> Painter:
+    """Prepare the masks of a turnaround without a hint; raises MSK-003 as `segment` does."""
+    return _standing(clip, steady(clip, flow, rng).world_from_camera, None, config)
+
+
 def _standing(
     clip: Clip, poses: Float[np.ndarray, "frame 4 4"], mark: Hint | None, config: Config
 ) -> Painter:
@@ -109,12 +114,11 @@ def _moving(
         judge = resting
     painter = Painter(clip, poses, balls, judge, config.height_px, Palette())
     painter = replace(painter, appearance=learn_palette(painter))
-    network = _learn(painter, references, config, rng)
+    network = learn_appearance(painter, references, config, rng)
     if network is None:
         return painter
-    room = free_space.without(references, lambda frame: _hidden(painter, frame, network))
-    radius_m = next(ball.radius_m for ball in balls if ball is not None)
-    balls = find_mover(
+    room = free_space.without(references, lambda frame: hidden(painter, frame, network))
+    found = find_mover(
         clip,
         poses,
         room,
@@ -122,10 +126,17 @@ def _moving(
         mark,
         lambda frame: network.log_odds(working_picture(clip, frame, config.height_px)),
     )
-    # rims of furniture may touch what looks like the animal: how large it is, motion alone knows better
-    balls = [ball and replace(ball, radius_m=radius_m * (GUESSED if ball.presumed else 1)) for ball in balls]
+    balls = resized(found, balls)
     judge = judge_motion(room) if resting is None else either(resting, judge_motion(room))
     return Painter(clip, poses, balls, judge, config.height_px, network)
+
+
+def resized(balls: list[Sphere | None], first: list[Sphere | None]) -> list[Sphere | None]:
+    """Give the balls of a track by appearance the size that motion alone found: rims of furniture may touch
+    what looks like the animal.
+    """
+    radius_m = next(ball.radius_m for ball in first if ball is not None)
+    return [ball and replace(ball, radius_m=radius_m * (GUESSED if ball.presumed else 1)) for ball in balls]
 
 
 def _has_depth(clip: Clip) -> bool:
@@ -135,7 +146,7 @@ def _has_depth(clip: Clip) -> bool:
     )
 
 
-def _learn(
+def learn_appearance(
     painter: Painter, references: References, config: Config, rng: np.random.Generator
 ) -> Appearance | None:
     """Learn the animal's appearance from first masks of frames spread over the recording, and the room's from
@@ -193,7 +204,7 @@ def _knows(network: Appearance, examples: list[Example]) -> bool:
     return bool(shown) and float(np.mean(shown)) > KNOWN_SHARE
 
 
-def _hidden(painter: Painter, frame: int, network: Appearance) -> Bool[np.ndarray, "height width"]:
+def hidden(painter: Painter, frame: int, network: Appearance) -> Bool[np.ndarray, "height width"]:
     """Mark where the animal, by its appearance and with a rim, hides the room: near where it was seen to
     move, if it was.
     """

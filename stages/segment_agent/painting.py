@@ -86,6 +86,10 @@ class Painter:
                 labels = cv2.resize(labels, self.clip.color_size[::-1], interpolation=cv2.INTER_NEAREST)
             yield replace(mask, labels=labels)
 
+    def working_picture(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        """Read a frame at working resolution."""
+        return working_picture(self.clip, frame, self.height_px)
+
     def working_mask(self, frame: int) -> Mask:
         """Make one mask at working resolution."""
         empty = np.zeros(working_size(self.clip, self.height_px), np.uint8)

@@ -86,14 +86,19 @@ def _percent(flags: Bool[np.ndarray, "frame"]) -> float:
     return 100 * float(flags.mean()) if len(flags) else float("nan")
 
 
-def report_quality(folder: Path, clip: Clip, summary: Summary, residual_m: float) -> None:
-    """Write the stage's quality page."""
+def report_quality(
+    folder: Path, clip: Clip, summary: Summary, residual_m: float, strangers: float | None = None
+) -> None:
+    """Write the stage's quality page; ``strangers``: share of frames with one, if several."""
+    checks = checks_of(summary, residual_m)
+    if strangers is not None:
+        checks.append(Check("frames with a stranger", 100 * strangers, "%", warn=5))
     area, visible = np.array(summary.area), np.array(summary.visible)
     over_time = plots.time_series({"share": area}, clip.timestamp_s, absent=~visible)
     qa.write(
         folder,
         good="the green outline hugs the animal in every frame, resting frames too",
         bad="the outline sits on furniture, flickers, or is missing while the animal is in view",
-        checks=checks_of(summary, residual_m),
+        checks=checks,
         pictures=qa.captioned(CAPTIONS, overlay=contact_sheet(clip, summary.shown), area=over_time),
     )

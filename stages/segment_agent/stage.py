@@ -1,5 +1,6 @@
 """The stage: frames and flow of one recording -> a mask per frame and the quality page."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, assert_never
@@ -7,11 +8,13 @@ from typing import Literal, assert_never
 import numpy as np
 
 from pipeline.core import devices
+from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
 from pipeline.core.videos import Video
 from pipeline.data.clips import Clip
-from stages.segment_agent import pictures, prompt, writing
+from stages.segment_agent import pictures, prompt, several, writing
 from stages.segment_agent.config import Config
+from stages.segment_agent.identity import Identities
 from stages.segment_agent.masks import segment
 
 MM = 1000
@@ -27,12 +30,26 @@ class Inputs:
     """`flow/<id>` of the recording."""
     prompt: Path | None = None
     """A user's hint where the animal is."""
+    identities: Path | None = None
+    """The artifact `identities`, in a home of several animals."""
 
 
 def run(
-    inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", video: Video | None = None
+    inputs: Inputs,
+    config: Config,
+    out: Path,
+    *,
+    device: devices.Device = "cpu",
+    video: Video | None = None,
+    videos: Sequence[Video] = (),
 ) -> writing.Summary:
-    """Segment one recording and write its masks into `out`."""
+    """Segment one recording and write its masks into `out`; in a home of several animals, those of the one
+    whose turnaround is among `videos`.
+
+    Raises InputError MSK-006 for what says nothing of several animals.
+    """
+    if inputs.identities is not None and _role(config, video) == "session":
+        return _run_of_several(inputs, inputs.identities, config, out, videos)
     clip = Clip.open(inputs.frames)
     hint = None if inputs.prompt is None else prompt.parse(inputs.prompt, clip)
     residual_m = np.nan
@@ -55,6 +72,27 @@ def run(
     pictures.report_quality(out, clip, summary, residual_m)
     if not any(summary.visible):
         log("the animal was never seen: does it move here? A hint (<recording>.prompt.toml) helps")
+    return summary
+
+
+def _run_of_several(
+    inputs: Inputs, identities: Path, config: Config, out: Path, videos: Sequence[Video]
+) -> writing.Summary:
+    """Segment a session of several animals."""
+    if inputs.prompt is not None or config.backend != "weightless":
+        what = "a hint" if inputs.prompt is not None else f"the backend {config.backend!r}"
+        raise InputError(
+            "MSK-006",
+            f"{what} does not say which of several animals is meant",
+            str(inputs.prompt or inputs.frames),
+            "leave it out: sessions of several animals are segmented by motion and by their turnarounds",
+        )
+    clip, followed = Clip.open(inputs.frames), next(video.animal for video in videos if video.animal)
+    assert followed is not None, "the planner lists one animal's turnaround"
+    network = Identities.load(identities)
+    masks, path, strangers = several.segment(clip, inputs.flow, followed, network, config)
+    summary = writing.write(out, track(masks, "masks", len(clip)), len(clip))
+    pictures.report_quality(out, clip, summary, path.residual_m, strangers)
     return summary
 
 

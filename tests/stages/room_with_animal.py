@@ -58,6 +58,8 @@ class Recording:
     world_from_camera: np.ndarray
     world_from_agent: np.ndarray
     masks: np.ndarray
+    others: np.ndarray
+    """masks of the other animal"""
 
 
 def record(
@@ -102,7 +104,7 @@ def record(
         )
         images.write_depth(folder / "depth" / f"{frame:06d}.exr", depth.reshape(DEPTH_SIZE))
         images.write_gray(folder / "confidence" / f"{frame:06d}.png", np.full(DEPTH_SIZE, 2, np.uint8))
-        masks.append((kind == 1).reshape(COLOR_SIZE))
+        masks.append(kind.reshape(COLOR_SIZE))
     count = len(world_from_camera)
     table = {"odometry_from_camera": odometry} if odometry is not None else {}
     npz.save(
@@ -114,7 +116,8 @@ def record(
         quality=np.ones(count, np.float32),
         **table,
     )
-    return Recording(world_from_camera, world_from_agent, np.stack(masks))
+    shown = np.stack(masks)
+    return Recording(world_from_camera, world_from_agent, shown == 1, shown == 2)
 
 
 def drifted(world_from_camera: np.ndarray, seed: int = 1) -> np.ndarray:

@@ -92,6 +92,50 @@ def test_the_builtin_capture_has_a_partner_for_its_second_phone():
     assert "heldout.r3d" not in builtin(3, heldout_of=0)
 
 
+def test_each_turnaround_of_several_names_its_animal():
+    names = ["walkthrough.r3d", "turnaround_cat.r3d", "TURNAROUND_Rex.r3d", "a.r3d"]
+    assert {v.file: v.animal for v in assigned(names).values()} == dict(
+        zip(names, (None, "cat", "rex", None), strict=True)
+    )
+    one = assigned(["walkthrough.r3d", "turnaround_cat.r3d", "a.r3d"])
+    assert one["turnaround_cat.r3d"].animal is None, "alone it needs no name"
+
+
+@pytest.mark.parametrize(
+    "names", [("turnaround_cat.r3d", "turnaround_cat.mp4"), ("turnaround.r3d", "turnaround_cat.r3d")]
+)
+def test_two_turnarounds_of_one_animal_are_refused(names):
+    with pytest.raises(InputError, match="CAP-043"):
+        assigned(["walkthrough.r3d", *names, "a.r3d"])
+
+
+TWO = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnaround_cat", "turnaround_dog", "a")}
+
+
+def test_animals_of_one_home_share_what_shows_none_of_them(house):
+    for name, text in TWO.items():
+        house.write(name, text)
+    made = house.make("-j2", "toy.behavior_data")
+    assert made.returncode == 0, made.stderr
+    for shared in ("frames/v000", "flow/v001", "features/v002", "scene_localizer", "identities"):
+        assert (house.folder / "build/toy" / shared / "manifest.json").exists(), shared
+    for name, own, other in (("cat", "v001", "v002"), ("dog", "v002", "v001")):
+        folder = house.folder / "build/toy/animals" / name
+        assert (folder / "masks" / own / "manifest.json").exists()
+        assert not (folder / "masks" / other).exists(), "the other's turnaround is not its own"
+        assert not (folder / "frames").exists(), "shared"
+    contents = [
+        (house.folder / f"build/toy/animals/{name}/reconstruction/0.bin").read_bytes()
+        for name in ("cat", "dog")
+    ]
+    assert contents[0] != contents[1]
+    again = house.make("-j2", "toy.behavior_data")
+    assert "begins" not in again.stderr, "nothing changed"
+    refused = house.python("pipeline.workflow.plan", "plan", "toy/variants/other")
+    assert refused.returncode == 2
+    assert "REC-008" in refused.stderr
+
+
 RECORDED = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnaround", "a")}
 HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", "-rf.r3d", "%.r3d", "#.r3d"]
 

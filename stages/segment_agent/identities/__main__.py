@@ -1,0 +1,14 @@
+"""Learn what the animals of a home look like, from all their turnarounds.
+
+One small network distinguishes them, pixel by pixel; `segment_agent` asks it who it is that moves.
+
+    python -m stages.segment_agent.identities --frames build/pair/frames --flow build/pair/flow \\
+        --videos build/pair/plan/videos.json --out build/pair/identities
+"""
+
+from pipeline.workflow import cli
+from stages.segment_agent.identities import stage
+from stages.segment_agent.identities.config import Config
+
+if __name__ == "__main__":
+    cli.main(__doc__, stage.run, stage.Inputs, Config)

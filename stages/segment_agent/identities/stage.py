@@ -1,0 +1,100 @@
+"""The stage: all turnarounds of a home -> the network that distinguishes its animals."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.core.errors import InputError
+from pipeline.core.progress import log
+from pipeline.core.videos import Video
+from pipeline.data import plots, qa
+from pipeline.data.clips import Clip
+from stages.segment_agent import identity, masks
+from stages.segment_agent.config import Config as MaskConfig
+from stages.segment_agent.identities.config import Config
+from stages.segment_agent.identity import Identities, Portrait
+
+APART = 0.8
+"""share of each animal's pixels, in portraits kept apart, that must be taken for it"""
+KEPT_APART = 4
+"""every so many portraits one is kept apart"""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the stage reads: folders of the turnarounds by id."""
+
+    frames: Mapping[str, Path]
+    flow: Mapping[str, Path]
+
+
+def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = ()) -> Identities:
+    """Learn to distinguish the animals and write the network into `out`.
+
+    Raises InputError MSK-005 where two look the same.
+    """
+    whose = {video.id: video.animal for video in videos if video.animal}
+    names = tuple(sorted(whose[id] for id in inputs.frames))
+    rng = np.random.default_rng(config.seed)
+    learned, tested = [], []
+    for id, folder in inputs.frames.items():
+        found = portraits(folder, inputs.flow[id], names.index(whose[id]), config, rng)
+        tested += found[KEPT_APART // 2 :: KEPT_APART]
+        learned += [each for index, each in enumerate(found) if index % KEPT_APART != KEPT_APART // 2]
+    network = identity.learn_identities(learned, names, config, rng)
+    shares = dict(zip(names, identity.recognized(network, tested).tolist(), strict=True))
+    log("recognized: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))
+    if min(shares.values()) < APART:
+        what = f"{' and '.join(names)} look the same: {100 * min(shares.values()):.0f} % recognized"
+        remedy = "is it one animal with two turnarounds? Keep one; else film both by the same light"
+        raise InputError("MSK-005", what, str(next(iter(inputs.frames.values())).parent), remedy)
+    network.save(out)
+    checks = [
+        qa.Check(f"pixels of {name} recognized", 100 * share, "%", warn=92, fail=APART * 100, better="higher")
+        for name, share in shares.items()
+    ]
+    qa.write(
+        out,
+        good="each animal in one colour, whole",
+        bad="animals of two colours: they look alike, or one turnaround shows both",
+        checks=checks,
+        pictures=qa.captioned(
+            {"portraits": "Portraits kept apart, every pixel in the colour of whom it is taken for."},
+            portraits=sheet(network, tested),
+        ),
+    )
+    return network
+
+
+def portraits(
+    frames: Path, flow: Path, animal: int, config: Config, rng: np.random.Generator
+) -> list[Portrait]:
+    """Segment frames spread evenly over a turnaround, at working resolution."""
+    clip = Clip.open(frames)
+    painter = masks.painter_of_turnaround(clip, flow, MaskConfig(height_px=config.height_px), rng)
+    chosen = np.unique(np.linspace(0, len(clip) - 1, config.portraits).astype(int)).tolist()
+    found = [
+        Portrait(animal, painter.working_picture(frame), painter.working_mask(frame).labels)
+        for frame in chosen
+    ]
+    return [each for each in found if (each.labels == 255).any()]
+
+
+def sheet(
+    network: Identities, tested: Sequence[Portrait], columns: int = 6
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw portraits with every pixel of an animal in the colour of whom it is taken for."""
+    tiles = []
+    for each in tested[:: max(1, len(tested) // (2 * columns))]:
+        taken = network.who(each.color)[1:].argmax(0)
+        hue = (taken * 180 / len(network.names)).astype(np.uint8)
+        tint = cv2.cvtColor(
+            np.dstack([hue, np.full_like(hue, 255), np.full_like(hue, 255)]), cv2.COLOR_HSV2RGB
+        )
+        inside = (each.labels == 255)[..., None]
+        tiles.append(np.where(inside, each.color // 3 + 2 * (tint // 3), each.color // 2).astype(np.uint8))
+    return plots.grid(tiles, columns)

@@ -1,0 +1,123 @@
+"""An orange and a green animal in one room: their looks are learned from turnarounds, and each pixel is one's."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.videos import Video
+from pipeline.data.clips import Clip
+from stages.segment_agent import identity, several, stage
+from stages.segment_agent.config import Config, LearningConfig
+from stages.segment_agent.identities import config as identities_config
+from stages.segment_agent.identities import stage as identities
+
+_spec = importlib.util.spec_from_file_location(
+    "room_with_animal", Path(__file__).parent.parent / "room_with_animal.py"
+)
+scenery = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scenery)
+
+OPTIONS = Config(learning=LearningConfig(examples=30, steps=60, batch=4, crop_px=96))
+SHORT = identities_config.Config(portraits=12, steps=40, batch=4, crop_px=64)
+VIDEOS = tuple(
+    Video(f"v00{index}", "", "turnaround", "none", None, animal=name)
+    for index, name in enumerate(("green", "orange"))
+)
+
+
+def nowhere(poses):
+    return np.full_like(poses, np.nan)
+
+
+@pytest.fixture(scope="module")
+def turnarounds(tmp_path_factory):
+    """Return the frames of a turnaround of each animal, by id."""
+    folder = tmp_path_factory.mktemp("turnarounds")
+    poses, agent = scenery.turnaround(24)
+    for video, (first, second) in zip(
+        VIDEOS, ((nowhere(agent), agent), (agent, nowhere(agent))), strict=True
+    ):
+        scenery.record(folder / video.id, poses, first, poses, world_from_other=second)
+    return {video.id: folder / video.id for video in VIDEOS}
+
+
+@pytest.fixture(scope="module")
+def network(turnarounds, tmp_path_factory):
+    out = tmp_path_factory.mktemp("identities")
+    identities.run(identities.Inputs(turnarounds, turnarounds), SHORT, out, videos=VIDEOS)
+    return identity.Identities.load(out)
+
+
+def test_looks_are_told_apart_and_kept(network, turnarounds):
+    assert network.names == ("green", "orange")
+    clip = Clip.open(turnarounds["v001"])
+    who = network.who(clip.color(3))
+    assert np.exp(who).sum(0) == pytest.approx(1, abs=1e-4)
+    middle = identity.margin(who, 1)[50:70, 35:55]
+    assert np.median(middle) > 0
+    assert np.allclose(identity.margin(who, 0)[50:70, 35:55][middle > 3].max(), -3, atol=3.1)
+
+
+def test_one_animal_filmed_twice_is_refused(turnarounds, tmp_path):
+    twice = dict.fromkeys(turnarounds, turnarounds["v000"])
+    with pytest.raises(InputError, match="MSK-005"):
+        identities.run(identities.Inputs(twice, twice), SHORT, tmp_path, videos=VIDEOS)
+
+
+def test_bodies_that_touch_are_parted_and_a_patch_does_not_part_one():
+    moving = np.zeros((80, 80), bool)
+    moving[30:50, 10:70] = True
+    margins = np.where(np.arange(80) < 40, 4.0, -4.0) * np.ones((80, 1))
+    own, probability = identity.of_one(moving, margins)
+    assert own[30:50, 10:38].all()
+    assert not own[:, 42:].any()
+    patch = np.full((80, 80), 4.0)
+    patch[38:42, 30:34] = -4.0
+    own, probability = identity.of_one(moving, patch)
+    assert own[moving].all()
+    assert (probability[moving] > 0.9).all()
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    """Return a session in which the animals pass each other, and its truth."""
+    poses, agent = scenery.session()
+    other = agent[np.r_[36:2:-1, [2] * 6]].copy()
+    other[:, 2, 3] += 0.45
+    folder = tmp_path_factory.mktemp("together") / "frames"
+    return folder, scenery.record(folder, poses, agent, scenery.drifted(poses), world_from_other=other)
+
+
+def test_two_that_pass_each_other_keep_their_masks(network, together):
+    folder, truth = together
+    for name, own, others in (("orange", truth.masks, truth.others), ("green", truth.others, truth.masks)):
+        found, _, strangers = several.segment(Clip.open(folder), Path("none"), name, network, OPTIONS)
+        labels = np.stack([mask.labels for mask in found])
+        shown = own.mean((1, 2)) > 0.002
+        score = [
+            ((mask == 255) & true).sum() / ((mask == 255) | true).sum()
+            for mask, true in zip(labels[shown], own[shown], strict=True)
+        ]
+        assert np.mean(score) > 0.7, "share; the pictures are 90 pixels wide"
+        assert (labels[others] == 255).mean() < 0.03, "of the other's pixels"
+        assert (labels[others] == 128).mean() > 0.6, "they are neither the animal nor the room"
+        assert strangers < 0.1
+
+
+def test_one_that_is_not_here_has_no_mask(network, tmp_path):
+    poses, agent = scenery.session()
+    scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
+    found, _, _ = several.segment(Clip.open(tmp_path / "frames"), Path("none"), "green", network, OPTIONS)
+    assert not any((mask.labels == 255).any() for mask in found)
+
+
+def test_a_hint_that_names_no_animal_is_refused(network, together, tmp_path):
+    network.save(tmp_path)
+    hint = tmp_path / "hint.toml"
+    hint.write_text("frame = 0\nclick = [0.5, 0.5]\n")
+    inputs = stage.Inputs(together[0], Path("none"), hint, tmp_path)
+    with pytest.raises(InputError, match="MSK-006"):
+        stage.run(inputs, OPTIONS, tmp_path, videos=VIDEOS[:1])
