@@ -1,7 +1,7 @@
 """The reconstruction seen by the held-out phone: depth within 0.1 m, PSNR and SSIM, all / agent / scene."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -21,7 +21,11 @@ KINDS = ("depth_acc", "rendered_depth_acc", "psnr", "ssim", "lpips")
 RENDERED_PIXELS = 12_000
 """Pixels of all pictures together on whose rays fields are integrated: shares are then within 0.01 (95 %),
 and it takes seconds."""
+FILMED_SHARE = 0.01
+"""Share of the session's picture above which its phone films the agent."""
+FILMED = ("reconstruction/depth_acc_agent_filmed", "reconstruction/agent_filmed_share")
 NAMES = (
+    *FILMED,
     *(f"reconstruction/{kind}_{part}" for kind in KINDS for part in PARTS),
     *(f"splats/{kind}_{part}" for kind in ("psnr", "ssim") for part in PARTS),
 )
@@ -39,6 +43,8 @@ class HeldoutShot:
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
     agent: Bool[np.ndarray, "height width"]
+    session_share: float = np.nan
+    """Share of the session's own picture, at that time, that truly shows the agent; NaN: not known."""
 
     def every(self, stride: int) -> "HeldoutShot":
         """Return the shot of the same camera with one pixel of ``stride`` x ``stride``, from the middle."""
@@ -47,8 +53,8 @@ class HeldoutShot:
         intrinsics = np.array(self.intrinsics, float)
         intrinsics[:2, 2] -= first + 0.5 - 0.5 * stride
         intrinsics[:2] /= stride
-        images = (image[chosen] for image in (self.color, self.depth, self.agent))
-        return HeldoutShot(self.world_from_camera, intrinsics, self.time_s, *images)
+        color, depth, agent = (image[chosen] for image in (self.color, self.depth, self.agent))
+        return replace(self, intrinsics=intrinsics, color=color, depth=depth, agent=agent)
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,7 @@ def view_metrics(views: Sequence[HeldoutView], lpips: Lpips | None = None) -> Me
     Phones may differ in the shape of their pictures. Without ``lpips`` LPIPS is not measured.
     """
     metrics = depth_metrics("reconstruction/depth_acc", views)
+    metrics.add(filmed_metrics(views))
     metrics.add(picture_metrics("reconstruction", views))
     names = [f"reconstruction/lpips_{part}" for part in PARTS]
     if lpips is None:
@@ -93,6 +100,21 @@ def depth_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
     for part, chosen in (("all", known), ("agent", known & agent), ("scene", known & ~agent)):
         value = float(right[chosen].mean()) if chosen.any() else np.nan
         metrics.put(f"{name}_{part}", value, "not in view of the held-out phone")
+    return metrics
+
+
+def filmed_metrics(views: Sequence[HeldoutView]) -> Metrics:
+    """Average DepthAcc of the agent over the pictures in which the session's own phone films it too, and give
+    the share of these pictures among those that show the agent; elsewhere its pose is a guess.
+    """
+    metrics, shown = Metrics(), [view for view in views if view.true.agent.any()]
+    if not shown or not all(np.isfinite(view.true.session_share) for view in shown):
+        metrics.skip(FILMED, "what the session's phone truly saw is not known")
+        return metrics
+    filmed = [view for view in shown if view.true.session_share >= FILMED_SHARE]
+    value = depth_metrics("filmed", filmed).values["filmed_agent"] if filmed else np.nan
+    metrics.put(FILMED[0], np.nan if value is None else value, "the session's phone does not film the agent")
+    metrics.put(FILMED[1], len(filmed) / len(shown))
     return metrics
 
 

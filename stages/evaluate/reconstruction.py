@@ -64,24 +64,21 @@ def reconstruction_metrics(
     metrics.add(_agent_chamfer(folders, sessions, motions, frames, config, rng))
     walkthrough = next(each for each in known if each.video.role == "walkthrough")
     metrics.add(_scene_chamfer(folders, walkthrough, frames, rng))
-    metrics.add(
-        _held_out(folders, [each for each in known if each.video.role == "heldout"], frames, config, device)
-    )
+    metrics.add(_held_out(folders, known, frames, config, device))
     return metrics
 
 
 def _held_out(
     folders: BuildFolders,
-    phones: Sequence[RecordingWithTruth],
+    known: Sequence[RecordingWithTruth],
     frames: TruthAlignment,
     config: Config,
     device: devices.Device,
 ) -> Metrics:
     """Compare with what the held-out phones truly saw."""
     seen = [
-        (session, shots_of(folders, phone, frames, config.heldout_frames))
-        for phone in phones
-        if (session := phone.video.synchronized_with)
+        (session.video.id, shots_of(folders, phone, session, frames, config.heldout_frames))
+        for phone, session in phones_with_sessions(known)
     ]
     return held_out_metrics(folders, seen, device, config.lpips_weights)
 
@@ -139,10 +136,26 @@ def agent_roots(
     return root_metrics("reconstruction", errors, placed)
 
 
+def phones_with_sessions(
+    known: Sequence[RecordingWithTruth],
+) -> list[tuple[RecordingWithTruth, RecordingWithTruth]]:
+    """Return the held-out phones, each with the session that it is synchronized with."""
+    of_id = {each.video.id: each for each in known}
+    return [
+        (each, of_id[each.video.synchronized_with])
+        for each in known
+        if each.video.role == "heldout" and each.video.synchronized_with in of_id
+    ]
+
+
 def shots_of(
-    folders: Reconstructed, phone: RecordingWithTruth, frames: TruthAlignment, count: int
+    folders: Reconstructed,
+    phone: RecordingWithTruth,
+    session: RecordingWithTruth,
+    frames: TruthAlignment,
+    count: int,
 ) -> list[HeldoutShot]:
-    """Return what the held-out phone saw while its session was filmed, in up to ``count`` frames, at its
+    """Return what the held-out phone saw while ``session`` was filmed, in up to ``count`` frames, at its
     depth's resolution.
     """
     true = read_depth(folders.truth_folder, phone.name, phone.source_index)
@@ -155,8 +168,12 @@ def shots_of(
             cv2.resize(phone.truth.masks[frame].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         )
         time_s = float(phone.clip.timestamp_s[frame] + phone.video.offset_s)
+        meanwhile = int(np.abs(session.clip.timestamp_s - time_s).argmin())
+        share = float(session.truth.masks[meanwhile].mean())
         shots.append(
-            HeldoutShot(cameras[frame], true.intrinsics[frame], time_s, color, true.depth[frame], agent)
+            HeldoutShot(
+                cameras[frame], true.intrinsics[frame], time_s, color, true.depth[frame], agent, share
+            )
         )
     return shots
 

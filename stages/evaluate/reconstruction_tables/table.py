@@ -88,12 +88,11 @@ def metrics(
         for role in ("walkthrough", "turnaround", "session", "heldout")
     }
     frames = reading.frames_of_truth(places, of_role["walkthrough"][0], of_role["turnaround"][0])
-    filmed = {phone.video.synchronized_with for phone in of_role["heldout"]}
-    sessions = [each for each in of_role["session"] if each.video.id in filmed]
+    pairs = reconstruction.phones_with_sessions(known)
+    sessions = [session for _, session in pairs]
     shots = [
-        (phone.video.synchronized_with, reconstruction.shots_of(places, phone, frames, heldout_frames))
-        for phone in of_role["heldout"]
-        if phone.video.synchronized_with
+        (session.video.id, reconstruction.shots_of(places, phone, session, frames, heldout_frames))
+        for phone, session in pairs
     ]
     pixels = heldout.RENDERED_PIXELS // max(len(shots), 1)
     right: dict[str, Float[np.ndarray, "view part"]] = {}

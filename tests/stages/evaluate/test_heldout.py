@@ -10,7 +10,7 @@ from pipeline.core.videos import Video
 from pipeline.data import images, npz
 from pipeline.geometry import cameras
 from stages.evaluate import heldout, reading, real_phone, reconstruction
-from stages.evaluate.heldout import HeldoutShot
+from stages.evaluate.heldout import HeldoutShot, HeldoutView
 from stages.evaluate.reading import BuildFolders
 
 PHONE = Video("v002", "heldout.r3d", "heldout", "none", None, "v001", 0.35)
@@ -59,6 +59,20 @@ def test_a_refused_session_is_wrong_everywhere(folders: BuildFolders):
     assert [
         values[f"reconstruction/heldout_{what}"] for what in ("phones_drawn", "phones_total", "frames")
     ] == [0, 2, 2]
+
+
+def test_what_the_session_films_is_judged_apart():
+    agent = np.arange(63).reshape(9, 7) < 12
+    depth, color = np.full((9, 7), 2.0, np.float32), np.zeros((9, 7, 3), np.uint8)
+    views = [
+        HeldoutView(color, depth + wrong, HeldoutShot(np.eye(4), np.eye(3), 0.0, color, depth, agent, share))
+        for wrong, share in ((0.0, 0.02), (0.5, 0.0), (0.0, 0.0), (0.5, 0.01))
+    ]
+    values = heldout.filmed_metrics(views).values
+    assert values["reconstruction/depth_acc_agent_filmed"] == 0.5
+    assert values["reconstruction/agent_filmed_share"] == 0.5
+    unknown = [HeldoutView(color, depth, HeldoutShot(np.eye(4), np.eye(3), 0.0, color, depth, agent))]
+    assert set(heldout.filmed_metrics(unknown).values.values()) == {None}
 
 
 def test_thinned_shots_look_along_the_same_rays():
