@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 59_580,
+    "lines": 59_800,
     "lines over 110 columns": 0,
     "recipe keys": 314,
     "packages over 16 modules": 0,
