@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.core import config
-from pipeline.workflow import dag, sources
+from pipeline.workflow import dag, recipes, sources
 
 ROOT = Path(__file__).parent.parent
 FILES = sorted(
@@ -261,7 +261,7 @@ def test_truth_is_for_evaluate_alone():
 def test_recipes_fit_the_programs(path):
     """Every table of every recipe loads into its stage's Config."""
     nodes = {dag.table_of(node): node for node in dag.FLOW}
-    for name, table in config.read_table(path).items():
+    for name, table in recipes.read(path)[0].items():
         if name in ("videos", "flow"):  # no stage's
             continue
         stage = nodes[name].stage
