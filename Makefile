@@ -26,11 +26,12 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 # What ends in a command line or a path holds plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
-$(foreach name,AGENT OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
+$(foreach name,AGENT NAME OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
-# Where an agent's, or its variant's, own things stand; what a variant does not touch is its agent's (`INPUTS` knows).
+# Where an agent's, its variant's, or in a home of several animals one's (NAME=) own things stand; what a variant does not
+# touch is its agent's (`INPUTS` knows).
 ANIMAL := $(or $(AGENT),cat)
-HOME_OF := build/$(ANIMAL)$(if $(VARIANT),/variants/$(VARIANT))
+HOME_OF := build/$(ANIMAL)$(if $(VARIANT),/variants/$(VARIANT))$(if $(NAME),/animals/$(NAME))
 INPUTS = inputs=$$($(PLAN) inputs $(HOME_OF:build/%=%) $1)
 # Called by a recipe, make shares the caller's jobs: as many at once as -j allows in all.
 NESTING := --no-print-directory NESTED=1
@@ -86,7 +87,7 @@ export: .venv/.ok
 	@$(call INPUTS,simulator reconstruction splats behavior_data frames masks) && \
 	$(PYTHON) -m stages.export $$inputs --format $(or $(FORMAT),glb) $(if $(INFLUENCES),--influences $(INFLUENCES)) \
 	  $(if $(wildcard $(HOME_OF)/take/manifest.json),--take $(HOME_OF)/take) \
-	  --videos build/$(ANIMAL)/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
+	  --videos build/$(ANIMAL)$(if $(NAME),/animals/$(NAME))/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
 	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); export.json lists what is lost'
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live. In another build's

@@ -7,9 +7,9 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 59_800,
+    "lines": 59_950,
     "lines over 110 columns": 0,
-    "recipe keys": 314,
+    "recipe keys": 315,
     "packages over 16 modules": 0,
     "private words in identifiers": 131,
     "tell, told": 12,

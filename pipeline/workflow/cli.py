@@ -92,6 +92,9 @@ class Task:
         if field.name == "variants":
             several = [need for need in needs if need.variants]
             return self.per_variant(several[0].artifact, several[0].variants)
+        others = [need.artifact for need in needs if need.others and need.option == field.name]
+        if others:
+            return self.per_animal(field.name, others[0], self.config.others)
         if dag.NODES[field.name].trials == "each":
             return self.per_trial(field.name, dag.trial_ids(self.config.methods, self.config.seeds))
         for need in needs:
@@ -156,6 +159,13 @@ class Task:
         """Return the folder of `name` in every one of the agent's variants, by the variant's name."""
         folder = self.input("variants")
         return {variant: self._opened(folder / variant / name, f"{variant}/{name}") for variant in variants}
+
+    def per_animal(self, name: str, artifact: str, animals: Sequence[str]) -> dict[str, Path]:
+        """Return the folder of `artifact` of every one of these animals of the home, by the animal's name."""
+        folder = self.input(name)
+        return {
+            animal: self._opened(folder / animal / artifact, f"{animal}/{artifact}") for animal in animals
+        }
 
     @contextmanager
     def create(self) -> Iterator[Path]:

@@ -53,6 +53,8 @@ class Need:
     """Only recordings with depth of their own, and the walk-through: what the map itself is made from."""
     per_animal: bool = False
     """In a home of several animals its part holds a folder per animal, of which one's own is read."""
+    others: bool = False
+    """Not one's own but that of every other animal of the home; the folder of all animals is given."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +229,11 @@ FLOW: tuple[Node, ...] = (
     Node(
         "behavior_data",
         "slice_behavior",
-        (Need("reconstruction", flow="recordings"), Need("trajectories", flow="trajectories")),
+        (
+            Need("reconstruction", flow="recordings"),
+            Need("trajectories", flow="trajectories"),
+            Need("reconstruction", flow="recordings", option="companions", others=True),
+        ),
         role_dependencies=("session",),
         flows=BOTH,
     ),
@@ -368,9 +374,7 @@ def table_of(node: Node) -> str:
 
 
 def nodes_of(flow: Flow, *, trials: bool = False, several: bool = False) -> tuple[Node, ...]:
-    """Return the nodes of one flow, in declared order; those made for tables only if ``trials``, those made
-    for ``several`` animals only if so.
-    """
+    """Return the nodes of one flow, in order; those of tables or ``several`` animals only if so."""
     return tuple(
         node
         for node in FLOW

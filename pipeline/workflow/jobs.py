@@ -128,6 +128,8 @@ class Plan:
     trials: tuple[Trial, ...] = ()
     animals: tuple["Plan", ...] = ()
     """Of a home of several animals: each one's plan, with its own turnaround alone."""
+    others: tuple[str, ...] = ()
+    """Of one animal's plan: the names of the others."""
 
     @property
     def nodes(self) -> tuple[Node, ...]:
@@ -178,15 +180,21 @@ def with_animals(plan: Plan) -> Plan:
     if names and plan.home != plan.home.base:
         what = f"{plan.home.agent} is a home of several animals, of which there are no variants and tables"
         raise InputError("REC-008", what, str(plan.home), f"make {plan.home.agent}")
-    each = (
-        replace(
-            plan,
-            home=replace(plan.home, animal=name),
-            videos=tuple(video for video in plan.videos if video.animal in (None, name)),
-            touched=of_animal(),
+    reading = [node.artifact for node in dag.FLOW if any(need.others for need in dag.needs_of(node))]
+    each = []
+    for name in names:
+        others = tuple(other for other in names if other != name)
+        named = {artifact: {**plan.tables[artifact], "others": list(others)} for artifact in reading}
+        each.append(
+            replace(
+                plan,
+                home=replace(plan.home, animal=name),
+                videos=tuple(video for video in plan.videos if video.animal in (None, name)),
+                tables=plan.tables | named,
+                touched=of_animal(),
+                others=others,
+            )
         )
-        for name in names
-    )
     return replace(plan, animals=tuple(each))
 
 
@@ -306,7 +314,7 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
     arguments: list[str] = []
     deciding = [video.id] if video else []
     for need in dag.needs_of(node, plan.flow):
-        if dag.NODES[need.artifact].of_several and not plan.home.animal:
+        if (dag.NODES[need.artifact].of_several or need.others) and not plan.home.animal:
             continue
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:
@@ -323,6 +331,7 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
         )
         whole = plan.home_of(need.artifact).folder / need.artifact
         path = whole if several else Path(found[0].path, found[0].part or "")
+        path = plan.home.base.folder / "animals" if need.others else path
         arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
         arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
     return inputs, arguments, deciding
@@ -332,6 +341,11 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
     """Yield the artifacts that one need of one job means."""
     source = dag.NODES[need.artifact]
     folder = plan.home_of(need.artifact).folder / need.artifact
+    if need.others:
+        for name in plan.others:
+            path = replace(plan.home, animal=name).folder / need.artifact
+            yield Input(f"{name}/{need.artifact}", str(path), need.part)
+        return
     if need.per_animal and plan.home.animal:
         need = replace(need, part=f"{need.part}/{plan.home.animal}")
     if source.trials == "each":

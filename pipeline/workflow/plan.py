@@ -167,6 +167,10 @@ def inputs(home: Home, names: Sequence[str]) -> str:
         raise InputError(
             "REC-007", f"no artifact {unknown[0]!r}", str(home), f"artifacts: {', '.join(known)}"
         )
+    animals = [each.animal for each in _animal_homes(home)] if not home.animal else []
+    if any(known[name].is_relative_to(home.folder / "animals") for name in names if animals):
+        what, each = f"{home} is a home of several animals", f"one of them: NAME={animals[0]}"
+        raise InputError("REC-008", what, ", ".join(names), each)
     several = {name for name in names if dag.NODES[name].roles}
     return " ".join(
         f"--{name.replace('_', '-')} {known[name].parent if name in several else known[name]}"

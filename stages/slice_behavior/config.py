@@ -20,3 +20,5 @@ class Config:
     [train_behavior] sets how far it sees ahead."""
     stride: int = 1
     """Frames between starts of training windows."""
+    others: tuple[str, ...] = ()
+    """Names of the home's other animals, whose motion is read as companions; the planner sets it."""

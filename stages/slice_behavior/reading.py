@@ -1,13 +1,14 @@
 """Reading what `reconstruct` and `read_trajectories` promise to the behaviour models."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.trajectories import KINDS
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.data.templates import bones_at_rest
@@ -26,12 +27,36 @@ class BehaviorSource:
     """For messages."""
 
 
-def read_reconstruction(folder: Path, sessions: Sequence[str]) -> BehaviorSource:
-    """Read the sessions that were reconstructed, all in one scene. Raises InputError ART-010 when damaged."""
+def read_reconstruction(
+    folder: Path, sessions: Sequence[str], others: Mapping[str, Path], min_confidence: float
+) -> BehaviorSource:
+    """Read the sessions that were reconstructed, all in one scene, with the home's other animals as
+    companions. Raises InputError ART-010 when damaged.
+    """
     motions = {id: read_motion(folder / id) for id in sessions if (folder / id).is_dir()}
+    for id, motion in motions.items():
+        present = [read_motion(other / id) for other in others.values() if (other / id).is_dir()]
+        if present:
+            tracks = [companion_of(each, motion.timestamp_s, min_confidence) for each in present]
+            motions[id] = replace(motion, companions=np.stack(tracks, axis=1))
     return BehaviorSource(
         motions, _rest(folder), (FeatureVolume.load(folder / "feature_volume.npz"),), str(folder)
     )
+
+
+def companion_of(
+    motion: ReconstructedMotion, timestamp_s: Float[np.ndarray, "frame"], min_confidence: float
+) -> Float[np.ndarray, "frame 4"]:
+    """Return where an animal is at the times of another's motion in the same recording, and that it is one;
+    NaN where it is not seen or its motion has less confidence.
+    """
+    found = np.full((len(timestamp_s), 4), np.nan)
+    trusted = motion.agent_visible & (motion.confidence >= min_confidence)
+    same, mine, its = np.intersect1d(timestamp_s, motion.timestamp_s[trusted], return_indices=True)
+    assert len(same) or not trusted.any(), "both come from the same frames"
+    found[mine, :3] = motion.world_from_agent[trusted][its, :3, 3]
+    found[mine, 3] = KINDS.index("animal")
+    return found
 
 
 def read_tables(folders: Mapping[str, Path]) -> BehaviorSource:

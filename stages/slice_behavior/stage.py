@@ -26,6 +26,8 @@ class Inputs:
     """Motion of all sessions in one scene."""
     trajectories: Mapping[str, Path] | None = None
     """Tables of motion, a folder per recording."""
+    companions: Mapping[str, Path] | None = None
+    """The artifact `reconstruction` of each other animal of the home, by its name."""
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> None:
@@ -38,11 +40,13 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     if inputs.trajectories is not None:
         source = reading.read_tables(inputs.trajectories)
     elif inputs.reconstruction is not None:
-        source = reading.read_reconstruction(inputs.reconstruction, list(sessions))
+        source = reading.read_reconstruction(
+            inputs.reconstruction, list(sessions), inputs.companions or {}, config.min_confidence
+        )
     else:
         raise InputError("ART-003", "no motion was given", "slice_behavior", "give --reconstruction")
     gaps = asdict(config)
-    stride, past_s = gaps.pop("stride"), gaps.pop("past_s")
+    stride, past_s, _ = gaps.pop("stride"), gaps.pop("past_s"), gaps.pop("others")
     past = max(round(past_s * config.rate_hz), LEAST_PAST)
     trajectories = {id: trajectory_from_motion(motion, **gaps) for id, motion in source.motions.items()}
     test = frozenset(id for id in trajectories if sessions[id].split == "test")

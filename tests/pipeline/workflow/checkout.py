@@ -32,6 +32,7 @@ SETTINGS = {
         "    companion: str = 'none'\n"
     ),
     "train_localizer": "    target: str = ''\n",
+    "slice_behavior": "    others: tuple[str, ...] = ()\n",
     "train_longterm": '    ablations: str = "none"\n',
 }
 CONFIG = '''"""Settings."""
@@ -162,6 +163,8 @@ def _fields(stage: str) -> str:
                 dag.NODES[need.artifact].trials == "each" and node.trials != "each"
             )
             kinds[need.option or need.artifact] = "Mapping[str, Path]" if several else "Path"
+            if need.others:
+                kinds[need.option] = "Mapping[str, Path]"
             if need.variants:
                 kinds["variants"] = "Mapping[str, Path]"
     required = [f"    {name}: {kind}" for name, kind in kinds.items() if name in in_every and name != "truth"]

@@ -3,12 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.behavior.trajectories import TEST, TRAIN, window_starts
+from pipeline.behavior.trajectories import KINDS, TEST, TRAIN, window_starts
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data import npz
 from pipeline.geometry import rigid
-from stages.slice_behavior import pictures
+from stages.slice_behavior import pictures, reading
 from stages.slice_behavior.config import Config
 from stages.slice_behavior.gridding import ReconstructedMotion, trajectory_from_motion
 from stages.slice_behavior.stage import Inputs, run
@@ -53,6 +53,18 @@ def test_companions_are_resampled_where_they_are():
     found = trajectory.companions[there[:, 1], 1]
     np.testing.assert_allclose(found[1:-1, 0], 0.3 * trajectory.timestamp_s[there[:, 1]][1:-1], atol=1e-5)
     assert (found[:, 3] == 1).all()
+
+
+def test_another_animal_is_a_companion_where_it_is_seen():
+    mine, its = (jittered(np.random.default_rng(0), 3.0) for _ in range(2))
+    seen = np.arange(len(its.timestamp_s)) % 3 > 0
+    its = replace(its, agent_visible=seen, confidence=np.where(seen, 0.9, 0.0))
+    track = reading.companion_of(its, mine.timestamp_s, min_confidence=0.3)
+    assert np.isnan(track[~seen]).all()
+    np.testing.assert_array_equal(track[seen, :3], its.world_from_agent[seen, :3, 3])
+    assert (track[seen, 3] == KINDS.index("animal")).all()
+    trajectory = trajectory_from_motion(replace(mine, companions=track[:, None]), **OPTIONS)
+    assert np.isfinite(trajectory.companions).all((1, 2)).mean() > 0.9, "short gaps are bridged"
 
 
 def test_only_short_gaps_are_bridged_and_doubtful_frames_are_gaps():
