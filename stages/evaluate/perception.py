@@ -25,15 +25,18 @@ class Overlaps:
     resting: Bool[np.ndarray, "frame"]
     confidence: Float[np.ndarray, "frame"]
     """that the masks report"""
+    swapped: Bool[np.ndarray, "frame"] | None = None
+    """whether the mask covers more of the other animals than of the agent; None where there are no others"""
 
 
 def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
     """Compare every frame in which the agent is visible, in truth or according to us; unknown pixels do not
     count.
     """
-    iou, resting, confidence = [], [], []
+    iou, resting, confidence, swapped = [], [], [], []
     for frame in range(len(masks)):
-        label, true = masks[frame], truth.masks[frame]
+        label = masks[frame]
+        true = truth.masks[frame] if truth.masks.size else np.zeros(label.shape, bool)
         ours, counts = label == 255, label != 128
         if max(true.mean(), ours.mean()) < SEEN_SHARE:
             continue
@@ -41,7 +44,14 @@ def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
         iou.append((ours & true & counts).sum() / union if union else 0.0)
         resting.append(not truth.moving[frame])
         confidence.append(masks.confidence[frame])
-    return Overlaps(np.array(iou, float), np.array(resting, bool), np.array(confidence, float))
+        if truth.others is not None:
+            swapped.append((ours & truth.others[frame]).sum() > (ours & true).sum())
+    return Overlaps(
+        np.array(iou, float),
+        np.array(resting, bool),
+        np.array(confidence, float),
+        np.array(swapped, bool) if truth.others is not None else None,
+    )
 
 
 def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Metrics:
@@ -51,6 +61,9 @@ def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> M
     resting = np.concatenate([each.resting for each in sessions]) if sessions else np.zeros(0, bool)
     metrics.put("masks/iou_mean", _mean(iou), "the animal is never visible")
     metrics.put("masks/iou_resting", _mean(iou[resting]), "the animal never rests in view")
+    swapped = [each.swapped for each in sessions if each.swapped is not None]
+    if swapped:
+        metrics.put("masks/identity_swaps", _mean(np.concatenate(swapped)), "no animal is ever visible")
     confidence = np.concatenate([each.confidence for each in sessions]) if sessions else np.zeros(0)
     metrics.add(reliability_metrics("masks", confidence, iou >= RIGHT_IOU))
     metrics.put("masks/iou_turnaround", _mean(turnaround.iou) if turnaround else np.nan, "no turnaround")

@@ -28,10 +28,12 @@ class RecordingTruth:
     vertices: Float[np.ndarray, "frame vertex 3"]
     """world positions less the agent's"""
     masks: Bool[np.ndarray, "frame height width"]
+    others: Bool[np.ndarray, "frame height width"] | None = None
+    """masks of the home's other animals; None where there are none"""
 
     @classmethod
     def open(cls, folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> "RecordingTruth":
-        """Read ``<name>.npz`` and ``<name>.masks.npz`` for the extracted frames."""
+        """Read ``<name>.npz``, ``<name>.masks.npz`` and ``<name>.others.npz`` for the extracted frames."""
         table = npz.load(folder / f"{name}.npz")
         frames = len(source_index)
         no_agent = {"world_from_agent": np.full((frames, 4, 4), np.nan), "vertices": np.zeros((frames, 0, 3))}
@@ -39,7 +41,10 @@ class RecordingTruth:
         if "world_from_agent" in table:
             masks = _masks(folder / f"{name}.masks.npz")[source_index]
         parts = {field: table[key][source_index] for field, key in FILED_AS.items() if key in table}
-        return cls(**no_agent | parts, masks=masks)
+        others = folder / f"{name}.others.npz"
+        return cls(
+            **no_agent | parts, masks=masks, others=_masks(others)[source_index] if others.exists() else None
+        )
 
     def vertices_world(self, frame: int) -> Float[np.ndarray, "vertex 3"]:
         """Return the true surface's vertices of one frame, metres, in the truth's world."""

@@ -1,5 +1,7 @@
 """Truth is brought to the extracted frames, and masks and flow are compared where both are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -80,3 +82,14 @@ def test_masks_are_compared_where_they_know(folder):
     assert metrics.values["masks/iou_mean"] == pytest.approx(0.8)
     assert metrics.values["masks/iou_resting"] == 1.0
     assert metrics.values["masks/iou_turnaround"] is None
+    assert "masks/identity_swaps" not in metrics.values, "nobody else is there"
+    others = np.roll(truth.masks, 6, axis=1) & ~truth.masks
+    npz.save(
+        folder / "s.others.npz",
+        packed=np.packbits(np.zeros((FRAMES, 16, 12), bool), axis=-1),
+        shape=np.array([FRAMES, 16, 12]),
+    )
+    truth = RecordingTruth.open(folder, "s", SOURCE)
+    assert perception.overlaps(Masks.open(out), truth).swapped.tolist() == [False] * 5
+    swapped = perception.overlaps(Masks.open(out), replace(truth, masks=others, others=truth.masks)).swapped
+    assert swapped.tolist() == [True] * 4 + [False], "the last mask is empty"
