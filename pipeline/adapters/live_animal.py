@@ -46,7 +46,9 @@ class LiveAnimal:
         """Open `build/<agent>`, in the home of another build where ``home`` is given; raises as
         `AnimalWorld.load`.
         """
-        world = AnimalWorld.load(build, EnvironmentConfig(), home=home, device=device)
+        world = AnimalWorld.load(
+            build, EnvironmentConfig(), homes=() if home is None else (home,), device=device
+        )
         animals = world.animals
         simulator = Simulator(
             animals.sampler,

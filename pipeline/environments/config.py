@@ -7,6 +7,8 @@ Embodiment = Literal["person", "robot"]
 """A person steps forward, sideways and turns; a robot on wheels drives forward and turns."""
 RewardName = Literal["approach", "follow", "calm", "none"]
 """See `pipeline.environments.rewards`."""
+Seen = Literal["animal", "velocity", "occupancy", "rgbd"]
+"""What can be observed, see `pipeline.environments.spaces`."""
 
 
 @dataclass(frozen=True)
@@ -17,6 +19,8 @@ class EnvironmentConfig:
     """What acts."""
     reward: RewardName = "approach"
     """What is rewarded."""
+    observations: tuple[Seen, ...] = ("animal", "velocity", "occupancy")
+    """What is observed; `rgbd` needs the artifact `reconstruction` of every home."""
     episode_s: float = 20.0
     """Length of an episode, seconds."""
     speed_m_s: float = 1.2

@@ -1,5 +1,6 @@
 """Person and animal both act, for PettingZoo: the animal's action is a goal that it plans its way to."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +47,22 @@ class PersonAnimalEnv(ParallelEnv):
         *,
         render_mode: str | None = None,
         home: str | Path | None = None,
+        homes: Sequence[str | Path] = (),
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
         **settings: Any,
     ):
-        """Open a build (`build/<agent>`), its animal in the home of another build where ``home`` names one.
+        """Open a build (`build/<agent>`), its animal in another build's home where ``home`` names one, or in
+        each of ``homes``: every episode draws one of them.
 
         ``settings`` replace fields of `EnvironmentConfig`.
         """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
+        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
         self.config, self.render_mode = self.world.config, render_mode
         self.possible_agents = [PERSON, ANIMAL]
         self.agents: list[str] = []
         self.observation_spaces = {
-            PERSON: person_observation_space(),
+            PERSON: person_observation_space(self.config.observations),
             ANIMAL: gymnasium.spaces.Box(-FAR, FAR, (4,), np.float32),
         }
         self.action_spaces = {

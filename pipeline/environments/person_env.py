@@ -1,5 +1,6 @@
 """One person, or robot, beside one animal, for Gymnasium."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +31,19 @@ class PersonEnv(gymnasium.Env):
         *,
         render_mode: str | None = None,
         home: str | Path | None = None,
+        homes: Sequence[str | Path] = (),
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
         **settings: Any,
     ):
-        """Open a build (`build/<agent>`), its animal in the home of another build where ``home`` names one.
+        """Open a build (`build/<agent>`), its animal in another build's home where ``home`` names one, or in
+        each of ``homes``: every episode draws one of them.
 
         ``settings`` replace fields of `EnvironmentConfig`.
         """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
+        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
         self.config, self.render_mode = self.world.config, render_mode
-        self.observation_space = person_observation_space()
+        self.observation_space = person_observation_space(self.config.observations)
         self.action_space = person_action_space(self.world)
         self.window: PictureWindow | None = None
 
@@ -50,7 +53,10 @@ class PersonEnv(gymnasium.Env):
         self.frame = 0
         self.world.begin(1, self.np_random, (options or {}).get("split", "train"))
         self._show()
-        info = {"distance_m": float(self.world.distance_m[0]), "share_known": self.world.share_known}
+        info = {
+            "distance_m": float(self.world.distance_m[0]),
+            "share_known": float(self.world.share_known[0]),
+        }
         return self._observation(), info
 
     def step(self, action: Float[np.ndarray, "action"]):
@@ -67,6 +73,7 @@ class PersonEnv(gymnasium.Env):
             "reached": reached,
             "flees": fled,
             "plans_per_step": self.world.plans_per_step,
+            "home": int(self.world.home[0]),
         }
         return self._observation(), reward, terminated, truncated, info
 

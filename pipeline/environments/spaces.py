@@ -1,37 +1,62 @@
 """What is observed and what can be done, as Gymnasium spaces."""
 
+from collections.abc import Sequence
+from typing import assert_never
+
 import gymnasium
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Shaped
 
+from pipeline.environments.config import Seen
 from pipeline.environments.floor import CELLS, to_local
+from pipeline.environments.rgbd import FAR_M, HEIGHT_PX, WIDTH_PX
 from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, animal_seen, occupancy_seen
 
 FAR = 20.0
 """Bound of all observed numbers: metres or m/s; homes are smaller, animals slower."""
 
 
-def person_observation_space() -> gymnasium.spaces.Dict:
+def person_observation_space(observations: Sequence[Seen]) -> gymnasium.spaces.Dict:
     """Return the space of `person_observation`."""
-    return gymnasium.spaces.Dict(
-        {
-            "animal": gymnasium.spaces.Box(-FAR, FAR, (ANIMAL_NUMBERS,), np.float32),
-            "velocity": gymnasium.spaces.Box(-FAR, FAR, (2,), np.float32),
-            "occupancy": gymnasium.spaces.Box(0.0, 1.0, (CELLS, CELLS), np.float32),
-        }
-    )
+    box = gymnasium.spaces.Box
+    parts: dict[str, gymnasium.Space] = {}
+    for seen in observations:
+        match seen:
+            case "animal":
+                parts["animal"] = box(-FAR, FAR, (ANIMAL_NUMBERS,), np.float32)
+            case "velocity":
+                parts["velocity"] = box(-FAR, FAR, (2,), np.float32)
+            case "occupancy":
+                parts["occupancy"] = box(0.0, 1.0, (CELLS, CELLS), np.float32)
+            case "rgbd":
+                parts["rgb"] = box(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+                parts["depth"] = box(0.0, FAR_M, (HEIGHT_PX, WIDTH_PX), np.float32)
+            case _:
+                assert_never(seen)
+    return gymnasium.spaces.Dict(parts)
 
 
-def person_observation(world: AnimalWorld) -> dict[str, Float[np.ndarray, "person ..."]]:
-    """Return what all persons observe: the animal and their own velocity in their frames, and what blocks the
-    way.
+def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "person ..."]]:
+    """Return what all persons observe, first axis person: the animal and their own velocity in their frames,
+    what blocks the way, and pictures with depth (metres, 0 = nothing).
     """
-    velocity = to_local(world.persons.velocity, world.persons.heading)
-    return {
-        "animal": animal_seen(world).clip(-FAR, FAR),
-        "velocity": velocity.astype(np.float32).clip(-FAR, FAR),
-        "occupancy": occupancy_seen(world),
-    }
+    parts: dict[str, np.ndarray] = {}
+    for seen in world.config.observations:
+        match seen:
+            case "animal":
+                parts["animal"] = animal_seen(world).clip(-FAR, FAR)
+            case "velocity":
+                velocity = to_local(world.persons.velocity, world.persons.heading)
+                parts["velocity"] = velocity.astype(np.float32).clip(-FAR, FAR)
+            case "occupancy":
+                parts["occupancy"] = occupancy_seen(world)
+            case "rgbd":
+                pictures = world.pictures()
+                parts["rgb"] = np.stack([picture.rgb for picture in pictures])
+                parts["depth"] = np.stack([picture.depth_m for picture in pictures])
+            case _:
+                assert_never(seen)
+    return parts
 
 
 def person_action_space(world: AnimalWorld) -> gymnasium.spaces.Box:

@@ -31,6 +31,7 @@ class PersonStableVecEnv(VecEnv):
         num_envs: int,
         *,
         home: str | Path | None = None,
+        homes: Sequence[str | Path] = (),
         split: str = "train",
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
@@ -40,9 +41,11 @@ class PersonStableVecEnv(VecEnv):
 
         ``settings`` replace fields of `EnvironmentConfig`.
         """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
+        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
         self.config, self.split, self.render_mode = self.world.config, split, None
-        super().__init__(num_envs, person_observation_space(), person_action_space(self.world))
+        super().__init__(
+            num_envs, person_observation_space(self.config.observations), person_action_space(self.world)
+        )
         self.rng = np.random.default_rng()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:

@@ -1,5 +1,6 @@
 """Many persons beside many animals at once, for Gymnasium's vector interface; animals plan in batches."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +31,19 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         num_envs: int = 1,
         *,
         home: str | Path | None = None,
+        homes: Sequence[str | Path] = (),
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
         **settings: Any,
     ):
-        """Open a build (`build/<agent>`), its animal in the home of another build where ``home`` names one.
+        """Open a build (`build/<agent>`), its animal in another build's home where ``home`` names one, or in
+        each of ``homes``: every episode draws one of them.
 
         ``settings`` replace fields of `EnvironmentConfig`.
         """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, device=device)
+        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
         self.config, self.num_envs, self.render_mode = self.world.config, num_envs, None
-        self.single_observation_space = person_observation_space()
+        self.single_observation_space = person_observation_space(self.config.observations)
         self.single_action_space = person_action_space(self.world)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -51,10 +54,10 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         self.split = (options or {}).get("split", "train")
         self.frame, self.ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         self.world.begin(self.num_envs, self.np_random, self.split)
-        share_known = np.full(self.num_envs, self.world.share_known)
         return person_observation(self.world), {
             "distance_m": self.world.distance_m,
-            "share_known": share_known,
+            "share_known": self.world.share_known,
+            "home": self.world.home,
         }
 
     def step(self, actions: Float[np.ndarray, "person action"]):
@@ -74,5 +77,6 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
             "distance_m": outcome.distance_m,
             "reached": lived & outcome.reached,
             "flees": lived & outcome.flees,
+            "home": self.world.home,
         }
         return person_observation(self.world), reward, terminated, truncated, info

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.model import bones_from_channels
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
@@ -22,8 +23,9 @@ from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorD
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
-from pipeline.environments.other_home import ReconstructedHome, move_in
+from pipeline.environments.homes import Habitat, settle
 from pipeline.environments.rewards import StepOutcome
+from pipeline.environments.rgbd import RgbdCamera, RgbdImage
 from pipeline.metrics.flight import WITHIN_FRAMES, flees
 from pipeline.workflow import artifact
 
@@ -60,10 +62,14 @@ class AnimalWorld:
         ego: Ego,
         config: EnvironmentConfig,
         *,
-        share_known: float = 1.0,
+        habitat: Habitat | None = None,
+        camera: RgbdCamera | None = None,
     ):
-        """``share_known`` (0..1) is how much of the scene looks like the home that the animal knows."""
-        self.data, self.scenes, self.config, self.share_known = data, scenes, config, share_known
+        """``habitat`` is where they live, all in one home where it is not given; ``camera`` is what `rgbd` is
+        seen with.
+        """
+        self.data, self.scenes, self.config, self.camera = data, scenes, config, camera
+        self.habitat = habitat or Habitat(data, scenes, np.zeros(len(data.videos), int), (1.0,))
         sampling = PlanSamplingConfig(
             method="ddim",
             goal_steps=config.goal_steps,
@@ -96,36 +102,38 @@ class AnimalWorld:
         settings: Mapping[str, Any],
         *,
         home: str | Path | None,
+        homes: Sequence[str | Path],
         device: str,
     ) -> "AnimalWorld":
         """Return the world of a build, or the one given; ``settings`` replace fields of ``config``."""
         config = replace(config or EnvironmentConfig(), **settings)
+        config = replace(config, observations=tuple(config.observations))
+        given = [Path(each) for each in (*(() if home is None else (home,)), *homes)]
         if isinstance(build, AnimalWorld):
-            assert home is None, "a world that is open has its home"
+            assert not given, "a world that is open has its homes"
             return build
-        return cls.load(Path(build), config, home=None if home is None else Path(home), device=device)
+        return cls.load(Path(build), config, homes=given, device=device)
 
     @classmethod
     def load(
-        cls, build: Path, config: EnvironmentConfig, *, home: Path | None = None, device: str = "cpu"
+        cls, build: Path, config: EnvironmentConfig, *, homes: Sequence[Path] = (), device: str = "cpu"
     ) -> "AnimalWorld":
-        """Open a finished build, its animal in the home of another one where ``home`` is given.
+        """Open a finished build, its animal in ``homes`` where there are any: builds, of which one may be its
+        own.
 
-        Raises ART-003 where it lacks the model, ART-007 where another version wrote it, SIM-006 for models
-        without goals, and what `pipeline.environments.other_home` raises for homes that cannot be used.
+        Raises ART-003 where it lacks the model, or the surfaces that `rgbd` shows, ART-007 where another
+        version wrote it, SIM-006 for models without goals, and what `pipeline.environments.other_home` raises
+        for homes that cannot be used.
         """
         artifact.require(build, "behavior", "behavior_data", remedy="make it: make <agent>.behavior")
         architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
         behavior.refuse_unplayable(architecture, str(build))
         data = BehaviorData.load(build / "behavior_data")
         sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
-        if home is None:
-            scenes = Scenes.load(build / "behavior_data", data.videos)
-            return cls(sampler, data, scenes, architecture.ego, config)
-        own, other = ReconstructedHome.of_build(build), ReconstructedHome.of_build(home)
-        moved = move_in(own, other, data)
+        habitat = settle(build, data, homes)
+        camera = RgbdCamera.load(build, homes or (build,)) if "rgbd" in config.observations else None
         return cls(
-            sampler, moved.data, moved.home.scenes(), architecture.ego, config, share_known=moved.share_known
+            sampler, habitat.data, habitat.scenes, architecture.ego, config, habitat=habitat, camera=camera
         )
 
     def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
@@ -188,6 +196,24 @@ class AnimalWorld:
         return self.scenes.number(self.video, len(self.video))
 
     @property
+    def home(self) -> Int[np.ndarray, "person"]:
+        """Number of each pair's home, in the order of `homes`."""
+        return self.habitat.home_of_video[self.video]
+
+    @property
+    def share_known(self) -> Float[np.ndarray, "person"]:
+        """How much (0..1) of each pair's home looks like the one that the animal knows."""
+        return np.array(self.habitat.share_known)[self.home]
+
+    def pictures(self) -> list[RgbdImage]:
+        """Return what the persons' cameras see."""
+        assert self.camera is not None, "a world that is seen is opened with `rgbd` among its observations"
+        now = self.animals.past[-1]
+        bones = bones_from_channels(now.bones[:, 0], self.data.agent_from_bone_rest)
+        rows = zip(self.home, self.eyes, self.persons.heading, now.root[:, 0], bones, strict=True)
+        return [self.camera.picture(int(home), *row) for home, *row in rows]
+
+    @property
     def fleeing(self) -> Bool[np.ndarray, "animal"]:
         """Whether a person is close and the rest of the animal's plan gets away by what counts as flight."""
         plan, played = self.animals.plan.root[..., :3, 3], self.animals.played
@@ -220,9 +246,7 @@ class AnimalWorld:
 
     def _drawn(self, some: Int[np.ndarray, "some"], split: str) -> Context:
         """Draw windows and starts for some pairs; the person has stood there, facing the animal."""
-        windows = self.data.indices(SPLITS[split])
-        assert len(windows), f"there is no window of the split {split}"
-        context, _ = self.data.windows(self.rng.choice(windows, len(some)))
+        context, _ = self.data.windows(self._moments(len(some), split))
         assert context.video is not None, "windows of data always name their recording"
         self.video[some] = context.video
         for row, video, root in zip(some, context.video, context.world_from_agent[:, -1, :3, 3], strict=True):
@@ -233,6 +257,17 @@ class AnimalWorld:
             self.persons.velocity[row] = 0.0
         observer = np.repeat(self.eyes[some][:, None], PAST, axis=1)
         return replace(context, observer_world=observer, observer_rotation=None)
+
+    def _moments(self, count: int, split: str) -> Int[np.ndarray, "some"]:
+        """Draw windows; where there are several homes, each is as likely as another."""
+        windows = self.data.indices(SPLITS[split])
+        assert len(windows), f"there is no window of the split {split}"
+        home = self.habitat.home_of_video[self.data.video[windows]]
+        homes = np.unique(home)
+        if len(homes) == 1:
+            return self.rng.choice(windows, count)
+        drawn = self.rng.choice(homes, count)
+        return np.array([self.rng.choice(windows[home == each]) for each in drawn])
 
     def _start(self, animal: Float[np.ndarray, "2"], floor: PersonFloor) -> Float[np.ndarray, "2"]:
         """Draw a free place around the animal, the last one drawn where none is free."""

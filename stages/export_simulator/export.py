@@ -10,6 +10,7 @@ from jaxtyping import Float
 from pipeline.data.glb import Action, Skin
 from pipeline.fields import weight_refit
 from pipeline.geometry import rigid
+from pipeline.geometry.decimation import decimate
 from pipeline.geometry.meshes import Mesh
 from stages.export_simulator import surfaces
 from stages.export_simulator.actions import SessionClip, resample
@@ -50,11 +51,11 @@ def simulator(
     body: CanonicalAgent, scene: Mesh, gaussians: SplatClouds, motions: list[SessionClip], config: Config
 ) -> SimulatorParts:
     """Thin the surfaces, fit the weights, resample the motion;"""
-    agent, kept = surfaces.decimate(body.mesh, config.agent_faces)
+    agent, kept = decimate(body.mesh, config.agent_faces)
     thinned = CanonicalAgent(agent, body.weights[kept], body.agent_from_bone_rest)
     four, eight = fit_weights(thinned, motions, FITTED_POSES)
     names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
-    room, _ = surfaces.decimate(scene, config.scene_faces)
+    room, _ = decimate(scene, config.scene_faces)
     inside = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions]).mean(0)
     positions = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     return SimulatorParts(

@@ -1,13 +1,9 @@
-"""Make surfaces light enough for a page: thin them, keep their colour and weights, find the floor, shrink
-splats.
-"""
+"""Make surfaces ready for a page: find the floor and the extent, orient faces, shrink splats."""
 
 from dataclasses import dataclass
 
-import fast_simplification
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from scipy.spatial import KDTree
 
 from pipeline.geometry.meshes import Mesh
 
@@ -20,20 +16,6 @@ _LEVEL_M, _UPRIGHT = 0.02, 0.9
 """Thickness of the layers among which the floor is sought; least upward part of a floor's normal."""
 _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not compress
 _BAND_0 = 0.28209479177387814  # the constant spherical harmonic
-
-
-def decimate(mesh: Mesh, max_faces: int) -> tuple[Mesh, Int[np.ndarray, " vertex"]]:
-    """Collapse edges until `max_faces` are left; also return, per new vertex, the nearest old one."""
-    if len(mesh.faces) <= max_faces:
-        return mesh, np.arange(len(mesh.vertices))
-    vertices, faces = fast_simplification.simplify(
-        np.ascontiguousarray(mesh.vertices, np.float64),
-        np.ascontiguousarray(mesh.faces, np.int32),
-        target_count=max_faces,
-    )[:2]
-    nearest = np.asarray(KDTree(mesh.vertices).query(vertices)[1])
-    color = None if mesh.color is None else mesh.color[nearest]
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), color), nearest
 
 
 def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3"]) -> float:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry import rigid
+from pipeline.geometry.decimation import decimate
 from pipeline.geometry.meshes import Mesh
 from stages.export_simulator import actions, surfaces
 from tests.stages.export_simulator import small_world
@@ -11,7 +12,7 @@ from tests.stages.export_simulator import small_world
 
 def test_thinning_keeps_the_shape() -> None:
     room = small_world.room()
-    light, nearest = surfaces.decimate(room, 200)
+    light, nearest = decimate(room, 200)
     assert len(light.faces) <= 220
     assert nearest.shape == (len(light.vertices),)
     np.testing.assert_allclose(surfaces.bounds(light), surfaces.bounds(room), atol=0.2)

@@ -1,0 +1,91 @@
+"""The animal of one build in several homes: each home's recorded moments and scenes, then all of them as one.
+
+`settle` gives what begins in one home, the animal's own or another build's; `together` joins homes so that
+one world holds them all and animals in different homes plan in one batch.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import BehaviorData
+from pipeline.environments.other_home import ReconstructedHome, move_in
+
+
+@dataclass(frozen=True)
+class Habitat:
+    """Where an animal lives: moments to begin from, and the scenes they are in."""
+
+    data: BehaviorData
+    scenes: Scenes
+    home_of_video: Int[np.ndarray, "video"]
+    """Number of the home of each recording."""
+    share_known: tuple[float, ...]
+    """Per home, share (0..1) of its surface that looks like the home the animal knows."""
+
+
+def settle(build: Path, data: BehaviorData, homes: Sequence[Path]) -> Habitat:
+    """Put the animal of ``build`` and ``data`` into ``homes``, its own home where there are none.
+
+    Raises what `pipeline.environments.other_home` raises for homes that cannot be used.
+    """
+    if not homes:
+        return _own(build, data)
+    own: ReconstructedHome | None = None
+    habitats = []
+    for home in homes:
+        if home.resolve() == build.resolve():
+            habitats.append(_own(build, data))
+            continue
+        own = own or ReconstructedHome.of_build(build)
+        moved = move_in(own, ReconstructedHome.of_build(home), data)
+        first = np.zeros(len(moved.data.videos), int)
+        habitats.append(Habitat(moved.data, moved.home.scenes(), first, (moved.share_known,)))
+    return together(habitats)
+
+
+def _own(build: Path, data: BehaviorData) -> Habitat:
+    scenes = Scenes.load(build / "behavior_data", data.videos)
+    return Habitat(data, scenes, np.zeros(len(data.videos), int), (1.0,))
+
+
+def together(habitats: Sequence[Habitat]) -> Habitat:
+    """Join habitats of one animal; recordings are named `<number of the home>/<recording>`."""
+    if len(habitats) == 1:
+        return habitats[0]
+    tracks, videos, of_video, home_of_video, windows = {}, [], [], [], []
+    volumes = 0
+    for number, habitat in enumerate(habitats):
+        data, scenes = habitat.data, habitat.scenes
+        names = [f"{number}/{video}" for video in data.videos]
+        tracks |= {name: data.trajectories[video] for name, video in zip(names, data.videos, strict=True)}
+        windows.append(data.video + len(videos))
+        videos += names
+        of_video.append(volumes + scenes.number(np.arange(len(names)), len(names)))
+        home_of_video.append(np.full(len(names), number))
+        volumes += len(scenes.volumes)
+    parts = [habitat.data for habitat in habitats]
+    data = replace(
+        parts[0],
+        trajectories=tracks,
+        videos=tuple(videos),
+        video=np.concatenate(windows),
+        start=np.concatenate([part.start for part in parts]),
+        split=np.concatenate([part.split for part in parts]),
+    )
+    joined = Scenes(
+        tuple(volume for habitat in habitats for volume in habitat.scenes.volumes),
+        tuple(allowed for habitat in habitats for allowed in habitat.scenes.allowed),
+        np.concatenate(of_video),
+        tuple(support for habitat in habitats for support in _supports(habitat.scenes)),
+    )
+    shares = tuple(share for habitat in habitats for share in habitat.share_known)
+    return Habitat(data, joined, np.concatenate(home_of_video), shares)
+
+
+def _supports(scenes: Scenes):
+    return scenes.supports or (None,) * len(scenes.volumes)

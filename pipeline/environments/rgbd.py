@@ -1,0 +1,106 @@
+"""What a person's camera sees: colour and depth of the reconstruction, with the animal as it stands there.
+
+The camera is at eye height and looks ahead and down. Scene and animal are the surfaces of the artifact
+`reconstruction`, the animal posed by its bones (dual-quaternion blending, as in the reconstruction itself).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from pipeline.core.errors import InputError
+from pipeline.data import ply
+from pipeline.data.templates import SKIN
+from pipeline.fields import skinning
+from pipeline.geometry import rigid
+from pipeline.geometry.decimation import decimate
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
+from pipeline.geometry.views import shade
+
+HEIGHT_PX, WIDTH_PX = 48, 64
+"""Of a picture: a policy's network reads it as a whole."""
+FIELD_RAD = np.deg2rad(80.0)
+"""Horizontal field of view, that of a phone's wide camera."""
+PITCH_RAD = np.deg2rad(20.0)
+"""How far the camera looks down: from standing height, at an animal on the floor 4 m off."""
+FAR_M = 10.0
+"""Largest depth; further surfaces are as far."""
+AGENT_FACES = 2000
+"""Triangles kept of the animal: half a pixel each at a metre."""
+FOCAL_PX = WIDTH_PX / 2 / np.tan(FIELD_RAD / 2)
+INTRINSICS = np.array([[FOCAL_PX, 0, WIDTH_PX / 2], [0, FOCAL_PX, HEIGHT_PX / 2], [0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class RgbdImage:
+    """Colour, and z-depth in metres (0 where nothing is)."""
+
+    rgb: UInt8[np.ndarray, "48 64 3"]
+    depth_m: Float[np.ndarray, "48 64"]
+
+
+class RgbdCamera:
+    """Surfaces of homes and the one animal that lives in them."""
+
+    def __init__(
+        self,
+        scenes: Sequence[Mesh],
+        body: Mesh,
+        weights: Float[np.ndarray, "vertex bone"],
+        agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
+    ):
+        """``scenes`` are in the world frames of their homes, ``body`` in the agent frame, metres."""
+        self.scenes = [RayCaster(scene) for scene in scenes]
+        self.body, nearest = decimate(body, AGENT_FACES)
+        self.weights = torch.from_numpy(np.asarray(weights[nearest], np.float32))
+        self.rest = torch.from_numpy(np.asarray(agent_from_bone_rest, np.float32))
+        self.points = torch.from_numpy(np.asarray(self.body.vertices, np.float32))
+
+    @classmethod
+    def load(cls, build: Path, homes: Sequence[Path]) -> "RgbdCamera":
+        """Open the animal of a build and the surfaces of homes. Raises ART-003 where a build has none."""
+        for folder in (build, *homes):
+            if not (folder / "reconstruction/scene.ply").is_file():
+                remedy = "make it: make <agent>.reconstruction, or leave `rgbd` out of `observations`"
+                raise InputError("ART-003", "has no reconstruction to be seen", str(folder), remedy)
+        skin = SKIN.load(build / "reconstruction/skin.npz", "weights", "agent_from_bone_rest")
+        return cls(
+            [ply.read_ply(home / "reconstruction/scene.ply") for home in homes],
+            ply.read_ply(build / "reconstruction/agent.ply"),
+            skin["weights"],
+            skin["agent_from_bone_rest"],
+        )
+
+    def picture(
+        self,
+        scene: int,
+        eye_world: Float[np.ndarray, "3"],
+        heading: float,
+        world_from_agent: Float[np.ndarray, "4 4"],
+        agent_from_bone: Float[np.ndarray, "bone 4 4"],
+    ) -> RgbdImage:
+        """Look from a place (metres) towards a heading about +y (radians, 0 along +z)."""
+        level = np.cos(PITCH_RAD)
+        ahead = np.array([np.sin(heading) * level, -np.sin(PITCH_RAD), np.cos(heading) * level])
+        camera = rigid.look_at(eye_world, eye_world + ahead, np.array([0.0, 1.0, 0.0]))
+        caster = self.scenes[scene]
+        depth, hits = render_view(caster, camera, INTRINSICS, HEIGHT_PX, WIDTH_PX)
+        rgb = shade(caster.mesh, hits).reshape(HEIGHT_PX, WIDTH_PX, 3)
+        posed = RayCaster(self._posed(world_from_agent, agent_from_bone))
+        near, struck = render_view(posed, camera, INTRINSICS, HEIGHT_PX, WIDTH_PX)
+        animal = (near > 0) & ((depth == 0) | (near < depth))
+        rgb = np.where(animal[..., None], shade(posed.mesh, struck).reshape(rgb.shape), rgb)
+        depth_m = np.where(animal, near, depth).clip(0, FAR_M)
+        return RgbdImage(rgb.astype(np.uint8), depth_m.astype(np.float32))
+
+    def _posed(
+        self, world_from_agent: Float[np.ndarray, "4 4"], agent_from_bone: Float[np.ndarray, "bone 4 4"]
+    ) -> Mesh:
+        bones = torch.from_numpy(np.asarray(agent_from_bone, np.float32))
+        points = skinning.move(skinning.blend(self.weights, bones, self.rest), self.points).numpy()
+        world = rigid.apply(np.asarray(world_from_agent, float), points.astype(float))
+        return Mesh(world.astype(np.float32), self.body.faces, self.body.color)

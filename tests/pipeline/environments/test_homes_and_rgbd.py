@@ -1,0 +1,158 @@
+"""Several homes in one world, and what a person's camera sees of them."""
+
+import shutil
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import BehaviorNets
+from pipeline.core.errors import InputError
+from pipeline.data import npz, ply
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.homes import settle
+from pipeline.environments.rgbd import FAR_M, INTRINSICS, PITCH_RAD, RgbdCamera
+from pipeline.environments.world import AnimalWorld
+from pipeline.geometry import rigid
+from pipeline.geometry.meshes import Mesh
+from stages.train_behavior.export import write_contract
+from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, wandering
+from tests.pipeline.environments.test_other_home import write
+from tests.stages.simulate.test_simulator import scaling
+
+gymnasium = pytest.importorskip("gymnasium")
+
+QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
+RED, BLUE = (200, 30, 30), (30, 30, 200)
+
+
+def box(extents, color, place=(0.0, 0.0, 0.0), inward=False):
+    """A box of one colour, centred at a place."""
+    made = trimesh.creation.box(extents, rigid.make(np.eye(3), np.array(place)))
+    faces = np.asarray(made.faces)[:, ::-1] if inward else np.asarray(made.faces)
+    vertices = np.asarray(made.vertices, np.float32)
+    return Mesh(vertices, np.ascontiguousarray(faces, np.int32), np.tile(np.uint8(color), (len(vertices), 1)))
+
+
+def write_surfaces(build):
+    """Write a blue room of 4 m and a red animal as boxes."""
+    (build / "reconstruction").mkdir()
+    ply.write_ply(build / "reconstruction/scene.ply", box((4.4, 2.5, 4.4), BLUE, (0, 1.25, 0), inward=True))
+    ply.write_ply(build / "reconstruction/agent.ply", box((0.2, 0.2, 0.4), RED))
+    npz.save(
+        build / "reconstruction/skin.npz",
+        weights=np.full((8, BONES), 1 / BONES, np.float32),
+        agent_from_bone_rest=REST.astype(np.float32),
+        bone_scale_m=np.ones((BONES, 3), np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def builds(tmp_path_factory):
+    """Two homes, of which the first has an untrained model and surfaces, the second surfaces alone."""
+    folder = tmp_path_factory.mktemp("builds")
+    own, other = write(folder / "own"), write(folder / "other")
+    (own / "behavior").mkdir()
+    write_contract(own / "behavior", BehaviorNets(ARCHITECTURE), ARCHITECTURE, scaling(), Schedule(), REST)
+    wandering().save(own / "behavior_data")
+    for build in (own, other):
+        write_surfaces(build)
+    return own, other
+
+
+def test_episodes_begin_in_every_home_and_animals_of_all_plan_together(builds):
+    import pipeline.environments.registration  # noqa: F401
+
+    own, other = builds
+    lives = []
+    for _ in range(2):
+        env = gymnasium.make_vec(
+            "AgentToSim/Cat-v0",
+            num_envs=6,
+            build=str(own),
+            homes=[str(own), str(other)],
+            config=QUICK,
+            episode_s=0.5,
+        )
+        seen, info = env.reset(seed=1)
+        homes = [info["home"].copy()]
+        assert info["share_known"].shape == (6,) and (info["share_known"] == 1).all(), "the same room twice"
+        for _ in range(14):
+            seen, *_, info = env.step(np.zeros((6, 3), np.float32))
+            homes.append(info["home"].copy())
+        assert set(np.concatenate(homes)) == {0, 1}
+        assert (homes[0] != homes[-1]).any(), "an episode that begins anew draws a home anew"
+        assert env.observation_space.contains(seen)
+        lives.append(seen["animal"])
+    np.testing.assert_array_equal(*lives)
+
+
+def test_joined_homes_keep_their_own_moments_and_volumes(builds):
+    own, other = builds
+    data = wandering()
+    alone = settle(own, data, [other])
+    both = settle(own, data, [own, other])
+    assert both.scenes.number(np.arange(len(both.data.videos)), len(both.data.videos)).tolist() == [
+        *([0] * len(data.videos)),
+        *([1] * len(alone.data.videos)),
+    ]
+    late = np.flatnonzero(both.home_of_video[both.data.video] == 1)
+    np.testing.assert_array_equal(
+        both.data.windows(late[:5])[0].world_from_agent, alone.data.windows(np.arange(5))[0].world_from_agent
+    )
+    assert settle(own, data, []).data is data
+
+
+@pytest.mark.parametrize("observations", [("rgbd",), ("animal", "rgbd")])
+def test_gymnasium_accepts_pictures(builds, observations):
+    from gymnasium.utils.env_checker import check_env
+
+    import pipeline.environments.registration  # noqa: F401
+
+    how = {"homes": [str(build) for build in builds], "config": QUICK, "observations": observations}
+    env = gymnasium.make("AgentToSim/Cat-v0", build=str(builds[0]), episode_s=3.0, **how)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    seen, _ = env.reset(seed=0)
+    assert set(seen) == {"rgb", "depth", *observations} - {"rgbd"}
+    rgb, depth = seen["rgb"].astype(int), seen["depth"]
+    animal = (rgb == RED).all(-1)
+    assert 5 < animal.sum() < 1000, "it begins in view, a metre or so away"
+    assert ((rgb == BLUE).all(-1) | animal).all() and depth[animal].mean() < depth[~animal].max()
+    assert 0.3 < depth[animal].mean() < 2.5, "metres"
+
+
+def test_depth_is_measured_from_the_eyes():
+    """A wall 1.6 m ahead, and an animal before it that one bone has lowered."""
+    body, wall = box((0.2, 0.2, 0.2), RED), box((20, 20, 1.0), BLUE, (0, 0, 2.1))
+    weights = np.zeros((8, BONES))
+    weights[:, 1] = 1
+    camera = RgbdCamera([wall], body, weights, REST)
+    level = rigid.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    eye = np.zeros(3)
+    plain = camera.picture(0, eye, 0.0, rigid.make(np.eye(3), np.array([0.0, 50, 0])), REST)
+    row = (np.arange(48) + 0.5 - INTRINSICS[1, 2]) / INTRINSICS[1, 1]
+    expected = 1.6 / (np.cos(PITCH_RAD) - row * np.sin(PITCH_RAD))
+    seen = (expected > 0) & (expected < FAR_M)
+    np.testing.assert_allclose(plain.depth_m[seen, 32], expected[seen], rtol=1e-3)
+    lowered = REST.copy()
+    lowered[1, 1, 3] -= 0.3
+    for bones, height in ((REST, 0.0), (lowered, -0.3)):
+        picture = camera.picture(0, eye, 0.0, level, bones)
+        rows, columns = np.nonzero((picture.rgb == RED).all(-1))
+        ray = (np.array([columns.mean(), rows.mean()]) + 0.5 - INTRINSICS[:2, 2]) / INTRINSICS[0, 0]
+        ahead = np.array([ray[0], -ray[1] * np.cos(PITCH_RAD) - np.sin(PITCH_RAD)]) / (
+            np.cos(PITCH_RAD) - ray[1] * np.sin(PITCH_RAD)
+        )
+        np.testing.assert_allclose(ahead * 0.95, [0, height], atol=0.06)  # metres, at the body's near side
+
+
+def test_a_build_without_surfaces_cannot_be_seen(builds, tmp_path):
+    shutil.copytree(builds[0], tmp_path / "blind", ignore=shutil.ignore_patterns("reconstruction"))
+    world = AnimalWorld.load(tmp_path / "blind", QUICK)
+    assert world.camera is None
+    with pytest.raises(InputError, match="ART-003.*blind"):
+        AnimalWorld.load(tmp_path / "blind", EnvironmentConfig(observations=("rgbd",)))
