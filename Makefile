@@ -26,7 +26,7 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 # What ends in a command line or a path holds plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
-$(foreach name,AGENT NAME OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
+$(foreach name,AGENT NAME OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
 # Where an agent's, its variant's, or in a home of several animals one's (NAME=) own things stand; what a variant does not
 # touch is its agent's (`INPUTS` knows).
@@ -80,15 +80,18 @@ capture-check: .venv/.ok
 gallery: .venv/.ok
 	@$(PYTHON) -m stages.compile_gallery build
 
-# One format for another program, after the simulator; with a take of `make simulate` as one motion more.
+# One format for another program, after the simulator; with a take of `make simulate` as one motion more, and on
+# the body of another build (BODY=luna).
+EXPORTED = $(HOME_OF)/exports/$(or $(FORMAT),glb)$(BODY:%=_on_%)
 export: .venv/.ok
 	@$(PYTHON) -m stages.export --format $(or $(FORMAT),glb) --help >/dev/null
-	@$(MAKE) $(NESTING) $(ANIMAL).simulator
+	@$(if $(BODY),$(PLAN) plan $(BODY))
+	@$(MAKE) $(NESTING) $(ANIMAL).simulator $(BODY:%=%.simulator)
 	@$(call INPUTS,simulator reconstruction splats behavior_data frames masks) && \
 	$(PYTHON) -m stages.export $$inputs --format $(or $(FORMAT),glb) $(if $(INFLUENCES),--influences $(INFLUENCES)) \
 	  $(if $(wildcard $(HOME_OF)/take/manifest.json),--take $(HOME_OF)/take) \
-	  --videos build/$(ANIMAL)$(if $(NAME),/animals/$(NAME))/plan/videos.json --out $(HOME_OF)/exports/$(or $(FORMAT),glb)
-	@echo '[$(HOME_OF)] written: $(HOME_OF)/exports/$(or $(FORMAT),glb); export.json lists what is lost'
+	  $(BODY:%=--body build/%/simulator) --videos build/$(ANIMAL)$(if $(NAME),/animals/$(NAME))/plan/videos.json --out $(EXPORTED)
+	@echo '[$(HOME_OF)] written: $(EXPORTED); export.json lists what is lost'
 
 # The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live. In another build's
 # home (HOME=other): a take, and a page that begins from it.

@@ -54,7 +54,7 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
             - truth[..., :3, 3]
         )
     distances = {"flat": np.concatenate(exact), "tree": np.concatenate(lost)}
-    loss: dict[str, float] = {}
+    loss: dict[str, float] = dict(agent.retargeting_loss_mm)
     for kind, apart in distances.items():
         apart_mm = 1000 * np.linalg.norm(apart, axis=-1)
         loss |= {

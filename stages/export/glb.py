@@ -18,7 +18,7 @@ def write(folder: Path, agent: Agent, scene: bytes) -> ExportRecord:
     for content in (data, scene):
         opened = trimesh.load_scene(io.BytesIO(content), file_type="glb")
         assert len(opened.geometry) == 1, "one surface a file"
-    loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()}
+    loss = agent.loss_mm
     influences = agent.skin.joints.shape[1]
     remark = (
         f"metres, +y up; joints are siblings under one root; {influences} influences a vertex; "

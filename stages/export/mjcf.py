@@ -33,7 +33,7 @@ def write(folder: Path, agent: Agent, occupancy: Occupancy) -> ExportRecord:
         motions[f"{action.name}/mocap_pos"] = poses[action.name][..., :3, 3]
         motions[f"{action.name}/mocap_quat"] = rigid.quaternion_from_rotation(poses[action.name][..., :3, :3])
     npz.save(folder / "motions.npz", compress=False, **motions)
-    loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()}
+    loss = agent.loss_mm
     loss["bodies"] = round(1000 * _posed(mujoco, folder / "agent.xml", motions, agent.actions[0].name), 4)
     loss["room_voxel"] = 1000 * occupancy.voxel_m
     remark = (

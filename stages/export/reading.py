@@ -4,7 +4,7 @@ cameras.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,15 @@ class Agent:
     actions: list[Action]
     skinning_loss_mm: dict[str, float]
     """linear weights against the reconstruction's dual quaternions"""
+    retargeting_loss_mm: dict[str, float] = field(default_factory=dict)
+    """where the motions are another animal's, see `pipeline.fields.retargeting`"""
+
+    @property
+    def loss_mm(self) -> dict[str, float]:
+        """Return what any format loses of the reconstruction."""
+        return {
+            f"skinning_{name}": value for name, value in self.skinning_loss_mm.items()
+        } | self.retargeting_loss_mm
 
 
 @dataclass(frozen=True)

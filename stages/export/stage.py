@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import assert_never
 
-from stages.export import bvh, cameras, glb, mjcf, neuro, reading, splats, tables, usd, writing
+from stages.export import bvh, cameras, glb, mjcf, neuro, reading, retarget, splats, tables, usd, writing
 from stages.export.config import Config
 
 
@@ -20,6 +20,8 @@ class Inputs:
     frames: Mapping[str, Path] = field(default_factory=dict)
     masks: Mapping[str, Path] = field(default_factory=dict)
     take: Path | None = None
+    body: Path | None = None
+    """Artifact `simulator` of another build, whose body takes the motions."""
 
 
 def run(inputs: Inputs, config: Config, out: Path) -> writing.ExportRecord:
@@ -55,7 +57,10 @@ def run(inputs: Inputs, config: Config, out: Path) -> writing.ExportRecord:
 
 def _agent(inputs: Inputs, config: Config) -> reading.Agent:
     take = inputs.take / "take.npz" if inputs.take is not None else None
-    return reading.agent(inputs.simulator, take, config.rate_hz, config.influences)
+    agent = reading.agent(inputs.simulator, take, config.rate_hz, config.influences)
+    if inputs.body is None:
+        return agent
+    return retarget.onto(agent, reading.agent(inputs.body, None, config.rate_hz, config.influences))
 
 
 def _frames(inputs: Inputs, config: Config) -> list[reading.CameraFrame]:

@@ -31,9 +31,7 @@ def write(folder: Path, agent: Agent, room: Mesh) -> ExportRecord:
     stage = _stage(pxr, folder / "scene.usdc")
     stage.SetDefaultPrim(_mesh(pxr, stage, "/scene", room).GetPrim())
     stage.Save()
-    loss = {f"skinning_{name}": value for name, value in agent.skinning_loss_mm.items()} | {
-        "joints": round(worst_mm, 4)
-    }
+    loss = agent.loss_mm | {"joints": round(worst_mm, 4)}
     return ExportRecord(
         version("usd-core"), loss, f"UsdSkel of {version('usd-core')}", "metres, +y up, time codes in frames"
     )

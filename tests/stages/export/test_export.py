@@ -4,6 +4,7 @@ import importlib
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from pipeline.core.errors import InputError
 from pipeline.data import glb, images, npz
 from pipeline.data.glb import Action, Skin
 from pipeline.geometry import rigid
-from stages.export import bvh, cameras, mjcf, neuro, reading, splats, tables, usd, writing
+from stages.export import bvh, cameras, mjcf, neuro, reading, retarget, splats, tables, usd, writing
 from stages.export import glb as glb_export
 from tests.stages.export_simulator import small_world
 
@@ -61,6 +62,26 @@ def session() -> reading.Session:
         np.full(15, 0.9),
         np.isfinite(agent).all((1, 2)),
     )
+
+
+def test_a_motion_on_another_body_is_exported_with_its_loss(agent: reading.Agent, tmp_path: Path) -> None:
+    """A body 1.5 times as long has its own surface and skin, and the motions of the first."""
+    stretch = np.array([1, 1, 1.5])
+    rest = agent.skin.agent_from_bone_rest.copy()
+    rest[:, :3, 3] *= stretch
+    mesh = replace(agent.mesh, vertices=(agent.mesh.vertices * stretch).astype(np.float32))
+    long = reading.Agent(mesh, replace(agent.skin, agent_from_bone_rest=rest), [], {"mean": 0.2})
+    moved = retarget.onto(agent, long)
+    record = glb_export.write(tmp_path, moved, glb.static(agent.mesh, "room"))
+    assert record.loss_mm["skinning_mean"] == 0.2 and record.loss_mm["retargeting_mean"] < 2, "mm"
+    assert record.loss_mm["retargeting_shape_distance"] < 1e-3
+    opened, _, actions = glb.read_skinned((tmp_path / "agent.glb").read_bytes())
+    np.testing.assert_allclose(opened.vertices, mesh.vertices, atol=1e-6)
+    assert [action.name for action in actions] == ["walk", "turn"]
+    for found, truth in zip(actions, agent.actions, strict=True):
+        np.testing.assert_allclose(found.time_s, truth.time_s, atol=1e-6)
+        bent, own = (each.agent_from_bone[:, 1, 0, 2] for each in (truth, found))
+        assert np.corrcoef(bent, own)[0, 1] > 0.9, "the second bone swings in the same rhythm"
 
 
 @pytest.mark.parametrize("influences", [4, 8])
