@@ -70,13 +70,10 @@ class Simulator {
       this.map.visit('animal', frame[0], frame[2], 0.25);
       this.map.visit('observer', camera[0], camera[2], 0.25);
     });
-    panel.progress(0.45, 'loading the behaviour model');
-    this.planner = await Planner.open(this.contract, (share) =>
-      panel.progress(0.45 + 0.5 * share, 'loading the behaviour model'),
-    );
-    const sheet = filledFloor(this.contract.volume, this.planner.allowed, this.contract.scene.floor_m);
+    const allowed = await assets.bytes('allowed');
+    const sheet = filledFloor(this.contract.volume, allowed, this.contract.scene.floor_m);
     if (sheet) this.room.scene.add(sheet);
-    this.support = new Support(this.contract.volume, this.planner.allowed);
+    this.support = new Support(this.contract.volume, allowed);
     this.connect();
     this.reset();
     panel.progress(1, 'ready');
@@ -85,6 +82,10 @@ class Simulator {
     if (this.contract.scene.warning) panel.warn(this.contract.scene.warning);
     this.last = performance.now();
     this.room.renderer.setAnimationLoop(() => this.frame());
+    // the animal is seen while what it plans with is loaded
+    this.planner = await Planner.open(this.contract, allowed, (share) =>
+      panel.status(`loading the behaviour model, ${Math.round(100 * share)} %`),
+    );
     await this.addSplats().catch((error) => {
       this.remark = `; drawn as a mesh, without splats: ${error.message}`;
     });
@@ -481,7 +482,7 @@ class Simulator {
   }
 
   async plan() {
-    if (this.waiting || !this.due) return;
+    if (!this.planner || this.waiting || !this.due) return;
     if (this.timeline.plans.length && this.state.interactivity > 0 && this.personMoved) this.notice();
     this.waiting = true;
     this.urgent = false;

@@ -5,7 +5,7 @@ import * as assets from './assets.js';
 const MODELS = ['perception', 'goal', 'path', 'body'];
 
 export class Planner {
-  static async open(contract, onProgress) {
+  static async open(contract, allowed, onProgress) {
     const planner = new Planner();
     const source = document.getElementById('asset-worker');
     const code = new Blob([await assets.bytes('worker')], { type: 'text/javascript' });
@@ -21,8 +21,7 @@ export class Planner {
       await Promise.all(MODELS.map(async (name) => [name, await assets.bytes(name)])),
     );
     onProgress(0.3);
-    const [volume, allowed] = [await assets.bytes('volume'), await assets.bytes('allowed')];
-    planner.allowed = allowed;
+    const volume = await assets.bytes('volume');
     await planner.ask('load', { contract, wasm, models, volume, allowed }, [
       wasm.buffer,
       volume.buffer,
