@@ -20,7 +20,7 @@ from pipeline.behavior.path_encoding import REST_SPEED_M_S
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.support import SUPPORTED, Support, floor_level
-from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Trajectory
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Trajectory
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.geometry import rigid
@@ -114,7 +114,7 @@ class Moved:
     home: ReconstructedHome
     """The other home as its model perceives it, for its own body."""
     data: BehaviorData
-    """Recorded moments as they would begin there: `PAST` valid frames each."""
+    """Recorded moments as they would begin there: the known frames of each are valid."""
     share_known: float
     """Share (0..1) of the other home's surface cells that look like the known home's."""
 
@@ -190,7 +190,7 @@ def set_down(
 ) -> BehaviorData:
     """Return recorded moments on the floor of the other home, turned and shifted as a whole.
 
-    Each is a recording of its own, named `<recording>-<first frame>`, whose first `PAST` frames are valid.
+    Each is a recording of its own, named `<recording>-<first frame>`, whose known frames are valid.
     The animal is as high above the floor as it was above what carried it; the observer keeps its height above
     the floor and stands on it where it was there at all. Raises SIM-011 where no moment fits in.
     """
@@ -202,7 +202,7 @@ def set_down(
         some = windows[np.linspace(0, len(windows) - 1, min(len(windows), count)).astype(int)]
         for window in some.tolist():
             name, start = data.videos[data.video[window]], int(data.start[window])
-            moment = _cut(data.trajectories[name], start, PAST + data.future)
+            moment = _cut(data.trajectories[name], start, data.past, data.future)
             placed = _placed(moment, own, other, scenes, floor, rng)
             if placed is not None:
                 tracks[f"{name}-{start}"] = placed
@@ -218,6 +218,8 @@ def set_down(
         np.array(splits, np.uint8),
         tuple(tracks),
         data.future,
+        data.past,
+        data.rate_hz,
     )
 
 
@@ -229,9 +231,9 @@ def _floor_places(home: ReconstructedHome) -> Float[np.ndarray, "place 3"]:
     return np.stack([place[:, 0], np.full(len(place), home.floor_m), place[:, 1]], axis=-1)
 
 
-def _cut(track: Trajectory, start: int, frames: int) -> Trajectory:
-    part = slice(start, start + frames)
-    valid = np.arange(frames) < PAST
+def _cut(track: Trajectory, start: int, past: int, future: int) -> Trajectory:
+    part = slice(start, start + past + future)
+    valid = np.arange(past + future) < past
     return Trajectory(
         track.timestamp_s[part] - track.timestamp_s[start],
         track.world_from_agent[part],
@@ -250,20 +252,22 @@ def _placed(
     rng: np.random.Generator,
 ) -> Trajectory | None:
     """Turn and shift a moment to a place on the floor where its past is free; None where none is found."""
-    now = moment.world_from_agent[PAST - 1, :3, 3]
-    step = now - moment.world_from_agent[PAST - 2, :3, 3]
-    moves = bool(np.hypot(step[0], step[2]) * RATE_HZ > REST_SPEED_M_S)
+    past = int(moment.valid.sum())
+    now = moment.world_from_agent[past - 1, :3, 3]
+    step = now - moment.world_from_agent[past - 2, :3, 3]
+    step_s = float(moment.timestamp_s[past - 1] - moment.timestamp_s[past - 2])
+    moves = bool(np.hypot(step[0], step[2]) > REST_SPEED_M_S * step_s)
     height = own.height_above_top(now, moves=moves)
     for _ in range(PLACE_DRAWS):
         turn = rigid.rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
         target = floor[rng.integers(len(floor))] + [0.0, height, 0.0]
         other_from_own = rigid.make(turn, target - turn @ now)
         roots = other_from_own @ moment.world_from_agent
-        if scenes.inside_solid(roots[None, :PAST, :3, 3], None).any():
+        if scenes.inside_solid(roots[None, :past, :3, 3], None).any():
             continue
         camera = other_from_own @ moment.world_from_camera
         camera[:, 1, 3] = moment.world_from_camera[:, 1, 3] - own.floor_m + other.floor_m
-        eye = camera[PAST - 1, :3, 3]
+        eye = camera[past - 1, :3, 3]
         on_floor = np.abs(floor[:, [0, 2]] - eye[[0, 2]]).max(1).min() <= other.volume.voxel_m / 2
         if on_floor or np.linalg.norm(eye - target) > PRESENT_M:
             return replace(moment, world_from_agent=roots, world_from_camera=camera)

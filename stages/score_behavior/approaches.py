@@ -15,7 +15,8 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.perception import FeatureVolume, world_from_ego
 from pipeline.behavior.planning import observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, Context
+from pipeline.behavior.trajectories import RATE_HZ, BehaviorData, Context
+from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.geometry import rigid
 from pipeline.metrics.flight import flees
@@ -44,6 +45,18 @@ def read(folder: Path) -> RecordedApproaches:
     )
 
 
+def check_rate(met: RecordedApproaches, data: BehaviorData, where: str) -> None:
+    """Raise REC-002 for a model of another rate or past than the scripted approaches have."""
+    past = met.observer.shape[2]
+    if data.rate_hz != RATE_HZ or data.past != past:
+        what = (
+            f"approaches of {past} known frames at {RATE_HZ} Hz cannot be shown to a model of {data.past} "
+            f"at {data.rate_hz:g} Hz"
+        )
+        remedy = "leave out `past_s` and `rate_hz` of [slice_behavior], or score without approaches"
+        raise InputError("REC-002", what, where, remedy)
+
+
 def shares(
     ats: Ats, met: RecordedApproaches, count: int, seed: int
 ) -> dict[str, Float[np.ndarray, "approach"]]:
@@ -53,12 +66,12 @@ def shares(
     ats = replace(ats, volume=met.scene)
     unaware = replace(ats.sampling, observer=False)
     asked = ({"seen": ats.sampling, "unseen": unaware}, {"standing": ats.sampling})
-    found = {}
+    found, past = {}, met.observer.shape[2]
     for twin, samplings in enumerate(asked):
-        context = Context(met.world_from_agent[twin, :, :PAST], met.agent_from_bone[twin], met.observer[twin])
+        context = Context(met.world_from_agent[twin, :, :past], met.agent_from_bone[twin], met.observer[twin])
         fled = _fled(ats, context, samplings, count, seed)
         root = met.world_from_agent[twin, :, :, :3, 3]
-        true = flees(root[:, PAST:], root[:, PAST - 1], met.observer[twin, :, -1]).astype(float)
+        true = flees(root[:, past:], root[:, past - 1], met.observer[twin, :, -1]).astype(float)
         found |= {f"flees/{name}": share for name, share in fled.items()} | {f"flees/{TRUE[twin]}": true}
     return found
 

@@ -24,8 +24,8 @@ def scores(
     """Return per protocol and score one number per window, averaged over trials, and the windows themselves.
 
     ``goal_window``, ``plan_window``: recording and first frame of the windows on which goals, and plans, are
-    judged. ``end_to_end/solid``: share of each window's sampled positions inside something solid or outside
-    the room.
+    judged; ``window_frames``: their known and predicted frames. ``end_to_end/solid``: share of each window's
+    sampled positions inside something solid or outside the room.
     """
     scenes = ats.volume
     assert isinstance(scenes, Scenes), "the model is opened with the windows' own scenes"
@@ -48,6 +48,7 @@ def scores(
         "goal_window": _listed(data, many),
         "plan_window": _listed(data, few),
         "videos": np.array(data.videos, np.str_),
+        "window_frames": np.array([data.past, data.future], np.int32),
     }
     true = scenes.inside_solid(future.path_world, context.video).mean(1)
     return (

@@ -31,7 +31,10 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu") -> None:
-    """Score one trained model. Raises BEH-004 without a test window."""
+    """Score one trained model.
+
+    Raises BEH-004 without a test window, REC-002 where approaches have another rate than the model.
+    """
     architecture = behavior.load(inputs.behavior_trials)[0]
     data = BehaviorData.load(inputs.behavior_data).with_horizon(architecture.future)
     if not len(data.indices(TEST)):
@@ -42,6 +45,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     scores = protocols.scores(ats, data, architecture.family, config)
     if inputs.approaches is not None and (inputs.approaches / "approaches.npz").is_file():
         recorded = approaches.read(inputs.approaches)
+        approaches.check_rate(recorded, data, str(inputs.approaches))
         scores |= approaches.shares(ats, recorded, config.approach_samples, config.seed)
     means = (f"{name} {scores[name].mean():.3f}" for name in REPORTED if name in scores)
     progress.log(", ".join(means))

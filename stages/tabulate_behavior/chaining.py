@@ -11,7 +11,7 @@ from scipy.stats import ks_2samp
 from pipeline.behavior.config import ReplanningConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
-from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, BehaviorData
+from pipeline.behavior.trajectories import TEST, BehaviorData
 from pipeline.rivals.predictors import Ats
 
 REST_M_S = 0.05
@@ -37,11 +37,11 @@ def figures(
     lived, tilt = poses[..., :3, 3], _tilts(poses)
     solid = scenes.inside_solid(lived, data.video[chosen]).mean(1)
     recorded = [data.trajectories[data.videos[video]] for video in np.unique(data.video[test])]
-    true = [_speeds(t.world_from_agent[:, :3, 3])[t.valid[1:] & t.valid[:-1]] for t in recorded]
+    true = [_speeds(t.world_from_agent[:, :3, 3], data.rate_hz)[t.valid[1:] & t.valid[:-1]] for t in recorded]
     tilted = np.quantile(
         np.concatenate([_tilts(t.world_from_agent[t.valid]) for t in recorded]), UPRIGHT_QUANTILE
     )
-    speeds, whole = [_speeds(life) for life in lived], np.concatenate(true)
+    speeds, whole = [_speeds(life, data.rate_hz) for life in lived], np.concatenate(true)
     return {
         "behavior/ats/chain_rollouts": float(count),
         "behavior/ats/chain_seconds": float(seconds),
@@ -86,9 +86,9 @@ def rollouts(
     ]
     flock.begin(context, rng)
     root = [context.world_from_agent[:, -1]]
-    for step in range(round(seconds * RATE_HZ)):
+    for step in range(round(seconds * data.rate_hz)):
         seen = [
-            walk[(start + PAST + step) % len(walk)]
+            walk[(start + data.past + step) % len(walk)]
             for walk, start in zip(walks, data.start[window], strict=True)
         ]
         root.append(flock.step(np.array(seen)).root[:, 0])
@@ -100,8 +100,8 @@ def _tilts(world_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarra
     return np.arccos(np.clip(world_from_agent[..., 1, 1], -1, 1))
 
 
-def _speeds(path: Float[np.ndarray, "frame 3"]) -> Float[np.ndarray, "step"]:
-    return np.linalg.norm(np.diff(path, axis=0), axis=-1) * RATE_HZ
+def _speeds(path: Float[np.ndarray, "frame 3"], rate_hz: float) -> Float[np.ndarray, "step"]:
+    return np.linalg.norm(np.diff(path, axis=0), axis=-1) * rate_hz
 
 
 def _ks_distance(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.behavior.trajectories import FUTURE, PAST
 from pipeline.data import npz
 
 
@@ -20,6 +21,10 @@ class MethodScores:
     """the same of paths and bodies"""
     values: dict[str, Float[np.ndarray, "_ _"]]
     """[seed window] of `<protocol>/<score>`, `recorded/solid`; `flees/<condition>`, which is per approach"""
+    past: int = PAST
+    """known frames of a window"""
+    future: int = FUTURE
+    """predicted frames of a window"""
 
     def windows_of(self, name: str) -> Int[np.ndarray, "window 2"]:
         """Return the windows that a score belongs to; every approach is an episode of its own."""
@@ -37,6 +42,7 @@ def stacked(folders: Sequence[Path]) -> MethodScores:
         read[0]["goal_window"],
         read[0]["plan_window"],
         {name: np.stack([each[name] for each in read]) for name in names},
+        *(int(frames) for frames in read[0]["window_frames"]),
     )
 
 

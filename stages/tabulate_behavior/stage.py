@@ -41,7 +41,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
         method: reading.curves([inputs.behavior_trials[trial] for trial in each])
         for method, each in trials.items()
     }
-    data = BehaviorData.load(inputs.behavior_data)
+    data = BehaviorData.load(inputs.behavior_data).with_horizon(scores[OURS].future)
     scores |= untrained.scores(data, scores[OURS], trials=config.trials, seed=config.seed)
     figures = tables.figures(scores, OURS, seed=config.seed) | tables.plateaus(curves)
     if config.rollouts:

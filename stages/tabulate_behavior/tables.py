@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.behavior.trajectories import FUTURE, PAST
 from pipeline.metrics.intervals import Interval, episodes
 from stages.tabulate_behavior.reading import MethodScores
 
@@ -31,8 +30,10 @@ def figures(
     table: dict[str, float | None] = {}
     for method, scores in found.items():
         for name, values in scores.values.items():
-            window = scores.windows_of(name)
-            table |= interval(values, window, draws, seed).as_figures(f"behavior/{method}/{_figure(name)}")
+            window, frames = scores.windows_of(name), scores.past + scores.future
+            table |= interval(values, window, frames, draws, seed).as_figures(
+                f"behavior/{method}/{_figure(name)}"
+            )
             rival = found[ours].values.get(name)
             if method != ours and rival is not None and np.array_equal(window, found[ours].windows_of(name)):
                 if min(len(rival), len(values)) > 1:
@@ -42,7 +43,7 @@ def figures(
                 less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(
                     values[:both], (both, values.shape[1])
                 )
-                table |= interval(less, window, draws, seed).as_figures(
+                table |= interval(less, window, frames, draws, seed).as_figures(
                     f"behavior/{ours}_minus_{method}/{_figure(name)}"
                 )
         _contrast(table, method, scores, draws, seed)
@@ -59,7 +60,8 @@ def _contrast(
     for name, first, second in CONTRASTS:
         if first in scores.values and second in scores.values:
             less = scores.values[first] - scores.values[second]
-            table |= interval(less, scores.windows_of(first), draws, seed).as_figures(
+            frames = scores.past + scores.future
+            table |= interval(less, scores.windows_of(first), frames, draws, seed).as_figures(
                 f"behavior/{method}/{name}"
             )
     fed, alone = (scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", UNPREFIXED))
@@ -68,15 +70,19 @@ def _contrast(
 
 
 def interval(
-    values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], draws: int, seed: int
+    values: Float[np.ndarray, "seed window"],
+    window: Int[np.ndarray, "window 2"],
+    frames: int,
+    draws: int,
+    seed: int,
 ) -> Interval:
-    """Resample seeds and episodes of 6.4 s, both with replacement, and return the mean with percentiles 2.5
-    and 97.5.
+    """Resample seeds and episodes as long as a window of ``frames``, both with replacement, and return the
+    mean with percentiles 2.5 and 97.5.
 
     The bounds of one episode alone are NaN.
     """
     rng = np.random.default_rng(seed)
-    episode = episodes(window[:, 1], window[:, 0], PAST + FUTURE)
+    episode = episodes(window[:, 1], window[:, 0], frames)
     count = episode.max() + 1
     if count == 1:
         return Interval(float(values.mean()), np.nan, np.nan)

@@ -54,7 +54,7 @@ def _scores(
         found |= {
             f"end_to_end/{name}": np.concatenate([part[name] for part in parts])[None] for name in parts[0]
         }
-    return MethodScores(like.goal_window, like.plan_window, found)
+    return MethodScores(like.goal_window, like.plan_window, found, like.past, like.future)
 
 
 def _predicts(samples: Samples, name: str) -> bool:

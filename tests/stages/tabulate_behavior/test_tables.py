@@ -21,8 +21,8 @@ def scores(values):
 def test_intervals_grow_with_what_seeds_disagree_about():
     rng = np.random.default_rng(0)
     windows = rng.normal(1, 0.01, (3, 640))
-    alike = tables.interval(windows, WINDOWS, 300, 0)
-    apart = tables.interval(windows + np.array([[-0.3], [0], [0.3]]), WINDOWS, 300, 0)
+    alike = tables.interval(windows, WINDOWS, 64, 300, 0)
+    apart = tables.interval(windows + np.array([[-0.3], [0], [0.3]]), WINDOWS, 64, 300, 0)
     assert alike.mean == pytest.approx(apart.mean)
     assert apart.high - apart.low > 10 * (alike.high - alike.low)
 
