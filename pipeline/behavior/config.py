@@ -14,8 +14,9 @@ goal."""
 Control = Literal["unet", "concatenation"]
 """How goal and path condition a UNet: through a second UNet (ControlNet), or as one more part of the
 perception code."""
-SceneEncoder = Literal["pillars", "volume"]
-"""2.5-D encoder with height in channels, or the six 3-D convolutions of the paper."""
+SceneEncoder = Literal["pillars", "volume", "none"]
+"""2.5-D encoder with height in channels, the six 3-D convolutions of the paper, or no encoder, for
+trajectories without a map."""
 ObservedPast = Literal["positions", "poses"]
 """What is read of the observer's past: where it was, or, as in the paper, its SE(3) poses."""
 Guided = Literal["observer", "all"]

@@ -99,8 +99,18 @@ class Architecture:
 
     @property
     def scene_stride(self) -> int:
-        """How many cells of the ego grid the scene encoder averages along each axis before it begins."""
-        return self.scene_block if self.scene == "pillars" else 1
+        """How many cells of the ego grid the scene encoder averages along each axis before it begins; all of
+        the height where it reads none.
+        """
+        match self.scene:
+            case "pillars":
+                return self.scene_block
+            case "volume":
+                return 1
+            case "none":
+                return GRID_SHAPE[1]
+            case _:
+                assert_never(self.scene)
 
     @property
     def map_cells(self) -> int:

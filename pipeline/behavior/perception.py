@@ -168,6 +168,19 @@ class VolumeScene(nn.Module):
     encode = forward
 
 
+class NoScene(nn.Module):
+    """No encoder: no map, and a code of zeros."""
+
+    def __init__(self, code: int):
+        super().__init__()
+        self.code = code
+
+    def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> SceneEncoding:
+        return grid.new_zeros(grid.shape[0], 0), grid.new_zeros(grid.shape[0], self.code)
+
+    encode = forward
+
+
 @dataclass(frozen=True)
 class PerceptionConfig:
     """Sizes of the perception network."""
@@ -201,6 +214,8 @@ class Perception(nn.Module):
                 self.scene = PillarScene(size.scene_channels, size.scene_width, size.code, size.scene_block)
             case "volume":
                 self.scene = VolumeScene(size.scene_channels, size.scene_width, size.code)
+            case "none":
+                self.scene = NoScene(size.code)
             case _:
                 assert_never(size.scene)
         sizes = size.past_frames, size.hidden, size.code

@@ -4,7 +4,7 @@
 scene, which the window's `Context.scene` names.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -56,6 +56,11 @@ class Scenes:
         """Return the one scene of all recordings, with all that is free allowed."""
         return cls((volume,), (volume.occupancy != 1,), np.zeros(1, int))
 
+    def without_features(self) -> "Scenes":
+        """Return the same scenes for a model that encodes none: they only limit where an agent may be."""
+        volumes = tuple(replace(volume, features=volume.features[:0]) for volume in self.volumes)
+        return replace(self, volumes=volumes)
+
     @property
     def channels(self) -> int:
         """Return the number of features per voxel."""
@@ -74,6 +79,8 @@ class Scenes:
         self, ego: Float[np.ndarray, "window 4 4"], video: Int[np.ndarray, "window"] | None
     ) -> Float[np.ndarray, "window channel 64 8 64"]:
         """Sample the ego grid (`world_from_ego`, metres) of every window in its own scene (Eq. 11)."""
+        if not self.channels:
+            return np.zeros((len(ego), 0, *GRID_SHAPE), np.float32)
         number = self.number(video, len(ego))
         if (number == number[:1]).all() and len(number):
             return self.volumes[number[0]].around(ego)

@@ -151,8 +151,10 @@ class Ats:
     ) -> "Ats":
         """Read a trained model (`behavior/`)."""
         architecture, nets, scaling, schedule, rest = behavior.load(model)
+        if architecture.scene == "none":
+            volume = (volume if isinstance(volume, Scenes) else Scenes.of(volume)).without_features()
         sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
-        knows = architecture.ablated_input != "scene"
+        knows = architecture.ablated_input != "scene" and architecture.scene != "none"
         return cls(
             sampler,
             volume,
@@ -174,6 +176,23 @@ class Ats:
             goal = self.sampler.goals(codes, self.sampling, rng).reshape(len(chunk), count, 3)
             goals.append(rigid.apply(world_from_ego(chunk.world_from_agent[:, -1], self.ego), goal))
         return Samples(np.concatenate(goals))
+
+    def courses(
+        self, context: Context, count: int, rng: np.random.Generator, *, at_once: int = WINDOWS_AT_ONCE
+    ) -> Samples:
+        """Draw goals and the paths to them, and spare the bodies; goals are where the paths end.
+
+        ``at_once`` windows are encoded together: without a scene thousands fit into memory.
+        """
+        parts = []
+        for start in range(0, len(context), at_once):
+            chunk = context[start : start + at_once]
+            path = self.sampler.course(self._observe(chunk), self.sampling, rng, count=count)
+            frame = np.repeat(world_from_ego(chunk.world_from_agent[:, -1], self.ego), count, axis=0)
+            path = rigid.apply(frame, path)
+            parts.append(path.reshape(len(chunk), count, *path.shape[1:]))
+        path = np.concatenate(parts)
+        return Samples(path[:, :, -1], path)
 
     def _plans(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         plan = self.sampler.plan(self._observe(context), self.sampling, rng, count=count)

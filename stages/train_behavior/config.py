@@ -113,7 +113,7 @@ class Config:
     """Write what the simulator needs (ONNX, golden plan, pictures); off for the trials of the tables."""
     scene: SceneEncoder = "pillars"
     """Scene encoder: 2.5-D with height in 32 channels, or the six 3-D convolutions of 128 channels of the
-    paper."""
+    paper, or none, for trajectories without a map."""
     observed_past: ObservedPast = "positions"
     """What is read of the observer's past: positions, from which distance and approach are computed, or SE(3)
     poses as in the paper; where rotations are not known, the observer looks at the agent."""

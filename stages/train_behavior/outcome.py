@@ -20,7 +20,7 @@ from stages.train_behavior import export, pictures, reactions
 from stages.train_behavior.config import Config
 from stages.train_behavior.training import TrainedBehavior
 
-SCENE_CHANNELS: dict[SceneEncoder, int] = {"pillars": 32, "volume": 128}
+SCENE_CHANNELS: dict[SceneEncoder, int] = {"pillars": 32, "volume": 128, "none": 0}
 """Width of the scene encoder: enough for minutes of video; the paper's (appendix A.2)."""
 
 

@@ -19,8 +19,8 @@ def check_settings(config: Config, data: BehaviorData, architecture: Architectur
     if config.map_lookup == "pointwise" and not architecture.map_cells:
         raise InputError(
             "REC-002",
-            "the 3-D encoder makes no map",
-            "[train_behavior]: reading",
+            "only the 2.5-D encoder makes a map",
+            "[train_behavior]: map_lookup",
             'scene = "pillars" makes one',
         )
     if config.export and not staged:
@@ -30,6 +30,13 @@ def check_settings(config: Config, data: BehaviorData, architecture: Architectur
             what,
             "[train_behavior]: export",
             "set it to false; `make behavior-tables` judges such models",
+        )
+    if config.export and config.scene == "none":
+        raise InputError(
+            "REC-002",
+            "a model without a scene encoder cannot be exported: the page shows it a scene",
+            "[train_behavior]: export",
+            "set it to false, or choose an encoder",
         )
     if config.export and data.rate_hz != RATE_HZ:
         raise InputError(

@@ -33,6 +33,7 @@ def run(
     data = BehaviorData.load(inputs.behavior_data)
     data = data.with_horizon(frames_from_seconds(config.horizon_s, data.rate_hz))
     scenes = Scenes.load(inputs.behavior_data, data.videos)
+    scenes = scenes.without_features() if config.scene == "none" else scenes
     architecture = outcome.architecture_for(config, data, scenes)
     weighting = config.training.objective.weighting
     schedule = Schedule(course="rectified" if weighting == "flow" else "linear")
