@@ -11,6 +11,9 @@ from pipeline.behavior.trajectories import ABSENT_M
 CLIP_GAP_S = 5.0
 """Between two clips of one recording, so that no window spans them."""
 
+STEP_TOLERANCE = 1e-3
+"""Share of a step by which a gap may be too short: times are rounded."""
+
 
 @dataclass(frozen=True)
 class MeasuredMotion:
@@ -46,9 +49,12 @@ def absent_observer(frames: int) -> Float[np.ndarray, "frame 4 4"]:
 
 
 def concatenated_times(times: list[Float[np.ndarray, "_"]]) -> Float[np.ndarray, "frame"]:
-    """Put clips on one clock, in order, far enough apart."""
+    """Put clips on one clock, in order, far enough apart: by a whole number of their steps, so that a grid of
+    the same rate holds the times of all clips and nothing between two frames is asked for.
+    """
     placed, begin = [], 0.0
     for time in times:
         placed.append(time - time[0] + begin)
-        begin = placed[-1][-1] + CLIP_GAP_S
+        step_s = float(np.median(np.diff(time))) if len(time) > 1 else CLIP_GAP_S
+        begin = placed[-1][-1] + np.ceil(CLIP_GAP_S / step_s - STEP_TOLERANCE) * step_s
     return np.concatenate(placed)

@@ -94,7 +94,10 @@ def motion_from_csv(
             "TRJ-002", "has rows without a time, or no rows", str(path), "give every row its time in seconds"
         )
     names = table.get("id", [""] * len(value["time"]))
-    rows = [np.flatnonzero(np.array(names) == name) for name in dict.fromkeys(names)]
+    number_of = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    number = np.array([number_of[name] for name in names])
+    order = np.argsort(number, kind="stable")
+    rows = np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
     rows = [mine[np.argsort(value["time"][mine], kind="stable")] for mine in rows]
     _refuse_impossible_times(path, [value["time"][mine] for mine in rows])
     rows = [
@@ -157,12 +160,16 @@ def companions_of(
     earliest, so that no window holds both.
     """
     parts = []
+    others = [
+        mine[np.isfinite(beings[mine]).all(1)] for mine in sorted(clips, key=lambda rows: time[rows[0]])
+    ]
+    others = [known for known in others if len(known)]
     for mine in agents:
         columns: list[np.ndarray] = []
         free_from: list[float] = []
-        for other in sorted(clips, key=lambda rows: time[rows[0]]):
-            known = other[np.isfinite(beings[other]).all(1)]
-            if names[other[0]] == names[mine[0]] or not len(known):
+        for known in others:
+            met = time[known[0]] <= time[mine[-1]] and time[mine[0]] <= time[known[-1]]
+            if not met or names[known[0]] == names[mine[0]]:
                 continue
             track = interpolated(time[known], beings[known], time[mine])
             here = np.flatnonzero(np.isfinite(track[:, 0]))

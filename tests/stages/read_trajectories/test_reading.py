@@ -8,7 +8,7 @@ from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
 from stages.read_trajectories import captured, pictures
 from stages.read_trajectories.config import Config
-from stages.read_trajectories.motion import CLIP_GAP_S
+from stages.read_trajectories.motion import CLIP_GAP_S, concatenated_times
 from stages.read_trajectories.reading import read
 
 READING = Config(root_joint=0, front_joint=2)
@@ -194,3 +194,12 @@ def test_obstacle_maps_that_cannot_be_are_refused(tmp_path, cells):
     (tmp_path / "obstacles.csv").write_text(cells)
     with pytest.raises(InputError, match="TRJ-001"):
         read(tmp_path, READING)
+
+
+@pytest.mark.parametrize("rate_hz", [2.5, 10.0, 60.0, 7.0])
+def test_clips_begin_on_the_grid_of_their_rate(rate_hz):
+    """So that slicing at that rate takes frames as they are, and none that is mixed with a later one."""
+    times = concatenated_times([3.0 + np.arange(count) / rate_hz for count in (9, 4, 21)])
+    frame = times * rate_hz
+    np.testing.assert_allclose(frame, frame.round(), atol=1e-6)
+    assert np.diff(times).max() >= CLIP_GAP_S - 1e-6
