@@ -18,7 +18,7 @@ endif
 PYTHON := .venv/bin/python
 PLAN   := $(PYTHON) -SE -m pipeline.workflow.plan
 RUN    := $(PYTHON) -SE -m pipeline.workflow.run $(if $(PROCESSES),--processes $(PROCESSES))
-COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark gallery export simulate serve extras dev types test test-fast test-slurm fuzz reproduce verify doctor clean
+COMMANDS := help new capture-check annotate behavior-tables registration-tables reconstruction-tables ablations longterm-tables behavior-benchmark real-benchmark gallery export simulate serve extras dev types test test-fast test-slurm fuzz reproduce verify doctor clean
 AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/*.toml)))
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
@@ -54,6 +54,10 @@ behavior-tables: .venv/.ok
 
 behavior-benchmark: .venv/.ok
 	@$(MAKE) $(NESTING) behavior-tables AGENT=benchmark
+
+# DATA is a folder of public data; what it lacks is skipped with the layout that is expected.
+real-benchmark: .venv/.ok
+	@$(if $(DATA),,$(error REC-004 give DATA=folder, which holds the public data))$(PYTHON) -m benchmarks.real "$$DATA"
 
 registration-tables reconstruction-tables: %-tables: .venv/.ok
 	@set -e; for variant in $$($(PYTHON) -SE -c 'from pipeline.workflow import dag; print(*dag.VARIANTS["$*"])'); do \

@@ -1,1 +1,1 @@
-"""Time and memory, measured on builds; never in tests."""
+"""Time and memory, measured on builds, and figures on real data (`real`); never in tests."""

@@ -76,7 +76,8 @@ def test_every_command_exists(page: str, line: str) -> None:
             if words[1] == "http.server":
                 assert "--directory" in help_of("http.server")
             elif words[1].startswith("benchmarks"):
-                assert (ROOT / (words[1].replace(".", "/") + ".py")).exists(), line
+                program = ROOT / words[1].replace(".", "/")
+                assert program.with_suffix(".py").exists() or (program / "__main__.py").exists(), line
             else:
                 assert {word for word in words[2:] if word.startswith("--")} <= set(
                     re.findall(r"--[a-z-]+", help_of(words[1]))

@@ -1,0 +1,139 @@
+"""Goals, paths and bodies of a dog in a motion-capture studio, each clip held out once.
+
+The stages are those of `agents/dog.toml`: joints become a root and bones, windows of 0.8 s + 5.6 s are cut, and
+the behaviour model learns from all clips but one.
+"""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.real.forecasts import StraightToPrior
+from benchmarks.real.table import Row
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
+from pipeline.core.progress import log
+from pipeline.core.videos import Video
+from pipeline.data import npz
+from pipeline.metrics.scores import SCORES
+from pipeline.rivals.predictors import Ats, ConstantVelocity, LocationPrior, Samples, StandStill
+from stages.read_trajectories import stage as reading
+from stages.read_trajectories.config import Config as ReadingConfig
+from stages.slice_behavior import stage as slicing
+from stages.slice_behavior.config import Config as SlicingConfig
+from stages.train_behavior import stage as training
+from stages.train_behavior.config import AugmentationConfig, BehaviorOptimizerConfig, BehaviorTrainingConfig
+from stages.train_behavior.config import Config as TrainingConfig
+
+SAMPLES = 16
+STRIDE = 4
+"""frames between the windows that are judged"""
+FIGURES = ("goal_minde_m", "goal_energy_score_m", "path_minade_m", "orientation_minade_rad")
+MODEL = TrainingConfig(
+    export=False,
+    scene="none",
+    training=BehaviorTrainingConfig(
+        BehaviorOptimizerConfig(steps=260, goal_steps=60), AugmentationConfig(turn=0.0)
+    ),
+)
+"""Steps as in `agents/dog.toml`. Ego frames are not turned: without a scene nothing depends on the heading, and
+two minutes of bodies in any heading would leave little to learn the turns of one from."""
+MethodScores = dict[str, dict[str, list[float]]]
+"""per method and score, one number per window"""
+TURNING_LIMIT = 2.0
+"""Turning error allowed, in parts of that of standing still."""
+
+
+def prepared(recording: Path, folder: Path) -> dict[str, Path]:
+    """Read every clip of an NPZ file of joints as a recording of its own."""
+    found = {}
+    for name, joints in npz.load(recording).items():
+        found[name] = folder / name
+        if not (found[name] / "motion.npz").is_file():
+            found[name].mkdir(parents=True, exist_ok=True)
+            npz.save(found[name] / "joints.npz", compress=False, joints=joints)
+            reading.run(reading.Inputs(found[name] / "joints.npz"), ReadingConfig(), found[name])
+    return found
+
+
+def held_out(clip: str, clips: dict[str, Path], folder: Path, config: TrainingConfig) -> MethodScores:
+    """Learn from all clips but one and return the scores of all methods on the windows of that one."""
+    sliced, model = folder / "behavior_data", folder / f"behavior-{config.seed}"
+    for each in (sliced, model):
+        shutil.rmtree(each, ignore_errors=True)
+        each.mkdir(parents=True)
+    videos = tuple(Video(name, name, "session", "test" if name == clip else "train", None) for name in clips)
+    slicing.run(slicing.Inputs(trajectories=clips), SlicingConfig(), sliced, videos=videos)
+    training.run(training.Inputs(sliced), config, model)
+    data = BehaviorData.load(sliced)
+    scenes = Scenes.load(sliced, data.videos)
+    train = data.windows(data.indices(TRAIN))
+    context, future = data.windows(data.indices(TEST)[::STRIDE])
+    prior = StraightToPrior(LocationPrior.fit(*train), data.future)
+    methods = {
+        "ours": Ats.load(model, scenes, PlanSamplingConfig(avoid_solid=False)),
+        "standing still": StandStill.fit(*train),
+        "constant velocity": ConstantVelocity.fit(*train),
+        "location prior": prior,
+    }
+    drawn = {
+        name: method.sample(context, SAMPLES, np.random.default_rng(config.seed))
+        for name, method in methods.items()
+    }
+    return {
+        name: {
+            score: SCORES[score](samples, future).tolist() for score in FIGURES if predicts(samples, score)
+        }
+        for name, samples in drawn.items()
+    }
+
+
+def predicts(samples: Samples, score: str) -> bool:
+    """Tell whether a method predicts what a score judges."""
+    needed = {"path_minade_m": samples.path, "orientation_minade_rad": samples.rotation}
+    return score not in needed or needed[score] is not None
+
+
+def row(recording: Path, out: Path, *, seeds: int = 1) -> Row:
+    """Hold every clip out once, and average over all windows and seeds."""
+    clips = prepared(recording, out / "dog" / "trajectories")
+    found: MethodScores = {}
+    for seed in range(seeds):
+        for clip in clips:
+            done = out / "dog" / clip / f"figures-{seed}.json"
+            if not done.is_file():
+                scores = held_out(clip, clips, done.parent, replace(MODEL, seed=seed))
+                done.write_text(json.dumps(scores) + "\n")
+            for method, scores in json.loads(done.read_text()).items():
+                log(
+                    f"{clip}, {method}: { ({name: round(float(np.mean(v)), 3) for name, v in scores.items()}) }"
+                )
+                for name, values in scores.items():
+                    found.setdefault(method, {}).setdefault(name, []).extend(values)
+    mean = {
+        method: {name: float(np.mean(values)) for name, values in scores.items()}
+        for method, scores in found.items()
+    }
+    ours, rivals = mean["ours"], [scores for method, scores in mean.items() if method != "ours"]
+    ahead = all(ours[name] < other[name] for other in rivals for name in ("goal_minde_m", "path_minade_m"))
+    still = mean["standing still"]["orientation_minade_rad"]
+    turning = ours["orientation_minade_rad"] < TURNING_LIMIT * still
+    cells = {
+        method: " / ".join(f"{scores[name]:.3f}" if name in scores else "-" for name in FIGURES)
+        for method, scores in mean.items()
+    }
+    return Row(
+        "goals, paths and bodies",
+        f"dog motion capture, {len(clips)} clips, each held out once",
+        f"goal, m; its energy score, m; path, m; turning, rad (best of {SAMPLES})",
+        cells.pop("ours") + (" (one seed)" if seeds == 1 else f" (mean of {seeds} seeds)"),
+        cells,
+        {},
+        "goal and path ahead of all; turning below twice that of standing still",
+        bool(ahead and turning),
+        {"means": mean, "windows": len(found["ours"]["goal_minde_m"]) // seeds},
+    )

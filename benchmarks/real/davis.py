@@ -1,0 +1,110 @@
+"""Animals of DAVIS 2016 as recordings: pictures without depth, flow between them, true masks, joints of BADJA.
+
+`animals` lists the sequences that a folder holds, `DavisSequence` opens one; `frames` and `flow` write its artifacts as
+`extract_frames` and `estimate_flow` do.
+"""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.data import images, npz
+from stages.estimate_flow import stage as flowing
+from stages.estimate_flow.config import Config as FlowConfig
+
+ANIMALS = frozenset(
+    "bear blackswan camel cows dog dog-agility elephant flamingo goat horsejump-high horsejump-low libby "
+    "mallard-fly mallard-water rhino".split()
+)
+"""Sequences of DAVIS 2016 in which the annotated object is an animal (with its rider, where it has one)."""
+RATE_HZ = 24.0
+FULL_SIZE_PX = np.array([1920.0, 1080.0])
+"""width and height of the pictures in which BADJA gives joints"""
+NO_DEPTH = (60, 107)
+"""size of a depth picture in which nothing is known"""
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Annotated joints of one frame."""
+
+    position_px: Float[np.ndarray, "joint 2"]
+    """x, y"""
+    visible: Bool[np.ndarray, "joint"]
+
+
+@dataclass(frozen=True)
+class DavisSequence:
+    """One sequence."""
+
+    name: str
+    pictures: tuple[Path, ...]
+    masks: tuple[Path, ...]
+    joints: Path | None
+
+    def mask(self, frame: int) -> Bool[np.ndarray, "height width"]:
+        """Read the true mask of a frame."""
+        return images.read_gray(self.masks[frame]) > 0
+
+    def joints_by_frame(self) -> dict[int, Joints]:
+        """Read the joints that BADJA annotates, by frame; it gives (row, column) of the full resolution."""
+        assert self.joints is not None, self.name
+        height, width = self.mask(0).shape
+        number_of = {path.stem: number for number, path in enumerate(self.pictures)}
+        found = {}
+        for entry in json.loads(self.joints.read_text()):
+            stem = Path(entry["image_path"]).stem
+            if stem in number_of:
+                position = np.array(entry["joints"], float)[:, ::-1] * [width, height] / FULL_SIZE_PX
+                found[number_of[stem]] = Joints(position, np.array(entry["visibility"], bool))
+        return found
+
+
+def animals(davis: Path) -> dict[str, DavisSequence]:
+    """Return the sequences of animals that a DAVIS folder holds with pictures and masks."""
+    found = {}
+    for folder in sorted((davis / "JPEGImages" / "480p").glob("*")):
+        pictures = tuple(sorted(folder.glob("*.jpg")))
+        masks = tuple(davis / "Annotations" / "480p" / folder.name / f"{path.stem}.png" for path in pictures)
+        if folder.name in ANIMALS and pictures and all(path.is_file() for path in masks):
+            joints = davis / "joint_annotations" / f"{folder.name}.json"
+            found[folder.name] = DavisSequence(
+                folder.name, pictures, masks, joints if joints.is_file() else None
+            )
+    return found
+
+
+def frames(sequence: DavisSequence, folder: Path) -> Path:
+    """Write the pictures as the frames of a recording without depth, poses and lens."""
+    if (folder / "frames.npz").is_file():
+        return folder
+    shutil.rmtree(folder, ignore_errors=True)
+    for name in ("color", "depth", "confidence"):
+        (folder / name).mkdir(parents=True)
+    for number, picture in enumerate(sequence.pictures):
+        shutil.copy(picture, folder / "color" / f"{number:06d}.jpg")
+    images.write_depth(folder / "depth" / "000000.exr", np.zeros(NO_DEPTH))
+    count = len(sequence.pictures)
+    eye = np.tile(np.eye(3), (count, 1, 1))
+    npz.save(
+        folder / "frames.npz",
+        timestamp_s=np.arange(count) / RATE_HZ,
+        intrinsics=eye,
+        depth_intrinsics=eye,
+        quality=np.ones(count, np.float32),
+        gravity_known=np.array(False),
+    )
+    return folder
+
+
+def flow(recording: Path, folder: Path) -> Path:
+    """Run `estimate_flow` on frames, unless that was done."""
+    if not (folder / "qa.json").is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        flowing.run(flowing.Inputs(recording), FlowConfig(), folder)
+    return folder

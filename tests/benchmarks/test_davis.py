@@ -1,0 +1,64 @@
+"""Flow and masks of DAVIS on a drawn sequence: what is read, and scores whose answer is known."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.real import davis, flow, masks
+
+SIZE = (60, 107)
+SHIFT_PX = 3
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    """A textured square that moves to the right before a textured wall, with two joints in two frames."""
+    rng = np.random.default_rng(0)
+    wall, animal = rng.integers(0, 255, (*SIZE, 3), np.uint8), rng.integers(0, 255, (20, 20, 3), np.uint8)
+    pictures, annotated = tmp_path / "JPEGImages/480p/cows", tmp_path / "Annotations/480p/cows"
+    for folder in (pictures, annotated, tmp_path / "joint_annotations"):
+        folder.mkdir(parents=True)
+    entries = []
+    for frame in range(4):
+        left = 10 + SHIFT_PX * frame
+        color, mask = wall.copy(), np.zeros(SIZE, np.uint8)
+        color[20:40, left : left + 20], mask[20:40, left : left + 20] = animal, 255
+        cv2.imwrite(str(pictures / f"{frame:05d}.jpg"), color)
+        cv2.imwrite(str(annotated / f"{frame:05d}.png"), mask)
+        place = np.array([[left + 5, 25], [left + 15, 35]]) * davis.FULL_SIZE_PX / SIZE[::-1]
+        entry = {"joints": place[:, ::-1].tolist(), "visibility": [True, frame > 0]}
+        entries += [entry | {"image_path": f"DAVIS/cows/{frame:05d}.jpg"}] if frame in (0, 2, 3) else []
+    (tmp_path / "joint_annotations" / "cows.json").write_text(json.dumps(entries))
+    return tmp_path
+
+
+def test_sequences_and_joints_are_read(sequence):
+    (footage,) = davis.animals(sequence).values()
+    joints = footage.joints_by_frame()
+    assert sorted(joints) == [0, 2, 3]
+    np.testing.assert_allclose(joints[2].position_px, [[21, 25], [31, 35]])
+    assert joints[0].visible.tolist() == [True, False]
+    assert footage.mask(1).sum() == 400
+    (sequence / "Annotations/480p/cows/00003.png").unlink()
+    assert davis.animals(sequence) == {}
+
+
+def test_joints_follow_true_flow_and_not_none(sequence):
+    (footage,) = davis.animals(sequence).values()
+    true = np.zeros((*SIZE, 2), np.float32)
+    true[..., 0] = SHIFT_PX
+    found = flow.hits(lambda frame: true, footage)
+    assert len(found) == 3 and found.all()
+    none = flow.hits(lambda frame: 0 * true, footage)
+    assert none.tolist() == [False, True, True], "6 px are more than 0.2 of 20 px, 3 px are not"
+
+
+def test_overlap():
+    half = np.zeros((4, 4), bool)
+    half[:2] = True
+    assert masks.iou(half, half) == 1.0
+    assert masks.iou(half, np.ones((4, 4), bool)) == 0.5
+    assert masks.iou(half, ~half) == 0.0
+    assert masks.iou(half & ~half, half & ~half) == 1.0
