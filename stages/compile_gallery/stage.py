@@ -14,13 +14,13 @@ _WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks 
 
 
 def run(root: Path, config: Config) -> str:
-    """Return the page for all builds in `root` (`build/`), variants beside their agents.
+    """Return the page for all builds in `root` (`build/`); variants, and animals of one home, have cards too.
 
     Raises InputError ART-003 where no simulator is finished.
     """
     folders = [
         folder
-        for pattern in ("*", "*/variants/*")
+        for pattern in ("*", "*/animals/*", "*/variants/*")
         for folder in root.glob(pattern)
         if (folder / "simulator/manifest.json").is_file() and (folder / "simulator/index.html").is_file()
     ]

@@ -44,16 +44,17 @@ def test_a_card_for_every_finished_simulator(tmp_path: Path) -> None:
     write_build(tmp_path / "luna", "luna & <co>", 0.4321, 30.0)
     write_build(tmp_path / "cat", "cat", None, 12.3)
     write_build(tmp_path / "cat/variants/no_scene", "cat without a scene", 0.5, 12.0)
+    write_build(tmp_path / "pair/animals/luna", "luna of the pair", 0.5, 12.0)
     (tmp_path / "toy/simulator").mkdir(parents=True)
     (tmp_path / "toy/simulator/index.html").write_text("a build that was stopped")
     page = stage.run(tmp_path, Config(thumbnail_px=120))
     names = re.findall(r"<h2>(.*?)</h2>", page)
-    assert names == ["cat", "cat without a scene", "luna &amp; &lt;co&gt;"]
+    assert names == ["cat", "cat without a scene", "luna &amp; &lt;co&gt;", "luna of the pair"]
     links = re.findall(r'href="([^"]*)"', page)
-    assert len(links) == 3 * 4 and all((tmp_path / link).is_file() for link in links)
+    assert len(links) == 4 * 4 and all((tmp_path / link).is_file() for link in links)
     assert "0.432 m" in page and "30 MB" in page and "12.3 MB" in page
     lights = re.findall(r'class="light (\w+)"', page)
-    assert lights == ["ok", "ok", "warn"], "a page of 30 MB is to be looked at"
+    assert lights == ["ok", "ok", "warn", "ok"], "a page of 30 MB is to be looked at"
     assert not re.search(r"https?://|src=\"(?!data:)", page), "nothing from the network"
     assert len(page) < 100_000, "thumbnails are small"
 
