@@ -136,11 +136,9 @@ class SceneSampler:
     """
 
     def __init__(self, scenes: Scenes, stride: int, device: str):
-        volumes = scenes.volumes
-        flat = [
-            _smoothed(volume, stride).reshape(volume.occupancy.size, scenes.channels) for volume in volumes
-        ]
-        rows = np.concatenate([*flat, np.zeros((1, flat[0].shape[1]), np.float32)])
+        volumes, channels = scenes.volumes, scenes.channels
+        flat = [_smoothed(volume, stride).reshape(volume.occupancy.size, channels) for volume in volumes]
+        rows = np.concatenate([*flat, np.zeros((1, channels), np.float32)])
         self.features = torch.from_numpy(rows).to(device)
         self.points = torch.from_numpy(grid_points_ego(stride).astype(np.float32)).to(device)
         first = np.cumsum([0, *(len(part) for part in flat[:-1])])
