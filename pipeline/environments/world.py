@@ -26,7 +26,7 @@ from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.homes import Habitat, settle
 from pipeline.environments.rewards import StepOutcome
 from pipeline.environments.rgbd import RgbdCamera, RgbdImage
-from pipeline.metrics.flight import WITHIN_FRAMES, flees
+from pipeline.metrics.flight import WITHIN_S, flees
 from pipeline.workflow import artifact
 
 EYE_M = 1.4
@@ -217,7 +217,7 @@ class AnimalWorld:
     def fleeing(self) -> Bool[np.ndarray, "animal"]:
         """Whether a person is close and the rest of the animal's plan gets away by what counts as flight."""
         plan, played = self.animals.plan.root[..., :3, 3], self.animals.played
-        frames = np.minimum(played[:, None] + np.arange(WITHIN_FRAMES), plan.shape[1] - 1)
+        frames = np.minimum(played[:, None] + np.arange(round(WITHIN_S * RATE_HZ)), plan.shape[1] - 1)
         path = np.take_along_axis(plan, frames[..., None], axis=1)
         return (self.distance_m < CLOSE_M) & flees(path, self.animal_position, self.eyes)
 
