@@ -131,11 +131,11 @@ types: dev
 # One process of tests per core, four at most: each takes up to 1.5 GB.
 WORKERS := auto --maxprocesses 4
 test: .venv/.ok
-	@$(PYTHON) -m pytest tests -n $(WORKERS) --dist loadgroup --no-loadscope-reorder
+	@$(PYTHON) -m pytest tests -n $(WORKERS) --no-loadscope-reorder
 
 # The inner loop: what takes seconds; `slow` and `toy` are left to `make test`.
 test-fast: .venv/.ok
-	@$(PYTHON) -m pytest tests -n $(WORKERS) --dist loadgroup -m 'not slow and not toy'
+	@$(PYTHON) -m pytest tests -n $(WORKERS) -m 'not slow and not toy'
 
 # A flow on a Slurm that the test starts on this machine; skipped where slurmctld, slurmd, munge or Snakemake's plugin lack.
 test-slurm: .venv/.ok

@@ -9,6 +9,7 @@ import cv2
 import jaxtyping
 import pytest
 import torch
+from xdist.scheduler import LoadScopeScheduling
 
 # From `make dev`; continuous integration has it. To prepare the signatures of `pipeline` takes 4 s once, and
 # checking them a fifth of the time of short tests, so that only the tests of `pipeline` itself do.
@@ -26,17 +27,30 @@ if WORKERS > 1:
     cv2.setNumThreads(threads)
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """Run unit and house tests first, then the builds of the toy.
+TOY_FILES = ("test_data_layout.py", "test_docs_example.py", "test_restart.py", "test_toy_build.py")
+"""Files with tests that build the toy: in several processes one of them runs all of these, first."""
 
-    In several processes the builds of the toy are one group and begin first; the tests of a file share its
-    fixtures in one process.
-    """
-    items.sort(key=lambda item: (item.get_closest_marker("toy") is not None) == (WORKERS == 1))
+
+def pytest_collection_modifyitems(items):
+    """Run unit and house tests first, then the builds of the toy; the other way round in several processes."""
     for item in items:
-        group = "toy" if item.get_closest_marker("toy") else item.path.relative_to(ROOT).as_posix()
-        item.add_marker(pytest.mark.xdist_group(group))
+        assert not item.get_closest_marker("toy") or item.path.name in TOY_FILES, f"{item.path}: TOY_FILES"
+    if WORKERS == 1:
+        items.sort(key=lambda item: item.get_closest_marker("toy") is not None)
+    else:
+        items.sort(key=lambda item: item.path.name not in TOY_FILES)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give each process whole files, whose tests share fixtures; all builds of the toy are one unit."""
+
+    class Scheduler(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            path = nodeid.split("::", 1)[0]
+            return "toy" if Path(path).name in TOY_FILES else path
+
+    return Scheduler(config, log)
 
 
 @pytest.hookimpl(tryfirst=True)
