@@ -102,10 +102,14 @@ class Identities(Appearance):
         return network.eval()
 
 
-def margin(who: Float[np.ndarray, "class height width"], animal: int) -> Float[np.ndarray, "height width"]:
-    """Return the log-odds that a pixel which moves shows this animal and no other, within +-6."""
+def margin(
+    who: Float[np.ndarray, "class height width"], animal: int, moves: float = MOVES
+) -> Float[np.ndarray, "height width"]:
+    """Return the log-odds that a pixel shows this animal and no other, within +-6; ``moves`` are the log-odds
+    by which it is rather one of the animals than nobody, infinite where that is known.
+    """
     others = np.delete(who, [NOBODY, animal + 1], axis=0)
-    return np.clip(who[animal + 1] - np.maximum(others.max(0), who[NOBODY] - MOVES), -LIMIT, LIMIT)
+    return np.clip(who[animal + 1] - np.maximum(others.max(0), who[NOBODY] - moves), -LIMIT, LIMIT)
 
 
 def stranger(who: Float[np.ndarray, "class height width"]) -> Float[np.ndarray, "height width"]:

@@ -55,11 +55,24 @@ class Margins:
         """Return the log-odds of one animal against all others; of the number after the last, of nobody."""
         return lambda frame: self._all(frame)[animal]
 
+    def between(self, animal: int) -> AppearanceOf:
+        """Return the log-odds of one animal against the others alone: of what geometry says is an animal, the
+        network need not know that it is one.
+        """
+        return lambda frame: self._all(frame)[len(self.network.names) + 1 + animal]
+
     def _all(self, frame: int) -> Float[np.ndarray, "animal height width"]:
-        count = len(self.network.names) + 1
+        animals = range(len(self.network.names))
+        count = 2 * len(animals) + 1
         if frame not in self.judged:
             who = self.network.who(working_picture(self.clip, frame, self.height_px))
-            found = np.stack([*(margin(who, index) for index in range(count - 1)), stranger(who)])
+            found = np.stack(
+                [
+                    *(margin(who, animal) for animal in animals),
+                    stranger(who),
+                    *(margin(who, animal, np.inf) for animal in animals),
+                ]
+            )
             rounded = np.round(found * STEPS + 128).astype(np.uint8)
             self.judged[frame] = cv2.imencode(".png", rounded.reshape(-1, rounded.shape[-1]))[1].tobytes()
         stored = cv2.imdecode(np.frombuffer(self.judged[frame], np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -101,7 +114,9 @@ def find_all(
     for animal in range(count):
         apart = margins.of(animal)
         balls = find_mover(clip, poses, references, config.animal, None, apart=apart)
-        painter = Painter(clip, poses, balls, judge_apart(judge, apart), config.height_px, Palette())
+        painter = Painter(
+            clip, poses, balls, judge_apart(judge, margins.between(animal)), config.height_px, Palette()
+        )
         painter = replace(painter, appearance=learn_palette(painter))
         if not _is_here(painter, apart):
             painter = replace(painter, balls=[None] * len(clip))
@@ -113,7 +128,7 @@ def find_all(
     return [
         painters[animal]
         if network is None
-        else _second(painters[animal], room, judge, network, margins.of(animal), config)
+        else _second(painters[animal], room, judge, network, margins, animal, config)
         for animal, network in enumerate(networks)
     ]
 
@@ -143,7 +158,7 @@ def joined(painters: list[Painter], margins: Margins, own: int, frame: int) -> M
     """Make the mask of one animal in one frame, at colour resolution, with the others' pixels unknown."""
     found = [next(painter.masks([frame])) for painter in painters]
     mine, labels = found[own], found[own].labels.copy()
-    apart = margins.of(own)(frame)
+    apart = margins.between(own)(frame)
     apart = cv2.resize(apart, labels.shape[::-1], interpolation=cv2.INTER_LINEAR)
     for index, other in enumerate(found):
         if index == own:
@@ -156,7 +171,13 @@ def joined(painters: list[Painter], margins: Margins, own: int, frame: int) -> M
 
 
 def _second(
-    painter: Painter, room: References, judge: Judge, network: Appearance, apart: AppearanceOf, config: Config
+    painter: Painter,
+    room: References,
+    judge: Judge,
+    network: Appearance,
+    margins: Margins,
+    animal: int,
+    config: Config,
 ) -> Painter:
     """Track an animal once more by its appearance in this recording."""
     clip, poses = painter.clip, painter.world_from_camera
@@ -167,10 +188,12 @@ def _second(
         config.animal,
         None,
         lambda frame: network.log_odds(painter.working_picture(frame)),
-        apart,
+        margins.of(animal),
     )
     balls = masks.resized(balls, painter.balls)
-    return replace(painter, balls=balls, judge=judge_apart(judge, apart), appearance=network)
+    return replace(
+        painter, balls=balls, judge=judge_apart(judge, margins.between(animal)), appearance=network
+    )
 
 
 def _is_here(painter: Painter, apart: AppearanceOf) -> bool:
