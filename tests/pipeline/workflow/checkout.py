@@ -154,7 +154,14 @@ def _fields(stage: str) -> str:
     kinds, in_every = (
         {},
         set.intersection(
-            *({need.option or need.artifact for need in dag.needs_of(node, "recordings")} for node in nodes)
+            *(
+                {
+                    need.option or need.artifact
+                    for need in dag.needs_of(node, "recordings")
+                    if not (need.others or dag.NODES[need.artifact].of_several)
+                }
+                for node in nodes
+            )
         ),
     )
     for node in nodes:
