@@ -54,8 +54,10 @@ def read(path: Path) -> tuple[dict[str, Any], str]:
 def _base(name: object, path: Path) -> dict[str, Any]:
     """Return the keys of the variant that the one at `path` starts from, which has no base itself."""
     other = path.with_name(f"{name}.toml")
-    known = sorted(each.stem for each in path.parent.glob("*.toml") if BASE not in config.read_table(each))
-    if not isinstance(name, str) or other.stem not in known:
+    if not isinstance(name, str) or not other.is_file() or BASE in config.read_table(other):
+        known = sorted(
+            each.stem for each in path.parent.glob("*.toml") if BASE not in config.read_table(each)
+        )
         what = f"{BASE}: {config.shown(name)} is no variant without a {BASE} of its own"
         raise InputError("REC-002", what, str(path), f"known: {', '.join(known)}")
     return read(other)[0]

@@ -95,13 +95,13 @@ def metrics(
         for phone, session in pairs
     ]
     pixels = heldout.RENDERED_PIXELS // max(len(shots), 1)
+    few = [heldout.thinned(seen, pixels) for _, seen in shots]
     right: dict[str, Float[np.ndarray, "view part"]] = {}
     for variant, folder in folders.items():
         here = replace(places, reconstruction=folder)
         motions = {each.video.id: reading.read_motion(folder, each.video.id) for each in sessions}
         views, rendered = [], []
-        for session, seen in shots:
-            integrated = heldout.thinned(seen, pixels)
+        for (session, seen), integrated in zip(shots, few, strict=True):
             drawn = reconstruction.drawn_by_fields(
                 here, session, motions.get(session), seen, integrated, device
             )
