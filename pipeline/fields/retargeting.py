@@ -81,8 +81,7 @@ def corresponding(
     """Return where points of the target lie in the source once its extents are those of the target, and the
     skinning weights of the source there.
     """
-    (low, high), (own_low, own_high) = source.extent, target.extent
-    place = low + (points - own_low) / (own_high - own_low) * (high - low)
+    place = _scaled(target, source, points)
     distance, nearest = KDTree(source.vertices).query(place, k=NEIGHBOURS)
     share = 1 / np.maximum(distance, 1e-6)
     share /= share.sum(1, keepdims=True)

@@ -113,8 +113,7 @@ class Appearance(nn.Module):
     def log_odds(self, color: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
         """Judge every pixel of a picture at working resolution, within +-8."""
         height, width = color.shape[:2]
-        padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
-        found = self.eval()(normalized(padded)[None])[0, :height, :width]
+        found = self.eval()(aligned(color))[0, :height, :width]
         return found.clamp(-LIMIT, LIMIT).numpy()
 
 
@@ -243,6 +242,13 @@ def _crop(
         color, labels = color[:, ::-1], labels[:, ::-1]
     shown = normalized(color) * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
     return shown.float(), torch.from_numpy(labels.copy())
+
+
+def aligned(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "1 3 row column"]:
+    """Return a picture as the networks take it: colours -1..1, widened to sides that are multiples of 16."""
+    height, width = color.shape[:2]
+    padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
+    return normalized(padded)[None]
 
 
 def normalized(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "3 height width"]:

@@ -19,7 +19,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from stages.segment_agent.appearance import ALIGNED_PX, GAIN, RATE, WEIGHT_DECAY, Appearance, normalized
+from stages.segment_agent.appearance import GAIN, RATE, WEIGHT_DECAY, Appearance, aligned, normalized
 from stages.segment_agent.identities.config import Config
 
 FILE = "identities.safetensors"
@@ -84,8 +84,7 @@ class Identities(Appearance):
     def who(self, color: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "class height width"]:
         """Return the log-probability of nobody and of each animal for every pixel."""
         height, width = color.shape[:2]
-        padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
-        found = self.eval().logits(normalized(padded)[None])[0, :, :height, :width]
+        found = self.eval().logits(aligned(color))[0, :, :height, :width]
         return F.log_softmax(found, dim=0).numpy()
 
     def save(self, folder: Path) -> None:
