@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from pipeline.core.errors import InputError
 from pipeline.data import ply
 from pipeline.data.templates import SKIN
 from pipeline.fields import skinning
@@ -20,6 +19,7 @@ from pipeline.geometry import rigid
 from pipeline.geometry.decimation import decimate
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.geometry.views import shade
+from pipeline.workflow import artifact
 
 HEIGHT_PX, WIDTH_PX = 48, 64
 """Of a picture: a policy's network reads it as a whole."""
@@ -62,11 +62,12 @@ class RgbdCamera:
 
     @classmethod
     def load(cls, build: Path, homes: Sequence[Path]) -> "RgbdCamera":
-        """Open the animal of a build and the surfaces of homes. Raises ART-003 where a build has none."""
+        """Open the animal of a build and the surfaces of homes. Raises ART-003 where a build has none,
+        ART-007 where another version wrote it.
+        """
         for folder in (build, *homes):
-            if not (folder / "reconstruction/scene.ply").is_file():
-                remedy = "make it: make <agent>.reconstruction, or leave `rgbd` out of `observations`"
-                raise InputError("ART-003", "has no reconstruction to be seen", str(folder), remedy)
+            remedy = "make it: make <agent>.reconstruction, or leave `rgbd` out of `observations`"
+            artifact.require(folder, "reconstruction", remedy=remedy)
         skin = SKIN.load(build / "reconstruction/skin.npz", "weights", "agent_from_bone_rest")
         return cls(
             [ply.read_ply(home / "reconstruction/scene.ply") for home in homes],
