@@ -27,6 +27,11 @@ class Habitat:
     share_known: tuple[float, ...]
     """Per home, share (0..1) of its surface that looks like the home the animal knows."""
 
+    @classmethod
+    def of_one_home(cls, data: BehaviorData, scenes: Scenes, share_known: float = 1.0) -> "Habitat":
+        """Return one home as a habitat, by default the animal's own."""
+        return cls(data, scenes, np.zeros(len(data.videos), int), (share_known,))
+
 
 def settle(build: Path, data: BehaviorData, homes: Sequence[Path]) -> Habitat:
     """Put the animal of ``build`` and ``data`` into ``homes``, its own home where there are none.
@@ -43,14 +48,12 @@ def settle(build: Path, data: BehaviorData, homes: Sequence[Path]) -> Habitat:
             continue
         own = own or ReconstructedHome.of_build(build)
         moved = move_in(own, ReconstructedHome.of_build(home), data)
-        first = np.zeros(len(moved.data.videos), int)
-        habitats.append(Habitat(moved.data, moved.home.scenes(), first, (moved.share_known,)))
+        habitats.append(Habitat.of_one_home(moved.data, moved.home.scenes(), moved.share_known))
     return together(habitats)
 
 
 def _own(build: Path, data: BehaviorData) -> Habitat:
-    scenes = Scenes.load(build / "behavior_data", data.videos)
-    return Habitat(data, scenes, np.zeros(len(data.videos), int), (1.0,))
+    return Habitat.of_one_home(data, Scenes.load(build / "behavior_data", data.videos))
 
 
 def together(habitats: Sequence[Habitat]) -> Habitat:

@@ -57,19 +57,15 @@ class AnimalWorld:
     def __init__(
         self,
         sampler: Sampler,
-        data: BehaviorData,
-        scenes: Scenes,
+        habitat: Habitat,
         ego: Ego,
         config: EnvironmentConfig,
         *,
-        habitat: Habitat | None = None,
         camera: RgbdCamera | None = None,
     ):
-        """``habitat`` is where they live, all in one home where it is not given; ``camera`` is what `rgbd` is
-        seen with.
-        """
-        self.data, self.scenes, self.config, self.camera = data, scenes, config, camera
-        self.habitat = habitat or Habitat(data, scenes, np.zeros(len(data.videos), int), (1.0,))
+        """``habitat`` is where they live; ``camera`` is what `rgbd` is seen with."""
+        self.habitat, self.config, self.camera = habitat, config, camera
+        data, scenes = habitat.data, habitat.scenes
         sampling = PlanSamplingConfig(
             method="ddim",
             goal_steps=config.goal_steps,
@@ -132,9 +128,7 @@ class AnimalWorld:
         sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
         habitat = settle(build, data, homes)
         camera = RgbdCamera.load(build, homes or (build,)) if "rgbd" in config.observations else None
-        return cls(
-            sampler, habitat.data, habitat.scenes, architecture.ego, config, habitat=habitat, camera=camera
-        )
+        return cls(sampler, habitat, architecture.ego, config, camera=camera)
 
     def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
         """Begin ``count`` pairs; ``rng`` draws windows, starts and all plans from here on."""
@@ -162,6 +156,16 @@ class AnimalWorld:
         self.steps += len(before)
         moved = np.linalg.norm((self.animal_position - last)[:, [0, 2]], axis=-1)
         return StepOutcome(before, self.distance_m, moved * RATE_HZ, self.fleeing)
+
+    @property
+    def data(self) -> BehaviorData:
+        """Moments to begin from."""
+        return self.habitat.data
+
+    @property
+    def scenes(self) -> Scenes:
+        """Scenes of these moments."""
+        return self.habitat.scenes
 
     @property
     def action_size(self) -> int:

@@ -15,6 +15,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import to_local, to_world
+from pipeline.environments.homes import Habitat
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
 from stages.train_behavior.export import write_contract
@@ -32,7 +33,7 @@ def small_world(config=QUICK):
     volume = room()
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
     scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
-    return AnimalWorld(sampler, wandering(), scenes, "yaw", config)
+    return AnimalWorld(sampler, Habitat.of_one_home(wandering(), scenes), "yaw", config)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,7 @@ def test_pettingzoo_finds_nothing_to_warn_of():
 
 def small_world_like(world):
     """Return another world of the same networks."""
-    return AnimalWorld(world.animals.sampler, world.data, world.scenes, "yaw", world.config)
+    return AnimalWorld(world.animals.sampler, world.habitat, "yaw", world.config)
 
 
 def test_many_at_once_begin_again_and_seeds_decide(build):
