@@ -16,6 +16,8 @@ from numpy import ndarray
 from pipeline.data import images
 
 Status = Literal["ok", "warn", "fail"]
+MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
+"""Signs of a status on pages, also for those who see no colours; "none" is without a check."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from pathlib import Path
 from pipeline.core.errors import InputError
 from pipeline.workflow import artifact
 from stages.compile_gallery import stage
-from stages.compile_gallery.config import Config
 
 
 def main(arguments: list[str]) -> int:
@@ -23,7 +22,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("build", type=Path, help="folder of builds: build")
     given = parser.parse_args(arguments)
     try:
-        page = stage.run(given.build, Config())
+        page = stage.run(given.build)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -5,7 +5,7 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from PIL import Image
 
@@ -22,6 +22,8 @@ METRICS = (
 """Keys of `metrics.json` that a visitor can picture."""
 _CHECKS = {"sessions to replay": "sessions to replay", "size of the page": "size of the page"}
 _QUALITY = 82
+_THUMBNAIL_PX = 480
+"""Longer side; twice the width of a card."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +52,14 @@ class Card:
     folder: str
     thumbnail: str | None
     """WebP as a data address"""
-    status: qa.Status | None
-    """worst light of its finished artifacts; None where none reported a check"""
+    status: qa.Status | Literal["none"]
+    """worst status of its finished artifacts; "none" where none reported a check"""
     figures: tuple[Figure, ...]
     page: Link
     links: tuple[Link, ...]
 
 
-def card(folder: Path, root: Path, thumbnail_px: int) -> Card:
+def card(folder: Path, root: Path) -> Card:
     """Read the build in `folder`, whose simulator is finished, for a gallery in `root`."""
     contract = json.loads((folder / "simulator/simulator.json").read_bytes())
     notes = [json.loads(file.read_bytes()) for file in _notes(folder)]
@@ -66,8 +68,8 @@ def card(folder: Path, root: Path, thumbnail_px: int) -> Card:
     return Card(
         name=str(contract["name"]),
         folder=folder.relative_to(root).as_posix(),
-        thumbnail=_thumbnail(pictures[0], thumbnail_px) if pictures else None,
-        status=qa.worst([check["status"] for check in checks]) if checks else None,
+        thumbnail=_thumbnail(pictures[0]) if pictures else None,
+        status=qa.worst([check["status"] for check in checks]) if checks else "none",
         figures=(*_checked(folder), *_measured(folder)),
         page=_link("walk with it", folder / "simulator/index.html", root),
         links=tuple(_links(folder, root)),
@@ -109,10 +111,10 @@ def _link(text: str, file: Path, root: Path) -> Link:
     return Link(text, file.relative_to(root).as_posix())
 
 
-def _thumbnail(file: Path, longest_px: int) -> str:
+def _thumbnail(file: Path) -> str:
     with Image.open(file) as picture:
         small = picture.convert("RGB")
-        small.thumbnail((longest_px, longest_px))
+        small.thumbnail((_THUMBNAIL_PX, _THUMBNAIL_PX))
         buffer = io.BytesIO()
         small.save(buffer, "WEBP", quality=_QUALITY)
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -6,14 +6,13 @@ from pathlib import Path
 import jinja2
 
 from pipeline.core.errors import InputError
+from pipeline.data import qa
 from stages.compile_gallery import reading
-from stages.compile_gallery.config import Config
 
-_MARKS = {"ok": "●", "warn": "▲", "fail": "■", None: "○"}
-_WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks failed", None: "no checks"}
+_WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks failed", "none": "no checks"}
 
 
-def run(root: Path, config: Config) -> str:
+def run(root: Path) -> str:
     """Return the page for all builds in `root` (`build/`); variants, and animals of one home, have cards too.
 
     Raises InputError ART-003 where no simulator is finished.
@@ -26,7 +25,7 @@ def run(root: Path, config: Config) -> str:
     ]
     if not folders:
         raise InputError("ART-003", "has no finished simulator", str(root), "build one: make cat")
-    cards = [reading.card(folder, root, config.thumbnail_px) for folder in sorted(folders)]
+    cards = [reading.card(folder, root) for folder in sorted(folders)]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("stages.compile_gallery", "."),
         autoescape=True,
@@ -35,7 +34,7 @@ def run(root: Path, config: Config) -> str:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["number"] = number
-    return environment.get_template("gallery.html").render(cards=cards, marks=_MARKS, words=_WORDS)
+    return environment.get_template("gallery.html").render(cards=cards, marks=qa.MARKS, words=_WORDS)
 
 
 def number(value: float) -> str:

@@ -5,13 +5,13 @@ from typing import Any
 
 import jinja2
 
+from pipeline.data import qa
 from pipeline.metrics import words as metric_words
 from stages.report.bars import Judged
 from stages.report.chapters import remedy
 from stages.report.collect import ChapterReport
 
 WORDS = {"ok": "fine", "warn": "to look at", "fail": "not good", "none": "without a note"}
-MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
 
 
 def render(
@@ -35,7 +35,7 @@ def render(
     environment.filters["in_words"] = in_words
     environment.globals["describe"] = metric_words.describe
     environment.globals["remedy"] = remedy
-    shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": MARKS}
+    shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": qa.MARKS}
     index = environment.get_template("index.html").render(
         **shared, judged=judged, metrics=metrics, reasons=reasons, methods=methods
     )
