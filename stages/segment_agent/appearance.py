@@ -216,7 +216,10 @@ def _scaled(
         return example, middle
     scale = float(np.exp(rng.uniform(*np.log(SCALES))))
     reach = math.ceil(crop_px / scale)
-    top, left = (max(at - reach // 2 - 1, 0) for at in middle)
+    top, left = (
+        int(np.clip(at - reach // 2 - 1, 0, max(side - reach - 2, 0)))
+        for at, side in zip(middle, example.labels.shape, strict=True)
+    )
     part = np.s_[top : top + reach + 2, left : left + reach + 2]
     color, labels = example.color[part], example.labels[part]
     size = tuple(max(1, round(scale * side)) for side in labels.shape[::-1])

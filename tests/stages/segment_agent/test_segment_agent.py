@@ -9,7 +9,7 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
-from stages.segment_agent import masks, movers, prompt
+from stages.segment_agent import appearance, masks, movers, prompt
 from stages.segment_agent.appearance import Example, learn
 from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.movers import Candidate, Hint
@@ -263,6 +263,15 @@ def test_looks_are_learnt_in_spite_of_frames_labelled_wrongly():
     for example, truth in list(zip(examples, truths, strict=True))[::7]:
         assert iou(network.log_odds(example.color) > 0, truth) > 0.7
         np.testing.assert_array_equal(network.log_odds(example.color), again.log_odds(example.color))
+
+
+def test_what_is_beyond_the_corner_of_a_picture_is_shown_from_nearer_too():
+    labels = np.zeros((120, 160), np.uint8)
+    labels[112:, 152:] = 255
+    example, rng = Example(np.repeat(labels[..., None], 3, 2), labels), np.random.default_rng(0)
+    for _ in range(50):
+        zoomed, _ = appearance._scaled(example, (119 + 53, 159 + 53), 144, 1.0, rng)
+        assert (zoomed.labels == 255).any()
 
 
 def test_a_recording_without_depth_asks_for_a_hint(tmp_path):
