@@ -36,6 +36,8 @@ POINT_SHARE = 0.15
 """Weight of the point-to-point term against point-to-plane, so that nothing slides away."""
 PRIOR_POINTS, POINT_SIGMA_M, DAMPING = 20, 0.03, 1e-6
 """Points that the prior of upright counts as, their noise (metres), and damping of a step."""
+PREDICTED_POINTS, LEAVING_COST_M = 40, 0.002
+"""Points that a predicted pose counts as, and cost of leaving it by one standard deviation, metres."""
 LEAST_POINTS, LEAST_ERODED_PX, NEAREST_M = 25, 60, 0.1
 """Depth points without which there is no observation, pixels that the eroded mask must keep, least depth
 (metres)."""
@@ -223,12 +225,69 @@ def fit_fine(
     rounds: int,
     tilt: bool,
 ) -> Float[np.ndarray, "pose 4 4"]:
-    """Fit to convergence; with ``tilt`` the root may lean."""
-    reach = np.full(rounds, REACH_M)
-    return _fit(observation, model, world_from_agent, reach, TILT_SIGMA_RAD if tilt else UPRIGHT_SIGMA_RAD)
+    """Fit to convergence, standing on what is below and, since animals lie down and jump, wherever depth
+    says; return what costs less. With ``tilt`` the root may lean.
+    """
+    reach, prior = np.full(rounds, REACH_M), TILT_SIGMA_RAD if tilt else UPRIGHT_SIGMA_RAD
+    standing, free = (
+        _fit(observation, model, world_from_agent, reach, prior, stands=stands) for stands in (True, False)
+    )
+    better = cost(observation, model, free) < cost(observation, model, standing)
+    return np.where(better[:, None, None], free, standing)
 
 
-def _fit(observation, model, world_from_agent, reaches, prior):
+@dataclass(frozen=True)
+class PosePrior:
+    """A Gaussian around a predicted pose."""
+
+    world_from_agent: Float[np.ndarray, "4 4"]
+    sigma: tuple[float, float]
+    """Standard deviations of rotation and position, radians and metres."""
+
+    def twist(self, world_from_agent: Float[np.ndarray, "pose 4 4"]) -> Float[np.ndarray, "pose 6"]:
+        """Return how far poses are from the predicted one, in standard deviations."""
+        offset = rigid.log(rigid.inverse(self.world_from_agent) @ world_from_agent)
+        return offset / np.repeat(self.sigma, 3)
+
+    def add(
+        self,
+        curvature: Float[np.ndarray, "pose 6 6"],
+        gradient: Float[np.ndarray, "pose 6"],
+        world_from_agent: Float[np.ndarray, "pose 4 4"],
+    ) -> tuple[Float[np.ndarray, "pose 6 6"], Float[np.ndarray, "pose 6"]]:
+        """Add the prior to normal equations, to first order in the offset."""
+        strength = PREDICTED_POINTS * POINT_SIGMA_M**2 / np.repeat(self.sigma, 3)
+        curvature[:, range(6), range(6)] += strength / np.repeat(self.sigma, 3)
+        return curvature, gradient + strength * self.twist(world_from_agent)
+
+
+@dataclass(frozen=True)
+class PriorFit:
+    """A pose fitted under a prior."""
+
+    world_from_agent: Float[np.ndarray, "4 4"]
+    cost_m: float
+    """`cost` of the pose, metres."""
+    total_m: float
+    """The same with the cost of leaving the prediction."""
+
+
+def fit_near(observation: AgentObservation, model: AgentModel, prior: PosePrior, *, rounds: int) -> PriorFit:
+    """Fit from a predicted pose, standing or not, whichever costs less."""
+    reach, start = np.full(rounds, REACH_M), prior.world_from_agent[None]
+    poses = np.concatenate(
+        [
+            _fit(observation, model, start, reach, TILT_SIGMA_RAD, stands=stands, near=prior)
+            for stands in (True, False)
+        ]
+    )
+    own = cost(observation, model, poses)
+    total = own + LEAVING_COST_M * (prior.twist(poses) ** 2).sum(-1)
+    best = int(total.argmin())
+    return PriorFit(poses[best], float(own[best]), float(total[best]))
+
+
+def _fit(observation, model, world_from_agent, reaches, prior, *, stands=True, near=None):
     """Step robustly, point to plane, with a little point to point so that nothing slides away."""
     placed = np.array(world_from_agent, float)
     for reach in reaches:
@@ -238,7 +297,9 @@ def _fit(observation, model, world_from_agent, reaches, prior):
         weight = (reach**2 / (reach**2 + distance**2)) ** 2
         gradient, curvature = _normal_equations(local, target, normal, weight)
         curvature, gradient = _keep_upright(placed, curvature, gradient, prior)
-        if np.isfinite(observation.standing_m):
+        if near is not None:
+            curvature, gradient = near.add(curvature, gradient, placed)
+        if stands and np.isfinite(observation.standing_m):
             curvature, gradient = _keep_standing(placed, curvature, gradient, observation.standing_m)
         placed = placed @ rigid.exp(np.linalg.solve(curvature, -gradient[..., None])[..., 0])
     return placed

@@ -16,6 +16,7 @@ from pipeline.geometry.meshes import Mesh
 from pipeline.localization.localizer import Localizer
 from stages.register_videos import agent_fit, headings
 from stages.register_videos.agent_fit import AgentModel, AgentObservation, StandingSurface
+from stages.register_videos.agent_tracking import Tracker
 from stages.register_videos.config import RootConfig
 from stages.register_videos.headings import RootHypotheses
 
@@ -70,7 +71,7 @@ def find_roots(
 ) -> Roots:
     """Find the animal's root in every frame that shows it."""
     model, roots = agent_fit.make_model(mesh, rng), Roots.unseen(len(clip))
-    poses, visible, cost, share = roots.world_from_agent, roots.visible, roots.cost_m, roots.share
+    poses, cost, share = roots.world_from_agent, roots.cost_m, roots.share
 
     def observe(frame: int) -> AgentObservation | None:
         return agent_fit.observe(clip, masks[frame], frame, world_from_camera[frame], model, standing)
@@ -87,9 +88,12 @@ def find_roots(
         assert observation is not None, frame
         start = each.world_from_agent[chosen][None]
         pose = agent_fit.fit_fine(observation, model, start, rounds=FINE_ROUNDS, tilt=True)
-        poses[frame], visible[frame], share[frame] = pose[0], True, observation.share
+        poses[frame], share[frame] = pose[0], observation.share
         cost[frame] = agent_fit.cost(observation, model, pose)[0]
-    return Roots(smooth(clip.timestamp_s, poses, cost, share, config.smooth_s), visible, cost, share)
+    tracked = Tracker(clip.timestamp_s, poses, cost, share, observe, model).track()
+    poses, cost = tracked.world_from_agent, tracked.cost_m
+    smoothed = smooth(clip.timestamp_s, poses, cost, share, config.smooth_s)
+    return Roots(smoothed, np.isfinite(cost), cost, share)
 
 
 def _hypotheses(

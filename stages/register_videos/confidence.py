@@ -14,6 +14,7 @@ from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import RayCaster
 from stages.register_videos.agent_roots import Roots
+from stages.register_videos.agent_tracking import excess
 from stages.register_videos.config import ConfidenceConfig
 from stages.register_videos.ncc import ncc
 
@@ -34,9 +35,9 @@ LEAST_SCORED = 20
 """Short recordings are compared in at least so many frames."""
 DRAWS = 400
 """Monte Carlo samples of a pose's covariance."""
-USUAL_QUANTILE, COST_SCALE_M, ENOUGH_SHARE = 0.3, 0.012, 0.15
-"""Roots: quantile of the cost that is a good fit, excess of cost that halves the confidence or so (metres),
-and visible share from which on visibility no longer counts."""
+COST_SCALE_M, ENOUGH_SHARE = 0.012, 0.15
+"""Roots: excess of cost that halves the confidence or so (metres), and visible share from which on visibility
+no longer counts."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +160,5 @@ def agent_confidence(roots: Roots) -> Float[np.ndarray, "frame"]:
     """Score each root 0..1: full for the video's usual fit in good view, less where it fits worse or little
     is seen; 0 unseen.
     """
-    if not roots.visible.any():
-        return np.zeros(len(roots.visible))
-    usual = np.nanquantile(roots.cost_m, USUAL_QUANTILE)
-    worse = np.maximum(np.nan_to_num(roots.cost_m, nan=1.0) - usual, 0) / COST_SCALE_M
+    worse = excess(roots.cost_m) / COST_SCALE_M
     return np.where(roots.visible, np.exp(-0.5 * worse**2) * np.minimum(roots.share / ENOUGH_SHARE, 1.0), 0.0)

@@ -1,5 +1,7 @@
 """The animal's root: the body is fitted from wrong starts, gaps stay NaN, noise is calmed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,6 +10,7 @@ from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from stages.register_videos import agent_fit
 from stages.register_videos import agent_roots as roots
+from stages.register_videos.agent_tracking import Tracker
 
 UP = np.array([0.0, 1.0, 0.0])
 K = np.array([[236.0, 0, 120], [0, 236.0, 160], [0, 0, 1]])
@@ -84,3 +87,48 @@ def test_smoothing_keeps_gaps_and_calms_noise():
         np.linalg.norm(poses[known, :3, 3] - truth[known, :3, 3], axis=1).mean() for poses in (noisy, smooth)
     )
     assert after < 0.7 * before
+
+
+def test_an_animal_that_lies_is_not_lifted_to_where_it_would_stand():
+    mesh = animal()
+    model = agent_fit.make_model(mesh, np.random.default_rng(0))
+    truth = rigid.make(rigid.rotation_from_vector(UP * 0.6), np.array([0.1, 0.22, -0.05]))
+    observation = replace(observation_of(mesh, truth), standing_m=0.22 + 0.12)
+    start = rigid.make(truth[:3, :3], truth[:3, 3] + [0.02, 0.1, 0.02])
+    placed = agent_fit.fit_fine(observation, model, start[None], rounds=12, tilt=True)[0]
+    assert np.linalg.norm(placed[:3, 3] - truth[:3, 3]) < 0.03, "metres"
+
+
+def partly(
+    observation: agent_fit.AgentObservation, agent_from_world: np.ndarray
+) -> agent_fit.AgentObservation:
+    """Leave the hind part of the animal."""
+    hind = rigid.apply(agent_from_world, observation.points_world)[:, 2] < -0.12
+    return replace(
+        observation, points_world=observation.points_world[hind], color=observation.color[hind], share=0.1
+    )
+
+
+def test_what_shows_little_is_tracked_from_what_shows_more_or_is_not_placed():
+    """Ten frames of a turn; of four only the hind part is seen, and of two more, after two seconds."""
+    mesh, time = animal(), np.append(np.arange(10) * 0.1, [3.0, 3.1])
+    model = agent_fit.make_model(mesh, np.random.default_rng(0))
+    truth = rigid.make(
+        rigid.rotation_from_vector(0.8 * time[:, None] * UP),
+        np.stack([0.2 * time, 0.22 + 0 * time, 0 * time], -1),
+    )
+    little = np.isin(np.arange(12), [4, 5, 6, 7, 10, 11])
+    shown = [observation_of(mesh, pose, frame) for frame, pose in enumerate(truth)]
+    shown = [
+        partly(each, rigid.inverse(pose)) if few else each
+        for each, pose, few in zip(shown, truth, little, strict=True)
+    ]
+    alone = truth.copy()
+    alone[little] = alone[little] @ rigid.make(rigid.rotation_from_vector(UP * np.pi), np.array([0, 0, -0.4]))
+    cost = np.array([agent_fit.cost(o, model, pose[None])[0] for o, pose in zip(shown, alone, strict=True)])
+    share = np.where(little, 0.1, 0.6)
+    found = Tracker(time, alone, cost, share, lambda frame: shown[frame], model).track()
+    assert np.isnan(found.cost_m[10:]).all() and np.isnan(found.world_from_agent[10:]).all()
+    off = np.linalg.norm(found.world_from_agent[:10, :3, 3] - truth[:10, :3, 3], axis=1)
+    turn = np.rad2deg(rigid.rotation_angle(found.world_from_agent[:10, :3, :3], truth[:10, :3, :3]))
+    assert off.max() < 0.08 and turn.max() < 30
