@@ -28,6 +28,10 @@ class Evidence:
     clear: Bool[np.ndarray, "height width"]
     """animal by clear motion alone, at steps of depth too"""
     room: Bool[np.ndarray, "height width"]
+    recolored: Float[np.ndarray, "height width"] | float = 0.0
+    """part of `log_odds` that rests on another colour alone: thin paws and tails on what others saw, but
+    gloss and shadows too
+    """
 
 
 MOVING, ROOM = 3.0, 3.0
@@ -63,16 +67,16 @@ def judge_motion(references: References) -> Judge:
         animal = movers.moving(votes)
         settled = known & ~animal & (votes.occupied > 0)
         step = np.clip((votes.gap_m - STEP_M) / STEP_SPREAD_M, -ROOM, 1)
-        log_odds = np.where(
-            animal, MOVING, np.where(settled, step + RECOLORED * recolored(window, votes, settled), 0.0)
-        )
+        color = np.where(settled, RECOLORED * recolored(window, votes, settled), 0.0)
+        log_odds = np.where(animal, MOVING, np.where(settled, step + color, 0.0))
         elsewhere, seen = known & ~near, votes.occupied / (votes.occupied + FEW)
         doubted = np.where(animal, DISTRUSTED_MOVING, np.where(settled, DISTRUSTED, DISTRUSTED_BEHIND))
         certainty = np.where(settled, seen, 1.0) * np.where(window.trusted, 1.0, doubted)
-        log_odds[elsewhere] = -ROOM
+        log_odds[elsewhere], color[elsewhere] = -ROOM, 0.0
         certainty[~(animal | settled | elsewhere)] = 0.05
         clear = animal & movers.clearly_moving(votes)
-        return Evidence(log_odds, certainty, animal & window.trusted, clear, log_odds <= -0.66 * ROOM)
+        room = log_odds <= -0.66 * ROOM
+        return Evidence(log_odds, certainty, animal & window.trusted, clear, room, color)
 
     return judge
 

@@ -145,12 +145,14 @@ class Painter:
     def _by_appearance(
         self, window: Window, evidence: Evidence, like: Float[np.ndarray, "height width"]
     ) -> tuple[UInt8[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-        """Return labels and what is sure, by evidence and the learned appearance.
+        """Return labels and what is sure, by evidence and the learned appearance: that a surface has another
+        colour counts as far as it looks like the animal.
 
         A small mask must be well backed, since chance makes small ones; and as a small view lies at steps of
         depth all over, what moves clearly there is sure too if no mask is found without it.
         """
-        known = refine.sharpen(evidence.log_odds, evidence.certainty, window.color, self.edges)
+        gloss = evidence.recolored / (1 + np.exp(like))
+        known = refine.sharpen(evidence.log_odds - gloss, evidence.certainty, window.color, self.edges)
         blind = evidence.certainty < UNKNOWN
         weight = np.where(blind, APPEARANCE_WEIGHT_BLIND, APPEARANCE_WEIGHT)
         most = np.where(blind, APPEARANCE_ALONE, 0.0)

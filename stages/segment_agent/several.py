@@ -149,6 +149,7 @@ def judge_apart(judge: Judge, apart: AppearanceOf) -> Judge:
             evidence.animal & ~another,
             evidence.clear & ~another,
             evidence.room | another,
+            np.where(another, 0.0, evidence.recolored),
         )
 
     return judged

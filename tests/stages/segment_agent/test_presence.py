@@ -120,3 +120,17 @@ def test_appearance_decides_where_geometry_knows_nothing():
     settled = Evidence(np.full(shape, -3.0), np.ones(shape), unknown, unknown, ~unknown)
     labels, _ = Painter._by_appearance(painter, window, settled, like)
     assert not (labels == 255).any()
+
+
+def test_gloss_that_does_not_look_like_the_animal_is_room():
+    """A surface of another colour than at other times, beside the animal, is animal where it looks like one."""
+    shape, no = (60, 80), np.zeros((60, 80), bool)
+    animal, gloss = no.copy(), no.copy()
+    animal[20:40, 10:40], gloss[20:40, 40:75] = True, True
+    like = np.where(animal, 2.0, -3.0)
+    recolored = np.where(animal | gloss, 6.0, 0.0)
+    evidence = Evidence(recolored - 2.0, np.ones(shape), animal, no, no, recolored)
+    window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
+    labels, _ = Painter._by_appearance(cast(Painter, SimpleNamespace(edges=Edges())), window, evidence, like)
+    assert ((labels == 255) & animal).sum() > 0.8 * animal.sum()
+    assert (labels == 255)[gloss].mean() < 0.1
