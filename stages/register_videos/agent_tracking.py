@@ -112,14 +112,12 @@ class Tracker:
             yield frame, fit
 
     def _speed(self, stands: Bool[np.ndarray, "frame"]) -> tuple[float, float]:
-        """Return root mean square speeds between neighbours that stand by themselves, rad/s and m/s, or
-        `SPEED`."""
+        """Return the usual speeds between neighbours that stand by themselves, or `SPEED` if that is more."""
         first = np.flatnonzero(stands[:-1] & stands[1:])
         if not len(first):
             return SPEED
         elapsed = np.diff(self.timestamp_s)[first, None]
         moved = rigid.log(rigid.inverse(self.world_from_agent[first]) @ self.world_from_agent[first + 1])
-        turned, stepped = (
-            (np.square(part / elapsed).sum(1).mean()) ** 0.5 for part in np.split(moved, 2, axis=1)
-        )
-        return max(SPEED[0], float(turned)), max(SPEED[1], float(stepped))
+        speeds = (np.linalg.norm(part / elapsed, axis=1) for part in np.split(moved, 2, axis=1))
+        turning, walking = (float(np.median(speed)) for speed in speeds)
+        return max(SPEED[0], turning), max(SPEED[1], walking)
