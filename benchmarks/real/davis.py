@@ -87,7 +87,7 @@ def frames(sequence: DavisSequence, folder: Path) -> Path:
         (folder / name).mkdir(parents=True)
     for number, picture in enumerate(sequence.pictures):
         shutil.copy(picture, folder / "color" / f"{number:06d}.jpg")
-    images.write_depth(folder / "depth" / "000000.exr", np.zeros(NO_DEPTH))
+        images.write_depth(folder / "depth" / f"{number:06d}.exr", np.zeros(NO_DEPTH))
     count = len(sequence.pictures)
     eye = np.tile(np.eye(3), (count, 1, 1))
     npz.save(

@@ -26,8 +26,8 @@ from stages.segment_agent.windows import working_picture, working_size
 SURE = 4.0
 """log-odds of a mask that is carried on"""
 MOTION_GAP = 4
-
-
+LEAST_MOVING = 0.15
+"""share of the hinted box that must move for motion to separate the animal from the rest of the box"""
 FIRST_STEPS, STEPS = 80, 160
 """training steps on the hinted frame, and on the whole recording"""
 HINTED_SHARE = 0.17
@@ -102,9 +102,12 @@ def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Bool[np
     low = np.clip(np.floor([x0, y0]), 1, [width - 8, height - 8]).astype(int)
     high = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1])
     marks = np.full((height, width), cv2.GC_BGD, np.uint8)
-    marks[low[1] : high[1], low[0] : high[0]] = cv2.GC_PR_FGD
+    boxed = np.s_[low[1] : high[1], low[0] : high[0]]
+    moves = residual(footage, hint.frame)[boxed]
+    still = (moves < STILL) & ((moves > MOVING).mean() > LEAST_MOVING)
+    marks[boxed] = np.where(still, cv2.GC_PR_BGD, cv2.GC_PR_FGD)
     inside = grab(color, marks, rng)
-    return inside if inside.any() else marks == cv2.GC_PR_FGD
+    return inside if inside.any() else marks != cv2.GC_BGD
 
 
 def grab(

@@ -74,7 +74,8 @@ class ObjectiveConfig:
     path_share: float = 0.5
     """Share of a batch's windows that paths, whose network is costly, are trained on in a step."""
     body_share: float = 0.5
-    """Share of a batch's windows that bodies, whose network is the costliest, are trained on in a step."""
+    """Share of a batch's windows that bodies, whose network is the costliest, are trained on in a step; 0
+    trains none."""
     goal_draws: int = 8
     """Noise levels per window for the goal, whose network is small."""
     earlier_share: float = 0.7

@@ -58,7 +58,7 @@ def level_losses(
     error: Callable[[Denoise, Float[Tensor, "row ..."]], Float[Tensor, "row ..."]],
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the mean error of goal, path and body, each given the level above it; ``goal`` takes the
-    perception code.
+    perception code. Without a share of the windows a body learns nothing.
     """
     joint = joint_mask(batch, objective, generator)
     with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
@@ -72,6 +72,8 @@ def level_losses(
     path = error(
         lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows]
     )
+    if not len(body_rows):
+        return goal_loss | {"path": path.mean()}
     body = error(
         lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows]
     )
@@ -90,6 +92,7 @@ def sequence_rows(
     paths, bodies = (
         max(round(len(batch.goal) * share), 1) for share in (objective.path_share, objective.body_share)
     )
+    bodies = bodies if objective.body_share > 0 else 0
     body = torch.argsort(batch.mirrored.int(), stable=True)[:bodies]
     return torch.arange(paths, device=body.device), body, ~batch.mirrored[body]
 

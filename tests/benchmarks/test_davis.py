@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.real import davis, flow, masks
+from pipeline.data.clips import Clip
 
 SIZE = (60, 107)
 SHIFT_PX = 3
@@ -53,6 +54,13 @@ def test_joints_follow_true_flow_and_not_none(sequence):
     assert len(found) == 3 and found.all()
     none = flow.hits(lambda frame: 0 * true, footage)
     assert none.tolist() == [False, True, True], "6 px are more than 0.2 of 20 px, 3 px are not"
+
+
+def test_every_frame_is_a_picture_without_depth(sequence, tmp_path):
+    (footage,) = davis.animals(sequence).values()
+    clip = Clip.open(davis.frames(footage, tmp_path / "frames"))
+    assert len(clip) == 4 and clip.color_size == SIZE
+    assert not any(clip.depth(frame).any() for frame in range(len(clip)))
 
 
 def test_overlap():

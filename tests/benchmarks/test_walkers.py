@@ -52,7 +52,7 @@ def tiny():
     return replace(walkers.MODEL, training=replace(walkers.MODEL.training, optimization=optimization))
 
 
-def forecast_windows_of_the_protocol(tmp_path):
+def test_windows_of_the_protocol(tmp_path):
     write(tmp_path / "a.txt", position(0))
     crowd = Crowd.read(tmp_path / "a.txt")
     np.testing.assert_allclose(crowd.position, position(0))

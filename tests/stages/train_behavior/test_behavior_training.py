@@ -415,15 +415,17 @@ def test_learning_rate_falls_twice():
 def test_each_part_of_training_moves_its_own_networks(data, windows):
     batch, _ = drawn(windows, AugmentationConfig())
     nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 3.0), 0)
-    parts = {
-        "goals": {"perception", "goal"},
-        "sequences": {"path", "body"},
-        "all": {"perception", "goal", "path", "body"},
-    }
-    for part, learning in parts.items():
+    every, bodiless = ObjectiveConfig(), ObjectiveConfig(body_share=0.0)
+    parts = (
+        ("goals", every, {"perception", "goal"}),
+        ("sequences", every, {"path", "body"}),
+        ("sequences", bodiless, {"path"}),
+        ("all", every, {"perception", "goal", "path", "body"}),
+    )
+    for part, shares, learning in parts:
         nets.zero_grad(set_to_none=True)
         generator = torch.Generator().manual_seed(0)
-        sum(losses(nets, batch, Schedule(), ObjectiveConfig(), generator, phase=part).values()).backward()
+        sum(losses(nets, batch, Schedule(), shares, generator, phase=part).values()).backward()
         assert {
             name.split(".")[0] for name, parameter in nets.named_parameters() if parameter.grad is not None
         } == learning
