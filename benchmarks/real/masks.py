@@ -17,7 +17,7 @@ from stages.segment_agent.config import Config
 AGENT = 255
 BAR_MEAN, BAR_WORST = 0.75, 0.60
 """mean and lowest IoU of the sequences that nothing was designed on"""
-DESIGNED_ON = "dog"
+DESIGNED_ON = frozenset({"blackswan", "dog"})
 
 
 def segmented(sequence: DavisSequence, folder: Path) -> float:
@@ -50,7 +50,7 @@ def iou(found: np.ndarray, true: np.ndarray) -> float:
 def row(data: Path, out: Path) -> Row:
     """Measure all sequences of animals."""
     each = {name: segmented(sequence, out / "davis" / name) for name, sequence in davis.animals(data).items()}
-    others = [value for name, value in each.items() if name != DESIGNED_ON]
+    others = [value for name, value in each.items() if name not in DESIGNED_ON]
     met = bool(others) and np.mean(others) >= BAR_MEAN and min(others) >= BAR_WORST
     listed = ", ".join(f"{name} {value:.2f}" for name, value in each.items())
     mean = f"{np.mean(others):.2f} over the {len(others)} others" if others else "no others"
@@ -61,7 +61,7 @@ def row(data: Path, out: Path) -> Row:
         f"{mean}; {listed}",
         {},
         {},
-        f"mean >= {BAR_MEAN:.2f} without {DESIGNED_ON}, none below {BAR_WORST:.2f}",
+        f"mean >= {BAR_MEAN:.2f} without {' and '.join(sorted(DESIGNED_ON))}, none below {BAR_WORST:.2f}",
         bool(met),
         {"iou": each},
     )
