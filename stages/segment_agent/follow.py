@@ -4,7 +4,7 @@ GrabCut cuts the animal out of the hinted frame and a network learns its appeara
 from there (`_followed`) as what looks like it near where flow carries the last mask. That loses sides of the
 animal never seen before, so the network learns again from the whole recording, where what moves against the
 background beside the followed part counts too, and the animal is followed once more. What moves elsewhere is
-some other mover.
+some other mover. At last the rims of all masks are moved to where colours change.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,6 +28,12 @@ SURE = 4.0
 MOTION_GAP = 4
 LEAST_MOVING = 0.15
 """share of the hinted box that must move for motion to separate the animal from the rest of the box"""
+RIM_SHARE = 0.13
+"""width of the rim of a followed mask that may be background, as a share of the root of its area"""
+OUTSIDE_PX, AROUND_PX = 6, 30
+"""how far outside a followed mask the animal may be, and how much of the picture around it is looked at"""
+TRIM_ROUNDS = 3
+"""of GrabCut, which begins close to the answer there"""
 FIRST_STEPS, STEPS = 80, 160
 """training steps on the hinted frame, and on the whole recording"""
 HINTED_SHARE = 0.17
@@ -85,7 +91,8 @@ def follow(
     assert network is not None, "the hinted frame shows the animal"
     allowed = _allowed(rough)
     found = _followed(footage, hint.frame, hinted, network, REACH_PX + 3, CARRIED / 2, allowed)
-    for mask in map(_unpacked, found):
+    for frame, followed in enumerate(map(_unpacked, found)):
+        mask = hinted if frame == hint.frame else trimmed(footage.color(frame), followed, rng)
         labels = cv2.resize(
             mask.astype(np.uint8) * 255, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR
         )
@@ -114,12 +121,35 @@ def grab(
     color: UInt8[np.ndarray, "height width 3"],
     marks: UInt8[np.ndarray, "height width"],
     rng: np.random.Generator,
+    rounds: int = 8,
 ) -> Bool[np.ndarray, "height width"]:
     """Cut something out of a picture by GrabCut (Rother et al. 2004); ``marks`` are OpenCV's four."""
     cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
     models, by_mask = np.zeros((2, 1, 65)), cv2.GC_INIT_WITH_MASK
-    found = cv2.grabCut(color, marks.copy(), (0, 0, 0, 0), models[0], models[1], 8, by_mask)[0]
+    found = cv2.grabCut(color, marks.copy(), (0, 0, 0, 0), models[0], models[1], rounds, by_mask)[0]
     return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
+
+
+def trimmed(
+    color: UInt8[np.ndarray, "height width 3"],
+    mask: Bool[np.ndarray, "height width"],
+    rng: np.random.Generator,
+) -> Bool[np.ndarray, "height width"]:
+    """Move the rim of a mask to where colours change: what is followed gathers a rim of background."""
+    rim = round(RIM_SHARE * np.sqrt(mask.sum()))
+    core = ~_grown(~mask, max(rim // 2, 1))
+    if not core.any():
+        return mask
+    rows, columns = np.nonzero(mask)
+    around = tuple(
+        slice(max(int(place.min()) - AROUND_PX, 0), int(place.max()) + AROUND_PX) for place in (rows, columns)
+    )
+    marks = np.where(core, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    marks[~_grown(mask, OUTSIDE_PX)] = cv2.GC_BGD
+    marks[~_grown(~mask, max(rim, 1))] = cv2.GC_FGD
+    found = np.zeros_like(mask)
+    found[around] = grab(color[around], marks[around], rng, TRIM_ROUNDS)
+    return found if found.any() else mask
 
 
 def residual(footage: Footage, frame: int) -> Float[np.ndarray, "height width"]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
-from stages.segment_agent.follow import MOTION_GAP, Footage, cut_out
+from stages.segment_agent.follow import MOTION_GAP, Footage, cut_out, trimmed
 from stages.segment_agent.prompt import Prompt
 
 SIZE = (120, 160)
@@ -43,3 +43,15 @@ def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
     footage = Footage(Clip.open(tmp_path), tmp_path, SIZE[0])
     found = cut_out(footage, Prompt(0, (40, 30, 120, 90)), np.random.default_rng(0))
     assert (found & animal).sum() > 0.95 * (found | animal).sum()
+
+
+def test_a_rim_of_background_is_trimmed():
+    """A mask 8 px too wide all around falls back to the animal; nothing is left as nothing."""
+    rng = np.random.default_rng(0)
+    animal, wide = np.zeros(SIZE, bool), np.zeros(SIZE, bool)
+    animal[40:80, 50:110] = wide[32:88, 42:118] = True
+    color = np.where(animal[..., None], (60, 40, 30), (40, 110, 40)) + rng.normal(0, 12, (*SIZE, 3))
+    picture = np.clip(color, 0, 255).astype(np.uint8)
+    found = trimmed(picture, wide, rng)
+    assert (found & animal).sum() > 0.95 * (found | animal).sum()
+    assert not trimmed(picture, np.zeros(SIZE, bool), rng).any()
