@@ -75,6 +75,7 @@ def no_recording(good: Path, bad: Path) -> None:
     bad.write_bytes(zlib.compress(good.read_bytes()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "code"),
     [(truncated, "CAP-001"), (no_recording, "CAP-001"), (bomb, "CAP-002"), (face_id, "CAP-005")],

@@ -51,10 +51,12 @@ def python(folder: Path, *words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_its_own_test_passes(copy):
     assert "3 passed" in python(copy, "-m", "pytest", "tests/stages/map_visits")
 
 
+@pytest.mark.slow
 def test_its_command_line_works(copy):
     usage = python(copy, "-m", "stages.map_visits", "--help")
     assert "--reconstruction" in usage and "cell_m = 0.25" in usage
@@ -65,6 +67,7 @@ def test_the_planner_knows_it(copy):
     assert "visits" in (copy / "build/toy/plan/rules.mk").read_text()
 
 
+@pytest.mark.slow
 def test_it_keeps_the_rules(copy):
     """Those of its own files, of the declaration, and the contracts of section 8."""
     chosen = "visits or dag.py or in_the_catalogue or room_is_in_the_flow or artifact_is_told"

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from benchmarks.real import captured_dog
 from pipeline.data import npz
@@ -20,6 +21,7 @@ def walk(seed: int, frames: int = 500) -> np.ndarray:
     return np.stack([root, root - up + swing, root + 0.2 * forward, root + 0.5 * forward, root + up], axis=1)
 
 
+@pytest.mark.slow
 def test_every_clip_is_held_out(tmp_path, monkeypatch):
     optimization = BehaviorOptimizerConfig(steps=3, goal_steps=1, batch=4, goal_batch=4)
     training = replace(captured_dog.MODEL.training, optimization=optimization)

@@ -2,12 +2,14 @@
 
 import cv2
 import numpy as np
+import pytest
 
 from benchmarks.real import rooms
 
 FRAMES = tuple(range(0, 200, 20))
 
 
+@pytest.mark.slow
 def test_halves_have_pictures_and_truth_but_no_poses(tmp_path):
     scene, rng = tmp_path / "7scenes_drawn", np.random.default_rng(0)
     scene.mkdir()

@@ -110,6 +110,7 @@ def test_tables_hold_what_was_read(fold):
     )
 
 
+@pytest.mark.slow
 def test_a_row_from_files(fold, data, monkeypatch):
     """Of one scene, whose recordings are read and sliced already."""
     _, folder = fold

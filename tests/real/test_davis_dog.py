@@ -61,6 +61,7 @@ def dog(tmp_path_factory):
     return folder, clip, masks, found
 
 
+@pytest.mark.slow
 def test_masks_from_one_box(dog):
     folder, clip, truth, _ = dog
     rows, columns = np.nonzero(truth[0])
@@ -97,6 +98,7 @@ def _joint_hits(move, joints, masks, pairs):
     return float(np.concatenate(hits).mean())
 
 
+@pytest.mark.slow
 def test_flow_is_not_below_opencv(dog):
     """On joints and on the whole mask carried for five frames."""
     _, clip, masks, found = dog

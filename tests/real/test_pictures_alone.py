@@ -57,6 +57,7 @@ def walk(tmp_path_factory) -> Walk:
     return Walk(clip, truth, kept, float(fitted.scale), np.linalg.norm(moved - true, axis=1))
 
 
+@pytest.mark.slow
 def test_path_and_lens_are_found(walk: Walk):
     assert len(walk.clip) >= 22
     assert np.sqrt((walk.gap_m**2).mean()) <= 0.08
@@ -82,6 +83,7 @@ def test_depth_agrees_with_the_depth_camera(walk: Walk):
     assert np.mean(covered) >= 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", range(4))
 def test_a_kitchen_stored_sideways_is_turned_upright(turns):
     """No gravity is told; the room and how the camera was held tell what is up."""

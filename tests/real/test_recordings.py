@@ -35,6 +35,7 @@ def test_exr_pictures_are_paired_with_their_rows():
         assert recording.timestamp_s[row] == told["frameTimestamps"][number]
 
 
+@pytest.mark.slow
 def test_seven_scenes_pass_the_self_check():
     path = _sample("7scenes_AB50")
     assert format_of(path).name == "7-Scenes RGB-D"
@@ -48,6 +49,7 @@ def test_seven_scenes_pass_the_self_check():
     assert not plan.gravity_known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", range(1, 4))
 def test_turned_seven_scenes_are_found_out(turn):
     recording = open_recording(_sample("7scenes_AB50"))

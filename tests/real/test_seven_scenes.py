@@ -62,6 +62,7 @@ def _near(errors: PoseErrors) -> float:
     return float(((errors.degrees <= NEAR[0]) & (errors.meters <= NEAR[1])).mean())
 
 
+@pytest.mark.slow
 def test_template_is_metric_without_odometry(kitchen: Kitchen):
     truth = (
         constant_between(kitchen.made.world_from_camera, kitchen.walk.world_from_camera)
@@ -72,6 +73,7 @@ def test_template_is_metric_without_odometry(kitchen: Kitchen):
     assert len(kitchen.made.start.registered) == len(kitchen.walk.clip)
 
 
+@pytest.mark.slow
 def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitchen):
     made, walk, clip = kitchen.made, kitchen.walk.clip, kitchen.session.clip
     localizer = _trained(made, walk, Config(scene=SceneConfig(held_out=40)), np.random.default_rng(0))
@@ -87,6 +89,7 @@ def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitc
     assert _near(ours) >= _near(retrieval) + 0.5
 
 
+@pytest.mark.slow
 def test_doubtful_answers_are_told_from_good_ones(kitchen: Kitchen):
     """A frame of noise finds no believable place in the kitchen."""
     made, rng = kitchen.made, np.random.default_rng(0)

@@ -131,6 +131,7 @@ except InputError as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["checkpoint", "tensors"])
 def test_a_full_disk_is_told_and_leaves_no_half_checkpoint(tmp_path, what):
     """A file may have 1 MB here, which is what a full disk is to its writer."""

@@ -62,6 +62,7 @@ def builds(tmp_path_factory):
     return own, other
 
 
+@pytest.mark.slow
 def test_episodes_begin_in_every_home_and_animals_of_all_plan_together(builds):
     import pipeline.environments.registration  # noqa: F401
 
@@ -105,6 +106,7 @@ def test_joined_homes_keep_their_own_moments_and_volumes(builds):
     assert settle(own, data, []).data is data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observations", [("rgbd",), ("animal", "rgbd")])
 def test_gymnasium_accepts_pictures(builds, observations):
     from gymnasium.utils.env_checker import check_env

@@ -22,6 +22,7 @@ def scene():
     return clip, *training.train(shown, config, Describer(), "cpu", rng)
 
 
+@pytest.mark.slow
 def test_bank_answers_for_new_views(scene):
     clip, localizer, held = scene
     fresh = MemoryClip(clip.caster, walk(12, seed=5), None)

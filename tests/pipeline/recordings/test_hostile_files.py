@@ -49,6 +49,7 @@ def _archive(path: Path, members: dict[str, bytes]) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_twenty_minutes_of_record3d_are_read(tmp_path):
     """72,000 frames of three files each: 216,001 members, refused as hostile before."""
     count, made = 72_000, walk(2)

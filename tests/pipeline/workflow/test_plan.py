@@ -112,6 +112,7 @@ def test_two_turnarounds_of_one_animal_are_refused(names):
 TWO = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnaround_cat", "turnaround_dog", "a")}
 
 
+@pytest.mark.slow
 def test_animals_of_one_home_share_what_shows_none_of_them(house):
     for name, text in TWO.items():
         house.write(name, text)
@@ -140,6 +141,7 @@ RECORDED = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnar
 HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", "-rf.r3d", "%.r3d", "#.r3d"]
 
 
+@pytest.mark.slow
 def test_file_names_are_never_executed(house):
     for name in ["walkthrough.r3d", "turnaround.r3d", *HOSTILE]:
         house.write(f"captures/toy/{name}", name)

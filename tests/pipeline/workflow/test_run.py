@@ -52,6 +52,7 @@ def leftovers(house):
     return [p for pattern in (".*.tmp*", ".*.old*") for p in (house.folder / "build").rglob(pattern)]
 
 
+@pytest.mark.slow
 def test_a_second_build_does_nothing(house):
     assert begun(house.make("toy")) == set()
 
@@ -65,6 +66,7 @@ def test_touching_reruns_nothing(house):
 FUTURE_NS = time.time_ns() + 10**9 * 3600 * 24 * 365
 
 
+@pytest.mark.slow
 def test_stamps_from_the_future_hide_nothing(house):
     """The clock was a year ahead when it was built, or the stamps were copied from where it was."""
     for stamp in (house.folder / "build/toy").rglob(artifact.STAMP):
@@ -74,6 +76,7 @@ def test_stamps_from_the_future_hide_nothing(house):
     assert begun(house.make("toy")) == set()
 
 
+@pytest.mark.slow
 def test_a_clock_that_goes_back_hides_nothing(house):
     """All was stamped by a clock that was a year ahead; it is put right while a build runs."""
     os.utime(house.folder / "build/toy/clock", ns=(FUTURE_NS, FUTURE_NS))
@@ -105,6 +108,7 @@ def test_a_changed_table_reruns_that_stage_and_what_depends_on_it(house):
     assert begun(house.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
 
 
+@pytest.mark.slow
 def test_equal_results_cut_the_work_off(house):
     """`pause_s` changes the key of the flow but not its content."""
     front = house.folder / "stages/estimate_flow/__main__.py"
@@ -112,11 +116,13 @@ def test_equal_results_cut_the_work_off(house):
     assert begun(house.make("toy")) == {"flow.v001", "flow.v002", "flow.v003"}
 
 
+@pytest.mark.slow
 def test_redo(house):
     assert begun(house.make("toy.masks.redo")) == {"masks.v001", "masks.v002", "masks.v003"}
     assert begun(house.make("toy")) == set()
 
 
+@pytest.mark.slow
 def test_a_record_cut_off_is_cleaned_up(house):
     """The writer died when its artifact was published and not yet stamped: nothing is made again."""
     (house.folder / "build/toy/records/.flow.v001.json.tmp").touch()
@@ -125,6 +131,7 @@ def test_a_record_cut_off_is_cleaned_up(house):
     assert not leftovers(house)
 
 
+@pytest.mark.slow
 def test_up_to_one_artifact(house):
     shutil.rmtree(house.folder / "build")
     assert begun(house.make("toy.flow")) == {
@@ -162,6 +169,7 @@ def test_a_damaged_input_is_named_when_a_stage_fails(house):
     assert "rm -r build/toy/behavior_data" in failed.stderr
 
 
+@pytest.mark.slow
 def test_what_changed_behind_a_builds_back_is_found(house):
     assert house.make("verify", "AGENT=toy").returncode == 0
     changed = house.folder / "build/toy/flow/v001/1.bin"
@@ -189,6 +197,7 @@ def test_an_unknown_job_is_named(house):
     assert house.python("pipeline.workflow.run", "toy", "nothing").stderr.startswith("error: RUN-001 toy")
 
 
+@pytest.mark.slow
 def test_a_removed_recording_reruns_the_merge(tmp_path):
     house = checkout.create(tmp_path)
     for name in ("walkthrough", "turnaround", "a", "b", "c"):
@@ -200,6 +209,7 @@ def test_a_removed_recording_reruns_the_merge(tmp_path):
     assert not again & {"frames.v003", "flow.v003", "masks.v003"}
 
 
+@pytest.mark.slow
 def test_two_builds_at_once_are_both_right(house):
     reference = contents(house)
     shutil.rmtree(house.folder / "build")
@@ -212,6 +222,7 @@ def test_two_builds_at_once_are_both_right(house):
     assert contents(house) == reference
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", ["group", "anyone"])
 def test_kills_leave_nothing_wrong(house, victim):
     """SIGKILL at random points; whatever counts as complete is, and the next build ends as if nothing had
@@ -268,6 +279,7 @@ def test_snakemake_finds_makes_results_up_to_date(house):
     assert "Nothing to be done" in told.stdout + told.stderr
 
 
+@pytest.mark.slow
 def test_snakemake_builds_the_same(house):
     reference = contents(house)
     shutil.rmtree(house.folder / "build")

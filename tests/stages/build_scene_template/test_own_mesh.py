@@ -55,6 +55,7 @@ def test_the_own_mesh_is_metric_upright_and_cut_where_nothing_was_seen(clip):
     assert len(made.mesh.faces) < len(_own(clip).faces)
 
 
+@pytest.mark.slow
 def test_a_mesh_of_another_scale_or_place_is_refused(clip):
     assert _built(clip, _own(clip, scale=1.1)) is None
     away = _own(clip)

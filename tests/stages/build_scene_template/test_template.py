@@ -27,6 +27,7 @@ def clip(tmp_path_factory) -> MemoryClip:
     return made
 
 
+@pytest.mark.slow
 def test_template_is_metric_upright_and_follows_the_truth(clip, tmp_path):
     fusion = FusionConfig(voxel_m=0.05, truncation_m=0.15, island_faces=30, feature_frames=6)
     config = Config(sfm=SFM, refinement=RefinementConfig(rounds=6), fusion=fusion)

@@ -40,6 +40,7 @@ def check_cameras(clip, true):
     assert abs(focal - 1) < 0.03, "the lens is calibrated"
 
 
+@pytest.mark.slow
 def test_a_session_is_placed_in_the_map_and_its_animal_on_the_floor(mapped, tmp_path):
     path, agent = filmed_room.session(24)
     clip, kept, depth, masks = estimate(mapped, tmp_path, path, agent, "session")
@@ -59,6 +60,7 @@ def test_a_session_is_placed_in_the_map_and_its_animal_on_the_floor(mapped, tmp_
     assert len(off_animal) > 0.7 * len(clip) and np.median(off_animal) < 0.1
 
 
+@pytest.mark.slow
 def test_a_turnaround_is_measured_by_several_views(mapped, tmp_path):
     path, agent = filmed_room.circle(40)
     clip, kept, depth, masks = estimate(mapped, tmp_path, path, agent, "turnaround")
@@ -73,6 +75,7 @@ def test_a_turnaround_is_measured_by_several_views(mapped, tmp_path):
     assert np.median(off) < 0.03
 
 
+@pytest.mark.slow
 def test_a_video_of_another_room_is_refused(mapped, tmp_path):
     path, agent = filmed_room.session(12)
     elsewhere = textured_room.textured_room(seed=7, edge_m=0.03)

@@ -131,6 +131,7 @@ def test_whoever_hears_the_page_is_told(simulator: Path, chromium: Browser) -> N
         assert wrong == []
 
 
+@pytest.mark.slow
 def test_a_visitor_with_a_headset_stands_in_the_room(simulator: Path, chromium: Browser) -> None:
     """The head is the person, a stick walks, a hand points at goals; afterwards the view is as before."""
     address = (simulator / "index.html").as_uri()

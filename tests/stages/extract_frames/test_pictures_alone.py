@@ -57,6 +57,7 @@ def _mapped(recording: Recording, measured, folder: Path):
     return photogrammetry.map_pictures(recording, measured, Config(without_depth=CONFIG), folder)
 
 
+@pytest.mark.slow
 def test_a_walk_is_mapped_and_a_session_with_depth_tells_its_metres(room, tmp_path):
     truth = textured_room.walk(14)
     session = _recording(

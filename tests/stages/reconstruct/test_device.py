@@ -19,6 +19,7 @@ STEPS = PhaseSteps(template=40, scene=2, stance=1, body=2, joint=2, save_every=2
 BATCHES = RayBatches(scene_rays=32, joint_scene_rays=16, rendered_rays=8, rendered_samples=8, runs=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["fused", "measured", "rendered"])
 def test_all_phases_and_results_run_on_another_device(form, tmp_path):
     rng = np.random.default_rng(0)

@@ -40,6 +40,7 @@ def added():
     return film("v003", 9, True, np.random.default_rng(5), WIDE)
 
 
+@pytest.mark.slow
 def test_fields_and_motion_are_those_of_the_former(made):
     folder, before, motions = made
     found, videos = problem(videos=films(added()))

@@ -145,6 +145,7 @@ def solved():
     return found, videos
 
 
+@pytest.mark.slow
 def test_room_and_ball_are_found(solved):
     found, _ = solved
     centre = torch.tensor([[0.0, 0.0, -0.8], [0.5, 0.5, 0.5]])
@@ -379,6 +380,7 @@ def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
     assert back.videos == ("v002",) and back.video_code(None) == -1
 
 
+@pytest.mark.slow
 def test_plain_networks_without_codes_learn_and_come_back(tmp_path):
     """The rivals of Table 3 take the same way: waves of the place instead of grids, one scene for all
     videos.
@@ -419,6 +421,7 @@ def test_frames_whose_camera_is_in_doubt_look_through_nothing(solved):
     assert 0 == seen_through(0) < seen_through(2) < seen_through(len(found.video))
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_bits(tmp_path):
     settings = dict(template=6, scene=8, body=2, joint=6, save_every=3)
     whole, _ = problem()

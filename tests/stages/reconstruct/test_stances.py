@@ -1,6 +1,7 @@
 """An animal that sits is told from one that stands, in each frame, though registration has it level."""
 
 import numpy as np
+import pytest
 import torch
 
 from stages.reconstruct import assemble, optimise, stances
@@ -31,6 +32,7 @@ def test_parts_are_told_by_frame():
     assert found.tolist() == [0] * 10 + [1] * 10 + [0] * 5
 
 
+@pytest.mark.slow
 def test_sitting_is_found_where_it_is_seen():
     """What is ahead rises by half its length: 30 degrees; registration has it level."""
     level = np.tile(np.eye(4), (FRAMES, 1, 1))

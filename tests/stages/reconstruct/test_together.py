@@ -65,6 +65,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor
     return learned(whole), weights, total
 
 
+@pytest.mark.slow
 def test_two_processes_do_what_one_does_with_the_same_batch(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         whole, weights, total = side(0, port, tmp_path)

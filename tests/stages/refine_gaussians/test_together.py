@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from pipeline.core import distributed
@@ -40,6 +41,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[FitRecord, torch.Tensor]:
     return record, found
 
 
+@pytest.mark.slow
 def test_two_processes_refine_as_one_does_on_both_frames(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         record, found = side(0, port, tmp_path)

@@ -36,6 +36,7 @@ def maps() -> registration.Maps:
     return registration.Maps(mesh, agent, scene, scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_odometry", [True, False])
 def test_recording_is_registered(maps, with_odometry):
     truth = walk(40, seed=7)
@@ -52,6 +53,7 @@ def test_recording_is_registered(maps, with_odometry):
     assert np.isnan(found.roots.world_from_agent).all()
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
     truth = walk(40, seed=7)
     odometry = drifting(truth, 2, deg=0.03, m=0.001)
@@ -64,6 +66,7 @@ def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
     assert distance.max() < 0.05, "metres; the jump is 0.6 m"
 
 
+@pytest.mark.slow
 def test_cameras_that_come_from_the_map_are_kept_and_only_believed_where_pictures_agree(maps):
     """Depth that was cast from a camera fits the map wherever the camera is, and must not confirm it."""
     truth = walk(40, seed=7)
@@ -78,6 +81,7 @@ def test_cameras_that_come_from_the_map_are_kept_and_only_believed_where_picture
     assert isinstance(refused, registration.Rejected)
 
 
+@pytest.mark.slow
 def test_foreign_room_is_refused(maps):
     truth = walk(40, seed=7)
     other = textured_room(seed=99)
@@ -127,6 +131,7 @@ def test_votes_come_from_masked_frames_only(maps):
     assert votes.nearest is None
 
 
+@pytest.mark.slow
 def test_a_repainted_room_of_the_same_shape_is_refused(maps):
     """In dim light as well, and unless frames were recognised with certainty."""
     truth, caster, rng = walk(40, seed=7), RayCaster(maps.scene), np.random.default_rng(0)

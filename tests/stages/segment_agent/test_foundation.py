@@ -34,6 +34,7 @@ def options(tmp_path_factory):
     return FoundationConfig(str(detector), str(tracker), threshold=0.0)
 
 
+@pytest.mark.slow
 def test_a_hint_is_followed_to_both_ends(options):
     from pipeline.backends.sam2 import Sam2
 

@@ -41,6 +41,7 @@ def walk(tmp_path_factory):
     return make(tmp_path_factory.mktemp("walk") / "frames", "session", poses, agent, scenery.drifted(poses))
 
 
+@pytest.mark.slow
 def test_a_walking_and_a_resting_animal_is_found(walk):
     found, truth = walk
     scores = np.array(
@@ -158,6 +159,7 @@ def click(mask, frame):
     return prompt.Prompt(frame, (column + 0.5, row + 0.5) * 2)
 
 
+@pytest.mark.slow
 def test_an_animal_that_never_moves_is_found_by_a_hint(tmp_path):
     poses, agent = scenery.session()
     agent = np.repeat(agent[20:21], 40, axis=0)
@@ -170,6 +172,7 @@ def test_an_animal_that_never_moves_is_found_by_a_hint(tmp_path):
     assert np.mean(*scores.values()) > 0.7
 
 
+@pytest.mark.slow
 def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
     """The animal leaves for good after 1.6 s; something of its size and of another colour walks about all the
     time.
@@ -242,6 +245,7 @@ def test_a_click_finds_the_surface(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_looks_are_learnt_in_spite_of_frames_labelled_wrongly():
     """A striped thing before noise; every seventh frame calls it room, as when first masks miss an animal at
     rest.

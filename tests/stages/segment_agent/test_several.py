@@ -91,6 +91,7 @@ def together(tmp_path_factory):
     return folder, scenery.record(folder, poses, agent, scenery.drifted(poses), world_from_other=other)
 
 
+@pytest.mark.slow
 def test_two_that_pass_each_other_keep_their_masks(network, together):
     folder, truth = together
     for name, own, others in (("orange", truth.masks, truth.others), ("green", truth.others, truth.masks)):
@@ -107,6 +108,7 @@ def test_two_that_pass_each_other_keep_their_masks(network, together):
         assert strangers < 0.1
 
 
+@pytest.mark.slow
 def test_one_that_is_not_here_has_no_mask(network, tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))

@@ -42,6 +42,7 @@ def made(scripts, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_same_bytes_whatever_the_order(scripts, made, tmp_path):
     produce.record(scripts[2], CREATURE, tmp_path, tmp_path)
     for path in tmp_path.iterdir():
@@ -98,6 +99,7 @@ def test_true_flow_moves_depth_onto_depth(scripts):
     assert np.nanmax(np.abs(film.true_flow(stage, 1, 1))) < 1e-2, "no time, no flow"
 
 
+@pytest.mark.slow
 def test_a_session_of_another_home_changes_no_other(scripts, made, tmp_path):
     more = script.scripts(replace(CONFIG, foreign_sessions=1), room.furnish(np.random.default_rng(4)), PHONE)
     assert [part.name for part in more] == [*(part.name for part in scripts), "session-3"]

@@ -243,6 +243,7 @@ def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [
@@ -261,6 +262,7 @@ def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shap
     assert write_networks(tmp_path, nets.eval(), shape) < 1e-4
 
 
+@pytest.mark.slow
 def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=8, goal_steps=4, batch=8))
     whole = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3)
@@ -319,6 +321,7 @@ def test_contract_is_whole_and_loads_back(windows, tmp_path):
     assert golden_plan(Sampler(TorchNetworks(loaded), schedule, rescaled), architecture) == golden
 
 
+@pytest.mark.slow
 def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
     goal = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval().goal
     inputs, output = signature("goal", ARCHITECTURE)
@@ -350,6 +353,7 @@ def test_golden_plan_uses_the_noise_it_names(windows):
     np.testing.assert_allclose(plan.path[0], golden["plans"]["guidance_1"]["path"], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_an_animal_that_stands_still_is_exported_too(windows, tmp_path):
     """A past in which every frame is alike: its velocity is zero, and so is the length that a power is taken
     of.

@@ -87,6 +87,7 @@ def alone(family: str, monkeypatch: pytest.MonkeyPatch) -> training.TrainedBehav
         return trained(family, 8)
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         together = side(0, port, tmp_path)

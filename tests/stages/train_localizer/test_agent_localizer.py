@@ -14,6 +14,7 @@ from stages.train_localizer.config import AgentConfig, Config, SceneConfig
 from tests.stages.textured_room import MemoryClip, noise_color, textured_room, walk
 
 
+@pytest.mark.slow
 def test_agent_is_found_from_all_around():
     parts = [
         ((0.16, 0.16, 0.4), (0, 0, 0)),

@@ -1,6 +1,7 @@
 """The kinds that are networks: both learn, both are kept by files, certainty ranks errors."""
 
 import numpy as np
+import pytest
 import torch
 
 from pipeline.geometry import rigid
@@ -62,6 +63,7 @@ def test_coordinates_are_learnt():
     assert np.median(share) > 0.5
 
 
+@pytest.mark.slow
 def test_poses_are_regressed():
     net = train_regressor(
         described(150, 1), "scene", NetworkConfig(steps=150, batch_views=32, pose_width=16), 0

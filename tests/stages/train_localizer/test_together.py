@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from pipeline.core import distributed
@@ -33,6 +34,7 @@ def side(rank: int, port: str, folder: Path) -> list[torch.Tensor]:
     return found
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkeypatch):
     records, fit = [], networks.fit
 

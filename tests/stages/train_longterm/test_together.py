@@ -45,6 +45,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> learning.TrainedLongTerm:
     return trained(8)
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         together = side(0, port, tmp_path)

@@ -32,6 +32,7 @@ def learned(dataset):
     return learning.train_networks(dataset, SETTINGS, sizes=SIZES)
 
 
+@pytest.mark.slow
 def test_every_network_learns(learned):
     for name, record in learned.records.items():
         total = record.total()
