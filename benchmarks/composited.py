@@ -21,7 +21,6 @@ from pipeline.geometry import cameras, rigid
 from pipeline.mapping.icp import DepthImage, depth_image
 from pipeline.mapping.odometry import align_gravity
 from stages.synthesize_capture import animal, gait, raster, shade
-from stages.synthesize_capture.film import SHADOW_BALLS
 from stages.synthesize_capture.session import STEP_S, AnimalCourse
 
 COLOR_FOCAL_PX, DEPTH_FOCAL_PX, BASELINE_M = 525.5, 585.0, 0.025
@@ -344,12 +343,16 @@ class Compositor:
         shine = (
             0.45 + 0.4 * (0.5 + 0.5 * normals[:, 1:2]) + 0.25 * np.clip(normals[:, :1], 0, 1)
         ) * self._light
-        balls = np.zeros((len(SHADOW_BALLS), 4))
-        for row, (bone, rest, radius) in enumerate(SHADOW_BALLS):
-            local = np.asarray(rest) - animal.HEADS[animal.INDEX[bone]]
-            balls[row] = *rigid.apply(camera_from_bone[animal.INDEX[bone]], local[None])[0], radius
+        anatomy, balls = self.creature.anatomy, []
+        for bone, rest, radius in anatomy.balls():
+            local = np.asarray(rest) - anatomy.heads[animal.INDEX[bone]]
+            balls.append([*rigid.apply(camera_from_bone[animal.INDEX[bone]], local[None])[0], radius])
         coat = shade.Coat(
-            self.creature.faces, self.creature.vertices, shine.astype(np.float32), self.creature.fur, balls
+            self.creature.faces,
+            self.creature.vertices,
+            shine.astype(np.float32),
+            self.creature.fur,
+            np.array(balls),
         )
         fur = shade.shade(view.face, view.inverse_corners, focal, _EMPTY, coat, camera_from_world)
         own = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, focal, height, width)

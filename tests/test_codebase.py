@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 60_560,
+    "lines": 60_870,
     "lines over 110 columns": 0,
     "recipe keys": 315,
     "packages over 16 modules": 0,

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+Species = Literal["cat", "dog", "rabbit", "hen"]
+
 
 @dataclass(frozen=True)
 class Config:
@@ -31,7 +33,9 @@ class Config:
     """Session (from 1) in low red sun from one side, overexposed, with another white balance; 0 = none."""
     foreign_sessions: int = 0
     """Additional sessions, each filmed in another home: registration is to refuse them."""
+    species: Species = "cat"
+    """The animal that lives here: its body, coat and gait; where it goes and why is the same for all."""
     companion: Literal["none", "dog"] = "none"
-    """A second animal that lives with the cat: it follows it, plays with it and avoids it."""
+    """A second animal of another species: it follows the first, plays with it and avoids it."""
     alone_session: int = 0
     """Session (from 1) in which the second animal is not at home; 0 = none."""

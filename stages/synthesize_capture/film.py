@@ -13,19 +13,6 @@ from stages.synthesize_capture import animal, light, raster, sensor, shade
 from stages.synthesize_capture.animal import INDEX, Animal
 from stages.synthesize_capture.script import Script
 
-SHADOW_BALLS = (
-    ("pelvis", (0, 0, -0.14), 0.075),
-    ("spine", (0, 0, -0.06), 0.075),
-    ("loin", (0, 0, 0.02), 0.075),
-    ("chest", (0, 0, 0.1), 0.075),
-    ("head", (0, 0.08, 0.25), 0.055),
-    ("left hand", (0.045, -0.21, 0.125), 0.03),
-    ("right hand", (-0.045, -0.21, 0.125), 0.03),
-    ("left toes", (0.05, -0.21, -0.165), 0.03),
-    ("right toes", (-0.05, -0.21, -0.165), 0.03),
-)
-"""Bone, rest point in the agent frame and radius of the balls that darken the ground near the animal."""
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -138,23 +125,23 @@ class Stage:
                 np.zeros((0, 4), np.float32),
                 np.zeros((0, 4)),
             )
-        received, balls = [], np.zeros((len(bodies) * len(SHADOW_BALLS), 4))
-        rows = iter(balls)
+        received, balls = [], []
         for body in bodies:
             creature, points = body.creature, body.vertices_world
             normals = animal.normals_of(points, creature.faces)
             received.append(light.light_on_body(points, normals, self.script.room, self.script.light))
             camera_from_bone = camera_from_world @ body.world_from_bone
-            for bone, rest, radius in SHADOW_BALLS:
-                local = creature.size * (np.asarray(rest) - animal.HEADS[INDEX[bone]])
+            anatomy = creature.anatomy
+            for bone, rest, radius in anatomy.balls():
+                local = anatomy.size * (np.asarray(rest) - anatomy.heads[INDEX[bone]])
                 middle = rigid.apply(camera_from_bone[INDEX[bone]], local[None])[0]
-                next(rows)[:] = *middle, creature.size * radius
+                balls.append([*middle, anatomy.size * radius])
         return shade.Coat(
             _joined_faces(bodies, start=0),
             np.concatenate([body.creature.vertices for body in bodies]),
             np.concatenate(received),
             np.concatenate([body.creature.fur for body in bodies]),
-            balls,
+            np.array(balls),
         )
 
 

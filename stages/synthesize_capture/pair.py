@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from stages.synthesize_capture.animal import DOG_SIZE
+from stages.synthesize_capture.dog import DOG
 from stages.synthesize_capture.navigation import Floor, Ground, floor_for
 from stages.synthesize_capture.observer import FILMING, Observer, ObserverStyle
 from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, SeenPerson
@@ -115,7 +115,7 @@ def simulate_pair(
     """Simulate one session of a cat and a dog; the same generator state gives the same session."""
     footprints = room.footprints()
     cats = floor_for(footprints, breadth_m=ANIMAL_BREADTH_M, height_m=ANIMAL_HEIGHT_M)
-    dogs = floor_for(footprints, breadth_m=ANIMAL_BREADTH_M * DOG_SIZE, height_m=ANIMAL_HEIGHT_M * DOG_SIZE)
+    dogs = floor_for(footprints, breadth_m=ANIMAL_BREADTH_M * DOG.size, height_m=ANIMAL_HEIGHT_M * DOG.size)
     people = floor_for(footprints, breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
     start = people.centers()[rng.integers(people.free.sum())]
     cat = Policy(cats, room.places, _at_distance(cats, start, 2.0, rng), rng)

@@ -22,8 +22,6 @@ from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.script import Script
 from stages.synthesize_capture.truth import TruthWriter, write_flow
 
-FIRST, SECOND = "cat", "dog"
-"""Names of the animals in a home of two."""
 FLOW_PAIRS = 40
 THUMBNAILS = 6
 
@@ -75,8 +73,8 @@ def record(
     truths = {truth_folder: TruthWriter(script, keep_depth)}
     if companion is not None:
         truths = {
-            truth_folder / name: TruthWriter(script, keep_depth, of_companion=name != FIRST)
-            for name in (FIRST, SECOND)
+            truth_folder / each.anatomy.name: TruthWriter(script, keep_depth, of_companion=each is companion)
+            for each in (creature, companion)
         }
     folders = list(truths)
     chosen = set(np.linspace(0, len(script.timestamp_s) - 1, THUMBNAILS).astype(int).tolist())

@@ -73,9 +73,7 @@ def report_quality(folder: Path, scripts: list[Script], made: list[FilmedRecordi
         Check("frames that show the animal", visible, "share", 0.7, 0.5, "higher"),
     ]
     pictures = qa.captioned(CAPTIONS, contact_sheet=contact_sheet(made), birds_eye=birds_eye(scripts))
-    good = (
-        "a lived-in room under changing light, and a cat that walks, sits and runs from whoever comes close"
-    )
+    good = "a lived-in room in changing light, an animal that walks, sits and runs from whoever comes close"
     bad = "an animal that never moves or is never in the picture"
     qa.write(folder, good=good, bad=bad, checks=checks, pictures=pictures)
 

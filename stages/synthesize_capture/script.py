@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from pipeline.geometry import cameras, rigid
 from stages.synthesize_capture import camera_motion, dwellings, gait, light, pair, sensor, session
-from stages.synthesize_capture.animal import DOG_SIZE
-from stages.synthesize_capture.config import Config
+from stages.synthesize_capture.animal import BODIES
+from stages.synthesize_capture.config import Config, Species
+from stages.synthesize_capture.dog import DOG
 from stages.synthesize_capture.gait import AnimalMotion
 from stages.synthesize_capture.light import Hour, Light
 from stages.synthesize_capture.room import Room
@@ -78,11 +79,11 @@ def scripts(config: Config, room: Room, phone: PhoneFormat = PHONE) -> list[Scri
     rng, seconds = next(streams), config.walkthrough_s
     path = camera_motion.walkthrough(room, rng, seconds)
     walkthrough = _script(phone, rng, "walkthrough", room, day, path, seconds)
-    rng, seconds = next(streams), config.turnaround_s
+    rng, seconds, species = next(streams), config.turnaround_s, config.species
     course = session.standing_course(room, rng, seconds)
     path = camera_motion.turnaround(course, rng)
-    name = "turnaround" if config.companion == "none" else "turnaround_cat"
-    turnarounds = [_script(phone, rng, name, room, day, path, seconds, course=course)]
+    name = "turnaround" if config.companion == "none" else f"turnaround_{config.species}"
+    turnarounds = [_script(phone, rng, name, room, day, path, seconds, course=course, species=species)]
     if config.companion != "none":
         rng = np.random.default_rng([config.seed, 4])
         course = session.standing_course(room, rng, seconds)
@@ -107,7 +108,7 @@ def _sessions(
         simulate = pair.simulate_pair if together else session.simulate_session
         lived = simulate(arranged, rng, seconds)
         path, turns = camera_motion.filming(lived, rng), int(number == config.sideways_session)
-        seen = {"course": lived.animal, "companion": lived.companion, "hour": hour}
+        seen = {"course": lived.animal, "companion": lived.companion, "hour": hour, "species": config.species}
         yield _script(phone, rng, name, arranged, lit, path, seconds, lived=lived, turns=turns, **seen)
         rng = next(streams)
         if number == config.heldout_of:
@@ -122,7 +123,18 @@ def _foreign(config: Config, phone: PhoneFormat, streams: Iterator[np.random.Gen
         home = dwellings.filmed_elsewhere(rng)
         lived = session.simulate_session(home, rng, seconds)
         lit, path = light.light_of_session(rng, "day"), camera_motion.filming(lived, rng)
-        yield _script(phone, rng, name, home, lit, path, seconds, course=lived.animal, lived=lived)
+        yield _script(
+            phone,
+            rng,
+            name,
+            home,
+            lit,
+            path,
+            seconds,
+            course=lived.animal,
+            lived=lived,
+            species=config.species,
+        )
 
 
 def _script(
@@ -134,6 +146,7 @@ def _script(
     path: camera_motion.Cameras,
     duration_s: float,
     *,
+    species: Species = "cat",
     course: AnimalCourse | None = None,
     companion: AnimalCourse | None = None,
     lived: SessionTrajectories | None = None,
@@ -155,14 +168,14 @@ def _script(
         intrinsics=sensor.lens(rng, timestamp_s, phone.color_size[1], phone.color_size[0]),
         odometry_from_camera=sensor.odometry(rng, timestamp_s, stored),
         gain=sensor.gains(rng, timestamp_s, exposure),
-        motion=None if course is None else gait.poses(course, timestamp_s),
+        motion=None if course is None else gait.poses(course, timestamp_s, BODIES[species]),
         moving=_moving(course, timestamp_s),
         quarter_turns=turns,
         color_size=phone.color_size,
         depth_size=phone.depth_size,
         fps=phone.fps,
         session=lived,
-        companion_motion=None if companion is None else gait.poses(companion, timestamp_s, DOG_SIZE),
+        companion_motion=None if companion is None else gait.poses(companion, timestamp_s, DOG),
         companion_moving=None if companion is None else _moving(companion, timestamp_s),
     )
 

@@ -35,7 +35,7 @@ def test_planted_feet_do_not_slide():
         course = _straight(speed)
         times = np.linspace(1.0, 3.0, 400)
         feet = _feet(gait.poses(course, times))
-        low = feet[..., 1] < gait.SOLE_M + 0.0005
+        low = feet[..., 1] < animal.CAT.gait.sole_m + 0.0005
         drift = np.linalg.norm(np.diff(feet[..., [0, 2]], axis=0), axis=-1) / np.diff(times)[:, None]
         planted = low[1:] & low[:-1]
         assert planted.mean() > 0.3, "each foot carries weight for a good part of the stride"

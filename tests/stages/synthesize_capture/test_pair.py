@@ -59,7 +59,7 @@ def test_its_feet_stand_on_the_floor():
     course = AnimalCourse(
         time, position, still, np.zeros((len(time), 3)), still, position + np.array([0, 0.3, 1]), still
     )
-    motion = gait.poses(course, np.linspace(1, 3, 30), animal.DOG_SIZE)
+    motion = gait.poses(course, np.linspace(1, 3, 30), animal.DOG)
     lowest = [
         animal.surface(DOG, world_from_agent @ bones)[:, 1].min()
         for world_from_agent, bones in zip(motion.world_from_agent, motion.agent_from_bone, strict=True)
