@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 60_870,
+    "lines": 61_129,
     "lines over 110 columns": 0,
     "recipe keys": 315,
     "packages over 16 modules": 0,

@@ -33,6 +33,8 @@ class MotionScene:
     high: Float[np.ndarray, "3"]
     """world frame"""
     voxel_m: float = 0.04
+    known: SignedDistance | None = None
+    """distances in that part, where the scan came with them"""
 
     @classmethod
     def for_motion(
@@ -46,8 +48,8 @@ class MotionScene:
 
     @cached_property
     def distance(self) -> SignedDistance:
-        """The signed distance in that part; measured when first asked for."""
-        return signed_distance.from_mesh(self.mesh, self.low, self.high, voxel_m=self.voxel_m)
+        """The signed distance in that part; measured when first asked for, where it is not known."""
+        return self.known or signed_distance.from_mesh(self.mesh, self.low, self.high, voxel_m=self.voxel_m)
 
     @cached_property
     def surface(self) -> SurfacePoints:

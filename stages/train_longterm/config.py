@@ -34,7 +34,7 @@ class Config:
     """Learn people instead: a model file of SMPL-X (needs the package smplx)."""
     smplx_motions: str | None = None
     """With it: a folder with `scene.ply` and recorded SMPL-X parameters (see
-    `stages.train_longterm.sources.people`).
+    `stages.train_longterm.sources.people`), or the folder of PROX as published.
     """
     seed: int = 0
     """Seed of weights, examples and batches."""

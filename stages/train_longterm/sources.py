@@ -13,6 +13,7 @@ from pipeline.longterm.examples import MotionDataset, reconstructed_dataset
 from pipeline.longterm.short_motions import resample_motion
 from pipeline.longterm.smplx_bodies import motion_from_parameters, smplx_body
 from pipeline.longterm.surroundings import MotionScene
+from stages.train_longterm import prox
 
 STUDY_REACH_M = 1.5
 """heights of the synthetic study's scene that are used, above and below where bodies have been"""
@@ -57,8 +58,12 @@ def people(model: Path, folder: Path) -> DatasetSplit:
     """Read recorded SMPL-X motion: `scene.ply` and `*.npz` of one person, the last in name order held out.
 
     Each holds `timestamp_s`, `transl`, `global_orient`, `body_pose` (rotation vectors, world +y up, metres)
-    and `betas`. Raises InputError LTM-001 where there is none, LTM-003 and LTM-004 where SMPL-X is not there.
+    and `betas`, and may hold `left_hand_pose` and `right_hand_pose` (45 numbers or principal coefficients).
+    A folder laid out as PROX is read as such. Raises InputError LTM-001 where there is none, LTM-003 and
+    LTM-004 where SMPL-X is not there, LTM-005 where PROX is damaged.
     """
+    if prox.is_prox(folder):
+        return _in_scans(model, folder)
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise InputError(
@@ -69,7 +74,7 @@ def people(model: Path, folder: Path) -> DatasetSplit:
     ]
     person = smplx_body(model, loaded[0]["betas"])
     moved = [
-        motion_from_parameters(person, each["transl"], each["global_orient"], each["body_pose"])
+        motion_from_parameters(person, each["transl"], each["global_orient"], each["body_pose"], _hands(each))
         for each in loaded
     ]
     motions = tuple(
@@ -80,3 +85,26 @@ def people(model: Path, folder: Path) -> DatasetSplit:
     dataset = MotionDataset(person.body, motions, (0,) * len(motions), (scene,))
     last = len(motions) - 1
     return DatasetSplit(dataset.subset(list(range(max(last, 1)))), dataset.subset([last]) if last else None)
+
+
+def _hands(table: dict[str, np.ndarray]) -> np.ndarray | None:
+    both = [table[name] for name in ("left_hand_pose", "right_hand_pose") if name in table]
+    return np.stack(both, axis=1) if len(both) == 2 else None
+
+
+def _in_scans(model: Path, folder: Path) -> DatasetSplit:
+    """Read PROX, the last recording held out."""
+    person, recordings, scenes = prox.read(model, folder)
+    names = list(scenes)
+    stretches = [(motion, names.index(each.scene)) for each in recordings for motion in each.motions]
+    last = sum(len(each.motions) for each in recordings[:-1])
+    if not stretches:
+        remedy = "give recordings with two seconds of fits without a gap"
+        raise InputError(
+            "LTM-001", "no two seconds of uninterrupted motion to learn from", str(folder), remedy
+        )
+    motions, places = zip(*stretches, strict=True)
+    dataset = MotionDataset(person.body, motions, places, tuple(scenes.values()))
+    held = list(range(last, len(motions))) if 0 < last < len(motions) else []
+    train = [index for index in range(len(motions)) if index not in held]
+    return DatasetSplit(dataset.subset(train), dataset.subset(held) if held else None)
