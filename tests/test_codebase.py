@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 61_140,
+    "lines": 61_175,
     "lines over 110 columns": 0,
     "recipe keys": 315,
     "packages over 16 modules": 0,

@@ -2,7 +2,9 @@
 on it.
 
 In depth, front and back look almost alike, and every fit errs by some degrees; over time an animal turns
-steadily and walks head first. Frames that show little, fit badly or repeat earlier views count little.
+steadily and walks head first. The head is the template's, a guess from shape that a hen's tail spoils: where
+a recording clearly shows the animal walking the other way, that is its head. Frames that show little, fit
+badly or repeat earlier views count little.
 """
 
 from dataclasses import dataclass
@@ -19,6 +21,9 @@ NOISE_DEG, MOST_COST = 20.0, 12.0
 MOTION_WEIGHT, WALKING_M_S = 4.0, (0.25, 0.6)
 """Units for walking tail first, counting from the first speed, fully from the second, m/s: an animal that
 turns on the spot shows other sides."""
+REVERSED_SHARE = 0.6
+"""The template's head is the tail if that saves this share of what walking tail first costs at most, and more
+than a turn to the other side."""
 TURN_DEG, TURN_S, FLIP_COST = 30.0, 0.1, 40.0
 """A turn by so many degrees in so many seconds costs one unit, up to the last."""
 STILL_WEIGHT, NEW_VIEW_M_S, CAMERA_SHARE = 0.06, 0.4, 0.5
@@ -67,11 +72,14 @@ def choose(timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypothe
 def path(
     timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]
 ) -> Float[np.ndarray, "observation"]:
-    """Return the likeliest heading of each observation, radians, by Viterbi decoding over a grid of
-    headings."""
+    """Return the likeliest heading of each observation, radians, by Viterbi decoding over a grid of headings.
+
+    It is decoded for an animal that walks along +z of its template, and for one that walks along -z.
+    """
     grid = 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
     moves, weight = motion_cues(timestamp_s, candidates), weights(candidates)
-    unary = [_own_cost(each, grid, moves, index) * weight[index] for index, each in enumerate(candidates)]
+    walking = MOTION_WEIGHT * weight * _walking(moves)
+    look = [_own_cost(each, grid, moves.novelty[index]) for index, each in enumerate(candidates)]
     turn = (rigid.wrap(grid[:, None] - grid[None]) / np.deg2rad(TURN_DEG)) ** 2
 
     def turn_cost(index: int) -> Float[np.ndarray, "before after"]:
@@ -79,7 +87,16 @@ def path(
         tenths = max(elapsed / TURN_S, 1.0)
         return np.minimum(turn / tenths, FLIP_COST / np.sqrt(tenths))
 
-    return grid[viterbi.viterbi_decode(unary, turn_cost)]
+    def decoded(sense: float) -> tuple[Float[np.ndarray, "observation"], float]:
+        against = 1 - sense * np.cos(grid - np.arctan2(*moves.velocity[:, [0, 2]].T)[:, None])
+        unary = weight[:, None] * look + walking[:, None] * against / 2
+        state = viterbi.viterbi_decode(unary, turn_cost)
+        turns = sum(turn_cost(index)[state[index - 1], state[index]] for index in range(1, len(state)))
+        return grid[state], float(unary[np.arange(len(state)), state].sum() + turns)
+
+    (head_first, cost), (tail_first, reversed_cost) = decoded(1.0), decoded(-1.0)
+    clearly = max(FLIP_COST, REVERSED_SHARE * walking.sum())
+    return tail_first if cost - reversed_cost > clearly else head_first
 
 
 def weights(candidates: list[RootHypotheses]) -> Float[np.ndarray, "observation"]:
@@ -116,11 +133,13 @@ def _turned_cost(candidates, angle):
     return candidates.cost + np.minimum(turned**2, FLIP_COST)
 
 
-def _own_cost(candidates, grid, moves, index):
-    """Return one frame's unary cost of each heading of the grid."""
-    seen = _turned_cost(candidates, grid[:, None]).min(1)
-    cost = moves.novelty[index] * np.minimum(seen - seen.min(), MOST_COST)
-    x, _, z = moves.velocity[index]
+def _walking(moves: MotionCues) -> Float[np.ndarray, "observation"]:
+    """Return 0..1: how surely the animal walks."""
     slow, fast = WALKING_M_S
-    walking = np.clip((np.hypot(x, z) - slow) / (fast - slow), 0, 1)
-    return cost + MOTION_WEIGHT * walking * (1 - np.cos(grid - np.arctan2(x, z))) / 2
+    return np.clip((np.hypot(*moves.velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
+
+
+def _own_cost(candidates, grid, novelty):
+    """Return one frame's cost of each heading of the grid, by looks alone."""
+    seen = _turned_cost(candidates, grid[:, None]).min(1)
+    return novelty * np.minimum(seen - seen.min(), MOST_COST)

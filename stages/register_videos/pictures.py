@@ -20,6 +20,8 @@ DEPTH_EDGE_M, OUTLINE = 0.08, 1.0
 """steps that are drawn as edges: of depth, and of the animal's silhouette (any step is larger)"""
 HEADING_M = 0.2
 """length of the line that shows where the animal faces"""
+WALK_FRAMES, WALK_M = 5, 0.2
+"""an animal walks that goes further than this in so many frames"""
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
@@ -75,6 +77,7 @@ def checks(result: Registered | Rejected) -> list[Check]:
     if isinstance(result, Rejected):
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
     agreed = float(result.supports.mean()) if len(result.supports) else None
+    roots = result.roots.world_from_agent
     gap_cm = _finite(result.aligned.median_gap_m * 100)
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
@@ -84,7 +87,20 @@ def checks(result: Registered | Rejected) -> list[Check]:
         Check("appearance of frames and renderings", result.appearance, "share", 0.5, None, "higher"),
         Check("camera confidence", float(result.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(result.roots.visible.mean()), "share of frames", 0.4, None, "higher"),
+        Check("way walked head first", head_first(roots), "share", 0.5, None, "higher"),
     ]
+
+
+def head_first(world_from_agent: Float[np.ndarray, "frame 4 4"]) -> float | None:
+    """Return the share of the animal's way on which it faced ahead; None where it does not walk.
+
+    Little where the template's head is the tail (`[build_agent_template] turn_deg`).
+    """
+    step = world_from_agent[WALK_FRAMES:, :3, 3] - world_from_agent[:-WALK_FRAMES, :3, 3]
+    ahead = (step * world_from_agent[:-WALK_FRAMES, :3, 2])[:, [0, 2]].sum(-1)
+    length = np.linalg.norm(step[:, [0, 2]], axis=-1)
+    walks = length > WALK_M
+    return float(length[walks & (ahead > 0)].sum() / length[walks].sum()) if walks.any() else None
 
 
 def pictures(result: Registered | Rejected, clip: Clip, maps: Maps) -> list[Picture]:

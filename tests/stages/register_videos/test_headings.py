@@ -38,6 +38,14 @@ def test_animals_walk_head_first():
     assert chosen([seen(frame, 0.0, (0, 0, 0.06 * frame), 1.5) for frame in range(30)]) == [0] * 30
 
 
+def test_a_template_whose_head_is_the_tail_walks_the_other_way():
+    """An animal whose looks say clearly in every frame that it walks along -z."""
+    there_and_back = 3.0 - np.abs(np.arange(60) * 0.06 - 1.8)
+    yaw = np.where(np.arange(60) < 30, 180.0, 0.0)
+    sights = [seen(frame, yaw[frame], (0, 0, there_and_back[frame]), -3.0) for frame in range(60)]
+    assert chosen(sights) == [0] * 60
+
+
 def test_what_was_learned_walking_is_kept_at_rest():
     z = np.minimum(np.arange(40), 15) * 0.06
     assert (

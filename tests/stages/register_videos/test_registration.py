@@ -205,3 +205,12 @@ def test_what_was_not_measured_is_null(maps):
 def test_a_refusal_names_the_nearest_moment_of_the_walk():
     path = walk(30)
     assert pictures.nearest_frame(path, path[17] @ rigid.exp(np.array([0.02, 0, 0, 0.01, 0, 0]))) == 17
+
+
+def test_walking_tail_first_is_found():
+    ahead = np.tile(np.eye(4), (30, 1, 1))
+    ahead[:, 2, 3] = 0.06 * np.arange(30)
+    ahead[10] = np.nan
+    backwards = ahead @ rigid.exp(np.array([0, np.pi, 0, 0, 0, 0]))
+    assert (pictures.head_first(ahead), pictures.head_first(backwards)) == (1.0, 0.0)
+    assert pictures.head_first(ahead[:1].repeat(30, axis=0)) is None, "at rest"
