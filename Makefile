@@ -26,13 +26,14 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 # What ends in a command line or a path holds plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
-$(foreach name,AGENT NAME OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
+$(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
 # Where an agent's, its variant's, or in a home of several animals one's (NAME=) own things stand; what a variant does not
 # touch is its agent's (`INPUTS` knows).
 ANIMAL := $(or $(AGENT),cat)
 HOME_OF := build/$(ANIMAL)$(if $(VARIANT),/variants/$(VARIANT))$(if $(NAME),/animals/$(NAME))
 INPUTS = inputs=$$($(PLAN) inputs $(HOME_OF:build/%=%) $1)
+TOGETHER_INPUTS = inputs=$$($(PLAN) together $(HOME_OF:build/%=%) $1)
 # Called by a recipe, make shares the caller's jobs: as many at once as -j allows in all.
 NESTING := --no-print-directory NESTED=1
 
@@ -97,20 +98,22 @@ export: .venv/.ok
 	  $(BODY:%=--body build/%/simulator) --videos build/$(ANIMAL)$(if $(NAME),/animals/$(NAME))/plan/videos.json --out $(EXPORTED)
 	@echo '[$(HOME_OF)] written: $(EXPORTED); export.json lists what is lost'
 
-# The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live. In another build's
-# home (HOME=other): a take, and a page that begins from it.
+# The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live. In a home of several
+# animals all together, without one (ABSENT=) or with a recorded one (REPLAYED=); one alone with NAME=. In another build's home
+# (HOME=other): a take, and a page that begins from it.
 JOURNEY = $(if $(SUBGOALS)$(PLACES),longterm) $(if $(SUBGOALS)$(filter-out behavior,$(PLACES)),,behavior)
 export SUBGOALS
 ELSEWHERE = $(HOME_OF)/homes/$(OTHER)
 MOVED = reconstruction splats behavior behavior_data
+TOGETHER = $(if $(SUBGOALS)$(PLACES)$(OTHER),INPUTS,TOGETHER_INPUTS)
 simulate: .venv/.ok
 	@test -z "$$SUBGOALS" || test -f "$$SUBGOALS" || { { echo "error: SIM-004 $$SUBGOALS: there is no such file"; echo "  -> write it as docs/long_motion.md explains"; } >&2; exit 2; }
 	@$(if $(PLACES),$(PYTHON) -m stages.simulate --places '$(PLACES)' --help >/dev/null)
 	@$(if $(OTHER),$(PLAN) plan $(OTHER))
 	@$(MAKE) $(NESTING) $(JOURNEY:%=$(ANIMAL).%) $(if $(OTHER),$(ANIMAL).splats $(OTHER).splats $(OTHER).behavior_data)
-	@$(call INPUTS,$(JOURNEY) $(if $(filter longterm,$(JOURNEY)),reconstruction) behavior_data $(if $(OTHER),feature_basis scene_template)) && \
+	@$(call $(TOGETHER),$(JOURNEY) $(if $(filter longterm,$(JOURNEY)),reconstruction) behavior_data $(if $(OTHER),feature_basis scene_template)) && \
 	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals "$$SUBGOALS") $(if $(PLACES),--places '$(PLACES)') $(if $(OTHER),--home build/$(OTHER)) \
-	  --out $(if $(OTHER),$(ELSEWHERE),$(HOME_OF))/take
+	  $(if $(ABSENT),--absent $(ABSENT)) $(if $(REPLAYED),--replayed $(REPLAYED)) --out $(if $(OTHER),$(ELSEWHERE),$(HOME_OF))/take
 	@$(if $(OTHER),$(call INPUTS,$(MOVED)) && $(PYTHON) -m stages.export_simulator $$inputs --config $(HOME_OF)/plan/configs/simulator.json \
 	  --home build/$(OTHER) --take $(ELSEWHERE)/take --out $(ELSEWHERE)/simulator && echo '[$(HOME_OF)] open: $(ELSEWHERE)/simulator/index.html')
 

@@ -56,9 +56,9 @@ GOAL_CHANGE_M = 0.3
 class AnimalBatch:
     """Animals that live at once, each in the scene of its recording.
 
-    Those of one life perceive each other and keep clear of each other's bodies. Plans are drawn for all
-    animals that need one in one batch, and followed until they end, somebody who is perceived moves, or a
-    commanded goal changes. ``plans_drawn`` counts them.
+    Those of one life, and companions from outside of the batch, are perceived and kept clear of. Plans are
+    drawn for all animals that need one in one batch, and followed until they end, somebody who is perceived
+    moves, or a commanded goal changes. ``plans_drawn`` counts them.
     """
 
     def __init__(
@@ -76,14 +76,19 @@ class AnimalBatch:
         self.sampling, self.chaining = sampling, chaining
 
     def begin(
-        self, context: Context, rng: np.random.Generator, life: Int[np.ndarray, "animal"] | None = None
+        self,
+        context: Context,
+        rng: np.random.Generator,
+        life: Int[np.ndarray, "animal"] | None = None,
+        companions: Float[np.ndarray, "animal companion past_frame 4"] | None = None,
     ) -> None:
         """Continue from these windows, one animal per window; animals of the same ``life`` are together, and
-        each is alone where none is given.
+        each is alone where none is given. ``companions`` are those who are not of the batch, as in a
+        `Context`.
         """
         bones = channels_from_bones(context.agent_from_bone, self.rest)
         self.video = None if context.video is None else np.array(context.video)
-        self.rng, self.plans_drawn, self.life = rng, 0, life
+        self.rng, self.plans_drawn, self.life, self.companions = rng, 0, life, companions
         root, observer = np.array(context.world_from_agent, float), np.array(context.observer_world, float)
         count = root.shape[1]
         frames = (slice(frame, frame + 1) for frame in range(count))
@@ -111,11 +116,16 @@ class AnimalBatch:
         """Steer animals to goals (metres, world); rows of NaN leave an animal to its own goals."""
         self.goal_command = np.array(goal_world, float)
 
-    def step(self, observer: Float[np.ndarray, "animal 3"]) -> PoseFrames:
+    def step(
+        self,
+        observer: Float[np.ndarray, "animal 3"],
+        companions: Float[np.ndarray, "animal companion past_frame 4"] | None = None,
+    ) -> PoseFrames:
         """Let 0.1 s pass with the observers at these positions (metres, world), and return the frame that
-        comes of it.
+        comes of it. ``companions`` are where those from outside have been, as many as at the beginning.
         """
         self.observer.append(np.asarray(observer, float))
+        self.companions = companions
         due = np.flatnonzero(self._due())
         if len(due):
             self._follow(due)
@@ -143,22 +153,24 @@ class AnimalBatch:
 
     def _companions(
         self, some: Int[np.ndarray, "some"]
-    ) -> Float[np.ndarray, "some animal past_frame 4"] | None:
-        """Return past positions of all animals, NaN those that are not in the life of ``some``."""
+    ) -> Float[np.ndarray, "some companion past_frame 4"] | None:
+        """Return past positions and kinds of all but the observer, NaN those that are not in the life of
+        ``some``.
+        """
+        found = [] if self.companions is None else [self.companions[some]]
         together = self._together(some)
-        if together is None:
-            return None
-        root = np.concatenate([frame.root[..., :3, 3] for frame in self.past], axis=1)
-        beings = np.pad(root, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
-        return np.where(together[..., None, None], beings, np.nan)
+        if together is not None:
+            root = np.concatenate([frame.root[..., :3, 3] for frame in self.past], axis=1)
+            found.append(np.where(together[..., None, None], as_companions(root), np.nan))
+        return np.concatenate(found, axis=1) if found else None
 
     def _others_now(self) -> Float[np.ndarray, "animal other 3"]:
         """Return where the others are, the observer first; NaN those that are not there."""
-        observer, root = self.observer[-1][:, None], self.past[-1].root[:, 0, :3, 3]
-        together = self._together(np.arange(len(root)))
-        if together is None:
+        observer = self.observer[-1][:, None]
+        companions = self._companions(np.arange(len(observer)))
+        if companions is None:
             return observer
-        return np.concatenate([observer, np.where(together[..., None], root, np.nan)], axis=1)
+        return np.concatenate([observer, companions[:, :, -1, :3]], axis=1)
 
     def _due(self) -> Bool[np.ndarray, "animal"]:
         """Return whose plan ends, or was made before one of the others moved noticeably, where these are
@@ -304,13 +316,24 @@ class Simulator:
         ``observer``.
         """
         rng = np.random.default_rng(seed)
-        context, _ = self.data.windows(rng.choice(self.data.indices(TRAIN), 1))
+        return self.begin(rng.choice(self.data.indices(TRAIN), 1), rng, observer)
+
+    def begin(
+        self,
+        window: Int[np.ndarray, "1"],
+        rng: np.random.Generator,
+        observer: Float[np.ndarray, "3"] | None = None,
+        companions: Float[np.ndarray, "companion past_frame 4"] | None = None,
+    ) -> SimulatorState:
+        """Begin at this window, beside ``companions`` where there are others."""
+        context, _ = self.data.windows(window)
         seen = (
             context.observer_world
             if observer is None
             else np.tile(np.asarray(observer, float), (1, self.data.past, 1))
         )
-        self.flock.begin(replace(context, observer_world=seen, observer_rotation=None), rng)
+        context = replace(context, observer_world=seen, observer_rotation=None)
+        self.flock.begin(context, rng, companions=None if companions is None else companions[None])
         self.frame = 0
         return self._state(self.flock.past[-1])
 
@@ -320,9 +343,19 @@ class Simulator:
         assert self.flock.video is not None, "windows of recordings name them"
         return self.data.trajectories[self.data.videos[self.flock.video[0]]]
 
-    def step(self, observer: Float[np.ndarray, "3"]) -> SimulatorState:
-        """Let 0.1 s pass with the observer at this position (metres, world)."""
-        now = self.flock.step(np.asarray(observer, float)[None])
+    @property
+    def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
+        """Return where the animal has been, now last; metres."""
+        return np.stack([frame.root[0, 0, :3, 3] for frame in self.flock.past])
+
+    def step(
+        self,
+        observer: Float[np.ndarray, "3"],
+        companions: Float[np.ndarray, "companion past_frame 4"] | None = None,
+    ) -> SimulatorState:
+        """Let 0.1 s pass with the observer at this position (metres, world), and ``companions`` there."""
+        others = None if companions is None else companions[None]
+        now = self.flock.step(np.asarray(observer, float)[None], others)
         self.frame += 1
         return self._state(now)
 
@@ -335,6 +368,13 @@ class Simulator:
             self.flock.goal[0].copy(),
             float(self.flock.blocked[0]),
         )
+
+
+def as_companions(
+    positions_world: Float[np.ndarray, "animal past_frame 3"],
+) -> Float[np.ndarray, "animal past_frame 4"]:
+    """Return animals as others perceive them: positions and kind."""
+    return np.pad(positions_world, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
 
 
 def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:

@@ -162,7 +162,7 @@ class Task:
 
     def per_animal(self, name: str, artifact: str, animals: Sequence[str]) -> dict[str, Path]:
         """Return the folder of `artifact` of every one of these animals of the home, by the animal's name."""
-        folder = self.input(name)
+        folder = self.paths[name]
         return {
             animal: self._opened(folder / animal / artifact, f"{animal}/{artifact}") for animal in animals
         }
@@ -332,6 +332,8 @@ def _add_option(parser: argparse.ArgumentParser, name: str, hint: Any) -> None:
     option, text = f"--{name.replace('_', '-')}", f"the setting `{name}`"
     if hint is bool:
         parser.add_argument(option, dest=name, action="store_true", default=None, help=text)
+    elif typing.get_origin(hint) is tuple:
+        parser.add_argument(option, dest=name, nargs="+", metavar="NAME", help=text)
     elif typing.get_origin(hint) is typing.Literal:
         parser.add_argument(option, dest=name, choices=typing.get_args(hint), help=text)
     else:

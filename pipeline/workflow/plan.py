@@ -3,7 +3,8 @@ read.
 
     python -SE -m pipeline.workflow.plan plan HOME...
     python -SE -m pipeline.workflow.plan redo HOME ARTIFACT        have one artifact made again
-    python -SE -m pipeline.workflow.plan inputs HOME ARTIFACT...   options that name artifacts to a stage
+    python -SE -m pipeline.workflow.plan inputs HOME ARTIFACT...   options that name artifacts to a stage;
+        `together` in place of `inputs`: in a home of several animals the folder of all
     python -SE -m pipeline.workflow.plan new AGENT [TAKEN...]      recipe and capture folder of a new animal
 
 HOME is an agent, <agent>/variants/<name>, or <agent>/tables; TAKEN are names that no animal may have.
@@ -159,16 +160,23 @@ def mark_redo(home: Home, name: str) -> None:
         Path(job["stamp"]).unlink(missing_ok=True)
 
 
-def inputs(home: Home, names: Sequence[str]) -> str:
-    """Return `--name path` of finished artifacts, each where a variant or the agent it stands on has it."""
+def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
+    """Return `--name path` of finished artifacts, each where a variant or the agent it stands on has it; in a
+    home of several animals ``together`` gives `--animals` instead. Raises REC-007, REC-008.
+    """
+    animals = [str(each.animal) for each in _animal_homes(home.base)]
+    if home.animal and home.animal not in animals:
+        raise InputError("REC-007", "no such animal", str(home), f"animals: {', '.join(animals) or 'one'}")
     known = {job["artifact"]: Path(job["out"]) for job in json.loads((home.plan / "dag.json").read_text())}
     unknown = [name for name in names if name not in known]
     if unknown:
         raise InputError(
             "REC-007", f"no artifact {unknown[0]!r}", str(home), f"artifacts: {', '.join(known)}"
         )
-    animals = [each.animal for each in _animal_homes(home)] if not home.animal else []
-    if any(known[name].is_relative_to(home.folder / "animals") for name in names if animals):
+    own = home.folder / "animals"
+    if not home.animal and any(known[name].is_relative_to(own) for name in names):
+        if together:
+            return f"--animals {own}"
         what, each = f"{home} is a home of several animals", f"one of them: NAME={animals[0]}"
         raise InputError("REC-008", what, ", ".join(names), each)
     several = {name for name in names if dag.NODES[name].roles}
@@ -234,12 +242,13 @@ def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) 
             f"\t@$(MAKE) $(NESTING) {name}.{node}",
         ]
     if not home.tables:
-        pages = [
+        shown = [
             f"{each.home_of(node).folder}/{node}/index.html"
             for each in plan.animals or (plan,)
-            for node in ("report", "simulator")
+            for node in ("home_simulator", "report", "simulator")
             if node in stamped
         ]
+        pages = list(dict.fromkeys(shown))
         lines += [
             f".PHONY: {name}",
             f"{name}: {' '.join(job.stamp for job in all_jobs if not dag.NODES[job.artifact].on_demand)}",
@@ -298,17 +307,7 @@ def _written_marks(home: Home) -> str:
     found = []
     animals = (each.plan for each in _animal_homes(home.base))
     for plan in dict.fromkeys((home.base.plan, home.plan, *animals)):
-        names = (
-            "dag.json",
-            "rules.mk",
-            "videos.json",
-            "ids.json",
-            "cache.json",
-            "jobs",
-            "keys",
-            "configs",
-            "redo",
-        )
+        names = "dag.json rules.mk videos.json ids.json cache.json jobs keys configs redo".split()
         paths = [plan / name for name in names]
         found += [[str(path), path.stat().st_mtime_ns] for path in paths if path.exists()]
     return artifact.digest_of(found)
@@ -378,8 +377,8 @@ def main(arguments: list[str]) -> int:
                         _plan(home, cache)
                 case ["redo", home, name]:
                     mark_redo(Home.parse(home), name)
-                case ["inputs", home, *names]:
-                    print(inputs(Home.parse(home), names))
+                case ["inputs" | "together" as kind, home, *names]:
+                    print(inputs(Home.parse(home), names, together=kind == "together"))
                 case ["new", name, *taken]:
                     new_agent(name, taken)
                 case _:

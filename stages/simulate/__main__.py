@@ -2,10 +2,11 @@
 take.
 
 With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`. In Python:
-`Simulator.reset(seed)` and `Simulator.step(observer)` of `pipeline.behavior.simulator`. With `--serve`: live
-in a browser, computed here; kept too. With `--longterm` and `--subgoals FILE` (see
+`Simulator.reset(seed)` and `Simulator.step(observer)` of `pipeline.behavior.simulator`. With `--animals`: all
+animals of a home together, each with a take in a folder of its name, and `from_above.jpg`. With `--serve`:
+live in a browser, computed here; kept too. With `--longterm` and `--subgoals FILE` (see
 `stages.simulate.subgoal_file`) or `--places`, or a recording that `--config` names: writes `take.npz` at 30
-fps, `take.glb`, `take.json` and `frames/`. Both in the space of `--behavior-data`.
+fps, `take.glb`, `take.json` and `frames/`. All in the space of `--behavior-data`.
 """
 
 from pipeline.workflow import cli
@@ -14,5 +15,5 @@ from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 
 if __name__ == "__main__":
-    options = ("serve", "port", "seed", "seconds", "places")
+    options = ("serve", "port", "seed", "seconds", "places", "absent", "replayed")
     cli.main(__doc__, stage.run, Inputs, Config, options=options)

@@ -39,6 +39,10 @@ class Config:
     """Take the reconstructed motion of this session, its longest stretch, instead."""
     pictures_per_s: float = 10.0
     """Pictures per second of long-term motion; 0: none."""
+    absent: tuple[str, ...] = ()
+    """Animals of the home that are left out, with `--animals`."""
+    replayed: tuple[str, ...] = ()
+    """Animals in whose place a recorded clip of them is played, with `--animals`."""
     seed: int = 0
     """Seed of the beginning and of all noise."""
     serve: bool = False

@@ -8,7 +8,7 @@ from pathlib import Path
 class Inputs:
     """Finished artifacts; which ones are needed depends on the take."""
 
-    behavior_data: Path
+    behavior_data: Path | None = None
     """Trajectories and scenes."""
     behavior: Path | None = None
     """The behaviour model."""
@@ -18,6 +18,8 @@ class Inputs:
     """The model of long-term motion."""
     reconstruction: Path | None = None
     """The room's surface and the animal's body."""
+    animals: Path | None = None
+    """Folder of the animals of a home, each with its artifacts in a folder of its name: all live together."""
     home: Path | None = None
     """Folder of another finished build, in whose home the animal is to live."""
     feature_basis: Path | None = None

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import Simulator
-from pipeline.behavior.trajectories import TRAIN, BehaviorData
+from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
 from pipeline.core import progress
 from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.data import glb, npz, ply
@@ -32,6 +33,7 @@ from stages.simulate.inputs import Inputs
 from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import UNKNOWN_OBSERVER_M, Observer, scripted
 from stages.simulate.rollout import rollout, write_take
+from stages.simulate.shared_home import HomeAnimal, ReplayedAnimal, SharedHome, rollout_of_all, write_takes
 
 MOVED_M = 0.25
 """A sub-goal that is met further off than this counts as moved."""
@@ -58,7 +60,7 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     data = BehaviorData.load(_required(inputs, "behavior_data"))
     if inputs.home is not None:
         return _elsewhere(inputs, inputs.home, data, c, device)
-    scenes = Scenes.load(inputs.behavior_data, data.videos)
+    scenes = Scenes.load(_required(inputs, "behavior_data"), data.videos)
     simulator = _simulator(inputs, data, scenes, c, ReplanningConfig(), device)
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
     summary = (
@@ -114,6 +116,42 @@ def _elsewhere(inputs: Inputs, home: Path, data: BehaviorData, c: Config, device
     return FinishedTake(summary, write)
 
 
+def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTake:
+    """Let all animals of a home live together. Raises InputError SIM-013 for names that it does not have, or
+    where nobody is left, ART-003 where an animal has no model or no windows.
+    """
+    known = sorted(path.name for path in animals.iterdir() if path.is_dir())
+    unknown = sorted({*c.absent, *c.replayed} - set(known))
+    names = [name for name in known if name not in c.absent]
+    if unknown or not names:
+        what = f"there is no animal {unknown[0]!r}" if unknown else "nobody is left"
+        raise InputError("SIM-013", what, str(animals), f"known: {', '.join(known)}")
+    living: dict[str, HomeAnimal] = {}
+    for name in names:
+        needed = ("reconstruction", "behavior_data", *(() if name in c.replayed else ("behavior",)))
+        for artifact in needed:
+            if not (animals / name / artifact / "manifest.json").is_file():
+                remedy = f"make it: make <agent>.{artifact}; or leave {name} out"
+                raise InputError("ART-003", f"{name} has no {artifact}", str(animals), remedy)
+        data = BehaviorData.load(animals / name / "behavior_data")
+        if name in c.replayed:
+            living[name] = ReplayedAnimal(data)
+            continue
+        scenes = Scenes.load(animals / name / "behavior_data", data.videos)
+        own = replace(inputs, behavior=animals / name / "behavior")
+        living[name] = _simulator(own, data, scenes, c, ReplanningConfig(), device)
+    home = SharedHome(living)
+    begun = home.reset(c.seed)[names[0]].world_from_agent[:3, 3]
+    takes = rollout_of_all(home, _recorded_person(home.recording, begun, c), seconds=c.seconds, seed=c.seed)
+    apart = np.linalg.norm(
+        takes[names[0]].world_from_agent[:, :3, 3] - takes[names[-1]].world_from_agent[:, :3, 3], axis=-1
+    )
+    scene = ply.read_ply(animals / names[0] / "reconstruction/scene.ply")
+    summary = f"{c.seconds:g} s of {', '.join(names)}"
+    summary += f", {apart.min():.2f} m apart at least" if len(names) == 2 else ""
+    return FinishedTake(summary, lambda folder: write_takes(folder, takes, scene))
+
+
 def of_recording(inputs: Inputs, c: Config, recording: str) -> FinishedTake:
     """Make reconstructed motion physical: the longest stretch of a session, at most as long as a take."""
     data = BehaviorData.load(_required(inputs, "behavior_data"))
@@ -142,7 +180,7 @@ def of_recording(inputs: Inputs, c: Config, recording: str) -> FinishedTake:
 def live(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     """Let the animal live in a browser until interrupted."""
     data, shown = BehaviorData.load(_required(inputs, "behavior_data")), _required(inputs, "simulator")
-    scenes = Scenes.load(inputs.behavior_data, data.videos)
+    scenes = Scenes.load(_required(inputs, "behavior_data"), data.videos)
     simulator = _simulator(inputs, data, scenes, c, ReplanningConfig(), device)
     with other_versions_refused("simulator", str(shown)):
         mesh, skin, _ = glb.read_skinned((shown / "agent.glb").read_bytes())
@@ -161,7 +199,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
     if written is not None:
         subgoals = written
     elif c.places == "behavior":
-        scenes = Scenes.load(inputs.behavior_data, data.videos)
+        scenes = Scenes.load(_required(inputs, "behavior_data"), data.videos)
         simulator = _simulator(inputs, data, scenes, c, UNINTERRUPTED, device)
         drawn = chained_goals(simulator, _observer(simulator, c), c.place_count, c.seed)
         subgoals = move_into_scene(drawn, world.scene, world.model.motion_prior)
@@ -228,7 +266,10 @@ def _observer(simulator: Simulator, c: Config) -> Observer:
     nobody is known of.
     """
     begin = simulator.reset(c.seed).world_from_agent[:3, 3]
-    track = simulator.recording
+    return _recorded_person(simulator.recording, begin, c)
+
+
+def _recorded_person(track: Trajectory, begin: Float[np.ndarray, "3"], c: Config) -> Observer:
     seen, been = (poses[track.valid, :3, 3] for poses in (track.world_from_camera, track.world_from_agent))
     known = seen[np.linalg.norm(seen - been, axis=-1) < UNKNOWN_OBSERVER_M]
     center = np.median(known, axis=0) if len(known) else begin + DEFAULT_OBSERVER_OFFSET_M

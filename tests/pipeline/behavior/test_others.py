@@ -12,7 +12,7 @@ from pipeline.behavior.encoders import OthersEncoder
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.planning import Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.simulator import AnimalBatch, as_companions
 from pipeline.behavior.trajectories import ABSENT_M, KINDS, MOST_COMPANIONS, PAST, BehaviorData, nearest
 from stages.train_behavior.objective import with_some_absent
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
@@ -175,3 +175,34 @@ def test_animals_of_one_life_perceive_each_other_and_keep_clear(sampler):
     for _ in range(60):
         flock.step(far)
     assert flock.plans_drawn > 4
+
+
+def test_companions_from_outside_of_the_batch_are_perceived_and_kept_clear_of(sampler):
+    volume = room()
+    scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
+    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
+    flock = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    context, _ = wandering().windows(np.array([0]))
+    context = replace(context, video=None, observer_world=np.full((1, PAST, 3), ABSENT_M))
+    here, far = context.world_from_agent[:, -1, :3, 3], np.full((1, 3), ABSENT_M)
+
+    def standing(place):
+        return as_companions(np.repeat(place[:, None], PAST, 1))[None]
+
+    plans = {}
+    for name, beside in {"alone": None, "far": standing(far), "near": standing(here + 0.6)}.items():
+        flock.begin(context, np.random.default_rng(0), companions=beside)
+        plans[name] = flock.plan.root.copy()
+    np.testing.assert_allclose(plans["alone"], plans["far"], atol=1e-4)
+    assert np.abs(plans["alone"] - plans["near"]).max() > 1e-2, "metres"
+    obstacle = here + np.array([[0.5, 0.0, 0.0]])
+    flock.begin(context, np.random.default_rng(0), companions=standing(obstacle))
+    lives = np.stack([flock.step(far, standing(obstacle)).root[0, 0, :3, 3] for _ in range(60)])
+    assert np.linalg.norm((lives - obstacle)[:, [0, 2]], axis=-1).min() > 0.36, "metres: a body's 0.4"
+    drawn = []
+    for moved_m in (0.0, 1.0):
+        flock.begin(context, np.random.default_rng(0), companions=standing(obstacle))
+        for _ in range(20):
+            flock.step(far, standing(obstacle + np.array([moved_m, 0.0, 0.0])))
+        drawn.append(flock.plans_drawn)
+    assert drawn == [1, 2], "who has moved is planned for anew"

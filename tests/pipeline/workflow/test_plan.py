@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import pytest
 
@@ -132,6 +133,13 @@ def test_animals_of_one_home_share_what_shows_none_of_them(house):
     assert contents[0] != contents[1]
     again = house.make("-j2", "toy.behavior_data")
     assert "begins" not in again.stderr, "nothing changed"
+    asked = ("behavior", "behavior_data")
+    together = house.python("pipeline.workflow.plan", "together", "toy", *asked)
+    assert together.stdout == "--animals build/toy/animals\n"
+    one = house.python("pipeline.workflow.plan", "together", "toy/animals/cat", *asked).stdout
+    assert one.startswith("--behavior build/toy/animals/cat/behavior ")
+    for home, code in (("toy", "REC-008"), ("toy/animals/bird", "REC-007.*bird: no such animal\n.*cat, dog")):
+        assert re.search(code, house.python("pipeline.workflow.plan", "inputs", home, *asked).stderr), code
     refused = house.python("pipeline.workflow.plan", "plan", "toy/variants/other")
     assert refused.returncode == 2
     assert "REC-008" in refused.stderr

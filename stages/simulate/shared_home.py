@@ -1,0 +1,204 @@
+"""Several animals in one home beside one person: each has networks and a body of its own, perceives the
+others as companions and keeps clear of them. One may be a recorded clip instead, which the others perceive.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.behavior.avoidance import BODY_M
+from pipeline.behavior.simulator import SimulatorState, as_companions
+from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Trajectory
+from pipeline.data import images
+from pipeline.geometry import views
+from pipeline.geometry.meshes import Mesh
+from stages.simulate.observers import Observer
+from stages.simulate.rollout import Take, take_of, write_take
+
+Companions = Float[np.ndarray, "companion past_frame 4"] | None
+"""Past world positions and kinds of others, metres; None where there are none"""
+PERSON_RGB = (47, 111, 159)
+COLORS = [(200, 114, 43), (76, 128, 103), (140, 86, 160), (190, 60, 70), (90, 90, 90)] * 3
+"""Of animals in order."""
+RING_M, ANGLES = 0.1, np.linspace(0, 2 * np.pi, 25)
+PALE = 0.45
+"""Share of the room's colors that is left under what is drawn over it."""
+
+
+class HomeAnimal(Protocol):
+    """What `Simulator` and `ReplayedAnimal` have in common."""
+
+    data: BehaviorData
+
+    def begin(
+        self,
+        window: Int[np.ndarray, "1"],
+        rng: np.random.Generator,
+        observer: Float[np.ndarray, "3"] | None = None,
+        companions: Companions = None,
+    ) -> SimulatorState:
+        """Begin at a window of ``data``."""
+        ...
+
+    def step(self, observer: Float[np.ndarray, "3"], companions: Companions = None) -> SimulatorState:
+        """Let 0.1 s pass."""
+        ...
+
+    @property
+    def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
+        """Return where it has been, now last; metres."""
+        ...
+
+
+class ReplayedAnimal:
+    """A recorded animal in the place of a simulated one: it goes on from its window to the end of the
+    unbroken stretch of its recording, which is then played again from its beginning.
+    """
+
+    def __init__(self, data: BehaviorData):
+        self.data = data
+
+    def begin(
+        self,
+        window: Int[np.ndarray, "1"],
+        rng: np.random.Generator,
+        observer: Float[np.ndarray, "3"] | None = None,
+        companions: Companions = None,
+    ) -> SimulatorState:
+        """Begin at a window; nobody changes what was recorded."""
+        self.track, start = recorded_at(self.data, window)
+        broken = np.flatnonzero(~self.track.valid)
+        first, last = (
+            int(broken[broken < start].max(initial=-1)) + 1,
+            int(broken[broken > start].min(initial=len(self.track.valid))),
+        )
+        self.frames, self.now, self.time = np.arange(first, last), start - first + self.data.past - 1, 0
+        return self._state()
+
+    def step(self, observer: Float[np.ndarray, "3"], companions: Companions = None) -> SimulatorState:
+        """Let 0.1 s pass."""
+        self.now, self.time = self.now + 1, self.time + 1
+        return self._state()
+
+    @property
+    def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
+        """Return where it has been, now last; metres."""
+        past = np.arange(self.now - self.data.past + 1, self.now + 1) % len(self.frames)
+        return self.track.world_from_agent[self.frames[past], :3, 3]
+
+    def _state(self) -> SimulatorState:
+        frame, roots = self.frames[self.now % len(self.frames)], self.track.world_from_agent
+        bones = self.track.agent_from_bone[frame].astype(np.float64)
+        return SimulatorState(
+            self.time / self.data.rate_hz, roots[frame], bones, roots[self.frames[-1], :3, 3], 0.0
+        )
+
+
+class SharedHome:
+    """A simulator of all animals of a home, by name; the action is the person's position in the world."""
+
+    def __init__(self, animals: Mapping[str, HomeAnimal]):
+        self.animals = animals
+
+    def reset(self, seed: int) -> dict[str, SimulatorState]:
+        """Begin at a random training window of the first animal; the others where they were at that time or,
+        where that is not known, at a recorded moment near it, apart from each other's bodies.
+        """
+        rng = np.random.default_rng(seed)
+        first, *others = self.animals.values()
+        windows = [rng.choice(first.data.indices(TRAIN), 1)]
+        self.recording, _ = recorded_at(first.data, windows[0])
+        for other in others:
+            before = zip(self.animals.values(), windows, strict=False)
+            placed = np.stack([_past_world(animal.data, window)[-1] for animal, window in before])
+            windows.append(_nearest_window(other.data, first.data, windows[0], placed))
+        begun = list(zip(self.animals.items(), windows, strict=True))
+        past = {name: _past_world(animal.data, window) for (name, animal), window in begun}
+        return {
+            name: animal.begin(window, each, companions=_companions_of(name, past))
+            for ((name, animal), window), each in zip(begun, rng.spawn(len(begun)), strict=True)
+        }
+
+    def step(self, observer: Float[np.ndarray, "3"]) -> dict[str, SimulatorState]:
+        """Let 0.1 s pass for all with the person at this position (metres, world)."""
+        past = {name: animal.past_world for name, animal in self.animals.items()}
+        return {name: each.step(observer, _companions_of(name, past)) for name, each in self.animals.items()}
+
+
+def recorded_at(data: BehaviorData, window: Int[np.ndarray, "1"]) -> tuple[Trajectory, int]:
+    """Return the recording of a window and the window's first frame in it."""
+    return data.trajectories[data.videos[int(data.video[window[0]])]], int(data.start[window[0]])
+
+
+def _past_world(data: BehaviorData, window: Int[np.ndarray, "1"]) -> Float[np.ndarray, "past_frame 3"]:
+    track, start = recorded_at(data, window)
+    return track.world_from_agent[start : start + data.past, :3, 3]
+
+
+def _companions_of(name: str, past: Mapping[str, Float[np.ndarray, "past_frame 3"]]) -> Companions:
+    others = [past[other] for other in past if other != name]
+    return as_companions(np.stack(others)) if others else None
+
+
+def _nearest_window(
+    data: BehaviorData,
+    leading: BehaviorData,
+    window: Int[np.ndarray, "1"],
+    placed: Float[np.ndarray, "animal 3"],
+) -> Int[np.ndarray, "1"]:
+    """Return the training window nearest in time to that of another animal, in the same recording if there is
+    one, in which the animal is not inside of those that are ``placed`` (metres, world).
+    """
+    (track, start), known = recorded_at(leading, window), data.indices(TRAIN)
+    same, time_s = leading.videos[int(leading.video[window[0]])], track.timestamp_s[start]
+    names = [data.videos[video] for video in data.video[known]]
+    begins = [
+        data.trajectories[name].timestamp_s[begin] - time_s
+        for name, begin in zip(names, data.start[known], strict=True)
+    ]
+    order = np.lexsort((np.abs(begins), np.array(names) != same))
+    for each in known[order]:
+        place = _past_world(data, each[None])[-1]
+        if (np.linalg.norm((placed - place)[:, [0, 2]], axis=-1) >= BODY_M).all():
+            return each[None]
+    return known[order[:1]]
+
+
+def rollout_of_all(home: SharedHome, observer: Observer, *, seconds: float, seed: int) -> dict[str, Take]:
+    """Let all animals live for some seconds beside an observer, who turns to the nearest of them."""
+    states = {name: [state] for name, state in home.reset(seed).items()}
+    first = next(iter(states.values()))[0]
+    seen = [observer(0.0, first.world_from_agent[:3, 3])]
+    for _ in range(round(seconds * RATE_HZ)):
+        places = np.stack([past[-1].world_from_agent[:3, 3] for past in states.values()])
+        nearest = places[np.linalg.norm(places - seen[-1], axis=-1).argmin()]
+        seen.append(observer(first.time_s + (len(seen) - 1) / RATE_HZ, nearest))
+        for name, state in home.step(seen[-1]).items():
+            states[name].append(state)
+    return {name: take_of(past, seen) for name, past in states.items()}
+
+
+def write_takes(folder: Path, takes: Mapping[str, Take], scene: Mesh) -> None:
+    """Write a take per animal into a folder of its name, and `from_above.jpg`: the room with the tracks of
+    all, each with its name where it begins, and of the person (blue).
+    """
+    first = next(iter(takes.values()))
+    lowest = min(float(take.world_from_agent[:, 1, 3].min()) for take in takes.values())
+    room = views.bird_view(scene, floor_m=lowest)
+    room.image[:] = np.round(PALE * room.image + (1 - PALE) * views.BACKGROUND)
+    tracks = {"person": first.observer_world}
+    tracks |= {name: take.world_from_agent[:, :3, 3] for name, take in takes.items()}
+    for (name, track), color in zip(tracks.items(), [PERSON_RGB, *COLORS], strict=False):
+        room.draw(track, color)
+        ring = track[0] + RING_M * np.stack([np.cos(ANGLES), 0 * ANGLES, np.sin(ANGLES)], axis=-1)
+        room.draw(ring, color, 3)
+        label_px = tuple(np.round(room.pixel(ring[:1])[0]).astype(int).tolist())
+        cv2.putText(room.image, f" {name}", label_px, cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, 1, cv2.LINE_AA)
+    for name, take in takes.items():
+        (folder / name).mkdir()
+        write_take(folder / name, take)
+    images.write_color(folder / "from_above.jpg", room.image)
