@@ -343,16 +343,13 @@ class Compositor:
         shine = (
             0.45 + 0.4 * (0.5 + 0.5 * normals[:, 1:2]) + 0.25 * np.clip(normals[:, :1], 0, 1)
         ) * self._light
-        anatomy, balls = self.creature.anatomy, []
-        for bone, rest, radius in anatomy.balls():
+        anatomy = self.creature.anatomy
+        balls = np.zeros((len(anatomy.balls()), 4))
+        for row, (bone, rest, radius) in enumerate(anatomy.balls()):
             local = np.asarray(rest) - anatomy.heads[animal.INDEX[bone]]
-            balls.append([*rigid.apply(camera_from_bone[animal.INDEX[bone]], local[None])[0], radius])
+            balls[row] = *rigid.apply(camera_from_bone[animal.INDEX[bone]], local[None])[0], radius
         coat = shade.Coat(
-            self.creature.faces,
-            self.creature.vertices,
-            shine.astype(np.float32),
-            self.creature.fur,
-            np.array(balls),
+            self.creature.faces, self.creature.vertices, shine.astype(np.float32), self.creature.fur, balls
         )
         fur = shade.shade(view.face, view.inverse_corners, focal, _EMPTY, coat, camera_from_world)
         own = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, focal, height, width)
