@@ -188,16 +188,16 @@ def _chosen(
     rng: np.random.Generator,
 ) -> tuple[Example, tuple[int, int]]:
     """Choose an example and the middle (row, column) of a crop: a mistake, near the animal, or any."""
-    height, width = examples[0].labels.shape
     if mistakes is not None and rng.random() < MINED:
         total = np.array([weight.sum(dtype=np.int64) for weight in mistakes])
         if total.any():
             index = int(rng.choice(len(mistakes), p=total / total.sum()))
             heaped = np.cumsum(mistakes[index], dtype=np.int64)
             return examples[2 * index], divmod(
-                int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right")), width
+                int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right")), mistakes[index].shape[1]
             )
     example = examples[int(rng.integers(len(examples)))]
+    height, width = example.labels.shape
     if rng.random() >= AT_ANIMAL or not (example.labels == 255).any():
         return example, (int(rng.integers(height)), int(rng.integers(width)))
     inside = np.flatnonzero(example.labels == 255)

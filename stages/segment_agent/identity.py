@@ -19,10 +19,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from pipeline.data import npz
 from stages.segment_agent.appearance import GAIN, RATE, WEIGHT_DECAY, Appearance, aligned, normalized
 from stages.segment_agent.identities.config import Config
 
-FILE = "identities.safetensors"
+FILE, PORTRAITS = "identities.safetensors", "portraits.npz"
 NOBODY = 0
 """class of pixels that show no animal; the animals follow in the order of their names"""
 IGNORED = -1
@@ -34,15 +35,19 @@ PASTED = 0.6
 """share of crops over which another animal is pasted"""
 SCALES = (0.35, 1.4)
 """how much smaller or larger than in its turnaround an animal is shown"""
-TINT, CONTRAST, BRIGHTNESS = 0.08, 0.25, 0.2
-"""standard deviations of changed white balance (share, per channel), contrast (share) and exposure (of
--1..1) of crops"""
+TINT, EXPOSURE, CONTRAST, BRIGHTNESS = 0.08, 0.4, 0.25, 0.2
+"""standard deviations of changed white balance (share, per channel), exposure (log), contrast (share) and
+brightness (of -1..1) of crops: sessions are filmed in other light than turnarounds"""
+GRAIN = 0.15
+"""largest standard deviation of the noise of crops (of -1..1), that of an evening"""
 WHOLE = 0.85
 """mean probability from which on all that moves together is one animal"""
 REACH = (0.15, 0.85)
 """where in a crop a pixel of its animal lies, shares of its side"""
 SEEDS = 2**31
 """seeds of the first weights"""
+AROUND_PX = 80
+"""of a portrait that is kept around its animal"""
 BLUR_PX = 0.4
 """standard deviation of the blur of what is shown smaller, pixels of the crop: thin stripes would alias"""
 SMOOTHED_SHARE = 0.08
@@ -61,6 +66,34 @@ class Portrait:
         """Return the class of each pixel."""
         found = np.where(self.labels == 255, self.animal + 1, NOBODY)
         return np.where(self.labels == 128, IGNORED, found)
+
+
+def save_portraits(folder: Path, portraits: Sequence[Portrait]) -> None:
+    """Write `portraits.npz`: each cut out with its surroundings."""
+    cut = [_cut(each) for each in portraits]
+    rows = {
+        f"{row:03d}/{part}": getattr(each, part)
+        for row, each in enumerate(cut)
+        for part in ("color", "labels")
+    }
+    npz.save(folder / PORTRAITS, compress=True, animal=np.array([each.animal for each in cut]), **rows)
+
+
+def load_portraits(folder: Path) -> list[Portrait]:
+    """Read what `save_portraits` wrote."""
+    table = npz.load(folder / PORTRAITS)
+    return [
+        Portrait(int(animal), table[f"{row:03d}/color"], table[f"{row:03d}/labels"])
+        for row, animal in enumerate(table["animal"])
+    ]
+
+
+def _cut(portrait: Portrait) -> Portrait:
+    rows, columns = np.nonzero(portrait.labels == 255)
+    part = tuple(
+        slice(max(int(at.min()) - AROUND_PX, 0), int(at.max()) + AROUND_PX) for at in (rows, columns)
+    )
+    return Portrait(portrait.animal, portrait.color[part], portrait.labels[part])
 
 
 class Identities(Appearance):
@@ -200,10 +233,13 @@ def _crop(
         color, classes = np.where(front[..., None], above, color), np.where(front, whose, classes)
     if rng.random() < 0.5:
         color, classes = color[:, ::-1], classes[:, ::-1]
-    tint = torch.from_numpy(1 + TINT * rng.normal(size=(3, 1, 1))).float()
-    shown = (normalized(color) + 1) * tint - 1
+    tint = np.exp(EXPOSURE * rng.normal()) * (1 + TINT * rng.normal(size=(3, 1, 1)))
+    shown = (normalized(color) + 1) * torch.from_numpy(tint).float() - 1
     shown = shown * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
-    return shown.float(), torch.from_numpy(np.ascontiguousarray(classes)).long()
+    grain = rng.uniform(0, GRAIN) * rng.standard_normal(shown.shape, np.float32)
+    return (shown + torch.from_numpy(grain)).clamp(-1, 1).float(), torch.from_numpy(
+        np.ascontiguousarray(classes)
+    ).long()
 
 
 def _square(

@@ -1,7 +1,7 @@
 """Masks of one recording from its pictures alone: the steps of this stage in order."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, assert_never
 
@@ -19,7 +19,7 @@ from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import either, judge_motion
 from stages.segment_agent.follow import Footage, follow
 from stages.segment_agent.free_space import References
-from stages.segment_agent.locate import find_mover
+from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.movers import Hint
 from stages.segment_agent.painting import Mask, Painter, learn_palette
 from stages.segment_agent.prompt import Prompt
@@ -146,11 +146,25 @@ def _has_depth(clip: Clip) -> bool:
     )
 
 
+@dataclass(frozen=True)
+class Known:
+    """What other recordings showed of an animal."""
+
+    examples: Sequence[Example]
+    """pictures of it"""
+    recognized: AppearanceOf
+    """log-odds of its appearance there; near where it is tracked, what is recognized is not taken for room"""
+
+
 def learn_appearance(
-    painter: Painter, references: References, config: Config, rng: np.random.Generator
+    painter: Painter,
+    references: References,
+    config: Config,
+    rng: np.random.Generator,
+    known: Known | None = None,
 ) -> Appearance | None:
     """Learn the animal's appearance from first masks of frames spread over the recording, and the room's from
-    the others.
+    the others; from what other recordings showed of it too, where that is known.
 
     None where the animal is never seen, or not learned well enough to judge.
     """
@@ -158,16 +172,20 @@ def learn_appearance(
     if not len(seen):
         return None
     chosen = seen[np.unique(np.linspace(0, len(seen) - 1, config.learning.examples).round().astype(int))]
-    shown = [
-        Example(working_picture(painter.clip, frame, painter.height_px), painter.working_mask(frame).labels)
-        for frame in chosen.tolist()
-    ]
+    shown = []
+    for frame in chosen.tolist():
+        labels = painter.working_mask(frame).labels
+        if known is not None:
+            unsure = (labels == 0) & _beside(painter, frame, labels.shape) & (known.recognized(frame) > 0)
+            labels = np.where(unsure, np.uint8(128), labels)
+        shown.append(Example(painter.working_picture(frame), labels))
     empty = [frame for frame, ball in enumerate(painter.balls) if not _certain(ball)]
     room = [
         Example(working_picture(painter.clip, frame, painter.height_px), _still(painter, references, frame))
         for frame in empty[:: max(1, -(-len(empty) * EMPTY_SHARE // len(shown)))]
     ]
-    network = learn(shown, config.learning, rng, room=room)
+    elsewhere = () if known is None else known.examples
+    network = learn([*shown, *elsewhere], config.learning, rng, room=room)
     return (
         network if network is not None and _knows(network, shown[:: max(1, len(shown) // PROBES)]) else None
     )
@@ -208,13 +226,17 @@ def hidden(painter: Painter, frame: int, network: Appearance) -> Bool[np.ndarray
     """Mark where the animal, by its appearance and with a rim, hides the room: near where it was seen to
     move, if it was.
     """
-    color = working_picture(painter.clip, frame, painter.height_px)
+    color = painter.working_picture(frame)
     like, ball = network.log_odds(color) > 0, painter.balls[frame]
     if ball is not None and not ball.presumed:
-        rows, columns = rectangle(
-            painter.clip, frame, painter.world_from_camera[frame], ball, color.shape[:2]
-        )
-        beside = np.ones_like(like)
-        beside[rows, columns] = False
-        like &= ~beside
+        like &= _beside(painter, frame, color.shape[:2])
     return cv2.dilate(like.astype(np.uint8), RIM) > 0
+
+
+def _beside(painter: Painter, frame: int, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    """Mark the rectangle in which the animal is looked for."""
+    inside, ball = np.zeros(size, bool), painter.balls[frame]
+    if ball is not None:
+        rows, columns = rectangle(painter.clip, frame, painter.world_from_camera[frame], ball, size)
+        inside[rows, columns] = True
+    return inside

@@ -5,7 +5,7 @@ animal goes the way of a single one (`masks`): its track, its appearance in this
 of the others are unknown in the mask of the one that is followed: neither it nor the room.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,11 +17,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
 from stages.segment_agent import free_space, masks
-from stages.segment_agent.appearance import Appearance
+from stages.segment_agent.appearance import Appearance, Example
 from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import ROOM, Evidence, Judge, judge_motion
 from stages.segment_agent.free_space import References
-from stages.segment_agent.identity import LIMIT, Identities, margin, of_one, stranger
+from stages.segment_agent.identity import LIMIT, MOVES, Identities, Portrait, margin, of_one, stranger
 from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.painting import Mask, Painter, learn_palette
 from stages.segment_agent.refine import Palette
@@ -35,6 +35,9 @@ LEAST_FRAMES, RECOGNIZED = 5, 0.75
 its pixels to be its"""
 ANOTHERS = -1.0
 """log-odds from which on a pixel that geometry knows nothing of is another animal's"""
+PORTRAITS_SHARE = 0.25
+"""portraits that a recording's appearance is learned from too, as a share of its own examples: more would
+outweigh what its room looks like"""
 STRANGER_SHARE = 0.5
 """share of the frames in which something moves about that is none of the animals, from which on an animal
 without a turnaround lives here; less may be people"""
@@ -54,6 +57,10 @@ class Margins:
     def of(self, animal: int) -> AppearanceOf:
         """Return the log-odds of one animal against all others; of the number after the last, of nobody."""
         return lambda frame: self._all(frame)[animal]
+
+    def recognized(self, animal: int) -> AppearanceOf:
+        """Return the log-odds of one animal against all others and the room."""
+        return lambda frame: self._all(frame)[animal] - MOVES
 
     def between(self, animal: int) -> AppearanceOf:
         """Return the log-odds of one animal against the others alone: of what geometry says is an animal, the
@@ -81,7 +88,7 @@ class Margins:
 
 
 def segment(
-    clip: Clip, flow: Path, followed: str, network: Identities, config: Config
+    clip: Clip, flow: Path, followed: str, network: Identities, portraits: Sequence[Portrait], config: Config
 ) -> tuple[Iterator[Mask], Trajectory, float]:
     """Return one mask per frame of the animal that is followed, the poses they rest on, and the share of
     frames in which something moves about that is none of the animals.
@@ -92,7 +99,7 @@ def segment(
     poses, margins = path.world_from_camera, Margins(clip, network, config.height_px)
     references = free_space.gather(clip, poses, config.references)
     strangers = _strangers(clip, poses, references, config, margins)
-    painters = find_all(clip, poses, references, config, margins)
+    painters = find_all(clip, poses, references, config, margins, portraits)
     for name, painter in zip(network.names, painters, strict=True):
         seen = sum(ball is not None and not ball.presumed for ball in painter.balls)
         log(f"{name}: tracked in {seen} of {len(clip)} frames" if seen else f"{name} is not here")
@@ -106,11 +113,15 @@ def find_all(
     references: References,
     config: Config,
     margins: Margins,
+    portraits: Sequence[Portrait],
 ) -> list[Painter]:
-    """Prepare the masks of every animal: what moves and is it, then the appearance that this teaches."""
+    """Prepare the masks of every animal: what moves and is it, then the appearance that this and the
+    turnarounds teach.
+    """
     count = len(margins.network.names)
     judge = judge_motion(references)
     painters, networks = [], []
+    most = round(PORTRAITS_SHARE * config.learning.examples)
     for animal in range(count):
         apart = margins.of(animal)
         balls = find_mover(clip, poses, references, config.animal, None, apart=apart)
@@ -122,7 +133,8 @@ def find_all(
             painter = replace(painter, balls=[None] * len(clip))
         painters.append(painter)
         rng = np.random.default_rng([config.seed, animal])
-        networks.append(masks.learn_appearance(painter, references, config, rng))
+        known = masks.Known(examples_of(portraits, animal, most), margins.recognized(animal))
+        networks.append(masks.learn_appearance(painter, references, config, rng, known))
     room = free_space.without(references, lambda frame: _any_hidden(painters, networks, frame))
     judge = judge_motion(room)
     return [
@@ -131,6 +143,13 @@ def find_all(
         else _second(painters[animal], room, judge, network, margins, animal, config)
         for animal, network in enumerate(networks)
     ]
+
+
+def examples_of(portraits: Sequence[Portrait], animal: int, most: int) -> list[Example]:
+    """Return portraits of one animal as examples, evenly chosen."""
+    own = [each for each in portraits if each.animal == animal]
+    chosen = np.unique(np.linspace(0, len(own) - 1, min(most, len(own))).astype(int)).tolist()
+    return [Example(own[index].color, own[index].labels) for index in chosen]
 
 
 def judge_apart(judge: Judge, apart: AppearanceOf) -> Judge:

@@ -14,7 +14,7 @@ from pipeline.core.videos import Video
 from pipeline.data.clips import Clip
 from stages.segment_agent import pictures, prompt, several, writing
 from stages.segment_agent.config import Config
-from stages.segment_agent.identity import Identities
+from stages.segment_agent.identity import Identities, load_portraits
 from stages.segment_agent.masks import segment
 
 MM = 1000
@@ -89,8 +89,8 @@ def _run_of_several(
         )
     clip, followed = Clip.open(inputs.frames), next(video.animal for video in videos if video.animal)
     assert followed is not None, "the planner lists one animal's turnaround"
-    network = Identities.load(identities)
-    masks, path, strangers = several.segment(clip, inputs.flow, followed, network, config)
+    network, portraits = Identities.load(identities), load_portraits(identities)
+    masks, path, strangers = several.segment(clip, inputs.flow, followed, network, portraits, config)
     summary = writing.write(out, track(masks, "masks", len(clip)), len(clip))
     pictures.report_quality(out, clip, summary, path.residual_m, strangers)
     return summary

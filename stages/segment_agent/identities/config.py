@@ -9,7 +9,7 @@ class Config:
 
     portraits: int = 48
     """Pictures of each turnaround, spread evenly; a quarter of them is kept apart to test on."""
-    steps: int = 500
+    steps: int = 1200
     """Training steps."""
     batch: int = 6
     """Crops per step."""

@@ -33,7 +33,8 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = ()) -> Identities:
-    """Learn to distinguish the animals and write the network into `out`.
+    """Learn to distinguish the animals and write the network and what it learned
+    from into `out`.
 
     Raises InputError MSK-005 where two look the same.
     """
@@ -53,6 +54,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = 
         remedy = "is it one animal with two turnarounds? Keep one; else film both by the same light"
         raise InputError("MSK-005", what, str(next(iter(inputs.frames.values())).parent), remedy)
     network.save(out)
+    identity.save_portraits(out, learned)
     checks = [
         qa.Check(f"pixels of {name} recognized", 100 * share, "%", warn=92, fail=APART * 100, better="higher")
         for name, share in shares.items()

@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +10,12 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data.clips import Clip
-from stages.segment_agent import identity, several, stage
+from stages.segment_agent import identity, masks, several, stage
+from stages.segment_agent.appearance import Example
 from stages.segment_agent.config import Config, LearningConfig
 from stages.segment_agent.identities import config as identities_config
 from stages.segment_agent.identities import stage as identities
+from stages.segment_agent.windows import Sphere
 
 _spec = importlib.util.spec_from_file_location(
     "room_with_animal", Path(__file__).parent.parent / "room_with_animal.py"
@@ -45,10 +48,56 @@ def turnarounds(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def network(turnarounds, tmp_path_factory):
+def learned(turnarounds, tmp_path_factory):
+    """Return the artifact of both animals' looks."""
     out = tmp_path_factory.mktemp("identities")
     identities.run(identities.Inputs(turnarounds, turnarounds), SHORT, out, videos=VIDEOS)
-    return identity.Identities.load(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def network(learned):
+    return identity.Identities.load(learned)
+
+
+@pytest.fixture(scope="module")
+def portraits(learned):
+    return identity.load_portraits(learned)
+
+
+def test_portraits_are_kept_and_are_examples_of_their_animal(portraits):
+    assert {each.animal for each in portraits} == {0, 1}
+    assert all((each.labels == 255).any() and each.color.shape[:2] == each.labels.shape for each in portraits)
+    own = [each for each in portraits if each.animal == 1]
+    examples = several.examples_of(portraits, 1, 3)
+    assert len(examples) == 3
+    assert examples[0].color is own[0].color and examples[-1].labels is own[-1].labels
+
+
+def test_what_turnarounds_recognize_beside_the_animal_is_not_learned_as_room(monkeypatch):
+    labels = np.zeros((60, 80), np.uint8)
+    labels[20:30, 20:30] = 255
+    painter = SimpleNamespace(
+        clip=None,
+        height_px=60,
+        balls=[Sphere(np.zeros(3), 1.0)] * 4,
+        world_from_camera=[None] * 4,
+        working_mask=lambda frame: SimpleNamespace(labels=labels),
+        working_picture=lambda frame: np.zeros((60, 80, 3), np.uint8),
+    )
+    monkeypatch.setattr(masks, "rectangle", lambda *_: (slice(10, 50), slice(10, 50)))
+    given = []
+    monkeypatch.setattr(masks, "learn", lambda examples, *_, **__: given.extend(examples))
+    recognized = np.full((60, 80), -1.0)
+    recognized[25:60, 20:60] = 1.0
+    elsewhere = Example(np.zeros((9, 9, 3), np.uint8), np.full((9, 9), 255, np.uint8))
+    known = masks.Known([elsewhere], lambda frame: recognized)
+    masks.learn_appearance(painter, None, OPTIONS, np.random.default_rng(0), known)
+    assert given[-1] is elsewhere and len(given) == 5
+    found = given[0].labels
+    assert (found[20:30, 20:30] == 255).all(), "the animal"
+    assert (found[30:50, 20:50] == 128).all(), "it may have rested there"
+    assert (found[50:, 20:60] == 0).all() and (found[25:50, 50:60] == 0).all(), "too far from its track"
 
 
 def test_looks_are_told_apart_and_kept(network, turnarounds):
@@ -92,10 +141,12 @@ def together(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_two_that_pass_each_other_keep_their_masks(network, together):
+def test_two_that_pass_each_other_keep_their_masks(network, portraits, together):
     folder, truth = together
     for name, own, others in (("orange", truth.masks, truth.others), ("green", truth.others, truth.masks)):
-        found, _, strangers = several.segment(Clip.open(folder), Path("none"), name, network, OPTIONS)
+        found, _, strangers = several.segment(
+            Clip.open(folder), Path("none"), name, network, portraits, OPTIONS
+        )
         labels = np.stack([mask.labels for mask in found])
         shown = own.mean((1, 2)) > 0.002
         score = [
@@ -109,10 +160,12 @@ def test_two_that_pass_each_other_keep_their_masks(network, together):
 
 
 @pytest.mark.slow
-def test_one_that_is_not_here_has_no_mask(network, tmp_path):
+def test_one_that_is_not_here_has_no_mask(network, portraits, tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
-    found, _, _ = several.segment(Clip.open(tmp_path / "frames"), Path("none"), "green", network, OPTIONS)
+    found, _, _ = several.segment(
+        Clip.open(tmp_path / "frames"), Path("none"), "green", network, portraits, OPTIONS
+    )
     assert not any((mask.labels == 255).any() for mask in found)
 
 
