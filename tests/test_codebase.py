@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 61_470,
+    "lines": 61_554,
     "lines over 110 columns": 0,
     "recipe keys": 317,
     "packages over 16 modules": 0,
