@@ -179,6 +179,11 @@ class BehaviorData:
             rate_hz=np.array(self.rate_hz),
         )
 
+    @property
+    def accompanied(self) -> bool:
+        """Return whether others than the observer were recorded beside the animal."""
+        return any(track.companions is not None for track in self.trajectories.values())
+
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
         """Return the windows of one split."""
         return np.flatnonzero(self.split == split)

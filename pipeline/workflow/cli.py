@@ -92,7 +92,9 @@ class Task:
         if field.name == "variants":
             several = [need for need in needs if need.variants]
             return self.per_variant(several[0].artifact, several[0].variants)
-        others = [need.artifact for need in needs if need.others and need.option == field.name]
+        others = [
+            need.artifact for need in needs if need.others and field.name == (need.option or need.artifact)
+        ]
         if others:
             return self.per_animal(field.name, others[0], self.config.others)
         if dag.NODES[field.name].trials == "each":

@@ -30,6 +30,8 @@ RECONSTRUCTION_VARIANTS = (
 VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}
 TEMPLATES = ("scene_template", "agent_template")
 LOCALIZERS = ("scene_localizer", "agent_localizer")
+LONGTERM_STUDIES = ("longterm_ablations", "longterm_world", "longterm_study")
+READ_BY_PAGES = ("reconstruction", "splats", "behavior", "behavior_data")
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Need:
     per_animal: bool = False
     """In a home of several animals its part holds a folder per animal, of which one's own is read."""
     others: bool = False
-    """Not one's own but that of every other animal of the home; the folder of all animals is given."""
+    """Not one's own but that of every other animal of the home, of all of them where it is made once; the
+    folder of all animals is given."""
 
 
 @dataclass(frozen=True)
@@ -149,11 +152,7 @@ FLOW: tuple[Node, ...] = (
         begins_animal=True,
         seconds_per_frame=0.11,
     ),
-    Node(
-        "feature_basis",
-        "fit_feature_basis",
-        (Need("frames", VIEWED, splits=("train", "none"), measured=True),),
-    ),
+    Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, ("train", "none"), measured=True),)),
     Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
     Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),
     Node(
@@ -290,17 +289,17 @@ FLOW: tuple[Node, ...] = (
     Node(
         "longterm_tables",
         "tabulate_longterm",
-        (
-            "reconstruction",
-            "behavior_data",
-            "behavior",
-            "longterm_ablations",
-            "longterm_world",
-            "longterm_study",
-        ),
+        ("reconstruction", "behavior_data", "behavior", *LONGTERM_STUDIES),
         on_demand=True,
     ),
-    Node("simulator", "export_simulator", ("reconstruction", "splats", "behavior", "behavior_data")),
+    Node("simulator", "export_simulator", READ_BY_PAGES),
+    Node(
+        "home_simulator",
+        "export_simulator.home",
+        tuple(Need(name, others=True) for name in READ_BY_PAGES),
+        table="export_simulator",
+        of_several=True,
+    ),
     Node(
         "evaluation",
         "evaluate",

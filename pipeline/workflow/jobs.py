@@ -129,7 +129,7 @@ class Plan:
     animals: tuple["Plan", ...] = ()
     """Of a home of several animals: each one's plan, with its own turnaround alone."""
     others: tuple[str, ...] = ()
-    """Of one animal's plan: the names of the others."""
+    """Of one animal's plan: the names of the others; of a home of several: of all."""
 
     @property
     def nodes(self) -> tuple[Node, ...]:
@@ -154,7 +154,8 @@ def of_animal() -> frozenset[str]:
     """
     found: set[str] = set()
     for node in dag.FLOW:
-        if node.begins_animal or any(need.artifact in found for need in dag.needs_of(node)):
+        needs = [need.artifact for need in dag.needs_of(node) if not need.others]
+        if node.begins_animal or not found.isdisjoint(needs):
             found.add(node.artifact)
     return frozenset(found)
 
@@ -184,18 +185,22 @@ def with_animals(plan: Plan) -> Plan:
     each = []
     for name in names:
         others = tuple(other for other in names if other != name)
-        named = {artifact: {**plan.tables[artifact], "others": list(others)} for artifact in reading}
         each.append(
             replace(
                 plan,
                 home=replace(plan.home, animal=name),
                 videos=tuple(video for video in plan.videos if video.animal in (None, name)),
-                tables=plan.tables | named,
+                tables=_named(plan, reading, others),
                 touched=of_animal(),
                 others=others,
             )
         )
-    return replace(plan, animals=tuple(each))
+    return replace(plan, animals=tuple(each), others=tuple(names), tables=_named(plan, reading, names))
+
+
+def _named(plan: Plan, reading: Sequence[str], others: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return the plan's tables with the names of ``others`` for the artifacts that read theirs."""
+    return plan.tables | {name: {**plan.tables[name], "others": list(others)} for name in reading}
 
 
 def jobs(plan: Plan) -> list[Job]:
@@ -314,7 +319,7 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
     arguments: list[str] = []
     deciding = [video.id] if video else []
     for need in dag.needs_of(node, plan.flow):
-        if (dag.NODES[need.artifact].of_several or need.others) and not plan.home.animal:
+        if (dag.NODES[need.artifact].of_several or need.others) and not plan.others:
             continue
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:

@@ -17,6 +17,8 @@ class SessionClip:
     world_from_agent: Float[np.ndarray, "frame 4 4"]
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
+    begin_s: float = 0.0
+    """when it begins in its session"""
 
 
 def longest_run(valid: Bool[np.ndarray, " frame"]) -> slice:
@@ -38,6 +40,7 @@ def cut(motion: SessionClip, frames: slice) -> SessionClip:
         motion.world_from_agent[frames],
         motion.agent_from_bone[frames],
         motion.world_from_camera[frames],
+        float(timestamp_s[0]),
     )
 
 

@@ -35,9 +35,52 @@ def write_simulator(
 
     ``remark`` is what a visitor should know of the home beside what carries the animal.
     """
+    about = _contract(parts, behavior, config.name, labels, remark)
+    room = glb.static(parts.scene, "scene")
+    size_mb = _write_page(folder, about, _room(parts, room) | _animal(parts, behavior), config.layout)
+    (folder / "agent.glb").write_bytes(glb.skinned(parts.agent, parts.skin, parts.actions))
+    (folder / "scene.glb").write_bytes(room)
+    npz.save(folder / "skin_8.npz", joints=parts.eight.joints, weights=parts.eight.weights)
+    (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
+    return size_mb
+
+
+def write_home(
+    folder: Path,
+    animals: Mapping[str, tuple[SimulatorParts, BehaviorAssets]],
+    config: Config,
+    labels: Mapping[str, str],
+) -> float:
+    """Write the page of several animals, by name, in the room of the first, and its contract; return
+    megabytes that a visitor loads.
+
+    Assets and contract of each are those of its own page; the contract adds when clips begin in their
+    sessions, so that all begin at one moment.
+    """
+    contracts = []
+    for name, (parts, behavior) in animals.items():
+        about = _contract(parts, behavior, name, labels, None)
+        about["assets"] = f"{name}-"
+        for clip, motion in zip(about["clips"], parts.motions, strict=True):
+            clip["begin_s"] = round(motion.begin_s, 4)
+        contracts.append(about)
+    shared = ("version", "units", "up", "quaternion", "rows", "scene", "observer", "controls")
+    whole = {"name": config.name, **{key: contracts[0][key] for key in shared}, "animals": contracts}
+    first = next(iter(animals.values()))[0]
+    assets = _room(first, glb.static(first.scene, "scene"))
+    for name, (parts, behavior) in animals.items():
+        assets |= {f"{name}-{key}": asset for key, asset in _animal(parts, behavior).items()}
+    size_mb = _write_page(folder, whole, assets, config.layout)
+    (folder / "simulator.json").write_text(json.dumps(whole, indent=1) + "\n")
+    return size_mb
+
+
+def _contract(
+    parts: SimulatorParts, behavior: BehaviorAssets, name: str, labels: Mapping[str, str], remark: str | None
+) -> dict[str, Any]:
     remarks = [text for text in (remark, support_warning(behavior.supported)) if text]
-    about = contract(
-        name=config.name,
+    return contract(
+        name=name,
         behavior=behavior.contract,
         setting=parts.setting,
         motions=parts.motions,
@@ -50,24 +93,24 @@ def write_simulator(
         labels=labels,
         warning=" ".join(remarks) or None,
     )
-    room = glb.static(parts.scene, "scene")
-    assets = {
-        "room": Asset(room, 4),
+
+
+def _room(parts: SimulatorParts, room: bytes) -> dict[str, Asset]:
+    """Return the assets that are the room's."""
+    return {"room": Asset(room, 4), "splats": Asset(parts.splat_rows, 32)}
+
+
+def _animal(parts: SimulatorParts, behavior: BehaviorAssets) -> dict[str, Asset]:
+    """Return the assets that are an animal's own."""
+    return {
         "agent": Asset(glb.skinned(parts.agent, parts.skin, []), 4),
         "clips": Asset(page.clip_rows(parts.motions), 4),
-        "splats": Asset(parts.splat_rows, 32),
         "agent-splats": Asset(parts.agent_splats.rows, 32),
         "agent-skin": Asset(parts.agent_splats.skin, 8),
         "volume": Asset(behavior.features, 2),
         "allowed": Asset(behavior.allowed),
         **{name: Asset(network, 4) for name, network in behavior.networks.items()},
     }
-    size = _write_page(folder, about, assets, config.layout)
-    (folder / "agent.glb").write_bytes(glb.skinned(parts.agent, parts.skin, parts.actions))
-    (folder / "scene.glb").write_bytes(room)
-    npz.save(folder / "skin_8.npz", joints=parts.eight.joints, weights=parts.eight.weights)
-    (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
-    return size / 1e6
 
 
 def support_warning(supported: float | None) -> str | None:
@@ -77,7 +120,8 @@ def support_warning(supported: float | None) -> str | None:
     return "Little of this floor was recorded: the animal may float or sink."
 
 
-def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], layout: Layout) -> int:
+def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], layout: Layout) -> float:
+    """Write the page and return its megabytes."""
     match layout:
         case "file":
             text, files = page.page(contract=about, assets=assets), {}
@@ -88,7 +132,7 @@ def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], l
             assert_never(layout)
     for name, content in {"index.html": text.encode(), **files}.items():
         (folder / name).write_bytes(content)
-    return len(text.encode()) + sum(map(len, files.values()))
+    return (len(text.encode()) + sum(map(len, files.values()))) / 1e6
 
 
 def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contrac
 from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
-from pipeline.behavior.trajectories import UP
+from pipeline.behavior.trajectories import MOST_COMPANIONS, UP
 from pipeline.geometry import rigid
 
 NETWORKS = ("perception", "goal", "path", "body")
@@ -35,10 +35,12 @@ def write_model(
     scaling: Scaling,
     schedule: Schedule,
     rest: Float[np.ndarray, "bone 4 4"],
+    *,
+    accompanied: bool = False,
 ) -> float:
     """Write everything a sampler needs. Return the largest difference between ONNX and torch."""
-    write_contract(folder, nets, architecture, scaling, schedule, rest)
-    return write_networks(folder, nets, architecture)
+    write_contract(folder, nets, architecture, scaling, schedule, rest, accompanied=accompanied)
+    return write_networks(folder, nets, architecture, accompanied=accompanied)
 
 
 def write_contract(
@@ -48,8 +50,12 @@ def write_contract(
     scaling: Scaling,
     schedule: Schedule,
     rest: Float[np.ndarray, "bone 4 4"],
+    *,
+    accompanied: bool = False,
 ) -> None:
-    """Write weights, `behavior.json` and, of the model that other samplers know, `golden.json`."""
+    """Write weights, `behavior.json` and, of the model that other samplers know, `golden.json`, in which an
+    ``accompanied`` animal has a companion.
+    """
     save_file(
         {name: value.contiguous() for name, value in nets.state_dict().items()},
         folder / "behavior.safetensors",
@@ -57,29 +63,37 @@ def write_contract(
     document = contract(architecture, scaling, schedule, rest)
     (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
     if architecture.family == "diffusion":
-        golden = golden_plan(Sampler(TorchNetworks(nets), schedule, scaling), architecture)
+        golden = golden_plan(
+            Sampler(TorchNetworks(nets), schedule, scaling), architecture, accompanied=accompanied
+        )
         (folder / "golden.json").write_text(json.dumps(golden) + "\n")
 
 
-def write_networks(folder: Path, nets: BehaviorNets, architecture: Architecture) -> float:
-    """Write the four ONNX files. Return the largest difference between ONNX and torch."""
+def write_networks(
+    folder: Path, nets: BehaviorNets, architecture: Architecture, *, accompanied: bool = False
+) -> float:
+    """Write the four ONNX files; that of an ``accompanied`` animal perceives any number of others, that of
+    another one the observer. Return the largest difference between ONNX and torch.
+    """
+    differences = []
     for name in NETWORKS:
-        export_network(getattr(nets, name), folder / f"{name}.onnx", *signature(name, architecture))
-    return float(
-        np.max(  # which NaN passes through
-            [
-                difference(getattr(nets, name), folder / f"{name}.onnx", signature(name, architecture)[0])
-                for name in NETWORKS
-            ]
-        )
-    )
+        inputs, output = signature(name, architecture, accompanied=accompanied)
+        path, network = folder / f"{name}.onnx", getattr(nets, name)
+        export_network(network, path, inputs, output)
+        differences.append(difference(network, path, inputs))
+    return float(np.max(differences))  # which NaN passes through
 
 
 def export_network(
     module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]], output: str
 ) -> None:
-    """Write one network as ONNX with a free batch dimension; the same weights always give the same bytes."""
+    """Write one network as ONNX with a free batch dimension and, where ``inputs`` have several others, a free
+    number of them; the same weights always give the same bytes.
+    """
     batch = torch.export.Dim("batch", min=1, max=4096)
+    free = [{0: batch} for _ in inputs]
+    if inputs.get("others", (1,))[0] > 1:
+        free[list(inputs).index("others")][1] = torch.export.Dim("other", min=2, max=1 + MOST_COMPANIONS)
     example = tuple(torch.zeros(2, *shape) for shape in inputs.values())
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(action="ignore"):
@@ -89,7 +103,7 @@ def export_network(
             input_names=list(inputs),
             output_names=[output],
             dynamo=True,
-            dynamic_shapes=tuple({0: batch} for _ in example),
+            dynamic_shapes=tuple(free),
             external_data=False,
             verbose=False,
         )
@@ -109,14 +123,18 @@ def export_network(
     onnx.checker.check_model(str(path))
 
 
-def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], str]:
-    """Return the inputs of a network (name and shape without batch) and the name of its output."""
+def signature(
+    name: str, a: Architecture, *, accompanied: bool = False
+) -> tuple[dict[str, tuple[int, ...]], str]:
+    """Return the inputs of a network (name and shape without batch) and the name of its output; an
+    ``accompanied`` animal has two others as an example.
+    """
     step: dict[str, tuple[int, ...]] = {"t": (), "condition": (a.condition_length,)}
     match name:
         case "perception":
             grid = {
                 "scene_grid": (a.scene_channels, *GRID_SHAPE),
-                "others": (1, a.past, POSE_CHANNELS + 1),
+                "others": (1 + accompanied, a.past, POSE_CHANNELS + 1),
                 "past": (a.past * (9 + 6 * a.bones),),
             }
             return grid | {"keep": (3,)}, "condition"
@@ -131,8 +149,10 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
             }, "epsilon"
 
 
-def golden_observation(a: Architecture) -> Observation:
-    """Return the fixed input of the golden plan; every number follows from its index."""
+def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observation:
+    """Return the fixed input of the golden plan; every number follows from its index. A companion walks away
+    to the left.
+    """
 
     def wave(*shape: int, amplitude: float, frequency: float) -> np.ndarray:
         return (
@@ -147,12 +167,16 @@ def golden_observation(a: Architecture) -> Observation:
     facing = rigid.look_at(observer, np.zeros(3), UP)
     scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
     past = wave(a.past * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
-    return Observation(scene, other_channels(facing[None]), past)
+    walk = np.linspace(0.5, 1.0, a.past)
+    companion = np.stack([walk, np.full(a.past, 0.1), 0.5 * walk, np.ones(a.past)], axis=-1)
+    return Observation(
+        scene, other_channels(facing[None], companion[None, None] if accompanied else None), past
+    )
 
 
-def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
+def golden_plan(sampler: Sampler, architecture: Architecture, *, accompanied: bool = False) -> dict:
     """Sample one plan by DDIM and note its input, its noise and its result."""
-    observation = golden_observation(architecture)
+    observation = golden_observation(architecture, accompanied=accompanied)
     sampling = PlanSamplingConfig(method="ddim", goal_steps=10, sequence_steps=10, max_path_draws=1)
     noise = np.random.default_rng(0)
     shapes = {
@@ -196,8 +220,9 @@ def difference(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int,
     rng = np.random.default_rng(0)
     drawn = {name: rng.standard_normal((4, *shape), dtype=np.float32) for name, shape in inputs.items()}
     for name in {"past", "others"} & drawn.keys():
-        still = drawn[name][-1].reshape(inputs["others"][1], -1)
-        drawn[name][-1] = np.broadcast_to(still[:1], still.shape).reshape(drawn[name][-1].shape)
+        beings = inputs[name][0] if name == "others" else 1
+        still = drawn[name][-1].reshape(beings, inputs["others"][1], -1)
+        drawn[name][-1] = np.broadcast_to(still[:, :1], still.shape).reshape(drawn[name][-1].shape)
     if "keep" in drawn:
         drawn["keep"][-1] = 1
     session = onnxruntime.InferenceSession(path, _one_thread(), providers=["CPUExecutionProvider"])

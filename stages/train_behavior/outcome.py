@@ -52,9 +52,13 @@ def write_trained(
     architecture: Architecture,
     schedule: Schedule,
     rest: Float[np.ndarray, "bone 4 4"],
+    *,
+    accompanied: bool = False,
 ) -> None:
     """Write weights, contract and the losses of every step."""
-    export.write_contract(folder, fitted.nets.cpu(), architecture, fitted.scaling, schedule, rest)
+    export.write_contract(
+        folder, fitted.nets.cpu(), architecture, fitted.scaling, schedule, rest, accompanied=accompanied
+    )
     losses = {f"loss/{name}": values for name, values in fitted.record.terms.items()}
     npz.save(folder / "losses.npz", compress=False, **losses)
 
@@ -72,7 +76,7 @@ def write_exported(
 ) -> None:
     """Write the networks for other samplers, and how the model looks."""
     sampler = sampler_of(architecture, TorchNetworks(fitted.nets), schedule, fitted.scaling)
-    difference = export.write_networks(folder, fitted.nets, architecture)
+    difference = export.write_networks(folder, fitted.nets, architecture, accompanied=data.accompanied)
     moments = reactions.moments(data, scenes, architecture)
     reaction = reactions.measure(
         sampler, moments.observation, radius_m=architecture.observer_radius_m, seed=seed

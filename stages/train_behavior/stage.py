@@ -44,7 +44,8 @@ def run(
     )
     if not distributed.leave():
         return
-    outcome.write_trained(out, fitted, architecture, schedule, data.agent_from_bone_rest)
+    rest = data.agent_from_bone_rest
+    outcome.write_trained(out, fitted, architecture, schedule, rest, accompanied=data.accompanied)
     if config.export:
         guided: Guided = "all" if config.training.objective.joint_dropout > 0 else "observer"
         outcome.write_exported(out, fitted, architecture, schedule, data, scenes, guided, seed=config.seed)

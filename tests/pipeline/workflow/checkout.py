@@ -33,6 +33,7 @@ SETTINGS = {
     ),
     "train_localizer": "    target: str = ''\n",
     "slice_behavior": "    others: tuple[str, ...] = ()\n",
+    "export_simulator.home": "    others: tuple[str, ...] = ()\n",
     "train_longterm": '    ablations: str = "none"\n',
 }
 CONFIG = '''"""Settings."""
@@ -171,7 +172,7 @@ def _fields(stage: str) -> str:
             )
             kinds[need.option or need.artifact] = "Mapping[str, Path]" if several else "Path"
             if need.others:
-                kinds[need.option] = "Mapping[str, Path]"
+                kinds[need.option or need.artifact] = "Mapping[str, Path]"
             if need.variants:
                 kinds["variants"] = "Mapping[str, Path]"
     required = [f"    {name}: {kind}" for name, kind in kinds.items() if name in in_every and name != "truth"]

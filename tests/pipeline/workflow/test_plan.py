@@ -126,6 +126,14 @@ def test_animals_of_one_home_share_what_shows_none_of_them(house):
         assert (folder / "masks" / own / "manifest.json").exists()
         assert not (folder / "masks" / other).exists(), "the other's turnaround is not its own"
         assert not (folder / "frames").exists(), "shared"
+    page = house.make("-j2", "toy.home_simulator")
+    assert page.returncode == 0, page.stderr
+    job = json.loads((house.folder / "build/toy/plan/jobs/home_simulator.json").read_text())
+    assert sorted(each["name"] for each in job["inputs"]) == sorted(
+        f"{name}/{part}"
+        for name in ("cat", "dog")
+        for part in ("reconstruction", "splats", "behavior", "behavior_data")
+    )
     contents = [
         (house.folder / f"build/toy/animals/{name}/reconstruction/0.bin").read_bytes()
         for name in ("cat", "dog")

@@ -3,6 +3,8 @@ to flee.
 """
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,8 @@ from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from stages.export_simulator import stage
 from stages.export_simulator.config import Config
+from stages.export_simulator.home import stage as home_stage
+from stages.export_simulator.home.config import Config as HomeConfig
 from stages.train_behavior.export import write_model
 
 BONES = 5
@@ -189,8 +193,10 @@ def _teach_paths(
         optimizer.step()
 
 
-def write(build: Path) -> None:
-    """Write the four artifacts that `export_simulator` reads (without manifests)."""
+def write(build: Path, *, accompanied: bool = False) -> None:
+    """Write the four artifacts that `export_simulator` reads (without manifests); networks of an
+    ``accompanied`` animal perceive others, from whom it flees as from a person.
+    """
     for name in ("reconstruction", "splats", "behavior_data", "behavior"):
         (build / name).mkdir(parents=True)
     write_surfaces(build / "reconstruction")
@@ -229,8 +235,29 @@ def write(build: Path) -> None:
         ensemble_size=1,
     )
     nets, scaling = networks_that_flee(architecture)
-    write_model(build / "behavior", nets, architecture, scaling, Schedule(), rest())
+    shape = (architecture, scaling, Schedule(), rest())
+    write_model(build / "behavior", nets, *shape, accompanied=accompanied)
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
+
+
+def write_home(animals: Path) -> None:
+    """Write a cat, and a dog with the same networks that walks where the cat is not."""
+    write(animals / "cat", accompanied=True)
+    shutil.copytree(animals / "cat", animals / "dog")
+    data = BehaviorData.load(animals / "dog/behavior_data")
+    half_a_circle = rigid.make(rigid.rotation_from_vector(np.array([0, np.pi, 0])), np.zeros(3))
+    for name, track in data.trajectories.items():
+        turned = half_a_circle @ track.world_from_agent
+        data.trajectories[name] = replace(track, world_from_agent=turned)
+    data.save(animals / "dog/behavior_data")
+
+
+def exported_home(animals: Path, out: Path) -> Path:
+    """Export the page of both into an empty folder; return the folder."""
+    out.mkdir(parents=True)
+    inputs = {name: {animal: animals / animal / name for animal in ("cat", "dog")} for name in READS}
+    home_stage.run(home_stage.Inputs(**inputs), HomeConfig(name="home", others=("cat", "dog")), out)
+    return out
 
 
 def exported(raw: Path, out: Path, config: Config = NAMED) -> Path:

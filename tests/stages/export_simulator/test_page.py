@@ -67,7 +67,7 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
         assert 0 < before["marks_s"]["animal"] < before["marks_s"]["plan"], (
             "seconds after opening: the animal is seen, then plans"
         )
-        _check_golden(golden, page.evaluate("golden => ats.golden(golden)", golden))
+        check_golden(golden, page.evaluate("golden => ats.golden(golden)", golden))
         page.evaluate("ats.pause()")
         _check_reaction(page)
         _check_it_reacts_as_python_does(page, simulator.parent)
@@ -117,7 +117,7 @@ def test_the_animal_walks_around_a_person_in_its_way(simulator: Path, chromium: 
         assert wrong == []
 
 
-def _check_golden(golden: dict, sampled: dict) -> None:
+def check_golden(golden: dict, sampled: dict) -> None:
     for name, plan in golden["plans"].items():
         for level, expected in plan.items():
             expected, found = np.array(expected), np.array(sampled[name][level])

@@ -122,7 +122,7 @@ def approaches(data: BehaviorData, count: int, rng: np.random.Generator) -> Appr
 def asked_of_the_page(page: Page, met: Approaches, checks: int) -> Answers:
     """Sample in an open page; the last two for the first ``checks`` plans only."""
     past = np.concatenate(
-        [_rows(met.context.world_from_agent[:, :, None]), _rows(met.context.agent_from_bone)], axis=2
+        [rows(met.context.world_from_agent[:, :, None]), rows(met.context.agent_from_bone)], axis=2
     )
     past = past.reshape(*past.shape[:2], -1)
 
@@ -177,7 +177,8 @@ def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) 
     )
 
 
-def _rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
+def rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
+    """Return rigid motions as rows of place and quaternion wxyz, as the page has them."""
     return np.concatenate(
         [a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1
     )

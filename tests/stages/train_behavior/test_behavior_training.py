@@ -2,6 +2,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 
@@ -483,3 +484,20 @@ def test_what_cannot_be_learned_or_made_is_refused_at_once(data, settings, code)
     with pytest.raises(InputError, match=code):
         asked(settings)
     asked(Config())
+
+
+@pytest.mark.slow
+def test_the_network_of_an_accompanied_animal_perceives_any_number_of_others(tmp_path):
+    torch.manual_seed(0)
+    nets = model.BehaviorNets(ARCHITECTURE, Schedule()).eval()
+    inputs, output = signature("perception", ARCHITECTURE, accompanied=True)
+    export_network(nets.perception, tmp_path / "perception.onnx", inputs, output)
+    assert difference(nets.perception, tmp_path / "perception.onnx", inputs) < 1e-4
+    session = onnxruntime.InferenceSession(tmp_path / "perception.onnx")
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 4):
+        shapes = inputs | {"others": (count, *inputs["others"][1:])}
+        drawn = {name: rng.standard_normal((3, *shape), dtype=np.float32) for name, shape in shapes.items()}
+        with torch.inference_mode():
+            expected = nets.perception(*map(torch.from_numpy, drawn.values())).numpy()
+        np.testing.assert_allclose(session.run(None, drawn)[0], expected, atol=1e-4)

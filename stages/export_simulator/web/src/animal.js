@@ -98,6 +98,12 @@ export class Animal {
     return this.group.visible;
   }
 
+  // Whether all of it is drawn, with its shadow.
+  set shown(value) {
+    this.group.visible = this.shadow.visible = value;
+    if (this.splats) this.splats.visible = value;
+  }
+
   // Take the pose of a frame: the root's row, then one row per bone; ground: the height of what carries it.
   pose(frame, ground) {
     setRow(this.root, frame, 0);

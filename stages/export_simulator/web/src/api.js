@@ -5,10 +5,18 @@ import { rootOf } from './timeline.js';
 
 export function api(simulator) {
   const { room, observer, planner } = simulator;
+  const selected = () => simulator.selected;
   return {
     contract: simulator.contract,
+    select: (name) => {
+      simulator.state.animal = name;
+      simulator.changed('animal');
+      simulator.panel.refresh();
+    },
+    employ: (name, does) => simulator.employ(name, does),
     state: () => {
-      const root = rootOf(simulator.timeline.at(simulator.now));
+      const { stops, route, take, timeline, turnNumber, clips } = selected();
+      const root = rootOf(timeline.at(simulator.now));
       return {
         tick: simulator.now,
         animal: root,
@@ -16,21 +24,28 @@ export function api(simulator) {
         observer: [...observer.place],
         eye: room.camera.getWorldPosition(room.camera.position.clone()).toArray(),
         headset: simulator.headset.presenting,
-        plans: simulator.turnNumber,
+        plans: turnNumber,
         milliseconds: simulator.milliseconds,
-        aim: simulator.stops.next,
-        stops: simulator.stops.left,
-        route: simulator.route && {
-          points: simulator.route.points,
-          done: simulator.route.done,
-          length: simulator.route.length,
+        aim: stops.next,
+        stops: stops.left,
+        route: route && {
+          points: route.points,
+          done: route.done,
+          length: route.length,
         },
         replay: simulator.replaying && {
           name: simulator.replaying.name,
           tick: simulator.replayTick,
-          place: [...simulator.clips.frame(simulator.replaying, simulator.replayTick).slice(0, 3)],
+          place: [...clips.frame(simulator.replaying, simulator.replayTick).slice(0, 3)],
         },
-        take_s: simulator.take.seconds,
+        animals: simulator.residents.map((each) => ({
+          name: each.name,
+          does: each.does,
+          place: rootOf(each.timeline.at(simulator.now)),
+          plans: each.turnNumber,
+        })),
+        selected: selected().name,
+        take_s: take.seconds,
         software: room.software,
         marks_s: Object.fromEntries(
           performance.getEntriesByType('mark').map((mark) => [mark.name, mark.startTime / 1000]),
@@ -43,17 +58,19 @@ export function api(simulator) {
     // still).
     sampleGoals: async ({ observer: seen, seed = 0, K = 16, steps = 10, ...rest }) => {
       const places = typeof seen?.[0] === 'number' ? [seen] : seen;
-      const count = simulator.contract.behavior.past_frames;
+      const { count } = selected();
       const walked =
         places && Array.from({ length: count }, (_, i) => places[Math.max(0, places.length - count + i)]);
-      const changes = walked ? { observer: walked.map((place) => observer.pose(place)) } : {};
+      const changes = walked
+        ? { observer: walked.map((place) => observer.pose(place, selected().place)) }
+        : {};
       const answer = await planner.goals(
-        simulator.question({ ...changes, seed, samples: K, steps, aim: null, path: null, ...rest }),
+        selected().question({ ...changes, seed, samples: K, steps, aim: null, path: null, ...rest }),
       );
       return answer.goals;
     },
-    plan: (changes = {}) => planner.plan(simulator.question({ seed: 0, ...changes })),
-    golden: (golden) => planner.golden(golden),
+    plan: (changes = {}) => planner.plan(selected().question({ seed: 0, ...changes })),
+    golden: (golden, animal = 0) => planner.golden(golden, animal),
     pause: () => {
       if (simulator.playing) simulator.play();
     },

@@ -73,7 +73,8 @@ export class Clips {
   // The first `count` frames of a clip.
   beginning(clip, count) {
     const frames = Array.from({ length: count }, (_, i) => this.frame(clip, Math.min(clip.count - 1, i)));
-    return { frames, observer: this.camera(clip, Math.min(clip.count, count) - 1) };
+    const last = Math.min(clip.count, count) - 1;
+    return { frames, observer: this.camera(clip, last), clip, last };
   }
 
   // A recorded past of `count` frames; the same seed gives the same moment.
@@ -84,7 +85,17 @@ export class Clips {
     const frames = Array.from({ length: count }, (_, i) =>
       this.frame(clip, Math.max(0, last - count + 1 + i)),
     );
-    return { frames, observer: this.camera(clip, last) };
+    return { frames, observer: this.camera(clip, last), clip, last };
+  }
+
+  // The past of `count` frames in the session and at the time of another animal's moment; one of its own
+  // where this animal was not seen then.
+  beside({ clip: theirs, last: tick }, seed, count) {
+    const clip = this.list.find(({ name, opened }) => name === theirs.name && !opened);
+    const last = clip && Math.round((theirs.begin_s - clip.begin_s) * RATE_HZ) + tick;
+    if (!clip || theirs.opened || last < count - 1 || last >= clip.count) return this.moment(seed, count);
+    const frames = Array.from({ length: count }, (_, i) => this.frame(clip, last - count + 1 + i));
+    return { frames, observer: this.camera(clip, last), clip, last };
   }
 }
 

@@ -70,6 +70,7 @@ export class Controls {
     else if (key === 'h') this.on.how();
     else if (key === 'c') this.on.call();
     else if (key === 'l') this.on.tell();
+    else if (key === 'n') this.on.next();
     else if (key === 'p' || key === 'g') this.on.hold(key === 'p' ? 'pen' : 'pins');
     else if (key === 'escape' && this.tool) this.on.hold(null);
   }

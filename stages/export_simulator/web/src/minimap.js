@@ -58,7 +58,7 @@ export class Minimap {
     this.stale = true;
   }
 
-  draw({ animal, observer, goals, chosen, path, recorded, commands }) {
+  draw({ animals, observer, goals, chosen, path, recorded, commands }) {
     const { pen, size } = this;
     if (this.stale)
       for (const who of ['observer', 'animal']) paintHeat(this.layers[who], this.heat[who], COLORS[who]);
@@ -74,7 +74,7 @@ export class Minimap {
       this.dot(goal[0], goal[2], i === chosen ? 5 : 3, i === chosen ? 1 : 0.45);
     for (const wish of commands) this.cross(wish);
     if (recorded) this.dot(recorded[0], recorded[2], 7, 0.9, '#6d675e');
-    this.wedge(animal, '#c8722b', false);
+    for (const animal of animals) this.wedge(animal, `#${animal.color.toString(16)}`, false);
     this.wedge(observer, '#2f6f9f', true);
   }
 

@@ -1,4 +1,4 @@
-// The person with the phone: a figure to drag or walk, and the last poses of the phone at 10 Hz.
+// The person with the phone: a figure to drag or walk.
 
 import * as THREE from 'three';
 import { lookAt } from './rigid.js';
@@ -7,7 +7,6 @@ export const WALK_M_S = 1.1;
 const DRAG_M_S = 2.5;
 const WALL_M = 0.15; // kept from the edges of the room
 const APART_M = 0.36; // kept from the animal: nobody walks through anybody
-const HISTORY_TICKS = 16;
 
 export class Observer {
   constructor(contract, color = 0x2f6f9f) {
@@ -17,9 +16,9 @@ export class Observer {
     this.figure = person(this.eye, color);
     this.place = [...contract.observer.start_m];
     this.target = null;
-    this.history = [];
-    this.animal = [0, this.floor, 0];
-    this.settle();
+    this.animal = [0, this.floor, 0]; // the one that the person looks at
+    this.animals = []; // where all are
+    this.step(0, [0, 0], 0);
   }
 
   // Walk by a direction in the view's heading, or towards the dragged point.
@@ -46,35 +45,25 @@ export class Observer {
     return Math.hypot(dx, dz) > 1e-5;
   }
 
-  // A step that would lead into the animal ends beside it; who stands there already may step back.
-  apart([x, z]) {
-    const gap = (place) => Math.hypot(place[0] - this.animal[0], place[1] - this.animal[2]);
+  // A step that would lead into an animal ends beside it; who stands there already may step back.
+  apart(place) {
+    return this.animals.reduce((kept, animal) => this.beside(kept, animal), place);
+  }
+
+  beside([x, z], animal) {
+    const gap = (place) => Math.hypot(place[0] - animal[0], place[1] - animal[2]);
     const reach = Math.min(APART_M, gap(this.place));
     const distance = gap([x, z]);
     if (distance >= reach || distance < 1e-6) return distance < 1e-6 ? this.place : [x, z];
     return [
-      this.animal[0] + ((x - this.animal[0]) * reach) / distance,
-      this.animal[2] + ((z - this.animal[2]) * reach) / distance,
+      animal[0] + ((x - animal[0]) * reach) / distance,
+      animal[2] + ((z - animal[2]) * reach) / distance,
     ];
   }
 
-  // The phone's pose: at eye height, looking at the animal.
-  pose(place = this.place) {
-    return lookAt(
-      [place[0], this.floor + this.eye, place[1]],
-      [this.animal[0], this.animal[1], this.animal[2]],
-    );
-  }
-
-  tick() {
-    this.history.push(this.pose());
-    if (this.history.length > HISTORY_TICKS) this.history.shift();
-  }
-
-  // Forget the walk: stand here as if for a while.
-  settle() {
-    this.history = Array.from({ length: HISTORY_TICKS }, () => this.pose());
-    this.step(0, [0, 0], 0);
+  // The phone's pose: at eye height, looking at an animal.
+  pose(place = this.place, animal = this.animal) {
+    return lookAt([place[0], this.floor + this.eye, place[1]], [animal[0], animal[1], animal[2]]);
   }
 }
 

@@ -9,6 +9,7 @@ export class Overlays {
   // floor: its height; crouch: height of the root above what it stands on, at least. Metres.
   constructor(scene, floor, crouch) {
     this.floor = floor;
+    this.group = new THREE.Group();
     this.ground = (point) => Math.max(floor, point[1] - crouch) + LIFT_M;
     this.goals = new THREE.InstancedMesh(
       new THREE.CircleGeometry(0.075, 24).rotateX(-Math.PI / 2),
@@ -34,8 +35,9 @@ export class Overlays {
     for (const node of [this.goals, this.chosen, this.fan, this.ribbon, this.route, this.commands]) {
       node.renderOrder = 3;
       node.visible = false;
-      scene.add(node);
+      this.group.add(node);
     }
+    scene.add(this.group);
     this.layers = { goals: true, path: true };
   }
 

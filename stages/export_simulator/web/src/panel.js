@@ -1,6 +1,6 @@
 // The controls: they read and write the state and call back; they know nothing of the room.
 
-import { SPEEDS } from './state.js';
+import { AWAY, SPEEDS, readDoings } from './state.js';
 
 const at = (id) => document.getElementById(id);
 const touch = matchMedia('(pointer: coarse)').matches;
@@ -12,7 +12,8 @@ const TOOLS = {
   pins: 'Click one place after the other; it visits them in this order.',
 };
 
-export function buildPanel(state, { clips, controls }, on) {
+export function buildPanel(state, contract, on) {
+  const { controls, clips = contract.animals[0].clips } = contract;
   const sync = [];
   const change = (key, value) => {
     state[key] = value;
@@ -98,12 +99,55 @@ export function buildPanel(state, { clips, controls }, on) {
   );
   sync.push(() => at('slow').setAttribute('aria-pressed', state.speed !== 1));
 
+  if (contract.animals) sync.push(...residents(state, contract, change, on.employ));
+
   const fold = () =>
     at('panel-toggle').setAttribute('aria-expanded', !at('panel').classList.toggle('closed'));
   at('panel-toggle').addEventListener('click', fold);
   if (matchMedia('(max-width: 720px), (max-height: 620px)').matches) fold(); // as in style.css
   sync.forEach((update) => update());
   return { refresh: () => sync.forEach((update) => update()) };
+}
+
+// The animals of the home by name: which is selected, and what each does. Returns what refreshes the list.
+function residents(state, contract, change, employ) {
+  at('animals').hidden = at('company').hidden = false;
+  document
+    .querySelector('.key.animal')
+    .replaceWith(
+      ...contract.animals.map(({ name }, i) =>
+        Object.assign(document.createElement('span'), {
+          className: `key animal a${i % 4}`,
+          textContent: name,
+        }),
+      ),
+    );
+  return contract.animals.map(({ name, clips }) => {
+    const radio = Object.assign(document.createElement('input'), {
+      type: 'radio',
+      name: 'animal',
+      value: name,
+    });
+    const label = document.createElement('label');
+    label.append(radio, Object.assign(document.createElement('span'), { textContent: name }));
+    const does = Object.assign(document.createElement('select'), { ariaLabel: `What ${name} does` });
+    const doings = [
+      ['', 'lives'],
+      [AWAY, 'is away'],
+      ...clips.map((clip) => [clip.name, `replays ${clip.label}`]),
+    ];
+    for (const [value, textContent] of doings)
+      does.append(Object.assign(document.createElement('option'), { value, textContent }));
+    const row = Object.assign(document.createElement('div'), { className: 'resident' });
+    row.append(label, does);
+    at('residents').append(row);
+    radio.addEventListener('change', () => change('animal', name));
+    does.addEventListener('change', () => employ(name, does.value));
+    return () => {
+      radio.checked = state.animal === name;
+      does.value = readDoings(state.does, contract)?.[name] ?? '';
+    };
+  });
 }
 
 export function addClip({ name, label = name }) {

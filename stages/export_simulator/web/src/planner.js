@@ -1,11 +1,12 @@
-// The main thread's side of the planner: starts the worker and sends it requests.
+// The main thread's side of the planner: starts the worker, which plans for all animals, and sends it requests.
 
 import * as assets from './assets.js';
 
 const MODELS = ['perception', 'goal', 'path', 'body'];
 
 export class Planner {
-  static async open(contract, allowed, onProgress) {
+  // residents: {contract, prefix of its assets, allowed} each.
+  static async open(residents, onProgress) {
     const planner = new Planner();
     const source = document.getElementById('asset-worker');
     const code = new Blob([await assets.bytes('worker')], { type: 'text/javascript' });
@@ -17,16 +18,21 @@ export class Planner {
     planner.worker.onerror = (event) => planner.broke(new Error(event.message));
     const wasm = await assets.bytes('ort.wasm');
     onProgress(0.15);
-    const models = Object.fromEntries(
-      await Promise.all(MODELS.map(async (name) => [name, await assets.bytes(name)])),
-    );
     onProgress(0.3);
-    const volume = await assets.bytes('volume');
-    await planner.ask('load', { contract, wasm, models, volume, allowed }, [
-      wasm.buffer,
-      volume.buffer,
-      ...Object.values(models).map((model) => model.buffer),
-    ]);
+    for (const [index, { contract, prefix, allowed }] of residents.entries()) {
+      const models = Object.fromEntries(
+        await Promise.all(MODELS.map(async (name) => [name, await assets.bytes(prefix + name)])),
+      );
+      const volume = await assets.bytes(`${prefix}volume`);
+      const first = index ? {} : { wasm };
+      planner.loaded = index / residents.length;
+      planner.share = 1 / residents.length;
+      await planner.ask('load', { contract, models, volume, allowed, ...first }, [
+        ...(index ? [] : [wasm.buffer]),
+        volume.buffer,
+        ...Object.values(models).map((model) => model.buffer),
+      ]);
+    }
     return planner;
   }
 
@@ -46,7 +52,7 @@ export class Planner {
   }
 
   answered({ id, share, result, error }, onProgress) {
-    if (share !== undefined) return onProgress(0.3 + 0.7 * share);
+    if (share !== undefined) return onProgress(0.3 + 0.7 * (this.loaded + this.share * share));
     const { done, fail } = this.asked.get(id);
     this.asked.delete(id);
     return error ? fail(new Error(error)) : done(result);
@@ -60,7 +66,7 @@ export class Planner {
     return this.ask('goals', question);
   }
 
-  golden(golden) {
-    return this.ask('golden', golden);
+  golden(golden, animal) {
+    return this.ask('golden', { golden, animal });
   }
 }

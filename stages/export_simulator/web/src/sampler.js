@@ -5,6 +5,7 @@ import { aroundPerson } from './avoidance.js';
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
+import { withoutObserver } from './senses.js';
 import {
   velocityChannelsAlong,
   distance,
@@ -34,17 +35,22 @@ export class Sampler {
     this.channels = this.contract.scaling.body_mean.length;
   }
 
-  // The code with everything that is kept, and the one without the observer.
+  // The code with everything that is kept, and the one without the observer, in which companions stay.
   async codes(observation, keep, interactivity) {
+    const rows = this.contract.past_frames;
+    const count = observation.others.length / (10 * rows);
     const perceive = (observer) =>
       this.networks.perception({
         scene_grid: [
           observation.sceneGrid,
           [1, this.contract.architecture.scene_channels, ...this.contract.grid.shape],
         ],
-        others: [observation.others, [1, 1, this.contract.past_frames, 10]],
+        others: [
+          observer || count === 1 ? observation.others : withoutObserver(observation.others, rows),
+          [1, count, rows, 10],
+        ],
         past: [observation.past, [1, observation.past.length]],
-        keep: [Float32Array.of(keep.scene, observer, keep.past), [1, 3]],
+        keep: [Float32Array.of(keep.scene, count === 1 ? observer : 1, keep.past), [1, 3]],
       });
     const full = await perceive(keep.observer);
     const last = observation.past.length / this.contract.past_frames;
@@ -219,7 +225,11 @@ export class Sampler {
 
   // Goals alone, in the world.
   async sampleGoals(question) {
-    const { frame, ...observation } = this.senses.observe(question.past, question.observer);
+    const { frame, ...observation } = this.senses.observe(
+      question.past,
+      question.observer,
+      question.companions,
+    );
     const codes = await this.codes(observation, question.keep, question.interactivity);
     return {
       goals: this.goalsInWorld(
@@ -230,15 +240,14 @@ export class Sampler {
   }
 
   // How a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived.
-  drawing(frame, { seed, steps, interactivity, keep, observer }) {
-    const [x, , z] = observer.at(-1);
+  drawing(frame, { seed, steps, interactivity, keep, observer, companions = [] }) {
     return {
       method: this.contract.sampling.method,
       draw: normals(seed),
       steps,
       interactivity,
       frame: keep.scene ? frame : null,
-      person: [x, z],
+      bodies: [observer, ...companions].map((places) => [places.at(-1)[0], places.at(-1)[2]]),
     };
   }
 
@@ -252,10 +261,10 @@ export class Sampler {
     return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, this.goal(scaled, i)));
   }
 
-  // A whole plan. question: {past, observer, keep, interactivity, samples, steps, seed, aim, raised, path}.
+  // A whole plan. question: {past, observer, companions, keep, interactivity, samples, steps, seed, aim, raised, path}.
   // `cleared` is where a plan ends that goes all the way to the aim: as near to it as the animal may be.
   async plan(question) {
-    const observation = this.senses.observe(question.past, question.observer);
+    const observation = this.senses.observe(question.past, question.observer, question.companions);
     const { frame } = observation;
     const options = this.drawing(frame, question);
     const whole = await this.codes(observation, question.keep, question.interactivity);
@@ -337,15 +346,13 @@ export class Sampler {
   }
 
   // Places of the ego frame as a scaled path that is possible: where the animal may be (unless it does not
-  // perceive the scene), around the person's body, on what carries it.
-  constrained(frame, start, places, { frame: perceived, person }) {
+  // perceive the scene), around the bodies of others, the person's last, on what carries it.
+  constrained(frame, start, places, { frame: perceived, bodies }) {
     const egoFromWorld = inverse(frame);
     const [from, clear] = [apply(frame, start), (place) => (perceived ? this.senses.cleared(place) : place)];
-    const around = aroundPerson(
+    const around = bodies.reduceRight(
+      (path, body) => aroundPerson(path, from, body, clear),
       places.map((place) => clear(apply(frame, place))),
-      from,
-      person,
-      clear,
     );
     const world = perceived
       ? this.senses.support.follow(

@@ -6,6 +6,7 @@ import { nearestAllowed } from './clearing.js';
 import { Support } from './support.js';
 import {
   ROW,
+  apply,
   compose,
   conjugate,
   inverse,
@@ -19,7 +20,8 @@ import {
 } from './rigid.js';
 
 const UPRIGHT = 0.2;
-const PERSON = 0; // kind of the only other that the page has
+const [PERSON, ANIMAL] = [0, 1]; // kinds of others
+const ABSENT_M = 1000; // where somebody is put who is not there
 const ROOT_CHANNELS = 6;
 const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
@@ -36,15 +38,21 @@ export class Senses {
     this.rest = behavior.agent_from_bone_rest.map(rowFromMatrix);
   }
 
-  // past: frames of rows (root, bones); observer: rows of the phone. Oldest first.
-  observe(past, observer) {
+  // past: frames of rows (root, bones); observer: rows of the phone; companions: places [x, y, z] of each
+  // other animal, of which no more is known. Oldest first.
+  observe(past, observer, companions = []) {
     const frame = this.frame(past.at(-1));
     const egoFromWorld = inverse(frame);
     return {
       frame,
       sceneGrid: this.around(frame),
       others: Float32Array.from(
-        observer.flatMap((row) => [...poseChannels(compose(egoFromWorld, row)), PERSON]),
+        [
+          observer.map((row) => [...poseChannels(compose(egoFromWorld, row)), PERSON]),
+          ...companions.map((places) =>
+            places.map((point) => [...apply(egoFromWorld, point), 0, 0, 0, 0, 0, 0, ANIMAL]),
+          ),
+        ].flat(2),
       ),
       past: Float32Array.from(past.flatMap((rows) => this.pastChannels(egoFromWorld, rows))),
     };
@@ -157,6 +165,13 @@ export class Senses {
     });
     return out;
   }
+}
+
+// Others with the first of them, the observer, out of sight; `frames` of ten numbers each.
+export function withoutObserver(others, frames) {
+  const out = Float32Array.from(others);
+  for (let i = 0; i < frames; i++) out[10 * i] = ABSENT_M;
+  return out;
 }
 
 function rowFromMatrix(m) {

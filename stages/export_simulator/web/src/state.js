@@ -2,15 +2,17 @@
 
 export const SPEEDS = [1, 0.3]; // seconds of the animal's life a second
 export const VIEWS = ['room', 'animal', 'you'];
+export const AWAY = 'off'; // what an animal does that is switched off
 const LARGEST_SEED = 999999;
-const SWITCHES = ['scene', 'observer', 'past', 'goal', 'goals', 'path', 'outline'];
+const SWITCHES = ['scene', 'observer', 'companions', 'past', 'goal', 'goals', 'path', 'outline'];
 
 // Every setting with its default; those of the behaviour model come with the contract.
-export function defaults({ controls: { interactivity, samples, steps } }) {
+export function defaults({ controls: { interactivity, samples, steps }, animals }) {
   return {
     interactivity: interactivity.default,
     scene: 1,
     observer: 1,
+    companions: 1,
     past: 1,
     goal: 1,
     samples: samples.default,
@@ -25,6 +27,8 @@ export function defaults({ controls: { interactivity, samples, steps } }) {
     goals: 1,
     path: 1,
     outline: 0,
+    animal: animals?.[0].name ?? '',
+    does: '',
   };
 }
 
@@ -46,6 +50,8 @@ export function readState(contract, clips, hash = location.hash) {
     aim: (text) => (readPlaces(text).length ? text : null),
     route: (text) => (readPlaces(text).length ? text : null),
     at: (text) => (readPoint(text) ? text : null),
+    animal: among((contract.animals ?? []).map(({ name }) => name)),
+    does: (text) => (readDoings(text, contract) ? text : null),
     ...Object.fromEntries(SWITCHES.map((key) => [key, among([0, 1])])),
   };
   const ignored = [];
@@ -63,6 +69,22 @@ export function writeState(state, contract) {
   const hash = new URLSearchParams(changed.map(([key, value]) => [key, String(value)])).toString();
   history.replaceState(null, '', hash ? `#${hash}` : location.pathname + location.search);
 }
+
+// 'name:off,name:clip,...', what animals do instead of living, to an object; null where it is something else.
+export function readDoings(text, { animals = [] }) {
+  const found = text ? text.split(',').map((each) => each.split(':')) : [];
+  const sound = found.every(([name, does]) => {
+    const animal = animals.find((each) => each.name === name);
+    return animal && (does === AWAY || animal.clips.some((clip) => clip.name === does));
+  });
+  return sound ? Object.fromEntries(found) : null;
+}
+
+export const doingsText = (doings) =>
+  Object.entries(doings)
+    .filter(([, does]) => does)
+    .map((each) => each.join(':'))
+    .join(',');
 
 // 'x,z;x,z;...' in metres to a list of points; none where it is something else.
 export function readPlaces(text) {

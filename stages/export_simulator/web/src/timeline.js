@@ -7,14 +7,10 @@ const FADE_TICKS = 4;
 const HOLD_TICKS = 10; // an animal that has to wait stands so long, unless a plan comes before
 
 export class Timeline {
-  constructor(past) {
-    this.reset(past);
-  }
-
-  // Start from recorded frames; the last of them is tick 0.
-  reset(past) {
+  // Start from frames of the past; the last of them is this tick.
+  constructor(past, tick = 0) {
     this.history = past.map((frame) => Float32Array.from(frame));
-    this.lastTick = 0;
+    this.lastTick = tick;
     this.base = this.history.at(-1);
     this.plans = [];
   }

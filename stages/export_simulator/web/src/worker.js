@@ -4,13 +4,13 @@ import * as ort from 'onnxruntime-web/wasm';
 import { Sampler } from './sampler.js';
 import { Senses } from './senses.js';
 
-let sampler;
+const samplers = []; // one per animal
 let turn = Promise.resolve();
 
 const answers = {
   async load({ contract, wasm, models, volume, allowed }, report) {
     ort.env.wasm.numThreads = 1;
-    ort.env.wasm.wasmBinary = wasm.buffer;
+    if (wasm) ort.env.wasm.wasmBinary = wasm.buffer;
     ort.env.logLevel = 'error';
     const networks = {};
     const names = Object.keys(models);
@@ -30,15 +30,15 @@ const answers = {
       };
       report((i + 1) / names.length);
     }
-    sampler = new Sampler(contract, networks, new Senses(contract, volume, allowed));
+    samplers.push(new Sampler(contract, networks, new Senses(contract, volume, allowed)));
   },
   async plan(question) {
     const start = performance.now();
-    const plan = await sampler.plan(question);
+    const plan = await samplers[question.animal].plan(question);
     return { ...plan, milliseconds: performance.now() - start };
   },
-  goals: (question) => sampler.sampleGoals(question),
-  golden: (golden) => sampler.golden(golden),
+  goals: (question) => samplers[question.animal].sampleGoals(question),
+  golden: ({ golden, animal }) => samplers[animal].golden(golden),
 };
 
 onmessage = ({ data: { id, kind, content } }) => {

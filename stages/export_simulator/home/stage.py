@@ -1,0 +1,75 @@
+"""Export the animals of one home as one page."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.videos import Video
+from pipeline.data import ply, qa
+from stages.export_simulator import export, pictures, reading, surfaces, surroundings, writing
+from stages.export_simulator.contract import RoomExtent
+from stages.export_simulator.home.config import Config
+
+WARN_MORE_MB = 10.0
+"""Megabytes that each animal but the first may add to the page before the report warns."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Artifacts of every animal, by its name."""
+
+    reconstruction: Mapping[str, Path]
+    splats: Mapping[str, Path]
+    behavior: Mapping[str, Path]
+    behavior_data: Mapping[str, Path]
+
+
+def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> float:
+    """Write page and `simulator.json` into ``out``; return megabytes of the page. The room is that of the
+    first animal's reconstruction.
+
+    Raises InputError EXP-001 where an animal has no session that is long enough, EXP-002 for a model that the
+    page cannot sample.
+    """
+    places = {
+        name: surroundings.at_home(
+            inputs.reconstruction[name], inputs.splats[name], inputs.behavior_data[name]
+        )
+        for name in inputs.behavior
+    }
+    first = next(iter(places.values()))
+    animals = {}
+    for name, place in places.items():
+        parts = export.simulator(
+            reading.body(inputs.reconstruction[name]),
+            ply.read_ply(first.surface),
+            reading.gaussians(first.splats, inputs.splats[name]),
+            place.motions,
+            config,
+        )
+        behavior = reading.behavior_assets(inputs.behavior[name], place.volume, place.roots_world)
+        animals[name] = (parts, behavior)
+    room = next(iter(animals.values()))[0].scene
+    been = np.concatenate([place.roots_world for place in places.values()])
+    setting = RoomExtent(surfaces.floor_height_m(room, been), surfaces.bounds(room))
+    animals = {name: (replace(parts, setting=setting), assets) for name, (parts, assets) in animals.items()}
+    labels = {video.id: Path(video.file).stem for video in videos}
+    size_mb = writing.write_home(out, animals, config, labels)
+    warn_mb = writing.WARN_PAGE_MB + WARN_MORE_MB * (len(animals) - 1)
+    qa.write(
+        out,
+        good="the page opens within seconds and shows every animal in the same room",
+        bad="an animal that floats or stands in a wall, or a page too big to send",
+        checks=[qa.Check("size of the page", size_mb, "MB", warn=warn_mb, fail=2 * warn_mb)],
+        pictures=[
+            qa.Picture(
+                f"visits_{name}",
+                pictures.visits(room, setting.floor_m, places[name].motions),
+                f"where {name} (amber) and the person (blue) have been",
+            )
+            for name in animals
+        ],
+    )
+    return size_mb

@@ -1,0 +1,149 @@
+"""The page of several animals: each lives, perceives the others as Python does, and obeys hands alone."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+
+from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import as_companions
+from pipeline.behavior.trajectories import BehaviorData, Context
+from pipeline.rivals.predictors import Ats
+from tests.stages.export_simulator import browser, small_world, twins
+from tests.stages.export_simulator.test_page import check_golden
+
+pytestmark = [
+    pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed"),
+    pytest.mark.slow,
+]
+ALL_PLAN = "ats.state().animals.every((animal) => animal.plans > 0)"
+
+
+@pytest.fixture(scope="module")
+def animals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("animals")
+    small_world.write_home(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(animals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_world.exported_home(animals, tmp_path_factory.mktemp("home") / "page")
+
+
+def test_contract_has_every_animal_and_the_room_once(home: Path, animals: Path) -> None:
+    told = json.loads((home / "simulator.json").read_bytes())
+    own = json.loads(
+        (small_world.exported(animals / "cat", home.parent / "cat") / "simulator.json").read_bytes()
+    )
+    assert [animal["name"] for animal in told["animals"]] == ["cat", "dog"]
+    cat = told["animals"][0]
+    assert (
+        cat["behavior"] == own["behavior"] and cat["agent"] == own["agent"] and cat["volume"] == own["volume"]
+    )
+    assert [clip["begin_s"] for clip in cat["clips"]] == [0.0, 0.0]
+    text = (home / "index.html").read_text()
+    for asset, times in (("room", 1), ("splats", 1), ("cat-perception", 1), ("dog-agent", 1), ("agent", 0)):
+        assert text.count(f'id="asset-{asset}"') == times, asset
+
+
+def test_animals_perceive_each_other_as_in_python(home: Path, animals: Path, chromium: Browser) -> None:
+    with browser.shown(chromium, (home / "index.html").as_uri()) as (page, wrong):
+        page.wait_for_function(ALL_PLAN, timeout=60_000)
+        page.evaluate("ats.pause()")
+        for index, name in enumerate(("cat", "dog")):
+            golden = json.loads((animals / name / "behavior/golden.json").read_bytes())
+            assert len(golden["input"]["others"]) == 2, "a person and a companion"
+            check_golden(golden, page.evaluate("([golden, i]) => ats.golden(golden, i)", [golden, index]))
+        _check_goals(page, home, animals / "cat")
+        assert wrong == []
+
+
+def _check_goals(page: Page, home: Path, cat: Path) -> None:
+    """Goals beside a companion, with the same noise: the page's are Python's, and shift away from it."""
+    met = twins.approaches(BehaviorData.load(cat / "behavior_data"), 20, np.random.default_rng(0))
+    contract = json.loads((home / "simulator.json").read_bytes())
+    height = np.full((*met.near.shape[:2], 1), 0.1)
+    place = np.concatenate([met.near[..., :1], height, met.near[..., 1:]], axis=-1)
+    past = np.concatenate(
+        [twins.rows(met.context.world_from_agent[:, :, None]), twins.rows(met.context.agent_from_bone)],
+        axis=2,
+    )
+    asked = {
+        "past": past.reshape(*past.shape[:2], -1).tolist(),
+        "observer": met.far.tolist(),
+        "companions": place[:, None].tolist(),
+        "seed": met.seed.tolist(),
+    }
+    questions = [dict(zip(asked, each, strict=True)) for each in zip(*asked.values(), strict=True)]
+    found = {}
+    for name, changes in {"near": {}, "alone": {"companions": []}}.items():
+        text = json.dumps(
+            [q | changes | {"K": 1, "steps": twins.STEPS, "interactivity": 1} for q in questions]
+        )
+        found[name] = np.array(page.evaluate(twins.ASK, text))[:, [0, 2]]
+    told = contract["animals"][0]["behavior"]["sampling"]
+    sampling = PlanSamplingConfig(told["method"], max(twins.STEPS, told["goal_steps"]), twins.STEPS, 1.0)
+    ats = Ats.load(cat / "behavior", Scenes.load(cat / "behavior_data", ("any",)), sampling)
+    eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
+    eyes = np.stack([met.far[..., 0], np.full(met.far.shape[:2], eyes_m), met.far[..., 1]], -1)
+    companions = np.stack([as_companions(each[None]) for each in place])
+    context = Context(met.context.world_from_agent, met.context.agent_from_bone, eyes, companions=companions)
+    expected = ats.goals(context, 1, twins.PageNoise(met.seed)).goal[:, 0][:, [0, 2]]
+    assert np.median(np.abs(found["near"] - expected)) < 1e-3, "metres"
+    away_m = -((found["near"] - found["alone"]) * met.side).sum(-1)
+    assert (away_m > 0.1).mean() > 0.4, "it flees from whom it perceives"
+
+
+def test_one_is_selected_switched_off_or_replayed(home: Path, animals: Path, chromium: Browser) -> None:
+    with browser.shown(chromium, (home / "index.html").as_uri(), size=(1100, 760)) as (page, wrong):
+        page.wait_for_function(ALL_PLAN, timeout=60_000)
+        gaps = []
+        for _ in range(20):
+            cat, dog = (np.array(each["place"])[[0, 2]] for each in page.evaluate("ats.state().animals"))
+            gaps.append(np.linalg.norm(cat - dog))
+            page.wait_for_timeout(100)
+        assert min(gaps) > 0.3, "metres: bodies' 0.4, less what two plans that fade into each other cut"
+        page.keyboard.press("n")
+        assert page.get_by_role("radio", name="dog").is_checked()
+        page.mouse.click(*page.evaluate("ats.screen([0.5, 0, -0.4])"))
+        assert np.allclose(page.evaluate("ats.state().aim"), [0.5, -0.4], atol=0.05), "metres: the dog's"
+        page.get_by_role("radio", name="cat").check()
+        assert page.evaluate("ats.state().aim") is None
+        assert page.get_by_role("radiogroup", name="The animal that clicks").count() == 1
+        _check_it_is_away(page)
+        _check_it_replays(page, animals)
+        page.reload()
+        page.wait_for_function(f"window.ats && {ALL_PLAN.replace('plans > 0', 'does || animal.plans > 0')}")
+        assert page.evaluate("ats.state().animals.map(({ does }) => does)") == ["v002", ""], (
+            "the address keeps it"
+        )
+        assert wrong == []
+
+
+def _check_it_is_away(page: Page) -> None:
+    page.get_by_role("combobox", name="What cat does").select_option("off")
+    assert "does=cat%3Aoff" in page.evaluate("location.hash")
+    before = page.evaluate("ats.state()")
+    page.wait_for_function(f"ats.state().tick > {before['tick'] + 3}", timeout=60_000)
+    after = page.evaluate("ats.state()")
+    assert after["animals"][0] == before["animals"][0], "no time passes for who is away"
+    assert page.locator(".tag:visible", has_text="cat").count() == 0
+
+
+def _check_it_replays(page: Page, animals: Path) -> None:
+    page.get_by_role("combobox", name="What cat does").select_option("v002")
+    before = page.evaluate("ats.state()")
+    page.wait_for_function(f"ats.state().tick > {before['tick'] + 8}", timeout=60_000)
+    page.evaluate("ats.pause()")
+    place = np.array(page.evaluate("ats.state().animals[0].place"))[:3]
+    recorded = (
+        BehaviorData.load(animals / "cat/behavior_data").trajectories["v002"].world_from_agent[:, :3, 3]
+    )
+    assert np.linalg.norm(recorded - place, axis=1).min() < 0.04, "metres: half a step of the recording"
+    plans = page.evaluate("ats.state().animals[0].plans")
+    assert plans == before["animals"][0]["plans"], "none was asked for"
+    page.evaluate("ats.play()")
