@@ -27,7 +27,10 @@ from pipeline.geometry.meshes import Mesh, RayCaster
 from stages.simulate.subgoal_file import SubgoalEntry, subgoals, tables
 from tests.stages.export_simulator import browser, reaction, small_world, twins
 
-pytestmark = pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed"),
+]
 DROP = """text => {
   const data = new DataTransfer();
   data.items.add(new File([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], 'dropped.npz'));
@@ -59,7 +62,6 @@ SEES_ALL = (
 )
 
 
-@pytest.mark.slow
 def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -> None:
     golden = json.loads((simulator.parent / "golden.json").read_bytes())
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
@@ -387,7 +389,6 @@ def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, 
         assert wrong == []
 
 
-@pytest.mark.slow
 def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
     """A box stands between it and the corner that the room is looked into from otherwise."""
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, _):
@@ -494,7 +495,6 @@ def test_splats_that_cannot_be_read_leave_the_mesh(
         assert [line for line in wrong if "favicon" not in line] == []
 
 
-@pytest.mark.slow
 def test_a_hall_is_framed_as_a_room_is_and_seen_whole_from_afar(
     simulator: Path, chromium: Browser, tmp_path: Path
 ) -> None:

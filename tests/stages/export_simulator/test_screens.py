@@ -10,7 +10,10 @@ from playwright.sync_api import Browser, CDPSession, Page
 
 from tests.stages.export_simulator import browser
 
-pytestmark = pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed"),
+]
 PARTS = ("#panel-toggle", "#panel-body", "#player", "#help", "#map", "#title")
 SIZES = (
     (1280, 720),
@@ -131,7 +134,6 @@ def test_whoever_hears_the_page_is_told(simulator: Path, chromium: Browser) -> N
         assert wrong == []
 
 
-@pytest.mark.slow
 def test_a_visitor_with_a_headset_stands_in_the_room(simulator: Path, chromium: Browser) -> None:
     """The head is the person, a stick walks, a hand points at goals; afterwards the view is as before."""
     address = (simulator / "index.html").as_uri()
