@@ -76,6 +76,15 @@ def surface_points(mesh: Mesh, spacing_m: float) -> SurfacePoints:
     return SurfacePoints(points, normal[face] / np.maximum(twice_area[face], 1e-12)[:, None])
 
 
+def voxel_centres(
+    low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], voxel_m: float
+) -> Float[np.ndarray, "x y z 3"]:
+    """Return the centres of the voxels between two corners of a box, the first one at ``low``; metres."""
+    shape = np.maximum(np.ceil((np.asarray(high, float) - low) / voxel_m).astype(int), 2)
+    axes = [low[axis] + voxel_m * np.arange(shape[axis]) for axis in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
 def from_mesh(
     mesh: Mesh,
     low: Float[np.ndarray, "3"],
@@ -91,10 +100,8 @@ def from_mesh(
     what most voxels around say; surfaces with solid on both sides, as fusion leaves them in walls, do not
     count: they would lead deeper.
     """
-    shape = np.maximum(np.ceil((np.asarray(high, float) - low) / voxel_m).astype(int), 2)
-    axes = [low[axis] + voxel_m * np.arange(shape[axis]) for axis in range(3)]
-    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    grid, surface = centres.reshape(*shape, 3), surface_points(mesh, spacing_m)
+    grid, surface = voxel_centres(low, high, voxel_m), surface_points(mesh, spacing_m)
+    centres, shape = grid.reshape(-1, 3), grid.shape[:3]
     solid = _agreed(_inside(mesh, centres).reshape(shape), _to_points(surface, grid, voxel_m), voxel_m)
     surface = _open(surface, solid, np.asarray(low, np.float64), voxel_m)
     distance = _to_points(surface, grid, voxel_m).reshape(-1)

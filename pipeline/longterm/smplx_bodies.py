@@ -22,6 +22,7 @@ from pipeline.longterm.short_motions import BodyMotion
 
 SHAPES = 10
 """betas of the paper"""
+# What is read of a model file.
 SURFACE = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs")
 HANDS = ("hands_meanl", "hands_meanr", "hands_componentsl", "hands_componentsr")
 BODY, FACE, HAND = 63, 9, 45
@@ -60,9 +61,7 @@ def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> 
             str(model),
             "get SMPLX_NEUTRAL.npz from its authors' site",
         )
-    file = npz.load(
-        model, (*("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs"), *HANDS)
-    )
+    file = npz.load(model, (*SURFACE, *HANDS))
     try:
         layer = smplx.SMPLXLayer(str(model), ext="npz", num_betas=SHAPES, use_pca=False)
     except (KeyError, AttributeError, ValueError, RuntimeError, AssertionError, IndexError) as error:

@@ -21,7 +21,7 @@ from stages.segment_agent.appearance import Appearance, Example, learn
 from stages.segment_agent.config import LearningConfig
 from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
-from stages.segment_agent.windows import working_picture, working_size
+from stages.segment_agent.windows import around, working_picture, working_size
 
 SURE = 4.0
 """log-odds of a mask that is carried on"""
@@ -140,15 +140,12 @@ def trimmed(
     core = ~_grown(~mask, max(rim // 2, 1))
     if not core.any():
         return mask
-    rows, columns = np.nonzero(mask)
-    around = tuple(
-        slice(max(int(place.min()) - AROUND_PX, 0), int(place.max()) + AROUND_PX) for place in (rows, columns)
-    )
+    part = around(mask, AROUND_PX)
     marks = np.where(core, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     marks[~_grown(mask, OUTSIDE_PX)] = cv2.GC_BGD
     marks[~_grown(~mask, max(rim, 1))] = cv2.GC_FGD
     found = np.zeros_like(mask)
-    found[around] = grab(color[around], marks[around], rng, TRIM_ROUNDS)
+    found[part] = grab(color[part], marks[part], rng, TRIM_ROUNDS)
     return found if found.any() else mask
 
 

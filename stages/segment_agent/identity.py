@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from pipeline.data import npz
 from stages.segment_agent.appearance import GAIN, RATE, WEIGHT_DECAY, Appearance, aligned, normalized
 from stages.segment_agent.identities.config import Config
+from stages.segment_agent.windows import around
 
 FILE, PORTRAITS = "identities.safetensors", "portraits.npz"
 NOBODY = 0
@@ -89,10 +90,7 @@ def load_portraits(folder: Path) -> list[Portrait]:
 
 
 def _cut(portrait: Portrait) -> Portrait:
-    rows, columns = np.nonzero(portrait.labels == 255)
-    part = tuple(
-        slice(max(int(at.min()) - AROUND_PX, 0), int(at.max()) + AROUND_PX) for at in (rows, columns)
-    )
+    part = around(portrait.labels == 255, AROUND_PX)
     return Portrait(portrait.animal, portrait.color[part], portrait.labels[part])
 
 
@@ -237,9 +235,8 @@ def _crop(
     shown = (normalized(color) + 1) * torch.from_numpy(tint).float() - 1
     shown = shown * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
     grain = rng.uniform(0, GRAIN) * rng.standard_normal(shown.shape, np.float32)
-    return (shown + torch.from_numpy(grain)).clamp(-1, 1).float(), torch.from_numpy(
-        np.ascontiguousarray(classes)
-    ).long()
+    shown = (shown + torch.from_numpy(grain)).clamp(-1, 1)
+    return shown.float(), torch.from_numpy(np.ascontiguousarray(classes)).long()
 
 
 def _square(

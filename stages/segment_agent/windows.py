@@ -53,6 +53,14 @@ def working_picture(clip: Clip, frame: int, height_px: int) -> UInt8[np.ndarray,
     return color if size == clip.color_size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
 
 
+def around(mask: Bool[np.ndarray, "height width"], margin_px: int) -> tuple[slice, slice]:
+    """Return the rows and columns of what a mask shows, and so many pixels around it."""
+    rows, columns = (
+        slice(max(int(at.min()) - margin_px, 0), int(at.max()) + margin_px) for at in np.nonzero(mask)
+    )
+    return rows, columns
+
+
 def rectangle(
     clip: Clip,
     frame: int,

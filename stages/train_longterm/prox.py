@@ -22,7 +22,7 @@ from scipy import ndimage
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
-from pipeline.geometry.signed_distance import SignedDistance
+from pipeline.geometry.signed_distance import SignedDistance, voxel_centres
 from pipeline.longterm.short_motions import RATE_HZ, STEPS, BodyMotion, resample_motion
 from pipeline.longterm.smplx_bodies import BODY, Person, motion_from_parameters, smplx_body
 from pipeline.longterm.surroundings import MotionScene
@@ -189,13 +189,10 @@ def _distances(file: Path, world_from_scan: np.ndarray, scene: MotionScene) -> S
         values = values.reshape(side, side, side)
     except (ValueError, EOFError, OSError) as error:
         raise _damaged(f"is no grid of distances ({error})", file) from error
-    count = np.maximum(np.ceil((scene.high - scene.low) / scene.voxel_m).astype(int), 2)
-    axes = [scene.low[axis] + scene.voxel_m * np.arange(count[axis]) for axis in range(3)]
-    points = rigid.apply(
-        rigid.inverse(world_from_scan), np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    )
+    centres = voxel_centres(scene.low, scene.high, scene.voxel_m)
+    points = rigid.apply(rigid.inverse(world_from_scan), centres.reshape(-1, 3))
     place = (points - low) / (high - low) * (side - 1)
-    read = ndimage.map_coordinates(values, place.T, order=1, mode="nearest").reshape(count)
+    read = ndimage.map_coordinates(values, place.T, order=1, mode="nearest").reshape(centres.shape[:3])
     return SignedDistance(torch.from_numpy(read), torch.from_numpy(scene.low).float(), scene.voxel_m)
 
 

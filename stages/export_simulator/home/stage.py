@@ -40,11 +40,11 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         for name in inputs.behavior
     }
     first = next(iter(places.values()))
-    animals = {}
+    surface, animals = ply.read_ply(first.surface), {}
     for name, place in places.items():
         parts = export.simulator(
             reading.body(inputs.reconstruction[name]),
-            ply.read_ply(first.surface),
+            surface,
             reading.gaussians(first.splats, inputs.splats[name]),
             place.motions,
             config,

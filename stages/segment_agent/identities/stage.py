@@ -33,8 +33,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = ()) -> Identities:
-    """Learn to distinguish the animals and write the network and what it learned
-    from into `out`.
+    """Learn to distinguish the animals and write the network, and what it learned from, into `out`.
 
     Raises InputError MSK-005 where two look the same.
     """
