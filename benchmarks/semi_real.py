@@ -14,7 +14,11 @@ built-in capture's with the same coat; sessions come without their poses, so tha
     python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 --coat 8 --first 500 --registered --no-poses
     cp -r OUT/recordings/* build/toy/synthetic_capture/recordings/turnaround.r3d captures/kitchen/
     cp agents/toy.toml agents/kitchen.toml && make kitchen.registration
-    python -m benchmarks.semi_real registration build/kitchen OUT/truth build/toy/synthetic_capture/truth
+    python -m benchmarks.semi_real registration build/kitchen OUT/truth build/toy/synthetic_capture/truth \\
+        --structure SEQUENCE
+
+With `--structure` cameras are also judged by structure from motion on the sequence's colour pictures
+(`benchmarks.structure`), brought to the build's world and metres by the walk-through's cameras.
 """
 
 import argparse
@@ -25,7 +29,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Integer
 
+from benchmarks import structure
 from benchmarks.composited import Compositor, Sequence, course, measure_noise, surfaces
 from pipeline.core.progress import log
 from pipeline.core.videos import Video
@@ -84,7 +90,7 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int, drawing: Drawing =
     npz.save(
         out / "truth" / f"{name}.npz", compress=True, timestamp_s=timestamp_s, packed=packed,
         source_index=np.round(timestamp_s * RATE_HZ).astype(int),
-        shape=np.array([len(masks), *masks[0].shape]), world_from_camera=poses,
+        shape=np.array([len(masks), *masks[0].shape]), world_from_camera=poses, number=sequence.numbers,
         world_from_agent=motion.world_from_agent, there=there,
     )  # fmt: skip
 
@@ -116,13 +122,14 @@ def read_truth(path: Path, index: np.ndarray) -> np.ndarray:
     return np.unpackbits(table["packed"][row], axis=-1, count=int(table["shape"][2])).astype(bool)
 
 
-def registered(build: Path, truth: Path, turnaround: Path) -> dict[str, float]:
+def registered(build: Path, truth: Path, turnaround: Path, sequence: Path | None = None) -> dict[str, float]:
     """Return medians and percentiles of camera and root errors over all frames of all sessions.
 
     Roots are judged where more than 0.1 % of the picture shows the animal, relative to the camera: the poses
     of the sequence, by which the animal was drawn, are no truth of the room (KinectFusion's scale may differ
     from the sensor's by several percent), but what a picture shows relative to its camera is exact. `placed`
     is the share of these frames that have a root, `root_where_empty` that of frames without the animal.
+    With ``sequence`` cameras are judged by structure from motion on its pictures as well.
     Metres and degrees.
     """
     videos = {Path(v.file).stem: v for v in read_videos(build / "plan" / "videos.json")}
@@ -136,7 +143,7 @@ def registered(build: Path, truth: Path, turnaround: Path) -> dict[str, float]:
     agent_from_true = constant_between(
         AgentCameras.open(build / "agent_template").agent_from_registered, true_agent_from_camera
     )
-    cameras, roots, empty = [], [], []
+    cameras, roots, empty, shown = [], [], [], {}
     for name, video in videos.items():
         if video.role != "session":
             continue
@@ -144,6 +151,7 @@ def registered(build: Path, truth: Path, turnaround: Path) -> dict[str, float]:
         poses = RegisteredPoses.open(build / "registration" / video.id) or RegisteredPoses.unknown(
             table["timestamp_s"]
         )
+        shown[name] = Shown(poses.world_from_camera, table["number"])
         cameras.append(pose_errors(poses.world_from_camera, world_from_true @ table["world_from_camera"]))
         true_roots = rigid.inverse(table["world_from_camera"]) @ table["world_from_agent"]
         true_roots = true_roots @ rigid.inverse(agent_from_true)
@@ -153,7 +161,10 @@ def registered(build: Path, truth: Path, turnaround: Path) -> dict[str, float]:
         empty.append(np.isfinite(poses.world_from_agent[share == 0, 0, 3]))
     camera, root = joined(cameras), joined(roots)
     placed = np.isfinite(root.meters)
-    return {
+    by_structure = (
+        {} if sequence is None else _by_structure(Shown(ours, walk["number"]), shown, sequence, truth)
+    )
+    return by_structure | {
         "frames": len(camera.meters), "camera_deg_median": float(np.median(camera.degrees)),
         "camera_m_median": float(np.median(camera.meters)), "camera_deg_p95": _p95(camera.degrees),
         "camera_m_p95": _p95(camera.meters), "root_frames": len(placed), "root_placed": float(placed.mean()),
@@ -162,6 +173,33 @@ def registered(build: Path, truth: Path, turnaround: Path) -> dict[str, float]:
         "root_flips": float((root.degrees[placed] > FLIPPED_DEG).mean()),
         "root_where_empty": float(np.concatenate(empty).mean()),
     }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A recording's cameras in our world, and the number of the sequence's frame that each shows."""
+
+    world_from_camera: Float[np.ndarray, "frame 4 4"]
+    number: Integer[np.ndarray, "frame"]
+
+    def where(self, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cameras that the reference has too, ours and its own."""
+        rows = [row for row, number in enumerate(self.number.tolist()) if number in known]
+        return self.world_from_camera[rows], np.stack([known[int(self.number[row])] for row in rows])
+
+
+def _by_structure(walk: Shown, sessions: dict[str, Shown], sequence: Path, out: Path) -> dict[str, float]:
+    """Compare cameras with structure from motion, computed once for ``out``."""
+    frames = np.unique(np.concatenate([walk.number, *(each.number for each in sessions.values())])).tolist()
+    known = structure.cameras(sequence, frames, out / "structure")
+    pairs = {name: each.where(known) for name, each in {"walk": walk, **sessions}.items()}
+    errors = {name: pose_errors(ours, structure.in_world(*pairs["walk"], other))
+              for name, (ours, other) in pairs.items()}  # fmt: skip
+    found = {"walk": errors.pop("walk"), "camera": joined(list(errors.values()))}
+    return {f"structure_{name}_{key}": value for name, each in found.items()
+            for key, value in (("frames", len(each.meters)), ("deg_median", float(np.median(each.degrees))),
+                               ("m_median", float(np.median(each.meters))), ("deg_p95", _p95(each.degrees)),
+                               ("m_p95", _p95(each.meters)))}  # fmt: skip
 
 
 def _rows(build: Path, video: Video, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -199,6 +237,9 @@ def main() -> None:
     three.add_argument("build", type=Path)
     three.add_argument("truth", type=Path, help="OUT/truth")
     three.add_argument("turnaround", type=Path, help="truth folder of the turnaround")
+    three.add_argument(
+        "--structure", type=Path, metavar="SEQUENCE", help="judge cameras by its pictures, too"
+    )
     task = parser.parse_args()
     if task.command == "draw":
         known = sorted(int(re.findall(r"\d+", p.name)[0]) for p in task.sequence.glob("frame-*.depth.png"))
@@ -208,7 +249,7 @@ def main() -> None:
         for seed in task.seeds:
             draw(sequence, task.out, "walkthrough" if task.empty else f"session-{seed}", seed, drawing)
     elif task.command == "registration":
-        for name, value in registered(task.build, task.truth, task.turnaround).items():
+        for name, value in registered(task.build, task.truth, task.turnaround, task.structure).items():
             print(f"{name:50s} {value:.4g}")
     else:
         for folder in sorted((task.out / task.masks).iterdir()):

@@ -1,8 +1,9 @@
 """Registration in a real room: the template of one half of a walk, cameras of the other half in it, without odometry.
 
 The halves of a 7-Scenes style folder become recordings without poses: `extract_frames` reads them, the first is
-mapped as a walk-through, the second is registered to it as a session. All poses are compared in the world of the
-first half's true cameras.
+mapped as a walk-through, the second is registered to it as a session. All poses are compared with two references,
+each brought to the template's world by the first half's cameras: the folder's own poses (KinectFusion), and
+structure from motion on the colour pictures alone.
 """
 
 import json
@@ -12,15 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Integer
 
+from benchmarks import structure
 from benchmarks.real.table import Row
 from pipeline.backends.descriptors import Describer
 from pipeline.core.progress import log
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip, Masks, read_source_index
 from pipeline.localization.localizer import Localizer
-from pipeline.metrics.pose_errors import PoseErrors, constant_between, pose_errors
+from pipeline.metrics.pose_errors import PoseErrors, pose_errors
 from stages.build_scene_template import template
 from stages.build_scene_template.config import Config as TemplateConfig
 from stages.build_scene_template.template import SceneTemplate
@@ -47,10 +49,11 @@ PUBLISHED = {"hloc, all of 7-Scenes": "1.10 / 0.14", "DSAC* RGB-D, all of 7-Scen
 
 @dataclass(frozen=True)
 class Half:
-    """One half as a recording, and where its cameras truly were."""
+    """One half as a recording, and where its cameras were by the folder's own poses."""
 
     clip: Clip
     world_from_camera: Float[np.ndarray, "frame 4 4"]
+    number: Integer[np.ndarray, "frame"]
 
 
 def numbers(scene: Path) -> list[int]:
@@ -73,7 +76,7 @@ def half(scene: Path, chosen: list[int], folder: Path) -> Half:
     extracting.run(extracting.Inputs(recording), FramesConfig(), frames)
     kept = read_source_index(frames)
     true = [np.loadtxt(scene / f"frame-{number:06d}.pose.txt") for number in kept]
-    return Half(Clip.open(frames), np.stack(true))
+    return Half(Clip.open(frames), np.stack(true), kept)
 
 
 def halves(scene: Path, folder: Path) -> tuple[Half, Half]:
@@ -106,15 +109,14 @@ def registered(
     return result.aligned.world_from_camera
 
 
-def measured(scene: Path, folder: Path) -> dict[str, dict[str, float]]:
-    """Return median errors (metres, degrees) of all methods on the second half."""
+def measured(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]]:
+    """Return median errors (metres, degrees) of all methods on the second half, by both references."""
     walk, session = halves(scene, folder)
     workspace = folder / "workspace"
     shutil.rmtree(workspace, ignore_errors=True)
     workspace.mkdir(parents=True)
     none = np.zeros((len(walk.clip), 4, 4, 2), np.float16)
     made, _ = template.build(walk.clip, none, TemplateConfig(), workspace)
-    truth = constant_between(made.world_from_camera, walk.world_from_camera) @ session.world_from_camera
     config, rng = LocalizerConfig(), np.random.default_rng(0)
     shown = training.scene_views(
         made.mesh, made.world_from_camera, made.floor_m, walk.clip, config.scene, rng
@@ -130,12 +132,42 @@ def measured(scene: Path, folder: Path) -> dict[str, dict[str, float]]:
         "SIFT, PnP on the template's walk": localizing.placed_by_sift(points, clip, frames),
         "retrieval": localizing.placed_by_retrieval(pictures, clip, frames),
     }
-    walked = pose_errors(
-        made.world_from_camera,
-        constant_between(made.world_from_camera, walk.world_from_camera) @ walk.world_from_camera,
+    known = structure.cameras(scene, [*walk.number.tolist(), *session.number.tolist()], folder / "structure")
+    own = dict(
+        zip(
+            [*walk.number, *session.number],
+            [*walk.world_from_camera, *session.world_from_camera],
+            strict=True,
+        )
     )
-    found = {name: medians(pose_errors(each, truth)) for name, each in poses.items()}
-    return found | {"the template's own cameras": medians(walked)}
+    return {
+        "structure from motion": compared(made.world_from_camera, walk, session, poses, known, resize=True),
+        "KinectFusion": compared(made.world_from_camera, walk, session, poses, own, resize=False),
+    }
+
+
+def compared(
+    template_cameras: Float[np.ndarray, "frame 4 4"],
+    walk: Half,
+    session: Half,
+    poses: dict[str, Float[np.ndarray, "frame 4 4"]],
+    reference: dict[int, Float[np.ndarray, "4 4"]],
+    *,
+    resize: bool,
+) -> dict[str, dict[str, float]]:
+    """Return median errors of all methods in the frames that the reference has; it is brought to the
+    template's world by the walk's cameras, to its scale too with ``resize``.
+    """
+    both, seen = (
+        [row for row, number in enumerate(half.number) if number in reference] for half in (walk, session)
+    )
+    fitted = template_cameras[both], np.stack([reference[walk.number[row]] for row in both])
+    truth = structure.in_world(
+        *fitted, np.stack([reference[session.number[row]] for row in seen]), resize=resize
+    )
+    found = {name: medians(pose_errors(each[seen], truth)) for name, each in poses.items()}
+    walked = structure.in_world(*fitted, fitted[1], resize=resize)
+    return found | {"the template's own cameras": medians(pose_errors(fitted[0], walked))}
 
 
 def medians(errors: PoseErrors) -> dict[str, float]:
@@ -151,15 +183,19 @@ def row(scene: Path, out: Path) -> Row:
         found = measured(scene, folder)
         done.write_text(json.dumps(found, indent=1) + "\n")
     found = json.loads(done.read_text())
-    for name, errors in found.items():
-        log(f"{scene.name}, {name}: {100 * errors['m']:.1f} cm, {errors['deg']:.2f} deg")
-    cells = {name: f"{100 * errors['m']:.1f} / {errors['deg']:.2f}" for name, errors in found.items()}
-    ours = found["ours"]
+    cells = {
+        f"{name}, by {reference}": f"{100 * errors['m']:.1f} / {errors['deg']:.2f}"
+        for reference, methods in found.items()
+        for name, errors in methods.items()
+    }
+    for name, cell in cells.items():
+        log(f"{scene.name}, {name}: {cell} cm / deg")
+    ours = found["structure from motion"]["ours"]
     return Row(
         "registration",
-        f"7-Scenes, {scene.name}: second half of the frames in the first, no odometry, against KinectFusion",
+        f"7-Scenes, {scene.name}: second half of the frames in the first, no odometry",
         "median, cm / deg",
-        cells.pop("ours"),
+        cells.pop("ours, by structure from motion"),
         cells,
         PUBLISHED,
         f"<= {100 * BAR_M:.0f} / {BAR_DEG} against structure from motion",
