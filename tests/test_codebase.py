@@ -7,9 +7,9 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 61_747,
+    "lines": 61_930,
     "lines over 110 columns": 0,
-    "recipe keys": 324,
+    "recipe keys": 325,
     "packages over 16 modules": 0,
     "private words in identifiers": 131,
     "tell, told": 12,

@@ -120,8 +120,17 @@ class Moved:
 
 
 def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData, *, seed: int = 0) -> Moved:
-    """Put the animal of ``own`` and ``data`` into the other home. Raises ART-007 where the volumes are not of
-    one kind, SIM-011 where features cannot be compared or no moment fits in.
+    """Put the animal of ``own`` and ``data`` into the other home. Raises ART-007 and SIM-011 as `perceived`
+    does, SIM-011 where no moment fits in.
+    """
+    seen = replace(perceived(own, other), stands_m=own.stands_m)
+    moved = set_down(data, own, seen, np.random.default_rng(seed))
+    return Moved(seen, moved, share_known(own, seen))
+
+
+def perceived(own: ReconstructedHome, other: ReconstructedHome) -> ReconstructedHome:
+    """Return the other home with features as a model learned in ``own`` reads them. Raises ART-007 where the
+    volumes are not of one kind, SIM-011 where features cannot be compared.
     """
     if other.volume.voxel_m != own.volume.voxel_m or len(other.volume.features) != len(own.volume.features):
         raise _other_version("has another kind of volume than the animal's own", Path("the other home"))
@@ -129,9 +138,7 @@ def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData
         what = f"has features of {other.describer.backend}, the animal's own of {own.describer.backend}"
         raise _unusable(what, Path("the other home"))
     features = expressed(other.volume.features, other.basis, own.basis)
-    seen = replace(other, volume=replace(other.volume, features=features), stands_m=own.stands_m)
-    moved = set_down(data, own, seen, np.random.default_rng(seed))
-    return Moved(seen, moved, share_known(own, seen))
+    return replace(other, volume=replace(other.volume, features=features))
 
 
 def expressed(

@@ -26,7 +26,7 @@ from pipeline.core import config as configuration
 from pipeline.core import devices, videos
 from pipeline.core.errors import InputError, coded_disk_errors
 from pipeline.core.videos import Role, Split, Video
-from pipeline.workflow import artifact, dag
+from pipeline.workflow import artifact, dag, recipes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,8 +97,12 @@ class Task:
         ]
         if others:
             return self.per_animal(field.name, others[0], self.config.others)
+        if of_homes := [
+            need.artifact for need in needs if need.homes == "other" and need.option == field.name
+        ]:
+            return self.per_home(self.paths[field.name], of_homes)
         if dag.NODES[field.name].trials == "each":
-            return self.per_trial(field.name, dag.trial_ids(self.config.methods, self.config.seeds))
+            return self.per_trial(field.name, recipes.trial_ids(self.config.methods, self.config.seeds))
         for need in needs:
             if need.artifact == field.name:
                 return self.per_video(field.name, need.roles, need.splits, measured=need.measured)
@@ -168,6 +172,12 @@ class Task:
         return {
             animal: self._opened(folder / animal / artifact, f"{animal}/{artifact}") for animal in animals
         }
+
+    def per_home(self, builds: Path, artifacts: Sequence[str]) -> dict[str, Path]:
+        """Return the folder of every further build that the configuration names; each has these artifacts."""
+        for name, artifact_name in itertools.product(self.config.homes, artifacts):
+            self._opened(builds / name / artifact_name, f"{name}/{artifact_name}")
+        return {name: builds / name for name in self.config.homes}
 
     @contextmanager
     def create(self) -> Iterator[Path]:

@@ -4,7 +4,6 @@
 only what `plan` wrote. Standard library only, no side effects.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -31,6 +30,7 @@ VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCT
 TEMPLATES = ("scene_template", "agent_template")
 LOCALIZERS = ("scene_localizer", "agent_localizer")
 LONGTERM_STUDIES = ("longterm_ablations", "longterm_world", "longterm_study")
+HOME_ARTIFACTS = ("behavior_data", "feature_basis", "scene_template")
 READ_BY_PAGES = ("reconstruction", "splats", "behavior", "behavior_data")
 
 
@@ -58,6 +58,9 @@ class Need:
     others: bool = False
     """Not one's own but that of every other animal of the home, of all of them where it is made once; the
     folder of all animals is given."""
+    homes: Literal["any", "own", "other"] = "any"
+    """Only where the table of the node names further `homes`, builds of the same animal: one's own, or each
+    of theirs, of which the folder of all builds is given."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +99,7 @@ class Node:
     flows: tuple[Flow, ...] = ("recordings",)
     """The flows that it is part of."""
     trials: Literal["none", "each", "all"] = "none"
-    """Made only for the tables of `make behavior-tables`: one job per trial (a method with a seed), or one
-    over all."""
+    """Only for `make behavior-tables`: one job per trial (a method with a seed), or one over all."""
     table: str | None = None
     """The recipe's table that configures it, where it is another node's too."""
     on_demand: bool = False
@@ -117,19 +119,18 @@ def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Nee
     return tuple(Need(artifact, roles) for artifact in artifacts)
 
 
+RECORDING = Need("synthetic_capture", part="recordings", option="recording")
+OF_HOMES = (
+    *(Need(name, homes="own", flow="recordings") for name in HOME_ARTIFACTS[1:]),
+    *(Need(name, option="homes", homes="other", flow="recordings") for name in HOME_ARTIFACTS),
+)
 FLOW: tuple[Node, ...] = (
     Node("synthetic_capture", "synthesize_capture", threads=2),
-    Node(
-        "frames",
-        "extract_frames",
-        (Need("synthetic_capture", part="recordings", option="recording"),),
-        roles=("walkthrough", "turnaround", "session", "heldout"),
-        seconds_per_frame=0.006,
-    ),
+    Node("frames", "extract_frames", (RECORDING,), roles=(*VIEWED, "heldout"), seconds_per_frame=0.006),
     Node(
         "pictures",
         "extract_frames",
-        (Need("synthetic_capture", part="recordings", option="recording"),),
+        (RECORDING,),
         roles=AGENT,
         table="extract_frames",
         mapped=True,
@@ -237,7 +238,13 @@ FLOW: tuple[Node, ...] = (
         flows=BOTH,
     ),
     Node(
-        "behavior", "train_behavior", ("behavior_data",), gpu=1, resumable=True, distributed=True, flows=BOTH
+        "behavior",
+        "train_behavior",
+        ("behavior_data", *OF_HOMES),
+        gpu=1,
+        resumable=True,
+        distributed=True,
+        flows=BOTH,
     ),
     Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True, distributed=True),
     Node("longterm_world", "synthesize_capture.motions", on_demand=True),
@@ -260,7 +267,7 @@ FLOW: tuple[Node, ...] = (
     Node(
         "behavior_trials",
         "train_behavior",
-        ("behavior_data",),
+        ("behavior_data", *OF_HOMES),
         table="train_behavior",
         fixed={"export": False},
         gpu=1,
@@ -391,8 +398,3 @@ def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
     """Return the node's inputs, in declared order; those of one flow only, if given."""
     needs = tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
     return tuple(need for need in needs if flow is None or need.flow in (None, flow))
-
-
-def trial_ids(methods: Sequence[str], seeds: int) -> tuple[str, ...]:
-    """Return the ids of the trials that the tables are made of: `<method>-<seed>`."""
-    return tuple(f"{method}-{seed}" for method in methods for seed in range(seeds))

@@ -3,7 +3,6 @@
 Standard library only, nothing is written here: `plan` writes it down, `run` does the jobs.
 """
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,10 +13,7 @@ from pipeline.core.videos import Video
 from pipeline.recordings import formats
 from pipeline.workflow import artifact, captures, dag
 from pipeline.workflow.dag import Flow, Need, Node
-from pipeline.workflow.recipes import Trial
-
-NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}\Z")
-NAME_RULE = "use a-z, 0-9, _ and -, beginning with a letter or digit, 63 at most"
+from pipeline.workflow.recipes import HOMES, NAME, NAME_RULE, Trial
 
 
 @dataclass(frozen=True)
@@ -321,6 +317,8 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
     for need in dag.needs_of(node, plan.flow):
         if (dag.NODES[need.artifact].of_several or need.others) and not plan.others:
             continue
+        if need.homes != "any" and not plan.tables[node.artifact].get(HOMES):
+            continue
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:
                 scale_from = formats.scale_sources(folder, video, plan.videos)
@@ -337,7 +335,9 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
         whole = plan.home_of(need.artifact).folder / need.artifact
         path = whole if several else Path(found[0].path, found[0].part or "")
         path = plan.home.base.folder / "animals" if need.others else path
-        arguments += [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
+        path = Path("build") if need.homes == "other" else path
+        option = [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
+        arguments += [] if option[0] in arguments else option
         arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
     return inputs, arguments, deciding
 
@@ -350,6 +350,10 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
         for name in plan.others:
             path = replace(plan.home, animal=name).folder / need.artifact
             yield Input(f"{name}/{need.artifact}", str(path), need.part)
+        return
+    if need.homes == "other":
+        for name in plan.tables[node.artifact][HOMES]:
+            yield Input(f"{name}/{need.artifact}", str(Path("build", name, need.artifact)), need.part)
         return
     if need.per_animal and plan.home.animal:
         need = replace(need, part=f"{need.part}/{plan.home.animal}")

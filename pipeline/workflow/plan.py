@@ -53,6 +53,7 @@ def read(home: Home, cache: sources.Cache) -> Plan:
         n.artifact: {**recipes.merged(tables[n.artifact], overlay.get(dag.table_of(n), {})), **n.fixed}
         for n in dag.FLOW
     }
+    recipes.refuse_homes(home.agent, changed["behavior"], where)
     folder = Path("captures", home.agent)
     names = captures.find(folder, flow)
     if names:

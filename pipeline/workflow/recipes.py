@@ -5,17 +5,22 @@ mean.
 know before any stage runs. Standard library only.
 """
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from pipeline.core import config
 from pipeline.core.errors import InputError
-from pipeline.workflow import captures, dag, sources
+from pipeline.workflow import artifact, captures, dag, sources
 from pipeline.workflow.dag import Flow
 
 VIDEOS_TABLE, FLOW_TABLE, TABLES_STAGE, TRIED_TABLE = "videos", "flow", "tabulate_behavior", "train_behavior"
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}\Z")
+NAME_RULE = "use a-z, 0-9, _ and -, beginning with a letter or digit, 63 at most"
+HOMES = "homes"
+"""The key of `TRIED_TABLE` that names further builds of the same animal."""
 BASE = "base"
 """The key at the top of a variant that names the variant whose keys it starts from."""
 OURS = "ats"
@@ -104,6 +109,17 @@ def flow(table: Mapping[str, Any], where: str) -> Flow:
     return begins
 
 
+def refuse_homes(agent: str, table: Mapping[str, Any], where: str) -> None:
+    """Raise REC-002 for `homes` that are no other builds, ART-003 for builds that are not there yet."""
+    for name in table.get(HOMES, ()):
+        if not NAME.match(name) or name == agent:
+            remedy = "name other builds of the same animal, folders below build/"
+            raise InputError(
+                "REC-002", f"{HOMES}: {name!r} is no other build", f"{where}: [{TRIED_TABLE}]", remedy
+            )
+        artifact.require(Path("build", name), *dag.HOME_ARTIFACTS, remedy=f"make {name}")
+
+
 def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
     """Yield every trained method of the tables with every seed; a method is a variant of that name."""
     settings = {**_defaults(TABLES_STAGE), **table}
@@ -127,8 +143,13 @@ def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
         path = Path("agents", "variants", f"{method}.toml")
         overlay, _ = read(path)
         config.refuse_unknown(overlay, (TRIED_TABLE,), where=f"{path}, a method of the tables", kind="table")
-        for seed, id in enumerate(dag.trial_ids((method,), count)):
+        for seed, id in enumerate(trial_ids((method,), count)):
             yield Trial(id, {**overlay.get(TRIED_TABLE, {}), "seed": seed})
+
+
+def trial_ids(methods: Sequence[str], seeds: int) -> tuple[str, ...]:
+    """Return the ids of the trials that the tables are made of: `<method>-<seed>`."""
+    return tuple(f"{method}-{seed}" for method in methods for seed in range(seeds))
 
 
 def merged(table: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import convolve1d
 from torch import Tensor
 
 from pipeline.behavior.encoders import beings
@@ -21,11 +20,12 @@ from pipeline.behavior.path_encoding import (
     velocity_channels_from_path,
     with_powered_length,
 )
-from pipeline.behavior.perception import FeatureVolume, PerceptionEnsemble, grid_points_ego, world_from_ego
+from pipeline.behavior.perception import PerceptionEnsemble, world_from_ego
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import RATE_HZ, BehaviorData
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
+from stages.train_behavior.scene_sampler import SceneSampler
 
 YAW_JITTER_RAD = 0.3
 """largest rotation of samples that are not turned by any angle"""
@@ -64,6 +64,8 @@ class TrainingWindows:
     frame: Int[Tensor, "window window_frame"]
     scene: Int[Tensor, "window"]
     """number of the window's feature volume"""
+    bones_known: Bool[Tensor, "window"]
+    """recorded in the animal's own build, whose bones the model has"""
     approached: Int[Tensor, "some"]
     """windows that begin with a person coming up, those at rare distances several times"""
     rate_hz: float = RATE_HZ
@@ -111,7 +113,8 @@ class TrainingBatch:
     held: Float[Tensor, "batch held_frame held_channel"]
     """root and bones of the frames that give velocity and posture, as they were"""
     bones_keep: Float[Tensor, "batch"]
-    mirrored: Bool[Tensor, "batch"]
+    bones_known: Bool[Tensor, "batch"]
+    """not mirrored, and of the animal's own build"""
     oversampled: Bool[Tensor, "batch"]
     """drawn for their observer, who is always perceived then: without, the odds would be wrong"""
     goal: Float[Tensor, "batch 3"]
@@ -128,63 +131,16 @@ class TrainingBatch:
         return TrainingBatch(*(value.to(device) for value in vars(self).values()))
 
 
-class SceneSampler:
-    """Samples the ego grid at the resolution that the scene encoder works on, fast enough for every step.
-
-    The encoder averages blocks of cells; here the volume is smoothed once as that averaging would, and read
-    at the blocks' centres.
-    """
-
-    def __init__(self, scenes: Scenes, stride: int, device: str):
-        volumes, channels = scenes.volumes, scenes.channels
-        flat = [_smoothed(volume, stride).reshape(volume.occupancy.size, channels) for volume in volumes]
-        rows = np.concatenate([*flat, np.zeros((1, channels), np.float32)])
-        self.features = torch.from_numpy(rows).to(device)
-        self.points = torch.from_numpy(grid_points_ego(stride).astype(np.float32)).to(device)
-        first = np.cumsum([0, *(len(part) for part in flat[:-1])])
-        self.first = torch.from_numpy(first).to(device)
-        self.origin = torch.from_numpy(np.stack([volume.origin for volume in volumes]).astype(np.float32)).to(
-            device
-        )
-        self.shape = torch.tensor([volume.occupancy.shape for volume in volumes], device=device)
-        self.voxel_m = torch.tensor([volume.voxel_m for volume in volumes], device=device)
-
-    def __call__(
-        self,
-        world_from_ego: Float[Tensor, "batch 4 4"],
-        side: Float[Tensor, "batch"],
-        scene: Int[Tensor, "batch"],
-    ) -> Float[Tensor, "batch channel x y z"]:
-        """Sample the grid in the volumes ``scene``; ``side`` is -1 where left and right are exchanged."""
-        points = (
-            self.points.flatten(0, 2)
-            * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
-        )
-        away = rigid_torch.apply(world_from_ego, points) - self.origin[scene][:, None]
-        index, shape = (away / self.voxel_m[scene][:, None, None]).floor().long(), self.shape[scene][:, None]
-        inside = ((index >= 0) & (index < shape)).all(-1)
-        row = (
-            (index[..., 0] * shape[..., 1] + index[..., 1]) * shape[..., 2]
-            + index[..., 2]
-            + self.first[scene][:, None]
-        )
-        features = self.features[torch.where(inside, row, len(self.features) - 1)]
-        return features.transpose(1, 2).unflatten(2, self.points.shape[:3])
-
-
-def _smoothed(volume: FeatureVolume, stride: int) -> Float[np.ndarray, "x y z channel"]:
-    """Return features as averaging the nearest voxels of blocks of cells would leave them, or as they are."""
-    features = volume.features.astype(np.float32)
-    kernel = np.convolve(np.ones(stride), [0.5, 0.5]) / stride if stride > 1 else np.array([1.0])
-    for axis in (1, 2, 3):
-        features = convolve1d(features, kernel, axis=axis, mode="constant")
-    return np.moveaxis(features, 0, -1)
-
-
 def windows_from_data(
-    data: BehaviorData, index: Int[np.ndarray, "window"], architecture: Architecture, scenes: Scenes
+    data: BehaviorData,
+    index: Int[np.ndarray, "window"],
+    architecture: Architecture,
+    scenes: Scenes,
+    bones_known: Bool[np.ndarray, "video"] | None = None,
 ) -> TrainingWindows:
-    """Put the frames of all recordings in one row and index each window in it."""
+    """Put the frames of all recordings in one row and index each window in it; bones are known
+    in all recordings without ``bones_known``.
+    """
     tracks = [data.trajectories[video] for video in data.videos]
     agent = np.concatenate([track.world_from_agent for track in tracks])
     observer = np.concatenate([track.world_from_camera for track in tracks])
@@ -202,7 +158,8 @@ def windows_from_data(
     )
     met = approached(now, observer[rows[:, : data.past], :3, 3], data.rate_hz)
     met = met[:0] if architecture.ablated_input == "observer" else met
-    indices = (torch.from_numpy(index) for index in (rows, number, met))
+    known = np.ones(len(data.videos), bool) if bones_known is None else bones_known
+    indices = (torch.from_numpy(index) for index in (rows, number, known[data.video[index]], met))
     return TrainingWindows(*tables, *indices, rate_hz=data.rate_hz)
 
 
@@ -242,13 +199,13 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     remembered of a body is scaled as the body is.
     """
     some = torch.arange(0, len(windows), -(-len(windows) // MAX_STATISTICS_WINDOWS))
-    tracks, rows = windows.tracks(some), windows.frame[some]
+    tracks, rows, known = windows.tracks(some), windows.frame[some], windows.bones_known[some]
     past, rate_hz = windows.past, windows.rate_hz
     future = tracks.root[:, past:].double().numpy()
     level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(0.02)
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
-    whole = body_statistics(tracks.rotation[:, past:], windows.bones[rows[:, past:].unique()], turn_rad)
+    whole = body_statistics(tracks.rotation[:, past:], windows.bones[rows[known, past:].unique()], turn_rad)
     strides = (
         velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)[..., :3]
         .double()
@@ -354,6 +311,7 @@ def draw_batch(
     posed = slice(count, None if bodies else count)
     index, chosen = _drawn_windows(windows, augmentation, size, generator)
     side, turn = _drawn_turns(augmentation, size, generator)
+    bones_known = windows.bones_known[index] & (side > 0)
     flip = torch.diag_embed(torch.stack([side, torch.ones(size), torch.ones(size)], dim=-1))
     new_from_old = flip @ turn.mT
     tracks = windows.tracks(index)
@@ -389,8 +347,8 @@ def draw_batch(
         beings(observer, facing, tracks.companions, new_from_old),
         past.flatten(1),
         held,
-        ((torch.rand(size, generator=generator) >= augmentation.hide_bones) & (side > 0)).float(),
-        side < 0,
+        ((torch.rand(size, generator=generator) >= augmentation.hide_bones) & bones_known).float(),
+        bones_known,
         chosen,
         track[:, -1],
         track.mT,

@@ -132,5 +132,8 @@ class Config:
     point itself; then paths read it too, at each noisy waypoint."""
     training: BehaviorTrainingConfig = field(default_factory=BehaviorTrainingConfig)
     """Length of training, augmentation, losses."""
+    homes: tuple[str, ...] = ()
+    """Further builds of the same animal, from which goals and paths are learned as well; bodies are learned
+    from this build alone, since every build has bones of its own."""
     seed: int = 0
     """Seed of weights, batches and noise."""

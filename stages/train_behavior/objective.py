@@ -86,15 +86,15 @@ def sequence_rows(
     """Return the windows from which paths learn, those from which bodies learn, and which of the latter have
     true bones.
 
-    Both are always as many in every step, for kernels are made anew for every size. Mirrored windows, whose
-    bones nobody knows, come last among the bodies.
+    Both are always as many in every step, for kernels are made anew for every size. Windows whose bones are
+    unknown (mirrored, of other homes) come last among the bodies.
     """
     paths, bodies = (
         max(round(len(batch.goal) * share), 1) for share in (objective.path_share, objective.body_share)
     )
     bodies = bodies if objective.body_share > 0 else 0
-    body = torch.argsort(batch.mirrored.int(), stable=True)[:bodies]
-    return torch.arange(paths, device=body.device), body, ~batch.mirrored[body]
+    body = torch.argsort((~batch.bones_known).int(), stable=True)[:bodies]
+    return torch.arange(paths, device=body.device), body, batch.bones_known[body]
 
 
 def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor, "row"]) -> Float[Tensor, ""]:

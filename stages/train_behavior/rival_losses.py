@@ -70,7 +70,7 @@ def one_stage_losses(
     """
     assert phase == "all", "a model of one stage has no goals that could learn before"
     code = perceive(nets, batch, objective, generator, joint_mask(batch, objective, generator))
-    known = ~batch.mirrored
+    known = batch.bones_known
     seen = torch.where(known[:, None, None], batch.body, torch.zeros_like(batch.body))
     whole = torch.cat([batch.path, seen], dim=1)
     nothing = torch.zeros_like(batch.places), torch.zeros(len(code), 1, device=code.device)

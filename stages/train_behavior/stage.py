@@ -1,5 +1,6 @@
 """The stage: trajectories and scenes -> a trained behaviour model, as files."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,8 +9,11 @@ from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, frames_from_seconds
 from pipeline.core import devices, distributed, progress
+from pipeline.core.errors import InputError
+from pipeline.environments.other_home import ReconstructedHome
 from stages.train_behavior import outcome
 from stages.train_behavior.config import Config
+from stages.train_behavior.homes import lived
 from stages.train_behavior.refusals import check_settings
 from stages.train_behavior.training import train
 
@@ -20,6 +24,12 @@ class Inputs:
 
     behavior_data: Path
     """Trajectories, windows and scenes."""
+    feature_basis: Path | None = None
+    """Of its own build, with ``homes``: what the features of the others are expressed in."""
+    scene_template: Path | None = None
+    """The same: its scale and floor."""
+    homes: Mapping[str, Path] | None = None
+    """Folders of further builds of the same animal."""
 
 
 def run(
@@ -27,7 +37,7 @@ def run(
 ) -> None:
     """Train, export and judge the model; of several processes the first writes.
 
-    Raises BEH-001, BEH-003, REC-002, ART-010.
+    Raises BEH-001, BEH-003, REC-002, ART-007, ART-010, SIM-011.
     """
     distributed.join(device)
     data = BehaviorData.load(inputs.behavior_data)
@@ -38,9 +48,18 @@ def run(
     weighting = config.training.objective.weighting
     schedule = Schedule(course="rectified" if weighting == "flow" else "linear")
     check_settings(config, data, architecture, str(inputs.behavior_data))
-    progress.log(f"{len(data.indices(TRAIN))} training windows, {len(data.start)} in all")
+    training = lived(data, scenes, *_homes(inputs, config))
+    progress.log(f"{len(training.data.indices(TRAIN))} training windows, {len(data.start)} in all of its own")
     fitted = train(
-        data, scenes, architecture, schedule, config.training, seed=config.seed, resume=resume, device=device
+        training.data,
+        training.scenes,
+        architecture,
+        schedule,
+        config.training,
+        seed=config.seed,
+        bones_known=training.bones_known,
+        resume=resume,
+        device=device,
     )
     if not distributed.leave():
         return
@@ -49,3 +68,16 @@ def run(
     if config.export:
         guided: Guided = "all" if config.training.objective.joint_dropout > 0 else "observer"
         outcome.write_exported(out, fitted, architecture, schedule, data, scenes, guided, seed=config.seed)
+
+
+def _homes(inputs: Inputs, config: Config) -> tuple[ReconstructedHome | None, list[Path]]:
+    """Return the animal's own home, to compare with, and the folders of the others."""
+    if not config.homes:
+        return None, []
+    if inputs.feature_basis is None or inputs.scene_template is None or inputs.homes is None:
+        what = "homes are learned from reconstructions; here the flow begins at trajectories"
+        raise InputError(
+            "REC-002", what, "[train_behavior]: homes", "leave it out: put all tables into one folder"
+        )
+    own = ReconstructedHome.load(inputs.behavior_data, inputs.feature_basis, inputs.scene_template)
+    return own, [inputs.homes[name] for name in config.homes]

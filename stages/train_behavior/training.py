@@ -5,7 +5,9 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from jaxtyping import Bool
 
 from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.diffusion import Schedule
@@ -16,7 +18,6 @@ from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from stages.train_behavior.batches import (
-    SceneSampler,
     WindowStatistics,
     draw_batch,
     largest_turn_rad,
@@ -26,6 +27,7 @@ from stages.train_behavior.batches import (
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig
 from stages.train_behavior.objective import TrainingPhase, losses
 from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
+from stages.train_behavior.scene_sampler import SceneSampler
 
 WEIGHT_DECAY = 0.05
 """Of AdamW; minutes of video overfit with the usual 0.01."""
@@ -59,17 +61,19 @@ def train(
     settings: BehaviorTrainingConfig,
     *,
     seed: int,
+    bones_known: Bool[np.ndarray, "video"] | None = None,
     resume: Path | None = None,
     device: str = "cpu",
 ) -> TrainedBehavior:
-    """Fit the networks to the training windows of the data.
+    """Fit the networks to the training windows of the data; bodies to those recordings where ``bones_known``,
+    by default all.
 
     Several processes (`pipeline.core.distributed`) share each step's batch; all hold the same networks.
     """
     minimised = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}[
         architecture.family
     ]
-    windows = windows_from_data(data, data.indices(TRAIN), architecture, scenes)
+    windows = windows_from_data(data, data.indices(TRAIN), architecture, scenes, bones_known)
     statistics = statistics_from_windows(windows, largest_turn_rad(settings.augmentation))
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)

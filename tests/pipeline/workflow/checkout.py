@@ -32,6 +32,7 @@ SETTINGS = {
         "    companion: str = 'none'\n"
     ),
     "train_localizer": "    target: str = ''\n",
+    "train_behavior": "    homes: tuple[str, ...] = ()\n",
     "slice_behavior": "    others: tuple[str, ...] = ()\n",
     "export_simulator.home": "    others: tuple[str, ...] = ()\n",
     "train_longterm": '    ablations: str = "none"\n',
@@ -159,7 +160,7 @@ def _fields(stage: str) -> str:
                 {
                     need.option or need.artifact
                     for need in dag.needs_of(node, "recordings")
-                    if not (need.others or dag.NODES[need.artifact].of_several)
+                    if not (need.others or need.homes != "any" or dag.NODES[need.artifact].of_several)
                 }
                 for node in nodes
             )
@@ -171,7 +172,7 @@ def _fields(stage: str) -> str:
                 dag.NODES[need.artifact].trials == "each" and node.trials != "each"
             )
             kinds[need.option or need.artifact] = "Mapping[str, Path]" if several else "Path"
-            if need.others:
+            if need.others or need.homes == "other":
                 kinds[need.option or need.artifact] = "Mapping[str, Path]"
             if need.variants:
                 kinds["variants"] = "Mapping[str, Path]"

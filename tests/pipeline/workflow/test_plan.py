@@ -349,6 +349,37 @@ def test_a_former_reconstruction_is_begun_from_but_not_by_variants(house):
     assert captures.not_understood(house.folder / "captures/toy") == []
 
 
+def test_further_homes_are_inputs_of_the_behavior_model_alone(house):
+    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
+        house.write(f"captures/toy/{name}", name)
+    house.write("agents/toy.toml", '[train_behavior]\nhomes = ["summer"]\n')
+    missing = house.python("pipeline.workflow.plan", "plan", "toy")
+    assert missing.returncode == 2 and "ART-003" in missing.stderr and "make summer" in missing.stderr
+    for artifact in ("behavior_data", "feature_basis", "scene_template"):
+        house.write(f"build/summer/{artifact}/world.json", "{}")
+    assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    jobs = {job["id"]: job for job in json.loads((house.folder / "build/toy/plan/dag.json").read_text())}
+    readers = {id for id, job in jobs.items() if any("summer" in each["path"] for each in job["inputs"])}
+    assert readers == {"behavior"}
+    assert [each["path"] for each in jobs["behavior"]["inputs"]] == [
+        "build/toy/behavior_data",
+        "build/toy/feature_basis",
+        "build/toy/scene_template",
+        "build/summer/behavior_data",
+        "build/summer/feature_basis",
+        "build/summer/scene_template",
+    ]
+    arguments = jobs["behavior"]["arguments"]
+    assert arguments.count("--homes") == 1 and arguments[arguments.index("--homes") + 1] == "build"
+
+
+@pytest.mark.parametrize("name", ["toy", "../cat", "pair/animals/dog"])
+def test_a_home_that_is_no_other_build_is_refused(house, name):
+    house.write("agents/toy.toml", f'[train_behavior]\nhomes = ["{name}"]\n')
+    refused = house.python("pipeline.workflow.plan", "plan", "toy")
+    assert refused.returncode == 2 and "REC-002" in refused.stderr and name in refused.stderr
+
+
 def test_a_prompt_beside_a_recording_reaches_its_masks_alone(house):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
         house.write(f"captures/toy/{name}", name)

@@ -1,0 +1,68 @@
+"""Windows of several homes of one animal, as one model learns them: one world each, features in own terms.
+
+Of the other homes the training windows are read. Their bones are not: each build found bones of its own, so
+that bodies are learned from the animal's own build alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
+from pipeline.core.errors import InputError
+from pipeline.environments.homes import Habitat, together
+from pipeline.environments.other_home import ReconstructedHome, perceived
+
+
+@dataclass(frozen=True)
+class TrainingHomes:
+    """What one model learns from: recordings and scenes of one or several homes."""
+
+    data: BehaviorData
+    scenes: Scenes
+    bones_known: Bool[np.ndarray, "video"]
+    """Recordings of the animal's own build."""
+
+
+def lived(
+    data: BehaviorData, scenes: Scenes, own: ReconstructedHome | None, others: Sequence[Path]
+) -> TrainingHomes:
+    """Add the training windows of ``others``, builds of the same animal, to those of its own build.
+
+    Raises REC-002 where their rate is another, and what `pipeline.environments.other_home` raises for homes
+    that cannot be used.
+    """
+    if not others:
+        return TrainingHomes(data, scenes, np.ones(len(data.videos), bool))
+    assert own is not None, "further homes are compared with the animal's own"
+    habitats = [Habitat.of_one_home(data, scenes)]
+    for build in others:
+        home = perceived(own, ReconstructedHome.of_build(build))
+        habitats.append(Habitat.of_one_home(_learned(build, data), home.scenes()))
+    habitat = together(habitats)
+    return TrainingHomes(habitat.data, habitat.scenes, habitat.home_of_video == 0)
+
+
+def _learned(build: Path, own: BehaviorData) -> BehaviorData:
+    """Return the training windows of another build, with as many bones as ``own`` has, at rest."""
+    data = BehaviorData.load(build / "behavior_data")
+    if (data.rate_hz, data.past) != (own.rate_hz, own.past):
+        what = f"{data.past} known frames at {data.rate_hz:g} Hz, here {own.past} at {own.rate_hz:g}"
+        raise InputError("REC-002", what, str(build), "give both builds the same [slice_behavior]")
+    data = data.with_horizon(own.future)
+    some = data.indices(TRAIN)
+    return replace(
+        data,
+        trajectories={name: _at_rest(track, own) for name, track in data.trajectories.items()},
+        agent_from_bone_rest=own.agent_from_bone_rest,
+        **{name: getattr(data, name)[some] for name in ("video", "start", "split")},
+    )
+
+
+def _at_rest(track: Trajectory, own: BehaviorData) -> Trajectory:
+    shape = (len(track.timestamp_s), *own.agent_from_bone_rest.shape)
+    return replace(track, agent_from_bone=np.broadcast_to(own.agent_from_bone_rest, shape))
