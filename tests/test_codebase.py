@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 61_930,
+    "lines": 61_913,
     "lines over 110 columns": 0,
     "recipe keys": 325,
     "packages over 16 modules": 0,

@@ -21,10 +21,10 @@ from pipeline.behavior.path_encoding import (
     with_powered_length,
 )
 from pipeline.behavior.perception import PerceptionEnsemble, world_from_ego
-from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import RATE_HZ, BehaviorData
+from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
+from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.scene_sampler import SceneSampler
 
 YAW_JITTER_RAD = 0.3
@@ -131,16 +131,9 @@ class TrainingBatch:
         return TrainingBatch(*(value.to(device) for value in vars(self).values()))
 
 
-def windows_from_data(
-    data: BehaviorData,
-    index: Int[np.ndarray, "window"],
-    architecture: Architecture,
-    scenes: Scenes,
-    bones_known: Bool[np.ndarray, "video"] | None = None,
-) -> TrainingWindows:
-    """Put the frames of all recordings in one row and index each window in it; bones are known
-    in all recordings without ``bones_known``.
-    """
+def windows_from_data(homes: TrainingHomes, architecture: Architecture) -> TrainingWindows:
+    """Put the frames of all recordings in one row and index each training window in it."""
+    data, index = homes.data, homes.windows()
     tracks = [data.trajectories[video] for video in data.videos]
     agent = np.concatenate([track.world_from_agent for track in tracks])
     observer = np.concatenate([track.world_from_camera for track in tracks])
@@ -150,7 +143,7 @@ def windows_from_data(
     first = np.cumsum([0, *(len(track.timestamp_s) for track in tracks[:-1])])
     rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(data.past + data.future)
     frame = world_from_ego(agent[rows[:, data.past - 1]], architecture.ego)
-    number = scenes.number(data.video[index], len(index))
+    number = homes.scenes.number(data.video[index], len(index))
     now = agent[rows[:, data.past - 1], :3, 3]
     companions = data.nearest_companions(index, now)
     tables = (
@@ -158,8 +151,8 @@ def windows_from_data(
     )
     met = approached(now, observer[rows[:, : data.past], :3, 3], data.rate_hz)
     met = met[:0] if architecture.ablated_input == "observer" else met
-    known = np.ones(len(data.videos), bool) if bones_known is None else bones_known
-    indices = (torch.from_numpy(index) for index in (rows, number, known[data.video[index]], met))
+    known = homes.home[data.video[index]] == 0
+    indices = (torch.from_numpy(index) for index in (rows, number, known, met))
     return TrainingWindows(*tables, *indices, rate_hz=data.rate_hz)
 
 

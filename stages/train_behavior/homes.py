@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Int
 
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
@@ -24,8 +24,22 @@ class TrainingHomes:
 
     data: BehaviorData
     scenes: Scenes
-    bones_known: Bool[np.ndarray, "video"]
-    """Recordings of the animal's own build."""
+    home: Int[np.ndarray, "video"]
+    """Number of each recording's home, 0 of the animal's own."""
+
+    @classmethod
+    def of_one(cls, data: BehaviorData, scenes: Scenes) -> "TrainingHomes":
+        """Return the animal's own build alone."""
+        return cls(data, scenes, np.zeros(len(data.videos), int))
+
+    def windows(self) -> Int[np.ndarray, "window"]:
+        """Return the training windows of all homes, repeated where a home has fewer than another, so that
+        each home is drawn as often.
+        """
+        index = self.data.indices(TRAIN)
+        each = [index[self.home[self.data.video[index]] == number] for number in range(self.home.max() + 1)]
+        most = max(len(mine) for mine in each)
+        return np.concatenate([np.resize(mine, most) for mine in each if len(mine)])
 
 
 def lived(
@@ -37,14 +51,14 @@ def lived(
     that cannot be used.
     """
     if not others:
-        return TrainingHomes(data, scenes, np.ones(len(data.videos), bool))
+        return TrainingHomes.of_one(data, scenes)
     assert own is not None, "further homes are compared with the animal's own"
     habitats = [Habitat.of_one_home(data, scenes)]
     for build in others:
         home = perceived(own, ReconstructedHome.of_build(build))
         habitats.append(Habitat.of_one_home(_learned(build, data), home.scenes()))
     habitat = together(habitats)
-    return TrainingHomes(habitat.data, habitat.scenes, habitat.home_of_video == 0)
+    return TrainingHomes(habitat.data, habitat.scenes, habitat.home_of_video)
 
 
 def _learned(build: Path, own: BehaviorData) -> BehaviorData:

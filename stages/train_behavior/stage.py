@@ -48,18 +48,10 @@ def run(
     weighting = config.training.objective.weighting
     schedule = Schedule(course="rectified" if weighting == "flow" else "linear")
     check_settings(config, data, architecture, str(inputs.behavior_data))
-    training = lived(data, scenes, *_homes(inputs, config))
-    progress.log(f"{len(training.data.indices(TRAIN))} training windows, {len(data.start)} in all of its own")
+    homes = lived(data, scenes, *_homes(inputs, config))
+    progress.log(f"{len(homes.data.indices(TRAIN))} training windows; {len(data.start)} windows of its own")
     fitted = train(
-        training.data,
-        training.scenes,
-        architecture,
-        schedule,
-        config.training,
-        seed=config.seed,
-        bones_known=training.bones_known,
-        resume=resume,
-        device=device,
+        homes, architecture, schedule, config.training, seed=config.seed, resume=resume, device=device
     )
     if not distributed.leave():
         return

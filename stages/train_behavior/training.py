@@ -5,16 +5,12 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Bool
 
 from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
 from pipeline.behavior.pointwise import WaypointUNet
-from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from stages.train_behavior.batches import (
@@ -25,6 +21,7 @@ from stages.train_behavior.batches import (
     windows_from_data,
 )
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig
+from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.objective import TrainingPhase, losses
 from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
 from stages.train_behavior.scene_sampler import SceneSampler
@@ -54,30 +51,27 @@ class TrainedBehavior:
 
 
 def train(
-    data: BehaviorData,
-    scenes: Scenes,
+    homes: TrainingHomes,
     architecture: Architecture,
     schedule: Schedule,
     settings: BehaviorTrainingConfig,
     *,
     seed: int,
-    bones_known: Bool[np.ndarray, "video"] | None = None,
     resume: Path | None = None,
     device: str = "cpu",
 ) -> TrainedBehavior:
-    """Fit the networks to the training windows of the data; bodies to those recordings where ``bones_known``,
-    by default all.
+    """Fit the networks to the training windows; bodies to those of the animal's own build.
 
     Several processes (`pipeline.core.distributed`) share each step's batch; all hold the same networks.
     """
     minimised = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}[
         architecture.family
     ]
-    windows = windows_from_data(data, data.indices(TRAIN), architecture, scenes, bones_known)
+    windows = windows_from_data(homes, architecture)
     statistics = statistics_from_windows(windows, largest_turn_rad(settings.augmentation))
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
-    scene = SceneSampler(scenes, architecture.scene_stride, device)
+    scene = SceneSampler(homes.scenes, architecture.scene_stride, device)
     optimization, drawn = settings.optimization, settings.augmentation
     of_paths = replace(drawn, approached=drawn.approached_paths)
     goal_steps = 0 if architecture.family == "one_stage" else optimization.goal_steps

@@ -12,7 +12,7 @@ from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, TRAIN, frames_from_seconds
+from pipeline.behavior.trajectories import PAST, frames_from_seconds
 from pipeline.core import training as fit
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid_torch
@@ -41,6 +41,7 @@ from stages.train_behavior.export import (
     write_contract,
     write_networks,
 )
+from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.objective import goal_error, joint_mask, losses, perceive, squared_error
 from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.refusals import check_settings
@@ -58,7 +59,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def windows(data):
-    return windows_from_data(data, data.indices(TRAIN), ARCHITECTURE, Scenes.of(room()))
+    return windows_from_data(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE)
 
 
 def drawn(windows, augmentation, seed=0):
@@ -233,7 +234,8 @@ def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=3, goal_steps=1, batch=8))
     half = replace(settings, optimization=replace(settings.optimization, precision="bfloat16"))
     exact, rough = (
-        train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), each, seed=3) for each in (settings, half)
+        train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), each, seed=3)
+        for each in (settings, half)
     )
     for name in ("path", "body"):
         ours, theirs = rough.record.terms[name][1:], exact.record.terms[name][1:]
@@ -255,7 +257,9 @@ def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
 )
 def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shape):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8))
-    fitted = train(data, Scenes.of(room()), shape, Schedule(course="rectified"), settings, seed=0)
+    fitted = train(
+        TrainingHomes.of_one(data, Scenes.of(room())), shape, Schedule(course="rectified"), settings, seed=0
+    )
     outcome.write_trained(tmp_path, fitted, shape, Schedule(course="rectified"), REST)
     architecture, nets, scaling, schedule, _ = model.load(tmp_path)
     assert (architecture, schedule) == (shape, Schedule(course="rectified"))
@@ -266,7 +270,7 @@ def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shap
 @pytest.mark.slow
 def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=8, goal_steps=4, batch=8))
-    whole = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3)
+    whole = train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), settings, seed=3)
     assert set(whole.record.terms) == {"goal", "path", "body"}
     learned = {
         name: np.flatnonzero(np.isfinite(values)).tolist() for name, values in whole.record.terms.items()
@@ -282,8 +286,22 @@ def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(fit._Loop, "advance", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
-    resumed = train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
+            train(
+                TrainingHomes.of_one(data, Scenes.of(room())),
+                ARCHITECTURE,
+                Schedule(),
+                settings,
+                seed=3,
+                resume=tmp_path,
+            )
+    resumed = train(
+        TrainingHomes.of_one(data, Scenes.of(room())),
+        ARCHITECTURE,
+        Schedule(),
+        settings,
+        seed=3,
+        resume=tmp_path,
+    )
     for name, value in whole.nets.state_dict().items():
         torch.testing.assert_close(resumed.nets.state_dict()[name], value, atol=0, rtol=0)
 
@@ -300,7 +318,7 @@ def test_goals_and_paths_ask_for_approaches_each_in_its_own_share(data, monkeypa
         BehaviorOptimizerConfig(steps=3, goal_steps=2, batch=4, goal_batch=4),
         AugmentationConfig(approached=0.2, approached_paths=0.5),
     )
-    train(data, Scenes.of(room()), ARCHITECTURE, Schedule(), settings, seed=0)
+    train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), settings, seed=0)
     assert asked == [0.2, 0.2, 0.5]
 
 

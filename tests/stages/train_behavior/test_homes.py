@@ -17,7 +17,7 @@ from stages.train_behavior.batches import (
     windows_from_data,
 )
 from stages.train_behavior.config import AugmentationConfig, BehaviorTrainingConfig, Config, ObjectiveConfig
-from stages.train_behavior.homes import lived
+from stages.train_behavior.homes import TrainingHomes, lived
 from stages.train_behavior.objective import sequence_rows
 from stages.train_behavior.scene_sampler import SceneSampler
 from stages.train_behavior.stage import Inputs, run
@@ -50,7 +50,7 @@ def learned(builds):
 
 
 def test_training_windows_of_both_homes_and_test_windows_of_its_own(learned):
-    data, own = wandering(), learned.bones_known[learned.data.video]
+    data, own = wandering(), learned.home[learned.data.video] == 0
     assert len(learned.data.indices(TRAIN)) == 2 * len(data.indices(TRAIN))
     assert len(learned.data.indices(TEST)) == len(data.indices(TEST))
     assert own[learned.data.indices(TEST)].all() and not own[learned.data.indices(TRAIN)].all()
@@ -58,14 +58,22 @@ def test_training_windows_of_both_homes_and_test_windows_of_its_own(learned):
     assert set(scene[own]) == {0} and set(scene[~own]) == {1}
 
 
-def test_bodies_are_learned_from_the_own_home_alone(learned):
+def test_each_home_is_as_likely_to_be_learned_from(learned):
     data = learned.data
-    index = data.indices(TRAIN)
-    windows = windows_from_data(data, index, ARCHITECTURE, learned.scenes, learned.bones_known)
+    few = np.concatenate([data.indices(TRAIN)[:5], data.indices(TRAIN)[len(data.indices(TRAIN)) // 2 :]])
+    some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start", "split")})
+    drawn = replace(learned, data=some).windows()
+    home = learned.home[some.video[drawn]]
+    assert (home == 0).sum() == (home == 1).sum() == len(few) - 5
+    assert set(drawn) == set(range(len(few)))
+
+
+def test_bodies_are_learned_from_the_own_home_alone(learned):
+    windows = windows_from_data(learned, ARCHITECTURE)
     drawn = AugmentationConfig(mirror=0.0)
     statistics = statistics_from_windows(windows, largest_turn_rad(drawn))
     alone = wandering()
-    own = windows_from_data(alone, alone.indices(TRAIN), ARCHITECTURE, Scenes.of(learned.scenes.volumes[0]))
+    own = windows_from_data(TrainingHomes.of_one(alone, Scenes.of(learned.scenes.volumes[0])), ARCHITECTURE)
     by_itself = statistics_from_windows(own, largest_turn_rad(drawn))
     np.testing.assert_allclose(
         statistics.scaling.body_mean[6:],
