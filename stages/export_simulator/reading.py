@@ -52,8 +52,8 @@ class BehaviorAssets:
     """shape, origin and voxel size of `features`"""
     features: bytes
     """half precision, channel first"""
-    allowed: bytes
-    """one byte per voxel: where the animal may be"""
+    voxels: dict[str, bytes]
+    """one byte per voxel: `allowed`, where the animal may be, and `occupancy`, of which furniture is found"""
     supported: float | None
     """share of recorded frames whose root is above something that carries it; None where that is unknown"""
 
@@ -140,7 +140,7 @@ def behavior_assets(
         raise InputError(
             "EXP-002", what, str(behavior), "take another variant: family diffusion, ego yaw or full"
         )
-    table = npz.load(volume, names=("features", "allowed", "origin", "voxel_m", "stands_m"))
+    table = npz.load(volume, names=("features", "occupancy", "allowed", "origin", "voxel_m", "stands_m"))
     return BehaviorAssets(
         contract=contract,
         networks={name: (behavior / f"{name}.onnx").read_bytes() for name in NETWORKS},
@@ -150,7 +150,7 @@ def behavior_assets(
             "voxel_m": float(table["voxel_m"]),
             "support": support_contract(table["stands_m"]),
         },
-        allowed=table["allowed"].astype(np.uint8).tobytes(),
+        voxels={name: table[name].astype(np.uint8).tobytes() for name in ("allowed", "occupancy")},
         supported=supported_share(table, roots_world),
         features=table["features"].astype("<f2").tobytes(),
     )

@@ -108,7 +108,7 @@ def _animal(parts: SimulatorParts, behavior: BehaviorAssets) -> dict[str, Asset]
         "agent-splats": Asset(parts.agent_splats.rows, 32),
         "agent-skin": Asset(parts.agent_splats.skin, 8),
         "volume": Asset(behavior.features, 2),
-        "allowed": Asset(behavior.allowed),
+        **{name: Asset(values) for name, values in behavior.voxels.items()},
         **{name: Asset(network, 4) for name, network in behavior.networks.items()},
     }
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 
 from pipeline.behavior.diffusion import Schedule, noised
 from pipeline.behavior.model import Architecture, BehaviorNets, Scaling
@@ -17,6 +18,7 @@ from pipeline.behavior.path_encoding import (
     velocity_channels_from_path,
     with_powered_length,
 )
+from pipeline.behavior.support import mark_supported
 from pipeline.behavior.trajectories import FUTURE, BehaviorData, Trajectory
 from pipeline.data import npz, ply
 from pipeline.geometry import rigid
@@ -30,6 +32,7 @@ from stages.train_behavior.export import write_model
 BONES = 5
 HALF_ROOM_M = 2.0
 CUPBOARD_M = 1.3
+BOX_M = (0.6, 0.8, 0.4)
 READS = ("reconstruction", "splats", "behavior", "behavior_data")
 NAMED = Config(name="tube")
 
@@ -273,6 +276,26 @@ def allowed(shape: tuple[int, int, int]) -> np.ndarray:
     edge = round((CUPBOARD_M + 2.2) / 0.1)
     space[edge:, :, : shape[2] - edge] = 0
     return space
+
+
+def furnish(build: Path) -> None:
+    """Put a box of `BOX_M` onto the middle of the floor, and floor and walls into the volume."""
+    scene, half = ply.read_ply(build / "reconstruction/scene.ply"), np.array(BOX_M) / 2
+    box = trimesh.creation.box(BOX_M, rigid.make(np.eye(3), [0, half[1], 0])).subdivide().subdivide()
+    vertices = np.concatenate([scene.vertices, box.vertices]).astype(np.float32)
+    faces = np.concatenate([scene.faces, box.faces + len(scene.vertices)]).astype(np.int32)
+    color = np.concatenate([scene.color, np.full((len(box.vertices), 3), (60, 90, 150))]).astype(np.uint8)
+    ply.write_ply(build / "reconstruction/scene.ply", Mesh(vertices, faces, color))
+    write_gaussians(build / "splats/scene.ply", Mesh(vertices, faces, color))
+    volume = npz.load(build / "behavior_data/volume.npz")
+    place = np.moveaxis(np.indices(volume["occupancy"].shape), 0, -1) * 0.1 + volume["origin"] + 0.05
+    inside = (np.abs(place) < [HALF_ROOM_M, np.inf, HALF_ROOM_M]).all(-1)
+    solid = ~inside | (place[..., 1] < 0)
+    solid |= (np.abs(place - [0, half[1], 0]) < half).all(-1)
+    volume["occupancy"] = solid.astype(np.uint8)
+    volume["allowed"] = mark_supported(~solid, volume["occupancy"])
+    volume["stands_m"] = np.array([[0.05, 0.15], [0.08, 0.12]])
+    npz.save(build / "behavior_data/volume.npz", **volume)
 
 
 def write_surfaces(reconstruction: Path) -> None:

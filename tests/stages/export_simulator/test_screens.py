@@ -36,7 +36,8 @@ HEADSET = Path(__file__).with_name("headset.js").read_text()
 def test_nothing_covers_anything(simulator: Path, chromium: Browser) -> None:
     """In windows of many sizes, with the panel folded and open, nothing overlaps and nothing is cut off."""
     with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(1280, 720)) as (page, _):
-        page.evaluate("ats.pause(); ats.visit([[0, 0]])")  # all buttons are there
+        page.evaluate("ats.pause(); ats.visit([[0, 0]])")
+        page.evaluate("for (const id of ['undo', 'restore']) document.getElementById(id).hidden = false")
         for (width, height), folded in itertools.product(SIZES, (False, True)):
             page.set_viewport_size({"width": width, "height": height})
             _fold(page, folded)

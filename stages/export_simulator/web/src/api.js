@@ -1,5 +1,6 @@
 // For tests and for the curious, as `window.ats`: ask the page the same questions that it asks itself.
 
+import { arranged } from './furniture.js';
 import { rotate } from './rigid.js';
 import { rootOf } from './timeline.js';
 
@@ -78,6 +79,24 @@ export function api(simulator) {
       if (!simulator.playing) simulator.play();
     },
     reset: () => simulator.reset(),
+    // Furniture that can be moved, what has been, and the volume of the selected animal as it is then.
+    furniture: () => {
+      const { mover } = simulator;
+      const { furniture, homes } = mover;
+      const own = homes[selected().index];
+      return {
+        pieces: furniture.pieces.map((piece) => ({
+          columns: piece.columns.map((column) => furniture.grid.columnCenter(column)),
+          top: furniture.grid.center(piece.cells.at(-1)),
+          cells: piece.cells.length,
+          by: mover.by.get(piece) ?? [0, 0],
+        })),
+        occupancy: Array.from(arranged(own, own.told?.moves ?? []).occupancy),
+        allowed: Array.from(own.told?.allowed ?? own.allowed),
+        triangles: room.mesh.geometry.index.count / 3,
+        held: mover.held && { by: mover.held.by },
+      };
+    },
     visit: (points) => simulator.visit(points),
     moveObserver: (place) => {
       observer.place = [...place];

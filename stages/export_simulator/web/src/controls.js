@@ -1,6 +1,6 @@
 // Hands on the scene: keys walk the observer and turn the view, a drag on the figure carries it, a click on
 // floor or furniture is a goal, one more with the pins (or with shift), a stroke with the pen (or with shift)
-// is a path. Keys that mean something to the part of the panel that has the focus stay its own.
+// is a path; with the tool for it, a drag moves furniture. Keys that mean something to the part of the panel that has the focus stay its own.
 
 const KEYS = {
   w: [0, 1],
@@ -13,6 +13,7 @@ const KEYS = {
   arrowright: [1, 0],
 };
 const TURNS = { q: [-1, 0], e: [1, 0], '+': [0, -1], '=': [0, -1], '-': [0, 1] };
+const TOOLS = { p: 'pen', g: 'pins', m: 'move' };
 const CLICK_PX = 6;
 const STROKE_M = 0.03;
 
@@ -27,6 +28,7 @@ export class Controls {
       dragging: false,
       tool: null,
       stroke: null,
+      lifted: null, // the height above the floor at which furniture is held
     });
     addEventListener('keydown', (event) => this.key(event));
     addEventListener('keyup', (event) => this.down.delete(event.code));
@@ -60,7 +62,10 @@ export class Controls {
     if (event.ctrlKey || event.metaKey || event.altKey) return this.down.clear();
     const key = event.key.toLowerCase();
     if (belongs(key, event.target)) return;
-    if (key in KEYS || key in TURNS) {
+    if (this.on.carries() && key.startsWith('arrow')) {
+      this.on.nudge(KEYS[key]);
+      event.preventDefault();
+    } else if (key in KEYS || key in TURNS) {
       this.down.set(event.code, key);
       event.preventDefault();
     } else if (key === ' ') {
@@ -71,7 +76,9 @@ export class Controls {
     else if (key === 'c') this.on.call();
     else if (key === 'l') this.on.tell();
     else if (key === 'n') this.on.next();
-    else if (key === 'p' || key === 'g') this.on.hold(key === 'p' ? 'pen' : 'pins');
+    else if (key in TOOLS) this.on.hold(TOOLS[key]);
+    else if (key === 'z') this.on.undo();
+    else if (key === 'enter' && this.tool === 'move') this.on.take();
     else if (key === 'escape' && this.tool) this.on.hold(null);
   }
 
@@ -86,6 +93,7 @@ export class Controls {
     if (!event.isPrimary) return this.cancel();
     this.press = { x: event.clientX, y: event.clientY, moved: false };
     if (event.button !== 0) return;
+    if (this.tool === 'move') return this.grasp(event);
     if (this.tool === 'pen' || event.shiftKey) this.stroke = [];
     else if (this.tool !== 'pins' && this.overObserver(event)) this.dragging = true;
     else return;
@@ -94,9 +102,20 @@ export class Controls {
     this.draw(event);
   }
 
+  // A press on furniture takes it up; elsewhere it moves the view, and a click says why nothing is taken up.
+  grasp(event) {
+    const surface = this.room.surfacePoint(event);
+    this.press.refusal = surface ? this.on.pick(surface) : 'This is outside of the room.';
+    if (this.press.refusal) return;
+    this.lifted = surface.up;
+    this.room.orbit.enabled = false;
+    this.room.canvas.setPointerCapture(event.pointerId);
+  }
+
   // A second finger means that the view is to be moved.
   cancel() {
-    Object.assign(this, { press: null, dragging: false, stroke: null });
+    if (this.lifted !== null) this.on.release(false);
+    Object.assign(this, { press: null, dragging: false, stroke: null, lifted: null });
     this.room.orbit.enabled = true;
   }
 
@@ -113,7 +132,10 @@ export class Controls {
     if (this.press && Math.hypot(event.clientX - this.press.x, event.clientY - this.press.y) > CLICK_PX)
       this.press.moved = true;
     if (this.stroke) this.draw(event);
-    else if (this.dragging) {
+    else if (this.lifted !== null) {
+      const point = this.room.levelPoint(event, this.lifted);
+      if (point) this.on.drag(point);
+    } else if (this.dragging) {
       const point = this.room.floorPoint(event);
       if (point) this.on.carry(point);
     } else if (!this.press) {
@@ -124,11 +146,16 @@ export class Controls {
   }
 
   end(event) {
-    const { stroke, press, dragging } = this;
+    const { stroke, press, dragging, lifted, tool } = this;
+    if (lifted !== null && event.type === 'pointerup') {
+      this.lifted = null;
+      this.on.release(true);
+    }
     this.cancel();
-    if (event.type !== 'pointerup') return;
+    if (event.type !== 'pointerup' || lifted !== null) return;
     const click = press && !press.moved && !dragging && event.button === 0;
     if (stroke && !(click && event.shiftKey)) this.on.drawn(stroke);
+    else if (click && tool === 'move') this.on.refuse(press.refusal);
     else if (click) {
       const surface = this.room.surfacePoint(event);
       if (surface) this.on.aim(surface, event.shiftKey || this.tool === 'pins');
@@ -139,6 +166,7 @@ export class Controls {
 // Whether a key means something to the element that has the focus.
 function belongs(key, element) {
   if (element.matches?.('[type=range]')) return key.startsWith('arrow') || '+=-'.includes(key);
-  if (element.matches?.('button, [type=checkbox]')) return key === ' ';
+  if (element.matches?.('button')) return key === ' ' || key === 'enter';
+  if (element.matches?.('[type=checkbox]')) return key === ' ';
   return Boolean(element.matches?.('input, select'));
 }

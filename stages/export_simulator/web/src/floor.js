@@ -8,8 +8,8 @@ const LIFT_M = 0.004;
 const OPACITY = 0.35;
 const DOT = 0.5; // of a voxel's edge
 
-// A mesh for the volume's marks, or null where all floor was seen. floor: its height.
-export function filledFloor({ shape: [, vx, vy, vz], origin, voxel_m: voxel }, marks, floor) {
+// The places [x, z] of the volume's marks.
+export function filledPlaces({ shape: [, vx, vy, vz], origin, voxel_m: voxel }, marks) {
   const places = [];
   for (let a = 0; a < vx; a++)
     for (let c = 0; c < vz; c++)
@@ -17,16 +17,27 @@ export function filledFloor({ shape: [, vx, vy, vz], origin, voxel_m: voxel }, m
         if (marks[(a * vy + b) * vz + c] === FILLED)
           places.push([origin[0] + (a + 0.5) * voxel, origin[2] + (c + 0.5) * voxel]);
       }
-  if (!places.length) return null;
+  return places;
+}
+
+// Dots at some places. floor: its height.
+export function filledFloor(places, voxel, floor) {
   const dot = new THREE.CircleGeometry((DOT * voxel) / 2, 12).rotateX(-Math.PI / 2);
-  const sheet = new THREE.InstancedMesh(
-    dot,
-    new THREE.MeshBasicMaterial({ color: 0x8d857a, transparent: true, opacity: OPACITY, depthWrite: false }),
-    places.length,
-  );
+  const material = new THREE.MeshBasicMaterial({
+    color: 0x8d857a,
+    transparent: true,
+    opacity: OPACITY,
+    depthWrite: false,
+  });
+  return sheet(dot, material, places, floor + LIFT_M);
+}
+
+// One flat shape, many times.
+export function sheet(geometry, material, places, height) {
+  const mesh = new THREE.InstancedMesh(geometry, material, places.length);
   const matrix = new THREE.Matrix4();
-  places.forEach(([x, z], i) => sheet.setMatrixAt(i, matrix.makeTranslation(x, floor + LIFT_M, z)));
-  sheet.frustumCulled = false;
-  sheet.renderOrder = 0.7;
-  return sheet;
+  places.forEach(([x, z], i) => mesh.setMatrixAt(i, matrix.makeTranslation(x, height, z)));
+  mesh.frustumCulled = false;
+  mesh.renderOrder = 0.7;
+  return mesh;
 }

@@ -4,9 +4,10 @@ import * as assets from './assets.js';
 import { api } from './api.js';
 import { Controls } from './controls.js';
 import { Film } from './film.js';
-import { filledFloor } from './floor.js';
+import { filledFloor, filledPlaces } from './floor.js';
 import { Headset } from './headset.js';
 import { Minimap } from './minimap.js';
+import { Mover } from './mover.js';
 import { arrays } from './npz.js';
 import { Observer } from './observer.js';
 import * as panel from './panel.js';
@@ -14,7 +15,7 @@ import { Planner } from './planner.js';
 import { Resident, TICK_S } from './resident.js';
 import { Room } from './room.js';
 import { Route } from './route.js';
-import { doingsText, readDoings, readPlaces, readPoint, readState, writeState } from './state.js';
+import { doingsText, readDoings, readMoves, readPlaces, readPoint, readState, writeState } from './state.js';
 import { Stops, metres, placesText } from './stops.js';
 import { Tags } from './tags.js';
 import { save } from './take.js';
@@ -53,13 +54,16 @@ class Simulator {
         this.map.visit('observer', camera[0], camera[2], 0.25);
       });
     const [{ contract, allowed }] = this.residents;
-    const sheet = filledFloor(contract.volume, allowed, this.contract.scene.floor_m);
-    if (sheet) this.room.scene.add(sheet);
+    const filled = filledPlaces(contract.volume, allowed);
+    if (filled.length)
+      this.room.scene.add(filledFloor(filled, contract.volume.voxel_m, this.contract.scene.floor_m));
+    this.mover = new Mover(this);
     this.connect();
+    const lost = this.furnish();
     this.reset();
     panel.progress(1, 'ready');
     panel.ready();
-    this.complain(ignored);
+    this.complain([...ignored, ...lost]);
     if (this.contract.scene.warning) panel.warn(this.contract.scene.warning);
     this.last = performance.now();
     this.room.renderer.setAnimationLoop(() => this.frame());
@@ -67,6 +71,7 @@ class Simulator {
     this.planner = await Planner.open(this.residents, (share) =>
       panel.status(`loading the behaviour model, ${Math.round(100 * share)} %`),
     );
+    this.mover.inform();
     await this.addSplats().catch((error) => {
       this.remark = `; drawn as a mesh, without splats: ${error.message}`;
     });
@@ -78,7 +83,27 @@ class Simulator {
     if (wanted.has('mesh') || (this.room.software && !wanted.has('splats'))) return;
     const rows = await assets.bytes('splats');
     if (rows) await this.room.addSplats(rows);
+    this.mover.view.moveSplats(this.mover.moves);
     for (const resident of this.residents) await resident.addSplats();
+  }
+
+  // Move the furniture that the state says. Returns what of it means nothing here.
+  furnish() {
+    const lost = this.mover.read(this.state.moved ? readMoves(this.state.moved) : []);
+    return lost ? [`moved=${lost} of the moved pieces`] : [];
+  }
+
+  // Furniture has been moved, or put back.
+  rearranged(any) {
+    panel.showMoved(any);
+    writeState(this.state, this.contract);
+    this.map.paint(this.room.picture(256));
+  }
+
+  // Save a file; what it does not keep is said.
+  keep(blob, name) {
+    save(blob, name);
+    if (this.state.moved) panel.help('The furniture you moved is not in this file: the link keeps it.', 6);
   }
 
   // Let the state say who is selected and what everybody does.
@@ -108,10 +133,12 @@ class Simulator {
       free: () => this.visit([]),
       call: () => this.call(),
       hold: (tool) => this.hold(tool),
-      csv: () => save(this.selected.take.csv(), `${this.fileName}.csv`),
-      glb: () => save(this.selected.take.glb(this.selected.model), `${this.fileName}.glb`),
+      undo: () => this.mover.undo(),
+      restore: () => this.mover.restore(),
+      csv: () => this.keep(this.selected.take.csv(), `${this.fileName}.csv`),
+      glb: () => this.keep(this.selected.take.glb(this.selected.model), `${this.fileName}.glb`),
       film: () => this.shoot(),
-      toml: () => save(this.selected.stops.toml, `${this.fileName}_subgoals.toml`),
+      toml: () => this.keep(this.selected.stops.toml, `${this.fileName}_subgoals.toml`),
       link: panel.copyLink,
       open: (file) => this.openTake(file),
       headset: () => this.enterHeadset(),
@@ -126,6 +153,7 @@ class Simulator {
       next: () => this.selectNext(),
       how: panel.howTo,
       tell: () => panel.say(this.whereabouts()),
+      ...this.mover.hands,
       stroke: (points) => this.selected.overlays.ask(points),
       drawn: (points) => this.follow(points),
       carry: (point) => {
@@ -143,7 +171,7 @@ class Simulator {
       const { state, ignored } = readState(this.contract, this.residents[0].clips.list);
       Object.assign(this.state, state);
       this.appoint();
-      this.complain(ignored);
+      this.complain([...ignored, ...this.furnish()]);
       this.panel.refresh();
       this.changed('view');
       this.reset();
@@ -232,7 +260,7 @@ class Simulator {
     const leading = this.replaying ? selected : this.residents[0];
     const moment = this.replaying
       ? leading.clips.beginning(this.replaying, leading.count)
-      : leading.clips.moment(this.state.seed, leading.count);
+      : this.mover.beginning(this.state.seed, (seed) => leading.clips.moment(seed, leading.count));
     this.replayTick = leading.count - 1;
     this.taken = Boolean(this.state.at);
     this.now = 0;
@@ -276,7 +304,11 @@ class Simulator {
       const top = this.selected.support
         .tops(x, z)
         .sort((a, b) => Math.abs(a - floor - up) - Math.abs(b - floor - up))[0];
-      if (top === undefined || Math.abs(top - floor - up) > RAISED_M || !this.selected.hasBeenOn(x, z, top))
+      if (
+        top === undefined ||
+        Math.abs(top - floor - up) > RAISED_M ||
+        !this.selected.hasBeenOn(...this.mover.before([x, z], top), top)
+      )
         return panel.help(
           `${this.selected.name} has never been up there: click where it can be, or the floor beside.`,
           5,
@@ -323,6 +355,7 @@ class Simulator {
 
   // Take a tool in hand, 'pen' or 'pins', or put away the one that is held.
   hold(tool) {
+    if (this.mover.held) this.mover.cancel();
     this.controls.tool = this.controls.tool === tool ? null : tool;
     panel.showTool(this.controls.tool);
   }

@@ -13,10 +13,15 @@ export class Minimap {
     this.turn = heading + Math.PI;
     this.size = canvas.width;
     this.half = 1.06 * this.reach(picture);
-    this.back = backdrop(picture, this.size, picture.half / this.half, this.turn);
+    this.paint(picture);
     this.heat = { animal: new Float32Array(CELLS * CELLS), observer: new Float32Array(CELLS * CELLS) };
     this.layers = { animal: heatLayer(), observer: heatLayer() };
     this.stale = true;
+  }
+
+  // Show another picture of the same room.
+  paint(picture) {
+    this.back = backdrop(picture, this.size, picture.half / this.half, this.turn);
   }
 
   // How far to the right and down on the map something is that lies x, z beside the centre.

@@ -6,6 +6,7 @@ import { lookAt } from './rigid.js';
 export const WALK_M_S = 1.1;
 const DRAG_M_S = 2.5;
 const WALL_M = 0.15; // kept from the edges of the room
+const LOOK_M = 0.05; // between places on a step that are tested
 const APART_M = 0.36; // kept from the animal: nobody walks through anybody
 
 export class Observer {
@@ -18,6 +19,7 @@ export class Observer {
     this.target = null;
     this.animal = [0, this.floor, 0]; // the one that the person looks at
     this.animals = []; // where all are
+    this.stands = () => false; // whether something stands at [x, z] that a person cannot walk through
     this.step(0, [0, 0], 0);
   }
 
@@ -45,9 +47,28 @@ export class Observer {
     return Math.hypot(dx, dz) > 1e-5;
   }
 
-  // A step that would lead into an animal ends beside it; who stands there already may step back.
+  // A step that would lead into an animal or into moved furniture ends beside it; who stands there already may
+  // step back.
   apart(place) {
-    return this.animals.reduce((kept, animal) => this.beside(kept, animal), place);
+    return this.around(this.animals.reduce((kept, animal) => this.beside(kept, animal), place));
+  }
+
+  // Along the side of what stands in the way, if one side is free.
+  around([x, z]) {
+    const ways = [
+      [x, z],
+      [x, this.place[1]],
+      [this.place[0], z],
+    ];
+    return this.stands(this.place) ? [x, z] : (ways.find((way) => !this.meets(way)) ?? this.place);
+  }
+
+  meets(to) {
+    const [dx, dz] = [0, 1].map((axis) => to[axis] - this.place[axis]);
+    const count = Math.ceil(Math.hypot(dx, dz) / LOOK_M);
+    return Array.from({ length: count }, (_, i) => (i + 1) / count).some((share) =>
+      this.stands([this.place[0] + share * dx, this.place[1] + share * dz]),
+    );
   }
 
   beside([x, z], animal) {

@@ -10,6 +10,9 @@ const HELP_MS = 12000; // the help stays this long at first
 const TOOLS = {
   pen: 'Draw on the floor with one stroke; it walks there.',
   pins: 'Click one place after the other; it visits them in this order.',
+  move: touch
+    ? 'Drag a piece of furniture to where it shall stand.'
+    : 'Drag a piece of furniture, or take one up with Enter, move it with the arrows, and set it down with Enter.',
 };
 
 export function buildPanel(state, contract, on) {
@@ -88,6 +91,8 @@ export function buildPanel(state, contract, on) {
   at('play').addEventListener('click', on.play);
   at('reset').addEventListener('click', on.reset);
   at('free').addEventListener('click', on.free);
+  at('undo').addEventListener('click', on.undo);
+  at('restore').addEventListener('click', on.restore);
   at('how').addEventListener('click', howTo);
   at('call').addEventListener('click', on.call);
   at('headset').addEventListener('click', on.headset);
@@ -112,16 +117,14 @@ export function buildPanel(state, contract, on) {
 // The animals of the home by name: which is selected, and what each does. Returns what refreshes the list.
 function residents(state, contract, change, employ) {
   at('animals').hidden = at('company').hidden = false;
-  document
-    .querySelector('.key.animal')
-    .replaceWith(
-      ...contract.animals.map(({ name }, i) =>
-        Object.assign(document.createElement('span'), {
-          className: `key animal a${i % 4}`,
-          textContent: name,
-        }),
-      ),
-    );
+  document.querySelector('.key.animal').replaceWith(
+    ...contract.animals.map(({ name }, i) =>
+      Object.assign(document.createElement('span'), {
+        className: `key animal a${i % 4}`,
+        textContent: name,
+      }),
+    ),
+  );
   return contract.animals.map(({ name, clips }) => {
     const radio = Object.assign(document.createElement('input'), {
       type: 'radio',
@@ -168,6 +171,12 @@ export function showTool(held) {
   for (const tool of Object.keys(TOOLS)) at(tool).setAttribute('aria-pressed', tool === held);
   at('view').classList.toggle('drawing', Boolean(held));
   help(TOOLS[held] ?? '');
+  if (held === 'move') at('view').focus(); // arrows and Enter are for the furniture
+}
+
+// Whether furniture has been moved that can be put back.
+export function showMoved(any) {
+  at('undo').hidden = at('restore').hidden = !any;
 }
 
 export function showFilm(running, possible) {

@@ -66,6 +66,10 @@ export class Planner {
     return this.ask('goals', question);
   }
 
+  furnish(furniture) {
+    return this.ask('furnish', furniture);
+  }
+
   golden(golden, animal) {
     return this.ask('golden', { golden, animal });
   }

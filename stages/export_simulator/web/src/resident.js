@@ -38,6 +38,8 @@ export class Resident {
     const { floor_m: floor } = contract.scene;
     resident.overlays = new Overlays(home.room.scene, floor, contract.agent.root_height_m[0] - floor);
     resident.allowed = await assets.bytes(`${prefix}allowed`);
+    resident.occupancy = await assets.bytes(`${prefix}occupancy`);
+    resident.detour = null;
     resident.support = new Support(contract.volume, resident.allowed);
     resident.place = [0, floor, 0];
     return resident;
@@ -102,6 +104,21 @@ export class Resident {
     if (this.clip) this.replay(this.count - 1);
   }
 
+  // Furniture has been moved: plan anew, and wait for that plan where the one that is followed would cross it.
+  rearranged(support, detour) {
+    Object.assign(this, { support, detour });
+    if (!this.timeline) return;
+    this.epoch += 1;
+    this.waiting = false;
+    this.urgent = true;
+    const { now } = this.home;
+    const ahead = Array.from({ length: Math.ceil(this.timeline.ticksLeft(now)) }, (_, i) =>
+      this.timeline.at(now + i + 1),
+    );
+    if (!this.clip && ahead.length && this.detour?.blocks(ahead, this.timeline.at(now)))
+      this.timeline.hold(now);
+  }
+
   // Follow the clip from a tick of it to its end.
   replay(tick) {
     const { clip, clips } = this;
@@ -139,10 +156,14 @@ export class Resident {
     return [this.home.observer.place, ...this.others.map(({ place }) => [place[0], place[2]])];
   }
 
-  // Whether the next moment would lead into somebody's body: then the animal waits for a plan around it.
+  // Whether the next moment would lead into somebody's body, or into furniture that was moved: then the animal
+  // waits for a plan around it.
   wouldMeet(next) {
     if (this.clip) return false;
     const [here, there] = [this.timeline.at(this.home.now), this.timeline.at(next)];
+    const end = this.timeline.plans.at(-1)?.frames.at(-1) ?? there;
+    if (this.home.state.scene && this.detour?.crosses(here, there, this.detour.exempt(here, end)))
+      return true;
     return this.bodies.some(([x, z]) => {
       const [gap, then] = [here, there].map((frame) => Math.hypot(frame[0] - x, frame[2] - z));
       return then < Math.min(BODY_M, gap) - 0.05 && then < gap - 1e-4;

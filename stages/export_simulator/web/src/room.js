@@ -21,7 +21,6 @@ const HEADROOM_M = 1.9; // what hangs higher above the floor is cut away, so tha
 // drawn per pixel of the screen, most and least; wanted ms a frame
 const PIXELS = { software: [0.75, 0.3, 75], graphics: [2, 0.6, 28] };
 const WALL_M = 0.35; // a wall's thickness, with what leans on it
-
 const FOG_M = 0.5; // Gaussians nearer to the eye are hidden
 const FURTHEST_M = 14; // how far away the view may go
 const FURTHEST = 4; // and in widths of the room: from there an upright phone shows it from wall to wall
@@ -60,7 +59,7 @@ export class Room {
     this.renderer.setClearColor(paperColor());
     matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => {
       this.renderer.setClearColor(paperColor());
-      if (this.backdrop) this.backdrop.key = '';
+      this.redraw();
     });
     this.renderer.localClippingEnabled = true;
     const [most, least, wanted] = PIXELS[this.software ? 'software' : 'graphics'];
@@ -93,6 +92,11 @@ export class Room {
     this.frameRoom();
     addEventListener('resize', () => this.resize());
     this.resize();
+  }
+
+  // Draw the still of the room anew.
+  redraw() {
+    if (this.backdrop) this.backdrop.key = '';
   }
 
   // The longer side of the room, metres.
@@ -313,9 +317,14 @@ export class Room {
     return this.floorAlong(this.aim(event));
   }
 
-  floorAlong({ ray }) {
-    const plane = new THREE.Plane(new THREE.Vector3(0, 1, 0), -this.contract.scene.floor_m);
-    const point = ray.intersectPlane(plane, new THREE.Vector3());
+  // Where the pointer meets a level so far above the floor, [x, z]; null above the horizon.
+  levelPoint(event, up) {
+    const point = levelAlong(this.aim(event), this.contract.scene.floor_m + up);
+    return point && [point.x, point.z];
+  }
+
+  floorAlong(caster) {
+    const point = levelAlong(caster, this.contract.scene.floor_m);
     const [low, high] = this.contract.scene.bounds_m;
     const inside = point && point.x > low[0] && point.x < high[0] && point.z > low[2] && point.z < high[2];
     return inside ? [point.x, point.z] : null;
@@ -375,6 +384,9 @@ export class Room {
     else this.renderer.render(this.scene, this.camera);
   }
 }
+
+const levelAlong = ({ ray }, height) =>
+  ray.intersectPlane(new THREE.Plane(new THREE.Vector3(0, 1, 0), -height), new THREE.Vector3());
 
 const paperColor = () =>
   new THREE.Color(getComputedStyle(document.documentElement).getPropertyValue('--paper').trim());

@@ -247,6 +247,7 @@ export class Sampler {
       steps,
       interactivity,
       frame: keep.scene ? frame : null,
+      detour: keep.scene ? this.senses.detour : null,
       bodies: [observer, ...companions].map((places) => [places.at(-1)[0], places.at(-1)[2]]),
     };
   }
@@ -273,7 +274,7 @@ export class Sampler {
     const bare = this.senses.boneless(observation, this.contract.scaling.body_mean);
     const codes = await this.codes(bare, question.keep, question.interactivity);
     const commanded = Boolean(question.aim);
-    const leg = commanded && this.leg(frame, question.aim, question.raised);
+    const leg = commanded && this.leg(frame, question.aim, question.raised, options.detour);
     const scaled = commanded ? leg.scaled : await this.sampledGoals(codes, question.samples, options);
     const keepGoal = commanded ? 1 : question.keep.goal;
     const goals = this.goalsInWorld(frame, scaled);
@@ -305,7 +306,9 @@ export class Sampler {
       options,
     );
     const lived = await this.withBody(frame, whole, path, options);
-    return { goals, chosen: tried[best], ...lived, cleared: leg.last ? lived.path.at(-1) : null };
+    const arrives =
+      leg.last && !options.detour?.unfinished(apply(frame, codes.start), lived.path.at(-1), question.aim);
+    return { goals, chosen: tried[best], ...lived, cleared: arrives ? lived.path.at(-1) : null };
   }
 
   // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.
@@ -346,14 +349,17 @@ export class Sampler {
   }
 
   // Places of the ego frame as a scaled path that is possible: where the animal may be (unless it does not
-  // perceive the scene), around the bodies of others, the person's last, on what carries it.
-  constrained(frame, start, places, { frame: perceived, bodies }) {
+  // perceive the scene), around furniture that was moved and the bodies of others, the person's last, on what
+  // carries it.
+  constrained(frame, start, places, { frame: perceived, detour, bodies }) {
     const egoFromWorld = inverse(frame);
     const [from, clear] = [apply(frame, start), (place) => (perceived ? this.senses.cleared(place) : place)];
-    const around = bodies.reduceRight(
+    const wanted = places.map((place) => apply(frame, place));
+    const led = bodies.reduceRight(
       (path, body) => aroundPerson(path, from, body, clear),
-      places.map((place) => clear(apply(frame, place))),
+      (detour?.lead(wanted, from) ?? wanted).map(clear),
     );
+    const around = detour?.halted(led, from) ?? led;
     const world = perceived
       ? this.senses.support.follow(
           around,
@@ -394,13 +400,25 @@ export class Sampler {
     return rows;
   }
 
-  // The visitor's goal in scaled units, not further than the animal goes in one plan; and whether it is there
-  // then.
-  leg(frame, aim, raised) {
-    const [x, y, z] = apply(inverse(frame), aim);
-    const whole = this.scaled([x, raised ? y : 0, z]);
-    const share = Math.min(1, FURTHEST / Math.max(1e-6, Math.hypot(...whole)));
-    return { scaled: Float32Array.from(whole, (value) => value * share), last: share === 1 };
+  // The visitor's goal in scaled units, not further than the animal goes in one plan, on the way around moved
+  // furniture where that is in between; and whether it is there then.
+  leg(frame, aim, raised, detour) {
+    const egoFromWorld = inverse(frame);
+    const scaled = (point) => {
+      const [x, y, z] = apply(egoFromWorld, point);
+      return this.scaled([x, raised ? y : 0, z]);
+    };
+    const share = (point) => Math.min(1, FURTHEST / Math.max(1e-6, Math.hypot(...scaled(point))));
+    let target = aim;
+    if (share(aim) < 1 && detour?.crosses(frame, aim)) {
+      const way = detour.route(frame, aim);
+      target = way[way.findIndex((point) => share(point) < 1) - 1] ?? way.at(-1) ?? aim;
+    }
+    const part = share(target);
+    return {
+      scaled: Float32Array.from(scaled(target), (value) => value * part),
+      last: target === aim && part === 1,
+    };
   }
 
   // Metres and channels, frame by frame.

@@ -3,6 +3,8 @@
 // plan.
 
 import { nearestAllowed } from './clearing.js';
+import { Detour } from './detour.js';
+import { Grid, movedFeatures } from './furniture.js';
 import { Support } from './support.js';
 import {
   ROW,
@@ -31,11 +33,22 @@ export class Senses {
     const { behavior } = contract;
     this.ego = behavior.architecture.ego;
     this.grid = behavior.grid;
-    this.volume = { ...contract.volume, values: halfTable(volume) };
-    this.allowed = allowed;
-    this.nearest = nearestAllowed(allowed, contract.volume.shape.slice(1));
-    this.support = new Support(this.volume, allowed);
+    this.recorded = halfTable(volume);
+    this.about = contract.volume;
+    this.furnish({ moves: [], allowed, band: null });
     this.rest = behavior.agent_from_bone_rest.map(rowFromMatrix);
+  }
+
+  // Perceive the home with furniture moved: [{cells, by}, ...], where the root may be then, and the layers that
+  // a body takes up.
+  furnish({ moves, allowed, band }) {
+    const { recorded, about: volume } = this;
+    const values = moves.length ? movedFeatures(recorded, new Grid(volume), moves) : recorded;
+    this.volume = { ...volume, values };
+    this.allowed = allowed;
+    this.nearest = nearestAllowed(allowed, volume.shape.slice(1));
+    this.support = new Support(this.volume, allowed);
+    this.detour = moves.length ? new Detour(volume, allowed, moves, band) : null;
   }
 
   // past: frames of rows (root, bones); observer: rows of the phone; companions: places [x, y, z] of each

@@ -29,6 +29,7 @@ export function defaults({ controls: { interactivity, samples, steps }, animals 
     outline: 0,
     animal: animals?.[0].name ?? '',
     does: '',
+    moved: '',
   };
 }
 
@@ -52,6 +53,7 @@ export function readState(contract, clips, hash = location.hash) {
     at: (text) => (readPoint(text) ? text : null),
     animal: among((contract.animals ?? []).map(({ name }) => name)),
     does: (text) => (readDoings(text, contract) ? text : null),
+    moved: (text) => (readMoves(text).length ? text : null),
     ...Object.fromEntries(SWITCHES.map((key) => [key, among([0, 1])])),
   };
   const ignored = [];
@@ -85,6 +87,13 @@ export const doingsText = (doings) =>
     .filter(([, does]) => does)
     .map((each) => each.join(':'))
     .join(',');
+
+// 'x,y,z,dx,dz;...', furniture by a place in it and how far it was moved, to numbers in metres; none where it is
+// something else.
+export function readMoves(text) {
+  const moves = text.split(';').map((move) => move.split(',').map(Number));
+  return moves.every((move) => move.length === 5 && move.every(Number.isFinite)) ? moves : [];
+}
 
 // 'x,z;x,z;...' in metres to a list of points; none where it is something else.
 export function readPlaces(text) {

@@ -32,6 +32,7 @@ const answers = {
     }
     samplers.push(new Sampler(contract, networks, new Senses(contract, volume, allowed)));
   },
+  furnish: ({ animal, ...furniture }) => samplers[animal].senses.furnish(furniture),
   async plan(question) {
     const start = performance.now();
     const plan = await samplers[question.animal].plan(question);
