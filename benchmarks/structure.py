@@ -16,7 +16,7 @@ from pipeline.core.progress import log
 from pipeline.data import npz
 from pipeline.geometry import rigid
 from pipeline.mapping import colmap
-from pipeline.mapping.sparse_model import read_sparse_model
+from pipeline.mapping.colmap import read_sparse_model
 from pipeline.metrics.pose_errors import constant_between
 
 FOCAL_PX, CENTER_PX = 525.0, "320,240"

@@ -56,6 +56,12 @@ def project(points_camera: Array, intrinsics: Array) -> tuple[Array, Array]:
     return _stack([x, y]), z
 
 
+def in_picture(pixel: Array, z: Array, size: tuple[int, int], nearest_m: float = 0.0) -> Array:
+    """Return which points of `project` lie in a picture of (height, width) and farther than ``nearest_m``."""
+    x, y = pixel[..., 0], pixel[..., 1]
+    return (z > nearest_m) & (x >= 0) & (y >= 0) & (x < size[1]) & (y < size[0])
+
+
 def read_depth(
     depth: Float[np.ndarray, "depth_height depth_width"],
     depth_intrinsics: Float[np.ndarray, "3 3"],

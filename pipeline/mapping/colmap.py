@@ -1,15 +1,20 @@
-"""COLMAP on one CPU thread and with fixed seeds, so that the same pictures give the same model."""
+"""COLMAP on one CPU thread and with fixed seeds, so that the same pictures give the same model.
+
+`extract`, `match` and `mapping_options` make a model; `read_sparse_model` reads it.
+"""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float
+from jaxtyping import Float, Int
+
+from pipeline.geometry import rigid
 
 GLOBAL_ADJUSTMENT_GROWTH = 1.3
-"""Global bundle adjustment after the model grew by this factor; COLMAP's 1.1 takes twice the time for equal
-models."""
+"""Global bundle adjustment after the model grew by this factor; COLMAP's 1.1 takes twice as long."""
 FIRST_PAIR_DEG = 6.0
 """Least triangulation angle of the first pair, degrees: walks through a room have small baselines."""
 LEAST_POSE_INLIERS = 20
@@ -58,8 +63,7 @@ def match(database: Path, pairs: Iterable[tuple[str, str]], seed: int) -> None:
 
 
 def mapping_options(seed: int, *, calibrate: bool = False) -> pycolmap.IncrementalPipelineOptions:
-    """Return options of incremental mapping; ``calibrate`` also refines the focal length and the
-    distortion."""
+    """Return options of incremental mapping; ``calibrate`` also refines focal length and distortion."""
     mapping = pycolmap.IncrementalPipelineOptions(
         num_threads=1,
         random_seed=seed,
@@ -73,3 +77,46 @@ def mapping_options(seed: int, *, calibrate: bool = False) -> pycolmap.Increment
     mapping.mapper.init_min_tri_angle = FIRST_PAIR_DEG
     mapping.mapper.abs_pose_min_num_inliers = LEAST_POSE_INLIERS
     return mapping
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Registered keyframes, points in the model's frame (arbitrary scale), observations in colour pixels."""
+
+    frame: Int[np.ndarray, " key"]
+    model_from_camera: Float[np.ndarray, "key 4 4"]
+    points_model: Float[np.ndarray, "point 3"]
+    observed_point: Int[np.ndarray, " observation"]
+    observed_key: Int[np.ndarray, " observation"]
+    observed_pixel: Float[np.ndarray, "observation 2"]
+    reprojection_px: float
+    reconstruction: pycolmap.Reconstruction
+    """COLMAP's own model, for its text files."""
+
+
+def read_sparse_model(model: pycolmap.Reconstruction) -> SparseModel:
+    """Read a model whose pictures are named by six digits, the frame."""
+    images = sorted(
+        (image for image in model.images.values() if image.has_pose), key=lambda image: image.name
+    )
+    key_of_image = {image.image_id: key for key, image in enumerate(images)}
+    camera_from_model = np.stack(
+        [np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images]
+    )
+    identifiers = sorted(model.points3D)
+    rows = []
+    for point, identifier in enumerate(identifiers):
+        for element in model.points3D[identifier].track.elements:
+            pixel = model.images[element.image_id].points2D[element.point2D_idx].xy
+            rows.append((point, key_of_image[element.image_id], *pixel))
+    table = np.array(rows).reshape(-1, 4)
+    return SparseModel(
+        frame=np.array([int(image.name[:6]) for image in images]),
+        model_from_camera=rigid.inverse(camera_from_model),
+        points_model=np.array([model.points3D[identifier].xyz for identifier in identifiers]).reshape(-1, 3),
+        observed_point=table[:, 0].astype(int),
+        observed_key=table[:, 1].astype(int),
+        observed_pixel=table[:, 2:],
+        reprojection_px=float(model.compute_mean_reprojection_error()),
+        reconstruction=model,
+    )

@@ -20,8 +20,7 @@ FURTHEST_M = 4.5
 NEAREST_M = 0.1
 """Depth below this is none, metres."""
 STEP_M, STEP_SHARE = 0.05, 0.05
-"""A pixel whose neighbour differs by more than this (metres and share of the depth) bounds a surface and is
-not used."""
+"""A pixel whose neighbour differs by more than this (metres and share of the depth) is not used."""
 NORMAL_JUMP_M, NORMAL_JUMP_SHARE = 0.05, 0.06
 """The same over the span of `image_normals`."""
 QUERY_REACH = 1.5
@@ -30,7 +29,7 @@ QUERY_REACH = 1.5
 
 @dataclass(frozen=True)
 class Scan:
-    """Points that one frame measured, in camera axes, and their standard deviation along any direction."""
+    """Points that one frame measured, in camera axes, and their standard deviation."""
 
     points_camera: Float[np.ndarray, "point 3"]
     sigma_m: Float[np.ndarray, "point"]
@@ -51,9 +50,7 @@ def depth_noise(depth_m: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]
 def image_normals(
     depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4
 ) -> Float[np.ndarray, "height width 3"]:
-    """Return unit normals towards the camera from central differences over ``span_px``; zero at edges and
-    unknown depth.
-    """
+    """Return unit normals towards the camera by central differences; zero at edges and unknown depth."""
     points = cameras.back_project(depth, intrinsics)
     normals = np.zeros_like(points)
     inner = slice(span_px, -span_px)
@@ -64,13 +61,8 @@ def image_normals(
     centre = depth[inner, inner]
     limit = NORMAL_JUMP_M + NORMAL_JUMP_SHARE * centre
     known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
-    for shifted in (
-        depth[inner, 2 * span_px :],
-        depth[inner, : -2 * span_px],
-        depth[2 * span_px :, inner],
-        depth[: -2 * span_px, inner],
-    ):
-        known &= shifted > 0
+    for end in (slice(2 * span_px, None), slice(None, -2 * span_px)):
+        known &= (depth[inner, end] > 0) & (depth[end, inner] > 0)
     normals[inner, inner] = np.where(known[..., None], cross / np.maximum(length, 1e-9)[..., None], 0)
     return normals
 
@@ -84,8 +76,7 @@ def scan(
     ignore: Bool[np.ndarray, "height width"] | None = None,
     furthest_m: float = FURTHEST_M,
 ) -> Scan:
-    """Keep one pixel in ``stride`` each way where depth (metres) is known, of confidence >= 1 and away from
-    depth edges."""
+    """Keep one pixel in ``stride`` each way of known depth (metres), of confidence >= 1, away from edges."""
     usable = (depth > NEAREST_M) & (depth < furthest_m)
     if confidence is not None:
         usable &= confidence >= 1
@@ -129,26 +120,17 @@ class SurfaceMap:
         first = np.repeat(frames, [len(scan.points_camera) for scan in scans])
         points = np.concatenate([scan.points_camera for scan in scans])
         sigma = np.concatenate([scan.sigma_m for scan in scans])
-        world = np.concatenate(
-            [
-                rigid.apply(world_from_camera[frame], scan.points_camera)
-                for frame, scan in zip(frames, scans, strict=True)
-            ]
-        )
+        poses = world_from_camera[frames]
+        world = [rigid.apply(pose, scan.points_camera) for pose, scan in zip(poses, scans, strict=True)]
+        world = np.concatenate(world)
         distance, nearest = self._tree.query(world, distance_upper_bound=QUERY_REACH * reach_m)
         matched = np.flatnonzero(np.isfinite(distance))
         nearest, first, world = np.asarray(nearest)[matched], first[matched], world[matched]
         normal = self.normals_world[nearest]
         facing = np.einsum("ci,ci->c", normal, world_from_camera[first, :3, 3] - world) > 0
-        matched, nearest, first, normal = matched[facing], nearest[facing], first[facing], normal[facing]
-        return Correspondences(
-            first,
-            np.full(len(matched), MAP),
-            points[matched],
-            self.points_world[nearest],
-            normal,
-            inflation * sigma[matched],
-        )
+        matched, met = matched[facing], self.points_world[nearest[facing]]
+        second, sigma = np.full(len(matched), MAP), inflation * sigma[matched]
+        return Correspondences(first[facing], second, points[matched], met, normal[facing], sigma)
 
     def distance(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
         """Return the distance along the nearest normal, negative behind the surface, metres."""

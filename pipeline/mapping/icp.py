@@ -25,8 +25,7 @@ DAMPING = 1e-3
 CONVERGED = 1e-5
 """Steps below this (radians, metres) end the iteration."""
 NORMAL_JUMP, NORMAL_JUMP_DEPTH_M = 0.06, 0.5
-"""Neighbours whose depth differs by more than this share of it (of at least so many metres) bound a
-surface."""
+"""Neighbours whose depth differs by more than this share of it (at least so many metres) bound a surface."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,7 @@ class DepthImage:
 
 @dataclass(frozen=True)
 class IcpResult:
-    """A refined motion with the information (inverse covariance) of its twist (rotation vector, translation;
-    target frame)."""
+    """A refined motion with the information (inverse covariance) of its twist in the target's frame."""
 
     target_from_source: Float[np.ndarray, "4 4"]
     information: Float[np.ndarray, "6 6"]
@@ -58,13 +56,10 @@ def depth_image(
     usable: Bool[np.ndarray, "height width"],
     stride: int,
 ) -> DepthImage:
-    """Prepare a depth picture (metres, 0 = unknown) at every ``stride``-th pixel; normals by central
-    differences."""
-    points = cameras.back_project(depth, intrinsics)[stride // 2 :: stride, stride // 2 :: stride].astype(
-        np.float32
-    )
-    valid = (usable & (depth > 0))[stride // 2 :: stride, stride // 2 :: stride]
-    points[~valid] = 0
+    """Prepare a depth picture (metres, 0 = unknown) at every ``stride``-th pixel."""
+    every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    points = cameras.back_project(depth, intrinsics)[every].astype(np.float32)
+    points[~(usable & (depth > 0))[every]] = 0
     scaled = intrinsics.copy()
     scaled[:2, 2] = (intrinsics[:2, 2] - stride // 2 - 0.5) / stride + 0.5
     scaled[:2, :2] /= stride
@@ -79,8 +74,7 @@ def align_views(
     reach_m: float,
     iterations: int,
 ) -> IcpResult:
-    """Refine ``target_from_source`` by point-to-plane ICP (Chen and Medioni 1992) with projective
-    association.
+    """Refine ``target_from_source`` by projective point-to-plane ICP (Chen and Medioni 1992).
 
     Points farther than ``reach_m`` from the surface they project to are left out (Tukey's weights); the reach
     halves half-way. The information counts `POINTS_PER_MEASUREMENT` points as one measurement.
@@ -90,20 +84,11 @@ def align_views(
     hessian, squares, weight, overlap = np.zeros((6, 6)), 0.0, 0.0, 0.0
     for iteration in range(iterations):
         reach = reach_m * (0.5 if iteration >= iterations // 2 else 1.0)
-        rotation, translation = (
-            np.ascontiguousarray(target_from_source[:3, :3], np.float32),
-            target_from_source[:3, 3].astype(np.float32),
-        )
-        hessian, gradient, squares, weight, overlap = _accumulate(
-            target.points,
-            target.normals,
-            source.points,
-            source.normals,
-            rotation,
-            translation,
-            focal,
-            np.float32(reach),
-        )
+        rotation = np.ascontiguousarray(target_from_source[:3, :3], np.float32)
+        motion = rotation, target_from_source[:3, 3].astype(np.float32)
+        surfaces = target.points, target.normals, source.points, source.normals
+        sums = _accumulate(*surfaces, *motion, focal, np.float32(reach))
+        hessian, gradient, squares, weight, overlap = sums
         step = -np.linalg.solve(hessian + np.eye(6) * (DAMPING * max(weight, 1.0)), gradient)
         target_from_source = rigid.exp(step) @ target_from_source
         if np.abs(step).max() < CONVERGED:
@@ -114,8 +99,7 @@ def align_views(
 
 
 def _normals(points: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
-    """Cross product of the neighbours' differences, zero across depth steps and at the rim; they point to the
-    camera."""
+    """Return unit normals towards the camera by central differences; zero at depth steps and the rim."""
     normals = np.zeros_like(points)
     across = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
@@ -148,10 +132,8 @@ def _accumulate(
             p = rotation @ source_points[i, j] + translation
             if p[2] < NEAREST_M:
                 continue
-            x, y = (
-                int(np.floor(p[0] / p[2] * focal[0] + focal[2])),
-                int(np.floor(p[1] / p[2] * focal[1] + focal[3])),
-            )
+            x = int(np.floor(p[0] / p[2] * focal[0] + focal[2]))
+            y = int(np.floor(p[1] / p[2] * focal[1] + focal[3]))
             if x < 0 or y < 0 or x >= width or y >= height:
                 continue
             n, q = target_normals[y, x], target_points[y, x]
@@ -159,22 +141,18 @@ def _accumulate(
                 continue
             seen += 1.0
             d = p - q
-            normal_target = rotation @ normal_source
-            if (
-                d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > 4 * reach * reach
-                or normal_target[0] * n[0] + normal_target[1] * n[1] + normal_target[2] * n[2] < LEAST_COSINE
-            ):
+            turned = rotation @ normal_source
+            cosine = turned[0] * n[0] + turned[1] * n[1] + turned[2] * n[2]
+            if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > 4 * reach * reach or cosine < LEAST_COSINE:
                 continue
             error = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
             if abs(error) >= reach:
                 continue
             weight = (1 - (error / reach) ** 2) ** 2 / max(1.0, p[2] * p[2])
-            row[0], row[1], row[2] = (
-                p[1] * n[2] - p[2] * n[1],
-                p[2] * n[0] - p[0] * n[2],
-                p[0] * n[1] - p[1] * n[0],
-            )
-            row[3], row[4], row[5] = n[0], n[1], n[2]
+            row[0] = p[1] * n[2] - p[2] * n[1]
+            row[1] = p[2] * n[0] - p[0] * n[2]
+            row[2] = p[0] * n[1] - p[1] * n[0]
+            row[3:] = n
             for a in range(6):
                 gradient[a] += weight * error * row[a]
                 for b in range(6):

@@ -1,23 +1,37 @@
 """Correct the drift of a depth recording's odometry, or make odometry where there is none.
 
-`correct_drift` aligns depth images of frames that see the same place (`icp`) and solves a pose graph of them
-with the device's odometry; `chain_alignments` makes a first odometry from frame to frame; `align_gravity`
-turns +y up.
+`find_jumps` detects where tracking was lost and resumed elsewhere, and `repair` chains the odometry without
+that. `correct_drift` aligns depth images of frames that see the same place (`icp`) and solves a pose graph of
+them with the device's odometry; `chain_alignments` makes a first odometry from frame to frame;
+`align_gravity` turns +y up.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+import scipy.ndimage
+import scipy.sparse
+import scipy.sparse.linalg
+from jaxtyping import Bool, Float
 
 from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.align import rotation_between
-from pipeline.mapping import tracking_jumps
 from pipeline.mapping.icp import DepthImage, IcpResult, align_views
-from pipeline.mapping.pose_graph import RelativePose, optimize_pose_graph
 
+JUMP_M_S = 4.0
+"""A step faster than its neighbours by more than this, m/s, is a jump: hands reach about 2 m/s."""
+WINDOW_STEPS = 5
+"""Steps whose median is the usual speed."""
+SHORTEST_S = 0.05
+"""Least time between frames, seconds: noise over less is no speed."""
+CAUCHY_SCALE = 3.0
+"""Mahalanobis distance at which the weight of an edge of the pose graph is halved."""
+FIXED_PRECISION, FREE_PRECISION = 1e12, 1e-6
+"""Prior precision of the graph's first pose, which stays, and of the others, to keep all solvable."""
+CONVERGED = 1e-6
+"""Steps of the graph below this (radians, metres) end the iteration."""
 KEYFRAME_STEP = 5
 """Frames between keyframes: half a second at 10 Hz, within which views overlap."""
 LOOP_RADIUS_M, LOOP_RADIUS_RAD, LOOP_DISTANCE = 1.0, 0.8, 1.2
@@ -25,8 +39,7 @@ LOOP_RADIUS_M, LOOP_RADIUS_RAD, LOOP_DISTANCE = 1.0, 0.8, 1.2
 LOOP_SPACING = 2
 """Keyframes on either side of a chosen loop partner that are not chosen too: they would repeat it."""
 REACH_M = 0.15
-"""Largest distance of a surface from its counterpart, metres: several times the drift between loop
-partners."""
+"""Largest distance of a surface from its counterpart, metres: several times the drift between partners."""
 SIGMA_RAD, SIGMA_M = 0.002, 0.004
 """Odometry's standard deviation from one frame to the next, radians and metres (ARKit at 10 Hz)."""
 JUMP_INFLATION = 60.0
@@ -65,14 +78,13 @@ def correct_drift(
     *,
     loops: int = 3,
 ) -> CorrectedOdometry:
-    """Refine odometry, repaired at tracking jumps, in its own frame; the first camera keeps its pose, so up
-    stays up.
+    """Refine odometry, repaired at tracking jumps, in its own frame; the first camera keeps its pose.
 
     Each keyframe is aligned to its predecessor and to ``loops`` earlier ones that see the same place.
     """
     view = functools.lru_cache(maxsize=CACHED_VIEWS)(view)
-    jumps = tracking_jumps.find_jumps(timestamp_s, odometry_from_camera)
-    odometry_from_camera = tracking_jumps.repair(timestamp_s, odometry_from_camera, jumps)
+    jumps = find_jumps(timestamp_s, odometry_from_camera)
+    odometry_from_camera = repair(timestamp_s, odometry_from_camera, jumps)
     inflation = np.where(jumps, JUMP_INFLATION, 1.0)[1:]
     sigma = np.repeat([SIGMA_RAD, SIGMA_M], 3)
     relative = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
@@ -88,9 +100,8 @@ def correct_drift(
             edges.append(RelativePose(first, second, result.target_from_source, result.information))
             residuals.append(result.residual_m)
     poses = optimize_pose_graph(odometry_from_camera, edges, iterations=GRAPH_ITERATIONS)
-    return CorrectedOdometry(
-        poses, len(residuals), float(np.median(residuals)) if residuals else float("nan")
-    )
+    residual_m = float(np.median(residuals)) if residuals else float("nan")
+    return CorrectedOdometry(poses, len(residuals), residual_m)
 
 
 def chain_alignments(
@@ -98,8 +109,7 @@ def chain_alignments(
     guess: Callable[[int, Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]],
     count: int,
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Make odometry of ``count`` frames by aligning each depth image to the one before; the first is the
-    origin.
+    """Make odometry of ``count`` frames by aligning each depth image to the one before.
 
     ``guess(i, last)`` starts the alignment of frame i+1 in frame i's axes; ``last`` is the motion before it.
     """
@@ -137,8 +147,7 @@ def _keyframe_pairs(poses: Float[np.ndarray, "frame 4 4"], loops: int) -> list[t
 def align_gravity(
     view: Callable[[int], DepthImage], world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Turn a world of unknown gravity so that +y is up: the direction near the cameras' own up that most
-    normals have."""
+    """Turn a world of unknown gravity so that +y is up: where most normals near the cameras' own up point."""
     up = -world_from_camera[:, :3, 1].mean(0)
     up /= np.linalg.norm(up)
     normals = []
@@ -152,3 +161,95 @@ def align_gravity(
             break
         up = facing.mean(0) / np.linalg.norm(facing.mean(0))
     return rigid.make(rotation_between(up, np.array([0.0, 1.0, 0.0])), np.zeros(3)) @ world_from_camera
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """A measured motion between two frames; the information weighs its twist in the first camera's frame."""
+
+    first: int
+    second: int
+    first_from_second: Float[np.ndarray, "4 4"]
+    information: Float[np.ndarray, "6 6"]
+    robust: bool = True
+    """Whether the measurement may be an outlier (Cauchy's weight)."""
+
+
+def optimize_pose_graph(
+    world_from_camera: Float[np.ndarray, "frame 4 4"], edges: Sequence[RelativePose], *, iterations: int
+) -> Float[np.ndarray, "frame 4 4"]:
+    """Minimise the edges' squared Mahalanobis errors by Gauss-Newton, the first frame held.
+
+    An edge's residual is log(measured_second_from_first @ current first_from_second), its robust weight
+    Cauchy's. Jacobians take the relative error as small, which odometry grants.
+    """
+    poses = np.array(world_from_camera, float)
+    first = np.array([edge.first for edge in edges])
+    second = np.array([edge.second for edge in edges])
+    measured = np.stack([edge.first_from_second for edge in edges])
+    information = np.stack([edge.information for edge in edges])
+    robust = np.array([edge.robust for edge in edges])
+    for _ in range(iterations):
+        relative = rigid.inverse(poses[first]) @ poses[second]
+        residual = rigid.log(relative @ rigid.inverse(measured))
+        square = np.einsum("ei,eij,ej->e", residual, information, residual)
+        weighted = information * np.where(robust, 1 / (1 + square / CAUCHY_SCALE**2), 1.0)[:, None, None]
+        step = _solve(len(poses), first, second, relative, residual, weighted)
+        poses = poses @ rigid.exp(step)
+        if np.abs(step).max() < CONVERGED:
+            break
+    return poses
+
+
+def _solve(count, first, second, relative, residual, information) -> Float[np.ndarray, "frame 6"]:
+    """Solve one Gauss-Newton step for the poses' twists, each on its camera's side."""
+    rotation, translation = relative[:, :3, :3], relative[:, :3, 3]
+    j_first = -np.broadcast_to(np.eye(6), information.shape)
+    # The adjoint carries the second camera's twist to the first camera's frame.
+    j_second = np.zeros_like(information)
+    j_second[:, :3, :3] = j_second[:, 3:, 3:] = rotation
+    j_second[:, 3:, :3] = np.cross(translation[:, None, :], rotation.transpose(0, 2, 1)).transpose(0, 2, 1)
+    entries, gradient, inner = [], np.zeros((count, 6)), np.arange(6)
+    for index_a, j_a in ((first, j_first), (second, j_second)):
+        weighted = j_a.transpose(0, 2, 1) @ information
+        np.add.at(gradient, index_a, np.einsum("eij,ej->ei", weighted, residual))
+        for index_b, j_b in ((first, j_first), (second, j_second)):
+            rows, columns = 6 * index_a[:, None, None] + inner[:, None], 6 * index_b[:, None, None] + inner
+            entries.append(np.broadcast_arrays(weighted @ j_b, rows, columns))
+    blocks, rows, columns = (np.concatenate(part).ravel() for part in zip(*entries, strict=True))
+    hessian = scipy.sparse.coo_matrix((blocks, (rows, columns)), shape=(6 * count, 6 * count))
+    held = scipy.sparse.diags(np.r_[np.full(6, FIXED_PRECISION), np.full(6 * (count - 1), FREE_PRECISION)])
+    return -scipy.sparse.linalg.spsolve((hessian + held).tocsc(), gradient.reshape(-1)).reshape(count, 6)
+
+
+def find_jumps(
+    timestamp_s: Float[np.ndarray, "frame"], odometry_from_camera: Float[np.ndarray, "frame 4 4"]
+) -> Bool[np.ndarray, "frame"]:
+    """Return which frames cannot be where odometry places them after the frame before; False for the first.
+
+    Only translation counts: a phone that is tipped over turns as fast as one whose tracking jumps.
+    """
+    if len(timestamp_s) < 2:
+        return np.zeros(len(timestamp_s), bool)
+    step_m = np.linalg.norm(np.diff(odometry_from_camera[:, :3, 3], axis=0), axis=1)
+    speed = step_m / np.maximum(np.diff(timestamp_s), SHORTEST_S)
+    usual = scipy.ndimage.median_filter(speed, WINDOW_STEPS, mode="mirror")
+    return np.concatenate([[False], speed - usual > JUMP_M_S])
+
+
+def repair(
+    timestamp_s: Float[np.ndarray, "frame"],
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    jumps: Bool[np.ndarray, "frame"],
+) -> Float[np.ndarray, "frame 4 4"]:
+    """Chain odometry anew, each jump replaced by the velocity around it; without jumps return it as it is."""
+    if not jumps.any():
+        return odometry_from_camera
+    step = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
+    gap_s = np.diff(timestamp_s)[:, None]
+    broken, intact = np.flatnonzero(jumps[1:]), np.flatnonzero(~jumps[1:])
+    rate = rigid.log(step[intact]) / np.maximum(gap_s[intact], SHORTEST_S)
+    step[broken] = rigid.exp(
+        gap_s[broken] * np.stack([np.interp(broken, intact, axis) for axis in rate.T], axis=1)
+    )
+    return rigid.accumulate(step, odometry_from_camera[0])

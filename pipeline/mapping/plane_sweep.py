@@ -12,11 +12,9 @@ from jaxtyping import Float, Int, UInt8
 from numba import njit
 
 from pipeline.geometry import cameras, rigid
-from pipeline.mapping.sparse_model import SparseModel
+from pipeline.mapping.colmap import SparseModel
 
 PATHS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
-
-
 BASELINE_DEG = (2.0, 25.0)
 """angles between rays to a shared point that pictures are chosen for, degrees"""
 LEAST_SHARED = 8
@@ -28,10 +26,7 @@ WINDOW_PX = (7, 7)
 CONTRAST_FLOOR = 3.0
 """grey levels (of 255) of contrast below which a patch carries little information"""
 SMALL_STEP, LARGE_STEP = np.float32(0.04), np.float32(0.5)
-"""P1 and P2 of semi-global matching, in correlation.
-
-A step of one plane between neighbours, and a larger one
-"""
+"""P1 and P2 of semi-global matching, in correlation: steps of one plane between pixels, and larger ones"""
 EDGE_GRAY = 12
 """difference of grey values at which a jump of depth costs half as much"""
 AGREE_SHARE = 0.03
@@ -62,7 +57,10 @@ def neighbours(sparse: SparseModel, most: int) -> list[Int[np.ndarray, "source"]
         for other in np.flatnonzero(shared.sum(1) >= LEAST_SHARED):
             if other != key:
                 points = sparse.points_model[shared[other]]
-                angle = _angle_deg(centres[key] - points, centres[other] - points)
+                rays, theirs = centres[key] - points, centres[other] - points
+                length = np.linalg.norm(rays, axis=1) * np.linalg.norm(theirs, axis=1)
+                cosine = (rays * theirs).sum(1) / np.maximum(length, 1e-12)
+                angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
                 score[other] = np.clip(np.minimum(angle / low, high / np.maximum(angle, 1e-6)), 0, 1).sum()
         order = np.argsort(-score, kind="stable")
         chosen.append(order[score[order] > 0][:most])
@@ -70,10 +68,7 @@ def neighbours(sparse: SparseModel, most: int) -> list[Int[np.ndarray, "source"]
 
 
 def depth_range(sparse: SparseModel, key: int) -> tuple[float, float]:
-    """Return the (nearest, furthest) distance worth trying for a key.
-
-    That of the points it sees, and some more.
-    """
+    """Return the (nearest, furthest) distance worth trying for a key: that of its points, and some more."""
     points = sparse.points_model[sparse.observed_point[sparse.observed_key == key]]
     z = rigid.apply(rigid.inverse(sparse.model_from_camera[key]), points)[:, 2]
     near, far = np.quantile(z[z > 0], DEPTH_QUANTILES)
@@ -83,9 +78,7 @@ def depth_range(sparse: SparseModel, key: int) -> tuple[float, float]:
 def sweep(
     view: SweepView, others: list[SweepView], reach: tuple[float, float], planes: int
 ) -> Float[np.ndarray, "height width"]:
-    """Return the depth at which the patches of a picture correlate best with the others, smooth but for
-    edges.
-    """
+    """Return the depth at which patches of a picture correlate best with the others, smooth but for edges."""
     distances = 1 / np.linspace(1 / reach[1], 1 / reach[0], planes)
     correlation = np.stack([_correlation(view, other, distances) for other in others])
     cost = _combined(correlation)
@@ -98,11 +91,7 @@ def sweep(
 def _correlation(
     view: SweepView, other: SweepView, distances: np.ndarray
 ) -> Float[np.ndarray, "plane height width"]:
-    """Return the normalised correlation of patches, plane by plane.
-
-    -1 where the other picture does not reach.
-    """
-    height, width = view.gray.shape
+    """Return the normalised correlation of patches, plane by plane; -1 where the other does not reach."""
 
     def mean(picture):
         return cv2.boxFilter(picture, cv2.CV_32F, WINDOW_PX)
@@ -112,25 +101,22 @@ def _correlation(
     to_pixel, from_pixel = centred @ other.intrinsics, np.linalg.inv(centred @ view.intrinsics)
     own_mean = mean(view.gray)
     own_variance = np.maximum(mean(view.gray**2) - own_mean**2, 0)
-    inside = np.full(other.gray.shape, 255, np.uint8)
-    correlation = np.empty((len(distances), height, width), np.float32)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    inside, size = np.full(other.gray.shape, 255, np.uint8), view.gray.shape[::-1]
+    correlation = np.empty((len(distances), *view.gray.shape), np.float32)
+    linear, nearest = (how | cv2.WARP_INVERSE_MAP for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
     for plane, distance in enumerate(distances):
         through = relative[:3, :3].copy()
         through[:, 2] += relative[:3, 3] / distance
         homography = to_pixel @ through @ from_pixel
         warped = cv2.warpPerspective(
-            other.gray, homography, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+            other.gray, homography, size, flags=linear, borderMode=cv2.BORDER_REPLICATE
         )
-        known = cv2.warpPerspective(
-            inside, homography, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        )
+        known = cv2.warpPerspective(inside, homography, size, flags=nearest) > 0
         their_mean = mean(warped)
         variance = np.maximum(mean(warped**2) - their_mean**2, 0)
         together = mean(warped * view.gray) - their_mean * own_mean
-        correlation[plane] = np.where(
-            known > 0, together / (np.sqrt(own_variance * variance) + CONTRAST_FLOOR**2), -1
-        )
+        ratio = together / (np.sqrt(own_variance * variance) + CONTRAST_FLOOR**2)
+        correlation[plane] = np.where(known, ratio, -1)
     return correlation
 
 
@@ -164,10 +150,7 @@ def _combined(correlation):
 
 @njit(cache=True, nogil=True)
 def _add_path(cost, total, down, right, small, large, gray):
-    """Add one direction of semi-global matching (Hirschmueller 2008).
-
-    Large steps are cheaper across edges.
-    """
+    """Add one direction of semi-global matching (Hirschmueller 2008); large steps cost less across edges."""
     planes, height, width = cost.shape
     path = np.zeros((height, width, planes), np.float32)
     for step_row in range(height):
@@ -180,10 +163,8 @@ def _add_path(cost, total, down, right, small, large, gray):
                     path[row, column, plane] = cost[plane, row, column]
             else:
                 before = path[before_row, before_column]
-                least = before.min()
-                jump = least + large / (
-                    1 + abs(gray[row, column] - gray[before_row, before_column]) / EDGE_GRAY
-                )
+                least, edge = before.min(), abs(gray[row, column] - gray[before_row, before_column])
+                jump = least + large / (1 + edge / EDGE_GRAY)
                 for plane in range(planes):
                     value = min(before[plane], jump)
                     if plane > 0:
@@ -214,27 +195,14 @@ def agreement(
     others: list[tuple[Float[np.ndarray, "height width"], SweepView]],
 ) -> UInt8[np.ndarray, "height width"]:
     """Count, per pixel, the other pictures that agree with the depth."""
-    points_world = rigid.apply(
-        view.world_from_camera, cameras.back_project(depth, view.intrinsics).reshape(-1, 3)
-    )
+    points_camera = cameras.back_project(depth, view.intrinsics).reshape(-1, 3)
+    points_world = rigid.apply(view.world_from_camera, points_camera)
     count = np.zeros(depth.size, np.uint8)
     for theirs, other in others:
-        pixel, z = cameras.project(
-            rigid.apply(rigid.inverse(other.world_from_camera), points_world), other.intrinsics
-        )
-        inside = np.flatnonzero(
-            (depth.ravel() > 0) & (z > 0) & (pixel >= 0).all(1) & (pixel < theirs.shape[::-1]).all(1)
-        )
+        theirs_camera = rigid.apply(rigid.inverse(other.world_from_camera), points_world)
+        pixel, z = cameras.project(theirs_camera, other.intrinsics)
+        inside = np.flatnonzero((depth.ravel() > 0) & cameras.in_picture(pixel, z, theirs.shape))
         column, row = np.floor(pixel[inside]).astype(int).T
         met = theirs[row, column]
         count[inside] += (met > 0) & (np.abs(met - z[inside]) < AGREE_SHARE * z[inside])
     return count.reshape(depth.shape)
-
-
-def _angle_deg(
-    first: Float[np.ndarray, "ray 3"], second: Float[np.ndarray, "ray 3"]
-) -> Float[np.ndarray, "ray"]:
-    cosine = (first * second).sum(1) / np.maximum(
-        np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1), 1e-12
-    )
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))

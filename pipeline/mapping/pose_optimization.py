@@ -23,16 +23,14 @@ LEAST_SIGMA = 0.001
 SHORTEST_S = 1e-3
 """Least time between frames, seconds."""
 DAMPING = 1e-6
-"""Damping of a step, share of each diagonal element and of their mean; directions that nothing measures stay
-still."""
+"""Damping of a step, share of each diagonal element and of their mean: what nothing measures stays still."""
 PRIOR_PRECISION = 1e-9
 """Added to the information so that frames that nothing holds have a finite covariance."""
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Pairs of points that should coincide along ``direction``; ``points_*`` in the axes of their camera (or
-    the map), metres."""
+    """Points that should coincide along ``direction``, metres, in the axes of their camera (or the map)."""
 
     first: Int[np.ndarray, "match"]
     second: Int[np.ndarray, "match"]
@@ -44,18 +42,13 @@ class Correspondences:
     @staticmethod
     def join(*parts: "Correspondences") -> "Correspondences":
         """Concatenate sets of correspondences."""
-        return Correspondences(
-            **{
-                field.name: np.concatenate([getattr(part, field.name) for part in parts])
-                for field in fields(Correspondences)
-            }
-        )
+        names = [field.name for field in fields(Correspondences)]
+        return Correspondences(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @dataclass(frozen=True)
 class RelativePoseFactors:
-    """Measured relative motions ``first_from_second`` with their standard deviations (isotropic in each
-    part)."""
+    """Measured relative motions ``first_from_second`` with their (isotropic) standard deviations."""
 
     first: Int[np.ndarray, "edge"]
     second: Int[np.ndarray, "edge"]
@@ -80,18 +73,12 @@ def odometry_factors(
     drift_rad_s: float,
     drift_m_s: float,
 ) -> RelativePoseFactors:
-    """Turn odometry into one factor per neighbouring pair; its deviations grow with the time between
-    (radians, metres)."""
+    """Turn odometry into one factor per neighbouring pair; its deviations grow with the time between."""
     first = np.arange(len(timestamp_s) - 1)
     gap_s = np.maximum(np.diff(timestamp_s), SHORTEST_S)
     first_from_second = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
-    return RelativePoseFactors(
-        first,
-        first + 1,
-        first_from_second,
-        drift_rad_s * gap_s + LEAST_SIGMA,
-        drift_m_s * gap_s + LEAST_SIGMA,
-    )
+    sigmas = (drift * gap_s + LEAST_SIGMA for drift in (drift_rad_s, drift_m_s))
+    return RelativePoseFactors(first, first + 1, first_from_second, *sigmas)
 
 
 def optimize_poses(
@@ -102,8 +89,7 @@ def optimize_poses(
     reach_m: tuple[float, ...],
     fixed: Bool[np.ndarray, "frame"] | None = None,
 ) -> OptimizedPoses:
-    """Minimise sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses; rho is Geman-McClure's of width
-    ``reach_m``.
+    """Minimise sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses; rho: Geman-McClure of ``reach_m``.
 
     Each round finds the correspondences anew within its reach (metres) and takes one Gauss-Newton step on the
     right-hand twist of each camera. ``fixed`` frames stay where they are.
@@ -112,9 +98,8 @@ def optimize_poses(
     free = np.ones(len(poses), bool) if fixed is None else ~fixed
     for reach in reach_m:
         correspondences = find_correspondences(poses, reach)
-        poses = poses @ rigid.exp(
-            _solve(*_normal_equations(poses, correspondences, relative_poses, reach), free)
-        )
+        normal, gradient = _normal_equations(poses, correspondences, relative_poses, reach)
+        poses = poses @ rigid.exp(_solve(normal, gradient, free))
     correspondences = find_correspondences(poses, reach_m[-1])
     return OptimizedPoses(poses, correspondences, residuals(poses, correspondences))
 
@@ -125,8 +110,7 @@ def marginal_covariance(
     relative_poses: RelativePoseFactors,
     reach_m: float,
 ) -> Float[np.ndarray, "frame 6 6"]:
-    """Return the marginal covariance of each camera's right-hand twist (rotation in radians, translation in
-    metres).
+    """Return the marginal covariance of each camera's right-hand twist (rotation, translation).
 
     Diagonal blocks of the inverse Gauss-Newton matrix. Correspondences must be with the map and factors
     between neighbours, so that the matrix is block tridiagonal and one forward and one backward pass suffice.
@@ -151,10 +135,9 @@ def residuals(
     world_from_camera: Float[np.ndarray, "frame 4 4"], correspondences: Correspondences
 ) -> Float[np.ndarray, "match"]:
     """Return the signed distance of each correspondence along its direction, metres."""
-    gap = _world(world_from_camera, correspondences.first, correspondences.points_first) - _world(
-        world_from_camera, correspondences.second, correspondences.points_second
-    )
-    return np.einsum("ci,ci->c", gap, correspondences.direction_world)
+    first = _world(world_from_camera, correspondences.first, correspondences.points_first)
+    second = _world(world_from_camera, correspondences.second, correspondences.points_second)
+    return np.einsum("ci,ci->c", first - second, correspondences.direction_world)
 
 
 def _normal_equations(poses, correspondences, relative_poses, reach):
@@ -172,9 +155,8 @@ def _normal_equations(poses, correspondences, relative_poses, reach):
 
 
 def _world(world_from_camera, index, points):
-    moved = (
-        np.einsum("cij,cj->ci", world_from_camera[index, :3, :3], points) + world_from_camera[index, :3, 3]
-    )
+    pose = world_from_camera[index]
+    moved = np.einsum("cij,cj->ci", pose[:, :3, :3], points) + pose[:, :3, 3]
     return np.where((index == MAP)[:, None], points, moved)
 
 
@@ -190,10 +172,8 @@ def _correspondence_rows(poses, correspondences):
         blocks.append(sign * np.concatenate([np.cross(points[row], direction), direction], axis=1))
         columns.append(index[row, None] * 6 + np.arange(6))
         rows.append(np.repeat(row[:, None], 6, axis=1))
-    entries = [np.concatenate(part).ravel() for part in (blocks, rows, columns)]
-    return sparse.csr_array(
-        (entries[0], (entries[1], entries[2])), shape=(len(residual), 6 * len(poses))
-    ), residual
+    values, rows, columns = (np.concatenate(part).ravel() for part in (blocks, rows, columns))
+    return sparse.csr_array((values, (rows, columns)), shape=(len(residual), 6 * len(poses))), residual
 
 
 def _edge_rows(poses, relative_poses):

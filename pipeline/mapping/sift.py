@@ -29,8 +29,7 @@ def sift_points(
     depth_intrinsics: Float[np.ndarray, "3 3"],
     most: int,
 ) -> SiftPoints:
-    """Describe the ``most`` strongest points of a picture and keep those with depth (metres); pixels of one
-    camera centre."""
+    """Describe the ``most`` strongest points of a picture and keep those with depth, metres."""
     keypoints, descriptors = cv2.SIFT.create(most).detectAndCompute(gray, None)
     if not keypoints:
         return SiftPoints(np.zeros((0, 128), np.float32), np.zeros((0, 3)))

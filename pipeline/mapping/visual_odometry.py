@@ -1,5 +1,4 @@
-"""Visual odometry with depth: optical flow pairs pixels, depth lifts them, a robust closed form gives the
-motion.
+"""Visual odometry with depth: flow pairs pixels, depth lifts them, a robust closed form gives the motion.
 
 `prepare_frame` resizes and lifts a frame, `relative_motion` compares two, `chain_motions` treats a whole
 recording that has no odometry of its own.
@@ -74,8 +73,7 @@ def prepare_frame(
     depth_intrinsics: Float[np.ndarray, "3 3"],
     usable: Bool[np.ndarray, "height width"],
 ) -> FlowFrame:
-    """Resize a frame for optical flow and lift its usable pixels; colour and depth (metres) share a
-    camera."""
+    """Resize a frame for optical flow and lift its usable pixels; colour and depth share a camera centre."""
     scale = min(1.0, HEIGHT_PX / min(color.shape[:2]))
     size = (round(color.shape[0] * scale), round(color.shape[1] * scale))
     gray = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
@@ -111,9 +109,8 @@ def relative_motion(
 def _motion_from_guess(first, second, guess, rng):
     """Compare the first picture with the second, warped to the first's viewpoint by the guessed motion."""
     height, width = first.gray.shape
-    row, column = np.mgrid[STRIDE_PX // 2 : height : STRIDE_PX, STRIDE_PX // 2 : width : STRIDE_PX].reshape(
-        2, -1
-    )
+    start = STRIDE_PX // 2
+    row, column = np.mgrid[start:height:STRIDE_PX, start:width:STRIDE_PX].reshape(2, -1)
     end = _flow_targets(first, second, guess, row, column)
     inside = ((end >= 0) & (end < (width, height))).all(1)
     source = second.points_camera[end[inside, 1], end[inside, 0]]
@@ -154,14 +151,14 @@ def _flow_targets(first, second, guess, row, column):
 
 def _motion_from_sift(first, second, rng):
     """Return the motion of matched SIFT points."""
-    points = [
-        sift.sift_points(
-            each.gray, each.intrinsics, each.points_camera[..., 2], each.intrinsics, SIFT_FEATURES
-        )
-        for each in (first, second)
-    ]
-    pairs = sift.matches(*points)
-    source, target = points[1].points_camera[pairs[:, 1]], points[0].points_camera[pairs[:, 0]]
+
+    def points(frame: FlowFrame) -> sift.SiftPoints:
+        intrinsics, depth = frame.intrinsics, frame.points_camera[..., 2]
+        return sift.sift_points(frame.gray, intrinsics, depth, intrinsics, SIFT_FEATURES)
+
+    first, second = points(first), points(second)
+    pairs = sift.matches(first, second)
+    source, target = second.points_camera[pairs[:, 1]], first.points_camera[pairs[:, 0]]
     return align.ransac_rigid(source, target, threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng)[0]
 
 

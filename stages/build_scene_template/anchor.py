@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, ground, rigid
-from pipeline.mapping.sparse_model import SparseModel
+from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.matches import points_under
 from stages.build_scene_template.refine import Keyframe
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping import depth_scans, pose_optimization
-from pipeline.mapping.sparse_model import SparseModel
+from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.config import RefinementConfig
 from stages.build_scene_template.matches import points_under
 

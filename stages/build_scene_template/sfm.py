@@ -15,7 +15,7 @@ from pipeline.core.progress import log
 from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
 from pipeline.mapping import colmap
-from pipeline.mapping.sparse_model import SparseModel, read_sparse_model
+from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.build_scene_template.config import SfmConfig
 from stages.build_scene_template.matches import confirm
 

@@ -12,7 +12,7 @@ from pipeline.core.progress import log
 from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
-from pipeline.mapping.sparse_model import SparseModel
+from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template import anchor, fuse, refine, sfm
 from stages.build_scene_template.config import Config
 

@@ -20,8 +20,8 @@ from pipeline.core.progress import track
 from pipeline.data import images
 from pipeline.geometry import cameras
 from pipeline.mapping import plane_sweep, sift
+from pipeline.mapping.colmap import SparseModel
 from pipeline.mapping.plane_sweep import SweepView
-from pipeline.mapping.sparse_model import SparseModel
 from pipeline.recordings import extraction, upright
 from pipeline.recordings.conventions import OPENCV, TOLERANCE_M, PoseCheck
 from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan, choose_frames

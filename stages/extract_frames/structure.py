@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, UInt8
 
 from pipeline.core.progress import log
 from pipeline.mapping import colmap
-from pipeline.mapping.sparse_model import SparseModel, read_sparse_model
+from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.extract_frames.config import PhotogrammetryConfig
 
 LEAST_KEYFRAMES = 8

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from pipeline.core.progress import track
 from pipeline.data.clips import Clip, Masks, usable_depth
 from pipeline.geometry import rigid
-from pipeline.mapping import pose_optimization, tracking_jumps, visual_odometry
+from pipeline.mapping import pose_optimization, visual_odometry
+from pipeline.mapping.odometry import find_jumps, repair
 from pipeline.mapping.visual_odometry import JUMP_INFLATION, Odometry
 from stages.register_videos.config import VoteConfig
 from stages.register_videos.votes import Votes, close
@@ -44,8 +45,8 @@ def of_pictures(clip: Clip, masks: Masks, rng: np.random.Generator) -> Odometry:
 def of_device(clip: Clip) -> Odometry:
     """Return the device's odometry, repaired at tracking jumps and hardly weighted there."""
     assert clip.odometry_from_camera is not None, "the recording has odometry"
-    jumps = tracking_jumps.find_jumps(clip.timestamp_s, clip.odometry_from_camera)
-    poses = tracking_jumps.repair(clip.timestamp_s, clip.odometry_from_camera, jumps)
+    jumps = find_jumps(clip.timestamp_s, clip.odometry_from_camera)
+    poses = repair(clip.timestamp_s, clip.odometry_from_camera, jumps)
     factors = pose_optimization.odometry_factors(
         clip.timestamp_s, poses, drift_rad_s=DRIFT_RAD_S, drift_m_s=DRIFT_M_S
     )

@@ -8,8 +8,13 @@ from pipeline.geometry import rigid
 from pipeline.geometry.ground import fit_ground
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.mapping.icp import align_views, depth_image
-from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
-from pipeline.mapping.pose_graph import RelativePose, optimize_pose_graph
+from pipeline.mapping.odometry import (
+    RelativePose,
+    align_gravity,
+    chain_alignments,
+    correct_drift,
+    optimize_pose_graph,
+)
 
 SIZE = (64, 48)
 INTRINSICS = np.array([[48.0, 0, 24], [0, 48.0, 32], [0, 0, 1]])
@@ -55,10 +60,7 @@ def drifted(poses, rng, radians=0.002, metres=0.004):
     steps = relative @ rigid.exp(
         np.c_[rng.normal(0, radians, (len(relative), 3)), rng.normal(0, metres, (len(relative), 3))]
     )
-    found = [poses[0]]
-    for step in steps:
-        found.append(found[-1] @ step)
-    return np.stack(found)
+    return rigid.accumulate(steps, poses[0])
 
 
 def test_alignment_recovers_a_small_motion(circle):

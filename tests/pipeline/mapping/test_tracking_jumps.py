@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.geometry import rigid
-from pipeline.mapping import tracking_jumps
+from pipeline.mapping.odometry import find_jumps, repair
 from tests.stages.textured_room import aligned_errors, drifting, walk
 
 TIME_S = 0.1 * np.arange(60)
@@ -19,18 +19,16 @@ def jumping(odometry, frame, metres=0.6):
 def test_a_jump_is_found_and_repaired():
     truth = walk(60)
     odometry = jumping(jumping(drifting(truth, 4, deg=0.03, m=0.001), 20), 41, 0.9)
-    jumps = tracking_jumps.find_jumps(TIME_S, odometry)
+    jumps = find_jumps(TIME_S, odometry)
     assert np.flatnonzero(jumps).tolist() == [20, 41]
     assert aligned_errors(odometry, truth)[1].max() > 0.3, "metres"
-    assert aligned_errors(tracking_jumps.repair(TIME_S, odometry, jumps), truth)[1].max() < 0.03, (
-        "metres, drift included"
-    )
+    assert aligned_errors(repair(TIME_S, odometry, jumps), truth)[1].max() < 0.03, "metres, drift included"
 
 
 def test_one_frame_elsewhere_tears_twice():
     odometry = walk(60)
     odometry[30, :3, 3] += 1.0
-    assert np.flatnonzero(tracking_jumps.find_jumps(TIME_S, odometry)).tolist() == [30, 31]
+    assert np.flatnonzero(find_jumps(TIME_S, odometry)).tolist() == [30, 31]
 
 
 def test_what_hands_do_is_no_tear():
@@ -49,6 +47,6 @@ def test_what_hands_do_is_no_tear():
         (TIME_S[:1], tipped[:1]),
         (TIME_S[:2], lunge[:2]),
     ):
-        jumps = tracking_jumps.find_jumps(time_s, odometry)
+        jumps = find_jumps(time_s, odometry)
         assert not jumps.any()
-        assert tracking_jumps.repair(time_s, odometry, jumps) is odometry
+        assert repair(time_s, odometry, jumps) is odometry

@@ -10,7 +10,7 @@ from pipeline.core.errors import InputError
 from pipeline.data import ply as mesh_files
 from pipeline.geometry import ground, rigid, tsdf
 from pipeline.geometry.meshes import Mesh, RayCaster
-from pipeline.mapping.sparse_model import SparseModel
+from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template import anchor, fuse, matches, refine, sfm, template
 from stages.build_scene_template.config import Config, FusionConfig, RefinementConfig, SfmConfig
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
