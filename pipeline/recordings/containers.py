@@ -4,27 +4,31 @@ Nothing is ever extracted to disk: members are checked when the container opens 
 most ``max_bytes`` each.
 """
 
+import json
 import lzma
 import stat
 import struct
 import zipfile
 import zlib
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Protocol
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt, UInt8
 
 from pipeline.core.errors import InputError
-from pipeline.recordings.recording import damaged
+from pipeline.data import images
+from pipeline.recordings.recording import broken_metadata, damaged, refuse_other_size, wrong_depth
 
+MAX_MEMBER_BYTES = 64 << 20
+UNKNOWN = 65535
+"""what 16-bit depth pictures hold, beside 0, where nothing was measured"""
 MAX_MEMBERS = 1_000_000
-"""members that are listed at all: 90 minutes at 60 frames per second with three files each.
-
-About 0.6 GB of memory
-"""
+"""members that are listed at all, in 0.6 GB of memory: 90 minutes at 60 Hz with three files a frame"""
 MEMBERS_PER_FRAME, MEMBERS_BESIDE = 4, 1000
-"""members that a recording of so many declared frames may hold: colour, depth, confidence and one more.
-
-And others
-"""
+"""members that a recording may hold per declared frame (colour, depth, confidence, one more), and beside"""
 GIB = 1 << 30
 MAX_TOTAL_BYTES = 256 * GIB
 MAX_RATIO = 200
@@ -47,19 +51,66 @@ _UNREADABLE = (
 """what zipfile raises for archives that are damaged, encrypted, of unknown methods, or lie"""
 
 
-class Container(Protocol):
+class Container(ABC):
     """Named members of a recording."""
 
     where: str
     """shown in messages"""
     names: frozenset[str]
 
-    def read(self, name: str, max_bytes: int) -> bytes:
+    @abstractmethod
+    def read(self, name: str, max_bytes: int = MAX_MEMBER_BYTES) -> bytes:
         """Read one member. Raises InputError when it is damaged or longer than ``max_bytes``."""
-        ...
+
+    def place(self, name: str) -> str:
+        """Return a member's name for messages."""
+        return f"{self.where}/{name}"
+
+    def text(self, name: str) -> str:
+        """Read a text; what is no UTF-8 in it is replaced."""
+        return self.read(name).decode(errors="replace")
+
+    def table(self, name: str) -> dict[str, Any]:
+        """Read a JSON table. Raises CAP-004."""
+        try:
+            table = json.loads(self.read(name))
+        except (ValueError, RecursionError) as error:
+            raise broken_metadata(self.place(name), f"not JSON ({error})") from error
+        if not isinstance(table, dict):
+            raise broken_metadata(self.place(name), "not a table")
+        return table
+
+    def color(self, name: str) -> UInt8[np.ndarray, "height width 3"]:
+        """Read a colour picture. Raises CAP-020."""
+        return images.decode_color(self.read(name), self.place(name))
+
+    def gray(self, name: str, dtype: type = np.uint8) -> UInt[np.ndarray, "height width"]:
+        """Read a single-channel PNG of 8 bits (confidence) or 16 (depth). Raises CAP-008 for others."""
+        image = images.decoded(self.read(name), cv2.IMREAD_UNCHANGED)
+        if image is None or image.ndim != 2 or image.dtype != dtype:
+            bits = 8 * np.dtype(dtype).itemsize
+            raise wrong_depth(self.place(name), f"not a readable {bits}-bit single-channel PNG")
+        return image
+
+    def meters(
+        self, name: str, size: tuple[int, int] | None = None, per_meter: float = 1000.0
+    ) -> Float32[np.ndarray, "height width"]:
+        """Read a 16-bit depth PNG of (height, width) ``size`` as metres, 0 = unknown. Raises CAP-008."""
+        raw = self.gray(name, np.uint16)
+        refuse_other_size(raw.shape, size, self.place(name))
+        return np.where(raw == UNKNOWN, 0, raw).astype(np.float32) / np.float32(per_meter)
+
+    def numbered(self, folder: str, *suffixes: str) -> dict[int, str]:
+        """Return the members of a folder that are named by frame number, by it; of these suffixes, if any."""
+        found = {}
+        for name in sorted(name for name in self.names if name.startswith(f"{folder}/")):
+            number, suffix = frame_number(Path(name).stem), Path(name).suffix.lower()
+            if number is not None and (not suffixes or suffix in suffixes):
+                found[number] = name
+        return found
 
 
-class FolderContainer:
+class FolderContainer(Container):
     """A folder's files, addressed by their relative paths; links are not followed."""
 
     def __init__(self, folder: Path) -> None:
@@ -69,26 +120,21 @@ class FolderContainer:
         self.names = frozenset(path.relative_to(folder).as_posix() for path in files)
 
     def path(self, name: str) -> Path:
-        """Return where a member lies."""
-        return self._folder / name
-
-    def regular(self, name: str) -> Path:
         """Return where a regular file lies. Raises CAP-001 for links, pipes and names that are not there."""
         if name not in self.names:
-            raise damaged(f"{self.where}/{name}", "there is no such regular file")
-        return self.path(name)
+            raise damaged(self.place(name), "there is no such regular file")
+        return self._folder / name
 
-    def read(self, name: str, max_bytes: int) -> bytes:
+    def read(self, name: str, max_bytes: int = MAX_MEMBER_BYTES) -> bytes:
         """Read one file of at most ``max_bytes``."""
-        where = f"{self.where}/{name}"
         try:
-            with open(self.regular(name), "rb") as file:
-                return _within(file.read(max_bytes + 1), max_bytes, where)
+            with open(self.path(name), "rb") as file:
+                return _within(file.read(max_bytes + 1), max_bytes, self.place(name))
         except OSError as error:
-            raise damaged(where, error.strerror or str(error)) from error
+            raise damaged(self.place(name), error.strerror or str(error)) from error
 
 
-class ZipContainer:
+class ZipContainer(Container):
     """A ZIP's members, after its directory has been checked for anything a recording never holds."""
 
     def __init__(self, path: Path) -> None:
@@ -103,14 +149,13 @@ class ZipContainer:
         _refuse_unsafe(self._archive.infolist(), self.where)
         self.names = frozenset(info.filename for info in self._archive.infolist() if not info.is_dir())
 
-    def read(self, name: str, max_bytes: int) -> bytes:
+    def read(self, name: str, max_bytes: int = MAX_MEMBER_BYTES) -> bytes:
         """Read one member of at most ``max_bytes``; its checksum is verified."""
-        where = f"{self.where}:{name}"
         try:
             with self._archive.open(name) as member:
-                return _within(member.read(max_bytes + 1), max_bytes, where)
+                return _within(member.read(max_bytes + 1), max_bytes, self.place(name))
         except _UNREADABLE as error:
-            raise damaged(where, str(error)) from error
+            raise damaged(self.place(name), str(error)) from error
 
 
 def refuse_surplus_members(container: Container, frames: int) -> None:
@@ -147,12 +192,8 @@ def _within(data: bytes, max_bytes: int, where: str) -> bytes:
 
 
 def _unsafe(where: str, why: str) -> InputError:
-    return InputError(
-        "CAP-002",
-        what=f"the archive is refused: {why}",
-        where=where,
-        remedy="use the file that the recording app exported, unchanged",
-    )
+    remedy = "use the file that the recording app exported, unchanged"
+    return InputError("CAP-002", f"the archive is refused: {why}", where, remedy)
 
 
 def _refuse_unsafe(members: list[zipfile.ZipInfo], where: str) -> None:

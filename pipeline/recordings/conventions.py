@@ -1,8 +1,7 @@
 """Check on the depth itself what a recording's device poses mean, and whether they mean anything.
 
-For a few pairs of frames, the depth of one is moved by the poses into the other and compared with what
-was measured there. The documented convention stays unless it is clearly refuted and another one clearly
-fits.
+The depth of a few frames is moved by the poses into others and compared with what was measured there. The
+documented convention stays unless it is clearly refuted and another one clearly fits.
 """
 
 from collections.abc import Callable, Sequence
@@ -108,10 +107,7 @@ def check_poses(
     documented: Convention = OPENGL,
     among: Sequence[Convention] = CONVENTIONS,
 ) -> PoseCheck:
-    """Decide which convention the poses follow, the documented one ``among`` them.
-
-    ``depth_view(i)`` gives frame i's depth on demand.
-    """
+    """Decide which convention ``among`` these the poses follow; ``depth_view`` reads a frame's depth."""
     broken = "the recording has no device poses" if pose is None else _fault_of(pose)
     if pose is None or broken:
         return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
@@ -162,19 +158,12 @@ def _moving_pairs(
     moved = (rigid.rotation_angle(np.eye(3), relative[:, :3, :3]) > MIN_TURN_RAD) | (
         np.linalg.norm(relative[:, :3, 3], axis=1) > MIN_SHIFT_M
     )
-    longest_s = (
-        max(GAP_S[1], GAP_FRAMES * float(np.median(np.diff(timestamp_s))))
-        if len(timestamp_s) > 1
-        else GAP_S[1]
-    )
-    usable = np.stack([first, second], axis=1)[
-        moved & (timestamp_s[second] - timestamp_s[first] <= longest_s)
-    ]
-    return (
-        usable[np.unique(np.linspace(0, len(usable) - 1, pairs).round().astype(int))]
-        if len(usable)
-        else usable
-    )
+    if len(first) == 0:
+        return np.zeros((0, 2), int)
+    longest_s = max(GAP_S[1], GAP_FRAMES * float(np.median(np.diff(timestamp_s))))
+    close = timestamp_s[second] - timestamp_s[first] <= longest_s
+    usable = np.stack([first, second], axis=1)[moved & close]
+    return usable[np.unique(np.linspace(0, len(usable) - 1, min(pairs, len(usable))).round().astype(int))]
 
 
 def _score(

@@ -1,11 +1,7 @@
-"""A depth camera that stands beside the colour camera.
+"""A depth camera that stands beside the colour camera, as in Kinects and most RGB-D cameras.
 
-Reproject its depth into the colour camera, with occlusion.
-
-Kinects and most RGB-D cameras measure depth by a camera of its own, with its own focal length, some
-centimetres from the colour camera. `reproject` brings a depth picture to the colour camera's optical
-frame, on a grid of about its own size; what the colour camera cannot see behind something nearer is left
-out by a z-buffer.
+`reproject` brings its depth to the colour camera's optical frame, on a grid of about its own size; what the
+colour camera cannot see behind something nearer is left out by a z-buffer.
 """
 
 from dataclasses import dataclass
@@ -37,10 +33,7 @@ class DepthCamera:
 
 
 def grid_size(depth_size: tuple[int, int], color_size: tuple[int, int]) -> tuple[int, int]:
-    """Return the (height, width) of reprojected depth.
-
-    The shape of the colour picture, the depth's longer side.
-    """
+    """Return the (height, width) of reprojected depth: the colour's shape, the depth's longer side."""
     share = max(depth_size) / max(color_size)
     return round(color_size[0] * share), round(color_size[1] * share)
 
@@ -62,14 +55,8 @@ def reproject(
     pixel, z = cameras.project(rigid.apply(rigid.inverse(camera.depth_from_color), points_depth), intrinsics)
     ahead = z > NEAREST_M
     pixel, z = pixel[ahead], z[ahead].astype(np.float32)
-    cells = max(
-        1,
-        int(
-            np.ceil(
-                max(intrinsics[0, 0] / camera.intrinsics[0, 0], intrinsics[1, 1] / camera.intrinsics[1, 1])
-            )
-        ),
-    )
+    footprint = intrinsics[[0, 1], [0, 1]] / camera.intrinsics[[0, 1], [0, 1]]
+    cells = max(1, int(np.ceil(footprint.max())))
     nearest = np.full(height * width, np.inf, np.float32)
     for down in range(cells):
         for right in range(cells):

@@ -1,8 +1,6 @@
 """From a recording to upright frames at a steady rate.
 
-First understand the whole, then read picture by picture.
-
-`understand` costs a second and reads a dozen depth pictures; `frames` then yields one `Frame` at a time.
+`understand` costs a second and reads a dozen depth pictures; `frames` then reads one picture at a time.
 """
 
 import dataclasses
@@ -47,10 +45,7 @@ DARK = 0.15
 
 @dataclass(frozen=True)
 class ExtractionPlan:
-    """What was understood of a recording.
-
-    ``chosen`` indexes the recording's frames, everything else is upright.
-    """
+    """What was understood of a recording; ``chosen`` indexes its frames, everything else is upright."""
 
     chosen: Int[np.ndarray, "frame"]
     timestamp_s: Float[np.ndarray, "frame"]
@@ -65,8 +60,7 @@ class ExtractionPlan:
     """clockwise, stored to upright"""
     pose_check: PoseCheck
     scale: str = MEASURED
-    """`measured` by the recording's own depth, `relative`, or the id of the recording that supplied the scale
-    """
+    """`measured` by its own depth, `relative`, or the id of the recording that supplied it"""
 
 
 @dataclass(frozen=True)
@@ -93,14 +87,11 @@ def understand(
 ) -> ExtractionPlan:
     """Choose frames, check the poses on the depth, find the upright turn and the size of the pictures.
 
-    Raises InputError CAP-006 for a recording without depth, CAP-004 and CAP-008 for intrinsics and depth
-    that cannot be.
+    Raises CAP-006 for a recording without depth, CAP-004 and CAP-008 for impossible intrinsics and depth.
     """
     if recording.depth_size is None or recording.intrinsics is None:
-        raise no_depth(
-            recording.where,
-            f"{recording.kind}; an animal moves, so its distance cannot be triangulated from pictures",
-        )
+        why = f"{recording.kind}; an animal moves, so its distance cannot be triangulated from pictures"
+        raise no_depth(recording.where, why)
     _refuse_other_pictures(recording.intrinsics, recording.color_size, recording.where)
     if recording.depth_camera is None:
         _refuse_other_shape(recording.color_size, recording.depth_size, recording.where)
@@ -124,9 +115,8 @@ def understand(
         pose, check = None, dataclasses.replace(check, reason="; ".join(filter(None, (check.reason, lost))))
     selected = choose_frames(recording.timestamp_s[used], rate_hz)
     chosen = used[selected]
-    odometry_from_camera, turns = _upright(
-        recording, None if pose is None else pose[selected], check, chosen, view
-    )
+    pose = None if pose is None else pose[selected]
+    odometry_from_camera, turns = _upright(recording, pose, check, chosen, view)
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
     return ExtractionPlan(
@@ -149,9 +139,7 @@ def _upright(
     chosen: Int[np.ndarray, "frame"],
     view: Callable[[int], conventions.DepthPicture],
 ) -> tuple[Float[np.ndarray, "frame 4 4"] | None, int]:
-    """Return the upright cameras of the chosen frames, if their poses are of use, and the quarter turns,
-    clockwise, from stored to upright.
-    """
+    """Return the upright cameras of the chosen frames, if poses are of use, and the turns to upright."""
 
     def room() -> list[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]]:
         shown = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
@@ -172,70 +160,45 @@ def _upright(
 def _refuse_other_pictures(
     intrinsics: Float[np.ndarray, "frame 3 3"], color_size: tuple[int, int], where: str
 ) -> None:
-    """Raise CAP-004 for intrinsics whose centre lies outside of the picture.
-
-    Those of another resolution, or of one turned.
-    """
-    (height, width), center = color_size, np.median(intrinsics[:, :2, 2], axis=0)
-    if not ((center > 0) & (center < (width, height))).all():
-        why = (
-            f"the intrinsics' centre, {center[0]:.0f} {center[1]:.0f}, lies "
-            f"outside of pictures of {width} x {height}"
-        )
+    """Raise CAP-004 for a centre outside of the picture: intrinsics of another resolution or turn."""
+    (height, width), (x, y) = color_size, np.median(intrinsics[:, :2, 2], axis=0)
+    if not (0 < x < width and 0 < y < height):
+        why = f"the intrinsics' centre, {x:.0f} {y:.0f}, lies outside of pictures of {width} x {height}"
         raise broken_metadata(where, why)
 
 
 def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int], where: str) -> None:
-    """Raise CAP-008 for depth of another shape than the pictures, all as stored.
-
-    The one shows more than the other.
-    """
+    """Raise CAP-008 for depth of another shape than the pictures, all as stored: one shows more."""
     (height, width), (depth_height, depth_width) = color_size, depth_size
     stretched_px = abs(depth_height - depth_width * height / width)
     rounding_px = 0.5 * (1 + height / width)
     if stretched_px > max(MOST_STRETCHED * depth_height, rounding_px):
-        what = (
-            f"depth of {depth_width} x {depth_height} cannot show the same as pictures of {width} x {height}"
-        )
-        raise InputError(
-            "CAP-008", what, where, "crop the one to what the other shows, turned as the pictures are stored"
-        )
+        sizes = f"depth of {depth_width} x {depth_height}", f"pictures of {width} x {height}"
+        remedy = "crop the one to what the other shows, turned as the pictures are stored"
+        raise InputError("CAP-008", " cannot show the same as ".join(sizes), where, remedy)
 
 
 def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
-    """Raise CAP-008 for depth that is typically farther or nearer than any sensor would be used at.
-
-    Written in another unit.
-    """
+    """Raise CAP-008 for depth too far or near for any sensor's use, as if written in another unit."""
     shown = recording.index[np.unique(np.linspace(0, len(recording.index) - 1, UNIT_VIEWS).astype(int))]
     depth = np.concatenate([recording.read_depth(int(number)).ravel() for number in shown])
     depth = depth[np.isfinite(depth) & (depth > 0)]
     typical_m = float(np.median(depth)) if len(depth) else max_depth_m
     if not NEAREST_TYPICAL_M < typical_m < FARTHEST_TYPICAL * max_depth_m:
         what = f"depth is typically {typical_m:.3g} m, where up to {max_depth_m:g} m are used"
-        remedy = (
-            "16-bit PNG holds millimetres, or the units per metre of a TUM folder's "
-            "depth_scale.txt, EXR metres; record within 5 m"
-        )
+        remedy = "PNG holds millimetres (TUM: see depth_scale.txt), EXR metres; record within 5 m"
         raise InputError("CAP-008", what, recording.where, remedy)
 
 
 def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.ndarray, "used 7"] | None, str]:
-    """Return the frames to use, their poses, and what was lost.
-
-    Where the tracking was lost for a few frames, the others are used; where it was lost for many, all
-    are, without poses.
-    """
+    """Return the frames to use, their poses, and what was lost: of many lost ones no pose is used."""
     everything = np.arange(len(recording.index))
     if recording.pose is None:
         return everything, None, ""
     known = np.isfinite(recording.pose).all(1)
-    if known.all():
-        return everything, recording.pose, ""
-    lost = f"{100 * (1 - known.mean()):.0f} % of the frames have no device pose"
-    if known.mean() < LEAST_TRACKED:
-        return everything, recording.pose, lost
-    return everything[known], recording.pose[known], lost
+    lost = "" if known.all() else f"{100 * (1 - known.mean()):.0f} % of the frames have no device pose"
+    used = known if known.mean() >= LEAST_TRACKED else np.ones_like(known)
+    return everything[used], recording.pose[used], lost
 
 
 def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
@@ -248,10 +211,7 @@ def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
 def frames(
     recording: Recording, plan: ExtractionPlan, *, max_depth_m: float, jpeg_quality: int
 ) -> Iterator[ExtractedFrame | None]:
-    """Yield the plan's frames in order, upright; None where the file is damaged.
-
-    Raises InputError for broken pictures.
-    """
+    """Yield the plan's frames in order, upright; None where the file is damaged."""
     for number in recording.index[plan.chosen]:
         stored = recording.read_color(int(number))
         if stored is None:
@@ -263,9 +223,8 @@ def frames(
         if color.shape[:2] != plan.stored_size:
             color = cv2.resize(color, plan.stored_size[::-1], interpolation=cv2.INTER_AREA)
         if plan.quarter_turns:
-            color, depth, confidence = (
-                cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence)
-            )
+            turned = (cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence))
+            color, depth, confidence = turned
         as_stored = not plan.quarter_turns and plan.stored_size == recording.color_size
         if as_stored and isinstance(stored, bytes) and stored[:2] == JPEG:
             jpeg = stored
@@ -276,32 +235,27 @@ def frames(
 
 
 def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float[np.ndarray, "height width"]:
-    """Read one frame's known depth as stored (not turned), metres.
-
-    Enlarged depth is brought back to a sensor's size.
-    """
+    """Read one frame's known depth as stored (not turned), metres, at most at a sensor's size."""
     depth = known_depth(recording.read_depth(number), max_depth_m)
     if recording.depth_camera is not None:
         assert recording.intrinsics is not None, recording.where
         row = int(np.searchsorted(recording.index, number))
         color = recording.intrinsics[row], recording.color_size
         depth = known_depth(reproject(depth, recording.depth_camera, *color), max_depth_m)
-    size = reduced_size(depth.shape, MAX_DEPTH_SIDE_PX)
-    return (
-        depth if depth.shape == size else cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-    )
+    return _sampled(depth, reduced_size(depth.shape, MAX_DEPTH_SIDE_PX))
+
+
+def _sampled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return a picture at another (height, width), by its nearest pixels."""
+    same = image.shape == size
+    return image if same else cv2.resize(image, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.ndarray, "height width 3"]:
     color = images.decode_color(stored, where) if isinstance(stored, bytes) else stored
     if color.shape[:2] != size:
-        raise broken_metadata(
-            where,
-            (
-                f"the picture is {color.shape[1]} x {color.shape[0]}, the "
-                f"recording declares {size[1]} x {size[0]}"
-            ),
-        )
+        declared = f"the recording declares {size[1]} x {size[0]}"
+        raise broken_metadata(where, f"the picture is {color.shape[1]} x {color.shape[0]}, {declared}")
     return color
 
 
@@ -309,18 +263,11 @@ def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[n
     """Return the phone's confidence; an export without it trusts all depth that there is."""
     if recording.read_confidence is None:
         return np.where(depth > 0, 2, 0).astype(np.uint8)
-    confidence = np.minimum(recording.read_confidence(number), 2)
-    return (
-        confidence
-        if confidence.shape == depth.shape
-        else cv2.resize(confidence, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-    )
+    return _sampled(np.minimum(recording.read_confidence(number), 2), depth.shape)
 
 
 def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
-    """Divide a (height, width) by the smallest whole number that brings the longer side to
-    ``max_side_px``.
-    """
+    """Divide a (height, width) by the least whole number that brings its longer side to ``max_side_px``."""
     factor = -(-max(size) // max_side_px)
     return (round(size[0] / factor), round(size[1] / factor))
 
@@ -355,10 +302,8 @@ def summary(recording: Recording, plan: ExtractionPlan) -> str:
     seconds = recording.timestamp_s[-1] - recording.timestamp_s[0]
     height, width = recording.color_size
     turned = f"turned {90 * plan.quarter_turns} deg clockwise" if plan.quarter_turns else "upright as stored"
-    seen = (
-        f"{seconds:.1f} s, {len(recording.index)} frames {width} x "
-        f"{height}, {len(plan.chosen)} kept, {turned}"
-    )
+    count, chosen = len(recording.index), len(plan.chosen)
+    seen = f"{seconds:.1f} s, {count} frames {width} x {height}, {chosen} kept, {turned}"
     check = plan.pose_check
     measured = f" ({1000 * check.residual_m:.1f} mm)" if np.isfinite(check.residual_m) else ""
     remarks = "".join(f"; {remark}" for remark in recording.remarks)
@@ -366,10 +311,9 @@ def summary(recording: Recording, plan: ExtractionPlan) -> str:
 
 
 def choose_frames(timestamp_s: Float[np.ndarray, "frame"], rate_hz: float) -> Int[np.ndarray, "chosen"]:
-    """Pick, for every tick of a clock at ``rate_hz``, the frame nearest to it within half a tick.
+    """Pick, for every tick of a clock at ``rate_hz``, the frame nearest to it within half a tick, if any.
 
-    Ticks start at the first frame. No frame is picked twice and none is invented: a tick without a frame
-    stays empty. ``timestamp_s`` must increase.
+    Ticks start at the first frame; ``timestamp_s`` must increase.
     """
     tick = np.rint((timestamp_s - timestamp_s[0]) * rate_hz).astype(int)
     distance_s = np.abs(timestamp_s - timestamp_s[0] - tick / rate_hz)

@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from pipeline.recordings.recording import Recording
 
 UNDERSTOOD = (
-    "Record3D .r3d or EXR + JPG folder, Stray Scanner, Polycam raw data, "
-    "NeRFCapture stream, TUM or 7-Scenes folder, "
-    "a folder with a video, depth/ and intrinsics.txt, a video alone for the walk-through"
+    "Record3D .r3d or EXR + JPG folder, Stray Scanner, Polycam raw data, NeRFCapture stream, TUM or 7-Scenes "
+    "folder, a folder with a video, depth/ and intrinsics.txt, a video alone for the walk-through"
 )
 
 MOST_SCALE_SOURCES = 3
@@ -34,51 +33,9 @@ class Format:
     name: str
     fits: Callable[[Path], bool]
     """whether a path is one, by names alone"""
-    open: Callable[[Path], Recording]
-    """reads what the pictures' frames need, no pictures; raises InputError"""
+    reader: str
+    """module of this package that opens it"""
     has_depth: bool = True
-
-
-def _record3d(path: Path) -> Recording:
-    from pipeline.recordings import record3d
-
-    return record3d.open_recording(path)
-
-
-def _stray(path: Path) -> Recording:
-    from pipeline.recordings import stray_scanner
-
-    return stray_scanner.open_recording(path)
-
-
-def _polycam(path: Path) -> Recording:
-    from pipeline.recordings import polycam
-
-    return polycam.open_recording(path)
-
-
-def _nerfcapture(path: Path) -> Recording:
-    from pipeline.recordings import nerfcapture
-
-    return nerfcapture.open_recording(path)
-
-
-def _tum(path: Path) -> Recording:
-    from pipeline.recordings import tum
-
-    return tum.open_recording(path)
-
-
-def _seven_scenes(path: Path) -> Recording:
-    from pipeline.recordings import seven_scenes
-
-    return seven_scenes.open_recording(path)
-
-
-def _plain_video(path: Path) -> Recording:
-    from pipeline.recordings import plain_video
-
-    return plain_video.open_recording(path)
 
 
 def _holds(*names: str) -> Callable[[Path], bool]:
@@ -102,21 +59,21 @@ def _holds_seven_scenes(path: Path) -> bool:
 
 
 FORMATS: tuple[Format, ...] = (
-    Format("Record3D .r3d", _is_file(".r3d"), _record3d),
+    Format("Record3D .r3d", _is_file(".r3d"), "record3d"),
     Format(
         "Record3D EXR + JPG",
         lambda path: _holds("metadata.json")(path) or _holds("EXR_RGBD/metadata.json")(path),
-        _record3d,
+        "record3d",
     ),
-    Format("Stray Scanner", _holds("rgb.mp4", "odometry.csv"), _stray),
-    Format("Polycam raw data", _holds("keyframes"), _polycam),
+    Format("Stray Scanner", _holds("rgb.mp4", "odometry.csv"), "stray_scanner"),
+    Format("Polycam raw data", _holds("keyframes"), "polycam"),
     Format(
-        "NeRFCapture", lambda path: _is_file(".zip")(path) or _holds("transforms.json")(path), _nerfcapture
+        "NeRFCapture", lambda path: _is_file(".zip")(path) or _holds("transforms.json")(path), "nerfcapture"
     ),
-    Format("TUM RGB-D", _holds("rgb.txt", "depth.txt"), _tum),
-    Format("7-Scenes RGB-D", _holds_seven_scenes, _seven_scenes),
-    Format("video and depth", _holds_movie, _plain_video),
-    Format("video alone", _is_file(*VIDEO_SUFFIXES), _plain_video, has_depth=False),
+    Format("TUM RGB-D", _holds("rgb.txt", "depth.txt"), "tum"),
+    Format("7-Scenes RGB-D", _holds_seven_scenes, "seven_scenes"),
+    Format("video and depth", _holds_movie, "plain_video"),
+    Format("video alone", _is_file(*VIDEO_SUFFIXES), "plain_video", has_depth=False),
 )
 
 
@@ -126,20 +83,33 @@ def format_of(path: Path) -> Format | None:
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a recording of any format; raises CAP-003 when it is none, and what its reader raises."""
+    """Open a recording of any format, reading no pictures; raises CAP-003, and what its reader raises."""
     if not path.exists():
         raise InputError("CAP-003", "there is no such recording", str(path), f"give one of: {UNDERSTOOD}")
     found = format_of(path)
     if found is None:
         raise InputError("CAP-003", "not a recording of a known format", str(path), f"known: {UNDERSTOOD}")
-    return found.open(path)
+    return _reader(found.reader)(path)
+
+
+def _reader(name: str) -> Callable[[Path], Recording]:
+    """Import what opens a format, as late as it is needed: the planner does without."""
+    from pipeline.recordings import (
+        nerfcapture,
+        plain_video,
+        polycam,
+        record3d,
+        seven_scenes,
+        stray_scanner,
+        tum,
+    )
+
+    modules = (nerfcapture, plain_video, polycam, record3d, seven_scenes, stray_scanner, tum)
+    return next(module.open_recording for module in modules if module.__name__.endswith(f".{name}"))
 
 
 def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[Video]:
-    """Return the recordings in ``folder`` whose depth may supply metric scale to ``video``.
-
-    For a walk-through without depth these are some training sessions with depth; for any other none.
-    """
+    """Return the training sessions in ``folder`` whose depth gives a walk-through without depth its scale."""
     if video.role != "walkthrough" or has_depth(folder / video.file):
         return []
     sessions = (other for other in videos if other.role == "session" and other.split == "train")

@@ -5,6 +5,7 @@ damaged place swallows shifts no other.
 """
 
 import contextlib
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,9 +23,7 @@ _GUARDS = {
     "protocol_whitelist": "file",
     "max_pixels": str(MAX_PIXELS),
 }
-"""FFmpeg's: a list of other files (ffconcat, HLS) is no video, and no picture is decoded that is larger
-than any phone's
-"""
+"""a list of other files (ffconcat, HLS) is no video, pictures larger than any phone's are not decoded"""
 SKIP_FRAMES = 90
 """further ahead than this, decoding begins anew at the nearest key frame"""
 
@@ -61,7 +60,7 @@ class Movie:
             if frame.pts is None or frame.pts < wanted:
                 continue
             if frame.pts > wanted:  # the wanted one is lost; this one may be asked for next
-                self._decoder = _again(frame, self._decoder)
+                self._decoder = itertools.chain([frame], self._decoder)
                 return None
             return None if frame.is_corrupt else frame.to_ndarray(format="rgb24")
         self._decoder = iter(())
@@ -104,17 +103,13 @@ class Movie:
             if codec is None:
                 raise damaged(self.where, "the video is of an unknown codec")
             if codec.width * codec.height > MAX_PIXELS:
-                raise damaged(
-                    self.where, f"pictures of {codec.width} x {codec.height}, larger than any phone's"
-                )
+                why = f"pictures of {codec.width} x {codec.height}, larger than any phone's"
+                raise damaged(self.where, why)
             yield container
 
 
 def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:
-    """Yield the times of all frames but those that an edit list hides.
-
-    They are decoded for others and never shown.
-    """
+    """Yield the times of all frames but those that an edit list hides: never shown, decoded for others."""
     packets = container.demux(stream)
     while True:
         try:
@@ -125,8 +120,3 @@ def _packet_times(container: av.container.InputContainer, stream: av.VideoStream
             return
         if packet.pts is not None and packet.size and not packet.is_discard:
             yield packet.pts
-
-
-def _again(frame: av.VideoFrame, rest: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
-    yield frame
-    yield from rest

@@ -1,9 +1,7 @@
-"""A plain video: alone, or in a folder with `depth/` (one picture per video frame, by its number) and
-`intrinsics.txt`.
+"""A video: alone, or in a folder with `intrinsics.txt` and `depth/`, a picture per video frame by its number.
 
-Depth: 16-bit PNG in millimetres or EXR in metres, aligned with the picture as stored. `poses.txt`, where
-there is one: frame number, tx ty tz qx qy qz qw of the camera (OpenCV axes) in its world. A video alone
-has no depth and no scale.
+Depth: 16-bit PNG in millimetres or EXR in metres, aligned with the picture as stored. `poses.txt`, if any:
+frame number, tx ty tz qx qy qz qw of the camera (OpenCV axes) in its world. A video alone has no scale.
 """
 
 from pathlib import Path
@@ -14,19 +12,16 @@ from jaxtyping import Float
 from pipeline.core.videos import VIDEO_SUFFIXES
 from pipeline.data import images
 from pipeline.recordings import text_files
-from pipeline.recordings.containers import FolderContainer, frame_number
+from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENCV
 from pipeline.recordings.movies import Movie
-from pipeline.recordings.recording import (  # fmt: skip
-    MAX_PICTURE_BYTES,
-    MAX_TEXT_BYTES,
+from pipeline.recordings.recording import (
     Recording,
     broken_metadata,
     intrinsics_from_coefficients,
-    meters_from_png,
     no_depth,
     no_frames,
-    wrong_depth,
+    refuse_other_size,
 )
 
 
@@ -41,24 +36,15 @@ def open_recording(path: Path) -> Recording:
     if len(movies) != 1:
         raise broken_metadata(container.where, f"{len(movies)} videos in the folder instead of one")
     movie = Movie(path / movies[0])
-    depth = {
-        number: name
-        for name in sorted(container.names)
-        if name.startswith("depth/") and (number := frame_number(Path(name).stem)) is not None
-    }
-    depth = {number: name for number, name in depth.items() if Path(name).suffix.lower() in (".png", ".exr")}
+    depth = container.numbered("depth", ".png", ".exr")
     if not depth:
         raise no_depth(container.where, "depth/ holds no numbered PNG or EXR pictures")
     index = np.array(sorted(number for number in depth if number < len(movie)), int)
     if len(index) == 0:
-        raise no_frames(
-            container.where, "no depth picture carries the number of a video frame, counted from 0"
-        )
+        why = "no depth picture carries the number of a video frame, counted from 0"
+        raise no_frames(container.where, why)
     if max(depth) + 1 < 0.5 * len(movie):
-        why = (
-            f"{len(movie)} video frames but depth up to number {max(depth)}: name "
-            "depth pictures by the frame they belong to"
-        )
+        why = f"{len(movie)} video frames, but depth up to number {max(depth)}: name it by the frame"
         raise broken_metadata(container.where, why)
     size = _depth(container, depth[int(index[0])], None).shape
     coefficients, remarks = text_files.coefficients(container, default=None)
@@ -103,21 +89,16 @@ def _depth(
     container: FolderContainer, name: str, size: tuple[int, int] | None
 ) -> Float[np.ndarray, "height width"]:
     if name.lower().endswith(".png"):
-        return meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, f"{container.where}/{name}")
+        return container.meters(name, size)
     depth = images.read_depth(container.path(name), channel=None)
-    if size is not None and depth.shape != size:
-        raise wrong_depth(
-            f"{container.where}/{name}",
-            f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}",
-        )
+    refuse_other_size(depth.shape, size, container.place(name))
     return depth
 
 
 def _poses(container: FolderContainer, index: np.ndarray) -> Float[np.ndarray, "frame 7"] | None:
     if "poses.txt" not in container.names:
         return None
-    where = f"{container.where}/poses.txt"
-    table = text_files.table(container.read("poses.txt", MAX_TEXT_BYTES).decode(errors="replace"), 8, where)
+    table = text_files.table(container, "poses.txt", 8)
     row = {int(number): i for i, number in enumerate(table[:, 0]) if np.isfinite(number)}
     pose = np.full((len(index), 7), np.nan)
     for frame, number in enumerate(index):

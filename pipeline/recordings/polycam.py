@@ -6,30 +6,23 @@ depth. The app's own mesh, `raw.glb`, stands turned to its axes; the inverse of 
 """
 
 import io
-import json
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 
-from pipeline.data import images
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
-from pipeline.recordings.containers import FolderContainer, frame_number
+from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (  # fmt: skip
-    MAX_PICTURE_BYTES,
-    MAX_TEXT_BYTES,
+from pipeline.recordings.recording import (
     Y_UP,
     Recording,
     broken_metadata,
     damaged,
-    decode_gray,
     intrinsics_from_coefficients,
-    meters_from_png,
     no_depth,
     no_frames,
     pose_from_matrix,
@@ -39,6 +32,7 @@ TRUSTED_M = 5.0
 """depth beyond this is unknown, metres"""
 MAX_MESH_BYTES = 512 << 20
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
+MATRIX = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 
 
 def open_recording(path: Path) -> Recording:
@@ -48,10 +42,10 @@ def open_recording(path: Path) -> Recording:
         name.split("/")[1] for name in container.names if name.startswith("keyframes/")
     }
     color, camera = ("corrected_images", "corrected_cameras") if corrected else ("images", "cameras")
-    stems = [_stems(container, part) for part in (color, camera, "depth")]
-    if not stems[2]:
+    files = [container.numbered(f"keyframes/{part}") for part in (color, camera, "depth")]
+    if not files[2]:
         raise no_depth(container.where, "keyframes/depth is empty: record in LiDAR or room mode")
-    index = np.array(sorted(set.intersection(*stems)), int)
+    index = np.array(sorted(set.intersection(*map(set, files))), int)
     if len(index) == 0:
         raise no_frames(container.where, "no keyframe has picture, camera and depth")
     tables = [_camera(container, f"keyframes/{camera}/{number}.json") for number in index]
@@ -59,104 +53,83 @@ def open_recording(path: Path) -> Recording:
     if len(sizes) != 1:
         raise broken_metadata(container.where, f"keyframes of {len(sizes)} sizes")
     size = _depth(container, int(index[0]), None).shape
-    known = set(index.tolist()) <= _stems(container, "confidence")
+    matrices = _columns(tables, MATRIX).reshape(-1, 3, 4)
+    known = set(index.tolist()) <= container.numbered("keyframes/confidence").keys()
+    mesh = {"raw.glb", "mesh_info.json"} <= container.names
 
     def depth(number: int) -> np.ndarray:
         measured = _depth(container, number, size)
-        return (
-            np.where(_border(container, f"keyframes/{color}/{number}.jpg", size), 0, measured)
-            if corrected
-            else measured
-        )
+        if not corrected:
+            return measured
+        return np.where(_border(container, f"keyframes/{color}/{number}.jpg", size), 0, measured)
 
     return Recording(
         where=container.where,
         kind="Polycam raw data",
         index=index,
         timestamp_s=(index - index[0]) * 1e-6,
-        intrinsics=intrinsics_from_coefficients(
-            np.array([[table[key] for key in COEFFICIENTS] for table in tables]), container.where
-        ),
-        pose=pose_from_matrix(np.stack([_world_from_camera(table) for table in tables])),
+        intrinsics=intrinsics_from_coefficients(_columns(tables, COEFFICIENTS), container.where),
+        pose=pose_from_matrix(rigid.make(matrices[..., :3], matrices[..., 3])),
         color_size=next(iter(sizes)),
         depth_size=size,
-        read_color=lambda i: container.read(f"keyframes/{color}/{i}.jpg", MAX_PICTURE_BYTES),
+        read_color=lambda i: container.read(f"keyframes/{color}/{i}.jpg"),
         read_depth=depth,
         read_confidence=(lambda i: _confidence(container, i, size)) if known else None,
         convention=OPENGL,
         up=Y_UP,
-        read_mesh=(lambda: _mesh(container))
-        if {"raw.glb", "mesh_info.json"} <= set(container.names)
-        else None,
+        read_mesh=(lambda: _mesh(container)) if mesh else None,
         remarks=("Polycam keeps sparse keyframes: good for the walk-through, too few for the animal",),
     )
 
 
-def _stems(container: FolderContainer, part: str) -> set[int]:
-    names = (Path(name) for name in container.names if name.startswith(f"keyframes/{part}/"))
-    return {number for name in names if (number := frame_number(name.stem)) is not None}
-
-
-def _camera(container: FolderContainer, name: str) -> dict[str, Any]:
-    where = f"{container.where}/{name}"
+def _camera(container: FolderContainer, name: str) -> dict[str, float]:
     try:
-        table = json.loads(container.read(name, MAX_TEXT_BYTES))
-        wanted = (
-            *COEFFICIENTS,
-            "width",
-            "height",
-            *(f"t_{row}{column}" for row in range(3) for column in range(4)),
-        )
-        return {key: float(table[key]) for key in wanted}
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise broken_metadata(where, f"not a camera ({error!r})") from error
+        table = container.table(name)
+        return {key: float(table[key]) for key in (*COEFFICIENTS, "width", "height", *MATRIX)}
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise broken_metadata(container.place(name), f"not a camera ({error!r})") from error
 
 
-def _world_from_camera(table: dict[str, float]) -> Float[np.ndarray, "4 4"]:
-    rows = [[table[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
-    return np.array([*rows, [0.0, 0.0, 0.0, 1.0]])
+def _columns(tables: list[dict[str, float]], keys: tuple[str, ...]) -> Float[np.ndarray, "frame column"]:
+    return np.array([[table[key] for key in keys] for table in tables])
 
 
 def _depth(
     container: FolderContainer, number: int, size: tuple[int, int] | None
 ) -> Float[np.ndarray, "height width"]:
-    name = f"keyframes/depth/{number}.png"
-    depth = meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, f"{container.where}/{name}")
+    depth = container.meters(f"keyframes/depth/{number}.png", size)
     return np.where(depth <= TRUSTED_M, depth, np.float32(0))
 
 
 def _mesh(container: FolderContainer) -> Mesh:
     """Read the app's mesh in the cameras' world. Raises CAP-001 and CAP-004."""
-    where = f"{container.where}/mesh_info.json"
+    table = container.table("mesh_info.json")
     try:
-        table = json.loads(container.read("mesh_info.json", MAX_TEXT_BYTES))
         aligned_from_world = np.array(table["alignmentTransform"], float).reshape(4, 4).T
         world_from_aligned = np.linalg.inv(aligned_from_world)
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        where = container.place("mesh_info.json")
         raise broken_metadata(where, f"no alignmentTransform of 16 numbers ({error!r})") from error
     try:
-        loaded = trimesh.load(
-            io.BytesIO(container.read("raw.glb", MAX_MESH_BYTES)), file_type="glb", force="mesh"
-        )
+        data = io.BytesIO(container.read("raw.glb", MAX_MESH_BYTES))
+        loaded = trimesh.load(data, file_type="glb", force="mesh")
     except Exception as error:  # whatever the reader meets in a file that was cut
-        raise damaged(f"{container.where}/raw.glb", repr(error)) from error
+        raise damaged(container.place("raw.glb"), repr(error)) from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise damaged(f"{container.where}/raw.glb", "it holds no surface")
+        raise damaged(container.place("raw.glb"), "it holds no surface")
     vertices = rigid.apply(world_from_aligned, np.asarray(loaded.vertices, float)).astype(np.float32)
     return Mesh(vertices, np.asarray(loaded.faces, np.int32), np.full((len(vertices), 3), 128, np.uint8))
 
 
 def _border(container: FolderContainer, name: str, size: tuple[int, int]) -> np.ndarray:
-    color = images.decode_color(container.read(name, MAX_PICTURE_BYTES), f"{container.where}/{name}")
-    return cv2.resize(color.max(-1), size[::-1], interpolation=cv2.INTER_AREA) < 3
+    return cv2.resize(container.color(name).max(-1), size[::-1], interpolation=cv2.INTER_AREA) < 3
 
 
 def _confidence(
     container: FolderContainer, number: int, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width"]:
     """Read 0 as low, 255 as high and whatever lies between as medium."""
-    name = f"keyframes/confidence/{number}.png"
-    raw = decode_gray(container.read(name, MAX_PICTURE_BYTES), f"{container.where}/{name}", np.uint8)
+    raw = container.gray(f"keyframes/confidence/{number}.png")
     if raw.shape != size:
         raw = cv2.resize(raw, size[::-1], interpolation=cv2.INTER_NEAREST)
     return np.where(raw == 0, 0, np.where(raw == 255, 2, 1)).astype(np.uint8)

@@ -1,17 +1,13 @@
-"""Record3D recordings, both ways the app exports them.
-
-One ``.r3d`` archive, or a folder of EXR and JPEG files.
+"""Record3D, both ways the app exports: an ``.r3d`` archive, or a folder of EXR and JPEG files.
 
 Files are paired with the metadata's rows by number, so that missing ones shift nothing.
 """
 
-import json
 import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import lzfse
 import numpy as np
@@ -19,11 +15,15 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.core.errors import InputError
 from pipeline.data import images
-from pipeline.recordings.containers import Container, FolderContainer, ZipContainer, refuse_surplus_members
+from pipeline.recordings.containers import (
+    Container,
+    FolderContainer,
+    ZipContainer,
+    frame_number,
+    refuse_surplus_members,
+)
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (  # fmt: skip
-    MAX_PICTURE_BYTES,
-    MAX_TEXT_BYTES,
+from pipeline.recordings.recording import (
     Y_UP,
     Recording,
     broken_metadata,
@@ -31,6 +31,7 @@ from pipeline.recordings.recording import (  # fmt: skip
     intrinsics_from_coefficients,
     no_depth,
     no_frames,
+    refuse_other_size,
     wrong_depth,
 )
 
@@ -43,10 +44,10 @@ MAX_SIDE_PX = 16384
 """a picture with a longer side is none that a phone takes"""
 LEAST_TIMED = 0.5
 """share of frames whose times increase below which the times are not used"""
-
-
-LZVN_HEADER_BYTES, LZFSE_V1_HEADER_BYTES, LZFSE_FIELD_BITS = 12, 772, 20
-"""sizes of block headers, and of a field in the packed header of version 2"""
+LZFSE_HEADER_BYTES = {b"bvxn": 12, b"bvx1": 772}
+"""of a block of LZVN, and of LZFSE with unpacked tables"""
+LZFSE_FIELD_BITS = 20
+"""of a field in the packed header of LZFSE's version 2"""
 LZFSE_END = b"bvx$"
 """marks the end of an LZFSE stream"""
 
@@ -78,10 +79,9 @@ def open_recording(path: Path) -> Recording:
 
 def _open(container: Container, layout: _Layout) -> Recording:
     if layout.metadata not in container.names:
+        what = f"not a Record3D recording: it has no {layout.metadata!r}"
         remedy = "export from Record3D as 'Shareable/Internal format (.r3d)' or 'EXR + JPG sequence'"
-        raise InputError(
-            "CAP-003", f"not a Record3D recording: it has no {layout.metadata!r}", container.where, remedy
-        )
+        raise InputError("CAP-003", what, container.where, remedy)
     metadata = _Metadata(container, layout.metadata)
     refuse_surplus_members(container, metadata.declared_frames())
     stored = _numbers(container.names, layout.depth)
@@ -104,7 +104,7 @@ def _open(container: Container, layout: _Layout) -> Recording:
         pose=pose,
         color_size=metadata.color_size,
         depth_size=depth_size,
-        read_color=lambda i: container.read(layout.color % i, MAX_PICTURE_BYTES),
+        read_color=lambda i: container.read(layout.color % i),
         read_depth=lambda i: _read_depth(container, layout.depth % i, depth_size),
         read_confidence=_confidence_reader(container, layout, index, depth_size),
         convention=OPENGL,
@@ -114,21 +114,14 @@ def _open(container: Container, layout: _Layout) -> Recording:
 
 
 class _Metadata:
-    """The recording's JSON, checked as it is asked for. Every complaint is CAP-004 and names the key.
+    """The recording's JSON, checked as it is read, rows by frame number; every complaint is CAP-004.
 
-    Rows are asked for by frame numbers; what single rows lack is mended, or left out, and counted in
-    ``remarks``.
+    What single rows lack is replaced, or left out, and counted in ``remarks``.
     """
 
     def __init__(self, container: Container, name: str) -> None:
         self.remarks: list[str] = []
-        self._where = f"{container.where}:{name}"
-        try:
-            self._table = json.loads(container.read(name, MAX_TEXT_BYTES))
-        except (ValueError, RecursionError) as error:
-            raise self._broken(f"not JSON ({error})") from error
-        if not isinstance(self._table, dict):
-            raise self._broken("not a table")
+        self._where, self._table = container.place(name), container.table(name)
         self.color_size = (self._pixels("h"), self._pixels("w"))
 
     def declared_frames(self) -> int:
@@ -138,15 +131,11 @@ class _Metadata:
 
     def depth_size(self) -> tuple[int, int] | None:
         """Return (height, width) of the depth pictures where the app wrote it."""
-        return (
-            (self._pixels("dh"), self._pixels("dw")) if "dh" in self._table and "dw" in self._table else None
-        )
+        written = "dh" in self._table and "dw" in self._table
+        return (self._pixels("dh"), self._pixels("dw")) if written else None
 
     def timestamp_s(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
-        """Return seconds since the first frame, NaN where they do not increase.
-
-        From the frame rate in recordings of old apps.
-        """
+        """Return seconds since the first frame, NaN where they do not increase; old apps wrote the rate."""
         if not self._table.get("frameTimestamps"):
             return (index - index[0]) / self._numbers("fps", (), positive=True)
         timestamp_s = self._rows("frameTimestamps", (), index)
@@ -157,13 +146,11 @@ class _Metadata:
         return np.where(good, timestamp_s - timestamp_s[good][0], np.nan)
 
     def intrinsics(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 3 3"]:
-        """Return K in colour pixels: per frame where the app wrote it, else the first frame's (stored by
-        columns).
-        """
+        """Return K in colour pixels, per frame where the app wrote it, else the first frame's."""
         coefficients = self._rows("perFrameIntrinsicCoeffs", (4,), index)
         missing = ~(np.all(np.isfinite(coefficients), axis=1) & np.all(coefficients[:, :2] > 0, axis=1))
         if missing.any():
-            first = self._numbers("K", (9,)).reshape(3, 3).T
+            first = self._numbers("K", (9,)).reshape(3, 3).T  # stored by columns
             coefficients[missing] = first[[0, 1, 0, 1], [0, 1, 2, 2]]
             if self._table.get("perFrameIntrinsicCoeffs"):
                 self._remark(missing, "have no intrinsics of their own: the first frame's are used")
@@ -187,18 +174,12 @@ class _Metadata:
         return pose
 
     def up(self) -> tuple[float, float, float] | None:
-        """Return what points up in the poses' world.
-
-        Nothing does in recordings of old apps, whose world is the first camera.
-        """
+        """Return what points up in the poses' world: nothing where old apps took the first camera for it."""
         first = self._rows("poses", (7,), np.zeros(1, int))
         return None if np.isnan(first).all() or np.allclose(first, (0, 0, 0, 1, 0, 0, 0), atol=1e-6) else Y_UP
 
     def _rows(self, key: str, shape: tuple[int, ...], index: Int[np.ndarray, "frame"]) -> np.ndarray:
-        """Read a table's rows of the given shape by frame numbers.
-
-        NaN where it has none or they hold what is no number.
-        """
+        """Read a table's rows of the given shape by frame number; NaN where there is none or no number."""
         rows = np.full((len(index), *shape), np.nan)
         if self._table.get(key):
             stored = self._numbers(key, (None, *shape), finite=False)
@@ -221,13 +202,12 @@ class _Metadata:
         """Read an array of numbers whose axes have the given lengths (None: any)."""
         if key not in self._table:
             raise self._broken(f"{key!r} is missing")
-        array = _array_from_json(self._table[key])
-        if (
-            array is None
-            or array.ndim != len(shape)
-            or any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True))
-        ):
-            raise self._broken(f"{key!r} has the wrong form")
+        try:
+            array = np.array(self._table[key], float)
+            if any(want not in (None, have) for want, have in zip(shape, array.shape, strict=True)):
+                raise ValueError(array.shape)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self._broken(f"{key!r} has the wrong form") from error
         if (finite and not np.isfinite(array).all()) or (positive and np.any(array <= 0)):
             raise self._broken(f"{key!r} holds impossible values")
         return array
@@ -236,26 +216,10 @@ class _Metadata:
         return broken_metadata(self._where, why)
 
 
-def _array_from_json(value: Any) -> np.ndarray | None:
-    try:
-        return np.array(value, float)
-    except (TypeError, ValueError, OverflowError):
-        return None
-
-
 def _numbers(names: frozenset[str], pattern: str) -> set[int]:
     """Return the frame numbers of the members that follow a pattern such as ``rgbd/%d.jpg``."""
-    prefix, suffix = pattern.split("%d")
-    stems = (
-        name[len(prefix) : -len(suffix)]
-        for name in names
-        if name.startswith(prefix) and name.endswith(suffix)
-    )
-    return {
-        int(stem)
-        for stem in stems
-        if stem.isascii() and stem.isdigit() and len(stem) < 10 and str(int(stem)) == stem
-    }
+    numbers = (frame_number(Path(name).stem) for name in names)
+    return {number for number in numbers if number is not None and pattern % number in names}
 
 
 def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, first: int) -> tuple[int, int]:
@@ -268,9 +232,7 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
         return height, width
     floats = len(_decompress(container, layout.depth % first, 4 * max(DEPTH_SIZES))) // 4
     if floats not in DEPTH_SIZES:
-        raise wrong_depth(
-            f"{container.where}:{layout.depth % first}", f"{floats} values fit no known depth camera"
-        )
+        raise wrong_depth(container.place(layout.depth % first), f"{floats} values fit no known depth camera")
     height, width = DEPTH_SIZES[floats]  # upright
     return (height, width) if metadata.color_size[0] >= metadata.color_size[1] else (width, height)
 
@@ -287,11 +249,7 @@ def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float
         depth = images.read_depth(container.path(name), channel="R")
     else:
         depth = np.frombuffer(_decompress_exactly(container, name, 4 * math.prod(size)), "<f4").reshape(size)
-    if depth.shape != size:
-        raise wrong_depth(
-            f"{container.where}:{name}",
-            f"{depth.shape[1]} x {depth.shape[0]} instead of {size[1]} x {size[0]}",
-        )
+    refuse_other_size(depth.shape, size, container.place(name))
     return depth
 
 
@@ -299,25 +257,27 @@ def _confidence_reader(
     container: Container, layout: _Layout, index: np.ndarray, size: tuple[int, int]
 ) -> Callable[[int], np.ndarray] | None:
     """Return a reader of confidence pictures where every frame has one."""
-    if isinstance(container, FolderContainer) or not set(index) <= _numbers(
-        container.names, layout.confidence
-    ):
+    known = _numbers(container.names, layout.confidence)
+    if isinstance(container, FolderContainer) or not set(index) <= known:
         return None
-    return lambda i: np.frombuffer(
-        _decompress_exactly(container, layout.confidence % i, math.prod(size)), np.uint8
-    ).reshape(size)
+
+    def read(frame: int) -> np.ndarray:
+        data = _decompress_exactly(container, layout.confidence % frame, math.prod(size))
+        return np.frombuffer(data, np.uint8).reshape(size)
+
+    return read
 
 
 def _decompress_exactly(container: Container, name: str, expected: int) -> bytes:
     data = _decompress(container, name, expected)
     if len(data) != expected:
-        raise wrong_depth(f"{container.where}:{name}", f"{len(data)} bytes instead of {expected}")
+        raise wrong_depth(container.place(name), f"{len(data)} bytes instead of {expected}")
     return data
 
 
 def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
     """Unpack LZFSE after its block headers promised at most ``max_bytes``."""
-    where = f"{container.where}:{name}"
+    where = container.place(name)
     packed = container.read(name, max_bytes + max_bytes // 8 + 4096)
     try:
         if unpacked_bytes(packed) > max_bytes:
@@ -349,18 +309,13 @@ def _block(data: bytes, at: int) -> tuple[int, int]:
             case b"bvx-":
                 (raw,) = struct.unpack_from("<I", data, at + 4)
                 return raw, 8 + raw
-            case b"bvxn":
+            case b"bvxn" | b"bvx1" as kind:
                 raw, payload = struct.unpack_from("<2I", data, at + 4)
-                return raw, LZVN_HEADER_BYTES + payload
-            case b"bvx1":
-                raw, payload = struct.unpack_from("<2I", data, at + 4)
-                return raw, LZFSE_V1_HEADER_BYTES + payload
+                return raw, LZFSE_HEADER_BYTES[kind] + payload
             case b"bvx2":
                 raw, first, second, third = struct.unpack_from("<I3Q", data, at + 4)
-                literals, matches = (
-                    first >> LZFSE_FIELD_BITS & 0xFFFFF,
-                    second >> 2 * LZFSE_FIELD_BITS & 0xFFFFF,
-                )
+                literals = first >> LZFSE_FIELD_BITS & 0xFFFFF
+                matches = second >> 2 * LZFSE_FIELD_BITS & 0xFFFFF
                 return raw, (third & 0xFFFFFFFF) + literals + matches
     except struct.error as error:
         raise BrokenBlockError("cut short") from error

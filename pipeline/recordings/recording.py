@@ -7,19 +7,15 @@ turning them is the next files' work.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.core.errors import InputError
-from pipeline.data import images
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.recordings.conventions import OPENCV, Convention
 from pipeline.recordings.depth_camera import DepthCamera
 
-MAX_PICTURE_BYTES = 64 << 20
-MAX_TEXT_BYTES = 64 << 20
 Y_UP = (0.0, 1.0, 0.0)
 ORTHONORMAL = 0.02
 """largest entry by which a rotation, times itself transposed, may differ from the identity"""
@@ -29,9 +25,7 @@ Picture = bytes | UInt8[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording whose frames are known and whose pictures are read on demand, all as stored (not yet
-    upright).
-    """
+    """A recording whose pictures are read on demand, all as stored (not yet upright)."""
 
     where: str
     kind: str
@@ -43,10 +37,7 @@ class Recording:
     intrinsics: Float[np.ndarray, "frame 3 3"] | None
     """colour pixels; None where they are unknown (plain video)"""
     pose: Float[np.ndarray, "frame 7"] | None
-    """four quaternion and three translation (metres) numbers as documented, NaN where lost.
-
-    None where there are none
-    """
+    """four quaternion and three translation (metres) numbers as documented, NaN where lost; None without"""
     color_size: tuple[int, int]
     """(height, width) in pixels"""
     depth_size: tuple[int, int] | None
@@ -66,42 +57,26 @@ class Recording:
     read_mesh: Callable[[], Mesh] | None = None
     """the app's own surface of the room, metres, in the poses' world; None where it has none"""
     depth_camera: DepthCamera | None = None
-    """the depth camera where it is another one than the colour camera.
-
-    None where depth is aligned with colour
-    """
+    """the depth camera where it is another one than the colour camera; None where depth is aligned"""
     remarks: tuple[str, ...] = ()
     """what had to be assumed or left out, one sentence each"""
 
 
 def damaged(where: str, why: str) -> InputError:
     """Make the error for something that cannot be read to its end."""
-    return InputError(
-        "CAP-001",
-        f"the recording is damaged or was not copied completely ({why})",
-        where,
-        "export it from the phone again",
-    )
+    what = f"the recording is damaged or was not copied completely ({why})"
+    return InputError("CAP-001", what, where, "export it from the phone again")
 
 
 def broken_metadata(where: str, why: str) -> InputError:
-    """Make the error for numbers beside the pictures that cannot be used.
-
-    Also what a changed export format leads to.
-    """
-    remedy = (
-        "export it from the phone again; if a newer app writes this, the "
-        "format has changed: report the app's version"
-    )
+    """Make the error for numbers beside the pictures that cannot be used, as after a change of format."""
+    remedy = "export it from the phone again; if a newer app wrote it, report the app's version"
     return InputError("CAP-004", f"the recording's metadata cannot be used: {why}", where, remedy)
 
 
 def no_depth(where: str, why: str) -> InputError:
     """Make the error for recordings without depth."""
-    remedy = (
-        "record with a LiDAR phone (Record3D, Stray Scanner), or add a depth "
-        "picture per frame: see the README's table of formats"
-    )
+    remedy = "record with a LiDAR phone, or add a depth picture per frame: see the README's table of formats"
     return InputError("CAP-006", f"no depth: {why}", where, remedy)
 
 
@@ -115,11 +90,14 @@ def wrong_depth(where: str, why: str) -> InputError:
     return InputError("CAP-008", f"a depth picture is wrong: {why}", where, "export it from the phone again")
 
 
-def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 7"]:
-    """Turn stored matrices into stored poses (quaternion xyzw, translation).
+def refuse_other_size(shape: tuple[int, ...], size: tuple[int, int] | None, where: str) -> None:
+    """Raise CAP-008 for a depth picture of another (height, width) than ``size``, where one is expected."""
+    if size is not None and shape != size:
+        raise wrong_depth(where, f"{shape[1]} x {shape[0]} instead of {size[1]} x {size[0]}")
 
-    NaN where a matrix is no rigid motion.
-    """
+
+def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 7"]:
+    """Turn matrices into stored poses (quaternion xyzw, translation); NaN where one is no rigid motion."""
     pose = np.full((len(world_from_camera), 7), np.nan)
     rotation = world_from_camera[:, :3, :3]
     with np.errstate(all="ignore"):
@@ -144,27 +122,3 @@ def intrinsics_from_coefficients(
     intrinsics = np.tile(np.eye(3), (len(coefficients), 1, 1))
     intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]] = coefficients
     return intrinsics
-
-
-def decode_gray(data: bytes, where: str, dtype: type = np.uint16) -> UInt[np.ndarray, "height width"]:
-    """Decode a single-channel PNG of 16 bits (depth) or 8 bits (confidence).
-
-    Raises CAP-008 for anything else.
-    """
-    image = images.decoded(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2 or image.dtype != dtype:
-        raise wrong_depth(where, f"not a readable {8 * np.dtype(dtype).itemsize}-bit single-channel PNG")
-    return image
-
-
-def meters_from_png(
-    data: bytes, size: tuple[int, int] | None, where: str, per_meter: float = 1000.0
-) -> Float[np.ndarray, "height width"]:
-    """Decode a 16-bit depth PNG to metres; 0 and 65535 are unknown.
-
-    Raises CAP-008 when it has not the expected size.
-    """
-    raw = decode_gray(data, where)
-    if size is not None and raw.shape != size:
-        raise wrong_depth(where, f"{raw.shape[1]} x {raw.shape[0]} instead of {size[1]} x {size[0]}")
-    return np.where(raw == 65535, 0, raw).astype(np.float32) / np.float32(per_meter)

@@ -1,8 +1,6 @@
-"""7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimetres), `.pose.txt` where there
-is one.
+"""7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimetres), `.pose.txt` or none.
 
-The frame number counts at 30 per second. Intrinsics from `camera-intrinsics.txt` or the set's default
-(depth camera).
+The frame number counts at 30 Hz. Intrinsics from `camera-intrinsics.txt` or the set's default (depth camera).
 """
 
 import re
@@ -11,17 +9,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.data import images
 from pipeline.recordings import text_files
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENCV
 from pipeline.recordings.depth_camera import DepthCamera
-from pipeline.recordings.recording import (  # fmt: skip
-    MAX_PICTURE_BYTES,
-    MAX_TEXT_BYTES,
+from pipeline.recordings.recording import (
     Recording,
     intrinsics_from_coefficients,
-    meters_from_png,
     no_depth,
     no_frames,
     pose_from_matrix,
@@ -30,15 +24,13 @@ from pipeline.recordings.recording import (  # fmt: skip
 RATE_HZ = 30.0
 KINECT_SIZE = (480, 640)
 KINECT_DEPTH, KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.5, 525.5, 320.0, 240.0)
-"""fx, fy, cx, cy of the set's Kinects at 640 x 480, pixels.
-
-The depth camera's as the set documents it, the colour camera's as matches between its pictures and depth
-edges show it
+"""fx, fy, cx, cy of the set's Kinects at 640 x 480, pixels: the depth camera's as documented, the colour
+camera's as matches between its pictures and depth edges show it
 """
 KINECT_DEPTH_FROM_COLOR = np.array([[1, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 """the colour camera stands 2.5 cm to the right of the depth camera"""
 SAME_LENS_PX = 0.5
-"""largest difference at which coefficients beside the pictures are the set's depth camera's"""
+"""largest difference at which a lens beside the pictures, as often, is the set's depth camera's"""
 NAME = re.compile(r"frame-([0-9]{1,18})\.(color\.(?:png|jpg|jpeg)|depth\.png|pose\.txt)\Z")
 
 
@@ -56,20 +48,13 @@ def open_recording(path: Path) -> Recording:
     if len(index) == 0:
         raise no_frames(container.where, "no frame has colour and depth")
     first = int(index[0])
-    color_size = images.decode_color(
-        container.read(files["color"][first], MAX_PICTURE_BYTES), container.where
-    ).shape[:2]
-    depth_size = meters_from_png(
-        container.read(files["depth"][first], MAX_PICTURE_BYTES), None, container.where
-    ).shape
-    sizes = color_size, depth_size
-    coefficients, remarks = text_files.coefficients(
-        container, default=KINECT_DEPTH if sizes == (KINECT_SIZE, KINECT_SIZE) else None
-    )
+    sizes = container.color(files["color"][first]).shape[:2], container.meters(files["depth"][first]).shape
+    kinect = sizes == (KINECT_SIZE, KINECT_SIZE)
+    coefficients, remarks = text_files.coefficients(container, KINECT_DEPTH if kinect else None)
     intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(index), 1)), container.where)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], sizes)
-    if camera is None and sizes == (KINECT_SIZE, KINECT_SIZE) and _is_kinect_depth(coefficients):
-        camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR, depth_size)
+    if camera is None and kinect and np.abs(coefficients - KINECT_DEPTH).max() < SAME_LENS_PX:
+        camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR, KINECT_SIZE)
         intrinsics = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
         camera_remarks = (text_files.depth_camera_remark(camera, intrinsics[0]),)
     return Recording(
@@ -79,40 +64,24 @@ def open_recording(path: Path) -> Recording:
         timestamp_s=(index - first) / RATE_HZ,
         intrinsics=intrinsics,
         pose=_poses(container, index, files["pose"], camera),
-        color_size=color_size,
-        depth_size=depth_size,
-        read_color=lambda i: container.read(files["color"][i], MAX_PICTURE_BYTES),
-        read_depth=lambda i: meters_from_png(
-            container.read(files["depth"][i], MAX_PICTURE_BYTES),
-            depth_size,
-            f"{container.where}/{files['depth'][i]}",
-        ),
+        color_size=sizes[0],
+        depth_size=sizes[1],
+        read_color=lambda i: container.read(files["color"][i]),
+        read_depth=lambda i: container.meters(files["depth"][i], sizes[1]),
         convention=OPENCV,
         depth_camera=camera,
         remarks=remarks + camera_remarks,
     )
 
 
-def _is_kinect_depth(coefficients: Float[np.ndarray, "4"]) -> bool:
-    """Tell whether a lens is that of the set's depth camera, which a file beside the pictures often holds."""
-    return bool(np.abs(coefficients - KINECT_DEPTH).max() < SAME_LENS_PX)
-
-
 def _poses(
     container: FolderContainer, index: np.ndarray, names: dict[int, str], camera: DepthCamera | None
 ) -> Float[np.ndarray, "frame 7"] | None:
-    """Return the colour camera's poses; the set's are its depth camera's.
-
-    Frames that the set marks as lost (not finite) or lack one are NaN.
-
-    None without any.
-    """
+    """Return the colour camera's poses (the set's are its depth camera's), NaN where lost."""
     if not names:
         return None
     matrices = np.full((len(index), 4, 4), np.nan)
     for row, number in enumerate(index):
         if int(number) in names:
-            name = names[int(number)]
-            text = container.read(name, MAX_TEXT_BYTES).decode(errors="replace")
-            matrices[row] = text_files.table(text, 4, f"{container.where}/{name}", rows=4)
+            matrices[row] = text_files.table(container, names[int(number)], 4, rows=4)
     return pose_from_matrix(matrices if camera is None else matrices @ camera.depth_from_color)

@@ -1,8 +1,6 @@
-"""Stray Scanner: a folder with `rgb.mp4`, one depth and confidence PNG per frame and `odometry.csv`, as
-stored in sensor landscape.
+"""Stray Scanner: a folder with `rgb.mp4`, `odometry.csv` and per frame depth and confidence, in landscape.
 
-Times are the odometry's (the video's are counted, not real); focal lengths per frame where the app wrote
-them.
+Times are the odometry's (the video's are counted, not real); focal lengths per frame where they were written.
 """
 
 import csv
@@ -14,20 +12,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.core.errors import InputError
-from pipeline.recordings.containers import FolderContainer, frame_number
+from pipeline.recordings import text_files
+from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENCV
 from pipeline.recordings.movies import Movie
-from pipeline.recordings.recording import (  # fmt: skip
-    MAX_PICTURE_BYTES,
-    MAX_TEXT_BYTES,
+from pipeline.recordings.recording import (
     Y_UP,
     Recording,
     broken_metadata,
-    decode_gray,
     intrinsics_from_coefficients,
-    meters_from_png,
     no_depth,
     no_frames,
+    refuse_other_size,
+    wrong_depth,
 )
 
 INTRINSICS_SIZE = (1440, 1920)
@@ -55,13 +52,9 @@ class Odometry:
 def open_recording(path: Path) -> Recording:
     """Open a Stray Scanner folder. Raises InputError CAP-001..009 for what cannot be used."""
     container = FolderContainer(path)
-    movie = Movie(container.regular("rgb.mp4"))
-    rows = read_odometry(_text(container, "odometry.csv"), f"{path}/odometry.csv")
-    depth = {
-        number: name
-        for name in sorted(container.names)
-        if name.startswith("depth/") and (number := frame_number(Path(name).stem)) is not None
-    }
+    movie = Movie(container.path("rgb.mp4"))
+    rows = read_odometry(container.text("odometry.csv"), container.place("odometry.csv"))
+    depth = container.numbered("depth")
     if not depth:
         raise no_depth(container.where, "the folder depth/ is empty")
     valid = np.array([number < len(movie) and int(number) in depth for number in rows.frame], bool)
@@ -83,22 +76,16 @@ def open_recording(path: Path) -> Recording:
         depth_size=size,
         read_color=movie.read,
         read_depth=lambda i: _depth(container, depth[i], size),
-        read_confidence=(lambda i: _confidence(container, f"confidence/{i:06d}.png")) if known else None,
+        read_confidence=(lambda i: container.gray(f"confidence/{i:06d}.png")) if known else None,
         convention=OPENCV,
         up=Y_UP,
     )
 
 
 def read_odometry(text: str, where: str) -> Odometry:
-    """Read the table by its column names.
-
-    7 (oldest, no header), 9 or 15 columns, blanks where nothing was known.
-    """
-    lines = [
-        [cell.strip() for cell in row]
-        for row in csv.reader(text.splitlines())
-        if any(cell.strip() for cell in row)
-    ]
+    """Read the table by its column names: 7 (oldest, no header), 9 or 15 columns, blanks where unknown."""
+    lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
+    lines = [row for row in lines if any(row)]
     header = tuple(lines[0]) if lines else ()
     if not set(POSE) <= set(header):
         if len(header) != len(OLDEST):
@@ -107,9 +94,8 @@ def read_odometry(text: str, where: str) -> Odometry:
     else:
         lines = lines[1:]
     try:
-        table = np.array(
-            [[float(cell) if cell else np.nan for cell in row[: len(header)]] for row in lines]
-        ).reshape(-1, len(header))
+        rows = [[float(cell) if cell else np.nan for cell in row[: len(header)]] for row in lines]
+        table = np.array(rows).reshape(-1, len(header))
     except ValueError as error:
         raise broken_metadata(where, f"a row is cut or no numbers ({error})") from error
     column = {name: table[:, i] for i, name in enumerate(header)}
@@ -119,77 +105,42 @@ def read_odometry(text: str, where: str) -> Odometry:
     frame = column.get("frame", np.arange(len(table)))
     if not (np.isfinite(frame) & (frame >= 0) & (frame < MAX_FRAMES)).all():
         raise broken_metadata(where, "a frame has no number")
-    coefficients = (
-        np.stack([column[name] for name in COEFFICIENTS], axis=1)
-        if set(COEFFICIENTS) <= set(column)
-        else None
-    )
-    if coefficients is not None and not np.isfinite(coefficients).all():
-        coefficients = None
-    return Odometry(
-        frame.astype(int), timestamp_s, np.stack([column[name] for name in POSE], axis=1), coefficients
-    )
+    pose, coefficients = np.stack([column[name] for name in POSE], axis=1), None
+    if set(COEFFICIENTS) <= set(column):
+        coefficients = np.stack([column[name] for name in COEFFICIENTS], axis=1)
+        coefficients = coefficients if np.isfinite(coefficients).all() else None
+    return Odometry(frame.astype(int), timestamp_s, pose, coefficients)
 
 
 def _intrinsics(
     container: FolderContainer, rows: Odometry, valid: np.ndarray, size: tuple[int, int]
 ) -> Float[np.ndarray, "frame 3 3"]:
-    """Return per-frame intrinsics in the video's pixels.
-
-    `camera_matrix.csv` (the last frame's) where the rows have none.
-    """
+    """Return intrinsics in the video's pixels: per frame, else the last frame's of `camera_matrix.csv`."""
     if rows.coefficients is not None:
         coefficients = rows.coefficients[valid]
     else:
-        text = _text(container, "camera_matrix.csv")
-        try:
-            matrix = np.array(
-                [[float(cell) for cell in line.split(",")] for line in text.splitlines() if line.strip()]
-            ).reshape(3, 3)
-        except ValueError as error:
-            raise broken_metadata(f"{container.where}/camera_matrix.csv", "it is no 3 x 3 matrix") from error
-        coefficients = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (int(valid.sum()), 1))
+        if "camera_matrix.csv" not in container.names:
+            raise broken_metadata(container.where, "camera_matrix.csv is missing")
+        coefficients = text_files.read_coefficients(container, "camera_matrix.csv")
+        coefficients = np.tile(coefficients, (int(valid.sum()), 1))
     height, width = (size[0] / INTRINSICS_SIZE[0], size[1] / INTRINSICS_SIZE[1])
     return intrinsics_from_coefficients(coefficients * [width, height, width, height], container.where)
-
-
-def _text(container: FolderContainer, name: str) -> str:
-    if name not in container.names:
-        raise broken_metadata(container.where, f"{name} is missing")
-    return container.read(name, MAX_TEXT_BYTES).decode("utf-8", errors="replace")
 
 
 def _depth(
     container: FolderContainer, name: str, size: tuple[int, int] | None
 ) -> Float[np.ndarray, "height width"]:
-    where = f"{container.where}/{name}"
-    if name.endswith(".npy"):
-        return meters_from_npy(container.read(name, MAX_PICTURE_BYTES), size, where)
-    return meters_from_png(container.read(name, MAX_PICTURE_BYTES), size, where)
-
-
-def meters_from_npy(
-    data: bytes, size: tuple[int, int] | None, where: str
-) -> Float[np.ndarray, "height width"]:
-    """Read the older app's `.npy` depth: uint16 millimetres. Raises CAP-008."""
+    """Read uint16 millimetres, PNG or as the older app wrote them, `.npy`. Raises CAP-008."""
+    if not name.endswith(".npy"):
+        return container.meters(name, size)
     try:
-        raw = np.load(io.BytesIO(data), allow_pickle=False)
+        raw = np.load(io.BytesIO(container.read(name)), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise InputError(
-            "CAP-008", f"a depth picture is wrong: {error}", where, "export it from the phone again"
-        ) from error
-    if raw.ndim != 2 or raw.dtype != np.uint16 or (size is not None and raw.shape != size):
-        raise InputError(
-            "CAP-008",
-            f"a depth picture is wrong: {raw.dtype} {raw.shape}",
-            where,
-            "export it from the phone again",
-        )
+        raise wrong_depth(container.place(name), str(error)) from error
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise wrong_depth(container.place(name), f"{raw.dtype} {raw.shape}")
+    refuse_other_size(raw.shape, size, container.place(name))
     return raw.astype(np.float32) / np.float32(1000)
-
-
-def _confidence(container: FolderContainer, name: str) -> np.ndarray:
-    return decode_gray(container.read(name, MAX_PICTURE_BYTES), f"{container.where}/{name}", np.uint8)
 
 
 def _refuse_constant_rows(container: FolderContainer, names: list[str]) -> None:
@@ -197,9 +148,5 @@ def _refuse_constant_rows(container: FolderContainer, names: list[str]) -> None:
     pictures = [_depth(container, name, None) for name in names]
     if all(np.ptp(picture, axis=1).max() == 0 and np.ptp(picture) > 0 for picture in pictures):
         what = "every row of the depth pictures holds one value: a fault of this version of Stray Scanner"
-        raise InputError(
-            "CAP-009",
-            what,
-            container.where,
-            "update the app and record again; the depth of this recording is lost",
-        )
+        remedy = "update the app and record again; the depth of this recording is lost"
+        raise InputError("CAP-009", what, container.where, remedy)

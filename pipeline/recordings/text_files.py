@@ -1,7 +1,4 @@
-"""Small text files beside pictures.
-
-Tables of numbers and the intrinsics that formats without metadata need.
-"""
+"""Small text files beside pictures: tables of numbers, and the cameras of formats without metadata."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,12 +7,7 @@ from pipeline.core.errors import InputError
 from pipeline.geometry import cameras
 from pipeline.recordings.containers import Container
 from pipeline.recordings.depth_camera import DepthCamera
-from pipeline.recordings.recording import (
-    MAX_TEXT_BYTES,
-    broken_metadata,
-    intrinsics_from_coefficients,
-    pose_from_matrix,
-)
+from pipeline.recordings.recording import broken_metadata, intrinsics_from_coefficients, pose_from_matrix
 
 INTRINSICS = ("intrinsics.txt", "camera-intrinsics.txt", "camera_matrix.csv")
 """3 x 3 or 4 x 4 matrix, or the four numbers fx fy cx cy, in colour pixels"""
@@ -25,25 +17,25 @@ DEPTH_INTRINSICS, DEPTH_FROM_COLOR = "depth_intrinsics.txt", "depth_from_color.t
 
 def lines(container: Container, name: str) -> list[str]:
     """Return a member's lines without comments and blanks."""
-    text = container.read(name, MAX_TEXT_BYTES).decode(errors="replace")
-    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    found = map(str.strip, container.text(name).splitlines())
+    return [line for line in found if line and not line.startswith("#")]
 
 
-def table(text: str, columns: int, where: str, rows: int | None = None) -> Float[np.ndarray, "row column"]:
+def table(
+    container: Container, name: str, columns: int, rows: int | None = None
+) -> Float[np.ndarray, "row column"]:
     """Read numbers in columns separated by blanks or commas; raises CAP-004 when they are no such table."""
-    data_lines = [
-        line
-        for line in text.replace(",", " ").splitlines()
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    cells = [line.replace(",", " ").split() for line in lines(container, name)]
     try:
-        read = np.array([[_number(cell) for cell in line.split()] for line in data_lines], float).reshape(
-            len(data_lines), columns
+        read = np.array([[_number(cell) for cell in row] for row in cells], float).reshape(
+            len(cells), columns
         )
     except ValueError as error:
-        raise broken_metadata(where, f"not a table of {columns} columns of numbers") from error
+        raise broken_metadata(
+            container.place(name), f"not a table of {columns} columns of numbers"
+        ) from error
     if rows is not None and len(read) != rows:
-        raise broken_metadata(where, f"{len(read)} rows instead of {rows}")
+        raise broken_metadata(container.place(name), f"{len(read)} rows instead of {rows}")
     return read
 
 
@@ -60,39 +52,29 @@ def coefficients(
     Raises CAP-011 without either.
     """
     name = next((name for name in INTRINSICS if name in container.names), None)
-    if name is None and default is None:
+    if name is not None:
+        return read_coefficients(container, name), ()
+    if default is None:
+        remedy = "write intrinsics.txt with the four numbers fx fy cx cy, in colour pixels"
         what = "the focal length of these pictures is unknown"
-        raise InputError(
-            "CAP-011",
-            what,
-            container.where,
-            "write intrinsics.txt with the four numbers fx fy cx cy, in colour pixels",
-        )
-    if name is None:
-        assert default is not None
-        return np.array(default), (
-            (
-                f"no intrinsics.txt: the default fx {default[0]:g}, cx "
-                f"{default[2]:g}, cy {default[3]:g} is assumed"
-            ),
-        )
-    return read_coefficients(container, name), ()
+        raise InputError("CAP-011", what, container.where, remedy)
+    fx, _, cx, cy = default
+    return np.array(default), (f"no intrinsics.txt: the default fx {fx:g}, cx {cx:g}, cy {cy:g} is assumed",)
 
 
 def read_coefficients(container: Container, name: str) -> Float[np.ndarray, "4"]:
     """Read (fx, fy, cx, cy) from a file of these four numbers or of a matrix. Raises CAP-004."""
-    text = container.read(name, MAX_TEXT_BYTES).decode(errors="replace").replace(",", " ")
-    where = f"{container.where}/{name}"
     try:
-        numbers = np.array([float(cell) for cell in text.split()])
+        numbers = np.array([float(cell) for cell in container.text(name).replace(",", " ").split()])
     except ValueError as error:
-        raise broken_metadata(where, "it holds more than numbers") from error
+        raise broken_metadata(container.place(name), "it holds more than numbers") from error
     if len(numbers) == 4:
         return numbers
     if len(numbers) in (9, 16):
         side = 3 if len(numbers) == 9 else 4
         return numbers.reshape(side, side)[[0, 1, 0, 1], [0, 1, 2, 2]]
-    raise broken_metadata(where, f"{len(numbers)} numbers are neither fx fy cx cy nor a matrix")
+    why = f"{len(numbers)} numbers are neither fx fy cx cy nor a matrix"
+    raise broken_metadata(container.place(name), why)
 
 
 def depth_camera(
@@ -100,13 +82,10 @@ def depth_camera(
     color_intrinsics: Float[np.ndarray, "3 3"],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> tuple[DepthCamera | None, tuple[str, ...]]:
-    """Return the depth camera of `depth_intrinsics.txt` and `depth_from_color.txt`, and a remark.
+    """Return the depth camera of `depth_intrinsics.txt` and `depth_from_color.txt`, if any, and a remark.
 
-    None without both.
-
-    ``sizes`` are (height, width) of colour and of depth as stored. The former file alone means cameras at
-    one place, the latter alone the colour camera's lens. Raises CAP-004 for a matrix that is no rigid
-    motion.
+    ``sizes`` are (height, width) of colour and of depth as stored. The former file alone means cameras at one
+    place, the latter alone the colour camera's lens. Raises CAP-004 for a matrix that is no rigid motion.
     """
     color_size, depth_size = sizes
     if not {DEPTH_INTRINSICS, DEPTH_FROM_COLOR} & container.names:
@@ -114,24 +93,19 @@ def depth_camera(
     intrinsics = cameras.scale_intrinsics(color_intrinsics, color_size, depth_size)
     if DEPTH_INTRINSICS in container.names:
         numbers = read_coefficients(container, DEPTH_INTRINSICS)[None]
-        intrinsics = intrinsics_from_coefficients(numbers, f"{container.where}/{DEPTH_INTRINSICS}")[0]
+        intrinsics = intrinsics_from_coefficients(numbers, container.place(DEPTH_INTRINSICS))[0]
     depth_from_color = np.eye(4)
     if DEPTH_FROM_COLOR in container.names:
-        where = f"{container.where}/{DEPTH_FROM_COLOR}"
-        text = container.read(DEPTH_FROM_COLOR, MAX_TEXT_BYTES).decode(errors="replace")
-        depth_from_color = table(text, 4, where, rows=4)
+        depth_from_color = table(container, DEPTH_FROM_COLOR, 4, rows=4)
         if not np.isfinite(pose_from_matrix(depth_from_color[None])).all():
-            raise broken_metadata(
-                where, "it is no rigid motion: rotation and translation in metres, four rows"
-            )
+            why = "it is no rigid motion: rotation and translation in metres, four rows"
+            raise broken_metadata(container.place(DEPTH_FROM_COLOR), why)
     found = DepthCamera(intrinsics, depth_from_color, depth_size)
     return found, (depth_camera_remark(found, color_intrinsics),)
 
 
 def depth_camera_remark(camera: DepthCamera, color_intrinsics: Float[np.ndarray, "3 3"]) -> str:
     """Say what the two cameras are, for capture-check and the log."""
-    return (
-        f"depth camera fx {camera.intrinsics[0, 0]:g}, {1000 * camera.baseline_m:.0f} "
-        "mm from the colour camera "
-        f"(fx {color_intrinsics[0, 0]:g}): depth is reprojected"
-    )
+    depth_fx, color_fx, apart_mm = camera.intrinsics[0, 0], color_intrinsics[0, 0], 1000 * camera.baseline_m
+    apart = f"{apart_mm:.0f} mm from the colour camera (fx {color_fx:g})"
+    return f"depth camera fx {depth_fx:g}, {apart}: depth is reprojected"

@@ -1,7 +1,7 @@
 """TUM RGB-D folders: `rgb.txt`, `depth.txt` and, where there is one, `groundtruth.txt`, associated by time.
 
-Depth is registered to the colour picture; `depth_scale.txt` holds its units per metre, else poses distinguish
-the set's 5000 from millimetres. Intrinsics from `intrinsics.txt` or the set's default.
+`depth_scale.txt` holds the units of depth per metre, else poses distinguish the set's 5000 from millimetres.
+Intrinsics from `intrinsics.txt` or the set's default.
 """
 
 from collections.abc import Callable
@@ -10,18 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.data import images
 from pipeline.geometry import cameras
 from pipeline.recordings import text_files
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENCV, DepthPicture, check_poses
-from pipeline.recordings.recording import (  # fmt: skip
-    MAX_PICTURE_BYTES,
-    MAX_TEXT_BYTES,
+from pipeline.recordings.recording import (
     Recording,
     broken_metadata,
     intrinsics_from_coefficients,
-    meters_from_png,
     no_depth,
     no_frames,
 )
@@ -56,27 +52,16 @@ def open_recording(path: Path) -> Recording:
     paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     if not pairs:
         raise no_frames(container.where, "no colour picture has depth within 20 ms")
-    color_size = images.decode_color(container.read(pairs[0][0], MAX_PICTURE_BYTES), container.where).shape[
-        :2
-    ]
-    depth_size = meters_from_png(container.read(pairs[0][1], MAX_PICTURE_BYTES), None, container.where).shape
-    coefficients, remarks = text_files.coefficients(
-        container, default=DEFAULT if color_size == DEFAULT_SIZE else None
-    )
+    color_size, depth_size = container.color(pairs[0][0]).shape[:2], container.meters(pairs[0][1]).shape
+    default = DEFAULT if color_size == DEFAULT_SIZE else None
+    coefficients, remarks = text_files.coefficients(container, default)
     intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(pairs), 1)), container.where)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (color_size, depth_size))
     pose = _poses(container, times[paired])
 
-    def depth(number: int, per_meter: float) -> np.ndarray:
-        name = pairs[number][1]
-        return meters_from_png(
-            container.read(name, MAX_PICTURE_BYTES), depth_size, f"{container.where}/{name}", per_meter
-        )
-
     def view(number: int, per_meter: float) -> DepthPicture:
-        return DepthPicture(
-            depth(number, per_meter), cameras.scale_intrinsics(intrinsics[number], color_size, depth_size)
-        )
+        depth = container.meters(pairs[number][1], depth_size, per_meter)
+        return DepthPicture(depth, cameras.scale_intrinsics(intrinsics[number], color_size, depth_size))
 
     per_meter, scale_remarks = _units_per_meter(container, pose, times[paired], view)
     return Recording(
@@ -88,8 +73,8 @@ def open_recording(path: Path) -> Recording:
         pose=pose,
         color_size=color_size,
         depth_size=depth_size,
-        read_color=lambda i: container.read(pairs[i][0], MAX_PICTURE_BYTES),
-        read_depth=lambda i: depth(i, per_meter),
+        read_color=lambda i: container.read(pairs[i][0]),
+        read_depth=lambda i: container.meters(pairs[i][1], depth_size, per_meter),
         convention=OPENCV,
         depth_camera=camera,
         remarks=remarks + scale_remarks + camera_remarks,
@@ -99,9 +84,7 @@ def open_recording(path: Path) -> Recording:
 def nearest(
     times: Float[np.ndarray, "frame"], others: Float[np.ndarray, "other"], within_s: float
 ) -> Int[np.ndarray, "frame"]:
-    """Return for each time the index of the nearest of `others` (increasing), -1 where none is near
-    enough.
-    """
+    """Return for each time the index of the nearest of `others` (increasing), -1 where none is near."""
     right = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
     left = np.clip(right - 1, 0, len(others) - 1)
     right = np.clip(right, 0, len(others) - 1)
@@ -120,28 +103,18 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
                 raise ValueError(time_s)
             found.append((time_s, cells[1]))
         except (ValueError, IndexError) as error:
-            raise broken_metadata(
-                f"{container.where}/{name}", f"{line[:QUOTED]!r} is no time and file name"
-            ) from error
+            why = f"{line[:QUOTED]!r} is no time and file name"
+            raise broken_metadata(container.place(name), why) from error
     return sorted(dict(found).items())
 
 
 def _poses(
     container: FolderContainer, times: Float[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame 7"] | None:
-    """Return the pose nearest in time to each frame, NaN where there is none within 20 ms.
-
-    None without the file.
-    """
+    """Return the pose nearest in time to each frame, NaN where there is none within 20 ms."""
     if "groundtruth.txt" not in container.names:
         return None
-    table = text_files.table(
-        container.read("groundtruth.txt", MAX_TEXT_BYTES).decode(errors="replace"),
-        8,
-        f"{container.where}/groundtruth.txt",
-    )
-    if len(table) == 0:
-        return None
+    table = text_files.table(container, "groundtruth.txt", 8)
     table = table[np.isfinite(table[:, 0])]
     if len(table) == 0:
         return None
@@ -158,39 +131,24 @@ def _units_per_meter(
     timestamp_s: Float[np.ndarray, "frame"],
     view: Callable[[int, float], DepthPicture],
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the units of `depth_scale.txt`.
-
-    Else millimetres where poses fit them and not the set's unit, which stands otherwise.
-    """
+    """Return the units of `depth_scale.txt`, else millimetres where poses fit them, else the set's."""
     name = "depth_scale.txt"
     if name in container.names:
-        where = f"{container.where}/{name}"
-        per_meter = float(
-            text_files.table(container.read(name, MAX_TEXT_BYTES).decode(errors="replace"), 1, where, rows=1)[
-                0, 0
-            ]
-        )
+        per_meter = float(text_files.table(container, name, 1, rows=1)[0, 0])
         if not 0 < per_meter < np.inf:
-            raise broken_metadata(where, "the units per metre must be positive")
+            raise broken_metadata(container.place(name), "the units per metre must be positive")
         return per_meter, ()
     assumed = PER_METER, (f"no {name}: {PER_METER:g} units per metre are assumed",)
     known = np.arange(0) if pose is None else np.flatnonzero(np.isfinite(pose).all(1))
     if pose is None or not len(known):
         return assumed
-    tracked = pose[known]
+    tracked = pose[known], timestamp_s[known]
 
     def off(per_meter: float) -> float:
-        check = check_poses(
-            tracked,
-            timestamp_s[known],
-            lambda i: view(known[i], per_meter),
-            documented=OPENCV,
-            among=(OPENCV,),
-        )
+        check = check_poses(*tracked, lambda i: view(known[i], per_meter), documented=OPENCV, among=(OPENCV,))
         return check.residual_m / check.tolerance_m
 
     if off(MILLIMETERS) < min(1.0, CLEARLY * off(PER_METER)):
-        return MILLIMETERS, (
-            f"no {name}: {MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not",
-        )
+        fit = f"{MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not"
+        return MILLIMETERS, (f"no {name}: {fit}",)
     return assumed

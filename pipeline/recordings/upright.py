@@ -1,7 +1,4 @@
-"""Find how many quarter turns make a recording upright.
-
-From gravity, or without it from how it was held and the room.
-"""
+"""Quarter turns that make a recording upright: from gravity, else from how it was held and the room."""
 
 from collections.abc import Sequence
 
@@ -32,11 +29,9 @@ def quarter_turns_from_gravity(
     up_odometry: tuple[float, float, float] | Float[np.ndarray, "3"] = (0.0, 1.0, 0.0),
     margin: float = 0.1,
 ) -> int:
-    """Return the clockwise quarter turns (0..3) after which up in the world points up in the pictures on
-    average.
+    """Return the clockwise quarter turns (0..3) after which up in the world points up in the pictures.
 
-    The pictures stay as they are unless another turn is better by ``margin`` (mean cosine): a phone that
-    looks straight down has no upright.
+    On average, and 0 unless another turn is better by ``margin`` (mean cosine): a phone may look down.
     """
     up_in_picture = [
         -(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean()
@@ -52,10 +47,9 @@ def up_from_room(
 ) -> Float[np.ndarray, "3"] | None:
     """Return the direction that points up where no sensor measured it, or None where the room is ambiguous.
 
-    Each of the four sides of the pictures may be up. It is sharpened by the room's planes (Manhattan) and
-    judged by what people film: more level surface is seen from above (floor, seats, tables) than from
-    below, and one side of the pictures stays level while they turn. ``views`` are (depth in metres,
-    intrinsics) of frames spread evenly.
+    Each of the four sides of the pictures may be up, sharpened by the room's planes (Manhattan): more level
+    surface is seen from above (floor, seats) than from below, and one side of the pictures stays level
+    while they turn. ``views`` are (depth in metres, intrinsics) of frames spread evenly.
     """
     seen = np.linspace(0, len(odometry_from_camera) - 1, len(views)).round().astype(int)
     normals = [
@@ -94,10 +88,7 @@ def quarter_turns_from_room(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
 ) -> int:
-    """Return the clockwise quarter turns (0..3) that make pictures upright where no sensor measured up.
-
-    0 where it is ambiguous.
-    """
+    """Return the clockwise quarter turns (0..3) to upright where no sensor measured up, 0 where ambiguous."""
     up = up_from_room(odometry_from_camera, views)
     return 0 if up is None else quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
 
@@ -105,10 +96,9 @@ def quarter_turns_from_room(
 def quarter_turns_from_surfaces(
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
 ) -> int:
-    """Return the clockwise quarter turns (0..3) that make pictures upright where not even poses are known.
+    """Return the clockwise quarter turns (0..3) to upright where not even poses are known.
 
-    Floors, seats and tables are seen from above, so surfaces face up in the pictures more than to any
-    other side; the pictures stay as they are where that is not clear.
+    Floors and tables are seen from above: surfaces face up more than to any other side of the pictures.
     """
     lean = [found.mean(0) for found in (_normals(*view) for view in views) if len(found) >= LEAST_POINTS]
     return quarter_turns_from_gravity(np.eye(4)[None], up_odometry=np.mean(lean, axis=0)) if lean else 0

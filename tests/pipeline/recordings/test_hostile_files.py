@@ -20,7 +20,7 @@ import pytest
 
 from pipeline.core.errors import InputError, coded_disk_errors
 from pipeline.data import clicks, images, ply
-from pipeline.recordings import containers, movies, recording
+from pipeline.recordings import containers, movies
 from pipeline.recordings.formats import open_recording
 from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import walk
@@ -260,7 +260,7 @@ def test_control_characters_do_not_reach_the_terminal():
     assert told.count("\n") == 1, "only the remedy has a line of its own"
 
 
-def test_a_small_png_or_jpeg_that_asks_for_gigabytes_is_not_decoded():
+def test_a_small_png_or_jpeg_that_asks_for_gigabytes_is_not_decoded(tmp_path):
     png = bytearray(made_formats.png(np.zeros((8, 8), np.uint16)))
     struct.pack_into(">2I", png, 16, 30_000, 30_000)
     struct.pack_into(">I", png, 29, zlib.crc32(png[12:29]))
@@ -269,5 +269,6 @@ def test_a_small_png_or_jpeg_that_asks_for_gigabytes_is_not_decoded():
     for data in (png, jpeg):
         with pytest.raises(InputError, match="CAP-020"):
             images.decode_color(bytes(data), "made")
+    (tmp_path / "0.png").write_bytes(png)
     with pytest.raises(InputError, match="CAP-008"):
-        recording.meters_from_png(bytes(png), None, "made")
+        containers.FolderContainer(tmp_path).meters("0.png")
