@@ -37,9 +37,7 @@ class PersonFloor:
         return cls(solid[:, above].any(1), volume.origin[[0, 2]], volume.voxel_m, floor_m)
 
     def blocks(self, points: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
-        """Return where world points (x, z; metres) are blocked or outside; nothing is where no scene is
-        known.
-        """
+        """Return which world points (x, z; metres) are blocked or outside; none without a scene."""
         if self.blocked.size == 1:
             return np.zeros(points.shape[:-1], bool)
         index = np.floor((points - self.corner) / self.cell_m).astype(int)

@@ -34,9 +34,7 @@ class StepOutcome:
 
 
 def approach(outcome: StepOutcome) -> Float[np.ndarray, "person"]:
-    """Reward progress towards an animal that does not flee; both reaching it and making it flee end the
-    episode.
-    """
+    """Reward progress towards the animal and reaching it, punish making it flee; both end the episode."""
     progress = outcome.distance_before_m - outcome.distance_m
     return progress + REACHED_REWARD * outcome.reached - FLEEING_COST * outcome.flees
 

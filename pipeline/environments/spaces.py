@@ -60,7 +60,5 @@ def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "pers
 
 
 def person_action_space(world: AnimalWorld) -> gymnasium.spaces.Box:
-    """Return ahead, left and turn of a person, or ahead and turn of a robot, in parts of the
-    highest speed.
-    """
+    """Return ahead, left and turn of a person, or ahead and turn of a robot, as shares of the top speed."""
     return gymnasium.spaces.Box(-1.0, 1.0, (world.action_size,), np.float32)

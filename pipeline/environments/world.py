@@ -310,9 +310,7 @@ ANIMAL_NUMBERS = 7
 
 
 def animal_seen(world: AnimalWorld) -> Float[np.ndarray, "person 7"]:
-    """Return the animal in the person's frame: left, ahead (m), height above the floor, heading sine and
-    cosine, velocity.
-    """
+    """Return the animal in the person's frame: place (left, ahead), height (m), heading, velocity (m/s)."""
     root, persons = world.animals.past[-1].root[:, 0], world.persons
     before = world.animals.past[-2].root[:, 0, :3, 3]
     place = to_local(root[:, [0, 2], 3] - persons.position, persons.heading)

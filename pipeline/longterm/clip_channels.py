@@ -65,9 +65,7 @@ def pose_channels(
 def clip_frames(
     start_world: Float[np.ndarray, "clip 4 4"], end_world: Float[np.ndarray, "clip 4 4"]
 ) -> Float[np.ndarray, "clip 4 4"]:
-    """Return frames half way between start and end, +y up, +z from start to end; where those meet, along the
-    heading.
-    """
+    """Return frames half way between start and end, +y up, +z from start to end, or along the heading."""
     frame = world_from_ego(start_world, "yaw")
     way = (end_world - start_world)[:, :3, 3] * [1.0, 0.0, 1.0]
     length = np.linalg.norm(way, axis=1, keepdims=True)
@@ -140,9 +138,7 @@ def encode_places(
     points: int,
     rng: np.random.Generator,
 ) -> EncodedPlaces:
-    """Describe where single bodies are to be: their heading frame, clearance, orientation and scene
-    points.
-    """
+    """Describe where single bodies are to be: heading frame, clearance, orientation, scene points."""
     world_from_place = world_from_ego(world_from_agent, "yaw")
     centre = np.asarray(world_from_agent)[:, :3, 3]
     clearance = torch.zeros(len(scene), 1)

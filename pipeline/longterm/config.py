@@ -42,9 +42,7 @@ class LongTermOptimizerConfig:
 
 @dataclass(frozen=True)
 class MotionOptimizationConfig:
-    """Length of the optimisation that makes motion physical; its terms are
-    `motion_optimization.MotionTerms`.
-    """
+    """Length of the optimisation; its terms are `motion_optimization.MotionTerms`."""
 
     steps: int = 200
     """steps of Adam"""

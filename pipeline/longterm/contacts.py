@@ -190,9 +190,7 @@ def _split_phases(
 def _make_room_to_swing(
     before: range, after: range, centres: Float[np.ndarray, "frame 3"], rate_hz: float
 ) -> tuple[range, range] | None:
-    """Give two phases of a foot the time between them that it needs to swing; None where there is not that
-    much.
-    """
+    """Give a foot time to swing between two phases; None where there is not that much."""
     away = np.linalg.norm(centres[after].mean(0) - centres[before].mean(0))
     lacking = max(int(np.ceil(np.sqrt(6 * away / SWING_M_S2) * rate_hz)) - (after.start - before.stop), 0)
     spare = [max(len(phase) - SHORTEST_PHASE_FRAMES, 0) for phase in (before, after)]

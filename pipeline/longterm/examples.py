@@ -16,7 +16,6 @@ from torch import Tensor
 
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.trajectories import BehaviorData
-from pipeline.data import ply
 from pipeline.geometry import rigid
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import PoseSpace, SkinnedBody, load_body
@@ -59,20 +58,14 @@ class MotionDataset:
 
 
 def reconstructed_dataset(reconstruction: Path, data: BehaviorData) -> tuple[MotionDataset, list[str]]:
-    """Read reconstructed sessions: all long enough stretches at 30 fps, and the recording that each
-    is from.
-    """
-    body, mesh = load_body(reconstruction), ply.read_ply(reconstruction / "scene.ply")
+    """Read all long enough stretches of reconstructed sessions at 30 fps, and the session of each."""
     found = [
         (video, part) for video, trajectory in data.trajectories.items() for part in stretches(trajectory)
     ]
-    roots = [
-        trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in data.trajectories.values()
-    ]
-    scene = MotionScene.for_motion(mesh, np.concatenate(roots))
-    return MotionDataset(body, tuple(part for _, part in found), (0,) * len(found), (scene,)), [
-        video for video, _ in found
-    ]
+    scene = MotionScene.reconstructed(reconstruction, data.trajectories.values())
+    parts = tuple(part for _, part in found)
+    dataset = MotionDataset(load_body(reconstruction), parts, (0,) * len(found), (scene,))
+    return dataset, [video for video, _ in found]
 
 
 STRIDE = 3

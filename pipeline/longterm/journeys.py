@@ -100,9 +100,7 @@ def refine_at_rate(
     given: BodyMotion,
     settings: MotionOptimizationConfig,
 ) -> tuple[BodyMotion, Plausibility, Plausibility]:
-    """Optimise motion of any rate at 30 fps and bring it back to its own frames; also return both
-    plausibilities, before and after.
-    """
+    """Optimise motion of any rate; return it at its own times, and plausibility before and after."""
     raw = resample_motion(timestamp_s, given)
     judge, stance = world.judge, world.judge.stance(raw, should_stand=True)
     done = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)

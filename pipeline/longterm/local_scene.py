@@ -60,9 +60,7 @@ def distance_fields(
     scenes: Sequence[MotionScene],
     most: int = 100,
 ) -> Float[Tensor, "clip x y z"]:
-    """Measure the signed distance around clips, ``most`` at a time; without scenes it is nothing
-    everywhere.
-    """
+    """Measure the signed distance around clips, ``most`` at a time; without scenes it is 0."""
     axes = [low + VOXEL_M * torch.arange(count) for low, count in zip(LOW_M, SHAPE, strict=True)]
     voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
     frames, field = (
@@ -80,9 +78,7 @@ def distance_fields(
 def read_distances(
     field: Float[Tensor, "clip x y z"], route: Float[Tensor, "clip frame 3"]
 ) -> Float[Tensor, "clip frame read"]:
-    """Read the distances around every frame of a route, and how much too near each is; beyond the box its
-    border's hold.
-    """
+    """Read the distances around every frame of a route, and how much too near each is."""
     places = route[:, :, None] + torch.tensor(PROBES_M, dtype=route.dtype, device=route.device)
     last = VOXEL_M * (torch.tensor(SHAPE, dtype=route.dtype, device=route.device) - 1)
     grid = 2 * (places - torch.tensor(LOW_M, dtype=route.dtype, device=route.device)) / last - 1

@@ -76,9 +76,7 @@ TERMS = MotionTerms()
 
 @dataclass(frozen=True)
 class ContactBody:
-    """What a body brings to the optimisation: surface, contacts, and the directions in which its pose may
-    move.
-    """
+    """What a body brings to the optimisation: surface, contacts, and a space of poses."""
 
     body: SkinnedBody
     contacts: ContactVertices
@@ -218,9 +216,7 @@ class _Objective:
 def _penetrating_vertices(
     body: SkinnedBody, correction: _Correction, scene: SignedDistance, most: int
 ) -> Int[np.ndarray, "vertex"]:
-    """Return vertices of the whole surface that are inside the scene in any frame, evenly left out beyond
-    ``most``.
-    """
+    """Return up to about ``most`` vertices of the surface that are inside the scene in any frame."""
     surface, deepest = PosedSurface(body), torch.full((len(body.mesh.vertices),), np.inf)
     for root, bones in zip(*(each.split(FRAMES_AT_ONCE) for each in correction()), strict=True):
         deepest = torch.minimum(deepest, scene.at(surface(root, bones)).amin(dim=0))
@@ -279,9 +275,7 @@ def foot_error(
 
 
 def collision_error(distance_m: Float[Tensor, "*vertex"], margin_m: float) -> Float[Tensor, "*vertex"]:
-    """Return how deep each vertex is inside the scene or its margin, given its distance from the scene
-    (E_col, Eq. 5).
-    """
+    """Return how deep each vertex is inside the scene or its margin, metres (E_col, Eq. 5)."""
     return (margin_m - distance_m).clamp_min(0)
 
 

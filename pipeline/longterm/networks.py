@@ -37,9 +37,7 @@ IDLE_M_S = 0.1
 
 
 class PointNet(nn.Module):
-    """A code for a set of points: shared layers, then the maximum (no transformation nets, as in
-    the paper).
-    """
+    """A code for a set of points: shared layers, then the maximum (no transformation nets)."""
 
     def __init__(self, code: int, sees_scene: bool = True):
         super().__init__()
@@ -70,9 +68,7 @@ class ResidualBlock(nn.Module):
 
 
 class StaticBody(nn.Module):
-    """A conditional VAE of bodies at a place: (t, r, p) given shape, clearance, orientation and scene points
-    (Sec. 3.2).
-    """
+    """A conditional VAE of bodies: (t, r, p) given shape, clearance, orientation, scene points (Sec. 3.2)."""
 
     def __init__(self, sizes: LongTermSizes):
         super().__init__()
@@ -95,9 +91,7 @@ class StaticBody(nn.Module):
         shape: Float[Tensor, "batch shape"],
         points: Float[Tensor, "batch point 3"],
     ) -> Float[Tensor, "batch width"]:
-        """Encode the condition: ``place`` is the clearance above the scene and r, in the body's own heading
-        frame.
-        """
+        """Encode the condition: ``place`` is the clearance above the scene and r, in the heading frame."""
         return self.condition(torch.cat([self.point_net(points), shape, place], dim=-1))
 
     def encode(
@@ -117,9 +111,7 @@ class StaticBody(nn.Module):
 
 
 class InbetweenNet(nn.Module):
-    """What RouteNet, PoseNet and BaseNet share: a bi-LSTM over start and end, the scene's code, two linear
-    layers.
-    """
+    """A bi-LSTM over start and end, the scene's code, two linear layers."""
 
     def __init__(self, channels: int, extra: int, sizes: LongTermSizes, sees_scene: bool):
         super().__init__()
@@ -139,9 +131,7 @@ class InbetweenNet(nn.Module):
         extra: Float[Tensor, "batch frame extra"] | None = None,
         coarse: Float[Tensor, "batch frame channel"] | None = None,
     ) -> Float[Tensor, "batch frame channel"]:
-        """Return the channels of all k + 1 frames, those of start and end at the ends: what is added to a
-        draft, or to the line.
-        """
+        """Return the channels of all k + 1 frames: a draft, or the line between the ends, and an offset."""
         share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)[None, :, None].expand(
             len(start), -1, 1
         )
@@ -192,9 +182,7 @@ class CoarseToFine(nn.Module):
 
 
 def end_window(like: Float[Tensor, "batch frame channel"]) -> Float[Tensor, "frame 1"]:
-    """Return a factor for every frame of a short motion that is 0 at both ends and near 1 from a tenth of a
-    second on.
-    """
+    """Return a factor per frame that is 0 at both ends and near 1 from a tenth of a second on."""
     share = torch.linspace(0, 1, STEPS + 1, dtype=like.dtype, device=like.device)[:, None]
     return torch.tanh(STEPS / 3 * share) * torch.tanh(STEPS / 3 * (1 - share))
 
@@ -251,9 +239,7 @@ class RouteNet(nn.Module):
     def forward(
         self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
     ) -> Float[Tensor, "batch frame 9"]:
-        """Return t and r of all frames; r on the straight line between the ends where the network does not
-        turn.
-        """
+        """Return t and r of all frames; r interpolated between the ends where the network does not turn."""
         return self.stages(start, end, seen)[-1]
 
 
@@ -351,9 +337,7 @@ def with_velocity(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch
 
 
 def gait_progress(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 3"]:
-    """Return how far a gait has come since the start: metres gone, seconds on the move, and turns of the
-    heading.
-    """
+    """Return, since the start: metres gone, seconds on the move, turns of the heading."""
     gone = (route[:, 1:, :3] - route[:, :-1, :3])[..., [0, 2]].norm(dim=-1)
     ahead = rigid_torch.rotation_from_6d(route[..., 3:])[..., 2]
     turned = (ahead[:, 1:] - ahead[:, :-1]).norm(dim=-1)
@@ -363,9 +347,7 @@ def gait_progress(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch
 
 
 class BaseNet(nn.Module):
-    """Route and poses from one network (ablation), which also corrects its draft by the distances
-    beside it.
-    """
+    """Route and poses from one network (ablation), its draft corrected by the distances beside it."""
 
     def __init__(self, sizes: LongTermSizes, *, sees_scene: bool = True):
         super().__init__()

@@ -74,9 +74,7 @@ class PlausibilityMeter:
     def gap_and_penetration(
         self, motion: BodyMotion
     ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
-        """Return, per frame, the gap between the body and the scene, and its deepest vertex inside the scene,
-        metres.
-        """
+        """Return, per frame, the gap between body and scene and the depth of the deepest vertex, metres."""
         distance = self.scene.at(self.surface(*motion_tensors(motion)))
         gap = distance[:, self.contacts.vertices].min(1).values.clamp_min(0)
         return gap.numpy(), (-distance).clamp_min(0).amax(1).numpy()

@@ -49,9 +49,7 @@ def concatenate_motions(parts: Sequence[BodyMotion]) -> BodyMotion:
 
 
 def jump_between_levels(motion: BodyMotion, hop_m: float = 0.08) -> BodyMotion:
-    """Let a motion that ends on another level go up before it goes across, or down after: straight, it would
-    go through the edge.
-    """
+    """Let a motion to another level rise before it goes across, or go across before it comes down."""
     share, (start, end) = np.linspace(0, 1, len(motion)), motion.world_from_agent[[0, -1], :3, 3]
     early, late = (_smoothstep(share, *span) for span in (EARLY, LATE))
     upward, across = (early, late) if end[1] > start[1] else (late, early)

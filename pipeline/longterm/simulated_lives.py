@@ -53,9 +53,7 @@ def save(
 
 
 def load(folder: Path) -> tuple[MotionDataset, list[Split]]:
-    """Read what `save` wrote, and what each session is for. Raises InputError ART-010, ART-020 when
-    damaged.
-    """
+    """Read what `save` wrote, and the split of each session. Raises InputError ART-010, ART-020."""
     stored = npz.load(
         folder / "motion.npz", ("frames", "world_from_agent", "agent_from_bone", "scene", "split")
     )

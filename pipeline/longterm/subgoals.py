@@ -91,9 +91,7 @@ class WalkableFloor:
 
     @classmethod
     def of(cls, scene: MotionScene, motion_prior: MotionPrior, breadth_m: float = 0.16) -> "WalkableFloor":
-        """Find the free floor of a scene for a body, upright as it travels: the largest that can be walked in
-        one piece.
-        """
+        """Find the largest connected floor of a scene that a body, upright as it travels, can walk on."""
         floor, grid, root_m = scene.floor_m, scene.distance, motion_prior.clearance_m
         low, span = grid.origin.double().numpy(), (np.array(grid.values.shape) - 1) * grid.voxel_m
         count = np.floor(span[[0, 2]] / CELL_M).astype(int) + 1
@@ -130,9 +128,7 @@ class WalkableFloor:
         return np.asarray(position) if stays else np.array([place[0], position[1], place[1]])
 
     def landing(self, position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
-        """Return where a leap to or from a position meets the ground: near, but each metre that is missing to
-        `LANDING_CLEARANCE` counts as two.
-        """
+        """Return where a leap meets the ground: each metre missing to `LANDING_CLEARANCE` counts as two."""
         cells = self._cells(self.room_m > min(TURN_M, self.room_m.max() / 2))
         off = np.linalg.norm(self.corner + CELL_M * cells - np.asarray(position)[[0, 2]], axis=1)
         missing = np.maximum(0, LANDING_CLEARANCE * (root_m - self.height_m) - self.room_m[tuple(cells.T)])
@@ -188,9 +184,7 @@ class WalkableFloor:
     def path(
         self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
     ) -> Float[np.ndarray, "point 2"]:
-        """Return a way over the ground from near one position to near another, smooth, away from
-        furniture.
-        """
+        """Return a smooth way over the ground between two positions, away from furniture; x and z, metres."""
         cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / NEAR_FURNITURE_M), BLOCKED_COST)
         cells, _ = route_through_array(
             cost, self.cell(start), self.cell(end), fully_connected=True, geometric=True
@@ -205,9 +199,7 @@ def plan_waypoints(
     scene: MotionScene,
     motion_prior: MotionPrior,
 ) -> Waypoints:
-    """Return places two seconds apart through all sub-goals; without ``start`` the first sub-goal is where it
-    begins.
-    """
+    """Return places two seconds apart through all sub-goals, from ``start`` or the first of them."""
     if len(subgoals) < (1 if start is not None else 2):
         raise InputError(
             "SIM-001", "too few sub-goals", f"{len(subgoals)}", "give at least two, or a start and one"
@@ -250,9 +242,7 @@ def sample_visited_subgoals(
     cell_m: float = 0.25,
     apart_m: float = 0.5,
 ) -> list[Subgoal]:
-    """Draw sub-goals from the heatmap of visited places: often visited cells more often, neighbours well
-    apart.
-    """
+    """Draw sub-goals from visited cells, often visited ones more often, consecutive ones well apart."""
     cells, number, visits = np.unique(
         np.floor(positions_world[:, [0, 2]] / cell_m), axis=0, return_inverse=True, return_counts=True
     )
@@ -272,9 +262,7 @@ def sample_visited_subgoals(
 def _standing(
     floor: WalkableFloor, scene: MotionScene, position: Float[np.ndarray, "3"], clearance_m: float
 ) -> Float[np.ndarray, "3"]:
-    """Return where a body stands that is to be at a position: on furniture if it is at home there, else where
-    it has room to turn.
-    """
+    """Return where a body at a position stands: on furniture that carries it, else where it can turn."""
     root_m = floor.height_m + clearance_m
     grounded = _grounded(position, root_m)
     if grounded[1] > root_m:
@@ -315,9 +303,7 @@ def _grounded(position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarr
 def _leg_ends(
     floor: WalkableFloor, start: np.ndarray, end: np.ndarray, root_m: float, longest_m: float
 ) -> list[Float[np.ndarray, "3"]]:
-    """Return the ends of the legs from one root position to another; onto furniture and down from it in one
-    leap.
-    """
+    """Return the ends of the legs from one root position to another; onto and off furniture in one leap."""
     leaps = [abs(place[1] - root_m) > 1e-6 for place in (start, end)]
     ground = floor.path(
         *(
@@ -339,9 +325,7 @@ def _leg_ends(
 def _split_path(
     floor: WalkableFloor, way: Float[np.ndarray, "point 3"], longest_m: float
 ) -> list[Float[np.ndarray, "3"]]:
-    """Return the ends of legs along a way: few, but straight from end to end they are to lead through as
-    little as can be.
-    """
+    """Return the ends of legs along a way: few, and as straight lines least blocked."""
     fewest = max(1, int(np.ceil(np.linalg.norm(np.diff(way, axis=0), axis=1).sum() / longest_m)))
     tried = [_resample_path(way, count) for count in range(fewest, fewest + MORE_LEGS + 1)]
     blocked = [floor.blocked_m(np.array([way[0], *points])) for points in tried]
@@ -358,9 +342,7 @@ def _resample_path(stations: Float[np.ndarray, "point 3"], count: int) -> list[F
 def _poses_along_path(
     points: Float[np.ndarray, "place 3"], headings: list[float | None]
 ) -> Float[np.ndarray, "place 4 4"]:
-    """Turn every place along the way through it, where no heading is given; a body at rest turns about in two
-    legs.
-    """
+    """Head every place along the way, where no heading is given; at rest a large turn takes two legs."""
     turned = []
     for index, given in enumerate(headings):
         way = points[min(index + 1, len(points) - 1)] - points[max(index - 1, 0)]

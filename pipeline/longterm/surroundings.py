@@ -3,12 +3,16 @@
 `MotionScene` is a part of a mesh; `MotionScene.around` draws the points near any frame, in that frame.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.behavior.trajectories import Trajectory
+from pipeline.data import ply
 from pipeline.geometry import rigid, signed_distance
 from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.signed_distance import SignedDistance, SurfacePoints
@@ -46,6 +50,12 @@ class MotionScene:
         high[1] = min(high[1], roots_world[:, 1].max() + reach_m)
         return cls(mesh, low, high)
 
+    @classmethod
+    def reconstructed(cls, reconstruction: Path, tracks: Iterable[Trajectory]) -> "MotionScene":
+        """Read `scene.ply` at the heights where the reconstructed animal has been."""
+        roots = np.concatenate([track.world_from_agent[track.valid, :3, 3] for track in tracks])
+        return cls.for_motion(ply.read_ply(reconstruction / "scene.ply"), roots)
+
     @cached_property
     def distance(self) -> SignedDistance:
         """The signed distance in that part; measured when first asked for, where it is not known."""
@@ -76,9 +86,7 @@ class MotionScene:
         count: int,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "batch point 3"]:
-        """Draw points no further than ``reach_m`` from each centre, in the given frames; zeros where there
-        are none.
-        """
+        """Draw points within ``reach_m`` of each centre, in the given frames; zeros where there are none."""
         points, standing = (
             self.surface.points.astype(np.float32),
             np.abs(self.surface.normals[:, 1]) < VERTICAL_SURFACE,

@@ -1,6 +1,4 @@
-"""Intervals for means and medians over overlapping windows: whole episodes are drawn again, not single
-windows.
-"""
+"""Bootstrap intervals for means and medians over overlapping windows: whole episodes are resampled."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,9 +9,7 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean, or a median, and its 95 % interval; NaN bounds where one episode alone says
-    nothing of others.
-    """
+    """A mean, or a median, and its 95 % interval; NaN bounds for a single episode."""
 
     mean: float
     low: float
@@ -36,9 +32,7 @@ def names_of(name: str) -> tuple[str, str, str]:
 def formatted_interval(
     figures: Mapping[str, float | None], name: str, form: str = ".4g", scale: float = 1.0
 ) -> str:
-    """Write ``scale`` times a figure of a table with its interval, where it has one; ``-`` where it is
-    nothing.
-    """
+    """Write ``scale`` times a figure with its interval, where it has one; ``-`` for no figure."""
     mean, *ends = (None if (v := figures.get(each)) is None else scale * v for each in names_of(name))
     if mean is None:
         return "-"
@@ -70,9 +64,7 @@ def bootstrapped(
     *,
     median: bool = False,
 ) -> Interval:
-    """Resample episodes with replacement and return the mean, or the median, with its percentiles 2.5 and
-    97.5.
-    """
+    """Resample episodes with replacement; return the mean or median with percentiles 2.5 and 97.5."""
     middle = float(np.median(values) if median else values.mean())
     count = episode.max() + 1
     if count < 2:

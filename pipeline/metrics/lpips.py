@@ -52,9 +52,7 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, folder: Path, device: str = "cpu") -> "Lpips":
-        """Read both files. Raises `InputError` MOD-001 for a missing file and MOD-003 for one of another
-        network.
-        """
+        """Read both files. Raises `InputError` MOD-001 for a missing file, MOD-003 for another network's."""
         model = cls()
         features, channels = _read(folder / ALEXNET_FILE), _read(folder / CHANNELS_FILE)
         try:

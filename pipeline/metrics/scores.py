@@ -22,20 +22,13 @@ def goal_distances(samples: Samples, future: Future) -> Float[np.ndarray, "windo
     return np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1)
 
 
-def path_distances(samples: Samples, future: Future) -> Float[np.ndarray, "window sample"]:
-    """Return the mean distance along every sampled path, metres."""
-    return np.linalg.norm(_predicted(samples.path) - future.path_world[:, None], axis=-1).mean(-1)
-
-
 def goal_minde(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
     """Return the distance of the best of the sampled goals, metres."""
     return goal_distances(samples, future).min(1)
 
 
 def goal_energy_score(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return E|X - y| - E|X - X'| / 2 (Gneiting & Raftery 2007), with the fair estimate of the
-    second term.
-    """
+    """Return E|X - y| - E|X - X'| / 2 (Gneiting & Raftery 2007), the second term unbiased."""
     count = samples.goal.shape[1]
     to_truth = goal_distances(samples, future).mean(1)
     among = np.linalg.norm(samples.goal[:, :, None] - samples.goal[:, None], axis=-1).sum((1, 2))
@@ -44,7 +37,8 @@ def goal_energy_score(samples: Samples, future: Future) -> Float[np.ndarray, "wi
 
 def path_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
     """Return the mean distance along the best of the sampled paths, metres."""
-    return path_distances(samples, future).min(1)
+    away = np.linalg.norm(_predicted(samples.path) - future.path_world[:, None], axis=-1)
+    return away.mean(-1).min(1)
 
 
 def orientation_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:

@@ -49,9 +49,7 @@ class TriangleSurface:
 
 
 def chamfer(ours: TriangleSurface, true: TriangleSurface, count: int, rng: np.random.Generator) -> float:
-    """Return the mean of both directions' mean distances between ``count`` points of one surface and the
-    other, metres.
-    """
+    """Return the mean of both mean distances from ``count`` points of one surface to the other, metres."""
     there, back = true.distance(ours.sample(count, rng)), ours.distance(true.sample(count, rng))
     return float((there.mean() + back.mean()) / 2)
 

@@ -8,7 +8,6 @@ spread evenly.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,7 +16,7 @@ from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.data import plots
 from pipeline.metrics.intervals import Interval, bootstrapped, episodes
 from pipeline.metrics.metrics import Metrics
-from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES, goal_distances, path_distances
+from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
 from pipeline.rivals.predictors import (
     WINDOWS_AT_ONCE,
     Ats,
@@ -27,7 +26,6 @@ from pipeline.rivals.predictors import (
     Samples,
     StandStill,
 )
-from stages.evaluate import best_of
 from stages.evaluate.config import Config
 
 OURS = "ats"
@@ -36,10 +34,8 @@ MOVING_M = 0.1
 """An animal that gets further than this in 5.6 s moves."""
 BOOTSTRAP_DRAWS = 2000
 """Resamples of every interval: its ends then move by a hundredth of its width between seeds."""
-CURVES = (
-    "Error of the best of K sampled goals and paths on the test "
-    "windows against K: ours and the simple rivals."
-)
+Scores = dict[str, Float[np.ndarray, "window"]]
+"""Of one method, by the names of `SCORES`."""
 
 
 def rivals(data: BehaviorData) -> dict[str, Predictor]:
@@ -57,19 +53,19 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
     metrics.put("behavior/test_windows", len(test))
     reason = "fewer than two sessions, or none long enough for a window: there is no test video"
     if len(test) == 0 or len(data.indices(TRAIN)) == 0:
-        metrics.skip(_names(), reason)
+        scores = [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in SCORES]
+        metrics.skip(["behavior/plan_windows", "behavior/plan_trials", *scores], reason)
         return metrics
     plans = plots.sample(len(test), config.plan_windows)
     metrics.put("behavior/plan_windows", len(plans))
     metrics.put("behavior/plan_trials", 1)
     episode = episodes(data.start[test], data.video[test], data.past + data.future)
     judged = {
-        name: _judged(method, data, test, test[plans], config)
+        name: _scores(method, data, test, test[plans], config)
         for name, method in ({OURS: ours} | rivals(data)).items()
     }
     episode_of = {name: episode if name in GOAL_SCORES else episode[plans] for name in SCORES}
-    _report(metrics, {name: each.scores for name, each in judged.items()}, episode_of, config)
-    metrics.charts[CURVES] = best_of.drawn({name: each.distances for name, each in judged.items()})
+    _report(metrics, judged, episode_of, config)
     return metrics
 
 
@@ -82,46 +78,31 @@ def moving_share(data: BehaviorData, index: Int[np.ndarray, "window"]) -> float:
     return float((away.max(1) > MOVING_M).mean())
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """One method on the test windows."""
-
-    scores: dict[str, Float[np.ndarray, "window"]]
-    """averaged over trials"""
-    distances: dict[str, Float[np.ndarray, "window sample"]]
-    """of every sampled goal and path, metres"""
-
-
-def _judged(
+def _scores(
     method: Predictor,
     data: BehaviorData,
     test: Int[np.ndarray, "window"],
     chosen: Int[np.ndarray, "chosen"],
     config: Config,
-) -> _Judged:
-    """Judge one method: its goals on all test windows, its plans on the chosen ones."""
-    rng = np.random.default_rng(config.seed)
-    goals = _goals_judged(method, data, test, config, rng)
-    plans = _plans_judged(method, data, chosen, config, rng)
-    return _Judged(goals.scores | plans.scores, goals.distances | plans.distances)
-
-
-def _goals_judged(
-    method: Predictor,
-    data: BehaviorData,
-    test: Int[np.ndarray, "window"],
-    config: Config,
-    rng: np.random.Generator,
-) -> _Judged:
-    goals, parts = _goals(method, data, test, config.samples * config.trials, rng), []
-    for window, drawn in zip(_chunks(test), _chunks(goals), strict=True):
+) -> Scores:
+    """Judge one method: its goals on all test windows, mean over trials, and one trial of its plans, where it
+    makes any, on the chosen ones.
+    """
+    rng, goals, plans = np.random.default_rng(config.seed), [], []
+    drawn = _goals(method, data, test, config.samples * config.trials, rng)
+    for window, sampled in zip(_chunks(test), _chunks(drawn), strict=True):
         future = data.windows(window, bones=False)[1]
-        trials = [Samples(trial) for trial in np.split(drawn, config.trials, axis=1)]
-        found = {
-            name: np.mean([SCORES[name](trial, future) for trial in trials], axis=0) for name in GOAL_SCORES
-        }
-        parts.append(_Judged(found, {"goal": goal_distances(Samples(drawn), future)}))
-    return _joined(parts)
+        trials = [Samples(trial) for trial in np.split(sampled, config.trials, axis=1)]
+        goals.append(
+            {name: np.mean([SCORES[name](trial, future) for trial in trials], axis=0) for name in GOAL_SCORES}
+        )
+    for window in _chunks(chosen):
+        context, future = data.windows(window)
+        samples = method.sample(context, config.samples, rng)
+        if samples.path is None:
+            break
+        plans.append({name: SCORES[name](samples, future) for name in PLAN_SCORES})
+    return _joined(goals) | _joined(plans)
 
 
 def _goals(
@@ -146,44 +127,18 @@ def _goals(
     )
 
 
-def _plans_judged(
-    method: Predictor,
-    data: BehaviorData,
-    chosen: Int[np.ndarray, "window"],
-    config: Config,
-    rng: np.random.Generator,
-) -> _Judged:
-    """Judge whole plans, one trial of them, where a method makes them."""
-    parts = []
-    for window in _chunks(chosen):
-        context, future = data.windows(window)
-        samples = method.sample(context, config.samples, rng)
-        if samples.path is None:
-            return _Judged({}, {})
-        scores = {name: SCORES[name](samples, future) for name in PLAN_SCORES}
-        parts.append(_Judged(scores, {"path": path_distances(samples, future)}))
-    return _joined(parts)
-
-
 def _chunks(array: np.ndarray) -> list[np.ndarray]:
     return [array[begin : begin + WINDOWS_AT_ONCE] for begin in range(0, len(array), WINDOWS_AT_ONCE)]
 
 
-def _joined(parts: Sequence[_Judged]) -> _Judged:
+def _joined(parts: Sequence[Scores]) -> Scores:
     """Put the windows of several chunks one after the other."""
-    scores, distances = (
-        {
-            name: np.concatenate([getattr(part, field)[name] for part in parts])
-            for name in getattr(parts[0], field)
-        }
-        for field in ("scores", "distances")
-    )
-    return _Judged(scores, distances)
+    return {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
 
 
 def _report(
     metrics: Metrics,
-    scores: Mapping[str, Mapping[str, Float[np.ndarray, "window"]]],
+    scores: Mapping[str, Scores],
     episode: Mapping[str, Int[np.ndarray, "window"]],
     config: Config,
 ) -> None:
@@ -202,8 +157,3 @@ def _report(
             if name in scores[rival]:
                 difference = interval(name, scores[OURS][name] - scores[rival][name])
                 metrics.put_mean(f"behavior/{OURS}_minus_{rival}/{name}", difference)
-
-
-def _names() -> list[str]:
-    scores = [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in SCORES]
-    return ["behavior/plan_windows", "behavior/plan_trials", *scores]

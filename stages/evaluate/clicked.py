@@ -13,9 +13,10 @@ from pipeline.data.clicks import ClickedClip
 from pipeline.data.poses import RegisteredPoses
 from pipeline.data.templates import SceneCameras
 from pipeline.geometry import rigid
-from pipeline.metrics.metrics import Metrics, median, percentile
-from pipeline.metrics.pose_errors import PoseErrors, joined, pose_errors
+from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.pose_errors import joined, pose_errors
 from stages.evaluate.reading import BuildFolders
+from stages.evaluate.registration import put_cameras
 
 TRUSTED_M = 0.10
 """frames whose clicks disagree by more than this are left out, metres"""
@@ -69,9 +70,7 @@ def cameras_from_clicks(path: Path, folders: BuildFolders, videos: Sequence[Vide
 def clicked_metrics(
     cameras: Mapping[str, Clicked], folders: BuildFolders, videos: Sequence[Video]
 ) -> Metrics:
-    """Compare registered cameras with clicked ones; a refused recording counts as failed in every clicked
-    frame.
-    """
+    """Compare registered cameras with clicked ones; a refused recording failed in every clicked frame."""
     metrics, errors, residual_m, left_out = Metrics(), [], [], 0
     for video in videos:
         if video.role != "session" or video.id not in cameras:
@@ -83,22 +82,14 @@ def clicked_metrics(
         ours = unknown if poses is None else poses.world_from_camera[clicked.frame]
         errors.append(pose_errors(ours[trusted], clicked.world_from_camera[trusted]))
         residual_m.append(clicked.residual_m[trusted])
-    every: PoseErrors = joined(errors)
+    every = joined(errors)
     if not len(every.degrees):
         why = NO_CLICKS
         if left_out:
             why = f"all {left_out} clicked frames disagree by more than {100 * TRUSTED_M:.0f} cm: click again"
         metrics.skip((*NAMES, *OWN_NAMES), why)
         return metrics
-    for unit, values in (("rotation_deg", every.degrees), ("translation_m", every.meters)):
-        metrics.put(
-            f"registration/{unit}_median", median(values), "more than half of the clicked frames have no pose"
-        )
-        metrics.put(
-            f"registration/{unit}_p95",
-            percentile(values, 95),
-            "a twentieth of the clicked frames has no pose",
-        )
+    put_cameras(metrics, every, "clicked frames")
     measured_by = (
         f"clicked correspondences in {len(every.degrees)} frames of "
         f"{len(errors)} sessions, {left_out} frames left out"

@@ -135,9 +135,7 @@ def picture_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
 
 
 def side_by_side(views: Sequence[HeldoutView], count: int = 6) -> UInt8[np.ndarray, "height width 3"]:
-    """Put some views beside each other: truth, ours, true depth, our depth; below smaller ones it stays
-    black.
-    """
+    """Put some views beside each other: truth, ours, true depth, our depth."""
     chosen = [views[index] for index in plots.sample(len(views), count)]
     columns = [(view.true.color, view.color, _gray(view.true.depth), _gray(view.depth)) for view in chosen]
     height = max(len(column[0]) for column in columns)

@@ -40,9 +40,7 @@ class Gallery:
 
 
 def metrics_of(name: str, errors: PoseErrors) -> Metrics:
-    """Summarise errors of single frames under a name's beginning; frames that were not placed count as
-    failures.
-    """
+    """Summarise errors of single frames; frames that were not placed count as failures."""
     metrics = Metrics()
     metrics.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
     metrics.put(f"{name}translation_m_median", median(errors.meters), FAILED)

@@ -73,9 +73,7 @@ def evaluate(
 def _against_clicks(
     folders: BuildFolders, videos: tuple[Video, ...], config: Config, device: devices.Device
 ) -> Metrics:
-    """Measure a real capture: registration by clicks, held-out views by the phone itself, placed by clicks or
-    registration.
-    """
+    """Measure a real capture: registration by clicks, held-out views by the phone's own sensor."""
     metrics, cameras = Metrics(), {}
     if folders.clicks is None:
         metrics.skip(clicked.NAMES + clicked.OWN_NAMES, clicked.NO_CLICKS)
@@ -87,23 +85,15 @@ def _against_clicks(
     for video in (video for video in videos if video.role == "heldout" and video.synchronized_with):
         placed = real_phone.cameras_of(folders, video, cameras.get(video.id))
         sources.append(placed[1] if placed else real_phone.UNPLACED)
-        seen.append(
-            (
-                video.synchronized_with,
-                real_phone.shots(folders, video, placed[0], config.heldout_frames) if placed else [],
-            )
-        )
+        shots = real_phone.shots(folders, video, placed[0], config.heldout_frames) if placed else []
+        seen.append((video.synchronized_with, shots))
     if sources:
         progress.log("evaluate: held-out phone")
         metrics.add(reconstruction.held_out_metrics(folders, seen, device, config.lpips_weights))
-        nowhere = all(where == real_phone.UNPLACED for where in sources)
-        metrics.skip(
-            *(
-                (heldout.NAMES, real_phone.UNPLACED)
-                if nowhere
-                else (real_phone.PARTS_WITHOUT_MASKS, real_phone.NO_MASKS)
-            )
-        )
+        if all(where == real_phone.UNPLACED for where in sources):
+            metrics.skip(heldout.NAMES, real_phone.UNPLACED)
+        else:
+            metrics.skip(real_phone.PARTS_WITHOUT_MASKS, real_phone.NO_MASKS)
         metrics.skip(["reconstruction/heldout_cameras"], f"from {'; '.join(sources)}")
     return metrics
 
@@ -112,22 +102,16 @@ def _against_truth(
     folders: BuildFolders, videos: Sequence, config: Config, rng: np.random.Generator, device: devices.Device
 ) -> Metrics:
     metrics, known = Metrics(), reading.recorded(folders, tuple(videos))
-    role = {
-        name: [each for each in known if each.video.role == name]
-        for name in ("walkthrough", "turnaround", "session", "heldout")
-    }
-    walkthrough, turnaround = role["walkthrough"][0], role["turnaround"][0]
-    frames = reading.frames_of_truth(folders, walkthrough, turnaround)
-    sessions = role["session"]
-    for label, part in (
-        ("registration", lambda: _registration(folders, sessions, frames)),
-        ("single frames", lambda: _single_frames(folders, walkthrough, sessions, frames, config)),
-        ("masks and flow", lambda: _perception(folders, sessions, turnaround)),
-        ("reconstruction", lambda: reconstruction.reconstruction_metrics(
-            folders, known, frames, config, rng, device)),
-    ):  # fmt: skip
-        progress.log(f"evaluate: {label}")
-        metrics.add(part())
+    frames, sessions = reading.frames_of_truth(folders, known), reading.of_role(known, "session")
+    progress.log("evaluate: registration")
+    metrics.add(_registration(folders, sessions, frames))
+    progress.log("evaluate: single frames")
+    walkthrough = reading.of_role(known, "walkthrough")[0]
+    metrics.add(_single_frames(folders, walkthrough, sessions, frames, config))
+    progress.log("evaluate: masks and flow")
+    metrics.add(_perception(folders, sessions, reading.of_role(known, "turnaround")[0]))
+    progress.log("evaluate: reconstruction")
+    metrics.add(reconstruction.reconstruction_metrics(folders, known, frames, config, rng, device))
     return metrics
 
 
@@ -187,11 +171,8 @@ def _single_frames(
     for name, parts in errors.items():
         metrics.add(localizing.metrics_of(name, joined(parts)))
     right = registration.is_right(joined(errors["localizer/"]))
-    metrics.add(
-        reliability_metrics(
-            "localizer", np.concatenate(probabilities) if probabilities else np.zeros(0), right
-        )
-    )
+    certain = np.concatenate(probabilities) if probabilities else np.zeros(0)
+    metrics.add(reliability_metrics("localizer", certain, right))
     return metrics
 
 

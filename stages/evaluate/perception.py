@@ -30,9 +30,7 @@ class Overlaps:
 
 
 def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
-    """Compare every frame in which the agent is visible, in truth or according to us; unknown pixels do not
-    count.
-    """
+    """Compare every frame that shows the agent, in truth or in ours; unknown pixels do not count."""
     iou, resting, confidence, swapped = [], [], [], []
     for frame in range(len(masks)):
         label = masks[frame]

@@ -1,13 +1,13 @@
 """Open what is measured, and bring truth into our frames."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.core.videos import Video
+from pipeline.core.videos import Role, Video
 from pipeline.data import motion, plots
 from pipeline.data.clips import FRAMES, Clip, read_source_index
 from pipeline.data.motion import Motion
@@ -95,10 +95,14 @@ def recorded(folders: Reconstructed, videos: tuple[Video, ...]) -> list[Recordin
     return found
 
 
-def frames_of_truth(
-    folders: Reconstructed, walkthrough: RecordingWithTruth, turnaround: RecordingWithTruth
-) -> TruthAlignment:
+def of_role(known: Sequence[RecordingWithTruth], role: Role) -> list[RecordingWithTruth]:
+    """Return the recordings of a role."""
+    return [each for each in known if each.video.role == role]
+
+
+def frames_of_truth(folders: Reconstructed, known: Sequence[RecordingWithTruth]) -> TruthAlignment:
     """Fit how truth lies in our frames."""
+    (walkthrough, *_), (turnaround, *_) = (of_role(known, role) for role in ("walkthrough", "turnaround"))
     true_agent_from_camera = (
         rigid.inverse(turnaround.truth.world_from_agent) @ turnaround.truth.world_from_camera
     )

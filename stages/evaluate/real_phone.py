@@ -33,14 +33,11 @@ PARTS_WITHOUT_MASKS = tuple(name for name in NAMES if name.endswith(("_agent", "
 def cameras_of(
     folders: BuildFolders, video: Video, clicked: Clicked | None
 ) -> tuple[Float[np.ndarray, "frame 4 4"], str] | None:
-    """Return ``world_from_camera`` of all frames (NaN where unknown) and where it comes from; None where
-    nothing places it.
-    """
+    """Return ``world_from_camera`` of all frames (NaN: unknown) and its source; None if unplaced."""
     clip = Clip.open(folders.frames[video.id])
     if clicked is not None and clicked.trusted.any():
-        return all_cameras(
-            clicked, clip.odometry_from_camera, len(clip)
-        ), f"clicked correspondences in {int(clicked.trusted.sum())} frames"
+        placed = all_cameras(clicked, clip.odometry_from_camera, len(clip))
+        return placed, f"clicked correspondences in {int(clicked.trusted.sum())} frames"
     if clip.odometry_from_camera is None:
         return None
     model = localizers.load(folders.scene_localizer)
@@ -49,16 +46,13 @@ def cameras_of(
         answers = model.localize(
             clip.color(frame), clip.depth(frame), clip.depth_intrinsics[frame], clip.intrinsics[frame]
         )
-        votes += (
-            [answers[0].map_from_camera @ rigid.inverse(clip.odometry_from_camera[frame])] if answers else []
-        )
+        if answers:
+            votes.append(answers[0].map_from_camera @ rigid.inverse(clip.odometry_from_camera[frame]))
     agreed = agreement(np.array(votes).reshape(-1, 4, 4))
     if agreed is None:
         return None
-    return (
-        agreed[0] @ clip.odometry_from_camera,
-        f"registration: {agreed[1]} of {len(votes)} single frames agree",
-    )
+    source = f"registration: {agreed[1]} of {len(votes)} single frames agree"
+    return agreed[0] @ clip.odometry_from_camera, source
 
 
 def agreement(votes: Float[np.ndarray, "vote 4 4"]) -> tuple[Float[np.ndarray, "4 4"], int] | None:
@@ -71,17 +65,14 @@ def agreement(votes: Float[np.ndarray, "vote 4 4"]) -> tuple[Float[np.ndarray, "
     group = near[near.sum(1).argmax()]
     if group.sum() < LEAST_VOTES:
         return None
-    return rigid.make(
-        rigid.mean_rotation(votes[group][:, :3, :3]), np.median(votes[group][:, :3, 3], axis=0)
-    ), int(group.sum())
+    shift = np.median(votes[group][:, :3, 3], axis=0)
+    return rigid.make(rigid.mean_rotation(votes[group][:, :3, :3]), shift), int(group.sum())
 
 
 def shots(
     folders: BuildFolders, video: Video, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int
 ) -> Sequence[HeldoutShot]:
-    """Return what the phone saw and measured while its session was filmed, in up to ``count`` frames whose
-    camera is known.
-    """
+    """Return what the phone measured during its session, in up to ``count`` frames of known camera."""
     clip, found = Clip.open(folders.frames[video.id]), []
     together = reading.filmed_together(folders, video)
     known = together[np.isfinite(world_from_camera[together]).all((1, 2))]
@@ -89,14 +80,9 @@ def shots(
         depth = usable_depth(clip, frame, farthest_m=RANGE_M)
         color = cv2.resize(clip.color(frame), depth.shape[::-1], interpolation=cv2.INTER_AREA)
         time_s = float(clip.timestamp_s[frame] + video.offset_s)
-        found.append(
-            HeldoutShot(
-                world_from_camera[frame],
-                clip.depth_intrinsics[frame],
-                time_s,
-                color,
-                depth,
-                np.zeros(depth.shape, bool),
-            )
+        camera, no_agent = (
+            (world_from_camera[frame], clip.depth_intrinsics[frame]),
+            np.zeros(depth.shape, bool),
         )
+        found.append(HeldoutShot(*camera, time_s, color, depth, no_agent))
     return found

@@ -56,31 +56,21 @@ def reconstruction_metrics(
 ) -> Metrics:
     """Return everything about the reconstruction."""
     metrics = Metrics()
-    sessions = [each for each in known if each.video.role == "session"]
+    sessions = reading.of_role(known, "session")
     motions = {each.video.id: reading.read_motion(folders.reconstruction, each.video.id) for each in sessions}
     metrics.add(agent_roots(sessions, motions, frames))
-    turnaround = next(each for each in known if each.video.role == "turnaround")
+    (turnaround, *_), (walkthrough, *_) = (
+        reading.of_role(known, role) for role in ("turnaround", "walkthrough")
+    )
     metrics.add(surfaces.track_metrics(track_distances(folders, sessions, motions, turnaround, frames)))
     metrics.add(_agent_chamfer(folders, sessions, motions, frames, config, rng))
-    walkthrough = next(each for each in known if each.video.role == "walkthrough")
     metrics.add(_scene_chamfer(folders, walkthrough, frames, rng))
-    metrics.add(_held_out(folders, known, frames, config, device))
-    return metrics
-
-
-def _held_out(
-    folders: BuildFolders,
-    known: Sequence[RecordingWithTruth],
-    frames: TruthAlignment,
-    config: Config,
-    device: devices.Device,
-) -> Metrics:
-    """Compare with what the held-out phones truly saw."""
     seen = [
         (session.video.id, shots_of(folders, phone, session, frames, config.heldout_frames))
         for phone, session in phones_with_sessions(known)
     ]
-    return held_out_metrics(folders, seen, device, config.lpips_weights)
+    metrics.add(held_out_metrics(folders, seen, device, config.lpips_weights))
+    return metrics
 
 
 def held_out_metrics(
@@ -101,9 +91,8 @@ def held_out_metrics(
         integrated = list(islice(few, len(shots)))
         surfaces, depths = drawn_by_fields(folders, session, motion, shots, integrated, device)
         by_fields, rendered = by_fields + surfaces, rendered + depths
-        by_splats += _drawn_by_splats(
-            folders, session, reading.read_motion(folders.splats, session) or motion, shots
-        )
+        refined = reading.read_motion(folders.splats, session) or motion
+        by_splats += _drawn_by_splats(folders, session, refined, shots)
         drawn += motion is not None and len(shots) > 0
     metrics.put("reconstruction/heldout_phones_drawn", drawn)
     metrics.put("reconstruction/heldout_phones_total", len(seen))
@@ -124,9 +113,7 @@ def held_out_metrics(
 def agent_roots(
     sessions: Sequence[RecordingWithTruth], motions: Mapping[str, Motion | None], frames: TruthAlignment
 ) -> Metrics:
-    """Compare the agent's root with truth in the frames that truly show the agent; poses interpolated over
-    long gaps do not count as placed.
-    """
+    """Compare the agent's root with truth where it is visible; interpolated poses do not count as placed."""
     errors, placed = [], []
     for each in sessions:
         motion, visible = motions[each.video.id], each.truth.agent_visible
@@ -155,26 +142,20 @@ def shots_of(
     frames: TruthAlignment,
     count: int,
 ) -> list[HeldoutShot]:
-    """Return what the held-out phone saw while ``session`` was filmed, in up to ``count`` frames, at its
-    depth's resolution.
-    """
+    """Return what the held-out phone saw during ``session``, in up to ``count`` frames, depth-sized."""
     true = read_depth(folders.truth_folder, phone.name, phone.source_index)
     cameras = frames.cameras(phone.truth)
     shots = []
     for frame in reading.subsampled(reading.filmed_together(folders, phone.video), count).tolist():
         size = true.depth[frame].shape[::-1]
         color = cv2.resize(phone.clip.color(frame), size, interpolation=cv2.INTER_AREA)
-        agent = (
-            cv2.resize(phone.truth.masks[frame].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        )
+        mask = phone.truth.masks[frame].astype(np.uint8)
+        agent = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
         time_s = float(phone.clip.timestamp_s[frame] + phone.video.offset_s)
         meanwhile = int(np.abs(session.clip.timestamp_s - time_s).argmin())
         share = float(session.truth.masks[meanwhile].mean())
-        shots.append(
-            HeldoutShot(
-                cameras[frame], true.intrinsics[frame], time_s, color, true.depth[frame], agent, share
-            )
-        )
+        seen = color, true.depth[frame], agent, share
+        shots.append(HeldoutShot(cameras[frame], true.intrinsics[frame], time_s, *seen))
     return shots
 
 
@@ -210,16 +191,13 @@ def _camera(shot: HeldoutShot) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarr
 def _drawn_by_splats(
     folders: BuildFolders, session: str, motion: Motion | None, shots: Sequence[HeldoutShot]
 ) -> list[HeldoutView]:
-    """Draw the 3D Gaussians as they stood in a session; where the animal's pose is not known, the room
-    alone.
-    """
+    """Draw the 3D Gaussians as they stood in a session; the room alone where the pose is not known."""
     if motion is None:
         return [HeldoutView.empty(shot) for shot in shots]
     scene = gaussians.load_scene(folders.splats, session)
     agent = gaussians.load_ply(folders.splats / "agent.ply")
-    weights = torch.from_numpy(
-        gaussian_ply.SPLATS.load(folders.splats / "splats.npz", "agent_weights")["agent_weights"]
-    )
+    table = gaussian_ply.SPLATS.load(folders.splats / "splats.npz", "agent_weights")
+    weights = torch.from_numpy(table["agent_weights"])
     rest = torch.from_numpy(bones_at_rest(folders.reconstruction))
     splats, views = gaussians.Splats(scene, agent, weights, rest, videos=0), []
     for shot in shots:
@@ -251,9 +229,7 @@ def track_distances(
     turnaround: RecordingWithTruth,
     frames: TruthAlignment,
 ) -> list[Float[np.ndarray, "point"]]:
-    """Follow surface points that are matched to truth once, in the turnaround; return distances per visible
-    frame, metres.
-    """
+    """Return distances, metres per visible frame, of surface points matched to truth in the turnaround."""
     skin = _skin(folders)[1].only(TRACKS.load(folders.reconstruction / "tracks.npz")["vertex_index"])
     partner = surfaces.matched_once(skin.points_agent, _at_rest(turnaround, frames))
     distances = []
@@ -262,16 +238,13 @@ def track_distances(
         for frame in np.flatnonzero(each.truth.agent_visible).tolist():
             true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame)[partner])
             ours = _posed(skin, motion, frame)
-            distances.append(
-                np.full(len(partner), np.inf) if ours is None else np.linalg.norm(ours - true, axis=1)
-            )
+            lost = np.full(len(partner), np.inf)
+            distances.append(lost if ours is None else np.linalg.norm(ours - true, axis=1))
     return distances
 
 
 def _at_rest(turnaround: RecordingWithTruth, frames: TruthAlignment, every: int = 8) -> Iterator[np.ndarray]:
-    """Return the true surface of some frames of the turnaround, in our agent frame: its tail may swing
-    meanwhile.
-    """
+    """Yield the true surface of some frames of the turnaround, in our agent frame."""
     truth = turnaround.truth
     for frame in range(0, len(turnaround.clip), every):
         in_agent = rigid.apply(rigid.inverse(truth.world_from_agent[frame]), truth.vertices_world(frame))
@@ -292,9 +265,7 @@ def _agent_chamfer(
     config: Config,
     rng: np.random.Generator,
 ) -> Metrics:
-    """Compare the agent's surface where its pose is known, and measure in what share of the frames that
-    is.
-    """
+    """Compare the agent's surface where its pose is known, and measure in what share of frames it is."""
     metrics, (mesh, skin), distances, total = Metrics(), _skin(folders), [], 0
     faces = ply.read_ply(folders.truth_folder / "agent.ply").faces
     for each in sessions:
@@ -305,16 +276,11 @@ def _agent_chamfer(
             known = motion is not None and motion.agent_known[frame]
             posed = _posed(skin, motion, frame) if known else None
             if posed is not None:
-                ours = TriangleSurface(posed[mesh.faces])
-                true = TriangleSurface(
-                    rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))[faces]
-                )
-                distances.append(chamfer(ours, true, AGENT_POINTS, rng))
-    value, share = (
-        (float(np.mean(distances)), len(distances) / total)
-        if distances
-        else (np.nan, 0.0 if total else np.nan)
-    )
+                true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))
+                surfaces_world = TriangleSurface(posed[mesh.faces]), TriangleSurface(true[faces])
+                distances.append(chamfer(*surfaces_world, AGENT_POINTS, rng))
+    value = float(np.mean(distances)) if distances else np.nan
+    share = len(distances) / total if total else np.nan
     metrics.put("reconstruction/agent_chamfer_m", value, "the agent's pose is known in no visible frame")
     metrics.put("reconstruction/agent_chamfer_share", share, "the animal is never visible")
     return metrics
@@ -335,8 +301,6 @@ def _scene_chamfer(
     chosen = plots.sample(len(cameras), CAMERAS_FOR_SEEN)
     camera = (cameras[chosen], walkthrough.truth.intrinsics[chosen], walkthrough.clip.color_size)
     seen = TriangleSurface(pieces[surfaces.seen_by(RayCaster(true), pieces.mean(1), *camera)])
-    metrics.put(
-        "reconstruction/scene_chamfer_m",
-        chamfer(TriangleSurface(ours.vertices[ours.faces].astype(np.float64)), seen, SCENE_POINTS, rng),
-    )
+    surface = TriangleSurface(ours.vertices[ours.faces].astype(np.float64))
+    metrics.put("reconstruction/scene_chamfer_m", chamfer(surface, seen, SCENE_POINTS, rng))
     return metrics

@@ -1,6 +1,4 @@
-"""Cameras and agent roots of all sessions against truth: every frame counts, refused recordings as
-failures.
-"""
+"""Cameras and agent roots of all sessions against truth; every frame of a refused recording failed."""
 
 from collections.abc import Mapping, Sequence
 
@@ -26,7 +24,7 @@ def camera_metrics(
 ) -> Metrics:
     """Summarise camera errors of all sessions, and of the frames that were most certain."""
     metrics, all_errors = Metrics(), joined(list(errors.values()))
-    _summarise(metrics, "registration", all_errors)
+    put_cameras(metrics, all_errors)
     metrics.put("registration/videos_registered", registered)
     metrics.put("registration/videos_total", len(errors))
     right = is_right(all_errors)
@@ -69,7 +67,9 @@ def root_metrics(
     return metrics
 
 
-def _summarise(metrics: Metrics, name: str, errors: PoseErrors) -> None:
+def put_cameras(metrics: Metrics, errors: PoseErrors, frames: str = "frames") -> None:
+    """Record median and 95th percentile of camera errors; ``frames`` names them in reasons."""
     for unit, values in (("rotation_deg", errors.degrees), ("translation_m", errors.meters)):
-        metrics.put(f"{name}/{unit}_median", median(values), REFUSED)
-        metrics.put(f"{name}/{unit}_p95", percentile(values, 95), "a twentieth of the frames has no pose")
+        many, few = (f"{share} of the {frames}" for share in ("more than half", "a twentieth"))
+        metrics.put(f"registration/{unit}_median", median(values), f"{many} have no pose")
+        metrics.put(f"registration/{unit}_p95", percentile(values, 95), f"{few} has no pose")

@@ -1,6 +1,4 @@
-"""How long one plan takes on one core. Times differ between runs, so that they are measured only where asked
-for.
-"""
+"""Seconds per plan on one core; they differ between runs, so that they are measured only if asked for."""
 
 import time
 from dataclasses import replace

@@ -44,17 +44,13 @@ class SkinnedPoints:
 def matched_once(
     points_agent: Float[np.ndarray, "point 3"], true_vertices_agent: Iterable[Float[np.ndarray, "vertex 3"]]
 ) -> Int[np.ndarray, "point"]:
-    """Match our points at rest to true vertices in that frame of several whose surface lies nearest to them;
-    all in our agent frame.
-    """
+    """Match points at rest to vertices of the nearest of several true surfaces, all in our agent frame."""
     answers = [KDTree(vertices).query(points_agent) for vertices in true_vertices_agent]
     return np.asarray(min(answers, key=lambda answer: np.mean(answer[0]))[1])
 
 
 def track_metrics(distances: Sequence[Float[np.ndarray, "point"]]) -> Metrics:
-    """Summarise distances of followed points over all frames of all sessions; unknown poses count as
-    failures.
-    """
+    """Summarise distances of followed points over all frames; unknown poses count as failures."""
     metrics = Metrics()
     every = np.concatenate(distances) if len(distances) else np.zeros(0)
     metrics.put(

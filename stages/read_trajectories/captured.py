@@ -38,9 +38,7 @@ def root_from_joints(
 def bones_from_joints(
     joints_agent: Float[np.ndarray, "frame joint 3"], parent: Int[np.ndarray, "joint"]
 ) -> tuple[Float[np.ndarray, "frame joint 4 4"], Float[np.ndarray, "joint 4 4"]]:
-    """Return ``agent_from_bone`` and its rest, one bone per joint, turned as its direction turns against the
-    mean.
-    """
+    """Return ``agent_from_bone`` and its rest, one bone per joint, turned from its mean direction."""
     child = np.array(
         [next((c for c in range(len(parent)) if parent[c] == j), -1) for j in range(len(parent))]
     )
@@ -58,9 +56,7 @@ def _unit(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"
 def _shortest_turn(
     start: Float[np.ndarray, "joint 3"], end: Float[np.ndarray, "frame joint 3"]
 ) -> Float[np.ndarray, "frame joint 3 3"]:
-    """Return the smallest rotations that take ``start`` to ``end``; none where a joint has no direction (twin
-    joints).
-    """
+    """Return the smallest rotations from ``start`` to ``end``; identity where a joint has no direction."""
     start = np.broadcast_to(start, end.shape)
     axis = np.cross(start, end)
     angle = np.arctan2(np.linalg.norm(axis, axis=-1), (start * end).sum(-1))

@@ -27,9 +27,7 @@ def no_scene() -> FeatureVolume:
 
 
 def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: float) -> FeatureVolume:
-    """Read occupied cells (x, z, optionally bottom and top) around the animal's ways. Raises TRJ-001 as
-    `columns` does.
-    """
+    """Read occupied cells (x, z, optionally bottom and top; metres). Raises TRJ-001 as `columns` does."""
     table = columns(path, ("x", "z"))
     x, z = numbers(path, table, "x"), numbers(path, table, "z")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):

@@ -202,9 +202,7 @@ def interpolated(
 
 
 def _refuse_impossible_times(path: Path, clips: list[Float[np.ndarray, "row"]]) -> None:
-    """Raise TRJ-001 for sorted times, one array per id, of which two are the same, or which can be no
-    seconds.
-    """
+    """Raise TRJ-001 where sorted times of an id repeat, or can be no seconds."""
     for time in clips:
         step = np.diff(time)
         if (step == 0).any():

@@ -114,9 +114,7 @@ def drawn(
     height: int,
     width: int,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the animal in its scene, each pixel by what is nearer; the animal is shaded by how it faces the
-    camera.
-    """
+    """Draw the animal in its scene, nearer pixels in front, shaded by how it faces the camera."""
     back, hits = render_view(scene, world_from_camera, intrinsics, height, width)
     front, touched = render_view(RayCaster(animal), world_from_camera, intrinsics, height, width)
     nearer = (front > 0) & ((back == 0) | (front < back))

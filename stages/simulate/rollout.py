@@ -56,9 +56,7 @@ def take_of(states: list[SimulatorState], seen: list[Float[np.ndarray, "3"]]) ->
 
 
 def write_take(folder: Path, take: Take) -> None:
-    """Write ``take.npz`` (everything) and ``take.csv`` (a row per frame: position, quaternion, speed,
-    distance).
-    """
+    """Write ``take.npz`` and ``take.csv`` (a row per frame: position, quaternion, speed, distance)."""
     npz.save(folder / "take.npz", **vars(take))
     position = take.world_from_agent[:, :3, 3]
     quaternion = rigid.quaternion_from_rotation(take.world_from_agent[:, :3, :3])

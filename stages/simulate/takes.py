@@ -54,9 +54,7 @@ class FinishedTake:
 
 
 def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
-    """Let the animal live beside a scripted observer; make the take physical where that is asked for and
-    possible.
-    """
+    """Let the animal live beside a scripted observer; optimise the take where asked for and possible."""
     data = BehaviorData.load(_required(inputs, "behavior_data"))
     if inputs.home is not None:
         return _elsewhere(inputs, inputs.home, data, c, device)
@@ -236,10 +234,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
 def _world(inputs: Inputs, data: BehaviorData) -> LongTermWorld:
     model = LongTerm.load(_required(inputs, "longterm"))
     reconstruction = _required(inputs, "reconstruction")
-    roots = np.concatenate(
-        [trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in data.trajectories.values()]
-    )
-    scene = MotionScene.for_motion(ply.read_ply(reconstruction / "scene.ply"), roots)
+    scene = MotionScene.reconstructed(reconstruction, data.trajectories.values())
     return LongTermWorld(model, load_body(reconstruction), scene)
 
 
@@ -262,9 +257,7 @@ def _simulator(
 
 
 def _observer(simulator: Simulator, c: Config) -> Observer:
-    """Return a person about where one stood in the recording that the life begins in; beside the animal where
-    nobody is known of.
-    """
+    """Return a person where one stood in the recording that the life begins in, else beside the animal."""
     begin = simulator.reset(c.seed).world_from_agent[:3, 3]
     return _recorded_person(simulator.recording, begin, c)
 

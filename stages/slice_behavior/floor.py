@@ -1,6 +1,4 @@
-"""Keep the animal at home and on something: fill floor that nobody recorded, and leave out what lies beyond
-the home.
-"""
+"""Keep the animal at home and on something: fill floor that nobody recorded, cut what lies beyond."""
 
 from typing import cast
 

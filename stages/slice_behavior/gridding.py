@@ -73,9 +73,7 @@ def resampled(
     max_gap_s: float,
     rate_hz: float,
 ) -> Float[np.ndarray, "sample companion 4"]:
-    """Resample who is not always there: NaN at times that known frames at most ``max_gap_s`` apart do not
-    enclose.
-    """
+    """Resample companions; NaN at times that known frames at most ``max_gap_s`` apart do not enclose."""
     found = np.full((len(grid), *companions.shape[1:]), np.nan, np.float32)
     for number in range(companions.shape[1]):
         known = np.isfinite(companions[:, number]).all(-1)
@@ -93,9 +91,7 @@ def within_short_gaps(
     max_gap_s: float,
     rate_hz: float = RATE_HZ,
 ) -> Bool[np.ndarray, "sample"]:
-    """Tell which grid times lie between (or within half a grid step of) good times at most ``max_gap_s``
-    apart.
-    """
+    """Return which grid times are on good times, or between such at most ``max_gap_s`` apart."""
     near = 0.5 / rate_hz
     after = np.searchsorted(good, grid, side="left").clip(0, len(good) - 1)
     before = (np.searchsorted(good, grid, side="right") - 1).clip(0)

@@ -60,9 +60,7 @@ def companion_of(
 
 
 def read_tables(folders: Mapping[str, Path]) -> BehaviorSource:
-    """Read recordings with a scene each. Raises BEH-002 when they are not of the same body, ART-010 when
-    damaged.
-    """
+    """Read recordings with a scene each. Raises BEH-002 for different bodies, ART-010 when damaged."""
     motions = {id: read_motion(folder) for id, folder in folders.items()}
     first, *others = folders.values()
     rest = _rest(first)

@@ -74,9 +74,7 @@ def allowed_voxels(
 def standing_heights(
     pairs: Iterable[tuple[FeatureVolume, Trajectory]], rate_hz: float = RATE_HZ
 ) -> Float[np.ndarray, "2 2"]:
-    """Return how high above what carries it the root is, see `Support.range_m`, of recordings in their
-    scenes.
-    """
+    """Return how high above what carries it the root is, see `Support.range_m`."""
     seen = []
     for volume, trajectory in pairs:
         root = trajectory.world_from_agent[:, :3, 3]

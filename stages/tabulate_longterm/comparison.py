@@ -1,6 +1,4 @@
-"""All methods on the same short motions of one source; minutes of motion and samples of the
-behaviour model.
-"""
+"""All methods on the same short motions of one source."""
 
 from pathlib import Path
 
@@ -37,9 +35,7 @@ BLOCKED_M = 0.06
 
 
 def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, float | None]:
-    """Measure every method on held-out short motions: on all, in unseen homes alone, and where something is
-    in the way.
-    """
+    """Measure every method on held-out short motions: on all, in unseen homes, around obstacles."""
     dataset, model = source.held_out, source.models.ours
     rng = np.random.default_rng(config.seed)
     cuts = select_pairs(select_clips(dataset, rng, stride=CLIP_STRIDE, resting=0.0), config.clips)
@@ -101,9 +97,7 @@ def even_pairs(count: int, most: int) -> Int[np.ndarray, "some"]:
 
 
 def blocked(clips: Clips, dataset: MotionDataset) -> Bool[np.ndarray, "clip"]:
-    """Return on which clips something is nearer than `BLOCKED_M` to the straight line that the root
-    could take.
-    """
+    """Return on which clips the straight line of the root comes nearer than `BLOCKED_M` to anything."""
     share = torch.linspace(0.1, 0.9, 17)[None, :, None]
     line = torch.lerp(clips.channels[:, :1, :3], clips.channels[:, -1:, :3], share).double().numpy()
     near = [

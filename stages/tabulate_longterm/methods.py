@@ -71,9 +71,7 @@ def route_cvae(
 
 
 def nearest(bank: Clips, clips: Clips) -> Float[Tensor, "clip frame channel"]:
-    """Take from the memory bank the short motion whose ends are most alike, laid where the clip is (after
-    HSNMS).
-    """
+    """Take from the memory bank the short motion with the most similar ends (after HSNMS)."""
 
     def ends(some: Clips) -> Float[Tensor, "clip channel"]:
         both = some.channels[:, [0, -1]]

@@ -1,6 +1,4 @@
-"""Samples of the behaviour model before and after they are made physical: penetration, sliding feet, goal and
-path errors.
-"""
+"""Samples of the behaviour model before and after optimisation: penetration, foot skate, errors."""
 
 from dataclasses import dataclass
 

@@ -13,9 +13,7 @@ from stages.tabulate_longterm.lengths import LongMotionLength
 
 @dataclass(frozen=True)
 class Inputs:
-    """Artifacts: reconstructed motion and what was learned from it, simulated motion and what was learned
-    from it.
-    """
+    """Artifacts: reconstructed and simulated motion, and what was learned from each."""
 
     reconstruction: Path
     behavior_data: Path
@@ -28,9 +26,7 @@ class Inputs:
 def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu"
 ) -> dict[str, float | None]:
-    """Write `tables.json` and `tables.txt` into ``out`` and return the figures, None where nothing can be
-    measured.
-    """
+    """Write `tables.json` and `tables.txt`; return the figures, None where nothing can be measured."""
     world = reading.simulated(inputs.longterm_world, inputs.longterm_study)
     recorded = reading.recorded(inputs.reconstruction, inputs.behavior_data, inputs.longterm_ablations)
     figures: dict[str, float | None] = {}

@@ -1,6 +1,4 @@
-"""The losses of long-term motion: L1 on what is predicted (Eqs. 3, 4), and what a static body owes to the
-scene.
-"""
+"""The losses of long-term motion: L1 on what is predicted (Eqs. 3, 4), and contact of static bodies."""
 
 import torch
 from jaxtyping import Float, Int
@@ -32,9 +30,7 @@ def pose_error(
     truth: Float[Tensor, "*batch pose"],
     lever: Float[Tensor, "pose channel"],
 ) -> Float[Tensor, ""]:
-    """Return the mean L1 distance between the bones' channels that p stands for, metres (radians at a lever
-    of 0.1 m).
-    """
+    """Return the mean L1 distance of the bones' channels that p stands for, metres (radians at 0.1 m)."""
     return ((made - truth) @ lever).abs().mean()
 
 
@@ -47,9 +43,7 @@ def lever_of(poses: PoseSpace, lever_m: float = 0.1) -> Float[Tensor, "pose chan
 def kl_divergence(
     mean: Float[Tensor, "batch latent"], log_variance: Float[Tensor, "batch latent"]
 ) -> Float[Tensor, ""]:
-    """Return the mean KL divergence of N(mean, variance) from the standard normal distribution, per number of
-    z.
-    """
+    """Return the mean KL divergence from the standard normal distribution, per number of z."""
     return 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).mean()
 
 

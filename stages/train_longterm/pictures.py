@@ -1,6 +1,4 @@
-"""What the quality page of long-term motion shows: losses, routes and bodies on motion that was not learned
-from.
-"""
+"""The quality page of long-term motion: losses, routes and bodies on held-out motion."""
 
 from dataclasses import dataclass
 

@@ -28,9 +28,7 @@ class DatasetSplit:
 
 
 def recorded(reconstruction: Path, behavior_data: Path) -> DatasetSplit:
-    """Read reconstructed sessions, those of the behaviour test held out. Raises LTM-001 where there is too
-    little motion.
-    """
+    """Read reconstructed sessions, those of the behaviour test held out. Raises LTM-001 without motion."""
     data = BehaviorData.load(behavior_data)
     dataset, video_of = reconstructed_dataset(reconstruction, data)
     learns = {data.videos[video] for video in np.unique(data.video[data.split == TRAIN])}

@@ -143,9 +143,7 @@ def predicted_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9
 
 
 def smoothed_true_routes(clips: Clips) -> Float[Tensor, "clip frame 9"]:
-    """Return the true routes, as smooth as predicted ones: along routes that are off, poses that fit none
-    would be learned.
-    """
+    """Return the true routes, as smooth as predicted ones."""
     route = clips.channels[..., :ROOT_CHANNELS]
     even = torch.from_numpy(gaussian_filter1d(route.numpy(), SMOOTH_FRAMES, axis=1, mode="nearest"))
     return orthonormalized(torch.cat([route[:, :1], even[:, 1:-1], route[:, -1:]], dim=1))

@@ -1,6 +1,4 @@
-"""The stage: reconstructions of all variants -> tables.json (flat), tables.txt (to be read), the quality
-page.
-"""
+"""The stage: reconstructions of all variants -> tables.json, tables.txt, the quality page."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

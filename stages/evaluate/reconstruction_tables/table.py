@@ -72,22 +72,15 @@ def metrics(
     device: devices.Device,
     lpips: Lpips | None = None,
 ) -> Metrics:
-    """Return ``<variant>/<figure>`` of every variant, and what its DepthAcc lacks against its reference, with
-    intervals.
-    """
+    """Return ``<variant>/<figure>`` of every variant, and DepthAcc below its reference, with intervals."""
     found = Metrics()
     if places.truth is None:
-        found.skip(
-            [f"{variant}/{kind}_{part}" for variant in folders for kind in COLUMNS for part in PARTS],
-            NO_TRUTH,
-        )
+        names = [f"{variant}/{kind}_{part}" for variant in folders for kind in COLUMNS for part in PARTS]
+        found.skip(names, NO_TRUTH)
         return found
     known = reading.recorded(places, tuple(videos))
-    of_role = {
-        role: [each for each in known if each.video.role == role]
-        for role in ("walkthrough", "turnaround", "session", "heldout")
-    }
-    frames = reading.frames_of_truth(places, of_role["walkthrough"][0], of_role["turnaround"][0])
+    frames = reading.frames_of_truth(places, known)
+    turnaround = reading.of_role(known, "turnaround")[0]
     pairs = reconstruction.phones_with_sessions(known)
     sessions = [session for _, session in pairs]
     shots = [
@@ -107,11 +100,14 @@ def metrics(
             )
             views, rendered = views + drawn[0], rendered + drawn[1]
         one = Metrics()
-        one.add(heldout.view_metrics(views, lpips) if views else _nothing())
-        if rendered:
+        if views:
+            one.add(heldout.view_metrics(views, lpips))
             one.add(heldout.depth_metrics("reconstruction/rendered_depth_acc", rendered))
+        else:
+            drawn = [name for name in heldout.NAMES if name.startswith("reconstruction/")]
+            one.skip(drawn, heldout.UNSEEN)
         one.add(reconstruction.agent_roots(sessions, motions, frames))
-        followed = reconstruction.track_distances(here, sessions, motions, of_role["turnaround"][0], frames)
+        followed = reconstruction.track_distances(here, sessions, motions, turnaround, frames)
         one.add(surfaces.track_metrics(followed))
         found.add_as(variant, one, "reconstruction")
         right[variant] = np.array([_depth_acc(view) for view in views])
@@ -121,12 +117,6 @@ def metrics(
         reference = REFERENCES.get(variant, "ours")
         if variant != "ours" and reference in right and len(right["ours"]):
             _compare(found, variant, right[reference] - right[variant], rng)
-    return found
-
-
-def _nothing() -> Metrics:
-    found = Metrics()
-    found.skip([name for name in heldout.NAMES if name.startswith("reconstruction/")], heldout.UNSEEN)
     return found
 
 
@@ -141,9 +131,7 @@ def _depth_acc(view: HeldoutView) -> list[float]:
 def _compare(
     found: Metrics, variant: str, lacking: Float[np.ndarray, "view part"], rng: np.random.Generator
 ) -> None:
-    """Put the mean difference of pictures to the reference with its 95 % interval; neighbouring pictures are
-    drawn again together.
-    """
+    """Put the mean difference of pictures to the reference; neighbouring pictures are resampled together."""
     for column, part in enumerate(PARTS):
         seen = np.flatnonzero(np.isfinite(lacking[:, column]))
         if not len(seen):
@@ -190,18 +178,12 @@ def rooms(folders: Mapping[str, Path]) -> dict[str, tuple[UInt8[np.ndarray, "hei
         floor_m = float(np.quantile(mesh.vertices[:, 1], FLOOR_QUANTILE))
         image = views.bird_view(mesh, floor_m=floor_m, width_px=ROOM_PX).image
         drawn.append(plots.labelled(image, NAMES.get(variant, variant)))
-    return {
-        "rooms": (
-            plots.grid(drawn, min(len(drawn), 3)),
-            "the reconstructed room from above, by method (Fig. 4)",
-        )
-    }
+    caption = "the reconstructed room from above, by method (Fig. 4)"
+    return {"rooms": (plots.grid(drawn, min(len(drawn), 3)), caption)}
 
 
 def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:
-    """Judge whether ours is ahead of each other method, and the paper's form ahead of its ablations, over all
-    pixels.
-    """
+    """Judge whether ours, or the paper's form, is ahead of its rivals and ablations over all pixels."""
     share = values.get("ours/depth_acc_all")
     found = [Check("DepthAcc of all pixels, ours", share, "share", 0.85, 0.7, "higher")]
     for variant in (each for each in variants if each != "ours"):

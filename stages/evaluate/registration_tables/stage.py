@@ -1,6 +1,4 @@
-"""The stage: registrations of all variants -> tables.json (flat), tables.txt (to be read), the quality
-page.
-"""
+"""The stage: registrations of all variants -> tables.json, tables.txt, the quality page."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,8 +31,8 @@ class Inputs:
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> Metrics:
     """Measure every variant and write the tables."""
     folders = {"ours": inputs.registration, **inputs.variants}
-    resampling = table.Resampling(table.EPISODE_S, table.BOOTSTRAP_DRAWS, np.random.default_rng(config.seed))
-    metrics = table.metrics(folders, inputs.frames, videos, inputs.scene_template, inputs.truth, resampling)
+    rng = np.random.default_rng(config.seed)
+    metrics = table.metrics(folders, inputs.frames, videos, inputs.scene_template, inputs.truth, rng)
     metrics.write(out, "tables.json")
     (out / "tables.txt").write_text(table.text(metrics.values, tuple(folders)))
     qa.write(

@@ -47,15 +47,6 @@ UNITS = {"rotation_deg": "degrees", "translation_m": "meters"}
 
 
 @dataclass(frozen=True)
-class Resampling:
-    """How intervals are drawn."""
-
-    episode_s: float
-    draws: int
-    rng: np.random.Generator
-
-
-@dataclass(frozen=True)
 class _Session:
     id: str
     camera: Float[np.ndarray, "frame 4 4"]
@@ -69,59 +60,56 @@ def metrics(
     videos: Sequence[Video],
     scene_template: Path,
     truth: Path | None,
-    resampling: Resampling,
+    rng: np.random.Generator,
 ) -> Metrics:
     """Return ``<variant>/<figure>`` of every variant, and what each changes against ours, with intervals."""
     found = Metrics()
     if truth is None:
-        names = [
-            f"{variant}/{unit}_{which}"
-            for variant in folders
-            for unit in UNITS
-            for which in ("median", "p95")
-        ]
-        found.skip(names, "the true poses of this capture are not known")
+        names = ("rotation_deg_median", "rotation_deg_p95", "translation_m_median", "translation_m_p95")
+        unknown = "the true poses of this capture are not known"
+        found.skip([f"{variant}/{name}" for variant in folders for name in names], unknown)
         return found
     sessions = _sessions(frames, videos, scene_template, truth)
     errors: dict[str, list[PoseErrors]] = {}
     for variant, folder in folders.items():
-        poses = {session.id: RegisteredPoses.open(folder / session.id) for session in sessions}
-        errors[variant] = [
-            pose_errors(_cameras(poses[session.id], session), session.camera) for session in sessions
-        ]
-        confidence = {session.id: _confidence(poses[session.id], session) for session in sessions}
-        named = {session.id: error for session, error in zip(sessions, errors[variant], strict=True)}
-        one = registration.camera_metrics(
-            named, confidence, sum(table is not None for table in poses.values())
-        )
+        named, confidence, registered = {}, {}, 0
+        for session in sessions:
+            poses = RegisteredPoses.open(folder / session.id)
+            registered += poses is not None
+            poses = poses or RegisteredPoses.unknown(session.timestamp_s)
+            named[session.id] = pose_errors(poses.world_from_camera, session.camera)
+            confidence[session.id] = poses.confidence
+        errors[variant] = list(named.values())
+        one = registration.camera_metrics(named, confidence, registered)
         for id, error in named.items():
-            for unit in UNITS:
-                found.put(
-                    f"{variant}/{id}/{unit}_median", median(getattr(error, UNITS[unit])), registration.REFUSED
-                )
+            for unit, name in UNITS.items():
+                value = median(getattr(error, name))
+                found.put(f"{variant}/{id}/{unit}_median", value, registration.REFUSED)
         found.add_as(variant, one, "registration")
     for variant in folders:
         if variant != "ours":
-            _compare(found, variant, sessions, errors, resampling)
+            _compare(found, variant, sessions, errors, rng)
     return found
 
 
-def _compare(found, variant, sessions, errors, resampling):
+def _compare(
+    found: Metrics,
+    variant: str,
+    sessions: Sequence[_Session],
+    errors: Mapping[str, Sequence[PoseErrors]],
+    rng: np.random.Generator,
+) -> None:
     """Put the paired mean differences to ours with 95 % intervals, over all sessions and over each."""
     chosen = {variant: list(range(len(sessions)))} | {
         f"{variant}/{session.id}": [index] for index, session in enumerate(sessions)
     }
     for name, part in chosen.items():
-        start = np.concatenate(
-            [(sessions[index].timestamp_s / resampling.episode_s).astype(int) for index in part]
-        )
+        start = np.concatenate([(sessions[index].timestamp_s / EPISODE_S).astype(int) for index in part])
         video = np.repeat(part, [len(sessions[index].timestamp_s) for index in part])
         both = [joined([errors[which][index] for index in part]) for which in (variant, "ours")]
         for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
             theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
-            interval = bootstrapped(
-                theirs - ours, episodes(start, video, 1), resampling.draws, resampling.rng
-            )
+            interval = bootstrapped(theirs - ours, episodes(start, video, 1), BOOTSTRAP_DRAWS, rng)
             found.put_mean(f"{name}/{unit}_more_than_ours", interval)
 
 
@@ -139,14 +127,6 @@ def _sessions(frames, videos, scene_template, truth) -> list[_Session]:
     world = constant_between(ours, true[walk].world_from_camera)
     chosen = [video.id for video in videos if video.role == "session"]
     return [_Session(id, world @ true[id].world_from_camera, tables[id]["timestamp_s"]) for id in chosen]
-
-
-def _cameras(poses, session):
-    return poses.world_from_camera if poses else np.full((len(session.camera), 4, 4), np.nan)
-
-
-def _confidence(poses, session):
-    return poses.confidence if poses else np.zeros(len(session.camera))
 
 
 def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:

@@ -1,25 +1,14 @@
-"""Curves of the best of K, and how physical motion is: exact on constructed cases."""
+"""How physical motion is: exact on constructed cases."""
 
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Context, Future
 from pipeline.rivals.predictors import Samples
-from stages.evaluate import best_of, physical
+from stages.evaluate import physical
 from tests.stages.export_simulator import small_world
-
-RNG = np.random.default_rng(0)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 6])
-def test_best_of_k_is_the_mean_over_all_choices(count: int) -> None:
-    distance = RNG.uniform(0, 1, (5, 6))
-    choices = [distance[:, list(chosen)].min(1).mean() for chosen in combinations(range(6), count)]
-    np.testing.assert_allclose(best_of.best_of(distance, [count]), [np.mean(choices)], atol=1e-12)
 
 
 @dataclass(frozen=True)

@@ -64,9 +64,9 @@ def capture(tmp_path):
 
 def test_ablations_are_compared_frame_by_frame(capture):
     folder, frames = capture
-    resampling = table.Resampling(5.0, 200, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
     both = {name: folder / name for name in ("ours", "worse")}
-    values = table.metrics(both, frames, VIDEOS, folder / "template", folder / "truth", resampling).values
+    values = table.metrics(both, frames, VIDEOS, folder / "template", folder / "truth", rng).values
     assert values["ours/rotation_deg_median"] == pytest.approx(1.0, abs=1e-6)
     assert values["ours/translation_m_median"] == pytest.approx(0.01, abs=1e-6)
     assert values["worse/videos_registered"] == 1
@@ -86,7 +86,7 @@ def test_ablations_are_compared_frame_by_frame(capture):
 
 def test_without_truth_nothing_is_claimed(capture):
     folder, frames = capture
-    resampling = table.Resampling(5.0, 10, np.random.default_rng(0))
-    found = table.metrics({"ours": folder / "ours"}, frames, VIDEOS, folder / "template", None, resampling)
+    rng = np.random.default_rng(0)
+    found = table.metrics({"ours": folder / "ours"}, frames, VIDEOS, folder / "template", None, rng)
     assert set(found.values.values()) == {None}
     assert set(found.values) == set(found.reasons)

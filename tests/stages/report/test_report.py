@@ -12,7 +12,7 @@ import pytest
 from pipeline.core.videos import Video
 from pipeline.data import images, qa
 from pipeline.workflow import artifact, dag
-from stages.evaluate.judging import LIMITS
+from stages.evaluate.stage import LIMITS
 from stages.report import bars, collect, pages, stage
 from stages.report.chapters import CHAPTERS, WORDS, remedy
 from stages.report.config import Config
