@@ -109,9 +109,8 @@ def decode_clip(
     with torch.no_grad():
         posed = poses.decode(channels[..., ROOT_CHANNELS:])
         if ends is not None:
-            given = torch.from_numpy(
-                channels_from_bones(np.asarray(ends, np.float64), poses.rest.double().numpy())
-            ).float()
+            rest = poses.rest.double().numpy()
+            given = torch.from_numpy(channels_from_bones(np.asarray(ends, np.float64), rest)).float()
             left = given - poses.decode(poses.encode(given))
             posed = posed + torch.lerp(left[0], left[1], torch.linspace(0, 1, len(channels))[:, None])
         bones = poses.bones(posed)

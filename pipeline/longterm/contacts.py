@@ -39,6 +39,8 @@ STANCE_SPEED, STANCE_SPEED_M_S = 0.4, 0.08
 """a foot slower than this, as a share of the body's speed or in meters per second, stands"""
 SLOWEST_FOOT, SLOWEST_FOOT_LIFTED = 0.8, 0.6
 """so does the slowest foot, below these shares: where feet should stand, and where they may not"""
+LIFTED_M = 0.03
+"""A foot higher than this above its ground is lifted."""
 SHORTEST_PHASE_FRAMES = 3
 """Frames that a phase has at least."""
 
@@ -113,8 +115,6 @@ def detect_stance(
     root_world: Float[np.ndarray, "frame 3"],
     *,
     should_stand: bool = False,
-    lifted_m: float = 0.03,
-    rate_hz: float = RATE_HZ,
 ) -> Bool[np.ndarray, "frame foot"]:
     """Return when each foot stands: near the scene, and hardly moving, or moving least of all feet and less
     than the body.
@@ -125,31 +125,24 @@ def detect_stance(
     glides: of those near the scene the one that moves least, however fast, as in the paper, and any that
     falls behind the body.
     """
-    foot = _speed(centres_world, rate_hz)
-    body = _speed(root_world[:, None], rate_hz)
-    even = ndimage.uniform_filter1d(foot, max(1, round(rate_hz / 6)), axis=0, mode="nearest")
-    low = (
-        height_m
-        < np.percentile(height_m, GROUND_PERCENTILE, axis=0, keepdims=True).clip(
-            -GROUND_ERROR_M, GROUND_ERROR_M
-        )
-        + lifted_m
-    )
+    foot, body = _speed(centres_world), _speed(root_world[:, None])
+    even = ndimage.uniform_filter1d(foot, round(RATE_HZ / 6), axis=0, mode="nearest")
+    ground = np.percentile(height_m, GROUND_PERCENTILE, axis=0, keepdims=True)
+    low = height_m < ground.clip(-GROUND_ERROR_M, GROUND_ERROR_M) + LIFTED_M
     least = np.where(low, even, np.inf)
     least = least == least.min(axis=1, keepdims=True)
     slow = foot < np.maximum(STANCE_SPEED * body, STANCE_SPEED_M_S)
-    slow |= (
-        (least | (even < SLOWEST_FOOT * body))
-        if should_stand
-        else (least & (even < SLOWEST_FOOT_LIFTED * body))
-    )
+    if should_stand:
+        slow |= least | (even < SLOWEST_FOOT * body)
+    else:
+        slow |= least & (even < SLOWEST_FOOT_LIFTED * body)
     both = ndimage.binary_closing(slow & low, np.ones((3, 1)))
     stands = ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
-    return enforce_swing_time(stands, centres_world, rate_hz) if should_stand else stands
+    return enforce_swing_time(stands, centres_world) if should_stand else stands
 
 
 def enforce_swing_time(
-    stance: Bool[np.ndarray, "frame foot"], centres_world: Float[np.ndarray, "frame foot 3"], rate_hz: float
+    stance: Bool[np.ndarray, "frame foot"], centres_world: Float[np.ndarray, "frame foot 3"]
 ) -> Bool[np.ndarray, "frame foot"]:
     """Shorten, part or leave out phases in which feet should stand, so that between two of them each foot can
     swing.
@@ -163,7 +156,7 @@ def enforce_swing_time(
         for phase in _split_phases(stance[:, foot], centres):
             while (
                 phases
-                and (pair := _make_room_to_swing(phases[-1], phase, centres, rate_hz)) is None
+                and (pair := _make_room_to_swing(phases[-1], phase, centres)) is None
                 and len(phase) > len(phases[-1])
             ):
                 phases.pop()
@@ -188,11 +181,11 @@ def _split_phases(
 
 
 def _make_room_to_swing(
-    before: range, after: range, centres: Float[np.ndarray, "frame 3"], rate_hz: float
+    before: range, after: range, centres: Float[np.ndarray, "frame 3"]
 ) -> tuple[range, range] | None:
     """Give a foot time to swing between two phases; None where there is not that much."""
     away = np.linalg.norm(centres[after].mean(0) - centres[before].mean(0))
-    lacking = max(int(np.ceil(np.sqrt(6 * away / SWING_M_S2) * rate_hz)) - (after.start - before.stop), 0)
+    lacking = max(int(np.ceil(np.sqrt(6 * away / SWING_M_S2) * RATE_HZ)) - (after.start - before.stop), 0)
     spare = [max(len(phase) - SHORTEST_PHASE_FRAMES, 0) for phase in (before, after)]
     if lacking > sum(spare):
         return None
@@ -206,9 +199,8 @@ def motion_tensors(motion: BodyMotion) -> tuple[Float[Tensor, "frame 4 4"], Floa
     return torch.from_numpy(root).float(), torch.from_numpy(bones).float()
 
 
-def _speed(points: Float[np.ndarray, "frame foot 3"], rate_hz: float) -> Float[np.ndarray, "frame foot"]:
+def _speed(points: Float[np.ndarray, "frame foot 3"]) -> Float[np.ndarray, "frame foot"]:
     if len(points) < 2:
         return np.zeros(points.shape[:2])
-    return ndimage.median_filter(
-        np.linalg.norm(np.gradient(points, 1 / rate_hz, axis=0), axis=-1), size=(3, 1)
-    )
+    speed = np.linalg.norm(np.gradient(points, 1 / RATE_HZ, axis=0), axis=-1)
+    return ndimage.median_filter(speed, size=(3, 1))

@@ -1,6 +1,6 @@
 """What long-term motion is learned from: stretches of motion in scenes, cut into clips and single bodies.
 
-`MotionDataset` is the common form of reconstructed sessions (`reconstructed_dataset`) and of simulated ones
+`MotionDataset` is the common form of reconstructed sessions (`reconstructed_split`) and of simulated ones
 (`simulated_lives.load`); `select_clips` and `encode_selection` make clips of it, `sample_static_bodies`
 single bodies.
 """
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.trajectories import BehaviorData
+from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.geometry import rigid
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import PoseSpace, SkinnedBody, load_body
@@ -57,15 +57,33 @@ class MotionDataset:
         return [self.scenes[index].distance for index in self.scene_of]
 
 
-def reconstructed_dataset(reconstruction: Path, data: BehaviorData) -> tuple[MotionDataset, list[str]]:
-    """Read all long enough stretches of reconstructed sessions at 30 fps, and the session of each."""
+@dataclass(frozen=True)
+class DatasetSplit:
+    """Motion to learn from, and motion held out, of which there may be none."""
+
+    train: MotionDataset
+    held_out: MotionDataset | None
+    kinds: tuple[str, ...] = ()
+    """per held-out stretch: held_out, unseen or test"""
+
+    @classmethod
+    def of(cls, dataset: MotionDataset, kinds: Sequence[str]) -> "DatasetSplit":
+        """Part a dataset by what each stretch is for: to `train`, or else."""
+        learned, rest = (np.flatnonzero((np.array(kinds) == "train") == kept) for kept in (True, False))
+        held_out = dataset.subset(rest) if len(rest) else None
+        return cls(dataset.subset(learned), held_out, tuple(kinds[index] for index in rest.tolist()))
+
+
+def reconstructed_split(reconstruction: Path, data: BehaviorData) -> DatasetSplit:
+    """Read all long enough stretches of reconstructed sessions, those of the behaviour test held out."""
     found = [
         (video, part) for video, trajectory in data.trajectories.items() for part in stretches(trajectory)
     ]
     scene = MotionScene.reconstructed(reconstruction, data.trajectories.values())
     parts = tuple(part for _, part in found)
     dataset = MotionDataset(load_body(reconstruction), parts, (0,) * len(found), (scene,))
-    return dataset, [video for video, _ in found]
+    learned = {data.videos[video] for video in np.unique(data.video[data.split == TRAIN])}
+    return DatasetSplit.of(dataset, ["train" if video in learned else "test" for video, _ in found])
 
 
 STRIDE = 3

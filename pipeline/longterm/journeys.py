@@ -78,20 +78,12 @@ def refine_motion(
 ) -> Journey:
     """Make any motion at 30 fps physical where ``settings`` are given; it has no sub-goals."""
     judge, stance = world.judge, world.judge.stance(raw, should_stand=True)
-    moving = (
-        raw
-        if settings is None
-        else optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
-    )
+    moving = raw
+    if settings is not None:
+        moving = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
     before, after = (judge.plausibility(each, stance) for each in (raw, moving))
-    return Journey(
-        moving,
-        np.zeros((0, 3)),
-        np.zeros(0),
-        before,
-        after,
-        float(seams(world.body, moving, STEPS).max(initial=0.0)),
-    )
+    largest_seam_m = float(seams(world.body, moving, STEPS).max(initial=0.0))
+    return Journey(moving, np.zeros((0, 3)), np.zeros(0), before, after, largest_seam_m)
 
 
 def refine_at_rate(
@@ -106,9 +98,6 @@ def refine_at_rate(
     done = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
     when = np.arange(len(done)) / RATE_HZ
     at = np.minimum(timestamp_s - timestamp_s[0], when[-1])
-    bones = [
-        rigid.interpolate(when, done.agent_from_bone[:, bone], at)
-        for bone in range(done.agent_from_bone.shape[1])
-    ]
+    bones = [rigid.interpolate(when, bone, at) for bone in np.moveaxis(done.agent_from_bone, 1, 0)]
     back = BodyMotion(rigid.interpolate(when, done.world_from_agent, at), np.stack(bones, axis=1))
     return back, judge.plausibility(raw, stance), judge.plausibility(done, stance)

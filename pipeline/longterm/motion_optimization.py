@@ -21,7 +21,7 @@ from pipeline.longterm.bodies import PosedSurface, PoseSpace, SkinnedBody
 from pipeline.longterm.config import MotionOptimizationConfig
 from pipeline.longterm.contacts import ContactVertices, motion_tensors
 from pipeline.longterm.plausibility import SOLID_M, PlausibilityMeter
-from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
+from pipeline.longterm.short_motions import BodyMotion
 
 LEARNING_RATE = 0.004
 """Of Adam, metres and radians a step; it falls to a tenth over the optimisation."""
@@ -110,13 +110,11 @@ def optimize_motion(
     scene: SignedDistance,
     settings: MotionOptimizationConfig,
     *,
-    rate_hz: float = RATE_HZ,
     held: Bool[np.ndarray, "frame"] | None = None,
 ) -> BodyMotion:
     """Return the motion with all constraints weighed against each other; ``held`` frames stay as they are."""
-    stance = PlausibilityMeter(contact_body.body, contact_body.contacts, scene).stance(
-        moving, rate_hz, should_stand=True
-    )
+    meter = PlausibilityMeter(contact_body.body, contact_body.contacts, scene)
+    stance = meter.stance(moving, should_stand=True)
     free = torch.ones(len(moving)) if held is None else torch.from_numpy(~held).float()
     return _minimize(moving, contact_body, scene, settings, TERMS, stance, free, reach=LIFT_FRAMES)
 
@@ -128,10 +126,8 @@ def settle_bodies(
     with torch.no_grad():
         feet = PosedSurface(contact_body.body, contact_body.contacts.vertices)(*motion_tensors(bodies))
         near = contact_body.contacts.lowest(scene.at(feet)).numpy() < NEAR_M
-    alone, terms = (
-        replace(settings, steps=min(settings.steps, SETTLING_STEPS)),
-        replace(TERMS, foot=0.0, smooth=0.0),
-    )
+    alone = replace(settings, steps=min(settings.steps, SETTLING_STEPS))
+    terms = replace(TERMS, foot=0.0, smooth=0.0)
     return _minimize(bodies, contact_body, scene, alone, terms, near, torch.ones(len(bodies)), reach=0)
 
 

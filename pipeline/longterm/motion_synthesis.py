@@ -109,13 +109,8 @@ class LongTerm:
         route = RouteNet(sizes, sees_scene=document["sees_scene"])
         pose = PoseNet(sizes, sees_scene=document["sees_scene"])
         for name, module in zip(("poses", *NETWORKS), (poses, static, route, pose), strict=True):
-            module.load_state_dict(
-                {
-                    key.removeprefix(f"{name}."): value
-                    for key, value in state.items()
-                    if key.startswith(f"{name}.")
-                }
-            )
+            own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
+            module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})
         contacts = ContactVertices(
             np.array(document["contact_vertices"]), np.array(document["foot_of_contact_vertex"])
         )
@@ -253,20 +248,17 @@ def measure_motion_prior(
         root = stretch.world_from_agent[:, :3, 3]
         way = np.linalg.norm((root[STEPS:] - root[:-STEPS])[:, [0, 2]], axis=1)
         middle = slice(STEPS // 2, len(way) + STEPS // 2)
-        up = (
-            stretch.world_from_agent[middle, 1:2, :3]
-            @ np.swapaxes(stretch.agent_from_bone[middle, :, :3, 3], 1, 2)
-        )[:, 0]
+        bones = np.swapaxes(stretch.agent_from_bone[middle, :, :3, 3], 1, 2)
+        up = (stretch.world_from_agent[middle, 1:2, :3] @ bones)[:, 0]
         clearance.append(scene.distance.at(torch.from_numpy(root[middle]).float()).numpy())
         above.append(up.max(1))
         pace.append(way)
         travels.append(way > moving_m)
-        turn.append(
-            rigid.rotation_angle(stretch.world_from_agent[:-1, :3, :3], stretch.world_from_agent[1:, :3, :3])
-        )
-    kept = np.concatenate(travels)
-    kept = kept if kept.any() else ~kept
-    found = (float(np.median(np.concatenate(each)[kept])) for each in (clearance, pace, above))
+        rotation = stretch.world_from_agent[:, :3, :3]
+        turn.append(rigid.rotation_angle(rotation[:-1], rotation[1:]))
+    chosen = np.concatenate(travels)
+    chosen = chosen if chosen.any() else ~chosen
+    found = (float(np.median(np.concatenate(each)[chosen])) for each in (clearance, pace, above))
     clearance_m, pace_m, above_m = found
     turn_rad = max(float(np.percentile(np.concatenate(turn), TURN_PERCENTILE)), np.pi / RATE_HZ)
     return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)

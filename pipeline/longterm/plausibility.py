@@ -57,19 +57,12 @@ class PlausibilityMeter:
         """All vertices of the body, to be posed."""
         return PosedSurface(self.body)
 
-    def stance(
-        self, motion: BodyMotion, rate_hz: float = RATE_HZ, *, should_stand: bool = False
-    ) -> Bool[np.ndarray, "frame foot"]:
+    def stance(self, motion: BodyMotion, *, should_stand: bool = False) -> Bool[np.ndarray, "frame foot"]:
         """Return which feet stand when, or with ``should_stand`` which should."""
         points = PosedSurface(self.body, self.contacts.vertices)(*motion_tensors(motion))
         centres, height = self.contacts.centres(points), self.contacts.lowest(self.scene.at(points))
-        return detect_stance(
-            centres.numpy(),
-            height.numpy(),
-            motion.world_from_agent[:, :3, 3],
-            should_stand=should_stand,
-            rate_hz=rate_hz,
-        )
+        roots = motion.world_from_agent[:, :3, 3]
+        return detect_stance(centres.numpy(), height.numpy(), roots, should_stand=should_stand)
 
     def gap_and_penetration(
         self, motion: BodyMotion
@@ -79,9 +72,7 @@ class PlausibilityMeter:
         gap = distance[:, self.contacts.vertices].min(1).values.clamp_min(0)
         return gap.numpy(), (-distance).clamp_min(0).amax(1).numpy()
 
-    def plausibility(
-        self, motion: BodyMotion, stance: Bool[np.ndarray, "frame foot"], rate_hz: float = RATE_HZ
-    ) -> Plausibility:
+    def plausibility(self, motion: BodyMotion, stance: Bool[np.ndarray, "frame foot"]) -> Plausibility:
         """Measure a motion on all vertices of the body."""
         distance, points = [], []
         for start in range(0, len(motion), FRAMES_AT_ONCE):
@@ -91,7 +82,7 @@ class PlausibilityMeter:
         depth, touching = torch.cat(distance), torch.cat(points)
         centres = self.contacts.centres(touching).numpy()
         both = stance[1:] & stance[:-1]
-        speed = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1) * rate_hz
+        speed = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1) * RATE_HZ
         near = self.contacts.lowest(depth[1:, self.contacts.vertices]).numpy() < CONTACT_M
         least = np.where(near, speed, np.inf).min(axis=1, initial=np.inf)
         slide, least = speed[both], least[np.isfinite(least)]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -78,11 +78,7 @@ def smooth_seams(motion: BodyMotion, every: int = STEPS, reach: int = 6) -> Body
     seam = np.clip(np.round(frame / every), 1, last) * every
     away = np.abs(frame - seam)
     kept = np.flatnonzero((away == 0) | (away > reach))
-    bones = [
-        _interpolate(kept, motion.agent_from_bone[kept, bone], frame)
-        for bone in range(motion.agent_from_bone.shape[1])
-    ]
-    return BodyMotion(_interpolate(kept, motion.world_from_agent[kept], frame), np.stack(bones, axis=1))
+    return _interpolate(kept, motion[kept], frame)
 
 
 def limit_turn_rate(motion: BodyMotion, most_rad: float) -> BodyMotion:
@@ -96,27 +92,19 @@ def limit_turn_rate(motion: BodyMotion, most_rad: float) -> BodyMotion:
     turned = np.concatenate([[0.0], np.cumsum((rotation[:-1].inv() * rotation[1:]).magnitude())])
     frame = np.arange(len(motion))
     ramp = max(most_rad, turned[-1] / max(len(motion) - 1, 1)) * frame
-    late, early = (
-        np.minimum.accumulate(turned - ramp) + ramp,
-        np.maximum.accumulate((turned - ramp)[::-1])[::-1] + ramp,
-    )
+    late = np.minimum.accumulate(turned - ramp) + ramp
+    early = np.maximum.accumulate((turned - ramp)[::-1])[::-1] + ramp
     wanted = np.clip((late + early) / 2, turned[-1] - ramp[::-1], ramp)
     roots = motion.world_from_agent.copy()
     roots[:, :3, :3] = Slerp(frame, rotation)(np.interp(wanted, turned + 1e-9 * frame, frame)).as_matrix()
     return BodyMotion(roots, motion.agent_from_bone)
 
 
-def resample_motion(
-    timestamp_s: Float[np.ndarray, "frame"], moving: BodyMotion, rate_hz: float = RATE_HZ
-) -> BodyMotion:
-    """Bring motion to an even rate: cubic spline on positions, slerp on rotations; roots and bones alike."""
-    count = int(np.floor((timestamp_s[-1] - timestamp_s[0]) * rate_hz + 1e-6)) + 1
-    query_s = np.minimum(timestamp_s[0] + np.arange(count) / rate_hz, timestamp_s[-1])
-    bones = [
-        _interpolate(timestamp_s, moving.agent_from_bone[:, bone], query_s)
-        for bone in range(moving.agent_from_bone.shape[1])
-    ]
-    return BodyMotion(_interpolate(timestamp_s, moving.world_from_agent, query_s), np.stack(bones, axis=1))
+def resample_motion(timestamp_s: Float[np.ndarray, "frame"], moving: BodyMotion) -> BodyMotion:
+    """Bring motion to 30 fps: cubic spline on positions, slerp on rotations; roots and bones alike."""
+    count = int(np.floor((timestamp_s[-1] - timestamp_s[0]) * RATE_HZ + 1e-6)) + 1
+    query_s = np.minimum(timestamp_s[0] + np.arange(count) / RATE_HZ, timestamp_s[-1])
+    return _interpolate(timestamp_s, moving, query_s)
 
 
 def stretches(trajectory: Trajectory, shortest_s: float = STEPS / RATE_HZ) -> list[BodyMotion]:
@@ -126,19 +114,17 @@ def stretches(trajectory: Trajectory, shortest_s: float = STEPS / RATE_HZ) -> li
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         when = trajectory.timestamp_s[start:end]
         if len(when) > 2 and when[-1] - when[0] >= shortest_s - 1e-6:
-            found.append(
-                resample_motion(
-                    when,
-                    BodyMotion(trajectory.world_from_agent[start:end], trajectory.agent_from_bone[start:end]),
-                )
-            )
+            motion = BodyMotion(trajectory.world_from_agent[start:end], trajectory.agent_from_bone[start:end])
+            found.append(resample_motion(when, motion))
     return found
 
 
 def _interpolate(
-    timestamp_s: np.ndarray, a_from_b: Float[np.ndarray, "frame 4 4"], query_s: np.ndarray
-) -> Float[np.ndarray, "sample 4 4"]:
-    rotation = Slerp(timestamp_s, Rotation.from_matrix(np.asarray(a_from_b[:, :3, :3], np.float64)))(
-        query_s
-    ).as_matrix()
-    return rigid.make(rotation, CubicSpline(timestamp_s, a_from_b[:, :3, 3])(query_s))
+    times: Real[np.ndarray, "frame"], motion: BodyMotion, query: Real[np.ndarray, "sample"]
+) -> BodyMotion:
+    def between(a_from_b: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "sample 4 4"]:
+        rotation = Slerp(times, Rotation.from_matrix(np.asarray(a_from_b[:, :3, :3], np.float64)))
+        return rigid.make(rotation(query).as_matrix(), CubicSpline(times, a_from_b[:, :3, 3])(query))
+
+    bones = [between(bone) for bone in np.moveaxis(motion.agent_from_bone, 1, 0)]
+    return BodyMotion(between(motion.world_from_agent), np.stack(bones, axis=1))

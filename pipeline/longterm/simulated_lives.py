@@ -1,23 +1,22 @@
 """Simulated motion of one body in several homes as files: `body/`, `scenes/<number>.ply`, `motion.npz`.
 
-`save` writes what a simulation of known truth produced; `load` reads it as `MotionDataset`.
+`save` writes what a simulation of known truth produced; `load` reads it.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from pipeline.data import npz, ply
 from pipeline.geometry.meshes import Mesh
 from pipeline.longterm.bodies import SkinnedBody, load_body
-from pipeline.longterm.examples import MotionDataset
+from pipeline.longterm.examples import DatasetSplit, MotionDataset
 from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.surroundings import MotionScene
 
 Split = Literal["train", "held_out", "unseen"]
-SPLITS: tuple[Split, ...] = get_args(Split)
 """to learn from; another session in a known home; a home never seen"""
 
 
@@ -52,8 +51,8 @@ def save(
     )
 
 
-def load(folder: Path) -> tuple[MotionDataset, list[Split]]:
-    """Read what `save` wrote, and the split of each session. Raises InputError ART-010, ART-020."""
+def load(folder: Path) -> DatasetSplit:
+    """Read what `save` wrote. Raises InputError ART-010, ART-020 when damaged."""
     stored = npz.load(
         folder / "motion.npz", ("frames", "world_from_agent", "agent_from_bone", "scene", "split")
     )
@@ -73,4 +72,4 @@ def load(folder: Path) -> tuple[MotionDataset, list[Split]]:
         tuple(stored["scene"].tolist()),
         scenes,
     )
-    return dataset, [SPLITS[SPLITS.index(each)] for each in stored["split"].tolist()]
+    return DatasetSplit.of(dataset, stored["split"].tolist())

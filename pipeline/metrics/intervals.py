@@ -6,6 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+BOOTSTRAP_DRAWS = 2000
+"""Resamples of an interval: its ends then move by a hundredth of its width between seeds."""
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -59,9 +62,9 @@ def episodes(
 def bootstrapped(
     values: Float[np.ndarray, "window"],
     episode: Int[np.ndarray, "window"],
-    draws: int,
     rng: np.random.Generator,
     *,
+    draws: int = BOOTSTRAP_DRAWS,
     median: bool = False,
 ) -> Interval:
     """Resample episodes with replacement; return the mean or median with percentiles 2.5 and 97.5."""
@@ -74,7 +77,6 @@ def bootstrapped(
         parts = [values[episode == number] for number in range(count)]
         drawn = [np.median(np.concatenate([parts[number] for number in row])) for row in chosen]
     else:
-        drawn = np.bincount(episode, values, count)[chosen].sum(1) / np.bincount(episode, minlength=count)[
-            chosen
-        ].sum(1)
+        total, size = np.bincount(episode, values, count), np.bincount(episode, minlength=count)
+        drawn = total[chosen].sum(1) / size[chosen].sum(1)
     return Interval(middle, *(float(bound) for bound in np.percentile(drawn, (2.5, 97.5))))

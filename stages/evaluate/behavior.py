@@ -32,8 +32,6 @@ OURS = "ats"
 RIVALS = ("location_prior", "stand_still", "constant_velocity")
 MOVING_M = 0.1
 """An animal that gets further than this in 5.6 s moves."""
-BOOTSTRAP_DRAWS = 2000
-"""Resamples of every interval: its ends then move by a hundredth of its width between seeds."""
 Scores = dict[str, Float[np.ndarray, "window"]]
 """Of one method, by the names of `SCORES`."""
 
@@ -144,7 +142,7 @@ def _report(
 ) -> None:
     def interval(name: str, values: Float[np.ndarray, "window"]) -> Interval:
         drawn = np.unique(episode[name], return_inverse=True)[1]
-        return bootstrapped(values, drawn, BOOTSTRAP_DRAWS, np.random.default_rng(config.seed))
+        return bootstrapped(values, drawn, np.random.default_rng(config.seed))
 
     for method, of_method in scores.items():
         for name in SCORES:

@@ -1,48 +1,39 @@
 """Minutes of motion through many sub-goals: seams, room, furniture."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from pipeline.longterm.bodies import PosedSurface
-from pipeline.longterm.config import MotionOptimizationConfig
 from pipeline.longterm.contacts import motion_tensors
-from pipeline.longterm.journeys import LongTermWorld, travel
+from pipeline.longterm.journeys import travel
 from pipeline.longterm.short_motions import RATE_HZ
 from pipeline.longterm.subgoals import sample_visited_subgoals
+from stages.tabulate_longterm.config import Config
+from stages.tabulate_longterm.reading import MotionSource
+
+WATCHED_VERTICES, FRAMES_AT_ONCE = 200, 300
+"""What is looked at of the surface, for being outside of the room, at a time."""
 
 
-@dataclass(frozen=True)
-class LongMotionLength:
-    """A long motion to make."""
-
-    seconds: float
-    subgoals: int
-
-
-def figures(
-    world: LongTermWorld,
-    been: Float[np.ndarray, "place 3"],
-    length: LongMotionLength,
-    settings: MotionOptimizationConfig,
-    seed: int,
-) -> dict[str, float | None]:
-    """Travel through preferred places for minutes and measure what the bars ask for; ``been`` is where the
-    root was, metres, world.
+def figures(source: MotionSource, config: Config) -> dict[str, float | None]:
+    """Travel through preferred places of the reconstructed scene for minutes and measure what the bars ask
+    for.
 
     Sub-goals are due at even times, so that the animal rests at those that it reaches early.
     """
-    rng = np.random.default_rng(seed)
-    drawn = sample_visited_subgoals(been, length.subgoals + 1, rng)
+    world = source.world
+    been = np.concatenate([stretch.world_from_agent[::3, :3, 3] for stretch in source.split.train.stretches])
+    rng = np.random.default_rng(config.seed)
+    drawn = sample_visited_subgoals(been, config.subgoals + 1, rng)
     timed = [
-        replace(goal, time_s=length.seconds * number / length.subgoals) for number, goal in enumerate(drawn)
+        replace(goal, time_s=config.minutes_s * number / config.subgoals) for number, goal in enumerate(drawn)
     ]
-    made = travel(world, timed, settings, rng)
+    made = travel(world, timed, config.optimization, rng)
     low, high = world.scene.surface.points.min(0), world.scene.surface.points.max(0)
-    surface, outside = PosedSurface(world.body, world.body.sample_vertices(200)), 0.0
-    for start in range(0, len(made.moving), 300):
-        points = surface(*motion_tensors(made.moving[start : start + 300])).numpy()
+    surface, outside = PosedSurface(world.body, world.body.sample_vertices(WATCHED_VERTICES)), 0.0
+    for start in range(0, len(made.moving), FRAMES_AT_ONCE):
+        points = surface(*motion_tensors(made.moving[start : start + FRAMES_AT_ONCE])).numpy()
         beyond = np.maximum(np.maximum(low - points, points - high), 0)[..., [0, 2]]
         outside = max(outside, float(beyond.max()))
     there = made.moving.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]

@@ -18,7 +18,6 @@ def figures(
     episode: Int[np.ndarray, "clip"],
     prefix: str,
     *,
-    draws: int,
     seed: int,
 ) -> dict[str, float | None]:
     """Return mean (of `MEDIANS` the median) and 95 % interval, drawn over episodes, of every metric of every
@@ -35,7 +34,7 @@ def figures(
                 continue
             groups = np.unique(episode[: len(column)][known], return_inverse=True)[1]
             rng, middle = np.random.default_rng(seed), metric in MEDIANS
-            found |= bootstrapped(column[known], groups, draws, rng, median=middle).as_figures(name)
+            found |= bootstrapped(column[known], groups, rng, median=middle).as_figures(name)
     return found
 
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from pipeline.geometry import rigid_torch
 from pipeline.geometry.signed_distance import SignedDistance
-from pipeline.longterm.bodies import PosedSurface, PoseSpace
+from pipeline.longterm.bodies import LEVER_M, PosedSurface, PoseSpace
 from pipeline.longterm.contacts import ContactVertices
 from pipeline.longterm.motion_optimization import collision_error, contact_error
 from pipeline.longterm.networks import ROOT_CHANNELS
@@ -19,10 +19,9 @@ def route_error(
     made: Float[Tensor, "*batch channel"], truth: Float[Tensor, "*batch known"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return the mean L1 distance of t (metres) and of r (6D rotations, no unit), the first nine channels."""
-    shift, turn = slice(0, 3), slice(3, ROOT_CHANNELS)
-    return (made[..., shift] - truth[..., shift]).abs().mean(), (
-        made[..., turn] - truth[..., turn]
-    ).abs().mean()
+    parts = (slice(0, 3), slice(3, ROOT_CHANNELS))
+    shift, turn = ((made[..., part] - truth[..., part]).abs().mean() for part in parts)
+    return shift, turn
 
 
 def pose_error(
@@ -34,9 +33,9 @@ def pose_error(
     return ((made - truth) @ lever).abs().mean()
 
 
-def lever_of(poses: PoseSpace, lever_m: float = 0.1) -> Float[Tensor, "pose channel"]:
+def lever_of(poses: PoseSpace) -> Float[Tensor, "pose channel"]:
     """Return the matrix from p to channels in metres."""
-    scale = torch.tensor([lever_m] * 3 + [1.0] * 3).repeat(len(poses.rest))
+    scale = torch.tensor([LEVER_M] * 3 + [1.0] * 3).repeat(len(poses.rest))
     return poses.basis * scale
 
 

@@ -10,11 +10,10 @@ from pipeline.data import plots
 from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid
 from pipeline.longterm.clip_channels import Clips
-from pipeline.longterm.examples import MotionDataset, encode_selection, select_clips
+from pipeline.longterm.examples import DatasetSplit, MotionDataset, encode_selection, select_clips
 from pipeline.longterm.networks import ROOT_CHANNELS
 from pipeline.longterm.plausibility import PlausibilityMeter
 from stages.train_longterm.learning import TrainedLongTerm
-from stages.train_longterm.sources import DatasetSplit
 
 SHOWN = 8
 """Clips drawn from above."""

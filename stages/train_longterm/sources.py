@@ -1,55 +1,30 @@
 """Where motion comes from, parted into what is learned from and what is held out."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.behavior.trajectories import TRAIN, BehaviorData
+from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core.errors import InputError
 from pipeline.data import npz, ply
-from pipeline.longterm import simulated_lives
-from pipeline.longterm.examples import MotionDataset, reconstructed_dataset
+from pipeline.longterm.examples import DatasetSplit, MotionDataset, reconstructed_split
 from pipeline.longterm.short_motions import resample_motion
 from pipeline.longterm.smplx_bodies import motion_from_parameters, smplx_body
 from pipeline.longterm.surroundings import MotionScene
 from stages.train_longterm import prox
 
+NO_MOTION = "no two seconds of uninterrupted motion to learn from"
 STUDY_REACH_M = 1.5
 """heights of the synthetic study's scene that are used, above and below where bodies have been"""
 
 
-@dataclass(frozen=True)
-class DatasetSplit:
-    """Motion to learn from and motion held out; the latter may be nothing."""
-
-    train: MotionDataset
-    held_out: MotionDataset | None
-
-
 def recorded(reconstruction: Path, behavior_data: Path) -> DatasetSplit:
     """Read reconstructed sessions, those of the behaviour test held out. Raises LTM-001 without motion."""
-    data = BehaviorData.load(behavior_data)
-    dataset, video_of = reconstructed_dataset(reconstruction, data)
-    learns = {data.videos[video] for video in np.unique(data.video[data.split == TRAIN])}
-    train = [index for index, video in enumerate(video_of) if video in learns]
-    if not train:
+    split = reconstructed_split(reconstruction, BehaviorData.load(behavior_data))
+    if not split.train.stretches:
         remedy = "record longer sessions in which the animal stays in view"
-        raise InputError(
-            "LTM-001", "no two seconds of uninterrupted motion to learn from", str(behavior_data), remedy
-        )
-    rest = [index for index, video in enumerate(video_of) if video not in learns]
-    return DatasetSplit(dataset.subset(train), dataset.subset(rest) if rest else None)
-
-
-def simulated(folder: Path) -> DatasetSplit:
-    """Read simulated motion; homes and sessions that are not for training are held out."""
-    dataset, split = simulated_lives.load(folder)
-    held = np.flatnonzero(np.array(split) != "train")
-    return DatasetSplit(
-        dataset.subset(np.flatnonzero(np.array(split) == "train")),
-        dataset.subset(held) if len(held) else None,
-    )
+        raise InputError("LTM-001", NO_MOTION, str(behavior_data), remedy)
+    return split
 
 
 def people(model: Path, folder: Path) -> DatasetSplit:
@@ -81,8 +56,8 @@ def people(model: Path, folder: Path) -> DatasetSplit:
     roots = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     scene = MotionScene.for_motion(ply.read_ply(folder / "scene.ply"), roots, reach_m=STUDY_REACH_M)
     dataset = MotionDataset(person.body, motions, (0,) * len(motions), (scene,))
-    last = len(motions) - 1
-    return DatasetSplit(dataset.subset(list(range(max(last, 1)))), dataset.subset([last]) if last else None)
+    last = max(len(motions) - 1, 1)
+    return DatasetSplit.of(dataset, ["train" if index < last else "test" for index in range(len(motions))])
 
 
 def _hands(table: dict[str, np.ndarray]) -> np.ndarray | None:
@@ -98,11 +73,8 @@ def _in_scans(model: Path, folder: Path) -> DatasetSplit:
     last = sum(len(each.motions) for each in recordings[:-1])
     if not stretches:
         remedy = "give recordings with two seconds of fits without a gap"
-        raise InputError(
-            "LTM-001", "no two seconds of uninterrupted motion to learn from", str(folder), remedy
-        )
+        raise InputError("LTM-001", NO_MOTION, str(folder), remedy)
     motions, places = zip(*stretches, strict=True)
     dataset = MotionDataset(person.body, motions, places, tuple(scenes.values()))
-    held = list(range(last, len(motions))) if 0 < last < len(motions) else []
-    train = [index for index in range(len(motions)) if index not in held]
-    return DatasetSplit(dataset.subset(train), dataset.subset(held) if held else None)
+    last = last or len(motions)
+    return DatasetSplit.of(dataset, ["train" if index < last else "test" for index in range(len(motions))])

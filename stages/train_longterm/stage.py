@@ -5,6 +5,8 @@ from pathlib import Path
 
 from pipeline.core import distributed, progress
 from pipeline.data import qa
+from pipeline.longterm import simulated_lives
+from pipeline.longterm.examples import DatasetSplit
 from pipeline.longterm.short_motions import RATE_HZ
 from stages.train_longterm import learning, pictures, sources
 from stages.train_longterm.config import Config
@@ -49,10 +51,10 @@ def run(inputs: Inputs, config: Config, out: Path, *, resume: Path | None = None
     return trained
 
 
-def _read(inputs: Inputs, config: Config) -> sources.DatasetSplit:
+def _read(inputs: Inputs, config: Config) -> DatasetSplit:
     if config.smplx_model is not None:
         return sources.people(Path(config.smplx_model), Path(config.smplx_motions or ""))
     if inputs.longterm_world is not None:
-        return sources.simulated(inputs.longterm_world)
+        return simulated_lives.load(inputs.longterm_world)
     assert inputs.reconstruction is not None and inputs.behavior_data is not None, "nothing to learn from"
     return sources.recorded(inputs.reconstruction, inputs.behavior_data)

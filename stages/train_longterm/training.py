@@ -119,9 +119,8 @@ def fit_route(
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
         shift, turn = _summed_route_errors(made, truth)
-        return {"translation": w.translation * shift} | (
-            {"rotation": w.rotation * turn} if net.predicts_rotation else {}
-        )
+        terms = {"translation": w.translation * shift}
+        return terms | ({"rotation": w.rotation * turn} if net.predicts_rotation else {})
 
     return trainer.fitted(name, net, optimizer_config, loss, len(clips))
 
@@ -165,18 +164,11 @@ def fit_pose(
         made = net(
             truth[:, 0, ROOT_CHANNELS:], truth[:, -1, ROOT_CHANNELS:], routes[index], clips.seen.points[index]
         )
-        terms = {
-            "pose": w.pose
-            * objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
-        }
-        return terms | (
-            {
-                "rotation": w.rotation
-                * objectives.route_error(made[..., :ROOT_CHANNELS], truth[..., :ROOT_CHANNELS])[1]
-            }
-            if net.predicts_rotation
-            else {}
-        )
+        pose = objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
+        terms = {"pose": w.pose * pose}
+        if net.predicts_rotation:
+            terms["rotation"] = w.rotation * objectives.route_error(made, truth)[1]
+        return terms
 
     return trainer.fitted(name, net, optimizer_config, loss, len(clips))
 
@@ -194,9 +186,7 @@ def fit_base(
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
-        shift, turn = _summed_route_errors(
-            [each[..., :ROOT_CHANNELS] for each in made], truth[..., :ROOT_CHANNELS]
-        )
+        shift, turn = _summed_route_errors(made, truth)
         errors = [
             objectives.pose_error(each[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
             for each in made
@@ -233,12 +223,12 @@ def fit_body(
         mesh = objectives.posed(made, frames[index], poses, surface)
         with torch.no_grad():
             true_mesh = objectives.posed(truth, frames[index], poses, surface)
-        shift, turn = objectives.route_error(made[..., :ROOT_CHANNELS], truth[..., :ROOT_CHANNELS])
+        shift, turn = objectives.route_error(made, truth)
+        pose = objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
         collision, contact = objectives.scene_errors(mesh, scene[index], distances, contacts, len(chosen))
         return {
             "root": w.translation * shift + w.rotation * turn,
-            "pose": w.pose
-            * objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever),
+            "pose": w.pose * pose,
             "vertices": w.vertices * (mesh - true_mesh).norm(dim=-1).mean(),
             "divergence": w.divergence * objectives.kl_divergence(mean, log_variance),
             "collision": w.collision * collision,

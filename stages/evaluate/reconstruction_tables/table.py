@@ -60,7 +60,6 @@ ROOM_PX = 320
 """Width of a room in the comparison."""
 EPISODE_FRAMES = 3
 """Rendered frames that are resampled together: neighbours look alike."""
-BOOTSTRAP_DRAWS = 2000
 
 
 def metrics(
@@ -137,7 +136,7 @@ def _compare(
         if not len(seen):
             continue
         episode = episodes(seen, np.zeros(len(seen), int), EPISODE_FRAMES)
-        interval = bootstrapped(lacking[seen, column], episode, BOOTSTRAP_DRAWS, rng)
+        interval = bootstrapped(lacking[seen, column], episode, rng)
         found.put_mean(f"{variant}/depth_acc_{part}_less_than_reference", interval)
 
 

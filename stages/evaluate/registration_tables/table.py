@@ -40,7 +40,6 @@ TITLE = (
 FOOTNOTE = "paper: on its own cat videos; '-': more than half (a twentieth) of the frames has no pose."
 EPISODE_S = 5.0
 """Intervals resample stretches of this length together: poses of neighbouring frames err alike."""
-BOOTSTRAP_DRAWS = 2000
 MOST_DEG, MOST_M = 180.0, 10.0
 """A frame without a pose counts as this wrong where errors are averaged"""
 UNITS = {"rotation_deg": "degrees", "translation_m": "meters"}
@@ -109,7 +108,7 @@ def _compare(
         both = [joined([errors[which][index] for index in part]) for which in (variant, "ours")]
         for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
             theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
-            interval = bootstrapped(theirs - ours, episodes(start, video, 1), BOOTSTRAP_DRAWS, rng)
+            interval = bootstrapped(theirs - ours, episodes(start, video, 1), rng)
             found.put_mean(f"{name}/{unit}_more_than_ours", interval)
 
 

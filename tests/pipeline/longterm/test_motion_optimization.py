@@ -74,7 +74,7 @@ def test_feet_that_should_stand_have_time_to_swing():
     feet[60:, 2, 0] = 0.1
     stance = np.ones((120, 3), bool)
     stance[60, 2] = False
-    kept = enforce_swing_time(stance, feet, 30.0)
+    kept = enforce_swing_time(stance, feet)
     assert kept[:, 1].all()
     gaps = {foot: np.diff(np.flatnonzero(np.diff(kept[:, foot].astype(int))))[::2] for foot in (0, 2)}
     assert gaps[2].tolist() == [int(np.ceil(np.sqrt(6 * 0.1 / SWING_M_S2) * 30))]

@@ -273,18 +273,18 @@ def test_intervals_widen_when_windows_repeat_each_other():
     start = np.arange(600)
     values = np.repeat(rng.normal(size=10), 60)
     blocks = episodes(start, np.zeros(600, int), 60)
-    wide = bootstrapped(values, blocks, 500, np.random.default_rng(0))
-    narrow = bootstrapped(values, start, 500, np.random.default_rng(0))
+    wide = bootstrapped(values, blocks, np.random.default_rng(0), draws=500)
+    narrow = bootstrapped(values, start, np.random.default_rng(0), draws=500)
     assert wide.high - wide.low > 3 * (narrow.high - narrow.low)
     assert wide.low <= wide.mean <= wide.high
     skewed = bootstrapped(
-        np.append(values, 1e6), np.append(blocks, 0), 500, np.random.default_rng(0), median=True
+        np.append(values, 1e6), np.append(blocks, 0), np.random.default_rng(0), draws=500, median=True
     )
     assert wide.low - 0.5 < skewed.low <= skewed.mean <= skewed.high < wide.high + 0.5
 
 
 def test_one_episode_alone_has_no_interval():
     found = Metrics()
-    found.put_mean("goal", bootstrapped(np.arange(5.0), np.zeros(5, int), 100, np.random.default_rng(0)))
+    found.put_mean("goal", bootstrapped(np.arange(5.0), np.zeros(5, int), np.random.default_rng(0)))
     assert found.values == {"goal": 2.0, "goal_ci95_low": None, "goal_ci95_high": None}
     assert "one episode" in found.reasons["goal_ci95_low"]

@@ -6,14 +6,13 @@ import torch
 
 from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
 from pipeline.longterm.contacts import find_contact_vertices
-from pipeline.longterm.examples import encode_selection, fit_pose_space, select_clips
+from pipeline.longterm.examples import DatasetSplit, encode_selection, fit_pose_space, select_clips
 from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
 from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
 from pipeline.longterm.short_motions import BodyMotion
 from pipeline.rivals import longterm_networks
-from stages.tabulate_longterm import comparison, methods, pictures, scores, tables
+from stages.tabulate_longterm import bars, comparison, lengths, methods, scores, tables
 from stages.tabulate_longterm.config import Config
-from stages.tabulate_longterm.lengths import LongMotionLength
 from stages.tabulate_longterm.methods import ComparedModels
 from stages.tabulate_longterm.reading import MotionSource
 from tests.pipeline.longterm import strider
@@ -44,11 +43,12 @@ def source():
         name: longterm_networks.build(kind, SIZES).eval()
         for name, kind in longterm_networks.ABLATIONS.items()
     }
-    return MotionSource(train, held, ("held_out", "unseen"), ComparedModels(model, ablated, bank))
+    split = DatasetSplit(train, held, ("held_out", "unseen"))
+    return MotionSource(split, ComparedModels(model, ablated, bank))
 
 
 def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
-    dataset, model = source.held_out, source.models.ours
+    dataset, model = source.split.held_out, source.models.ours
     part = dataset.stretches[0][:61]
     reference = scores.references([part], np.array([0]), dataset, model)[0]
     told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
@@ -79,7 +79,7 @@ def test_the_memory_bank_finds_itself(source):
 
 def test_route_and_cvae_keeps_the_route(source):
     some = source.models.bank[np.arange(2)]
-    made = methods.route_cvae(source.models.ours, some, source.train, np.random.default_rng(0))
+    made = methods.route_cvae(source.models.ours, some, source.split.train, np.random.default_rng(0))
     route = source.models.ours.route(some.channels[:, 0], some.channels[:, -1], some.seen)
     torch.testing.assert_close(made[..., :9], route)
     assert made.shape == some.channels.shape
@@ -112,11 +112,11 @@ def test_tables_hold_every_method_with_intervals(source):
     assert "longterm_unseen/ours/mpvpe_mm" in found and "longterm_unseen/ours_opt/mpvpe_mm" not in found
     text = tables.text(found)
     assert text.count("Table 1") == text.count("Table 4") == len({name.split("/")[0] for name in found})
-    assert len(pictures.pictures(found)) == 1 and len(pictures.checks(found)) > 10
+    assert len(bars.checks(found)) > 10
 
 
 def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
-    dataset, model = source.held_out, source.models.ours
+    dataset, model = source.split.held_out, source.models.ours
     cuts = comparison.select_pairs(select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0), 6)
     assert len(cuts.start) == 6 and set(cuts.start[1::2] - cuts.start[::2]) == {60}
     assert (cuts.stretch[1::2] == cuts.stretch[::2]).all()
@@ -135,7 +135,7 @@ def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
 
 
 def test_minutes_are_measured(source):
-    found = comparison.minutes(source, LongMotionLength(12.0, 3), SMALL)
+    found = lengths.figures(source, replace(SMALL, minutes_s=12.0, subgoals=3))
     assert found["longterm_minutes/seconds"] >= 12.0
     assert found["longterm_minutes/subgoals"] == 3
     assert found["longterm_minutes/outside_room_m"] < 0.05
@@ -144,8 +144,8 @@ def test_minutes_are_measured(source):
 def test_a_clip_is_blocked_where_the_block_stands_between_its_ends(source):
     """The strider walks around the block: only ends on opposite sides of it have it between them."""
     clips = comparison.encode_selection(
-        source.held_out,
-        select_clips(source.held_out, np.random.default_rng(0), stride=5),
+        source.split.held_out,
+        select_clips(source.split.held_out, np.random.default_rng(0), stride=5),
         source.models.ours.poses,
         4,
         np.random.default_rng(0),
@@ -154,7 +154,7 @@ def test_a_clip_is_blocked_where_the_block_stands_between_its_ends(source):
     inverse = torch.from_numpy(np.linalg.inv(clips.world_from_clip)).float()
     for frame, place in ((0, [-1.2, 0.2, 0.0]), (-1, [1.2, 0.2, 0.0])):
         around[:, frame, :3] = inverse[:, :3, :3] @ torch.tensor(place) + inverse[:, :3, 3]
-    assert comparison.blocked(replace(clips, channels=around), source.held_out).all()
+    assert comparison.blocked(replace(clips, channels=around), source.split.held_out).all()
     for frame, place in ((0, [-1.2, 0.2, 1.2]), (-1, [1.2, 0.2, 1.2])):
         around[:, frame, :3] = inverse[:, :3, :3] @ torch.tensor(place) + inverse[:, :3, 3]
-    assert not comparison.blocked(replace(clips, channels=around), source.held_out).any()
+    assert not comparison.blocked(replace(clips, channels=around), source.split.held_out).any()

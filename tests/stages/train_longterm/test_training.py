@@ -7,11 +7,11 @@ from safetensors.torch import save_file
 
 from pipeline.core.errors import InputError
 from pipeline.longterm.config import LongTermSizes
+from pipeline.longterm.examples import DatasetSplit
 from pipeline.longterm.networks import PointNet
 from pipeline.rivals import longterm_networks
 from stages.train_longterm import learning, objectives, pictures
 from stages.train_longterm.config import Config
-from stages.train_longterm.sources import DatasetSplit
 from stages.train_longterm.training import LongTermOptimizerConfig
 from tests.pipeline.longterm import strider
 
