@@ -77,8 +77,8 @@ def odometry_factors(
     first = np.arange(len(timestamp_s) - 1)
     gap_s = np.maximum(np.diff(timestamp_s), SHORTEST_S)
     first_from_second = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
-    sigmas = (drift * gap_s + LEAST_SIGMA for drift in (drift_rad_s, drift_m_s))
-    return RelativePoseFactors(first, first + 1, first_from_second, *sigmas)
+    sigma_rad, sigma_m = (drift * gap_s + LEAST_SIGMA for drift in (drift_rad_s, drift_m_s))
+    return RelativePoseFactors(first, first + 1, first_from_second, sigma_rad, sigma_m)
 
 
 def optimize_poses(

@@ -11,8 +11,7 @@ class Config:
     """of all randomness"""
     turn_deg: float = 0.0
     """rotation of the canonical axes, degrees, counterclockwise from above, where the report's turntable does
-    not begin with the head: 180 where head and tail were confused, 90 or -90 where a side was taken for the
-    head"""
+    not begin with the head: 180 where it begins with the tail, 90 or -90 with a side"""
     voxel_m: float = 0.008
     """cells of the fused volume, metres"""
     vertices: int = 3000

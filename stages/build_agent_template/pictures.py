@@ -19,9 +19,7 @@ SATURATION, VALUES = 0.75, (0.7, 0.95)
 
 
 def turntable(mesh: Mesh, views: int = 8, size_px: int = 220) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the mesh (agent frame) from around, the head's side first; the rows look from the side and from
-    above.
-    """
+    """Draw the mesh (agent frame) from around, the head's side first, rows from the side and from above."""
     caster, radius = RayCaster(mesh), float(np.linalg.norm(mesh.vertices, axis=1).max())
     focal, up = FOCAL * size_px, np.array([0.0, 1.0, 0.0])
     intrinsics = np.array([[focal, 0, size_px / 2], [0, focal, size_px / 2], [0, 0, 1]])

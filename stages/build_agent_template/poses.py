@@ -33,8 +33,7 @@ class Circle:
 
 
 def walk_around(clip: Clip, masks: Masks) -> Circle:
-    """Place all cameras by the whole still scene, the animal included; the ground is the level surface around
-    it.
+    """Place all cameras by the whole still scene, the animal included; the ground is the level around it.
 
     Raises InputError AGT-001 where hardly any depth was measured on the animal, or on a level surface.
     """
@@ -54,9 +53,7 @@ def walk_around(clip: Clip, masks: Masks) -> Circle:
     for frame in np.flatnonzero(masks.visible)[:: max(1, int(masks.visible.sum()) // GROUND_FRAMES)]:
         seen = view(frame)
         label = depth_labels(masks[frame], clip.depth_size)[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-        points = rigid.apply(poses[frame], seen.points.reshape(-1, 3).astype(float)).reshape(
-            seen.points.shape
-        )
+        points = rigid.apply(poses[frame], seen.points.astype(float))
         up = seen.normals @ poses[frame, 1, :3]
         known = seen.points[..., 2] > 0
         animal.append(points[known & (label == 255)])
@@ -64,9 +61,7 @@ def walk_around(clip: Clip, masks: Masks) -> Circle:
     on_animal, on_floor = np.concatenate(animal), np.concatenate(floor)
     if min(len(on_animal), len(on_floor)) < LEAST_POINTS:
         what = f"only {len(on_animal)} depth points lie on the animal and {len(on_floor)} on level ground"
-        remedy = (
-            "circle it from about 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
-        )
+        remedy = "circle it from 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
         raise InputError("AGT-001", what, str(masks.folder), remedy)
     return Circle(poses, fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=REACH_M), odometry_fit)
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core.progress import log
-from pipeline.data import qa
+from pipeline.data import ply, qa
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.features import open_features
-from stages.build_agent_template import pictures, writing
+from pipeline.data.templates import AgentCameras, SkinTable, write_vertex_features
+from stages.build_agent_template import pictures
 from stages.build_agent_template.config import Config
 from stages.build_agent_template.template import build
 
@@ -34,8 +35,13 @@ def run(inputs: Inputs, config: Config, out: Path) -> None:
     template = build(clip, masks, features, config, np.random.default_rng(config.seed))
     log(f"surface: {len(template.mesh.vertices)} vertices from {template.around_deg:.0f} deg around")
     log(f"depth pictures agree within {1000 * template.residual_m:.0f} mm")
+    ply.write_ply(out / "agent.ply", template.mesh)
+    bones = template.bones
+    SkinTable(template.weights, bones.agent_from_bone_rest, bones.bone_scale_m).write(out)
+    write_vertex_features(out, template.features)
+    poses = template.agent_from_camera
+    AgentCameras(clip.timestamp_s, poses, clip.intrinsics, np.isfinite(poses[:, 0, 0])).write(out)
     checks, shown = pictures.report(template)
-    writing.write(out, template, clip)
     qa.write(
         out,
         good="a whole animal, closed, with thin legs and tail, and one hue per limb",

@@ -10,11 +10,10 @@ from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.features import STRIDE_PX
 from pipeline.fields.skinning import skinning_weights
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import Mesh
 from stages.build_agent_template import appearance
-from stages.build_agent_template.bones import Bones, lay_bones
-from stages.build_agent_template.canonical import find_heading
+from stages.build_agent_template.canonical import Bones, find_heading, lay_bones
 from stages.build_agent_template.config import Config
 from stages.build_agent_template.fuse import fuse
 from stages.build_agent_template.poses import walk_around
@@ -47,36 +46,27 @@ def build(
     config: Config,
     rng: np.random.Generator,
 ) -> CanonicalTemplate:
-    """Build the template from one turnaround. Raises InputError AGT-001 when the animal is seen in too few
-    frames.
-    """
+    """Build the template from one turnaround. Raises InputError AGT-001 if too few frames show the animal."""
     if masks.visible.sum() < LEAST_FRAMES:
-        raise InputError(
-            "AGT-001",
-            f"the animal is seen in {int(masks.visible.sum())} frames",
-            str(masks.folder),
-            "circle the resting animal once, the whole of it in view",
-        )
+        what = f"the animal is seen in {int(masks.visible.sum())} frames"
+        remedy = "circle the resting animal once, the whole of it in view"
+        raise InputError("AGT-001", what, str(masks.folder), remedy)
     circle = walk_around(clip, masks)
     body = fuse(clip, masks, circle, config.voxel_m, config.vertices)
     heading = find_heading(body.inside_world, circle.ground, config.turn_deg)
     agent_from_world = rigid.inverse(heading.world_from_agent)
-    mesh = Mesh(
-        rigid.apply(agent_from_world, body.mesh.vertices.astype(float)).astype(np.float32), body.mesh.faces
-    )
+    vertices = rigid.apply(agent_from_world, body.mesh.vertices.astype(float)).astype(np.float32)
+    mesh = Mesh(vertices, body.mesh.faces)
     bones = lay_bones(rigid.apply(agent_from_world, body.inside_world), body.voxel_m, config.bones, rng)
-    vertices, rest, scale = (
-        torch.from_numpy(np.asarray(part, np.float32))
-        for part in (mesh.vertices, bones.agent_from_bone_rest, bones.bone_scale_m)
-    )
-    weights = skinning_weights(vertices, rest, scale)
+    parts = (vertices, bones.agent_from_bone_rest, bones.bone_scale_m)
+    surface, rest, scale = (torch.from_numpy(np.asarray(part, np.float32)) for part in parts)
+    weights = skinning_weights(surface, rest, scale)
     cameras = agent_from_world @ circle.world_from_camera
     seen = np.flatnonzero(masks.visible)
-    views = seen[np.unique(np.linspace(0, len(seen) - 1, config.views).astype(int))]
+    views = seen[subsampling.evenly(len(seen), config.views)]
     weight, pixel = appearance.visibility(mesh, cameras[views], clip.intrinsics[views], clip.color_size)
-    weight = weight * np.stack(
-        [appearance.on_mask(at, masks[view]) for at, view in zip(pixel, views, strict=True)]
-    )
+    on_mask = [appearance.on_mask(at, masks[view]) for at, view in zip(pixel, views, strict=True)]
+    weight = weight * np.stack(on_mask)
     color = appearance.gather(mesh.vertices, weight, pixel, [clip.color(view) for view in views], 1)
     vertex_features = appearance.gather(mesh.vertices, weight, pixel, list(features[views]), STRIDE_PX)
     vertex_features /= np.maximum(np.linalg.norm(vertex_features, axis=1, keepdims=True), 1e-9)

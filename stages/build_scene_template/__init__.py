@@ -1,2 +1,1 @@
-"""Build the scene template: structure from motion, metric scale and gravity, depth fusion to a coloured
-mesh."""
+"""Build the scene template: structure from motion, metric scale and gravity, depth fused to a mesh."""

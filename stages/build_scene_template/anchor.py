@@ -1,5 +1,4 @@
-"""Anchor the walk-through in the world: metric scale from depth, a check by depth, propagation by odometry,
-gravity.
+"""Anchor the walk-through in the world: metric scale from depth, propagation by odometry, gravity.
 
 The sparse model is refuted when depth contradicts it; then odometry is the initial trajectory.
 """
@@ -13,17 +12,15 @@ from jaxtyping import Float, Int
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, ground, rigid
 from pipeline.mapping.colmap import SparseModel
-from stages.build_scene_template.matches import points_under
 from stages.build_scene_template.refine import Keyframe
+from stages.build_scene_template.sfm import points_under
 
 LEAST_REGISTERED = 0.6
 """Share of the keyframes that must be in the largest model; with less, odometry explains more of the walk."""
 MOST_SCALE_DEVIATION = 0.06
-"""Robust relative deviation of depth over SfM depth beyond which the model is refuted; sound models have 1-3
-%."""
+"""Robust relative deviation of depth over SfM depth beyond which it is refuted; sound models have 1-3 %."""
 MOST_GAP_M, MOST_GAP_RATIO = 0.06, 1.5
-"""Gap between overlapping depth images beyond which the model is refuted, metres, if it is also so many times
-the gap under the odometry."""
+"""Gap between depth images that refutes the model, metres, if so many times the gap under the odometry."""
 LEAST_RATIOS = 20
 """Tracks with depth below which there is no scale."""
 MAD_TO_SIGMA = 1.4826
@@ -54,15 +51,13 @@ class InitialTrajectory:
 
 
 def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
-    """Return metres per model unit and its robust relative deviation, from depth under the tracks; None
-    without depth."""
+    """Return metres per model unit and its robust relative deviation, by depth under tracks; None without."""
     ratios = []
     for view, frame in enumerate(sparse.frame):
         row = np.flatnonzero(sparse.observed_key == view)
         measured = points_under(clip, int(frame), sparse.observed_pixel[row])[:, 2]
-        model = rigid.apply(
-            rigid.inverse(sparse.model_from_camera[view]), sparse.points_model[sparse.observed_point[row]]
-        )[:, 2]
+        camera_from_model = rigid.inverse(sparse.model_from_camera[view])
+        model = rigid.apply(camera_from_model, sparse.points_model[sparse.observed_point[row]])[:, 2]
         ratios.append((measured / model)[np.isfinite(measured) & (model > 0)])
     ratio = np.concatenate(ratios)
     if len(ratio) < LEAST_RATIOS:
@@ -72,26 +67,17 @@ def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
 
 
 def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "key 4 4"]) -> float:
-    """Return how far depth images of keyframes 1, 3 and 8 apart differ, metres: the mean of their 75 %
-    quantiles."""
+    """Return how far depth images of keyframes `HOPS` apart differ, metres: the mean of their quantiles."""
     gaps = []
     for hop in HOPS:
         for first in range(len(keyframes) - hop):
-            moved = rigid.apply(
-                rigid.inverse(world_from_camera[first + hop]) @ world_from_camera[first],
-                keyframes[first].scan.points_camera,
-            )
             target = keyframes[first + hop]
+            target_from_first = rigid.inverse(world_from_camera[first + hop]) @ world_from_camera[first]
+            moved = rigid.apply(target_from_first, keyframes[first].scan.points_camera)
             pixel, z = cameras.project(moved, target.intrinsics)
-            column, row = np.floor(pixel).astype(int).T
-            inside = (
-                (z > NEAREST_M)
-                & (row >= 0)
-                & (column >= 0)
-                & (row < target.depth.shape[0])
-                & (column < target.depth.shape[1])
-            )
-            measured = target.depth[row[inside], column[inside]]
+            inside = cameras.in_picture(pixel, z, target.depth.shape, NEAREST_M)
+            column, row = np.floor(pixel[inside]).astype(int).T
+            measured = target.depth[row, column]
             gap = np.abs(measured - z[inside])[measured > 0]
             gaps.append(np.quantile(gap, GAP_QUANTILE) if len(gap) > LEAST_OVERLAP else np.nan)
     return float(np.nanmean(gaps)) if np.isfinite(gaps).any() else np.inf
@@ -100,21 +86,16 @@ def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "k
 def propagate(
     clip: Clip, frames: Int[np.ndarray, "key"], world_from_camera: Float[np.ndarray, "key 4 4"]
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Propagate keyframe poses to all frames: along odometry from both neighbouring keyframes, blended; else
-    in time."""
+    """Propagate keyframe poses to all frames: blended along odometry from both neighbours; else in time."""
     time = clip.timestamp_s
     if clip.odometry_from_camera is None:
         return rigid.interpolate(time[frames], world_from_camera, time)
     odometry = clip.odometry_from_camera
     world_from_odometry = world_from_camera @ rigid.inverse(odometry[frames])
-    if len(frames) > 1:
-        after = np.clip(np.searchsorted(frames, np.arange(len(time)), side="right"), 1, len(frames) - 1)
-    else:
-        after = np.zeros(len(time), int)
+    after = np.searchsorted(frames, np.arange(len(time)), side="right").clip(1).clip(max=len(frames) - 1)
     before = np.maximum(after - 1, 0)
-    blend = np.clip(
-        (time - time[frames[before]]) / np.maximum(time[frames[after]] - time[frames[before]], 1e-9), 0, 1
-    )
+    gap_s = time[frames[after]] - time[frames[before]]
+    blend = np.clip((time - time[frames[before]]) / np.maximum(gap_s, 1e-9), 0, 1)
     ends = [world_from_odometry[index] @ odometry for index in (before, after)]
     step = rigid.log(rigid.inverse(ends[0]) @ ends[1])
     return ends[0] @ rigid.exp(step * blend[:, None])
@@ -123,32 +104,28 @@ def propagate(
 def choose_start(
     clip: Clip, frames: Int[np.ndarray, "key"], keyframes: list[Keyframe], sparse: SparseModel | None
 ) -> InitialTrajectory | None:
-    """Return SfM poses if enough keyframes are registered, their scale is steady and depth agrees; else the
-    odometry.
+    """Return SfM poses if enough keyframes are registered, the scale is steady and depth agrees, or odometry.
 
     None where there is neither.
     """
     odometry = clip.odometry_from_camera
     gap = {} if odometry is None else {"odometry": depth_gap(keyframes, odometry[frames])}
-    deviation = ratio = None
-    poses, reason = None, "no model came out"
-    measured = None if sparse is None else metric_scale(sparse, clip)
-    if sparse is not None and measured is None:
-        reason = "depth lies under too few of its points"
-    elif sparse is not None and measured is not None:
-        scale, deviation = measured
+    deviation = ratio = poses = None
+    if sparse is None:
+        reason, registered = "no model came out", np.zeros(0, int)
+    elif (measured := metric_scale(sparse, clip)) is None:
+        reason, registered = "depth lies under too few of its points", sparse.frame
+    else:
+        registered, (scale, deviation) = sparse.frame, measured
         poses = sparse.model_from_camera.copy()
         poses[:, :3, 3] *= scale
-        poses = propagate(clip, sparse.frame, poses)
+        poses = propagate(clip, registered, poses)
         gap["colmap"] = depth_gap(keyframes, poses[frames])
-        reason = _refutation(len(sparse.frame) / len(frames), deviation, gap)
+        reason = _refutation(len(registered) / len(frames), deviation, gap)
         if odometry is not None:
-            step = [
-                np.linalg.norm(np.diff(path[sparse.frame, :3, 3], axis=0), axis=1).sum()
-                for path in (odometry, poses)
-            ]
-            ratio = float(step[0] / max(step[1], 1e-9))
-    registered = sparse.frame if sparse is not None else np.zeros(0, int)
+            steps = (np.diff(path[registered, :3, 3], axis=0) for path in (odometry, poses))
+            own, found = (np.linalg.norm(step, axis=1).sum() for step in steps)
+            ratio = float(own / max(found, 1e-9))
     if odometry is not None and (poses is None or reason):
         return InitialTrajectory(odometry, "odometry", reason, registered, deviation, ratio, gap)
     if poses is None:
@@ -173,14 +150,11 @@ def upright(
     points_world: Float[np.ndarray, "point 3"],
     normals_world: Float[np.ndarray, "point 3"],
 ) -> tuple[Float[np.ndarray, "4 4"], str]:
-    """Return ``upright_from_world`` that turns +y up, and the source of up: the phone's gravity or the
-    dominant planes.
-    """
+    """Return ``upright_from_world`` that turns +y up, and whence up is known: gravity or dominant planes."""
     if clip.odometry_from_camera is not None and clip.gravity_known:
-        up = (world_from_camera[:, :3, :3] @ np.swapaxes(clip.odometry_from_camera[:, :3, :3], 1, 2))[
-            :, :, 1
-        ].mean(0)
-        how = "gravity of the phone"
+        odometry_from_camera = clip.odometry_from_camera[:, :3, :3]
+        world_from_odometry = world_from_camera[:, :3, :3] @ np.swapaxes(odometry_from_camera, 1, 2)
+        up, how = world_from_odometry[:, :, 1].mean(0), "gravity of the phone"
     else:
         guess = -world_from_camera[:, :3, 1].mean(0)
         up, how = ground.floor_direction(normals_world, guess / np.linalg.norm(guess)), "dominant planes"

@@ -19,8 +19,8 @@ from stages.build_scene_template.template import REGISTERED_WITHIN_M, SceneTempl
 EDGE_M, SUBDIVISIONS = 0.05, 12
 """Longer edges are divided, at most so often, so that vertices can carry colours, metres."""
 MOST_SCALE_ERROR, MOST_GAP_M, LEAST_AGREE = 0.03, 0.05, 0.7
-"""The mesh is used when its relative scale error, the median distance of depth from it (metres) and the share
-of depth that meets it are better than these; Polycam's meshes have 1 %, 2 cm and 0.85."""
+"""Bounds on its relative scale error, its median distance from depth (metres) and the share of depth that
+meets it; Polycam's meshes have 1 %, 2 cm and 0.85."""
 SEEN_WITHIN_M, NEAREST_M = 0.08, 0.1
 """A vertex was seen where depth agrees within the first, metres; depth below the second is none."""
 SCALE_VIEWS, SCALE_STRIDE_PX, COLOR_VIEWS = 10, 4, 60
@@ -30,25 +30,16 @@ SCALE_VIEWS, SCALE_STRIDE_PX, COLOR_VIEWS = 10, 4, 60
 def build(
     clip: Clip, features: Float[np.ndarray, "frame height width channel"], mesh: Mesh, config: Config
 ) -> SceneTemplate | None:
-    """Make the template of a mesh that stands in the odometry's world; None where measured depth refutes
-    it."""
+    """Make the template of a mesh that stands in the odometry's world; None where depth refutes it."""
     odometry = clip.odometry_from_camera
     if odometry is None:
         return None
-    vertices, faces = trimesh.remesh.subdivide_to_size(
-        mesh.vertices, mesh.faces, EDGE_M, max_iter=SUBDIVISIONS
-    )[:2]
-    fine = Mesh(
-        vertices.astype(np.float32), faces.astype(np.int32), np.full((len(vertices), 3), 128, np.uint8)
-    )
-    upright_from_world, gravity = anchor.upright(
-        clip, odometry, fine.vertices.astype(float), fine.vertex_normals()
-    )
-    fine = Mesh(
-        rigid.apply(upright_from_world, fine.vertices.astype(float)).astype(np.float32),
-        fine.faces,
-        fine.color,
-    )
+    parts = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, EDGE_M, max_iter=SUBDIVISIONS)
+    vertices, faces = parts[0].astype(np.float32), parts[1].astype(np.int32)
+    points, normals = vertices.astype(float), Mesh(vertices, faces).vertex_normals()
+    upright_from_world, gravity = anchor.upright(clip, odometry, points, normals)
+    upright = rigid.apply(upright_from_world, points).astype(np.float32)
+    fine = Mesh(upright, faces, np.full((len(vertices), 3), 128, np.uint8))
     scale, agree = depth_against(clip, fine, upright_from_world @ odometry, SEEN_WITHIN_M)
     poses, gap = fuse.align_frames(clip, fine, upright_from_world @ odometry, config.fusion)
     off_m = float(np.nanmedian(gap)) if np.isfinite(gap).any() else np.inf
@@ -81,8 +72,7 @@ def build(
 def depth_against(
     clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], within_m: float
 ) -> tuple[float, float]:
-    """Return the median of measured depth over the mesh's distance along the same rays, and the share that
-    meets it."""
+    """Return the median of depth over the mesh's distance along the rays, and the share that meets it."""
     caster, ratios, meets = RayCaster(mesh), [], []
     for frame in subsampling.evenly(len(clip), SCALE_VIEWS):
         depth = clip.depth(int(frame))[::SCALE_STRIDE_PX, ::SCALE_STRIDE_PX]
@@ -105,9 +95,8 @@ def seen_and_colored(
         depth, color = clip.depth(int(frame)), clip.color(int(frame))
         in_depth, z = cameras.project(local, clip.depth_intrinsics[frame])
         in_color, _ = cameras.project(local, clip.intrinsics[frame])
-        inside = np.flatnonzero(
-            (z > NEAREST_M) & _within(in_depth, depth.shape) & _within(in_color, color.shape[:2])
-        )
+        inside = cameras.in_picture(in_depth, z, depth.shape, NEAREST_M)
+        inside = np.flatnonzero(inside & cameras.in_picture(in_color, z, color.shape[:2]))
         column, row = np.floor(in_depth[inside]).astype(int).T
         inside = inside[np.abs(depth[row, column] - z[inside]) < SEEN_WITHIN_M]
         column, row = np.floor(in_color[inside]).astype(int).T
@@ -115,7 +104,3 @@ def seen_and_colored(
         weight[inside] += 1 / z[inside]
     mean = total / np.maximum(weight, 1e-9)[:, None]
     return weight > 0, np.where(weight[:, None] > 0, mean.round(), 128).astype(np.uint8)
-
-
-def _within(pixel: Float[np.ndarray, "vertex 2"], size: tuple[int, int]) -> Bool[np.ndarray, "vertex"]:
-    return (pixel >= 0).all(1) & (pixel[:, 0] < size[1]) & (pixel[:, 1] < size[0])

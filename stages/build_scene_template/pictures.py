@@ -29,8 +29,8 @@ CAPTIONS = {
 def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
     """Draw the template for people."""
     caster = RayCaster(template.mesh)
-    turned, beside = turntable(template, caster), frames(template, clip, caster)
-    return captioned(CAPTIONS, turntable=turned, coverage=coverage(template), frames=beside)
+    turned, compared = turntable(template, caster), frames(template, clip, caster)
+    return captioned(CAPTIONS, turntable=turned, coverage=coverage(template), frames=compared)
 
 
 def turntable(template: SceneTemplate, caster: RayCaster) -> UInt8[np.ndarray, "height width 3"]:

@@ -1,9 +1,7 @@
-"""Refine the walk-through's cameras: keyframes against each other, then every frame against the fused
-surface.
+"""Refine the walk-through's keyframes against each other.
 
-Keyframes are tied by what they share: SfM tracks (sideways, by pixel noise) and overlapping depth (along
-surface normals), with odometry between neighbours. All terms are contacts of
-`pipeline.mapping.pose_optimization`.
+They are tied by what they share: SfM tracks (sideways, by pixel noise) and overlapping depth (along surface
+normals), with odometry between neighbours: correspondences of `pipeline.mapping.pose_optimization`.
 """
 
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from pipeline.geometry import cameras, rigid
 from pipeline.mapping import depth_scans, pose_optimization
 from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.config import RefinementConfig
-from stages.build_scene_template.matches import points_under
+from stages.build_scene_template.sfm import points_under
 
 DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.5), 0.02
 """Drift of the odometry that the graph allows, several times that of phones: depth decides."""
@@ -35,8 +33,7 @@ NEAREST_M = 0.1
 TRACK_HOPS = (1, 3)
 """Observations of a track are paired with the next one and the third after it."""
 OVERLAP_STEP, LEAST_OVERLAP = 7, 0.3
-"""One point in so many measures the overlap of two keyframes, and the least share that makes them
-neighbours."""
+"""One point in so many measures the overlap of two keyframes; the least share that makes them neighbours."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +49,8 @@ class Keyframe:
 def load_keyframe(clip: Clip, frame: int) -> Keyframe:
     """Read one frame's depth, its subsampled points and its normals (camera axes, zero where unknown)."""
     depth, intrinsics = usable_depth(clip, frame), clip.depth_intrinsics[frame]
-    return Keyframe(
-        depth_scans.scan(depth, intrinsics, stride=STRIDE_PX),
-        depth,
-        depth_scans.image_normals(depth, intrinsics),
-        intrinsics,
-    )
+    scan = depth_scans.scan(depth, intrinsics, stride=STRIDE_PX)
+    return Keyframe(scan, depth, depth_scans.image_normals(depth, intrinsics), intrinsics)
 
 
 def depth_correspondences(
@@ -76,25 +69,17 @@ def _pair_correspondences(keyframes, first, second, world_from_camera, reach_m):
     second_from_first = rigid.inverse(world_from_camera[second]) @ world_from_camera[first]
     moved = rigid.apply(second_from_first, source.points_camera)
     pixel, z = cameras.project(moved, target.intrinsics)
-    column, row = np.floor(pixel).astype(int).T
-    height, width = target.depth.shape
-    inside = np.flatnonzero((z > NEAREST_M) & (row >= 0) & (column >= 0) & (row < height) & (column < width))
-    row, column = row[inside], column[inside]
+    inside = np.flatnonzero(cameras.in_picture(pixel, z, target.depth.shape, NEAREST_M))
+    column, row = np.floor(pixel[inside]).astype(int).T
     met = cameras.unproject(pixel[inside], target.intrinsics) * target.depth[row, column, None]
     normal = target.normals[row, column]
     gap = np.abs(np.einsum("ci,ci->c", moved[inside] - met, normal))
     good = (np.abs(normal).sum(1) > 0) & (gap < CANDIDATE_REACH * reach_m)
-    inside, met, normal = inside[good], met[good], normal[good]
-    count = len(inside)
+    inside, met = inside[good], met[good]
     sigma = DEPTH_INFLATION * np.hypot(source.sigma_m[inside], depth_scans.depth_noise(met[:, 2]))
-    return pose_optimization.Correspondences(
-        np.full(count, first),
-        np.full(count, second),
-        source.points_camera[inside],
-        met,
-        normal @ world_from_camera[second, :3, :3].T,
-        sigma,
-    )
+    direction = normal[good] @ world_from_camera[second, :3, :3].T
+    a, b = (np.full(len(inside), key) for key in (first, second))
+    return pose_optimization.Correspondences(a, b, source.points_camera[inside], met, direction, sigma)
 
 
 @dataclass(frozen=True)
@@ -110,8 +95,7 @@ class TrackMatches:
     def correspondences(
         self, world_from_camera: Float[np.ndarray, "key 4 4"]
     ) -> pose_optimization.Correspondences:
-        """Constrain the points across the second camera's viewing ray; along the ray depth is more
-        accurate."""
+        """Constrain the points across the second camera's ray; along it depth is more accurate."""
         ray = self.points_second / np.linalg.norm(self.points_second, axis=1, keepdims=True)
         sides = []
         for axis in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
@@ -135,17 +119,12 @@ def match_tracks(sparse: SparseModel, clip: Clip, key_of_view: Int[np.ndarray, "
     order = np.lexsort((sparse.observed_key, sparse.observed_point))
     order = order[np.isfinite(points[order, 0])]
     track = sparse.observed_point[order]
-    hops = [
-        np.stack([order[:-hop], order[hop:]], 1)[track[:-hop] == track[hop:]]
-        for hop in TRACK_HOPS
-        if len(order) > hop
-    ]
-    first, second = np.concatenate([np.zeros((0, 2), int), *hops]).T
+    hops = [np.stack([order[:-hop], order[hop:]], 1)[track[:-hop] == track[hop:]] for hop in TRACK_HOPS]
+    first, second = np.concatenate(hops).T
     focal = clip.intrinsics[sparse.frame[sparse.observed_key[second]], 0, 0]
-    first_key, second_key = key_of_view[sparse.observed_key[first]], key_of_view[sparse.observed_key[second]]
-    return TrackMatches(
-        first_key, second_key, points[first], points[second], PIXEL_SIGMA_PX * points[second, 2] / focal
-    )
+    sigma = PIXEL_SIGMA_PX * points[second, 2] / focal
+    first_key, second_key = (key_of_view[sparse.observed_key[each]] for each in (first, second))
+    return TrackMatches(first_key, second_key, points[first], points[second], sigma)
 
 
 def overlapping(
@@ -159,17 +138,13 @@ def overlapping(
         for second in range(len(keyframes)):
             local = rigid.apply(rigid.inverse(world_from_camera[second]) @ world_from_camera[first], points)
             pixel, z = cameras.project(local, keyframe.intrinsics)
-            inside = (
-                (z > NEAREST_M) & (pixel > 0).all(1) & (pixel < np.array(keyframe.depth.shape[::-1])).all(1)
-            )
+            inside = cameras.in_picture(pixel, z, keyframe.depth.shape, NEAREST_M)
             seen[second] = inside.mean() if len(points) else 0
         seen[first] = 0
         ranked = np.argsort(-seen, kind="stable")
         best = ranked[seen[ranked] > LEAST_OVERLAP]
-        chosen = set(best[:: max(1, len(best) // neighbours)][:neighbours].tolist()) | (
-            {first + 1} if first + 1 < len(keyframes) else set()
-        )
-        pairs += [(first, second) for second in sorted(chosen)]
+        chosen = {first + 1, *best[:: max(1, len(best) // neighbours)][:neighbours].tolist()}
+        pairs += [(first, second) for second in sorted(chosen) if second < len(keyframes)]
     return np.array(pairs).reshape(-1, 2)
 
 
@@ -191,22 +166,18 @@ def refine_keyframes(
             return correspondences
         return pose_optimization.Correspondences.join(correspondences, tracks.correspondences(poses))
 
-    fixed = np.arange(len(frames)) == 0
+    fixed, odometry = np.arange(len(frames)) == 0, odometry_factors(clip, frames)
     reach = tuple(np.geomspace(*REACH_M, config.rounds))
-    return pose_optimization.optimize_poses(
-        world_from_camera, find, odometry_factors(clip, frames), reach_m=reach, fixed=fixed
-    ).world_from_camera
+    found = pose_optimization.optimize_poses(world_from_camera, find, odometry, reach_m=reach, fixed=fixed)
+    return found.world_from_camera
 
 
 def odometry_factors(
     clip: Clip, frames: Int[np.ndarray, "key"]
 ) -> pose_optimization.RelativePoseFactors | None:
     """Return the odometry between neighbouring frames of a selection, None where there is none."""
-    if clip.odometry_from_camera is None:
+    odometry, time_s = clip.odometry_from_camera, clip.timestamp_s[frames]
+    if odometry is None:
         return None
-    return pose_optimization.odometry_factors(
-        clip.timestamp_s[frames],
-        clip.odometry_from_camera[frames],
-        drift_rad_s=DRIFT_RAD_S,
-        drift_m_s=DRIFT_M_S,
-    )
+    drift = dict(drift_rad_s=DRIFT_RAD_S, drift_m_s=DRIFT_M_S)
+    return pose_optimization.odometry_factors(time_s, odometry[frames], **drift)

@@ -1,7 +1,8 @@
-"""Structure from motion over keyframes of the walk-through with COLMAP, on one CPU thread and with fixed
-seeds.
+"""Structure from motion over keyframes of the walk-through, matches verified by depth.
 
 `choose_keyframes` subsamples the clip, `reconstruct` returns the largest model in its own scale, or None.
+A repeating rug matches one tile further on, at the wrong distance: `confirm` keeps the matches of each pair
+that one rigid motion of their depth points explains, and drops pairs that are few or contradict odometry.
 """
 
 import itertools
@@ -9,15 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Int
+from jaxtyping import Float, Int, Num
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
-from pipeline.geometry import rigid
+from pipeline.geometry import align, cameras, rigid
 from pipeline.mapping import colmap
 from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.build_scene_template.config import SfmConfig
-from stages.build_scene_template.matches import confirm
 
 KEYFRAME_M, KEYFRAME_DEG = 0.12, 9.0
 """A keyframe follows the last one after this much motion or turning, by odometry, metres and degrees."""
@@ -28,17 +28,26 @@ FIRST_OCTAVE = -1
 PEAK_THRESHOLD = 0.004
 """SIFT's contrast threshold; plain walls need a low one (COLMAP's default is 0.0067)."""
 LOOP_M, LOOP_DEG = 1.0, 35.0
-"""Loop candidates: keyframes this close by odometry (metres) whose axes differ by less than this
-(degrees)."""
+"""Loop candidates by odometry: keyframes this close, metres, whose axes differ by less, degrees."""
 FIRST_STEP, SECOND_STEP = 5, 3
 """Without odometry every fifth keyframe is matched with every third one."""
 LEAST_KEYFRAMES = 3
 """A smaller model is none."""
+AGREE_M = 0.06
+"""Matched depth points this close after one rigid motion agree, metres: twice the depth noise at 4 m."""
+LEAST_SHARE, LEAST_MATCHES = 0.5, 8
+"""Share and number of the matches with depth that must agree."""
+MOST_DEG, MOST_M = 6.0, 0.3
+"""The motion may differ by this much from the odometry's, degrees and metres: drift, not another tile."""
+RANSAC_TRIPLETS = 80
+LEAST_SIDE_M = 0.15
+"""Least side of a RANSAC triplet, metres."""
+NEAREST_M = 0.1
+"""Depth below this is none, metres."""
 
 
 def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
-    """Subsample a clip by its odometry's motion, or by time where there is none; always fewer than the
-    bound."""
+    """Subsample a clip by its odometry's motion, or by time where there is none; fewer than the bound."""
     if clip.odometry_from_camera is None:
         progress = clip.timestamp_s / KEYFRAME_S
     else:
@@ -56,8 +65,7 @@ def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
 def choose_pairs(
     clip: Clip, keyframes: Int[np.ndarray, "key"], config: SfmConfig
 ) -> Int[np.ndarray, "pair 2"]:
-    """Pair each keyframe with its successors, and with loop candidates by odometry (without it, with a coarse
-    grid)."""
+    """Pair each keyframe with successors and with loop candidates by odometry, or a coarse grid without."""
     count = len(keyframes)
     first, second = np.triu_indices(count, 1)
     chosen = second - first <= config.overlap
@@ -66,16 +74,12 @@ def choose_pairs(
     else:
         pose = clip.odometry_from_camera[keyframes]
         near = np.linalg.norm(pose[first, :3, 3] - pose[second, :3, 3], axis=1) / LOOP_M
-        near = np.maximum(
-            near,
-            np.arccos(np.clip((pose[first, :3, 2] * pose[second, :3, 2]).sum(1), -1, 1))
-            / np.deg2rad(LOOP_DEG),
-        )
+        turned = np.arccos(np.clip((pose[first, :3, 2] * pose[second, :3, 2]).sum(1), -1, 1))
+        near = np.maximum(near, turned / np.deg2rad(LOOP_DEG))
         for key in range(count):
             candidates = np.flatnonzero((first == key) & ~chosen & (near < 1))
-            chosen[candidates[np.argsort(near[candidates], kind="stable")[: config.loops_per_keyframe]]] = (
-                True
-            )
+            order = np.argsort(near[candidates], kind="stable")
+            chosen[candidates[order[: config.loops_per_keyframe]]] = True
     return np.stack([first[chosen], second[chosen]], axis=1)
 
 
@@ -85,11 +89,7 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
     keyframes = choose_keyframes(clip, config)
     names = [f"{frame:06d}.jpg" for frame in keyframes]
     database, pictures = workspace / "database.db", clip.folder / "color"
-    sift = {
-        "max_num_features": config.features,
-        "first_octave": FIRST_OCTAVE,
-        "peak_threshold": PEAK_THRESHOLD,
-    }
+    sift = dict(max_num_features=config.features, first_octave=FIRST_OCTAVE, peak_threshold=PEAK_THRESHOLD)
     colmap.extract(database, pictures, names, colmap.pinhole(np.median(clip.intrinsics, axis=0)), sift)
     colmap.match(database, ((names[a], names[b]) for a, b in choose_pairs(clip, keyframes, config)), seed)
     confirmed, pairs = confirm(clip, database, np.random.default_rng(seed))
@@ -99,3 +99,61 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
         return None
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     return read_sparse_model(largest) if largest.num_reg_images() >= LEAST_KEYFRAMES else None
+
+
+def points_under(
+    clip: Clip, frame: int, pixel: Float[np.ndarray, "sample 2"]
+) -> Float[np.ndarray, "sample 3"]:
+    """Lift colour pixels by the depth under them to camera axes; NaN where unknown or of low confidence."""
+    depth, confidence = clip.depth(frame), clip.confidence(frame)
+    limit = np.array(clip.depth_size[::-1])
+    at = np.floor(pixel * limit / np.array(clip.color_size[::-1])).astype(int)
+    column, row = np.clip(at, 0, limit - 1).T
+    z = np.where(confidence[row, column] >= 1, depth[row, column], 0)
+    points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
+    return np.where((z > NEAREST_M)[:, None], points, np.nan)
+
+
+def confirm(clip: Clip, database: Path, rng: np.random.Generator) -> tuple[int, int]:
+    """Rewrite COLMAP's verified matches to those that depth confirms; return the pairs left, and all."""
+    with pycolmap.Database.open(database) as table:
+        frames = {image.image_id: int(image.name[:6]) for image in table.read_all_images()}
+        points = {
+            key: points_under(clip, frame, table.read_keypoints(key)[:, :2].astype(float))
+            for key, frame in frames.items()
+        }
+        pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
+        confirmed = 0
+        for pair in pairs:
+            geometry = table.read_two_view_geometry(*pair)
+            good = _confirmed(clip, frames, points, *pair, geometry.inlier_matches, rng)
+            table.delete_two_view_geometry(*pair)
+            if len(good):
+                geometry.inlier_matches = good
+                table.write_two_view_geometry(*pair, geometry)
+                confirmed += 1
+    return confirmed, len(pairs)
+
+
+def _confirmed(clip, frames, points, first, second, matches, rng) -> Num[np.ndarray, "match 2"]:
+    """Return the matches of a pair that depth confirms, none where the pair as a whole is not believed."""
+    if len(matches) == 0:
+        return matches
+    source, target = points[second][matches[:, 1]], points[first][matches[:, 0]]
+    known = np.isfinite(source[:, 0]) & np.isfinite(target[:, 0])
+    if known.sum() < LEAST_MATCHES:
+        return matches[:0]
+    first_from_second, inlier = align.ransac_rigid(
+        source[known], target[known],
+        threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng, least_side_m=LEAST_SIDE_M,
+    )  # fmt: skip
+    if inlier.sum() < max(LEAST_MATCHES, LEAST_SHARE * known.sum()):
+        return matches[:0]
+    if clip.odometry_from_camera is not None:
+        odometry = clip.odometry_from_camera
+        expected = rigid.inverse(odometry[frames[first]]) @ odometry[frames[second]]
+        turned = np.rad2deg(rigid.rotation_angle(expected[:3, :3], first_from_second[:3, :3]))
+        if turned > MOST_DEG or np.linalg.norm(expected[:3, 3] - first_from_second[:3, 3]) > MOST_M:
+            return matches[:0]
+    known[known] = inlier
+    return matches[known]

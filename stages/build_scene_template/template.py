@@ -49,28 +49,19 @@ class SceneTemplate:
 def build(
     clip: Clip, features: Float[np.ndarray, "frame height width channel"], config: Config, workspace: Path
 ) -> tuple[SceneTemplate, SparseModel | None]:
-    """Build the template; the sparse model comes back in the world, ready to be written. Raises InputError
-    MAP-001 and MAP-002.
-    """
+    """Build the template; return SfM's model too. Raises InputError MAP-001, MAP-002, MAP-003, MAP-005."""
     sparse = sfm.reconstruct(clip, config.sfm, workspace, config.seed)
     frames = sfm.choose_keyframes(clip, config.sfm)
     keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
     start = anchor.choose_start(clip, frames, keyframes, sparse)
     if start is None:
-        raise InputError(
-            "MAP-001",
-            "the walk-through has no odometry, and COLMAP found no metric model in it",
-            str(clip.folder),
-            "record a slower walk-through in better light",
-        )
-    log(
-        f"start from {start.source}{': ' + start.reason if start.reason else ''}; "
-        f"{len(start.registered)} of {len(frames)} keyframes in the model"
-    )
+        what = "the walk-through has no odometry, and COLMAP found no metric model in it"
+        raise InputError("MAP-001", what, str(clip.folder), "record a slower walk-through in better light")
+    why = f": {start.reason}" if start.reason else ""
+    log(f"start from {start.source}{why}; {len(start.registered)} of {len(frames)} keyframes in the model")
+    keys = start.world_from_camera[frames]
     trusted = sparse if start.source == "colmap" else None
-    keys = refine.refine_keyframes(
-        clip, frames, keyframes, start.world_from_camera[frames], trusted, config.refinement
-    )
+    keys = refine.refine_keyframes(clip, frames, keyframes, keys, trusted, config.refinement)
     poses = anchor.propagate(clip, frames, keys)
     points, normals = _measured(keyframes, keys)
     if len(points) < LEAST_POINTS:
@@ -80,9 +71,8 @@ def build(
     if len(mesh.faces) < LEAST_POINTS:
         raise _no_surface(clip)
     poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion)
-    mesh = fuse.clean(
-        fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion), workspace, config.fusion.island_faces
-    )
+    mesh = fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion)
+    mesh = fuse.clean(mesh, workspace, config.fusion.island_faces)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
     made = SceneTemplate(
         mesh=mesh,
@@ -100,9 +90,7 @@ def build(
     return made, sparse
 
 
-def _measured(
-    keyframes: list[refine.Keyframe], world_from_camera: Float[np.ndarray, "key 4 4"]
-) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, "point 3"]]:
+def _measured(keyframes, world_from_camera):
     """Return the keyframes' measured points that have a normal, and the normals, in the world."""
     pairs = list(zip(keyframes, world_from_camera, strict=True))
     normals = np.concatenate([k.normals.reshape(-1, 3)[k.scan.pixel_index] @ p[:3, :3].T for k, p in pairs])
@@ -112,12 +100,8 @@ def _measured(
 
 
 def _no_surface(clip: Clip) -> InputError:
-    return InputError(
-        "MAP-002",
-        "depth fused to no surface",
-        str(clip.folder),
-        "check that the recording has LiDAR depth within 4 m",
-    )
+    remedy = "check that the recording has LiDAR depth within 4 m"
+    return InputError("MAP-002", "depth fused to no surface", str(clip.folder), remedy)
 
 
 def floor_height(mesh: Mesh) -> float:
@@ -131,15 +115,13 @@ def floor_height(mesh: Mesh) -> float:
 def write_model(
     sparse: SparseModel | None, world_from_camera: Float[np.ndarray, "frame 4 4"], folder: Path
 ) -> None:
-    """Write COLMAP's model as text, moved into the world by the similarity that best takes its camera centres
-    there."""
+    """Write COLMAP's model as text, moved into the world by the best similarity of its camera centres."""
     folder.mkdir()
     if sparse is None:
         (folder / "README.txt").write_text("COLMAP found no model in this walk-through.\n")
         return
-    world_from_model = pycolmap.estimate_sim3d(
-        sparse.model_from_camera[:, :3, 3], world_from_camera[sparse.frame][:, :3, 3]
-    )
+    centres = sparse.model_from_camera[:, :3, 3], world_from_camera[sparse.frame][:, :3, 3]
+    world_from_model = pycolmap.estimate_sim3d(*centres)
     if world_from_model is not None:
         sparse.reconstruction.transform(world_from_model)
     sparse.reconstruction.write_text(folder)

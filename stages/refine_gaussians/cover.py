@@ -1,4 +1,4 @@
-"""Cover the reconstruction's surfaces with Gaussians, in the colors of the pictures.
+"""Cover the reconstruction's surfaces with Gaussians, in the colors of the pictures (`splats`).
 
 `sample_surfaces` puts many points on the surface that all videos share and on what single videos saw
 elsewhere (a chair that is moved between sessions). `observe` projects them into some pictures of every video
@@ -8,19 +8,21 @@ of them where colors change fast and where cameras looked: there a coarse cover 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from pipeline.data import ply
 from pipeline.data.clips import usable_depth
-from pipeline.fields import gaussians, marching_cubes
+from pipeline.fields import fields, gaussians, marching_cubes
 from pipeline.fields.fields import Field
-from pipeline.fields.gaussians import Gaussians, SurfaceSamples
+from pipeline.fields.gaussians import Gaussians, Splats, SurfaceSamples
 from pipeline.geometry import cameras, rigid
-from stages.refine_gaussians.refine import Sequence4D, usable_frames
-from stages.refine_gaussians.views import AGENT, UNKNOWN
+from stages.refine_gaussians.config import GaussianCounts
+from stages.refine_gaussians.views import AGENT, UNKNOWN, DrawnVideo
 
 CANDIDATES = 6
 """points that are sampled for each that is kept"""
@@ -73,23 +75,40 @@ class CoveredScene:
     """each video's exposure"""
 
 
+def splats(
+    reconstruction: Path,
+    counts: GaussianCounts,
+    videos: Sequence[DrawnVideo],
+    frames: int,
+    rng: np.random.Generator,
+) -> Splats:
+    """Cover a reconstruction; the agent's Gaussians take their skinning weights from its body."""
+    loaded = fields.load(reconstruction)
+    codes = [loaded.video_code(video.id) for video in videos if video.appearance is not None]
+    room = scene(loaded.scene, codes, counts.scene, videos, frames, rng)
+    agent = gaussians.from_mesh(ply.read_ply(reconstruction / "agent.ply"), counts.agent, rng)
+    with torch.no_grad():
+        weights = loaded.body.weights(agent.means)
+    rest, stands = loaded.body.agent_from_bone_rest, torch.from_numpy(room.stands)
+    made = Splats(room.gaussians, agent, weights, rest, len(codes), stands)
+    made.appearance.data.copy_(torch.from_numpy(room.appearance))
+    return made
+
+
 def scene(
     field: Field,
     codes: Sequence[int],
     number: int,
-    sequences: Sequence[Sequence4D],
+    videos: Sequence[DrawnVideo],
     frames: int,
     rng: np.random.Generator,
 ) -> CoveredScene:
-    """Cover the shared scene and what single videos saw; ``codes`` are the videos' in the field, ``frames``
-    as in the recipe.
-    """
+    """Cover the shared scene and what single videos saw, with colors of about ``frames`` pictures."""
     points, layer, stands = sample_surfaces(field, codes, CANDIDATES * number, rng)
-    seen = observe(points, stands, sequences, frames)
+    seen = observe(points, stands, videos, frames)
     chosen, spacing_m = subsample(points.points, layer, seen, number, rng)
-    cloud = gaussians.surface_gaussians(
-        points.points[chosen], points.normal[chosen], seen.color[chosen], spacing_m
-    )
+    surface = points.points[chosen], points.normal[chosen], seen.color[chosen]
+    cloud = gaussians.surface_gaussians(*surface, spacing_m)
     return CoveredScene(cloud, stands[:, chosen], seen.appearance)
 
 
@@ -124,22 +143,17 @@ def sample_surfaces(
 
 
 def observe(
-    samples: SurfaceSamples,
-    stands: Bool[np.ndarray, "row point"],
-    sequences: Sequence[Sequence4D],
-    frames: int,
+    samples: SurfaceSamples, stands: Bool[np.ndarray, "row point"], videos: Sequence[DrawnVideo], frames: int
 ) -> ObservedColors:
-    """Average the pictures' colors at points; each video's exposure is fitted to the colors that the points
-    have.
-    """
+    """Average the pictures' colors at points; fit each video's exposure to the colors that points have."""
     points, color = samples.points, samples.color
-    videos = [sequence for sequence in sequences if sequence.video is not None]
+    videos = [video for video in videos if video.appearance is not None]
     total, appearance = np.zeros_like(color), np.tile(np.eye(3, 4), (len(videos), 1, 1))
     weight, through = np.zeros(len(points)), np.zeros(len(points))
-    every = max(1, sum(len(usable_frames(sequence)) for sequence in videos) // frames)
-    for sequence in videos:
+    every = max(1, sum(len(video.usable_frames()) for video in videos) // frames)
+    for video in videos:
         sums, weights = np.zeros_like(color), np.zeros(len(points))
-        for look in _looks(samples, stands[sequence.video], sequence, every):
+        for look in _looks(samples, stands[video.appearance], video, every):
             sums[look.shown] += look.shown_weight[:, None] * look.color
             weights[look.shown] += look.shown_weight
             through[look.through] += look.through_weight
@@ -148,7 +162,7 @@ def observe(
             continue
         mean = sums[shown] / weights[shown, None]
         ours = exposure(color[shown], mean, weights[shown])
-        appearance[sequence.video] = ours
+        appearance[video.appearance] = ours
         total[shown] += weights[shown, None] * ((mean - ours[:, 3]) @ np.linalg.inv(ours[:, :3]).T)
         weight += weights
     mean = np.clip(total / np.maximum(weight, 1e-9)[:, None], 0, 1)
@@ -178,19 +192,16 @@ class _Look:
     through_weight: Float[np.ndarray, "through"]
 
 
-def _looks(samples: SurfaceSamples, stands: np.ndarray, sequence: Sequence4D, every: int) -> Iterator[_Look]:
+def _looks(samples: SurfaceSamples, stands: np.ndarray, video: DrawnVideo, every: int) -> Iterator[_Look]:
     """Project the points of a video into some of its frames; back faces and the animal's pixels show none."""
-    clip, masks = sequence.recording.clip, sequence.recording.masks
-    homogeneous = np.concatenate([samples.points, np.ones((len(samples.points), 1))], axis=1).astype(
-        np.float32
-    )
-    for frame in usable_frames(sequence)[::every]:
-        world_from_camera = sequence.motion.world_from_camera[frame]
+    clip, masks = video.clip, video.masks
+    homogeneous = np.pad(samples.points, ((0, 0), (0, 1)), constant_values=1).astype(np.float32)
+    for frame in video.usable_frames()[::every]:
+        world_from_camera = video.motion.world_from_camera[frame]
         points_camera = homogeneous @ rigid.inverse(world_from_camera)[:3].T.astype(np.float32)
         ahead = np.flatnonzero(stands & (points_camera[:, 2] > NEAREST_M))
         pixel, z = cameras.project(points_camera[ahead], clip.intrinsics[frame])
-        height, width = clip.color_size
-        inside = (pixel >= 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+        (height, width), inside = clip.color_size, cameras.in_picture(pixel, z, clip.color_size)
         index, z, (column, row) = ahead[inside], z[inside], pixel[inside].astype(int).T
         depth = usable_depth(clip, frame)
         measured = depth[row * depth.shape[0] // height, column * depth.shape[1] // width]
@@ -231,10 +242,10 @@ def subsample(
     chosen = order[np.flatnonzero(np.diff(np.floor(steps), prepend=np.floor(steps[0] - share[order[0]])) > 0)]
     fourth_m = np.empty(len(chosen))
     for one in np.unique(layer[chosen]):
-        here = points[chosen[layer[chosen] == one]]
-        fourth_m[layer[chosen] == one] = (
-            KDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0].reshape(len(here), -1)[:, -1]
-        )
+        own = layer[chosen] == one
+        here = points[chosen[own]]
+        distance_m = KDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0]
+        fourth_m[own] = distance_m.reshape(len(here), -1)[:, -1]
     return chosen, np.clip(fourth_m, LEAST_SPACING_M, np.quantile(fourth_m, WIDEST))
 
 

@@ -10,40 +10,33 @@ from jaxtyping import UInt8
 from pipeline.core.training import FitRecord
 from pipeline.data import plots, qa
 from pipeline.fields.gaussians import render
-from stages.refine_gaussians.refine import FrameLoss, Sequence4D, usable_frames
-from stages.refine_gaussians.views import drawn_size, read
+from stages.refine_gaussians.refine import FrameLoss
+from stages.refine_gaussians.views import DrawnVideo, read
 
 
-def report_quality(folder: Path, loss: FrameLoss, sequences: Sequence[Sequence4D], record: FitRecord) -> None:
+def report_quality(folder: Path, loss: FrameLoss, videos: Sequence[DrawnVideo], record: FitRecord) -> None:
     """Write qa.json: PSNR over a few frames of every session, pictures of them."""
     rows, psnrs = [], []
-    for sequence in sequences:
-        if sequence.video is None or sequence.recording.masks is None:
+    for video in videos:
+        if video.appearance is None or video.masks is None:
             continue
-        frames = usable_frames(sequence)
+        frames = video.usable_frames()
         for frame in frames[:: max(1, len(frames) // 3)][:3]:
-            image, psnr = compare(loss, sequence, frame)
+            image, psnr = compare(loss, video, frame)
             psnrs.append(psnr)
             rows.append(image)
     color = record.terms.get("color", np.array([np.nan]))
     window = max(1, len(color) // 10)
+    psnr = float(np.mean(psnrs)) if psnrs else None
+    ratio = float(np.nanmean(color[-window:]) / np.nanmean(color[:window]))
     checks = [
-        qa.Check(
-            "PSNR of drawn training frames", float(np.mean(psnrs)) if psnrs else None, "dB", 20, 15, "higher"
-        ),
-        qa.Check(
-            "color error of the last tenth against the first",
-            float(np.nanmean(color[-window:]) / np.nanmean(color[:window])),
-            "ratio",
-            1.0,
-            1.3,
-        ),
+        qa.Check("PSNR of drawn training frames", psnr, "dB", 20, 15, "higher"),
+        qa.Check("color error of the last tenth against the first", ratio, "ratio", 1.0, 1.3),
     ]
-    pictures = (
-        [qa.Picture("frames", plots.grid(rows[:6], 1), "picture, Gaussians, depth, the agent's share")]
-        if rows
-        else []
-    )
+    pictures = []
+    if rows:
+        shown = plots.grid(rows[:6], 1)
+        pictures = [qa.Picture("frames", shown, "picture, Gaussians, depth, the agent's share")]
     qa.write(
         folder,
         good="sharper pictures than the fields give, an agent of its own",
@@ -55,13 +48,13 @@ def report_quality(folder: Path, loss: FrameLoss, sequences: Sequence[Sequence4D
 
 @torch.no_grad()
 def compare(
-    loss: FrameLoss, sequence: Sequence4D, frame: int
+    loss: FrameLoss, video: DrawnVideo, frame: int
 ) -> tuple[UInt8[np.ndarray, "height width 3"], float]:
     """Draw one frame beside its picture; return the row of pictures and the PSNR."""
-    size = drawn_size(sequence.recording, loss.long_side_px)
-    target = read(sequence.recording, frame, size, loss.device)
-    camera = loss.camera(sequence, frame)
-    cloud = loss.cloud(sequence, frame, camera, target)
+    size = video.drawn_size(loss.long_side_px)
+    target = read(video, frame, size, loss.device)
+    camera = loss.camera(video, frame)
+    cloud = loss.cloud(video, frame, camera, target)
     view = render(cloud, camera, target.intrinsics, *size, backend=loss.backend)
     error = (view.color.clamp(0, 1) - target.color).square().mean()
     depth = plots.depth_colors(view.depth.cpu().numpy())

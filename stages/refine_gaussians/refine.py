@@ -5,7 +5,7 @@ Of several processes (`pipeline.core.distributed`) each draws a frame of its own
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,10 @@ from pipeline.fields.gaussians import Cloud, Splats, concatenate, render
 from pipeline.fields.rasterize import Backend, in_view
 from pipeline.geometry import cameras, rigid_torch
 from stages.refine_gaussians.config import GaussianWeights
-from stages.refine_gaussians.views import DrawnRecording, Target, drawn_size, flow_lattice, read
+from stages.refine_gaussians.views import DrawnVideo, Target, flow_lattice, read
 
 RATES = {"means": 5e-4, "rotation": 2e-3, "log_scale": 1e-2, "opacity_logit": 3e-2, "band0": 1e-2}
-"""learning rates of Adam: metres, quaternions, logarithms of metres, logits, coefficients of the constant
-harmonic; all fall to a tenth"""
+"""learning rates of Adam: metres, quaternions, logarithms of metres, logits, coefficients of harmonics"""
 EXPOSURE_RATE, MOTION_RATE = 2e-3, 3e-4
 """of each video's exposure, and of root and bones, metres and radians"""
 BETA2 = 0.99
@@ -39,18 +38,6 @@ MOST_FLOW_PX = 100.0
 """rendered flow is clamped to this, drawn pixels: points at the camera's side project anywhere"""
 MOST_FLOW_LOSS, LEAST_COVERAGE = 4.0, 0.5
 """flow errors saturate, and count where the Gaussians cover so much of a pixel"""
-
-
-@dataclass(frozen=True)
-class Sequence4D:
-    """One video with its motion on the frame axis of all videos."""
-
-    recording: DrawnRecording
-    motion: Motion
-    first: int
-    """index of its first frame"""
-    video: int | None
-    """index of its appearance; None: the turnaround, whose world is the agent"""
 
 
 class MotionDeltas(nn.Module):
@@ -79,146 +66,114 @@ class FrameLoss:
         self,
         splats: Splats,
         deltas: MotionDeltas,
-        sequences: Sequence[Sequence4D],
+        videos: Sequence[DrawnVideo],
         weights: GaussianWeights,
         long_side_px: int,
         backend: Backend,
     ):
-        self.splats, self.deltas, self.sequences = splats, deltas, sequences
+        self.splats, self.deltas, self.videos = splats, deltas, videos
         self.weights, self.long_side_px = weights, long_side_px
         self.backend: Backend = backend
         self.device = str(splats.appearance.device)
-        self.frames = [(s, f) for s, sequence in enumerate(sequences) for f in usable_frames(sequence)]
+        self.frames = [(video, frame) for video in videos for frame in video.usable_frames()]
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
-        number, frame = self.frames[int(torch.randint(len(self.frames), (1,), generator=generator))]
-        sequence = self.sequences[number]
-        size = drawn_size(sequence.recording, self.long_side_px)
-        target = read(sequence.recording, frame, size, self.device)
-        camera = self.camera(sequence, frame)
-        cloud = self.cloud(sequence, frame, camera, target)
-        later = self._later_pixels(sequence, frame, target, cloud)
+        video, frame = self.frames[int(torch.randint(len(self.frames), (1,), generator=generator))]
+        size = video.drawn_size(self.long_side_px)
+        target = read(video, frame, size, self.device)
+        camera = self.camera(video, frame)
+        cloud = self.cloud(video, frame, camera, target)
+        later = self._later_pixels(video, frame, target, cloud)
         view = render(cloud, camera, target.intrinsics, *size, backend=self.backend, extra=later)
         room = torch.ones_like(target.agent) if cloud.agent.any() else ~target.agent
-        everywhere = room if sequence.video is not None else target.agent
+        everywhere = room if video.appearance is not None else target.agent
         measured = (target.depth > 0) & everywhere
         weights, terms = self.weights, {}
         behind = torch.rand(3, generator=generator).to(self.device)
         color = view.color + (1 - view.coverage)[..., None] * behind
         terms["color"] = weights.color * (color - target.color).abs().mean(-1)[everywhere & target.known]
-        terms["depth"] = (
-            weights.depth * ((view.depth - target.depth).abs() / DEPTH_UNIT_M).clamp_max(1)[measured]
-        )
+        depth_error = ((view.depth - target.depth).abs() / DEPTH_UNIT_M).clamp_max(1)
+        terms["depth"] = weights.depth * depth_error[measured]
         terms["silhouette"] = weights.silhouette * (view.agent - target.agent.float()).abs()[target.known]
         if later is not None:
-            terms["flow"] = weights.flow * self._flow_errors(
-                sequence, target, view.extra, view.coverage, everywhere
-            )
+            errors = self._flow_errors(video, target, view.extra, view.coverage, everywhere)
+            terms["flow"] = weights.flow * errors
         elif distributed.size() > 1:  # all processes have the same terms
             terms["flow"] = torch.zeros(1, device=self.device)
-        index = sequence.first + frame
+        index = video.first + frame
         correction = torch.cat([self.deltas.root[index : index + 1], self.deltas.bone[index]])
         terms["motion"] = weights.motion * (correction / MOTION_UNIT).square()
         return {name: values.mean() if values.numel() else values.sum() for name, values in terms.items()}
 
     def cloud(
-        self, sequence: Sequence4D, frame: int, camera_from_world: Float[Tensor, "4 4"], target: Target
+        self, video: DrawnVideo, frame: int, camera_from_world: Float[Tensor, "4 4"], target: Target
     ) -> Cloud:
         """Return the Gaussians in view of one frame's camera."""
         parts = []
-        if sequence.video is not None:
+        if video.appearance is not None:
             scene = self.splats.scene
-            seen = in_view(
-                scene.means, scene.log_scale, camera_from_world, target.intrinsics, *target.depth.shape
-            )
-            parts.append(self.splats.place_scene(sequence.video, seen))
-        if sequence.video is None or self._shows_agent(sequence, frame, camera_from_world, target):
-            parts.append(self.splats.place_agent(*self._pose(sequence, frame), sequence.video))
+            height, width = target.depth.shape
+            camera = camera_from_world, target.intrinsics, height, width
+            seen = in_view(scene.means, scene.log_scale, *camera)
+            parts.append(self.splats.place_scene(video.appearance, seen))
+        if video.appearance is None or self._shows_agent(video, frame, camera_from_world, target):
+            parts.append(self.splats.place_agent(*self._pose(video, frame), video.appearance))
         return concatenate(*parts)
 
-    def _shows_agent(
-        self, sequence: Sequence4D, frame: int, camera_from_world: Tensor, target: Target
-    ) -> bool:
+    def _shows_agent(self, video: DrawnVideo, frame: int, camera_from_world: Tensor, target: Target) -> bool:
         """Return whether the agent's pose is known and its bounding ball is in view."""
-        if not sequence.motion.agent_known[frame]:
+        if not video.motion.agent_known[frame]:
             return False
-        root = torch.from_numpy(sequence.motion.world_from_agent[frame]).float().to(self.device)
+        root = torch.from_numpy(video.motion.world_from_agent[frame]).float().to(self.device)
         radius = self.splats.agent.means.detach().norm(dim=-1).amax() / REACH
         centre = root[None, :3, 3]
-        return (
-            len(
-                in_view(
-                    centre,
-                    radius.log().expand(1, 3),
-                    camera_from_world,
-                    target.intrinsics,
-                    *target.depth.shape,
-                )
-            )
-            > 0
-        )
+        size = radius.log().expand(1, 3)
+        seen = in_view(centre, size, camera_from_world, target.intrinsics, *target.depth.shape)
+        return len(seen) > 0
 
-    def _pose(self, sequence: Sequence4D, frame: int) -> tuple[Tensor, Tensor]:
+    def _pose(self, video: DrawnVideo, frame: int) -> tuple[Tensor, Tensor]:
         root, bones = (
             torch.from_numpy(a[frame]).float().to(self.device)
-            for a in (sequence.motion.world_from_agent, sequence.motion.agent_from_bone)
+            for a in (video.motion.world_from_agent, video.motion.agent_from_bone)
         )
-        return self.deltas.apply(root, bones, sequence.first + frame)
+        return self.deltas.apply(root, bones, video.first + frame)
 
-    def camera(self, sequence: Sequence4D, frame: int) -> Float[Tensor, "4 4"]:
+    def camera(self, video: DrawnVideo, frame: int) -> Float[Tensor, "4 4"]:
         """Return ``camera_from_world`` of one frame."""
-        return (
-            torch.from_numpy(np.linalg.inv(sequence.motion.world_from_camera[frame])).float().to(self.device)
-        )
+        camera_from_world = np.linalg.inv(video.motion.world_from_camera[frame])
+        return torch.from_numpy(camera_from_world).float().to(self.device)
 
-    def _later_pixels(self, sequence: Sequence4D, frame: int, target: Target, cloud: Cloud) -> Tensor | None:
+    def _later_pixels(self, video: DrawnVideo, frame: int, target: Target, cloud: Cloud) -> Tensor | None:
         """Return where each Gaussian is seen one frame later, in drawn pixels from where it is now."""
-        motion, later = sequence.motion, frame + 1
-        if (
-            target.flow_px is None
-            or later >= len(motion.timestamp_s)
-            or not np.isfinite(motion.world_from_camera[later]).all()
-        ):
+        motion, later = video.motion, frame + 1
+        if target.flow_px is None or later >= len(motion.timestamp_s):
+            return None
+        if not np.isfinite(motion.world_from_camera[later]).all():
             return None
         means = cloud.means
         if cloud.agent.any():
             if not motion.agent_known[later]:
                 return None
-            moved = self.splats.place_agent(*self._pose(sequence, later), sequence.video).means
+            moved = self.splats.place_agent(*self._pose(video, later), video.appearance).means
             means = torch.cat([cloud.means[: len(cloud.means) - len(moved)], moved])
-        now = cameras.project(
-            rigid_torch.apply(self.camera(sequence, frame), cloud.means), target.intrinsics
-        )[0]
-        then = cameras.project(rigid_torch.apply(self.camera(sequence, later), means), target.intrinsics)[0]
+        now, then = (
+            cameras.project(rigid_torch.apply(self.camera(video, at), points), target.intrinsics)[0]
+            for at, points in ((frame, cloud.means), (later, means))
+        )
         return (then - now).clamp(-MOST_FLOW_PX, MOST_FLOW_PX)
 
     def _flow_errors(
-        self, sequence: Sequence4D, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor
+        self, video: DrawnVideo, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor
     ) -> Tensor:
         assert target.flow_px is not None and target.flow_confidence is not None, "a frame without flow"
         rows, columns = target.flow_confidence.shape
         height, width = target.color.shape[:2]
-        lattice = flow_lattice(rows, columns, sequence.recording.clip.color_size, (height, width))
+        lattice = flow_lattice(rows, columns, video.clip.color_size, (height, width))
         row, column = (index.to(self.device) for index in lattice)
         found = drawn[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
-        error = (
-            functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0)
-            .sum(-1)
-            .clamp_max(MOST_FLOW_LOSS)
-        )
-        return (error * target.flow_confidence)[
-            (coverage[row, column] > LEAST_COVERAGE) & everywhere[row, column]
-        ]
-
-
-def usable_frames(sequence: Sequence4D) -> list[int]:
-    """Return the frames whose camera is known, and for the turnaround also the agent's mask."""
-    good = np.all(np.isfinite(sequence.motion.world_from_camera), axis=(1, 2))
-    if sequence.video is None:
-        assert sequence.recording.masks is not None, "the turnaround has masks"
-        rooted = np.all(np.isfinite(sequence.motion.world_from_agent), axis=(1, 2))
-        good &= rooted & sequence.recording.masks.visible
-    return np.flatnonzero(good).tolist()
+        error = functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0).sum(-1)
+        counted = (coverage[row, column] > LEAST_COVERAGE) & everywhere[row, column]
+        return (error.clamp_max(MOST_FLOW_LOSS) * target.flow_confidence)[counted]
 
 
 def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_every: int) -> FitRecord:
@@ -248,17 +203,8 @@ def refined(motion: Motion, deltas: MotionDeltas, first: int) -> Motion:
     """Return one video's motion with its corrections."""
     frame = torch.arange(first, first + len(motion.timestamp_s))
     device = deltas.root.device
-    root, bones = (
-        torch.from_numpy(array).to(device)
-        for array in (motion.world_from_agent.astype(np.float64), motion.agent_from_bone.astype(np.float64))
-    )
+    poses = (motion.world_from_agent, motion.agent_from_bone)
+    root, bones = (torch.from_numpy(array.astype(np.float64)).to(device) for array in poses)
     root, bones = deltas.double().apply(root, bones, frame.to(device))
     deltas.float()
-    return Motion(
-        motion.timestamp_s,
-        motion.world_from_camera,
-        root.cpu().numpy(),
-        bones.cpu().numpy(),
-        motion.confidence,
-        motion.agent_visible,
-    )
+    return replace(motion, world_from_agent=root.cpu().numpy(), agent_from_bone=bones.cpu().numpy())

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
-from stages.build_agent_template.bones import lay_bones
-from stages.build_agent_template.carve import Silhouettes
+from stages.build_agent_template.canonical import lay_bones
 from stages.build_agent_template.config import Config
+from stages.build_agent_template.fuse import Silhouettes
 from stages.build_agent_template.poses import depth_labels, walk_around
 from stages.build_agent_template.template import build
 

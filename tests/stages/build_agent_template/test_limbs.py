@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.geometry.tsdf import Volume
 from stages.build_agent_template import appearance
-from stages.build_agent_template.limbs import find_limb, space_of
+from stages.build_agent_template.fuse import find_limb, space_of
 
 CELLS = np.stack(np.meshgrid(*[np.arange(-0.1, 0.101, 0.02)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 """of a still body, 20 cm wide"""

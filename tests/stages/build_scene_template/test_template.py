@@ -11,7 +11,7 @@ from pipeline.data import ply as mesh_files
 from pipeline.geometry import ground, rigid, tsdf
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.mapping.colmap import SparseModel
-from stages.build_scene_template import anchor, fuse, matches, refine, sfm, template
+from stages.build_scene_template import anchor, fuse, refine, sfm, template
 from stages.build_scene_template.config import Config, FusionConfig, RefinementConfig, SfmConfig
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
@@ -72,7 +72,7 @@ def test_wrong_structure_is_refuted_by_depth(clip):
     rows = np.arange(len(frames) * 40)
     key, pixel = rows % len(frames), np.random.default_rng(0).uniform(20, 100, (len(rows), 2))
     points = np.stack(
-        [matches.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)]
+        [sfm.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)]
     )
     world = np.stack([rigid.apply(bent[k], p[None])[0] for k, p in zip(key, points, strict=True)])
     sparse = SparseModel(frames, bent, world, rows, key, pixel, 0.5, None)
@@ -162,7 +162,7 @@ def test_false_matches_are_dropped_by_depth(clip, tmp_path):
         geometry.inlier_matches = wrong
         table.delete_two_view_geometry(*pairs[0])
         table.write_two_view_geometry(*pairs[0], geometry)
-    confirmed, all_pairs = matches.confirm(clip, tmp_path / "database.db", np.random.default_rng(0))
+    confirmed, all_pairs = sfm.confirm(clip, tmp_path / "database.db", np.random.default_rng(0))
     assert all_pairs == len(pairs)
     assert confirmed == len(pairs) - 1, "the scrambled pair goes, the others stay"
 

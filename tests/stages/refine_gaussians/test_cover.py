@@ -15,7 +15,7 @@ from pipeline.fields.fields import Field, FieldShape
 from pipeline.fields.fused_depth import NODES, FusedGeometry
 from pipeline.geometry.meshes import Mesh
 from stages.refine_gaussians import cover
-from stages.refine_gaussians.refine import Sequence4D
+from stages.refine_gaussians.views import DrawnVideo
 
 SIZE, FOCAL, WALL_M = (120, 160), 80.0, 1.5
 LIGHT = (1.0, 0.7)
@@ -30,7 +30,7 @@ def paint(points: np.ndarray) -> np.ndarray:
     return np.where(points[:, :1] < 0, 0.5, squares)
 
 
-def film(video: int) -> Sequence4D:
+def film(video: int) -> DrawnVideo:
     """Film the wall from its front, the camera a little aside in each frame."""
     intrinsics = np.array([[FOCAL, 0, 80], [0, FOCAL, 60], [0, 0, 1]])
     camera = np.tile(np.eye(4), (4, 1, 1))
@@ -55,7 +55,7 @@ def film(video: int) -> Sequence4D:
         np.ones(4),
         np.zeros(4, bool),
     )
-    return Sequence4D(SimpleNamespace(id=f"v{video}", clip=clip, masks=None), motion, 4 * video, video)
+    return DrawnVideo(f"v{video}", clip, None, None, motion, 4 * video, video)
 
 
 @pytest.fixture(scope="module")

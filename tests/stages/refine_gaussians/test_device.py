@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from pipeline.fields.gaussians import Splats
-from stages.refine_gaussians import refine, writing
+from stages.refine_gaussians import refine, stage
 from stages.refine_gaussians.config import GaussianWeights
-from stages.refine_gaussians.refine import FrameLoss, MotionDeltas, Sequence4D
-from stages.refine_gaussians.views import DrawnRecording
+from stages.refine_gaussians.refine import FrameLoss, MotionDeltas
+from stages.refine_gaussians.views import DrawnVideo
 from tests.simulated_device import DEVICE, is_on_device, simulated_device
 from tests.stages.refine_gaussians.test_cover import SIZE, film
 from tests.stages.refine_gaussians.test_splats import ball
@@ -21,16 +21,15 @@ class _Masks(list):
     visible = np.ones(4, bool)
 
 
-def session() -> Sequence4D:
+def session() -> DrawnVideo:
     """Return four frames of a wall with an animal of one bone before it, with masks and flow."""
     plain, root = film(0), np.tile(np.eye(4), (4, 1, 1))
     root[:, 2, 3] = 1.0
     masks = _Masks([np.where(np.indices(SIZE)[1] > 80, 255, 0).astype(np.uint8)] * 4)
     cells = (3, SIZE[0] // 4, SIZE[1] // 4)
     flow = np.zeros((*cells, 2), np.float16), np.full(cells, 255, np.uint8)
-    recording = DrawnRecording("v0", plain.recording.clip, masks, flow)
     motion = replace(plain.motion, world_from_agent=root, agent_from_bone=np.tile(np.eye(4), (4, 1, 1, 1)))
-    return replace(plain, recording=recording, motion=motion)
+    return replace(plain, masks=masks, flow=flow, motion=motion)
 
 
 def test_refinement_runs_on_another_device(tmp_path):
@@ -43,5 +42,5 @@ def test_refinement_runs_on_another_device(tmp_path):
         record = refine.refine(loss, 3, 0, tmp_path / "resume", 2)
         assert set(record.terms) == {"color", "depth", "silhouette", "flow", "motion"}
         assert np.isfinite(record.total()).all() and all(map(is_on_device, splats.parameters()))
-        writing.write(tmp_path, splats, deltas, [sequence])
+        stage.write(tmp_path, splats, deltas, [sequence])
     assert (tmp_path / "v0" / "motion.npz").exists() and (tmp_path / "scene.ply").exists()
