@@ -19,7 +19,6 @@ from pipeline.data import npz
 from stages.synthesize_capture import animal, dwellings, record3d, script, sheets, texture
 from stages.synthesize_capture.config import Config
 from stages.synthesize_capture.film import Stage
-from stages.synthesize_capture.record3d import Header
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.script import PhoneFormat
 
@@ -91,7 +90,8 @@ def film(out: Path, seed: int, seconds: float) -> None:
     plot = next(
         each for each in script.scripts(config, home(rng), PhoneFormat(fps=FPS)) if each.session is not None
     )
-    assert plot.motion is not None, "a session has an animal"
+    motion = plot.motions[0]
+    assert motion is not None, "a session has an animal"
     name, masks = f"session-{seed}", []
     (out / "recordings").mkdir(parents=True, exist_ok=True)
     (out / "truth").mkdir(exist_ok=True)
@@ -101,20 +101,14 @@ def film(out: Path, seed: int, seconds: float) -> None:
             writer.add(
                 frame.color, depth, np.where(depth > 0, np.maximum(frame.confidence, 1), 0).astype(np.uint8)
             )
-            masks.append(frame.mask)
-        writer.finish(
-            Header(
-                plot.timestamp_s, plot.intrinsics, plot.odometry_from_camera, plot.color_size,
-                plot.depth_size,
-                round(plot.fps),
-            )
-        )  # fmt: skip
+            masks.append(frame.masks[0])
+        writer.finish(plot)
     packed = np.packbits(np.stack(masks), axis=-1)
     npz.save(
         out / "truth" / f"{name}.npz", compress=True, timestamp_s=plot.timestamp_s, packed=packed,
         source_index=np.arange(len(masks)),
         shape=np.array([len(masks), *masks[0].shape]), world_from_camera=plot.world_from_camera,
-        world_from_agent=plot.motion.world_from_agent,
+        world_from_agent=motion.world_from_agent,
     )  # fmt: skip
     log(f"{name}: {len(masks)} frames, the animal in {np.mean([m.mean() > 0.001 for m in masks]):.0%}")
 

@@ -61,8 +61,7 @@ def depth_of(
     world_from_camera: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "height width"]:
     """Return the depth of a body that stands at a point, its back ``back_m`` above, inside a mask; 0 outside
-    and where no ray meets it. Metres, world +y up.
-    """
+    and where no ray meets it. Metres, world +y up."""
     rows, columns = np.nonzero(mask)
     eye = world_from_camera[:3, 3]
     rays = (
@@ -85,8 +84,7 @@ def between(
     timestamp_s: Float[np.ndarray, "frame"], found: list[Contact | None], most_s: float
 ) -> Float[np.ndarray, "frame 3"]:
     """Return the contact of each frame; where it is not certain, one interpolated between certain ones at
-    most ``most_s`` away, NaN where there is none.
-    """
+    most ``most_s`` away, NaN where there is none."""
     certain = np.array([frame for frame, each in enumerate(found) if each is not None and each.certain], int)
     points = np.full((len(found), 3), np.nan)
     if not len(certain):

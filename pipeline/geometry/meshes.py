@@ -82,8 +82,7 @@ class RayCaster:
         directions: Float[np.ndarray, "ray 3"],
     ) -> Hits:
         """Return the first hit of each ray, from origins of its own or one of all, in the mesh's frame,
-        metres.
-        """
+        metres."""
         origins = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), np.float32)
         found = self._scene.run(origins, np.ascontiguousarray(directions, np.float32), output=True)
         hit = found["primID"] >= 0

@@ -17,8 +17,7 @@ CORNER_SHARE = 1e-4
 """added to the trilinear shares of corners: a point on one that has no color takes its neighbors'"""
 FREE_GAIN = 0.2
 """Weight of a ray that passes far in front of what it met, against one that ends here: rims and thin legs
-would be carved away.
-"""
+would be carved away."""
 
 
 class Volume:
@@ -46,8 +45,7 @@ class Volume:
         trust: Float[np.ndarray, "height width"] | None = None,
     ) -> None:
         """Add one frame; depth 0 is unknown and changes nothing. Near views weigh more (1 / depth squared),
-        times the trust (0..1).
-        """
+        times the trust (0..1)."""
         trust = np.ones(depth.shape, np.float32) if trust is None else np.ascontiguousarray(trust, np.float32)
         camera_from_world = rigid.inverse(world_from_camera)
         start = camera_from_world[:3, :3] @ self.origin + camera_from_world[:3, 3]

@@ -41,8 +41,7 @@ NEWTON_STEPS, RIDGE = 50, (1e-3, 5e-3)
 @dataclass(frozen=True)
 class Calibration:
     """P(within 2 deg and 5 cm; agent: 15 deg and 8 cm) = logistic(bias + slope * inlier ratio), fitted on
-    held-out renders.
-    """
+    held-out renders."""
 
     bias: float
     slope: float
@@ -167,8 +166,7 @@ class Localizer:
 
 def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample"]) -> Calibration:
     """Fit P(good) as a logistic curve of a score in 0..1 by Newton steps; one pseudo-observation at each end
-    and a ridge keep separable data finite.
-    """
+    and a ridge keep separable data finite."""
     x = np.concatenate([score, [0.0, 1.0]])
     y = np.concatenate([good.astype(float), [0.0, 1.0]])
     design = np.stack([np.ones_like(x), x], axis=1)

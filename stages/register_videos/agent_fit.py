@@ -129,8 +129,7 @@ def observe(
     standing: StandingSurface,
 ) -> AgentObservation | None:
     """Lift the masked depth to the world, without the mask's rim and without what lies far from the rest;
-    None if too little is left.
-    """
+    None if too little is left."""
     inside = mask == 255
     depth = clip.depth(frame)
     small = cv2.resize(inside.astype(np.uint8), depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -226,8 +225,7 @@ def fit_fine(
     tilt: bool,
 ) -> Float[np.ndarray, "pose 4 4"]:
     """Fit to convergence, standing on what is below and, since animals lie down and jump, wherever depth
-    says; return what costs less. With ``tilt`` the root may lean.
-    """
+    says; return what costs less. With ``tilt`` the root may lean."""
     reach, prior = np.full(rounds, REACH_M), TILT_SIGMA_RAD if tilt else UPRIGHT_SIGMA_RAD
     standing, free = (
         _fit(observation, model, world_from_agent, reach, prior, stands=stands) for stands in (True, False)

@@ -159,8 +159,7 @@ def smooth(
     smooth_s: float,
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Smooth visible roots by local linear regression on SE(3), weighted by closeness in time (``smooth_s``,
-    seconds), cost (metres) and visibility; twice, robustly.
-    """
+    seconds), cost (metres) and visibility; twice, robustly."""
     known = np.flatnonzero(np.isfinite(cost_m))
     result, time, best = world_from_agent.copy(), timestamp_s[known], np.nanmin(cost_m, initial=np.inf)
     low = np.searchsorted(time, time - SMOOTHING_REACH * smooth_s, side="right")

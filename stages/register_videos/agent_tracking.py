@@ -90,8 +90,7 @@ class Tracker:
         self, order: Int[np.ndarray, "seen"], stands: Bool[np.ndarray, "frame"]
     ) -> Iterator[tuple[int, PriorFit]]:
         """Predict each frame that does not stand from the one before it in ``order``; yield frames and their
-        fits, until one does not fit.
-        """
+        fits, until one does not fit."""
         before, pose, most, speed = 0, None, usual(self.cost_m) + LOST_M, self._speed(stands)
         for frame in order.tolist():
             elapsed = abs(float(self.timestamp_s[frame] - self.timestamp_s[before]))

@@ -55,8 +55,7 @@ class AlignedCameras:
     """Median distance of the static depth from the surface; NaN where nothing was in reach."""
     fit: Float[np.ndarray, "frame"]
     """Share of the static depth within 5 cm of the surface, of what lies within half a metre of it; NaN where
-    there is no static depth to measure.
-    """
+    there is no static depth to measure."""
 
     @property
     def median_gap_m(self) -> float:
@@ -155,8 +154,7 @@ def measure_fit(
 ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
     """Return each frame's median gap (metres) and the share of its depth within 5 cm of the surface, of that
     within 50 cm; NaN for frames that measured too few points, and no share at all where they lie nowhere
-    near.
-    """
+    near."""
     gap, fit = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
     for frame, scan in enumerate(scans):
         if len(scan.points_camera) >= MEASURABLE_POINTS:

@@ -111,8 +111,7 @@ def right_place(
     targets: Float[np.ndarray, "frame"], decoys: Float[np.ndarray, "decoy"], attempts: int
 ) -> Float[np.ndarray, "frame"]:
     """Return one minus the q-value: the least share of decoys over the share of targets that look at least so
-    much alike, of all limits that a frame passes; 0 where nothing can be compared.
-    """
+    much alike, of all limits that a frame passes; 0 where nothing can be compared."""
     decoys, known = decoys[np.isfinite(decoys)], np.flatnonzero(np.isfinite(targets))
     order = known[np.argsort(targets[known], kind="stable")]
     limit, found = targets[order], np.zeros(len(targets))
@@ -158,7 +157,6 @@ def averaged(
 
 def agent_confidence(roots: Roots) -> Float[np.ndarray, "frame"]:
     """Score each root 0..1: full for the video's usual fit in good view, less where it fits worse or little
-    is seen; 0 unseen.
-    """
+    is seen; 0 unseen."""
     worse = excess(roots.cost_m) / COST_SCALE_M
     return np.where(roots.visible, np.exp(-0.5 * worse**2) * np.minimum(roots.share / ENOUGH_SHARE, 1.0), 0.0)

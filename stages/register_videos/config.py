@@ -73,8 +73,7 @@ class Config:
 
     initialization: Literal["votes", "middle"] = "votes"
     """votes: localized frames place the recording; middle: it starts in the middle of the room with the
-    heading of its odometry, and is never refused (the ablation without a localizer).
-    """
+    heading of its odometry, and is never refused (the ablation without a localizer)."""
     odometry: Literal["device", "pictures"] = "device"
     """device: its own poses where the recording has them; pictures: visual odometry with depth, always."""
     vote: VoteConfig = field(default_factory=VoteConfig)

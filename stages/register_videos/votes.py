@@ -91,8 +91,7 @@ def agree(
     config: VoteConfig,
 ) -> Agreement | None:
     """Find ``world_from_odometry`` by letting each vote propose one and weighing who supports it (4 DoF where
-    gravity is known).
-    """
+    gravity is known)."""
     if not len(votes.frame):
         return None
     odometry, voted = odometry_from_camera[votes.frame], votes.world_from_camera

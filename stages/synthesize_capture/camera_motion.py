@@ -10,15 +10,9 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from pipeline.geometry import rigid
-from stages.synthesize_capture.navigation import floor_for
+from stages.synthesize_capture.navigation import PERSON_M, floor_for
 from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Room
-from stages.synthesize_capture.session import (
-    PERSON_BREADTH_M,
-    PERSON_HEIGHT_M,
-    STEP_S,
-    AnimalCourse,
-    SessionTrajectories,
-)
+from stages.synthesize_capture.session import STEP_S, AnimalCourse, SessionTrajectories, steps
 
 Cameras = Float[np.ndarray, "sample 4 4"]
 ARM_M = 0.3
@@ -27,9 +21,9 @@ ARM_M = 0.3
 
 def walkthrough(room: Room, rng: np.random.Generator, duration_s: float) -> Cameras:
     """Sweep an empty room all round, from across it: along the floor, into corners, over furniture."""
-    timestamp_s = _times(duration_s)
+    timestamp_s = np.arange(steps(duration_s)) * STEP_S
     share = timestamp_s / timestamp_s[-1]
-    floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
+    floor = floor_for(room.obstacles(), PERSON_M)
     rounds = 2.0 + 0.5 * (duration_s > 30)
     angle = 2 * np.pi * rounds * share + rng.uniform(0, 2 * np.pi)
     # The person stands across the room from what is filmed, so that near walls do not fill the picture.
@@ -69,8 +63,7 @@ def turnaround(course: AnimalCourse, rng: np.random.Generator) -> Cameras:
 
 def filming(session: SessionTrajectories, rng: np.random.Generator) -> Cameras:
     """Return the filming person's phone: in front of the body, at chest height, on what the person looks
-    at.
-    """
+    at."""
     looks_at, ground = session.observer_looks_at, session.observer_position
     toward = looks_at[:, [0, 2]] - ground
     toward = gaussian_filter1d(toward, 0.15 / STEP_S, axis=0)
@@ -86,7 +79,7 @@ def filming(session: SessionTrajectories, rng: np.random.Generator) -> Cameras:
 
 def bystanding(session: SessionTrajectories, room: Room, rng: np.random.Generator) -> Cameras:
     """Return a second phone that keeps to the side of the animal opposite to the filming person."""
-    floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
+    floor = floor_for(room.obstacles(), PERSON_M)
     animal = session.animal.position[:, [0, 2]]
     opposite = animal + (animal - session.observer_position)
     centers = floor.centers()
@@ -142,7 +135,3 @@ def _wander(rng: np.random.Generator, count: int, seconds: float) -> Float[np.nd
     pad = int(4 * seconds / STEP_S) + 1
     noise = gaussian_filter1d(rng.standard_normal((count + 2 * pad, 3)), seconds / STEP_S, axis=0)
     return noise[pad : pad + count] * np.sqrt(2 * np.sqrt(np.pi) * seconds / STEP_S)
-
-
-def _times(duration_s: float) -> Float[np.ndarray, "sample"]:
-    return np.arange(int(np.ceil(duration_s / STEP_S)) + 2) * STEP_S

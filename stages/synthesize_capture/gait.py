@@ -127,8 +127,7 @@ def footfalls(
     course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"], anatomy: Anatomy = CAT
 ) -> Float[np.ndarray, "frame foot 3"]:
     """Return the four feet's world positions (bone heads of hands and toes) from the rhythm of the gait
-    alone.
-    """
+    alone."""
     phase, duty, offset, lift = _rhythm(course, anatomy.gait)
     neutral = _neutral(anatomy)
     neutral[:, 1] = anatomy.gait.sole_m
@@ -150,8 +149,7 @@ def footfalls(
 
 def _rhythm(course: AnimalCourse, gait: Gait) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return stride phase, share of the stride on the ground, phase offset per foot and lift of the feet in
-    metres.
-    """
+    metres."""
     step = float(course.timestamp_s[1] - course.timestamp_s[0])
     speed = gaussian_filter1d(np.where(course.airborne > 0.5, 0.0, course.speed()), 0.08 / step)
     turn = gaussian_filter1d(np.abs(np.gradient(course.yaw, step)), 0.08 / step)
@@ -172,8 +170,7 @@ def _planted(
     course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, neutral: np.ndarray
 ) -> Float[np.ndarray, "frame 3"]:
     """Return where a foot stands in stride ``index``: under its neutral place at the middle of that
-    stance.
-    """
+    stance."""
     rising = cycle + 1e-9 * np.arange(len(cycle))
     when = np.interp(index + half_duty, rising, course.timestamp_s)
     yaw = np.interp(when, course.timestamp_s, course.yaw)

@@ -36,8 +36,7 @@ class Light:
 
 def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
     """Draw a light: by day the window rules, in the evening the lamp, at sunset one low red sun and hardly
-    anything else.
-    """
+    anything else."""
     warm, cool = np.array([1.0, 0.82, 0.6]), np.array([0.9, 0.98, 1.08])
     if hour == "evening":
         window, lamp, ambient = 0.10 * cool, rng.uniform(0.75, 0.95) * warm, 0.16 * np.array([1.0, 0.9, 0.78])

@@ -1,14 +1,17 @@
 """Find ways around furniture: a grid of free floor, shortest paths on it, and walking along them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 from skimage.graph import route_through_array
 
-from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Footprint
+from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Standing
 
 CELL_M = 0.1
+ANIMAL_M, PERSON_M = (0.46, 0.34), (0.40, 1.7)
+"""Breadth and height of who walks."""
 Ground = Float[np.ndarray, "2"]
 """A point (x, z) on the floor."""
 
@@ -43,9 +46,7 @@ class Floor:
     def route(
         self, start: Ground, goal: Ground, *, avoid: Ground | None = None, avoid_m: float = 1.0
     ) -> Float[np.ndarray, "waypoint 2"]:
-        """Return a shortest way that keeps off ``avoid``; blocked cells are crossed only when there is no
-        other.
-        """
+        """Return a shortest way that keeps off ``avoid``; blocked cells are crossed as a last resort."""
         cost = np.where(self.free, 1.0, 60.0)
         if avoid is not None:
             x = (np.arange(self.free.shape[0]) + 0.5) * CELL_M - WIDTH_M / 2 - avoid[0]
@@ -60,26 +61,17 @@ class Floor:
         return np.asarray(goal, float)[None]
 
 
-def floor_for(footprints: list[Footprint], *, breadth_m: float, height_m: float) -> Floor:
-    """Return where a walker of some breadth and height can stand between the footprints and the walls."""
+def floor_for(obstacles: Sequence[Standing], size_m: tuple[float, float]) -> Floor:
+    """Return where a walker of this breadth and height can stand between the obstacles and the walls."""
     x = (np.arange(round(WIDTH_M / CELL_M)) + 0.5) * CELL_M - WIDTH_M / 2
     z = (np.arange(round(DEPTH_M / CELL_M)) + 0.5) * CELL_M - DEPTH_M / 2
-    grid = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
-    reach = breadth_m / 2
-    free = (np.abs(grid[..., 0]) < WIDTH_M / 2 - reach) & (np.abs(grid[..., 1]) < DEPTH_M / 2 - reach)
-    for block in footprints:
-        if block.bottom >= height_m:
-            continue
-        cosine, sine = np.cos(block.yaw), np.sin(block.yaw)
-        away = grid - np.asarray(block.center)
-        local = np.abs(
-            np.stack(
-                [cosine * away[..., 0] - sine * away[..., 1], sine * away[..., 0] + cosine * away[..., 1]],
-                axis=-1,
-            )
-        )
-        outside = np.maximum(local - np.asarray(block.size) / 2, 0)
-        free &= np.linalg.norm(outside, axis=-1) >= reach
+    x, z = np.meshgrid(x, z, indexing="ij")
+    reach, height_m = size_m[0] / 2, size_m[1]
+    free = (np.abs(x) < WIDTH_M / 2 - reach) & (np.abs(z) < DEPTH_M / 2 - reach)
+    for block in obstacles:
+        if block.piece.bottom < height_m:
+            outside = np.maximum(block.axis_distance(x, z) - np.array(block.piece.size) / 2, 0)
+            free &= np.linalg.norm(outside, axis=-1) >= reach
     return Floor(free)
 
 
@@ -118,10 +110,10 @@ class Walker:
             target_speed = min(
                 desired_speed, np.sqrt(2 * 0.8 * self.acceleration * max(left - 0.03, 0.0)) + 0.08
             )
-        error = _wrapped((heading if face is None else face) - self.yaw)
+        error = wrapped((heading if face is None else face) - self.yaw)
         self.yaw += float(np.clip(error, -self.turn_rate * seconds, self.turn_rate * seconds))
         if face is None:
-            target_speed *= max(np.cos(_wrapped(heading - self.yaw)), 0.0) ** 2
+            target_speed *= max(np.cos(wrapped(heading - self.yaw)), 0.0) ** 2
             heading = self.yaw
         change = self.acceleration * seconds
         self.speed += float(np.clip(target_speed - self.speed, -1.6 * change, change))
@@ -139,5 +131,6 @@ class Walker:
         self.speed *= 0.5
 
 
-def _wrapped(angle: float) -> float:
+def wrapped(angle: float) -> float:
+    """Bring an angle to -pi..pi, radians."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -11,9 +11,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from stages.synthesize_capture.navigation import Floor, Ground, Walker
+from stages.synthesize_capture.navigation import Floor, Ground, Walker, wrapped
 from stages.synthesize_capture.room import Place
 
+STEP_S = 1.0 / 30.0
+"""Everyone moves on by so much at once."""
 DELAY_S = 0.25
 """How long it takes to notice what the person does."""
 NOTICE_M = 3.0
@@ -25,8 +27,8 @@ REASONS: tuple[Reason, ...] = ("own", "flee", "approach")
 
 
 @dataclass(frozen=True)
-class SeenPerson:
-    """The person as the animal sees it: position and velocity on the floor."""
+class SeenWalker:
+    """A person or another animal as it is seen: position and velocity on the floor."""
 
     position: Ground
     velocity: Ground
@@ -65,7 +67,7 @@ class Policy:
         """Where it stands: x, height of the ground under it, z."""
         return np.array([self.walker.position[0], self.height, self.walker.position[1]])
 
-    def step(self, seconds: float, seen: SeenPerson) -> None:
+    def step(self, seconds: float, seen: SeenWalker) -> None:
         """Decide, then move on by one step."""
         self._feel(seconds, seen)
         if self.leap is not None:
@@ -88,7 +90,7 @@ class Policy:
         )
         self._look(seconds, seen)
 
-    def _feel(self, seconds: float, seen: SeenPerson) -> None:
+    def _feel(self, seconds: float, seen: SeenWalker) -> None:
         """Follow how long the person has been calm and how threatening it is."""
         away = self.walker.position - seen.position
         distance = float(np.linalg.norm(away))
@@ -105,7 +107,7 @@ class Policy:
             or (self.distance < near + 0.75 and self.closing > 0.65)
         )
 
-    def _decide(self, seconds: float, seen: SeenPerson) -> None:
+    def _decide(self, seconds: float, seen: SeenWalker) -> None:
         if self._threatened() and self.fear_s <= 0:
             self._flee(seen)
             return
@@ -124,7 +126,7 @@ class Policy:
         elif self.rest_s <= -2.5 and self.rng.random() < 0.5 * seconds:
             self._visit()
 
-    def _flee(self, seen: SeenPerson) -> None:
+    def _flee(self, seen: SeenWalker) -> None:
         """Run to a free spot straight away from the person, about two metres off, not past it."""
         centers = self.walker.floor.centers()
         off = centers - self.walker.position
@@ -147,7 +149,7 @@ class Policy:
         self.wanted = np.array([0.0, 0.0, 0.7])
         self.rest_s = self.rng.uniform(1.4, 2.0)
 
-    def _refuge(self, goal: Ground, seen: SeenPerson) -> Place | None:
+    def _refuge(self, goal: Ground, seen: SeenWalker) -> Place | None:
         """Return a high place close to where it runs, not on the person's side."""
         for place in self.places:
             entry = np.asarray(place.entry)
@@ -159,7 +161,7 @@ class Policy:
                 return place
         return None
 
-    def _approach(self, seen: SeenPerson) -> None:
+    def _approach(self, seen: SeenWalker) -> None:
         """Walk up to about a metre from the person, a little to one side."""
         from_person = self.walker.position - seen.position
         angle = np.arctan2(from_person[0], from_person[1]) + self.rng.normal(0, 0.15)
@@ -208,10 +210,9 @@ class Policy:
         self.leap = Leap(self.position, end)
         self.walker.speed = 0.0
 
-    def _faces(self, seen: SeenPerson) -> float | None:
+    def _faces(self, seen: SeenWalker) -> float | None:
         """Return where it turns to while it rests: out from a perch, towards a person that it minds, or
-        nowhere.
-        """
+        nowhere."""
         if self.perch is not None:
             return self.perch.yaw
         if self.reason == "own" or self.distance > NOTICE_M or self.posture[:2].max() > 0.3:
@@ -230,12 +231,12 @@ class Policy:
             leap.start[1] + course * (leap.end[1] - leap.start[1]) + 4 * 0.16 * share * (1 - share)
         )
         toward = (leap.end - leap.start)[[0, 2]]
-        error = (np.arctan2(toward[0], toward[1]) - self.walker.yaw + np.pi) % (2 * np.pi) - np.pi
+        error = wrapped(np.arctan2(toward[0], toward[1]) - self.walker.yaw)
         self.walker.yaw += float(np.clip(error, -9 * seconds, 9 * seconds))
         if share >= 1.0:
             self.height, self.leap = float(leap.end[1]), None
 
-    def _look(self, seconds: float, seen: SeenPerson) -> None:
+    def _look(self, seconds: float, seen: SeenWalker) -> None:
         """Turn the gaze: at the person when it matters, else ahead or around."""
         self._gaze_s -= seconds
         ahead = self.position + np.array([np.sin(self.walker.yaw), 0.22, np.cos(self.walker.yaw)])

@@ -12,33 +12,28 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipeline.core import processes, progress
-from pipeline.data import ply
+from pipeline.data import plots, ply
 from pipeline.geometry.meshes import Mesh
 from stages.synthesize_capture import record3d, sheets
 from stages.synthesize_capture.animal import BONES, Animal
 from stages.synthesize_capture.film import Stage
-from stages.synthesize_capture.record3d import Header
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.script import Script
 from stages.synthesize_capture.truth import TruthWriter, write_flow
 
 FLOW_PAIRS = 40
-THUMBNAILS = 6
+THUMBNAILS, OUTLINE = 6, (255, 0, 255)
+"""Frames of a recording on the quality page, and the colour around its animals."""
 
 
 @dataclass(frozen=True)
 class FilmedRecording:
-    """What is worth knowing about a finished recording: some frames (colour, animal outlined, depth) and
-    shares.
-    """
+    """What the quality page shows of a finished recording."""
 
-    name: str
-    frames: int
-    visible_share: float
-    thumbnails: UInt8[np.ndarray, "picture height width 3"]
-    outlines: UInt8[np.ndarray, "picture height width"]
-    """255 where an animal is shown."""
-    depths: np.ndarray
+    visible_share: float | None
+    """Share of the frames that show an animal; None where none is there."""
+    thumbnails: list[UInt8[np.ndarray, "height width 3"]]
+    """Some frames with the animals' outlines."""
 
 
 def produce(
@@ -72,44 +67,37 @@ def record(
     keep_depth = script.name == "heldout"
     truths = {truth_folder: TruthWriter(script, keep_depth)}
     if companion is not None:
+        animals = enumerate((creature, companion))
         truths = {
-            truth_folder / each.anatomy.name: TruthWriter(script, keep_depth, of_companion=each is companion)
-            for each in (creature, companion)
+            truth_folder / each.anatomy.name: TruthWriter(script, keep_depth, number)
+            for number, each in animals
         }
-    folders = list(truths)
-    chosen = set(np.linspace(0, len(script.timestamp_s) - 1, THUMBNAILS).astype(int).tolist())
-    thumbnails, outlines, depths = [], [], []
+    chosen = np.linspace(0, len(script.timestamp_s) - 1, THUMBNAILS).astype(int)
+    thumbnails = []
     with record3d.Writer(recordings / f"{script.name}.r3d") as writer:
         for index, frame in enumerate(stage.frames()):
             writer.add(frame.color, frame.depth, frame.confidence)
             for truth in truths.values():
                 truth.add(frame, index)
             if index in chosen:
-                thumbnails.append(frame.color)
-                outlines.append((frame.mask | frame.companion_mask).astype(np.uint8) * 255)
-                depths.append(np.nan_to_num(frame.depth))
-        writer.finish(_header(script))
+                outlined = plots.outlined(frame.color, frame.masks[0] | frame.masks[1], OUTLINE)
+                thumbnails.append(outlined[::2, ::2])
+        writer.finish(script)
     for folder, truth in truths.items():
         folder.mkdir(exist_ok=True)
         truth.write(folder)
     if script.session is not None:
-        write_flow(stage, folders[0], pairs=FLOW_PAIRS)
-        for folder in folders[1:]:
-            shutil.copy(folders[0] / f"{script.name}.flow.npz", folder)
-    return FilmedRecording(
-        script.name,
-        len(script.timestamp_s),
-        max(float(truth.visible().mean()) for truth in truths.values()),
-        np.stack(thumbnails),
-        np.stack(outlines),
-        np.stack(depths),
-    )
+        first, *others = truths
+        write_flow(stage, first, pairs=FLOW_PAIRS)
+        for folder in others:
+            shutil.copy(first / f"{script.name}.flow.npz", folder)
+    there = any(motion is not None for motion in script.motions)
+    visible = max(float(truth.visible().mean()) for truth in truths.values()) if there else None
+    return FilmedRecording(visible, thumbnails)
 
 
 def write_world(room: Room, creature: Animal, seed: int, folder: Path) -> None:
-    """Write the true room (as in the walk-through, world of the truth), the animal at rest (agent frame), and
-    names.
-    """
+    """Write the room of the walk-through (world frame), the animal at rest (agent frame), and names."""
     about = {"seed": seed, "up": [0, 1, 0], "bones": [bone.name for bone in BONES]}
     (folder / "world.json").write_text(json.dumps(about, indent=1) + "\n")
     vertices, faces, coordinates, _owner = sheets.triangles(room.sheets())
@@ -127,14 +115,3 @@ def _room_colors(room: Room, coordinates: np.ndarray) -> UInt8[np.ndarray, "vert
         colors.append(sheet.picture[at[:, 1], at[:, 0]])
         start += count
     return np.concatenate(colors)
-
-
-def _header(script: Script) -> Header:
-    return Header(
-        script.timestamp_s,
-        script.intrinsics,
-        script.odometry_from_camera,
-        script.color_size,
-        script.depth_size,
-        round(script.fps),
-    )

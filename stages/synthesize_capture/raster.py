@@ -106,8 +106,7 @@ def _invert(a, b, c, out):
 @njit(cache=True, error_model="numpy")
 def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height, width):
     """Return exact z-depth ``[height width]`` (0 = nothing) at the pixel centres of the view in another
-    size.
-    """
+    size."""
     depth = np.zeros((height, width), np.float32)
     fx, fy, cx, cy = focal_center
     rows, columns = face_of.shape

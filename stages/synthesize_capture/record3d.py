@@ -6,7 +6,6 @@ camera-to-world with OpenGL axes, quaternion x y z w then translation; K is colu
 
 import json
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,42 +14,29 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.geometry import cameras, rigid
+from stages.synthesize_capture.script import Script
 
 _ZIP_TIME = (2024, 6, 1, 12, 0, 0)
 
 
-@dataclass(frozen=True)
-class Header:
-    """What a recording says about itself."""
-
-    timestamp_s: Float[np.ndarray, "frame"]
-    intrinsics: Float[np.ndarray, "frame 4"]
-    """fx, fy, cx, cy in stored colour pixels."""
-    odometry_from_camera: Float[np.ndarray, "frame 4 4"]
-    """OpenCV axes of the stored canvas."""
-    color_size: tuple[int, int]
-    depth_size: tuple[int, int]
-    """Height, width."""
-    fps: int
-
-    def metadata(self) -> dict:
-        """Return the JSON of apps of 2024 and later."""
-        world_from_camera = cameras.opencv_from_opengl(self.odometry_from_camera)
-        quaternion = np.roll(rigid.quaternion_from_rotation(world_from_camera[:, :3, :3]), -1, axis=-1)
-        fx, fy, cx, cy = self.intrinsics[0]
-        return {
-            "w": self.color_size[1],
-            "h": self.color_size[0],
-            "dw": self.depth_size[1],
-            "dh": self.depth_size[0],
-            "fps": self.fps,
-            "K": [round(float(value), 6) for value in (fx, 0, 0, 0, fy, 0, cx, cy, 1)],
-            "poses": np.concatenate([quaternion, world_from_camera[:, :3, 3]], axis=-1).round(8).tolist(),
-            "frameTimestamps": self.timestamp_s.round(6).tolist(),
-            "initPose": [0, 0, 0, 1, 0, 0, 0],
-            "cameraType": 1,
-            "perFrameIntrinsicCoeffs": self.intrinsics.round(5).tolist(),
-        }
+def metadata(script: Script) -> dict:
+    """Return the JSON of apps of 2024 and later."""
+    phone, world_from_camera = script.phone, cameras.opencv_from_opengl(script.odometry_from_camera)
+    quaternion = np.roll(rigid.quaternion_from_rotation(world_from_camera[:, :3, :3]), -1, axis=-1)
+    fx, fy, cx, cy = script.intrinsics[0]
+    return {
+        "w": phone.color_size[1],
+        "h": phone.color_size[0],
+        "dw": phone.depth_size[1],
+        "dh": phone.depth_size[0],
+        "fps": round(phone.fps),
+        "K": [round(float(value), 6) for value in (fx, 0, 0, 0, fy, 0, cx, cy, 1)],
+        "poses": np.concatenate([quaternion, world_from_camera[:, :3, 3]], axis=-1).round(8).tolist(),
+        "frameTimestamps": script.timestamp_s.round(6).tolist(),
+        "initPose": [0, 0, 0, 1, 0, 0, 0],
+        "cameraType": 1,
+        "perFrameIntrinsicCoeffs": script.intrinsics.round(5).tolist(),
+    }
 
 
 class Writer:
@@ -73,27 +59,22 @@ class Writer:
         confidence: UInt8[np.ndarray, "rows columns"],
     ) -> None:
         """Append one frame: RGB, depth in metres (float32), confidence 0 to 2."""
-        done, jpeg = cv2.imencode(
-            ".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]
-        )
+        bgr, quality = cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]
+        done, jpeg = cv2.imencode(".jpg", bgr, quality)
         assert done, "JPEG encoding failed"
-        self._member(f"rgbd/{self._count}.jpg", jpeg.tobytes())
-        self._member(
-            f"rgbd/{self._count}.depth", lzfse.compress(np.ascontiguousarray(depth, "<f4").tobytes())
-        )
-        self._member(
-            f"rgbd/{self._count}.conf", lzfse.compress(np.ascontiguousarray(confidence, np.uint8).tobytes())
-        )
+        name = f"rgbd/{self._count}"
+        self._member(f"{name}.jpg", jpeg.tobytes())
+        self._member(f"{name}.depth", lzfse.compress(np.ascontiguousarray(depth, "<f4").tobytes()))
+        self._member(f"{name}.conf", lzfse.compress(np.ascontiguousarray(confidence, np.uint8).tobytes()))
         if self._count == 0:
             self._member("icon", jpeg.tobytes())
         self._count += 1
 
-    def finish(self, header: Header) -> None:
+    def finish(self, script: Script) -> None:
         """Write the metadata, after the frames."""
-        assert len(header.timestamp_s) == self._count, (
-            f"{self._count} frames, {len(header.timestamp_s)} timestamps"
-        )
-        self._member("metadata", json.dumps(header.metadata()).encode())
+        times = len(script.timestamp_s)
+        assert times == self._count, f"{self._count} frames, {times} timestamps"
+        self._member("metadata", json.dumps(metadata(script)).encode())
 
     def _member(self, name: str, data: bytes) -> None:
         member = zipfile.ZipInfo(name, _ZIP_TIME)

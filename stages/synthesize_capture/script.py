@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.geometry import cameras, rigid
-from stages.synthesize_capture import camera_motion, dwellings, gait, light, pair, sensor, session
+from stages.synthesize_capture import camera_motion, dwellings, gait, light, sensor, session
 from stages.synthesize_capture.animal import BODIES
 from stages.synthesize_capture.config import Config, Species
 from stages.synthesize_capture.dog import DOG
@@ -53,17 +53,13 @@ class Script:
     """fx, fy, cx, cy in stored colour pixels."""
     odometry_from_camera: Float[np.ndarray, "frame 4 4"]
     gain: Float[np.ndarray, "frame"]
-    motion: AnimalMotion | None
-    moving: np.ndarray
+    motions: tuple[AnimalMotion | None, AnimalMotion | None]
+    """Of the animal and of the companion, where they are there."""
+    moving: tuple[Bool[np.ndarray, "frame"], Bool[np.ndarray, "frame"]]
     quarter_turns: int
     """Clockwise turns that make the stored picture upright."""
-    color_size: tuple[int, int]
-    depth_size: tuple[int, int]
-    fps: float
+    phone: PhoneFormat
     session: SessionTrajectories | None = None
-    companion_motion: AnimalMotion | None = None
-    """Of the second animal, where it is there."""
-    companion_moving: np.ndarray | None = None
 
 
 MOVING_M_S = 0.15
@@ -105,8 +101,7 @@ def _sessions(
         arranged = room.arranged(rng)
         lit = light.light_of_session(rng, hour)
         together = config.companion != "none" and number != config.alone_session
-        simulate = pair.simulate_pair if together else session.simulate_session
-        lived = simulate(arranged, rng, seconds)
+        lived = session.simulate_session(arranged, rng, seconds, with_dog=together)
         path, turns = camera_motion.filming(lived, rng), int(number == config.sideways_session)
         seen = {"course": lived.animal, "companion": lived.companion, "hour": hour, "species": config.species}
         yield _script(phone, rng, name, arranged, lit, path, seconds, lived=lived, turns=turns, **seen)
@@ -123,18 +118,8 @@ def _foreign(config: Config, phone: PhoneFormat, streams: Iterator[np.random.Gen
         home = dwellings.filmed_elsewhere(rng)
         lived = session.simulate_session(home, rng, seconds)
         lit, path = light.light_of_session(rng, "day"), camera_motion.filming(lived, rng)
-        yield _script(
-            phone,
-            rng,
-            name,
-            home,
-            lit,
-            path,
-            seconds,
-            course=lived.animal,
-            lived=lived,
-            species=config.species,
-        )
+        seen = {"course": lived.animal, "lived": lived, "species": config.species}
+        yield _script(phone, rng, name, home, lit, path, seconds, **seen)
 
 
 def _script(
@@ -168,15 +153,14 @@ def _script(
         intrinsics=sensor.lens(rng, timestamp_s, phone.color_size[1], phone.color_size[0]),
         odometry_from_camera=sensor.odometry(rng, timestamp_s, stored),
         gain=sensor.gains(rng, timestamp_s, exposure),
-        motion=None if course is None else gait.poses(course, timestamp_s, BODIES[species]),
-        moving=_moving(course, timestamp_s),
+        motions=(
+            None if course is None else gait.poses(course, timestamp_s, BODIES[species]),
+            None if companion is None else gait.poses(companion, timestamp_s, DOG),
+        ),
+        moving=(_moving(course, timestamp_s), _moving(companion, timestamp_s)),
         quarter_turns=turns,
-        color_size=phone.color_size,
-        depth_size=phone.depth_size,
-        fps=phone.fps,
+        phone=phone,
         session=lived,
-        companion_motion=None if companion is None else gait.poses(companion, timestamp_s, DOG),
-        companion_moving=None if companion is None else _moving(companion, timestamp_s),
     )
 
 

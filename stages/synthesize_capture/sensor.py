@@ -23,8 +23,7 @@ _TONE = (np.clip(1.06 * (1 - np.exp(-1.9 * np.linspace(0, 2.5, 4096))), 0, 1) **
 @dataclass(frozen=True)
 class Exposure:
     """How one recording is exposed: gain on linear light and its slow wander, white balance, noise at unit
-    signal.
-    """
+    signal."""
 
     gain: float
     gain_wander: float
@@ -35,8 +34,7 @@ class Exposure:
 
 def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
     """Draw an exposure; the evening is lifted by gain, stays darker, noisier and more blurred, the sunset is
-    overexposed.
-    """
+    overexposed."""
     balance = 1.0 + rng.uniform(-0.07, 0.07, 3)
     balance[1] = 1.0
     if hour == "sunset":
@@ -48,8 +46,7 @@ def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
 
 def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float[np.ndarray, "frame"]:
     """Return recorded times from 0: nominal rate, a millisecond of jitter, now and then one to three frames
-    lost.
-    """
+    lost."""
     times = np.arange(int(duration_s * fps + 1e-6) + 1) / fps
     times[1:] += np.clip(rng.normal(0, 0.0012, len(times) - 1), -0.004, 0.004)
     keep = np.ones(len(times), bool)
@@ -167,8 +164,7 @@ def motion_blur_px(
     shutter_s: float,
 ) -> Float[np.ndarray, "frame 2"]:
     """Return how far (x, y) the picture's centre moves while the shutter is open, from the camera's
-    turning.
-    """
+    turning."""
     turn = rigid.vector_from_rotation(
         np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
     )

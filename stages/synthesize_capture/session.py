@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from stages.synthesize_capture.navigation import floor_for
+from stages.synthesize_capture import companion
+from stages.synthesize_capture.companion import Companion
+from stages.synthesize_capture.dog import DOG
+from stages.synthesize_capture.navigation import ANIMAL_M, PERSON_M, Floor, Ground, floor_for
 from stages.synthesize_capture.observer import FILMING, Observer, ObserverStyle
-from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, SeenPerson
+from stages.synthesize_capture.policy import DELAY_S, REASONS, STEP_S, Policy, SeenWalker
 from stages.synthesize_capture.room import Room
-
-STEP_S = 1.0 / 30.0
-ANIMAL_BREADTH_M, ANIMAL_HEIGHT_M = 0.46, 0.34
-PERSON_BREADTH_M, PERSON_HEIGHT_M = 0.40, 1.7
 
 
 @dataclass(frozen=True)
@@ -56,30 +55,52 @@ class SessionTrajectories:
 
 
 def simulate_session(
-    room: Room, rng: np.random.Generator, duration_s: float, style: ObserverStyle = FILMING
+    room: Room,
+    rng: np.random.Generator,
+    duration_s: float,
+    style: ObserverStyle = FILMING,
+    *,
+    with_dog: bool = False,
 ) -> SessionTrajectories:
-    """Simulate one session in a room; the same generator state gives the same session."""
-    animal_floor = floor_for(room.footprints(), breadth_m=ANIMAL_BREADTH_M, height_m=ANIMAL_HEIGHT_M)
-    person_floor = floor_for(room.footprints(), breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
+    """Simulate one session in a room; the same generator state gives the same session.
+
+    Where a dog lives too, the person films whom it looks at, one or both.
+    """
+    obstacles = room.obstacles()
+    animal_floor, person_floor = floor_for(obstacles, ANIMAL_M), floor_for(obstacles, PERSON_M)
     start = person_floor.centers()[rng.integers(person_floor.free.sum())]
-    centers = animal_floor.centers()
-    begin = centers[
-        np.argmin(np.abs(np.linalg.norm(centers - start, axis=-1) - 2.0) + rng.uniform(0, 0.5, len(centers)))
-    ]
-    animal = Policy(animal_floor, room.places, begin, rng)
+    animals = [Policy(animal_floor, room.places, _at_distance(animal_floor, start, 2.0, rng), rng)]
+    if with_dog:
+        dog_floor = floor_for(obstacles, (ANIMAL_M[0] * DOG.size, ANIMAL_M[1] * DOG.size))
+        begin = _at_distance(dog_floor, animals[0].walker.position, 1.2, rng)
+        animals.append(Companion(dog_floor, room.places, begin, rng))
     observer = Observer(person_floor, start, rng, style)
-    past: deque[SeenPerson] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
-    count = int(np.ceil(duration_s / STEP_S)) + 2
-    course, person, reason = [], [], []
-    for _ in range(count):
-        observer.step(STEP_S, animal.position)
-        past.append(SeenPerson(observer.walker.position.copy(), observer.velocity.copy()))
-        animal.step(STEP_S, past[0])
-        course.append(course_row(animal))
-        person.append((observer.walker.position.copy(), observer.looks_at.copy()))
-        reason.append(REASONS.index(animal.reason))
+    phase = rng.uniform(0, 2 * np.pi) if with_dog else 0.0
+    past: deque[list[SeenWalker]] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
+    rows, person, reason = [], [], []
+    for index in range(steps(duration_s)):
+        observer.step(STEP_S, companion.focus(animals, index * STEP_S, phase))
+        walker = observer.walker
+        seen_person = SeenWalker(walker.position.copy(), observer.velocity.copy())
+        past.append([seen_person, *(companion.seen(animal) for animal in animals)])
+        companion.live(STEP_S, animals, past[0])
+        rows.append([course_row(animal) for animal in animals])
+        person.append((walker.position.copy(), observer.looks_at.copy()))
+        reason.append(REASONS.index(animals[0].reason))
     position, looks_at = (np.array(column) for column in zip(*person, strict=True))
-    return SessionTrajectories(course_from_rows(course), position, looks_at, np.array(reason))
+    first, *others = (course_from_rows(course) for course in zip(*rows, strict=True))
+    return SessionTrajectories(first, position, looks_at, np.array(reason), others[0] if others else None)
+
+
+def steps(duration_s: float) -> int:
+    """Return the number of samples that cover a duration."""
+    return int(np.ceil(duration_s / STEP_S)) + 2
+
+
+def _at_distance(floor: Floor, start: Ground, distance_m: float, rng: np.random.Generator) -> Ground:
+    centers = floor.centers()
+    off = np.abs(np.linalg.norm(centers - start, axis=-1) - distance_m)
+    return centers[np.argmin(off + rng.uniform(0, 0.5, len(centers)))]
 
 
 CourseRow = tuple[np.ndarray, float, np.ndarray, float, np.ndarray, float]
@@ -100,8 +121,8 @@ def course_from_rows(rows: Sequence[CourseRow]) -> AnimalCourse:
 
 def standing_course(room: Room, rng: np.random.Generator, duration_s: float) -> AnimalCourse:
     """Return the course of an animal that stands calmly on the rug, looking about now and then."""
-    count = int(np.ceil(duration_s / STEP_S)) + 2
-    floor = floor_for(room.footprints(), breadth_m=1.0, height_m=PERSON_HEIGHT_M)
+    count = steps(duration_s)
+    floor = floor_for(room.obstacles(), (1.0, PERSON_M[1]))
     spot = floor.nearest(np.array([0.55, 0.15]) + rng.uniform(-0.1, 0.1, 2))
     position = np.broadcast_to(np.array([spot[0], 0.008, spot[1]]), (count, 3)).copy()
     yaw = np.full(count, rng.uniform(-np.pi, np.pi))
@@ -114,6 +135,5 @@ def standing_course(room: Room, rng: np.random.Generator, duration_s: float) -> 
         current = goal if current is None else current + (goal - current) * (1 - np.exp(-STEP_S / 0.3))
         gaze[index] = current
     still = np.zeros(count)
-    return AnimalCourse(
-        np.arange(count) * STEP_S, position, yaw, np.zeros((count, 3)), still, gaze, still + 0.1
-    )
+    timestamp_s, posture = np.arange(count) * STEP_S, np.zeros((count, 3))
+    return AnimalCourse(timestamp_s, position, yaw, posture, still, gaze, still + 0.1)

@@ -57,8 +57,7 @@ def flat(corner, right, down, paint: Paint, *, glow: float = 0.0, cells: tuple[i
 
 def box(center, size, paint: Paint | dict[str, Paint], *, skip: str = "") -> list[Sheet]:
     """Make an upright box; ``paint`` may name faces (``+x`` ... ``-z``) apart ("" = the rest); ``skip`` omits
-    faces.
-    """
+    faces."""
     center, half = np.asarray(center, float), np.asarray(size, float) / 2
     sheets = []
     for name, normal in (
@@ -114,8 +113,7 @@ def cylinder(
 
 def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: int) -> Sheet:
     """Make a hanging cloth from its top left corner along ``right``, in ``folds`` waves of ``depth``
-    metres.
-    """
+    metres."""
     corner, right = np.asarray(corner, float), np.asarray(right, float)
     u = np.linspace(0, 1, folds * 4 + 1)
     out = np.cross(right, [0, 1.0, 0]) / np.linalg.norm(right)

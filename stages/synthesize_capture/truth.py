@@ -13,7 +13,6 @@ from jaxtyping import Bool
 from pipeline.data import npz
 from pipeline.geometry import cameras
 from stages.synthesize_capture.film import Frame, Stage, matrices, true_flow
-from stages.synthesize_capture.gait import AnimalMotion
 from stages.synthesize_capture.script import Script
 
 VISIBLE_SHARE = 0.001
@@ -27,8 +26,8 @@ class TruthWriter:
 
     script: Script
     keep_depth: bool
-    of_companion: bool = False
-    """Whether the second animal is the agent, and the first one the other."""
+    number: int = 0
+    """1: the companion is the agent, and the first animal the other."""
     masks: list[np.ndarray] = field(default_factory=list)
     others: list[np.ndarray] = field(default_factory=list)
     depth: list[np.ndarray] = field(default_factory=list)
@@ -36,24 +35,15 @@ class TruthWriter:
 
     def add(self, frame: Frame, index: int) -> None:
         """Take over one frame."""
-        turns = self.script.quarter_turns
-        own, other = frame.mask, frame.companion_mask
-        vertices_world = frame.vertices_world
-        if self.of_companion:
-            own, other, vertices_world = other, own, frame.companion_vertices_world
-        self.masks.append(cameras.turn_image(own, turns))
-        if self.script.companion_motion is not None:
-            self.others.append(cameras.turn_image(other, turns))
+        turns, motion = self.script.quarter_turns, self.script.motions[self.number]
+        self.masks.append(cameras.turn_image(frame.masks[self.number], turns))
+        if self.script.motions[1] is not None:
+            self.others.append(cameras.turn_image(frame.masks[1 - self.number], turns))
         if self.keep_depth:
             self.depth.append(cameras.turn_image(frame.true_depth, turns).astype(np.float16))
-        if vertices_world is not None and self.motion is not None:
-            root = self.motion.world_from_agent[index, :3, 3]
-            self.vertices.append((vertices_world - root).astype(np.float16))
-
-    @property
-    def motion(self) -> AnimalMotion | None:
-        """Return the motion of the agent; None where it is not there."""
-        return self.script.companion_motion if self.of_companion else self.script.motion
+        vertices_world = frame.vertices_world[self.number]
+        if vertices_world is not None and motion is not None:
+            self.vertices.append((vertices_world - motion.world_from_agent[index, :3, 3]).astype(np.float16))
 
     def visible(self) -> Bool[np.ndarray, "frame"]:
         """Return in which frames the animal can be seen."""
@@ -61,38 +51,29 @@ class TruthWriter:
 
     def write(self, folder: Path) -> None:
         """Write the recording's files into the truth folder."""
-        script, name = self.script, self.script.name
+        script, path, motion = self.script, folder / self.script.name, self.script.motions[self.number]
+        turns, size, depth_size = script.quarter_turns, script.phone.color_size, script.phone.depth_size
+        stored = matrices(script.intrinsics)
         contents = {
             "timestamp_s": script.timestamp_s,
-            "world_from_camera": cameras.turn_camera(script.world_from_camera, script.quarter_turns),
-            "intrinsics": cameras.turn_intrinsics(
-                matrices(script.intrinsics), script.color_size, script.quarter_turns
-            ),
+            "world_from_camera": cameras.turn_camera(script.world_from_camera, turns),
+            "intrinsics": cameras.turn_intrinsics(stored, size, turns),
             "agent_visible": self.visible(),
-            "moving": script.moving,
+            "moving": script.moving[self.number],
         }
-        if self.of_companion:
-            still = np.zeros(len(script.timestamp_s), bool)
-            contents["moving"] = still if script.companion_moving is None else script.companion_moving
-        if self.motion is not None:
-            contents["world_from_agent"] = self.motion.world_from_agent
-            contents["agent_from_bone"] = self.motion.agent_from_bone.astype(np.float32)
+        if motion is not None:
+            contents["world_from_agent"] = motion.world_from_agent
+            contents["agent_from_bone"] = motion.agent_from_bone.astype(np.float32)
             contents["agent_vertices_world"] = np.stack(self.vertices)
-            _save_masks(folder / f"{name}.masks.npz", self.masks)
+            _save_masks(path.with_suffix(".masks.npz"), self.masks)
         if self.others:
-            _save_masks(folder / f"{name}.others.npz", self.others)
-        npz.save(folder / f"{name}.npz", compress=False, **contents)
+            _save_masks(path.with_suffix(".others.npz"), self.others)
+        npz.save(path.with_suffix(".npz"), compress=False, **contents)
         if self.keep_depth:
-            stored = cameras.scale_intrinsics(
-                matrices(script.intrinsics), script.color_size, script.depth_size
-            )
-            depth_intrinsics = cameras.turn_intrinsics(stored, script.depth_size, script.quarter_turns)
-            npz.save(
-                folder / f"{name}.depth.npz",
-                compress=True,
-                depth=np.stack(self.depth),
-                depth_intrinsics=depth_intrinsics,
-            )
+            lens = cameras.scale_intrinsics(stored, size, depth_size)
+            lens = cameras.turn_intrinsics(lens, depth_size, turns)
+            depth = np.stack(self.depth)
+            npz.save(path.with_suffix(".depth.npz"), compress=True, depth=depth, depth_intrinsics=lens)
 
 
 def _save_masks(path: Path, masks: Sequence[np.ndarray]) -> None:

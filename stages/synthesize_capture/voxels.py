@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.behavior.perception import FeatureVolume
-from stages.synthesize_capture.dwellings import Dwelling, Standing
-from stages.synthesize_capture.room import DEPTH_M, WIDTH_M
-from stages.synthesize_capture.sheets import Sheet, upright
+from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Room, Standing
+from stages.synthesize_capture.sheets import Sheet
 
 VOXEL_M = 0.1
 MARGIN_M = 0.2
@@ -27,7 +26,7 @@ HEADROOM_M = 0.5
 """Free above a place to rest."""
 
 
-def volume_of(home: Dwelling) -> FeatureVolume:
+def volume_of(home: Room) -> FeatureVolume:
     """Voxelise floor, walls, surfaces and what they enclose."""
     origin = np.array([-WIDTH_M / 2 - MARGIN_M, -MARGIN_M, -DEPTH_M / 2 - MARGIN_M])
     shape = tuple(
@@ -39,9 +38,9 @@ def volume_of(home: Dwelling) -> FeatureVolume:
         "wall"
     )
     kind[centres[..., 1] < 0] = KINDS.index("floor")
-    for thing in home.standing:
+    for thing in (*home.standing, *home.loose):
         kind[_taken(thing, centres, origin)] = KINDS.index(thing.name)
-    for place in home.room.places:
+    for place in home.places:
         if place.position[1] > 0.1:
             near = np.hypot(centres[..., 0] - place.position[0], centres[..., 2] - place.position[2]) < 0.3
             level = (centres[..., 1] > place.position[1] + 0.05) & (
@@ -56,22 +55,14 @@ def volume_of(home: Dwelling) -> FeatureVolume:
 def _taken(
     thing: Standing, centres: Float[np.ndarray, "x y z 3"], origin: Float[np.ndarray, "3"]
 ) -> np.ndarray:
-    """Return the voxels of a thing: its surfaces above its clearance, and in its block all below the topmost
-    surface.
-    """
-    cosine, sine = np.cos(thing.yaw), np.sin(thing.yaw)
-    away_x, away_z = centres[..., 0] - thing.x, centres[..., 2] - thing.z
-    size = np.array(thing.piece.size) / 2
-    block = (np.abs(cosine * away_x - sine * away_z) < size[0]) & (
-        np.abs(sine * away_x + cosine * away_z) < size[1]
-    )
+    """Return a thing's voxels: surfaces above its clearance, and in its block all below the topmost one."""
+    block = (thing.axis_distance(centres[..., 0], centres[..., 2]) < np.array(thing.piece.size) / 2).all(-1)
     if thing.name == "rug":  # colours the floor
         return block & (np.abs(centres[..., 1] + VOXEL_M / 2) < VOXEL_M / 2)
     if thing.name == "window":  # radiator and curtains hang on the wall
         return block & (centres[..., 1] > 0) & (centres[..., 1] < thing.piece.top)
     taken: np.ndarray = np.zeros(centres.shape[:3], bool)
-    placed = [sheet.moved(upright(thing.x, thing.z, thing.yaw)) for sheet in thing.piece.sheets]
-    points = np.concatenate([surface_points(sheet) for sheet in placed])
+    points = np.concatenate([surface_points(sheet) for sheet in thing.sheets()])
     index = np.floor((points[points[:, 1] > max(thing.piece.bottom, 0.01)] - origin) / VOXEL_M).astype(int)
     index = index[((index >= 0) & (index < taken.shape)).all(-1)]
     taken[tuple(index.T)] = True

@@ -63,8 +63,7 @@ class Config:
     """What is localized against: the room or the animal."""
     kind: Literal["bank", "coordinates", "regression"] = "bank"
     """bank: nearest neighbours among patches of rendered views; coordinates: a network regresses each patch's
-    point of the map; regression: a network regresses the pose, as in the paper.
-    """
+    point of the map; regression: a network regresses the pose, as in the paper."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     """Views of the room."""
     agent: AgentConfig = field(default_factory=AgentConfig)

@@ -1,5 +1,4 @@
-"""Scripted approaches: a person stands, then walks up to the animal; in a twin of each the person goes on
-standing.
+"""Scripted approaches: a person stands, then walks up to the animal; in its twin the person goes on standing.
 
 What the animal's true policy does in either case is what a behaviour model should do when it is shown the
 same 0.8 s.
@@ -17,21 +16,13 @@ from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.trajectories import FUTURE, PAST
 from pipeline.data import npz
 from stages.synthesize_capture import gait
-from stages.synthesize_capture.dwellings import Dwelling
+from stages.synthesize_capture.dwellings import rearranged
 from stages.synthesize_capture.lives.lives import RATE_HZ
-from stages.synthesize_capture.navigation import floor_for
+from stages.synthesize_capture.navigation import ANIMAL_M, PERSON_M, floor_for
 from stages.synthesize_capture.observer import Observer
-from stages.synthesize_capture.policy import DELAY_S, Policy, SeenPerson
-from stages.synthesize_capture.session import (
-    ANIMAL_BREADTH_M,
-    ANIMAL_HEIGHT_M,
-    PERSON_BREADTH_M,
-    PERSON_HEIGHT_M,
-    STEP_S,
-    AnimalCourse,
-    course_from_rows,
-    course_row,
-)
+from stages.synthesize_capture.policy import DELAY_S, STEP_S, Policy, SeenWalker
+from stages.synthesize_capture.room import Room
+from stages.synthesize_capture.session import AnimalCourse, course_from_rows, course_row
 from stages.synthesize_capture.voxels import volume_of
 
 CALM_S = 2.0
@@ -55,12 +46,10 @@ class ScriptedApproaches:
     volume: FeatureVolume
 
 
-def scripted(home: Dwelling, rng: np.random.Generator, count: int) -> ScriptedApproaches:
+def scripted(home: Room, rng: np.random.Generator, count: int) -> ScriptedApproaches:
     """Play ``count`` approaches and their twins, each from a place and a mood of its own."""
-    home = home.rearranged(rng)
-    footprints = home.room.footprints()
-    ground = floor_for(footprints, breadth_m=ANIMAL_BREADTH_M, height_m=ANIMAL_HEIGHT_M)
-    floor = floor_for(footprints, breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
+    home = rearranged(home, rng)
+    ground, floor = (floor_for(home.obstacles(), size_m) for size_m in (ANIMAL_M, PERSON_M))
     windows = []
     while len(windows) < count:
         begin = ground.centers()[rng.integers(ground.free.sum())]
@@ -68,7 +57,7 @@ def scripted(home: Dwelling, rng: np.random.Generator, count: int) -> ScriptedAp
         near = floor.centers()[(away > FAR_M[0]) & (away < FAR_M[1])]
         if not len(near):
             continue
-        animal = Policy(ground, home.room.places, begin, rng.spawn(1)[0])
+        animal = Policy(ground, home.places, begin, rng.spawn(1)[0])
         person = Observer(floor, near[rng.integers(len(near))], rng.spawn(1)[0])
         windows.append(_pair(animal, person, rng.uniform(0.9, 1.2)))
     columns = [np.stack([[pair[twin][part] for pair in windows] for twin in (0, 1)]) for part in range(3)]
@@ -76,9 +65,7 @@ def scripted(home: Dwelling, rng: np.random.Generator, count: int) -> ScriptedAp
 
 
 def _pair(animal: Policy, person: Observer, speed_m_s: float) -> tuple[tuple[np.ndarray, ...], ...]:
-    """Play one approach and its twin from the same start; the animal's own choices fall alike until it
-    notices.
-    """
+    """Play one approach and its twin from one start: the animal chooses alike until it notices."""
     twins = []
     for walks in (True, False):
         rows, seen = _played(copy.deepcopy(animal), copy.deepcopy(person), speed_m_s if walks else None)
@@ -86,29 +73,30 @@ def _pair(animal: Policy, person: Observer, speed_m_s: float) -> tuple[tuple[np.
         timestamp_s = now + np.arange(1 - PAST, FUTURE + 1) / RATE_HZ
         motion = gait.poses(rows, timestamp_s)
         sample = np.round(timestamp_s[:PAST] / STEP_S).astype(int)
-        twins.append(
-            (motion.world_from_agent, motion.agent_from_bone[:PAST].astype(np.float32), seen[sample])
-        )
+        bones = motion.agent_from_bone[:PAST].astype(np.float32)
+        twins.append((motion.world_from_agent, bones, seen[sample]))
     return tuple(twins)
 
 
 def _played(
     animal: Policy, person: Observer, speed_m_s: float | None
 ) -> tuple[AnimalCourse, Float[np.ndarray, "sample 3"]]:
-    """Let both live; the person stands, and after a while walks up at ``pace``, if given."""
-    past: deque[SeenPerson] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
+    """Let both live; the person stands, and after a while walks up at ``speed_m_s``, if given."""
+    past: deque[SeenWalker] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
     person.mode, person.left_s = "watch", np.inf
     rows, seen = [], []
     for step in range(int(np.ceil((CALM_S + WALKED_S + FUTURE / RATE_HZ + 0.5) / STEP_S))):
         if speed_m_s is not None and step == round(CALM_S / STEP_S):
-            person.mode = "approach"
-            person.speed_m_s = speed_m_s
-            person.left_s = 4.0
-            person.since_plan_s = np.inf
+            person.mode, person.speed_m_s, person.left_s, person.since_plan_s = (
+                "approach",
+                speed_m_s,
+                4.0,
+                np.inf,
+            )
         if person.mode != "approach":
             person.left_s = np.inf
         person.step(STEP_S, animal.position)
-        past.append(SeenPerson(person.walker.position.copy(), person.velocity.copy()))
+        past.append(SeenWalker(person.walker.position.copy(), person.velocity.copy()))
         animal.step(STEP_S, past[0])
         rows.append(course_row(animal))
         seen.append([person.walker.position[0], EYE_M, person.walker.position[1]])
@@ -117,11 +105,6 @@ def _played(
 
 def write(folder: Path, met: ScriptedApproaches) -> None:
     """Write `approaches.npz` and the home's `volume.npz`."""
-    npz.save(
-        folder / "approaches.npz",
-        compress=True,
-        world_from_agent=met.world_from_agent,
-        agent_from_bone=met.agent_from_bone,
-        observer=met.observer,
-    )
-    npz.save(folder / "volume.npz", compress=True, **vars(met.volume))
+    arrays = dict(vars(met))
+    npz.save(folder / "volume.npz", compress=True, **vars(arrays.pop("volume")))
+    npz.save(folder / "approaches.npz", compress=True, **arrays)

@@ -10,8 +10,8 @@ from pipeline.behavior.perception import FeatureVolume
 from pipeline.data import npz
 from stages.synthesize_capture import camera_motion, gait, session
 from stages.synthesize_capture.animal import BONES, HEADS
-from stages.synthesize_capture.dwellings import Dwelling
 from stages.synthesize_capture.observer import AT_HOME
+from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.voxels import volume_of
 
 RATE_HZ = 10.0
@@ -32,25 +32,17 @@ class SimulatedLife:
     """Index into `policy.REASONS`, per frame."""
 
 
-def lived(home: Dwelling, rng: np.random.Generator, duration_s: float, takes: int = 1) -> SimulatedLife:
-    """Let animal and a person who lives there be together for a while, in several takes, each begun anew from
-    anywhere.
-    """
+def lived(home: Room, rng: np.random.Generator, duration_s: float, takes: int = 1) -> SimulatedLife:
+    """Let an animal and a person live in a home, in several takes, each begun anew from anywhere."""
     played = [_take(home, rng, duration_s / takes) for _ in range(takes)]
     begun_s = np.arange(takes) * (duration_s / takes + APART_S)
     time, agent, bones, camera, reason = (np.concatenate(column) for column in zip(*played, strict=True))
-    return SimulatedLife(
-        time + np.repeat(begun_s, [len(part[0]) for part in played]),
-        agent,
-        bones,
-        camera,
-        volume_of(home),
-        reason,
-    )
+    timestamp_s = time + np.repeat(begun_s, [len(part[0]) for part in played])
+    return SimulatedLife(timestamp_s, agent, bones, camera, volume_of(home), reason)
 
 
-def _take(home: Dwelling, rng: np.random.Generator, duration_s: float) -> tuple[np.ndarray, ...]:
-    lived_session = session.simulate_session(home.room, rng, duration_s, AT_HOME)
+def _take(home: Room, rng: np.random.Generator, duration_s: float) -> tuple[np.ndarray, ...]:
+    lived_session = session.simulate_session(home, rng, duration_s, AT_HOME)
     timestamp_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     sample = np.round(timestamp_s / session.STEP_S).astype(int)
     motion = gait.poses(lived_session.animal, timestamp_s)

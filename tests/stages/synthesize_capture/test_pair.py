@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from stages.synthesize_capture import animal, gait, pair, produce, room, script
+from stages.synthesize_capture import animal, gait, produce, room, script, session
 from stages.synthesize_capture.config import Config
 from stages.synthesize_capture.session import AnimalCourse
 
@@ -29,7 +29,9 @@ CONFIG = Config(
 
 
 def test_the_dog_follows_and_makes_way():
-    lived = [pair.simulate_pair(HOME, np.random.default_rng(seed), 40.0) for seed in (1, 2)]
+    lived = [
+        session.simulate_session(HOME, np.random.default_rng(seed), 40.0, with_dog=True) for seed in (1, 2)
+    ]
     for each in lived:
         assert each.companion is not None
         apart = np.linalg.norm((each.animal.position - each.companion.position)[:, [0, 2]], axis=-1)
@@ -41,7 +43,7 @@ def test_the_dog_follows_and_makes_way():
         (np.linalg.norm(one.animal.position - one.companion.position, axis=-1) < 1.3).mean() for one in lived
     ]
     assert np.mean(near) > 0.3, "share of the time"
-    again = pair.simulate_pair(HOME, np.random.default_rng(1), 40.0)
+    again = session.simulate_session(HOME, np.random.default_rng(1), 40.0, with_dog=True)
     np.testing.assert_array_equal(again.companion.position, lived[0].companion.position)
 
 
@@ -71,8 +73,8 @@ def test_each_has_a_truth_of_its_own(tmp_path):
     scripts = script.scripts(CONFIG, HOME, PHONE)
     names = ["walkthrough", "turnaround_cat", "turnaround_dog", "session-1", "session-2"]
     assert [part.name for part in scripts] == names
-    assert [part.companion_motion is not None for part in scripts] == [False, False, True, True, False]
-    assert [part.motion is not None for part in scripts] == [False, True, False, True, True]
+    assert [part.motions[0] is not None for part in scripts] == [False, True, False, True, True]
+    assert [part.motions[1] is not None for part in scripts] == [False, False, True, True, False]
     produce.produce(scripts[2:4], CAT, tmp_path, tmp_path, workers=1, companion=DOG)
     found = {}
     for name in ("cat", "dog"):

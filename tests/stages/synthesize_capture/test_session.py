@@ -5,8 +5,8 @@ import numpy as np
 from stages.synthesize_capture import review, room
 from stages.synthesize_capture.navigation import floor_for
 from stages.synthesize_capture.observer import AT_HOME, FILMING
-from stages.synthesize_capture.policy import REASONS, Policy, SeenPerson
-from stages.synthesize_capture.session import STEP_S, simulate_session
+from stages.synthesize_capture.policy import REASONS, STEP_S, Policy, SeenWalker
+from stages.synthesize_capture.session import simulate_session
 
 HOME = room.furnish(np.random.default_rng(0))
 
@@ -20,11 +20,11 @@ def test_same_seed_same_session():
 def test_who_lives_there_comes_up_from_farther_than_who_films():
     nearest = []
     for style in (FILMING, AT_HOME):
-        told = simulate_session(HOME, np.random.default_rng(5), 40.0, style)
-        away = np.linalg.norm(told.animal.position[:, [0, 2]] - told.observer_position, axis=-1)
+        lived = simulate_session(HOME, np.random.default_rng(5), 40.0, style)
+        away = np.linalg.norm(lived.animal.position[:, [0, 2]] - lived.observer_position, axis=-1)
         walks = (
             np.linalg.norm(
-                np.diff(told.observer_position, axis=0, append=told.observer_position[-1:]), axis=-1
+                np.diff(lived.observer_position, axis=0, append=lived.observer_position[-1:]), axis=-1
             )
             > 0.02
         )
@@ -47,10 +47,10 @@ def test_manner_over_minutes():
 
 
 def test_someone_far_away_or_still_never_makes_it_run():
-    floor = floor_for([], breadth_m=0.24, height_m=0.3)
+    floor = floor_for([], (0.24, 0.3))
     for seen in (
-        SeenPerson(np.array([2.8, 2.2]), np.array([-0.9, -0.9])),
-        SeenPerson(np.array([-0.6, -1.0]), np.zeros(2)),
+        SeenWalker(np.array([2.8, 2.2]), np.array([-0.9, -0.9])),
+        SeenWalker(np.array([-0.6, -1.0]), np.zeros(2)),
     ):
         cat = Policy(floor, HOME.places, np.array([-2.0, -1.6]), np.random.default_rng(1))
         for _ in range(20):
@@ -59,10 +59,10 @@ def test_someone_far_away_or_still_never_makes_it_run():
 
 
 def test_it_runs_away_from_whoever_comes():
-    floor = floor_for([], breadth_m=0.24, height_m=0.3)
+    floor = floor_for([], (0.24, 0.3))
     for angle in np.linspace(0, 2 * np.pi, 7):
         toward = np.array([np.sin(angle), np.cos(angle)])
         cat = Policy(floor, HOME.places, np.zeros(2), np.random.default_rng(2))
         for _ in range(45):
-            cat.step(STEP_S, SeenPerson(-1.2 * toward, 1.1 * toward))
+            cat.step(STEP_S, SeenWalker(-1.2 * toward, 1.1 * toward))
         assert cat.walker.position @ toward > 0.5, "metres along the way from the person to it"

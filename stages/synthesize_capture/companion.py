@@ -1,30 +1,16 @@
-"""Let two animals live together: a cat that minds the person and the dog, and a dog that plays with the cat,
-follows it and leaves it alone in turn.
+"""A second animal: a dog that plays with the first one, follows it and leaves it alone in turn.
 
-`simulate_pair` is `session.simulate_session` for two; the person films whom it looks at, one or both.
+`live` moves one or two animals on, `focus` is what the person films.
 """
 
-from collections import deque
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from stages.synthesize_capture.dog import DOG
-from stages.synthesize_capture.navigation import Floor, Ground, floor_for
-from stages.synthesize_capture.observer import FILMING, Observer, ObserverStyle
-from stages.synthesize_capture.policy import DELAY_S, REASONS, Policy, SeenPerson
-from stages.synthesize_capture.room import Place, Room
-from stages.synthesize_capture.session import (
-    ANIMAL_BREADTH_M,
-    ANIMAL_HEIGHT_M,
-    PERSON_BREADTH_M,
-    PERSON_HEIGHT_M,
-    STEP_S,
-    SessionTrajectories,
-    course_from_rows,
-    course_row,
-)
+from stages.synthesize_capture.navigation import Floor, Ground
+from stages.synthesize_capture.policy import Policy, SeenWalker
+from stages.synthesize_capture.room import Place
 
 Mode = Literal["own", "follow", "play", "avoid"]
 NEXT: dict[Mode, tuple[tuple[Mode, ...], tuple[float, ...]]] = {
@@ -35,10 +21,7 @@ NEXT: dict[Mode, tuple[tuple[Mode, ...], tuple[float, ...]]] = {
 }
 """What follows a mode, and how likely."""
 LASTING_S: dict[Mode, tuple[float, float]] = {
-    "own": (2.0, 4.0),
-    "follow": (4.0, 8.0),
-    "play": (2.0, 4.0),
-    "avoid": (2.0, 4.0),
+    mode: (4.0, 8.0) if mode == "follow" else (2.0, 4.0) for mode in NEXT
 }
 PACE_M_S: dict[Mode, float] = {"own": 0.7, "follow": 0.9, "play": 1.5, "avoid": 1.2}
 REACH_M: dict[Mode, float] = {"follow": 0.95, "play": 0.75}
@@ -62,14 +45,9 @@ class Companion(Policy):
         super().__init__(floor, low, position, rng)
         self.mode: Mode = "follow"
         self.left_s, self.planned_s = rng.uniform(1.0, 3.0), 0.0
-        self.other = SeenPerson(self.walker.position, np.zeros(2))
+        self.other = SeenWalker(self.walker.position, np.zeros(2))
 
-    def live(self, seconds: float, person: SeenPerson, other: SeenPerson) -> None:
-        """Decide by person and other animal, then move on by one step."""
-        self.other = other
-        self.step(seconds, person)
-
-    def _decide(self, seconds: float, seen: SeenPerson) -> None:
+    def _decide(self, seconds: float, seen: SeenWalker) -> None:
         if self.distance < 0.5 and self.closing > 0.25 and self.fear_s <= 0:
             self._flee(seen)
             return
@@ -109,56 +87,33 @@ class Companion(Policy):
         self.walker.go(goal)
 
 
-def simulate_pair(
-    room: Room, rng: np.random.Generator, duration_s: float, style: ObserverStyle = FILMING
-) -> SessionTrajectories:
-    """Simulate one session of a cat and a dog; the same generator state gives the same session."""
-    footprints = room.footprints()
-    cats = floor_for(footprints, breadth_m=ANIMAL_BREADTH_M, height_m=ANIMAL_HEIGHT_M)
-    dogs = floor_for(footprints, breadth_m=ANIMAL_BREADTH_M * DOG.size, height_m=ANIMAL_HEIGHT_M * DOG.size)
-    people = floor_for(footprints, breadth_m=PERSON_BREADTH_M, height_m=PERSON_HEIGHT_M)
-    start = people.centers()[rng.integers(people.free.sum())]
-    cat = Policy(cats, room.places, _at_distance(cats, start, 2.0, rng), rng)
-    dog = Companion(dogs, room.places, _at_distance(dogs, cat.walker.position, 1.2, rng), rng)
-    observer, phase = Observer(people, start, rng, style), rng.uniform(0, 2 * np.pi)
-    past: deque[tuple[SeenPerson, ...]] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
-    courses, person, reason = ([], []), [], []
-    for index in range(int(np.ceil(duration_s / STEP_S)) + 2):
-        observer.step(STEP_S, _focus(cat, dog, index * STEP_S, phase))
-        walker = observer.walker
-        past.append((SeenPerson(walker.position.copy(), observer.velocity.copy()), _seen(cat), _seen(dog)))
-        seen_person, seen_cat, seen_dog = past[0]
-        cat.step(STEP_S, _minded(cat, seen_person, seen_dog))
-        dog.live(STEP_S, seen_person, seen_cat)
-        _keep_apart(cat, dog)
-        for course, each in zip(courses, (cat, dog), strict=True):
-            course.append(course_row(each))
-        person.append((walker.position.copy(), observer.looks_at.copy()))
-        reason.append(REASONS.index(cat.reason))
-    position, looks_at = (np.array(column) for column in zip(*person, strict=True))
-    first, second = (course_from_rows(course) for course in courses)
-    return SessionTrajectories(first, position, looks_at, np.array(reason), second)
+def live(seconds: float, animals: list[Policy], past: list[SeenWalker]) -> None:
+    """Move the animals on by one step, given the person and the animals as they notice them now."""
+    person, *others = past
+    match animals:
+        case [animal]:
+            animal.step(seconds, person)
+        case [cat, Companion() as dog]:
+            cat.step(seconds, _minded(cat, person, others[1]))
+            dog.other = others[0]
+            dog.step(seconds, person)
+            _keep_apart(seconds, cat, dog)
 
 
-def _at_distance(floor: Floor, start: Ground, distance_m: float, rng: np.random.Generator) -> Ground:
-    centers = floor.centers()
-    off = np.abs(np.linalg.norm(centers - start, axis=-1) - distance_m)
-    return centers[np.argmin(off + rng.uniform(0, 0.5, len(centers)))]
-
-
-def _seen(animal: Policy) -> SeenPerson:
+def seen(animal: Policy) -> SeenWalker:
+    """Return an animal as others see it."""
     walker = animal.walker
     velocity = walker.speed * np.array([np.sin(walker.yaw), np.cos(walker.yaw)])
-    return SeenPerson(walker.position.copy(), velocity)
+    return SeenWalker(walker.position.copy(), velocity)
 
 
-def _minded(cat: Policy, person: SeenPerson, dog: SeenPerson) -> SeenPerson:
+def _minded(cat: Policy, person: SeenWalker, dog: SeenWalker) -> SeenWalker:
     """Return whom the cat minds: the dog when it is near and nearer than the person."""
     apart = [float(np.linalg.norm(each.position - cat.walker.position)) for each in (person, dog)]
     return dog if apart[1] < min(MINDED_M, apart[0]) else person
 
 
-def _keep_apart(cat: Policy, dog: Companion) -> None:
+def _keep_apart(seconds: float, cat: Policy, dog: Companion) -> None:
     """Have bodies on the floor make way for each other: the dog, or the cat where the dog cannot."""
     if cat.height > 0.1 or cat.leap is not None:
         return
@@ -167,7 +122,7 @@ def _keep_apart(cat: Policy, dog: Companion) -> None:
     if distance >= APART_M:
         return
     way = off / distance if distance > 1e-6 else np.array([1.0, 0.0])
-    step = min(APART_M - distance, PUSH_M_S * STEP_S)
+    step = min(APART_M - distance, PUSH_M_S * seconds)
     for animal, sign in ((dog, 1.0), (cat, -1.0)):
         goal = animal.walker.position + sign * step * way
         if animal.walker.floor.is_free(goal):
@@ -175,10 +130,11 @@ def _keep_apart(cat: Policy, dog: Companion) -> None:
             return
 
 
-def _focus(cat: Policy, dog: Companion, now_s: float, phase: float) -> Float[np.ndarray, "3"]:
-    """Return what the person films: between both where they are near each other, else one and then the
-    other.
-    """
+def focus(animals: list[Policy], now_s: float, phase: float) -> Float[np.ndarray, "3"]:
+    """Return what the person films: of two that are near each other the middle, else one after the other."""
+    if len(animals) == 1:
+        return animals[0].position
+    cat, dog = animals
     apart = float(np.linalg.norm(cat.position - dog.position))
     turn = 0.5 + 0.5 * np.tanh(3 * np.sin(2 * np.pi * now_s / FOCUS_PERIOD_S + phase))
     both = np.clip((BOTH_M + 0.4 - apart) / 0.4, 0, 1)
