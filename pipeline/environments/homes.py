@@ -80,15 +80,12 @@ def together(habitats: Sequence[Habitat]) -> Habitat:
         start=np.concatenate([part.start for part in parts]),
         split=np.concatenate([part.split for part in parts]),
     )
+    every = [habitat.scenes for habitat in habitats]
     joined = Scenes(
-        tuple(volume for habitat in habitats for volume in habitat.scenes.volumes),
-        tuple(allowed for habitat in habitats for allowed in habitat.scenes.allowed),
+        tuple(volume for scenes in every for volume in scenes.volumes),
+        tuple(allowed for scenes in every for allowed in scenes.allowed),
         np.concatenate(of_video),
-        tuple(support for habitat in habitats for support in _supports(habitat.scenes)),
+        tuple(support for scenes in every for support in scenes.supports or (None,) * len(scenes.volumes)),
     )
     shares = tuple(share for habitat in habitats for share in habitat.share_known)
     return Habitat(data, joined, np.concatenate(home_of_video), shares)
-
-
-def _supports(scenes: Scenes):
-    return scenes.supports or (None,) * len(scenes.volumes)

@@ -84,9 +84,8 @@ class ReconstructedHome:
         level = floor_level(table["allowed"] >= SUPPORTED)
         if level is None or not np.isfinite(table["stands_m"]).all():
             raise _unusable("shows no floor that carries an animal", behavior_data)
-        volume = FeatureVolume(
-            table["features"], table["occupancy"], table["origin"], float(table["voxel_m"])
-        )
+        arrays = table["features"], table["occupancy"], table["origin"]
+        volume = FeatureVolume(*arrays, float(table["voxel_m"]))
         floor_m = float(volume.origin[1] + level * volume.voxel_m)
         return cls(volume, table["allowed"], table["stands_m"], basis, describer, floor_m)
 
@@ -217,17 +216,8 @@ def set_down(
     if TRAIN not in splits:
         raise _unusable("has no free floor on which the animal can be set down", Path("the other home"))
     number = np.arange(len(tracks), dtype=np.int32)
-    return BehaviorData(
-        tracks,
-        data.agent_from_bone_rest,
-        number,
-        np.zeros_like(number),
-        np.array(splits, np.uint8),
-        tuple(tracks),
-        data.future,
-        data.past,
-        data.rate_hz,
-    )
+    windows = {"video": number, "start": np.zeros_like(number), "split": np.array(splits, np.uint8)}
+    return replace(data, trajectories=tracks, videos=tuple(tracks), **windows)
 
 
 def _floor_places(home: ReconstructedHome) -> Float[np.ndarray, "place 3"]:
@@ -241,13 +231,9 @@ def _floor_places(home: ReconstructedHome) -> Float[np.ndarray, "place 3"]:
 def _cut(track: Trajectory, start: int, past: int, future: int) -> Trajectory:
     part = slice(start, start + past + future)
     valid = np.arange(past + future) < past
-    return Trajectory(
-        track.timestamp_s[part] - track.timestamp_s[start],
-        track.world_from_agent[part],
-        track.agent_from_bone[part],
-        track.world_from_camera[part],
-        valid,
-    )
+    time_s = track.timestamp_s[part] - track.timestamp_s[start]
+    poses = track.world_from_agent[part], track.agent_from_bone[part], track.world_from_camera[part]
+    return Trajectory(time_s, *poses, valid)
 
 
 def _placed(

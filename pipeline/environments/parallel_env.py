@@ -1,6 +1,5 @@
 """Person and animal both act, for PettingZoo: the animal's action is a goal that it plans its way to."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from jaxtyping import Float
 from pettingzoo import ParallelEnv
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rendering import bird_view
 from pipeline.environments.rewards import ENDING, REWARDS
@@ -41,23 +39,9 @@ class PersonAnimalEnv(ParallelEnv):
         "render_fps": RATE_HZ,
     }
 
-    def __init__(
-        self,
-        build: str | Path | AnimalWorld,
-        *,
-        render_mode: str | None = None,
-        home: str | Path | None = None,
-        homes: Sequence[str | Path] = (),
-        device: str = "cpu",
-        config: EnvironmentConfig | None = None,
-        **settings: Any,
-    ):
-        """Open a build (`build/<agent>`), its animal in another build's home where ``home`` names one, or in
-        each of ``homes``: every episode draws one of them.
-
-        ``settings`` replace fields of `EnvironmentConfig`.
-        """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
+    def __init__(self, build: str | Path | AnimalWorld, *, render_mode: str | None = None, **opening: Any):
+        """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
+        self.world = AnimalWorld.opened(build, **opening)
         self.config, self.render_mode = self.world.config, render_mode
         self.possible_agents = [PERSON, ANIMAL]
         self.agents: list[str] = []

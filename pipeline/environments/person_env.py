@@ -1,6 +1,5 @@
 """One person, or robot, beside one animal, for Gymnasium."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.rendering import PictureWindow, bird_view
 from pipeline.environments.rewards import ENDING, REWARDS
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
@@ -25,23 +23,9 @@ class PersonEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RATE_HZ}  # noqa: RUF012
 
-    def __init__(
-        self,
-        build: str | Path | AnimalWorld,
-        *,
-        render_mode: str | None = None,
-        home: str | Path | None = None,
-        homes: Sequence[str | Path] = (),
-        device: str = "cpu",
-        config: EnvironmentConfig | None = None,
-        **settings: Any,
-    ):
-        """Open a build (`build/<agent>`), its animal in another build's home where ``home`` names one, or in
-        each of ``homes``: every episode draws one of them.
-
-        ``settings`` replace fields of `EnvironmentConfig`.
-        """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
+    def __init__(self, build: str | Path | AnimalWorld, *, render_mode: str | None = None, **opening: Any):
+        """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
+        self.world = AnimalWorld.opened(build, **opening)
         self.config, self.render_mode = self.world.config, render_mode
         self.observation_space = person_observation_space(self.config.observations)
         self.action_space = person_action_space(self.world)

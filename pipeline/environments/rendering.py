@@ -8,13 +8,8 @@ from pipeline.environments.world import AnimalWorld
 
 SIDE_PX, SIDE_M = 400, 8.0
 """Side of a picture in pixels, and of what it shows in metres."""
-GROUND, SOLID, PERSON, ANIMAL, PLAN = (
-    (250, 250, 250),
-    (150, 150, 150),
-    (85, 168, 104),
-    (59, 110, 165),
-    (221, 132, 82),
-)
+GROUND, SOLID = (250, 250, 250), (150, 150, 150)
+PERSON, ANIMAL, PLAN = (85, 168, 104), (59, 110, 165), (221, 132, 82)
 """Colours, RGB."""
 
 
@@ -33,17 +28,15 @@ def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
     animals = world.animals
     path = animals.plan.root[row, animals.played[row] :, :3, 3][:, [0, 2]]
     root = animals.past[-1].root[row, 0]
-    cv2.polylines(
-        picture, [np.array([pixel(point) for point in path], np.int32).reshape(-1, 1, 2)], False, PLAN, 1
-    )
+    line = np.array([pixel(point) for point in path], np.int32).reshape(-1, 1, 2)
+    cv2.polylines(picture, [line], False, PLAN, 1)
     cv2.circle(picture, pixel(animals.goal[row][[0, 2]]), 4, PLAN, -1)
     nose = root[[0, 2], 3] + 0.3 * root[[0, 2], 2]
     cv2.line(picture, pixel(root[[0, 2], 3]), pixel(nose), ANIMAL, 3)
     cv2.circle(picture, pixel(root[[0, 2], 3]), 6, ANIMAL, -1)
     heading = world.persons.heading[row]
-    cv2.line(
-        picture, pixel(centre), pixel(centre + 0.5 * np.array([np.sin(heading), np.cos(heading)])), PERSON, 2
-    )
+    ahead = np.array([np.sin(heading), np.cos(heading)])
+    cv2.line(picture, pixel(centre), pixel(centre + 0.5 * ahead), PERSON, 2)
     cv2.circle(picture, pixel(centre), 8, PERSON, -1)
     return picture
 

@@ -5,7 +5,6 @@ The camera is at eye height and looks ahead and down. Scene and animal are the s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +32,6 @@ AGENT_FACES = 2000
 """Triangles kept of the animal: half a pixel each at a metre."""
 FOCAL_PX = WIDTH_PX / 2 / np.tan(FIELD_RAD / 2)
 INTRINSICS = np.array([[FOCAL_PX, 0, WIDTH_PX / 2], [0, FOCAL_PX, HEIGHT_PX / 2], [0, 0, 1]])
-
-
-@dataclass(frozen=True)
-class RgbdImage:
-    """Colour, and z-depth in metres (0 where nothing is)."""
-
-    rgb: UInt8[np.ndarray, "48 64 3"]
-    depth_m: Float[np.ndarray, "48 64"]
 
 
 class RgbdCamera:
@@ -83,8 +74,10 @@ class RgbdCamera:
         heading: float,
         world_from_agent: Float[np.ndarray, "4 4"],
         agent_from_bone: Float[np.ndarray, "bone 4 4"],
-    ) -> RgbdImage:
-        """Look from a place (metres) towards a heading about +y (radians, 0 along +z)."""
+    ) -> tuple[UInt8[np.ndarray, "48 64 3"], Float[np.ndarray, "48 64"]]:
+        """Look from a place (metres) towards a heading about +y (radians, 0 along +z). Return colour, and
+        z-depth in metres (0 where nothing is).
+        """
         level = np.cos(PITCH_RAD)
         ahead = np.array([np.sin(heading) * level, -np.sin(PITCH_RAD), np.cos(heading) * level])
         camera = rigid.look_at(eye_world, eye_world + ahead, np.array([0.0, 1.0, 0.0]))
@@ -96,7 +89,7 @@ class RgbdCamera:
         animal = (near > 0) & ((depth == 0) | (near < depth))
         rgb = np.where(animal[..., None], shade(posed.mesh, struck).reshape(rgb.shape), rgb)
         depth_m = np.where(animal, near, depth).clip(0, FAR_M)
-        return RgbdImage(rgb.astype(np.uint8), depth_m.astype(np.float32))
+        return rgb.astype(np.uint8), depth_m.astype(np.float32)
 
     def _posed(
         self, world_from_agent: Float[np.ndarray, "4 4"], agent_from_bone: Float[np.ndarray, "bone 4 4"]

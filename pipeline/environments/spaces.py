@@ -51,9 +51,7 @@ def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "pers
             case "occupancy":
                 parts["occupancy"] = occupancy_seen(world)
             case "rgbd":
-                pictures = world.pictures()
-                parts["rgb"] = np.stack([picture.rgb for picture in pictures])
-                parts["depth"] = np.stack([picture.depth_m for picture in pictures])
+                parts["rgb"], parts["depth"] = map(np.stack, zip(*world.pictures(), strict=True))
             case _:
                 assert_never(seen)
     return parts

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.rewards import ENDING, REWARDS
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
 from pipeline.environments.world import AnimalWorld
@@ -26,22 +25,12 @@ class PersonStableVecEnv(VecEnv):
     """
 
     def __init__(
-        self,
-        build: str | Path | AnimalWorld,
-        num_envs: int,
-        *,
-        home: str | Path | None = None,
-        homes: Sequence[str | Path] = (),
-        split: str = "train",
-        device: str = "cpu",
-        config: EnvironmentConfig | None = None,
-        **settings: Any,
+        self, build: str | Path | AnimalWorld, num_envs: int, *, split: str = "train", **opening: Any
     ):
-        """Open a build (`build/<agent>`); episodes begin at moments of ``split``, train or test.
-
-        ``settings`` replace fields of `EnvironmentConfig`.
+        """Open a build (`build/<agent>`) by what `AnimalWorld.opened` takes; episodes begin at moments of
+        ``split``, train or test.
         """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
+        self.world = AnimalWorld.opened(build, **opening)
         self.config, self.split, self.render_mode = self.world.config, split, None
         super().__init__(
             num_envs, person_observation_space(self.config.observations), person_action_space(self.world)

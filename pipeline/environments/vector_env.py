@@ -1,6 +1,5 @@
 """Many persons beside many animals at once, for Gymnasium's vector interface; animals plan in batches."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.rewards import ENDING, REWARDS
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
 from pipeline.environments.world import AnimalWorld
@@ -25,23 +23,9 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP,
     }
 
-    def __init__(
-        self,
-        build: str | Path | AnimalWorld,
-        num_envs: int = 1,
-        *,
-        home: str | Path | None = None,
-        homes: Sequence[str | Path] = (),
-        device: str = "cpu",
-        config: EnvironmentConfig | None = None,
-        **settings: Any,
-    ):
-        """Open a build (`build/<agent>`), its animal in another build's home where ``home`` names one, or in
-        each of ``homes``: every episode draws one of them.
-
-        ``settings`` replace fields of `EnvironmentConfig`.
-        """
-        self.world = AnimalWorld.opened(build, config, settings, home=home, homes=homes, device=device)
+    def __init__(self, build: str | Path | AnimalWorld, num_envs: int = 1, **opening: Any):
+        """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
+        self.world = AnimalWorld.opened(build, **opening)
         self.config, self.num_envs, self.render_mode = self.world.config, num_envs, None
         self.single_observation_space = person_observation_space(self.config.observations)
         self.single_action_space = person_action_space(self.world)

@@ -5,13 +5,13 @@ happened. Persons are moved by actions, animals by the behaviour model through `
 where a plan ends or the person has moved noticeably: `plans_per_step` is that rate.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
@@ -25,7 +25,7 @@ from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.homes import Habitat, settle
 from pipeline.environments.rewards import StepOutcome
-from pipeline.environments.rgbd import RgbdCamera, RgbdImage
+from pipeline.environments.rgbd import RgbdCamera
 from pipeline.metrics.flight import WITHIN_S, flees
 from pipeline.workflow import artifact
 
@@ -73,35 +73,31 @@ class AnimalWorld:
             guidance=config.guidance,
             max_path_draws=1,
         )
-        self.animals = AnimalBatch(
-            sampler,
-            scenes,
-            data.agent_from_bone_rest,
-            ego,
-            sampling=sampling,
-            chaining=ReplanningConfig(candidates=config.candidates),
-        )
+        rest, chaining = data.agent_from_bone_rest, ReplanningConfig(candidates=config.candidates)
+        self.animals = AnimalBatch(sampler, scenes, rest, ego, sampling=sampling, chaining=chaining)
         tracks = [data.trajectories[name] for name in data.videos]
         roots = [track.world_from_agent[track.valid, :3, 3] for track in tracks]
-        self.floors = []
+        self.floors, scene_of = [], self._scene_of_videos()
         for number, volume in enumerate(scenes.volumes):
-            here = [
-                root for root, scene in zip(roots, self._scene_of_videos(), strict=True) if scene == number
-            ]
+            here = [root for root, scene in zip(roots, scene_of, strict=True) if scene == number]
             self.floors.append(PersonFloor.of(volume, np.concatenate(here)))
 
     @classmethod
     def opened(
         cls,
         build: "str | Path | AnimalWorld",
-        config: EnvironmentConfig | None,
-        settings: Mapping[str, Any],
         *,
-        home: str | Path | None,
-        homes: Sequence[str | Path],
-        device: str,
+        home: str | Path | None = None,
+        homes: Sequence[str | Path] = (),
+        device: str = "cpu",
+        config: EnvironmentConfig | None = None,
+        **settings: Any,
     ) -> "AnimalWorld":
-        """Return the world of a build, or the one given; ``settings`` replace fields of ``config``."""
+        """Return the world of a build, or the one given, its animal in another build's home where ``home``
+        names one, or in each of ``homes``: every episode draws one of them.
+
+        ``settings`` replace fields of ``config``.
+        """
         config = replace(config or EnvironmentConfig(), **settings)
         config = replace(config, observations=tuple(config.observations))
         given = [Path(each) for each in (*(() if home is None else (home,)), *homes)]
@@ -209,8 +205,8 @@ class AnimalWorld:
         """How much (0..1) of each pair's home looks like the one that the animal knows."""
         return np.array(self.habitat.share_known)[self.home]
 
-    def pictures(self) -> list[RgbdImage]:
-        """Return what the persons' cameras see."""
+    def pictures(self) -> list[tuple[UInt8[np.ndarray, "48 64 3"], Float[np.ndarray, "48 64"]]]:
+        """Return what the persons' cameras see: colour, and z-depth in metres (0 where nothing is)."""
         assert self.camera is not None, "a world that is seen is opened with `rgbd` among its observations"
         now = self.animals.past[-1]
         bones = bones_from_channels(now.bones[:, 0], self.data.agent_from_bone_rest)
@@ -322,10 +318,6 @@ def animal_seen(world: AnimalWorld) -> Float[np.ndarray, "person 7"]:
 
 def occupancy_seen(world: AnimalWorld) -> Float[np.ndarray, "person 16 16"]:
     """Return what blocks the way around each person, in its own frame."""
-    maps = [
-        world.floors[scene].around(
-            world.persons.position[row : row + 1], world.persons.heading[row : row + 1]
-        )
-        for row, scene in enumerate(world.scene)
-    ]
-    return np.concatenate(maps)
+    position, heading = world.persons.position, world.persons.heading
+    rows = [(scene, slice(row, row + 1)) for row, scene in enumerate(world.scene)]
+    return np.concatenate([world.floors[scene].around(position[row], heading[row]) for scene, row in rows])

@@ -43,9 +43,8 @@ def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
         arrival_s=journey.arrival_s.astype(np.float64),
     )
     skin = skin_of(body, journey.moving.agent_from_bone)
-    action = glb.Action(
-        "take", journey.timestamp_s, journey.moving.world_from_agent, journey.moving.agent_from_bone
-    )
+    moving = journey.moving
+    action = glb.Action("take", journey.timestamp_s, moving.world_from_agent, moving.agent_from_bone)
     (folder / "take.glb").write_bytes(glb.skinned(body.mesh, skin, [action]))
     about = {
         "units": "metres, radians, seconds",
@@ -83,9 +82,8 @@ def write_frames(
     chosen = np.arange(0, len(moving), max(1, round(RATE_HZ / rate_hz)))
     for number, frame in enumerate(progress.track(chosen, "frames", total=len(chosen))):
         posed = surface(*motion_tensors(moving[frame : frame + 1]))[0].numpy()
-        picture = drawn(
-            caster, Mesh(posed, body.mesh.faces, body.mesh.color), seen[frame], intrinsics, height, width
-        )
+        animal = Mesh(posed, body.mesh.faces, body.mesh.color)
+        picture = drawn(caster, animal, seen[frame], intrinsics, height, width)
         images.write_color(folder / "frames" / f"{number:06d}.jpg", picture)
 
 
@@ -95,15 +93,9 @@ def following(
     """Return a camera that looks down at the animal from the side of the room's centre, moving smoothly."""
     target = np.asarray(gaussian_filter1d(roots_world, SMOOTHED_FRAMES, axis=0, mode="nearest"))
     away = (centre - target) * [1.0, 0.0, 1.0]
-    away = gaussian_filter1d(
-        away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), OFF_CENTER_M),
-        TURNED_FRAMES,
-        axis=0,
-        mode="nearest",
-    )
-    eyes = target + ASIDE_M * away + ABOVE_M
-    up = np.array([0.0, 1.0, 0.0])
-    return rigid.look_at(eyes, target, up)
+    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), OFF_CENTER_M)
+    away = gaussian_filter1d(away, TURNED_FRAMES, axis=0, mode="nearest")
+    return rigid.look_at(target + ASIDE_M * away + ABOVE_M, target, np.array([0.0, 1.0, 0.0]))
 
 
 def drawn(
@@ -130,11 +122,9 @@ def skin_of(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4 
     some = agent_from_bone[weight_refit.different_poses(agent_from_bone, FITTED_POSES)]
     still = torch.eye(4).expand(len(some), 4, 4)
     posed = PosedSurface(body)(still, torch.from_numpy(some).float()).double().numpy()
-    four, _ = weight_refit.refit_weights(
-        np.asarray(body.mesh.vertices, np.float64),
-        body.weights,
-        weight_refit.Poses(some @ rigid.inverse(rest), posed),
-    )
+    poses = weight_refit.Poses(some @ rigid.inverse(rest), posed)
+    vertices = np.asarray(body.mesh.vertices, np.float64)
+    four, _ = weight_refit.refit_weights(vertices, body.weights, poses)
     return glb.Skin(four.joints, four.weights, rest, tuple(f"bone_{bone:02d}" for bone in range(len(rest))))
 
 

@@ -55,12 +55,8 @@ class LiveView:
         try:
             import viser  # late: an extra
         except ImportError as error:
-            raise InputError(
-                "SIM-010",
-                f"the live view needs viser: {error}",
-                "the Python environment",
-                "install it: make extras",
-            ) from error
+            what, where = f"the live view needs viser: {error}", "the Python environment"
+            raise InputError("SIM-010", what, where, "install it: make extras") from error
         self.simulator, self.seed = simulator, seed
         self.server = _serving_own_page_only(viser.ViserServer, port)
         self.server.scene.set_up_direction("+y")
@@ -146,13 +142,8 @@ class LiveView:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        self.interactivity = gui.add_slider(
-            "interactivity",
-            0.0,
-            1.0,
-            SLIDER_STEP,
-            float(np.clip(self.simulator.flock.sampling.guidance, 0, 1)),
-        )
+        guidance = float(np.clip(self.simulator.flock.sampling.guidance, 0, 1))
+        self.interactivity = gui.add_slider("interactivity", 0.0, 1.0, SLIDER_STEP, guidance)
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
         gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())
@@ -184,10 +175,7 @@ def _serving_own_page_only(start: Callable[..., Any], port: int) -> Any:
         server.serve = serve
     if not checked:
         started.stop()
-        raise InputError(
-            "SIM-010",
-            "this version of viser would answer other sites",
-            "the Python environment",
-            "install the version of envs/extras.txt: make extras",
-        )
+        what = "this version of viser would answer other sites"
+        remedy = "install the version of envs/extras.txt: make extras"
+        raise InputError("SIM-010", what, "the Python environment", remedy)
     return started

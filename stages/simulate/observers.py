@@ -32,12 +32,9 @@ def scripted(script: ObserverScript, *, center: Float[np.ndarray, "3"], speed_m_
         case "still":
             return lambda time_s, animal: center
         case "circle":
+            rate = speed_m_s / CIRCLE_M
             return lambda time_s, animal: (
-                center
-                + CIRCLE_M
-                * np.array(
-                    [np.cos(time_s * speed_m_s / CIRCLE_M), 0.0, np.sin(time_s * speed_m_s / CIRCLE_M)]
-                )
+                center + CIRCLE_M * np.array([np.cos(rate * time_s), 0.0, np.sin(rate * time_s)])
             )
         case "approach":
             return ApproachingObserver(center, speed_m_s)

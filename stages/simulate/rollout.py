@@ -13,6 +13,8 @@ from pipeline.data import npz
 from pipeline.geometry import rigid
 from stages.simulate.observers import Observer
 
+CSV_COLUMNS = "time_s,x,y,z,qw,qx,qy,qz,speed_m_s,observer_x,observer_y,observer_z,distance_m"
+
 
 @dataclass(frozen=True)
 class Take:
@@ -45,14 +47,8 @@ def take_of(states: list[SimulatorState], seen: list[Float[np.ndarray, "3"]]) ->
         name: np.array([getattr(state, name) for state in states])
         for name in ("time_s", "world_from_agent", "agent_from_bone", "goal_world", "blocked")
     }
-    return Take(
-        columns["time_s"],
-        columns["world_from_agent"],
-        columns["agent_from_bone"].astype(np.float32),
-        np.array(seen),
-        columns["goal_world"],
-        columns["blocked"],
-    )
+    bones = columns.pop("agent_from_bone").astype(np.float32)
+    return Take(columns.pop("time_s"), agent_from_bone=bones, observer_world=np.array(seen), **columns)
 
 
 def write_take(folder: Path, take: Take) -> None:
@@ -62,23 +58,8 @@ def write_take(folder: Path, take: Take) -> None:
     quaternion = rigid.quaternion_from_rotation(take.world_from_agent[:, :3, :3])
     speed = np.linalg.norm(np.gradient(position, 1 / RATE_HZ, axis=0), axis=1)
     distance = np.linalg.norm((take.observer_world - position)[:, [0, 2]], axis=1)
-    columns = [
-        "time_s",
-        "x",
-        "y",
-        "z",
-        "qw",
-        "qx",
-        "qy",
-        "qz",
-        "speed_m_s",
-        "observer_x",
-        "observer_y",
-        "observer_z",
-        "distance_m",
-    ]
     rows = np.column_stack([take.timestamp_s, position, quaternion, speed, take.observer_world, distance])
     with open(folder / "take.csv", "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
+        writer.writerow(CSV_COLUMNS.split(","))
         writer.writerows([f"{value:.5f}" for value in row] for row in rows)

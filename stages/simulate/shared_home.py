@@ -72,10 +72,8 @@ class ReplayedAnimal:
         """Begin at a window; nobody changes what was recorded."""
         self.track, start = recorded_at(self.data, window)
         broken = np.flatnonzero(~self.track.valid)
-        first, last = (
-            int(broken[broken < start].max(initial=-1)) + 1,
-            int(broken[broken > start].min(initial=len(self.track.valid))),
-        )
+        first = int(broken[broken < start].max(initial=-1)) + 1
+        last = int(broken[broken > start].min(initial=len(self.track.valid)))
         self.frames, self.now, self.time = np.arange(first, last), start - first + self.data.past - 1, 0
         return self._state()
 
@@ -93,9 +91,8 @@ class ReplayedAnimal:
     def _state(self) -> SimulatorState:
         frame, roots = self.frames[self.now % len(self.frames)], self.track.world_from_agent
         bones = self.track.agent_from_bone[frame].astype(np.float64)
-        return SimulatorState(
-            self.time / self.data.rate_hz, roots[frame], bones, roots[self.frames[-1], :3, 3], 0.0
-        )
+        time_s, end = self.time / self.data.rate_hz, roots[self.frames[-1], :3, 3]
+        return SimulatorState(time_s, roots[frame], bones, end, 0.0)
 
 
 class SharedHome:

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from pipeline.core import config as configuration
 from pipeline.core import devices, progress
 from pipeline.core.errors import InputError
 from stages.simulate import subgoal_file, takes
@@ -14,14 +13,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     """Make one take, or one of each animal of a home. Raises SIM-002, SIM-004, SIM-005, SIM-006, SIM-010,
     SIM-011, SIM-013, ART-003, ART-007.
     """
-    subgoals = None
-    if inputs.subgoals is not None:
-        path = inputs.subgoals
-        tables = subgoal_file.tables(configuration.read_table(path), path)
-        entries = [
-            configuration.from_table(subgoal_file.SubgoalEntry, table, where=str(path)) for table in tables
-        ]
-        subgoals = subgoal_file.subgoals(entries, path)
+    subgoals = None if inputs.subgoals is None else subgoal_file.read(inputs.subgoals)
     of_behavior = not config.serve and config.recording is None and subgoals is None
     if inputs.home is not None and not (of_behavior and config.places == "none"):
         what = "sub-goals, recordings and the live view have the animal's own home"

@@ -9,13 +9,12 @@ A place on the floor without room to turn, by a wall or inside of furniture, or 
 to the nearest that has both; `take.json` holds where to.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from pipeline.core import config as configuration
 from pipeline.core.errors import InputError
 from pipeline.longterm.subgoals import Subgoal
 
@@ -35,43 +34,26 @@ class SubgoalEntry:
     """When to be there, seconds from the beginning; None: as fast as usual."""
 
 
-def tables(table: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
-    """Return the `[[subgoal]]` tables of a file. Raises InputError SIM-002."""
+def read(path: Path) -> list[Subgoal]:
+    """Read the sub-goals of a file. Raises InputError SIM-002, and those of a table that is no TOML."""
+    table = configuration.read_table(path)
     rows = table.get("subgoal")
-    if (
-        set(table) != {"subgoal"}
-        or not isinstance(rows, list)
-        or not all(isinstance(row, Mapping) for row in rows)
-    ):
-        raise InputError(
-            "SIM-002",
-            "holds no sub-goals",
-            str(path),
-            "write one [[subgoal]] table per sub-goal, nothing else",
-        )
-    return rows
-
-
-def subgoals(written: list[SubgoalEntry], path: Path) -> list[Subgoal]:
-    """Check what was written and return it as sub-goals. Raises InputError SIM-002."""
+    if set(table) != {"subgoal"} or not isinstance(rows, list) or not all(isinstance(r, dict) for r in rows):
+        remedy = "write one [[subgoal]] table per sub-goal, nothing else"
+        raise InputError("SIM-002", "holds no sub-goals", str(path), remedy)
+    written = [configuration.from_table(SubgoalEntry, row, where=str(path)) for row in rows]
     found, clock = [], 0.0
     for number, each in enumerate(written, 1):
         where = f"{path}: subgoal {number}"
         if len(each.position) not in (2, 3) or not np.isfinite(each.position).all():
-            raise InputError(
-                "SIM-002", f"{each.position} is no position", where, "give [x, z] or [x, y, z] in metres"
-            )
+            remedy = "give [x, z] or [x, y, z] in metres"
+            raise InputError("SIM-002", f"{each.position} is no position", where, remedy)
         if not np.isfinite(each.heading_deg or 0.0) or not (each.time_s or 0.0) <= LONGEST_S:
-            raise InputError(
-                "SIM-002", f"heading_deg or time_s is no number up to {LONGEST_S:g} s", where, "correct it"
-            )
+            what = f"heading_deg or time_s is no number up to {LONGEST_S:g} s"
+            raise InputError("SIM-002", what, where, "correct it")
         if each.time_s is not None and each.time_s < clock:
-            raise InputError(
-                "SIM-002",
-                f"time_s {each.time_s:g} is before the sub-goal ahead of it",
-                where,
-                "let times rise",
-            )
+            what = f"time_s {each.time_s:g} is before the sub-goal ahead of it"
+            raise InputError("SIM-002", what, where, "let times rise")
         clock = each.time_s if each.time_s is not None else clock
         x, *middle, z = each.position
         position = np.array([x, middle[0] if middle else np.nan, z])

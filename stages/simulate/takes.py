@@ -61,20 +61,16 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     scenes = Scenes.load(_required(inputs, "behavior_data"), data.videos)
     simulator = _simulator(inputs, data, scenes, c, ReplanningConfig(), device)
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
-    summary = (
-        f"{c.seconds:g} s, {float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space"
-    )
+    blocked = float(take.blocked.mean())
+    summary = f"{c.seconds:g} s, {blocked:.1%} of the plans' frames outside the allowed space"
     if not (c.optimise and inputs.longterm and inputs.reconstruction):
         return FinishedTake(summary, lambda folder: write_take(folder, take))
     motion = BodyMotion(take.world_from_agent, take.agent_from_bone.astype(np.float64))
     motion, before, after = journeys.refine_at_rate(
         _world(inputs, data), take.timestamp_s, motion, MotionOptimizationConfig()
     )
-    take = replace(
-        take,
-        world_from_agent=motion.world_from_agent,
-        agent_from_bone=motion.agent_from_bone.astype(np.float32),
-    )
+    bones = motion.agent_from_bone.astype(np.float32)
+    take = replace(take, world_from_agent=motion.world_from_agent, agent_from_bone=bones)
     summary += f"; deepest {100 * before.deepest_m:.1f} -> {100 * after.deepest_m:.1f} cm"
     summary += f", foot skate {100 * before.slide_m_s:.1f} -> {100 * after.slide_m_s:.1f} cm/s"
 
@@ -103,12 +99,8 @@ def _elsewhere(inputs: Inputs, home: Path, data: BehaviorData, c: Config, device
         npz.save(
             folder / "volume.npz", compress=True, **vars(volume), allowed=marks, stands_m=moved.home.stands_m
         )
-        about = {
-            "home": home.name,
-            "share_known": moved.share_known,
-            "goals": len(goals),
-            "goals_in_solid": in_solid,
-        }
+        about = {"home": home.name, "share_known": moved.share_known}
+        about |= {"goals": len(goals), "goals_in_solid": in_solid}
         (folder / "home.json").write_text(json.dumps(about, indent=1) + "\n")
 
     return FinishedTake(summary, write)
@@ -154,20 +146,12 @@ def of_recording(inputs: Inputs, c: Config, recording: str) -> FinishedTake:
     """Make reconstructed motion physical: the longest stretch of a session, at most as long as a take."""
     data = BehaviorData.load(_required(inputs, "behavior_data"))
     if recording not in data.trajectories:
-        raise InputError(
-            "SIM-005",
-            f"there is no motion of {recording!r}",
-            str(inputs.behavior_data),
-            f"known: {', '.join(data.videos)}",
-        )
+        what, known = f"there is no motion of {recording!r}", f"known: {', '.join(data.videos)}"
+        raise InputError("SIM-005", what, str(inputs.behavior_data), known)
     found = stretches(data.trajectories[recording], shortest_s=0.5)
     if not found:
-        raise InputError(
-            "SIM-005",
-            f"{recording} holds no uninterrupted motion",
-            str(inputs.behavior_data),
-            "take another session",
-        )
+        what = f"{recording} holds no uninterrupted motion"
+        raise InputError("SIM-005", what, str(inputs.behavior_data), "take another session")
     world, raw = _world(inputs, data), max(found, key=len)[: round(c.seconds * RATE_HZ) + 1]
     made = journeys.refine_motion(world, raw, MotionOptimizationConfig() if c.optimise else None)
     before_mm, after_mm = 1000 * made.before.penetration_m, 1000 * made.after.penetration_m
@@ -202,12 +186,9 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
         drawn = chained_goals(simulator, _observer(simulator, c), c.place_count, c.seed)
         subgoals = move_into_scene(drawn, world.scene, world.model.motion_prior)
     else:
-        learned = [
-            data.trajectories[data.videos[video]] for video in np.unique(data.video[data.split == TRAIN])
-        ]
-        been = np.concatenate(
-            [trajectory.world_from_agent[trajectory.valid, :3, 3] for trajectory in learned]
-        )
+        videos = np.unique(data.video[data.split == TRAIN])
+        learned = [data.trajectories[data.videos[video]] for video in videos]
+        been = np.concatenate([track.world_from_agent[track.valid, :3, 3] for track in learned])
         subgoals = sample_visited_subgoals(been, c.place_count + 1, rng)
     made = journeys.travel(world, subgoals, MotionOptimizationConfig() if c.optimise else None, rng)
     asked = np.stack([goal.position_world for goal in subgoals])
@@ -222,12 +203,9 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
     metrics = made.after
     summary = f"{made.timestamp_s[-1]:.0f} s through {len(subgoals)} sub-goals; "
     summary += f"{metrics.non_collision:.2%} free of collision, {metrics.contact:.1%} in contact, "
-    summary += (
-        f"foot skate {100 * metrics.slide_m_s:.1f} cm/s, largest seam {100 * made.largest_seam_m:.1f} cm"
-    )
-    summary += (
-        f"; {moved} sub-goals moved to where the animal can be: take.json holds where to" if moved else ""
-    )
+    summary += f"foot skate {100 * metrics.slide_m_s:.1f} cm/s, "
+    summary += f"largest seam {100 * made.largest_seam_m:.1f} cm"
+    summary += f"; {moved} sub-goals moved to where it can be: take.json holds where to" if moved else ""
     return FinishedTake(summary, write)
 
 
@@ -272,7 +250,6 @@ def _recorded_person(track: Trajectory, begin: Float[np.ndarray, "3"], c: Config
 def _required(inputs: Inputs, name: str) -> Path:
     path = getattr(inputs, name)
     if path is None:
-        raise InputError(
-            "SIM-004", f"this take needs {name}", "stages.simulate", f"give --{name.replace('_', '-')}"
-        )
+        remedy = f"give --{name.replace('_', '-')}"
+        raise InputError("SIM-004", f"this take needs {name}", "stages.simulate", remedy)
     return path

@@ -20,11 +20,10 @@ import trimesh
 from playwright.sync_api import Browser, Page
 
 from pipeline.behavior.trajectories import BehaviorData
-from pipeline.core import config
 from pipeline.data import npz, ply
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
-from stages.simulate.subgoal_file import SubgoalEntry, subgoals, tables
+from stages.simulate.subgoal_file import read
 from tests.stages.export_simulator import browser, reaction, small_world, twins
 
 pytestmark = [
@@ -214,11 +213,7 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
     with page.expect_download() as download:
         page.click("#toml")
     download.value.save_as(folder / "goals.toml")
-    written = [
-        config.from_table(SubgoalEntry, each, where="")
-        for each in tables(config.read_table(folder / "goals.toml"), folder)
-    ]
-    journey = subgoals(written, folder)
+    journey = read(folder / "goals.toml")
     assert (
         np.linalg.norm(journey[0].position_world - begin[:3]) < 0.5 and journey[0].heading_rad is not None
     ), "metres: it begins where it was"

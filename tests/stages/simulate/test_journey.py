@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.core import config
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.longterm import journeys
@@ -39,10 +38,7 @@ def world():
 
 def read(path, text):
     path.write_text(text)
-    tables = subgoal_file.tables(config.read_table(path), path)
-    return subgoal_file.subgoals(
-        [config.from_table(subgoal_file.SubgoalEntry, each, where=str(path)) for each in tables], path
-    )
+    return subgoal_file.read(path)
 
 
 def test_sub_goals_are_read(tmp_path):
