@@ -1,5 +1,5 @@
-"""No path leads through the person's body: paths are led around it, or wait. The page's `avoidance.js` does
-the same.
+"""No path leads through somebody's body: paths are led around it, or wait. `avoidance.js` of the page does so
+too.
 """
 
 from collections.abc import Callable
@@ -7,8 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float
 
-BODY_M = 0.4
-"""Least distance of the root from the person's middle: half a person (0.2 m) and half an animal's breadth."""
+PERSON_M = 0.12
+"""Radius of a person: of the head, or of legs."""
+UNKNOWN_REACH_M = 0.28
+"""From the root to the muzzle of an animal without bones ahead of its root: a cat's."""
 HURRY = 1.5
 """How much longer than planned a step may be that makes up for a detour."""
 LEAST_STEP_M = 0.04
@@ -17,21 +19,30 @@ LEAST_STEP_M = 0.04
 Points = Float[np.ndarray, "plan 3"]
 
 
+def clearance_of(agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]) -> float:
+    """Return the least distance, metres, of the root from somebody's middle: that of the foremost bone at
+    rest (+z) and a person's radius.
+    """
+    reach_m = float(agent_from_bone_rest[:, 2, 3].max())
+    return PERSON_M + (reach_m if reach_m > 0 else UNKNOWN_REACH_M)
+
+
 def around_person(
     path_world: Float[np.ndarray, "plan frame 3"],
     start_world: Points,
     person_world: Points,
+    clearance_m: float,
     clear: Callable[[Points], Points] = lambda points: points,
 ) -> Float[np.ndarray, "plan frame 3"]:
     """Lead paths, which begin a frame after ``start_world``, around a person who stands still; world frame,
     metres.
 
-    An animal that is nearer than `BODY_M` already does not come nearer still. ``clear`` moves points to where
-    the animal may be; where that leads to the person it waits. Heights stay.
+    An animal that is nearer than ``clearance_m`` already does not come nearer still. ``clear`` moves points
+    to where the animal may be; where that leads to the person it waits. Heights stay.
     """
     level = [0, 2]
     person = person_world[:, level]
-    reach = np.minimum(BODY_M, np.linalg.norm(start_world[:, level] - person, axis=1))
+    reach = np.minimum(clearance_m, np.linalg.norm(start_world[:, level] - person, axis=1))
     here, before, led = np.array(start_world, float), start_world, []
     for wish in np.moveaxis(path_world, 1, 0):
         step = np.maximum(LEAST_STEP_M, HURRY * np.linalg.norm((wish - before)[:, level], axis=1))

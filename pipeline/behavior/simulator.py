@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.behavior.avoidance import around_person
+from pipeline.behavior.avoidance import around_person, clearance_of
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels, channels_from_bones
 from pipeline.behavior.perception import world_from_ego
@@ -73,7 +73,7 @@ class AnimalBatch:
     ):
         self.sampler, self.scenes, self.rest = sampler, scenes, rest
         self.ego: Ego = ego
-        self.sampling, self.chaining = sampling, chaining
+        self.sampling, self.chaining, self.clearance_m = sampling, chaining, clearance_of(rest)
 
     def begin(
         self,
@@ -266,9 +266,8 @@ class AnimalBatch:
             near = np.asarray(np.isfinite(being).all(1))
             if near.any():
                 far = start_world + np.array([ABSENT_M, 0.0, 0.0])
-                clear_world = around_person(
-                    clear_world, start_world, np.where(near[:, None], being, far), clear
-                )
+                there = np.where(near[:, None], being, far)
+                clear_world = around_person(clear_world, start_world, there, self.clearance_m, clear)
         return rigid.apply(rigid.inverse(frame), clear_world)
 
     def _courses(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.behavior.avoidance import BODY_M
+from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.simulator import SimulatorState, as_companions
 from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Trajectory
 from pipeline.data import images
@@ -157,10 +157,11 @@ def _nearest_window(
         data.trajectories[name].timestamp_s[begin] - time_s
         for name, begin in zip(names, data.start[known], strict=True)
     ]
+    clearance_m = clearance_of(data.agent_from_bone_rest)
     order = np.lexsort((np.abs(begins), np.array(names) != same))
     for each in known[order]:
         place = _past_world(data, each[None])[-1]
-        if (np.linalg.norm((placed - place)[:, [0, 2]], axis=-1) >= BODY_M).all():
+        if (np.linalg.norm((placed - place)[:, [0, 2]], axis=-1) >= clearance_m).all():
             return each[None]
     return known[order[:1]]
 

@@ -3,16 +3,28 @@
 import numpy as np
 import pytest
 
-from pipeline.behavior.avoidance import BODY_M, around_person
+from pipeline.behavior.avoidance import PERSON_M, around_person, clearance_of
 from tests.stages.export_simulator.test_support_twins import SOURCES, asked_of_node, needs_node
 
 ASK = (
-    f"import {{ aroundPerson }} from '{SOURCES}/avoidance.js';"
+    f"import {{ aroundPerson, clearanceOf }} from '{SOURCES}/avoidance.js';"
     + """
-const { paths, people } = JSON.parse(await new Response(process.stdin).text());
-console.log(JSON.stringify(paths.map((path, i) => aroundPerson(path.slice(1), path[0], people[i]))));
+const { paths, people, rest } = JSON.parse(await new Response(process.stdin).text());
+console.log(JSON.stringify(paths.map((path, i) => aroundPerson(path.slice(1), path[0], people[i], clearanceOf(rest)))));
 """
 )
+REST = np.tile(np.eye(4), (3, 1, 1))
+REST[:, 2, 3] = (-0.38, 0.0, 0.28)
+CLEARANCE_M = clearance_of(REST)
+
+
+def test_the_clearance_grows_with_the_animal():
+    assert clearance_of(REST) == pytest.approx(0.4), "metres, of a cat"
+    dog = REST * np.array([1.0, 1.0, 1.0, 1.3])
+    assert clearance_of(dog) == pytest.approx(PERSON_M + 1.3 * 0.28)
+    assert clearance_of(REST[1:2]) == pytest.approx(0.4), (
+        "metres, of an animal of which only the root is known"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +47,9 @@ def nearest_m(paths: np.ndarray) -> np.ndarray:
 
 
 def test_no_path_leads_through_the_body(paths):
-    led = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)))
+    led = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)), CLEARANCE_M)
     whole = np.concatenate([paths[:, :1], led], axis=1)
-    assert nearest_m(paths).min() < 0.05 and nearest_m(whole).min() > BODY_M - 0.01, "metres"
+    assert nearest_m(paths).min() < 0.05 and nearest_m(whole).min() > CLEARANCE_M - 0.01, "metres"
     steps = np.linalg.norm(np.diff(whole[..., [0, 2]], axis=1), axis=-1)
     assert steps.max() < 0.09, "metres in 0.1 s: a walk, no jump"
     past = np.linalg.norm((led[:, -1] - paths[:, -1])[:, [0, 2]], axis=1)
@@ -46,17 +58,19 @@ def test_no_path_leads_through_the_body(paths):
 
 def test_who_stands_too_near_does_not_come_nearer(paths):
     start = 0.2 * paths[:, 0] / np.linalg.norm(paths[:, 0][:, [0, 2]], axis=1, keepdims=True)
-    led = around_person(paths[:, 1:], start, np.zeros((len(paths), 3)))
+    led = around_person(paths[:, 1:], start, np.zeros((len(paths), 3)), CLEARANCE_M)
     assert np.linalg.norm(led[..., [0, 2]], axis=-1).min() > 0.19, "metres"
 
 
 def test_nobody_near_changes_nothing(paths):
-    led = around_person(paths[:, 1:], paths[:, 0], np.full((len(paths), 3), 9.0))
+    led = around_person(paths[:, 1:], paths[:, 0], np.full((len(paths), 3), 9.0), CLEARANCE_M)
     np.testing.assert_allclose(led, paths[:, 1:], atol=1e-12)
 
 
 @needs_node
 def test_page_and_python_lead_alike(paths):
-    theirs = asked_of_node(ASK, paths=paths.tolist(), people=np.zeros((len(paths), 2)).tolist())
-    ours = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)))
+    theirs = asked_of_node(
+        ASK, paths=paths.tolist(), people=np.zeros((len(paths), 2)).tolist(), rest=REST.tolist()
+    )
+    ours = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)), CLEARANCE_M)
     np.testing.assert_allclose(theirs, ours, atol=1e-9)

@@ -1,15 +1,23 @@
-// No path leads through the person's body. Counterpart of pipeline/behavior/avoidance.py.
+// No path leads through somebody's body. Counterpart of pipeline/behavior/avoidance.py.
 
-export const BODY_M = 0.4; // of the root from the person's middle: half a person and half an animal's breadth
+const PERSON_M = 0.12; // radius of a person: of the head, or of legs
+const UNKNOWN_REACH_M = 0.28; // from the root to the muzzle of an animal without bones ahead of its root
 const HURRY = 1.5; // how much longer a step may be that makes up for a detour
 const LEAST_STEP_M = 0.04;
 
+// The least distance of the root from somebody's middle: that of the foremost bone at rest (+z) and a person's
+// radius.
+export function clearanceOf(rest) {
+  const reach = Math.max(...rest.map((bone) => bone[2][3]));
+  return PERSON_M + (reach > 0 ? reach : UNKNOWN_REACH_M);
+}
+
 // A path of points [x, y, z] that begins a frame after `start`, led around a person who stands at [x, z]. An
-// animal that is nearer than `BODY_M` already does not come nearer still. clear: moves a point to where the
+// animal that is nearer than `clearance` already does not come nearer still. clear: moves a point to where the
 // animal may be; where that leads to the person it waits.
-export function aroundPerson(path, start, person, clear = (point) => point) {
+export function aroundPerson(path, start, person, clearance, clear = (point) => point) {
   const away = ([x, , z]) => Math.hypot(x - person[0], z - person[1]);
-  const reach = Math.min(BODY_M, away(start));
+  const reach = Math.min(clearance, away(start));
   let [here, before] = [start, start];
   return path.map((target) => {
     const step = Math.max(LEAST_STEP_M, HURRY * Math.hypot(target[0] - before[0], target[2] - before[2]));

@@ -3,7 +3,7 @@
 
 import * as assets from './assets.js';
 import { Animal } from './animal.js';
-import { BODY_M } from './avoidance.js';
+import { clearanceOf } from './avoidance.js';
 import { Clips } from './clips.js';
 import { Overlays } from './overlays.js';
 import { distance } from './path_encoding.js';
@@ -42,6 +42,7 @@ export class Resident {
     resident.detour = null;
     resident.support = new Support(contract.volume, resident.allowed);
     resident.place = [0, floor, 0];
+    resident.clearance = clearanceOf(contract.behavior.agent_from_bone_rest);
     return resident;
   }
 
@@ -166,7 +167,7 @@ export class Resident {
       return true;
     return this.bodies.some(([x, z]) => {
       const [gap, then] = [here, there].map((frame) => Math.hypot(frame[0] - x, frame[2] - z));
-      return then < Math.min(BODY_M, gap) - 0.05 && then < gap - 1e-4;
+      return then < Math.min(this.clearance, gap) - 0.05 && then < gap - 1e-4;
     });
   }
 
@@ -211,7 +212,7 @@ export class Resident {
     const ahead = Array.from({ length: AVOID_TICKS }, (_, i) => this.timeline.at(now + i + 1));
     return this.bodies.some(([x, z]) => {
       const gap = (frame) => Math.hypot(frame[0] - x, frame[2] - z);
-      const reach = Math.min(BODY_M, gap(this.timeline.at(now))) - 0.02;
+      const reach = Math.min(this.clearance, gap(this.timeline.at(now))) - 0.02;
       return ahead.some((frame) => gap(frame) < reach);
     });
   }

@@ -1,7 +1,7 @@
 // From what is perceived to a plan: goal, then path, then body. Counterpart of Sampler in
 // pipeline/behavior/planning.py.
 
-import { aroundPerson } from './avoidance.js';
+import { aroundPerson, clearanceOf } from './avoidance.js';
 import { guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
@@ -33,6 +33,7 @@ export class Sampler {
     this.frames = this.contract.future_frames;
     this.pathChannels = this.contract.path_encoding.channels;
     this.channels = this.contract.scaling.body_mean.length;
+    this.clearance = clearanceOf(this.contract.agent_from_bone_rest);
   }
 
   // The code with everything that is kept, and the one without the observer, in which companions stay.
@@ -356,7 +357,7 @@ export class Sampler {
     const [from, clear] = [apply(frame, start), (place) => (perceived ? this.senses.cleared(place) : place)];
     const wanted = places.map((place) => apply(frame, place));
     const led = bodies.reduceRight(
-      (path, body) => aroundPerson(path, from, body, clear),
+      (path, body) => aroundPerson(path, from, body, this.clearance, clear),
       (detour?.lead(wanted, from) ?? wanted).map(clear),
     );
     const around = detour?.halted(led, from) ?? led;
