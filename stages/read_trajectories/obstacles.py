@@ -21,9 +21,8 @@ MOST_VOXELS = 10_000_000
 
 def no_scene() -> FeatureVolume:
     """Return a volume of one voxel of which nothing is known."""
-    return FeatureVolume(
-        np.zeros((CHANNELS, 1, 1, 1), np.float16), np.full((1, 1, 1), 2, np.uint8), np.zeros(3), 0.1
-    )
+    features, unseen = np.zeros((CHANNELS, 1, 1, 1), np.float16), np.full((1, 1, 1), 2, np.uint8)
+    return FeatureVolume(features, unseen, np.zeros(3), 0.1)
 
 
 def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: float) -> FeatureVolume:
@@ -31,9 +30,8 @@ def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: f
     table = columns(path, ("x", "z"))
     x, z = numbers(path, table, "x"), numbers(path, table, "z")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):
-        raise InputError(
-            "TRJ-001", "has cells without x or z", str(path), "give both of every occupied cell, metres"
-        )
+        remedy = "give both of every occupied cell, metres"
+        raise InputError("TRJ-001", "has cells without x or z", str(path), remedy)
     floor = float(np.nanmin(visited[:, 1])) if len(visited) else 0.0
     floor = 0.0 if 0.0 <= floor < HEADROOM_M else floor
     heights = {

@@ -13,12 +13,8 @@ from stages.read_trajectories.config import Config
 from stages.read_trajectories.motion import MeasuredMotion, absent_observer, concatenated_times
 
 MOTION_KEYS = (
-    "timestamp_s",
-    "world_from_agent",
-    "agent_from_bone",
-    "world_from_camera",
-    "agent_from_bone_rest",
-)
+    "timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "agent_from_bone_rest",
+)  # fmt: skip
 FLOOR_QUANTILE = 0.002
 MAX_DISTANCE_M = 10_000.0
 """Further from the origin single precision resolves no more than millimetres, of which walks are made."""
@@ -29,12 +25,10 @@ def read(path: Path, config: Config) -> MeasuredMotion:
     motion = _read(path, config)
     for who, pose in (("the animal", motion.world_from_agent), ("the observer", motion.world_from_camera)):
         away_m = float(np.nanmax(np.abs(pose[:, :3, 3]), initial=0.0))
-        if away_m <= MAX_DISTANCE_M:
-            continue
-        what = f"{who} is up to {away_m / 1000:.4g} km away from the origin"
-        raise InputError(
-            "TRJ-001", what, str(path), "write metres; subtract one origin near the animal from all positions"
-        )
+        if away_m > MAX_DISTANCE_M:
+            what = f"{who} is up to {away_m / 1000:.4g} km away from the origin"
+            remedy = "write metres; subtract one origin near the animal from all positions"
+            raise InputError("TRJ-001", what, str(path), remedy)
     return motion
 
 
@@ -46,9 +40,8 @@ def _read(path: Path, config: Config) -> MeasuredMotion:
     try:
         stored = npz.load(path)
     except InputError as error:
-        raise InputError(
-            "TRJ-001", error.what, str(path), "save it again with numpy.savez, arrays of numbers only"
-        ) from error
+        remedy = "save it again with numpy.savez, arrays of numbers only"
+        raise InputError("TRJ-001", error.what, str(path), remedy) from error
     return _from_life(stored) if set(MOTION_KEYS) <= set(stored) else _from_joints(path, stored, config)
 
 
@@ -83,33 +76,20 @@ def _from_joints(path: Path, stored: dict[str, np.ndarray], config: Config) -> M
     ]
     if not clips or not all(fitting):
         shapes = ", ".join(f"{name} {value.shape}" for name, value in stored.items())
-        what = f"arrays {shapes} are no joint positions"
-        raise InputError(
-            "TRJ-001", what, str(path), "store [frame joint 3] in metres, +y up, one array per clip"
-        )
+        remedy = "store [frame joint 3] in metres, +y up, one array per clip"
+        raise InputError("TRJ-001", f"arrays {shapes} are no joint positions", str(path), remedy)
     joints = np.concatenate(clips)
     if not np.isfinite(joints).all():
-        raise InputError(
-            "TRJ-001",
-            "some joints are not finite",
-            str(path),
-            "leave out frames in which a joint is not known",
-        )
-    if config.root_joint == config.front_joint or not {config.root_joint, config.front_joint} <= set(
-        range(joints.shape[1])
-    ):
-        raise InputError(
-            "TRJ-001",
-            f"has {joints.shape[1]} joints",
-            str(path),
-            "set root_joint and front_joint in the recipe",
-        )
+        remedy = "leave out frames in which a joint is not known"
+        raise InputError("TRJ-001", "some joints are not finite", str(path), remedy)
+    named = {config.root_joint, config.front_joint}
+    if len(named) < 2 or not named <= set(range(joints.shape[1])):
+        remedy = "set root_joint and front_joint in the recipe"
+        raise InputError("TRJ-001", f"has {joints.shape[1]} joints", str(path), remedy)
     joints = joints - [0.0, np.quantile(joints[..., 1].min(1), FLOOR_QUANTILE), 0.0]
     agent = captured.root_from_joints(joints, config)
-    bones, rest = captured.bones_from_joints(
-        rigid.apply(rigid.inverse(agent), joints), captured.parents(joints, config.root_joint)
-    )
+    parents = captured.parents(joints, config.root_joint)
+    bones, rest = captured.bones_from_joints(rigid.apply(rigid.inverse(agent), joints), parents)
     time = concatenated_times([np.arange(len(clip)) / config.rate_hz for clip in clips])
-    return MeasuredMotion(
-        time, agent, bones, absent_observer(len(time)), rest.astype(np.float32), obstacles.no_scene()
-    )
+    nobody, scene = absent_observer(len(time)), obstacles.no_scene()
+    return MeasuredMotion(time, agent, bones, nobody, rest.astype(np.float32), scene)

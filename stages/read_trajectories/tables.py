@@ -40,9 +40,8 @@ def columns(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
                 for name, value in row.items():
                     found[name.strip().lower()].append((value or "").strip())
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(
-            "TRJ-001", f"cannot be read as CSV: {error}", str(path), "save it as comma-separated UTF-8"
-        ) from error
+        what = f"cannot be read as CSV: {error}"
+        raise InputError("TRJ-001", what, str(path), "save it as comma-separated UTF-8") from error
     missing = [name for name in needed if name not in found]
     if missing:
         present = ",".join(found) or "nothing"
@@ -57,12 +56,8 @@ def numbers(path: Path, table: dict[str, list[str]], name: str) -> Float[np.ndar
         found = np.array([float(value) if value else np.nan for value in table[name]])
         return np.where(np.isinf(found), np.nan, found)
     except ValueError as error:
-        raise InputError(
-            "TRJ-001",
-            f"column {name} is not numeric: {error}",
-            str(path),
-            "one number per cell, metres or seconds",
-        ) from error
+        what, remedy = f"column {name} is not numeric: {error}", "one number per cell, metres or seconds"
+        raise InputError("TRJ-001", what, str(path), remedy) from error
 
 
 def motion_from_csv(
@@ -85,14 +80,11 @@ def motion_from_csv(
     observed = any(name in table for name in OBSERVER_COLUMNS)
     if observed:
         columns(path, OBSERVER_COLUMNS)
-    value = {
-        name: numbers(path, table, name)
-        for name in (*REQUIRED_COLUMNS, *(OBSERVER_COLUMNS if observed else ()))
-    }
+    needed = REQUIRED_COLUMNS + (OBSERVER_COLUMNS if observed else ())
+    value = {name: numbers(path, table, name) for name in needed}
     if not np.isfinite(value["time"]).all() or not len(value["time"]):
-        raise InputError(
-            "TRJ-002", "has rows without a time, or no rows", str(path), "give every row its time in seconds"
-        )
+        what = "has rows without a time, or no rows"
+        raise InputError("TRJ-002", what, str(path), "give every row its time in seconds")
     names = table.get("id", [""] * len(value["time"]))
     number_of = {name: number for number, name in enumerate(dict.fromkeys(names))}
     number = np.array([number_of[name] for name in names])
@@ -100,11 +92,8 @@ def motion_from_csv(
     rows = np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
     rows = [mine[np.argsort(value["time"][mine], kind="stable")] for mine in rows]
     _refuse_impossible_times(path, [value["time"][mine] for mine in rows])
-    rows = [
-        clip
-        for mine in rows
-        for clip in np.split(mine, 1 + np.flatnonzero(np.diff(value["time"][mine]) > CLIP_GAP_S))
-    ]
+    gaps = [1 + np.flatnonzero(np.diff(value["time"][mine]) > CLIP_GAP_S) for mine in rows]
+    rows = [clip for mine, gap in zip(rows, gaps, strict=True) for clip in np.split(mine, gap)]
     kinds = being_kinds(path, table, names)
     companions = None
     if kinds is not None:
@@ -115,10 +104,8 @@ def motion_from_csv(
     order = np.concatenate(rows)
     turn = np.zeros((len(order), 3))
     turn[:, 1] = value["heading"][order]
-    agent = rigid.make(
-        rigid.rotation_from_vector(np.nan_to_num(turn)),
-        np.stack([value[axis][order] for axis in "xyz"], axis=-1),
-    )
+    position = np.stack([value[axis][order] for axis in "xyz"], axis=-1)
+    agent = rigid.make(rigid.rotation_from_vector(np.nan_to_num(turn)), position)
     agent[~np.isfinite(turn[:, 1])] = np.nan
     camera = absent_observer(len(order))
     if observed:
@@ -140,10 +127,8 @@ def being_kinds(path: Path, table: dict[str, list[str]], names: list[str]) -> In
     wrong = [kind for name, kind in zip(names, table["kind"], strict=True) if kind != kind_of[name]]
     wrong += [kind for kind in kind_of.values() if kind not in KINDS]
     if wrong:
-        what = f"column kind holds {wrong[0]!r}"
-        raise InputError(
-            "TRJ-001", what, str(path), f"one of {', '.join(KINDS)}, the same in all rows of an id"
-        )
+        remedy = f"one of {', '.join(KINDS)}, the same in all rows of an id"
+        raise InputError("TRJ-001", f"column kind holds {wrong[0]!r}", str(path), remedy)
     return np.array([KINDS.index(kind_of[name]) for name in names])
 
 
@@ -159,10 +144,8 @@ def companions_of(
     A column belongs to one being at a time, and to the next one `CLIP_GAP_S` after it has gone at the
     earliest, so that no window holds both.
     """
-    parts = []
-    others = [
-        mine[np.isfinite(beings[mine]).all(1)] for mine in sorted(clips, key=lambda rows: time[rows[0]])
-    ]
+    parts, ordered = [], sorted(clips, key=lambda rows: time[rows[0]])
+    others = [mine[np.isfinite(beings[mine]).all(1)] for mine in ordered]
     others = [known for known in others if len(known)]
     for mine in agents:
         columns: list[np.ndarray] = []

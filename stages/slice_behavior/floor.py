@@ -38,9 +38,8 @@ def with_filled_floor(
     masked = np.where(home[:, None], marks, 0)
     carried, solid = masked >= SUPPORTED, occupancy == 1
     unsupported = (masked > 0).any(1) & ~carried[:, : level + 2].any(1) & ~solid[:, : level + 2].any(1)
-    unsupported &= (masked[:, level] > 0) | ~carried.any(
-        1
-    )  # under a seat that nobody saw from below there is no floor
+    # under a seat that nobody saw from below there is no floor
+    unsupported &= (masked[:, level] > 0) | ~carried.any(1)
     masked[:, level][unsupported] = FILLED
     carried = np.any(masked >= SUPPORTED, axis=1, keepdims=True)
     masked[np.broadcast_to(~carried, masked.shape)] = 0

@@ -39,9 +39,8 @@ def trajectory_from_motion(
     Invalid times hold the nearest trusted motion, so that every number is finite. ``smooth_s`` is the
     standard deviation of a Gaussian in time that takes the jitter out of the agent's root.
     """
-    finite = np.isfinite(motion.world_from_agent).all((1, 2)) & np.isfinite(motion.agent_from_bone).all(
-        (1, 2, 3)
-    )
+    finite = np.isfinite(motion.world_from_agent).all((1, 2))
+    finite &= np.isfinite(motion.agent_from_bone).all((1, 2, 3))
     camera_known = np.isfinite(motion.world_from_camera).all((1, 2)) & (motion.confidence >= min_confidence)
     trusted = finite & camera_known & motion.agent_visible
     time = motion.timestamp_s
@@ -57,9 +56,8 @@ def trajectory_from_motion(
         nowhere = np.zeros(len(grid), bool)
         return Trajectory(grid, still.copy(), rest.copy(), still.copy(), nowhere, companions)
     good = time[trusted]
-    agent = rigid.smoothed(
-        rigid.interpolate(good, motion.world_from_agent[trusted], grid), smooth_s * rate_hz
-    )
+    agent = rigid.interpolate(good, motion.world_from_agent[trusted], grid)
+    agent = rigid.smoothed(agent, smooth_s * rate_hz)
     bone = [rigid.interpolate(good, motion.agent_from_bone[trusted, b], grid) for b in range(bones)]
     camera = rigid.interpolate(good, motion.world_from_camera[trusted], grid)
     valid = within_short_gaps(good, grid, max_gap_s, rate_hz)

@@ -61,11 +61,8 @@ def visitation(
     bins = [np.arange(low[axis], high[axis] + VISIT_M, VISIT_M) for axis in (0, 1)]
     tracks = {"animal": "world_from_agent", "observer": "world_from_camera"}
     for axis, (name, key) in zip(axes[0], tracks.items(), strict=True):
-        places = [
-            getattr(data.trajectories[v], key)[data.trajectories[v].valid, :3, 3]
-            for v in data.videos
-            if v not in test
-        ]
+        known = [track for video, track in data.trajectories.items() if video not in test]
+        places = [getattr(track, key)[track.valid, :3, 3] for track in known]
         plots.floor_plan(axis, solid, low, volume.voxel_m)
         if places:
             count = np.histogram2d(*np.concatenate(places)[:, [0, 2]].T, bins=bins)[0]
@@ -80,16 +77,12 @@ def histograms(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
     context, future = data.windows(some(data.indices(TRAIN)), bones=False)
     position = future.path_world
     speed = np.linalg.norm(np.diff(position, axis=1), axis=-1)[:, ::7] * data.rate_hz
-    distance = np.linalg.norm(
-        (context.observer_world - context.world_from_agent[..., :3, 3])[:, -1][:, ::2], axis=-1
-    )
+    away = (context.observer_world - context.world_from_agent[..., :3, 3])[:, -1]
+    distance = np.linalg.norm(away[:, ::2], axis=-1)
     moved = np.linalg.norm(future.goal_world - context.world_from_agent[:, -1, :3, 3], axis=-1)
+    displacement = f"displacement in {data.future / data.rate_hz:g} s [m]"
     return plots.histograms(
-        {
-            "speed [m/s]": speed,
-            "distance to the observer [m]": distance,
-            f"displacement in {data.future / data.rate_hz:g} s [m]": moved,
-        }
+        {"speed [m/s]": speed, "distance to the observer [m]": distance, displacement: moved}
     )
 
 
@@ -98,17 +91,10 @@ def validity(data: BehaviorData, test: Collection[str]) -> UInt8[np.ndarray, "he
     figure, axes = plots.panels(1, 1, width_in=9, height_in=0.5 + 0.4 * max(len(data.videos), 2))
     axis = axes[0, 0]
     for row, video in enumerate(data.videos):
-        trajectory = data.trajectories[video]
-        axis.scatter(
-            trajectory.timestamp_s[trajectory.valid],
-            np.full(trajectory.valid.sum(), row),
-            s=3,
-            color=plots.BLUE,
-        )
-        mine = data.video == row
-        axis.scatter(
-            trajectory.timestamp_s[data.start[mine]], np.full(mine.sum(), row + 0.25), s=3, color=plots.RED
-        )
+        trajectory, mine = data.trajectories[video], data.video == row
+        valid, starts = trajectory.timestamp_s[trajectory.valid], trajectory.timestamp_s[data.start[mine]]
+        axis.scatter(valid, np.full(len(valid), row), s=3, color=plots.BLUE)
+        axis.scatter(starts, np.full(len(starts), row + 0.25), s=3, color=plots.RED)
     names = [
         f"{video} {'test' if video in test else 'train'}: {(data.video == row).sum()}"
         for row, video in enumerate(data.videos)

@@ -9,10 +9,10 @@ from pipeline.core import progress
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data import qa
-from stages.slice_behavior import pictures, reading, writing
+from stages.slice_behavior import pictures, reading
 from stages.slice_behavior.config import Config
 from stages.slice_behavior.gridding import trajectory_from_motion
-from stages.slice_behavior.windows import slice_windows
+from stages.slice_behavior.windows import slice_windows, write_volumes
 
 LEAST_PAST = 3
 """Frames that a posture and a velocity are taken from."""
@@ -34,9 +34,8 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     """Slice all sessions. Raises ART-004 without recordings, BEH-001 without a training window."""
     sessions = {video.id: video for video in videos if video.role == "session"}
     if not sessions:
-        raise InputError(
-            "ART-004", "which recordings?", "slice_behavior", "give --videos build/<agent>/plan/videos.json"
-        )
+        remedy = "give --videos build/<agent>/plan/videos.json"
+        raise InputError("ART-004", "which recordings?", "slice_behavior", remedy)
     if inputs.trajectories is not None:
         source = reading.read_tables(inputs.trajectories)
     elif inputs.reconstruction is not None:
@@ -55,20 +54,14 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     )
     training = len(data.indices(TRAIN))
     if not training:
-        remedy = (
-            "record longer sessions in which the animal stays in view, lower min_confidence, "
-            "or raise max_gap_s where rows are further apart"
-        )
-        raise InputError(
-            "BEH-001",
-            f"no {(data.past + data.future) / data.rate_hz:.1f} s of uninterrupted motion to learn from",
-            source.where,
-            remedy,
-        )
+        remedy = "record longer sessions in which the animal stays in view, lower min_confidence, "
+        remedy += "or raise max_gap_s where rows are further apart"
+        what = f"no {(data.past + data.future) / data.rate_hz:.1f} s of uninterrupted motion to learn from"
+        raise InputError("BEH-001", what, source.where, remedy)
     progress.log(f"{training} training windows, {len(data.start) - training} test windows")
     data.save(out)
     training_tracks = {id: trajectory for id, trajectory in trajectories.items() if id not in test}
-    writing.write_volumes(out, source.volumes, training_tracks, tuple(source.motions), config.rate_hz)
+    write_volumes(out, source.volumes, training_tracks, tuple(source.motions), config.rate_hz)
     qa.write(
         out,
         good="hundreds of windows, an animal that covers the room, and an observer at many distances",

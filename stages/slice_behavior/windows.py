@@ -1,6 +1,7 @@
 """The exact list of training and test windows, and where in the room an animal may be."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -19,7 +20,12 @@ from pipeline.behavior.trajectories import (
     Trajectory,
     window_starts,
 )
+from pipeline.data import npz
 from stages.slice_behavior.floor import with_filled_floor
+
+REACH_VOXELS = 2
+"""Voxels around visited places in which the animal may be, whatever the map says: its root errs by as much.
+"""
 
 
 def slice_windows(
@@ -42,17 +48,10 @@ def slice_windows(
     tested = np.array([v in test for v in videos])
     split = np.where(tested[video], TEST, TRAIN).astype(np.uint8)
     start = np.concatenate(starts).astype(np.int32)
-    return BehaviorData(
-        {v: trajectories[v] for v in videos},
-        agent_from_bone_rest,
-        video,
-        start,
-        split,
-        videos,
-        future,
-        past,
-        rate_hz,
-    )
+    tracks = {v: trajectories[v] for v in videos}
+    windows = {"video": video, "start": start, "split": split, "videos": videos}
+    lengths = {"future": future, "past": past, "rate_hz": rate_hz}
+    return BehaviorData(tracks, agent_from_bone_rest, **windows, **lengths)
 
 
 def allowed_voxels(
@@ -81,3 +80,28 @@ def standing_heights(
         speed = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0, prepend=root[:1, [0, 2]]), axis=-1) * rate_hz
         seen.append((volume, root[trajectory.valid], (speed > REST_SPEED_M_S)[trajectory.valid]))
     return height_ranges(seen)
+
+
+def write_volumes(
+    folder: Path,
+    volumes: tuple[FeatureVolume, ...],
+    seen: Mapping[str, Trajectory],
+    videos: tuple[str, ...],
+    rate_hz: float,
+) -> None:
+    """Write `volume.npz`, or `volumes/<id>.npz` where each recording has its own scene.
+
+    ``seen`` are the training recordings: only where they went counts as visited.
+    """
+    scene = dict(zip(videos, volumes if len(volumes) > 1 else volumes * len(videos), strict=True))
+    stands_m = standing_heights(((scene[id], trajectory) for id, trajectory in seen.items()), rate_hz)
+    if len(volumes) == 1:
+        allowed = allowed_voxels(volumes[0], dict(seen), reach_voxels=REACH_VOXELS)
+        npz.save(folder / "volume.npz", compress=True, **vars(volumes[0]), allowed=allowed, stands_m=stands_m)
+        return
+    (folder / "volumes").mkdir()
+    for id, volume in zip(videos, volumes, strict=True):
+        visited = {id: seen[id]} if id in seen else {}
+        allowed = allowed_voxels(volume, visited, reach_voxels=REACH_VOXELS)
+        path = folder / "volumes" / f"{id}.npz"
+        npz.save(path, compress=True, **vars(volume), allowed=allowed, stands_m=stands_m)

@@ -135,16 +135,16 @@ def test_depth_is_measured_from_the_eyes():
     camera = RgbdCamera([wall], body, weights, REST)
     level = rigid.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
     eye = np.zeros(3)
-    plain = camera.picture(0, eye, 0.0, rigid.make(np.eye(3), np.array([0.0, 50, 0])), REST)
+    _, depth_m = camera.picture(0, eye, 0.0, rigid.make(np.eye(3), np.array([0.0, 50, 0])), REST)
     row = (np.arange(48) + 0.5 - INTRINSICS[1, 2]) / INTRINSICS[1, 1]
     expected = 1.6 / (np.cos(PITCH_RAD) - row * np.sin(PITCH_RAD))
     seen = (expected > 0) & (expected < FAR_M)
-    np.testing.assert_allclose(plain.depth_m[seen, 32], expected[seen], rtol=1e-3)
+    np.testing.assert_allclose(depth_m[seen, 32], expected[seen], rtol=1e-3)
     lowered = REST.copy()
     lowered[1, 1, 3] -= 0.3
     for bones, height in ((REST, 0.0), (lowered, -0.3)):
-        picture = camera.picture(0, eye, 0.0, level, bones)
-        rows, columns = np.nonzero((picture.rgb == RED).all(-1))
+        rgb, depth_m = camera.picture(0, eye, 0.0, level, bones)
+        rows, columns = np.nonzero((rgb == RED).all(-1))
         ray = (np.array([columns.mean(), rows.mean()]) + 0.5 - INTRINSICS[:2, 2]) / INTRINSICS[0, 0]
         ahead = np.array([ray[0], -ray[1] * np.cos(PITCH_RAD) - np.sin(PITCH_RAD)]) / (
             np.cos(PITCH_RAD) - ray[1] * np.sin(PITCH_RAD)
