@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry import cameras, rigid
+from pipeline.geometry.subsampling import evenly
 
 TOLERANCE_M = 0.015
 TOLERANCE_SHARE = 0.01
@@ -163,7 +164,7 @@ def _moving_pairs(
     longest_s = max(GAP_S[1], GAP_FRAMES * float(np.median(np.diff(timestamp_s))))
     close = timestamp_s[second] - timestamp_s[first] <= longest_s
     usable = np.stack([first, second], axis=1)[moved & close]
-    return usable[np.unique(np.linspace(0, len(usable) - 1, min(pairs, len(usable))).round().astype(int))]
+    return usable[evenly(len(usable), pairs, rounded=True)]
 
 
 def _score(

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, UInt8
 from pipeline.core.errors import InputError
 from pipeline.data import images
 from pipeline.geometry import cameras, rigid
+from pipeline.geometry.subsampling import evenly
 from pipeline.recordings import conventions
 from pipeline.recordings.conventions import PoseCheck
 from pipeline.recordings.depth_camera import grid_size, reproject
@@ -142,8 +143,8 @@ def _upright(
     """Return the upright cameras of the chosen frames, if poses are of use, and the turns to upright."""
 
     def room() -> list[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]]:
-        shown = np.unique(np.linspace(0, len(chosen) - 1, UPRIGHT_VIEWS).round().astype(int))
-        return [(each.depth, each.intrinsics) for each in map(view, chosen[shown])]
+        shown = chosen[evenly(len(chosen), UPRIGHT_VIEWS, rounded=True)]
+        return [(each.depth, each.intrinsics) for each in map(view, shown)]
 
     turns = recording.quarter_turns
     if pose is None:
@@ -180,7 +181,7 @@ def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int]
 
 def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
     """Raise CAP-008 for depth too far or near for any sensor's use, as if written in another unit."""
-    shown = recording.index[np.unique(np.linspace(0, len(recording.index) - 1, UNIT_VIEWS).astype(int))]
+    shown = recording.index[evenly(len(recording.index), UNIT_VIEWS)]
     depth = np.concatenate([recording.read_depth(int(number)).ravel() for number in shown])
     depth = depth[np.isfinite(depth) & (depth > 0)]
     typical_m = float(np.median(depth)) if len(depth) else max_depth_m
@@ -206,6 +207,18 @@ def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
     axis, angle = np.cross(up, (0.0, 1.0, 0.0)), np.arccos(np.clip(up[1] / np.linalg.norm(up), -1, 1))
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.array([1.0, 0.0, 0.0])
     return rigid.make(rigid.rotation_from_vector(axis * angle), np.zeros(3))
+
+
+def picture(
+    recording: Recording, row: int, size: tuple[int, int] | None = None
+) -> UInt8[np.ndarray, "height width 3"] | None:
+    """Read one frame's picture, not turned, reduced to a (height, width); None where it is damaged."""
+    stored = recording.read_color(int(recording.index[row]))
+    if stored is None:
+        return None
+    color = images.decode_color(stored, recording.where) if isinstance(stored, bytes) else stored
+    size = size or color.shape[:2]
+    return color if color.shape[:2] == size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
 
 
 def frames(

@@ -1,7 +1,6 @@
-"""Check recordings before a build, in under a minute each.
+"""Check recordings before a build, in under a minute each: what it is, how good, what to do better.
 
-What each is, how good it is, and what to do better. It has a command line of its own because
-it makes no artifact: it runs before there is a plan, and prints each verdict as soon as it is known.
+It has a command line of its own because it makes no artifact and runs before there is a plan.
 
 make capture-check AGENT=luna        or: python -m stages.check_captures captures/luna
 """
@@ -26,11 +25,8 @@ def main(arguments: list[str]) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, help="captures/<agent>, or another folder with recordings")
-    parser.add_argument(
-        "--recipe",
-        type=Path,
-        help="recipe whose [videos] table gives roles (default: agents/<folder's name>.toml)",
-    )
+    about = "recipe whose [videos] table gives roles (default: agents/<folder's name>.toml)"
+    parser.add_argument("--recipe", type=Path, help=about)
     given = parser.parse_args(arguments)
     try:
         files, refused = _files(given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml"))
@@ -42,10 +38,8 @@ def main(arguments: list[str]) -> int:
         unusable += not verdict.usable
         print(f"{printable(verdict.text)}\n", flush=True)
     for name in captures.not_understood(given.folder):
-        print(
-            f"{printable(captures.named(given.folder / name))}  left alone: not a "
-            "recording of a known format (CAP-003)\n"
-        )
+        named = printable(captures.named(given.folder / name))
+        print(f"{named}  left alone: not a recording of a known format (CAP-003)\n")
     missing = captures.missing_roles([role for _, role in files])
     for role, what in missing:
         print(f"CAP-040 there is no {role} among the recordings\n    -> add {what}")
@@ -53,9 +47,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _files(folder: Path, recipe: Path) -> tuple[list[tuple[Path, Role]], list[CaptureVerdict]]:
-    """Return the recordings with their roles, from names, sidecars and the recipe, and those with a bad
-    sidecar.
-    """
+    """Return recordings with roles, by names, sidecars and recipe, and those with a bad sidecar."""
     names = captures.find(folder)
     if not names:
         captures.refuse_strangers(folder)

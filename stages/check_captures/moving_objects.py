@@ -1,7 +1,6 @@
-"""Whether something moves: points of one frame that another frame saw through, in clumps of an animal's size.
+"""Whether something moves: points of one frame that others saw through, in clumps of an animal's size.
 
-No weights and no map; device poses must be usable. A quick look, not a mask: an animal that rests all the
-time is missed.
+Device poses must be usable. A quick look, not a mask: an animal that rests all the time is missed.
 """
 
 from collections.abc import Sequence
@@ -37,9 +36,7 @@ def find_motion(shots: Sequence[SampledFrame]) -> MotionShare | None:
     """Find moving things in sampled frames; None where device poses are missing."""
     if len(shots) < 4 or shots[0].odometry_from_camera is None:
         return None
-    clumps = [
-        _clumps(shot, _vanished(shot, [other for other in shots if other is not shot])) for shot in shots
-    ]
+    clumps = [_clumps(shot, _vanished(shot, shots)) for shot in shots]
     seen = float(np.mean([bool(found) for found in clumps]))
     several = float(np.mean([_far_apart(found) for found in clumps]))
     return MotionShare(seen, several)
@@ -47,27 +44,22 @@ def find_motion(shots: Sequence[SampledFrame]) -> MotionShare | None:
 
 def _vanished(shot: SampledFrame, others: Sequence[SampledFrame]) -> Bool[np.ndarray, "height width"]:
     """Mark pixels whose points at least two other frames saw through, and fewer saw in place."""
-    points = rigid.apply(
-        rigid.inverse(shot.camera_from_odometry),
-        cameras.back_project(shot.depth, shot.depth_intrinsics).reshape(-1, 3),
-    )
+    points_camera = cameras.back_project(shot.depth, shot.depth_intrinsics).reshape(-1, 3)
+    points = rigid.apply(rigid.inverse(shot.camera_from_odometry), points_camera)
     through, there = np.zeros(len(points), int), np.zeros(len(points), int)
-    for other in others:
-        pixel, depth = cameras.project(
-            rigid.apply(other.camera_from_odometry, points), other.depth_intrinsics
-        )
+    for other in (each for each in others if each is not shot):
+        points_other = rigid.apply(other.camera_from_odometry, points)
+        pixel, depth = cameras.project(points_other, other.depth_intrinsics)
         height, width = other.depth.shape
         inside = (depth > 0.1) & (pixel >= 1).all(-1) & (pixel[:, 0] < width - 1) & (pixel[:, 1] < height - 1)
         column, row = np.floor(pixel[inside]).astype(int).T
         low, high = _range_around(other.depth)
         margin = THROUGH_M + 0.03 * depth[inside]
         measured = low[row, column]
-        through[inside] += (measured > depth[inside] + margin) & (measured > 0)
-        there[inside] += (
-            (high[row, column] > depth[inside] - margin)
-            & (low[row, column] < depth[inside] + margin)
-            & (measured > 0)
-        )
+        beyond = measured > depth[inside] + margin
+        before = high[row, column] <= depth[inside] - margin
+        through[inside] += beyond & (measured > 0)
+        there[inside] += ~before & (measured < depth[inside] + margin) & (measured > 0)
     marked = ((through >= VOTES) & (through > there)).reshape(shot.depth.shape) & (shot.depth > 0)
     return cv2.morphologyEx(marked.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 

@@ -1,7 +1,4 @@
-"""Whether a recording shows the room of the walk-through.
-
-SIFT points lifted by depth, a rigid fit, agreement over time.
-"""
+"""Whether a recording shows the walk-through's room: SIFT with depth, a rigid fit, agreement over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,30 +30,24 @@ class DescribedFrame:
 
 def describe(shots: Sequence[SampledFrame]) -> list[DescribedFrame]:
     """Describe frames; those with too few points are left out."""
-    found = [
-        DescribedFrame(
-            shot, sift.sift_points(shot.gray, shot.intrinsics, shot.depth, shot.depth_intrinsics, POINTS)
-        )
-        for shot in shots
-    ]
-    return [each for each in found if len(each.points.points_camera) >= LEAST]
+    found = []
+    for shot in shots:
+        points = sift.sift_points(shot.gray, shot.intrinsics, shot.depth, shot.depth_intrinsics, POINTS)
+        if len(points.points_camera) >= LEAST:
+            found.append(DescribedFrame(shot, points))
+    return found
 
 
 def placed_share(
     walkthrough: Sequence[DescribedFrame], session: Sequence[DescribedFrame], rng: np.random.Generator
 ) -> float:
-    """Return the share (0..1) of session frames that are found in the walk-through, at places that agree
-    with each other.
-    """
+    """Return the share (0..1) of session frames that are found in the walk-through, at places that agree."""
     if not session or not walkthrough:
         return 0.0
     votes = [_best_place(walkthrough, frame, rng) for frame in session]
     placed = [vote for vote in votes if vote is not None]
-    if (
-        not placed
-        or walkthrough[0].shot.odometry_from_camera is None
-        or session[0].shot.odometry_from_camera is None
-    ):
+    with_odometry = all(shown[0].shot.odometry_from_camera is not None for shown in (walkthrough, session))
+    if not placed or not with_odometry:
         return len(placed) / len(session)
     places = np.stack(placed)
     degrees = np.degrees(rigid.rotation_angle(places[:, None, :3, :3], places[None, :, :3, :3]))
@@ -68,9 +59,7 @@ def placed_share(
 def _best_place(
     walkthrough: Sequence[DescribedFrame], frame: DescribedFrame, rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"] | None:
-    """Return where one frame puts its odometry in the walk-through's (4 x 4), or None where no walk-
-    through frame fits.
-    """
+    """Return where one frame puts its odometry in the walk-through's, None where no frame of that fits."""
     best, place = LEAST - 1, None
     for known in walkthrough:
         mine, theirs = sift.matches(frame.points, known.points).T

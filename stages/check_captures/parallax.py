@@ -1,7 +1,4 @@
-"""Whether a video without depth can be mapped from its pictures.
-
-Do neighbours show the same things, from elsewhere.
-"""
+"""Whether a video without depth can be mapped: do neighbours show the same things, from elsewhere."""
 
 import itertools
 from collections.abc import Sequence
@@ -16,9 +13,7 @@ SIDE_PX, POINTS, RATIO, WITHIN_PX = 480, 800, 0.8, 2.0
 LINKED = 25
 """matches on which two views must agree to show the same things"""
 TURNED = 0.9
-"""share of these that a mere turn of the camera (or one plane) explains, beyond which the pair has no
-parallax
-"""
+"""share of these explained by a mere turn of the camera (or one plane) beyond which there is no parallax"""
 
 
 @dataclass(frozen=True)
@@ -34,13 +29,9 @@ class Parallax:
 def parallax(shots: Sequence[SampledFrame]) -> Parallax:
     """Match neighbouring pictures and compare two views of a scene with a mere turn."""
     described = [_described(shot) for shot in shots]
-    links = [
-        link for first, second in itertools.pairwise(described) if (link := _link(first, second)) is not None
-    ]
-    pairs = max(len(shots) - 1, 1)
-    return Parallax(
-        len(links) / pairs, float(np.mean([turned < TURNED for turned in links])) if links else 0.0
-    )
+    links = [link for pair in itertools.pairwise(described) if (link := _link(*pair)) is not None]
+    with_parallax = float(np.mean([turned < TURNED for turned in links])) if links else 0.0
+    return Parallax(len(links) / max(len(shots) - 1, 1), with_parallax)
 
 
 def _described(shot: SampledFrame) -> tuple[np.ndarray, np.ndarray | None]:
@@ -58,9 +49,7 @@ def _link(
     if mine is None or theirs is None or min(len(mine), len(theirs)) < LINKED:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(mine, theirs, k=2)
-    good = np.array(
-        [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance], int
-    ).reshape(-1, 2)
+    good = np.array([(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance], int)
     if len(good) < LINKED:
         return None
     mine, theirs = first[0][good[:, 0]], second[0][good[:, 1]]

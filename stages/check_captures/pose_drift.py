@@ -13,10 +13,7 @@ MOST_PAIRS = 60
 
 
 def drift_m(shots: Sequence[SampledFrame]) -> float:
-    """Return the median disagreement of depth between frames at least 5 s apart, metres.
-
-    NaN where none overlap.
-    """
+    """Return the median disagreement of depth between frames at least 5 s apart, metres; NaN without any."""
     if len(shots) < 2 or shots[0].odometry_from_camera is None:
         return np.nan
     pairs = [

@@ -45,184 +45,94 @@ LEAST_LINKED, LEAST_PARALLAX = 0.6, 0.3
 MOST_SEVERAL = 0.5
 LONGEST_GAP_S = 1.0
 SPARSE_HZ = 5.0
+REMEDIES = {
+    "CAP-030": "copy it from the phone again",
+    "CAP-032": "open the curtains, switch on the lights",
+    "CAP-033": "move and turn more slowly, wipe the lens",
+    "CAP-034": "keep the app in front, free some storage",
+    "CAP-035": "record video; keyframes serve for the walk-through only",
+    "CAP-036": "keep furniture of the walk-through in view; record with a LiDAR phone for measured depth",
+    "CAP-037": "avoid mirrors, glass and black things; do not cover the sensor",
+    "CAP-038": "stay within 4 m of floor, walls and animal",
+    "CAP-039": "record it with a LiDAR phone, or let a session with depth go where it went",
+    "CAP-050": "begin to record when the app's tracking is ready; the build goes on without, less surely",
+    "CAP-051": "nothing to do; if pictures look wrong, report the app's version",
+    "CAP-052": "move smoothly, keep textured things in view; the build repairs what depth shows",
+    "CAP-053": "film the walk-through again and include this part of the room, or leave the file out",
+    "CAP-054": "keep the animal in view; if it rests all the time, point at it with a prompt",
+    "CAP-055": "keep other animals and people out, or point at the animal with a prompt",
+    "CAP-056": "walk sideways instead of turning on the spot, slowly, along things with a pattern",
+}
 
 
 def problems(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
     """Return what is wrong with a recording in its role, worst first."""
-    return [
-        *_of_pictures(seen.sample, role),
-        *_of_depth(seen, role),
-        *_of_poses(seen),
-        *_of_content(seen, role),
-    ]
+    found = _of_pictures(seen.sample, role) | _of_depth(seen, role)
+    found |= _of_poses(seen) | _of_content(seen, role)
+    remedies = REMEDIES | {"CAP-031": f"record at least {SHORTEST_S[role]:.0f} s for a {role}"}
+    return [CaptureProblem(code, what, remedies[code]) for code, what in found.items()]
 
 
-def _of_pictures(sample: RecordingSample, role: Role) -> list[CaptureProblem]:
-    found = []
+def _of_pictures(sample: RecordingSample, role: Role) -> dict[str, str]:
+    found = {}
     if sample.damaged > MOST_DAMAGED:
-        found.append(
-            CaptureProblem(
-                "CAP-030", f"{sample.damaged:.0%} of the pictures are damaged", "copy it from the phone again"
-            )
-        )
+        found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged"
     if sample.duration_s < SHORTEST_S[role]:
-        found.append(
-            CaptureProblem(
-                "CAP-031",
-                f"only {sample.duration_s:.0f} s long",
-                f"record at least {SHORTEST_S[role]:.0f} s for a {role}",
-            )
-        )
+        found["CAP-031"] = f"only {sample.duration_s:.0f} s long"
     if sample.dark > MOST_DARK:
-        found.append(
-            CaptureProblem(
-                "CAP-032",
-                f"{sample.dark:.0%} of the pictures are dark",
-                "open the curtains, switch on the lights",
-            )
-        )
+        found["CAP-032"] = f"{sample.dark:.0%} of the pictures are dark"
     if sample.blurred > MOST_BLURRED:
-        found.append(
-            CaptureProblem(
-                "CAP-033",
-                f"{sample.blurred:.0%} of the pictures are blurred",
-                "move and turn more slowly, wipe the lens",
-            )
-        )
+        found["CAP-033"] = f"{sample.blurred:.0%} of the pictures are blurred"
     if sample.longest_gap_s > LONGEST_GAP_S and sample.rate_hz > 1:
-        found.append(
-            CaptureProblem(
-                "CAP-034",
-                f"frames are missing for {sample.longest_gap_s:.1f} s",
-                "keep the app in front, free some storage",
-            )
-        )
+        found["CAP-034"] = f"frames are missing for {sample.longest_gap_s:.1f} s"
     if sample.rate_hz < SPARSE_HZ and role != "walkthrough":
-        found.append(
-            CaptureProblem(
-                "CAP-035",
-                f"only {sample.rate_hz:.1f} frames per second",
-                "record video; keyframes serve for the walk-through only",
-            )
-        )
+        found["CAP-035"] = f"only {sample.rate_hz:.1f} frames per second"
     return found
 
 
-def _of_depth(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
-    sample = seen.sample
+def _of_depth(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
+    sample, found = seen.sample, {}
     if sample.plan is None:
-        return _of_pictures_alone(seen.parallax) if role == "walkthrough" else [_NO_DEPTH]
-    found = []
+        return _of_pictures_alone(seen.parallax, role)
     if sample.depth_valid < LEAST_DEPTH:
-        found.append(
-            CaptureProblem(
-                "CAP-037",
-                f"{1 - sample.depth_valid:.0%} of the depth is unknown",
-                "avoid mirrors, glass and black things; do not cover the sensor",
-            )
-        )
+        found["CAP-037"] = f"{1 - sample.depth_valid:.0%} of the depth is unknown"
     if sample.beyond > MOST_BEYOND:
-        found.append(
-            CaptureProblem(
-                "CAP-038",
-                f"{sample.beyond:.0%} of the depth is beyond the sensor's range",
-                "stay within 4 m of floor, walls and animal",
-            )
-        )
+        found["CAP-038"] = f"{sample.beyond:.0%} of the depth is beyond the sensor's range"
     return found
 
 
-_NO_DEPTH = CaptureProblem(
-    "CAP-036",
-    "there is no depth: cameras and depth come from the walk-through's map, the animal's is inferred",
-    "keep furniture of the walk-through's room in view; record with a LiDAR phone for measured depth",
-)
-
-
-def _of_pictures_alone(parallax: Parallax | None) -> list[CaptureProblem]:
-    what = (
-        "there is no depth: the room is mapped from pictures; without a "
-        "session that has depth its scale is relative"
-    )
-    found = [
-        CaptureProblem(
-            "CAP-039", what, "record it with a LiDAR phone, or let a session with depth go where it went"
-        )
-    ]
+def _of_pictures_alone(parallax: Parallax | None, role: Role) -> dict[str, str]:
+    if role != "walkthrough":
+        what = "there is no depth: it comes from the walk-through's map, the animal's is inferred"
+        return {"CAP-036": what}
+    mapped = "there is no depth: the room is mapped from pictures"
+    found = {"CAP-039": f"{mapped}; without a session that has depth its scale is relative"}
     if parallax is not None and (parallax.linked < LEAST_LINKED or parallax.with_parallax < LEAST_PARALLAX):
-        what = (
-            f"{parallax.linked:.0%} of neighbouring pictures show the same things, "
-            f"{parallax.with_parallax:.0%} of these from elsewhere"
-        )
-        found.append(
-            CaptureProblem(
-                "CAP-056",
-                what,
-                "walk sideways instead of turning on the spot, slowly, along things with a pattern",
-            )
-        )
+        linked = f"{parallax.linked:.0%} of neighbouring pictures show the same things"
+        found["CAP-056"] = f"{linked}, {parallax.with_parallax:.0%} of these from elsewhere"
     return found
 
 
-def _of_poses(seen: CaptureMeasurements) -> list[CaptureProblem]:
-    plan = seen.sample.plan
+def _of_poses(seen: CaptureMeasurements) -> dict[str, str]:
+    plan, found = seen.sample.plan, {}
     if plan is None:
-        return []
-    check = plan.pose_check
+        return found
     if plan.odometry_from_camera is None:
-        what = f"device poses are not used: {check.reason}"
-        return [
-            CaptureProblem(
-                "CAP-050",
-                what,
-                "begin to record when the app's tracking is ready; the build goes on without, less surely",
-            )
-        ]
-    found = []
-    if check.verdict == "other":
-        found.append(
-            CaptureProblem(
-                "CAP-051", check.reason, "nothing to do; if pictures look wrong, report the app's version"
-            )
-        )
+        return {"CAP-050": f"device poses are not used: {plan.pose_check.reason}"}
+    if plan.pose_check.verdict == "other":
+        found["CAP-051"] = plan.pose_check.reason
     if seen.drift_m > MOST_DRIFT_M:
-        what = f"device poses drift: {100 * seen.drift_m:.0f} cm between visits of one place"
-        found.append(
-            CaptureProblem(
-                "CAP-052",
-                what,
-                "move smoothly, keep textured things in view; the build repairs what depth shows",
-            )
-        )
+        found["CAP-052"] = f"device poses drift: {100 * seen.drift_m:.0f} cm between visits of one place"
     return found
 
 
-def _of_content(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
-    found = []
+def _of_content(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
+    found = {}
     if seen.placed is not None and seen.placed < LEAST_PLACED:
-        what = f"{seen.placed:.0%} of the frames are found in the walk-through"
-        found.append(
-            CaptureProblem(
-                "CAP-053",
-                what,
-                "film the walk-through again and include this part of the room, or leave the file out",
-            )
-        )
+        found["CAP-053"] = f"{seen.placed:.0%} of the frames are found in the walk-through"
     if seen.moving is not None and role == "session":
         if seen.moving.seen < LEAST_SEEN:
-            what = f"something of an animal's size moves in {seen.moving.seen:.0%} of the frames"
-            found.append(
-                CaptureProblem(
-                    "CAP-054",
-                    what,
-                    "keep the animal in view; if it rests all the time, point at it with a prompt",
-                )
-            )
+            found["CAP-054"] = f"something of an animal's size moves in {seen.moving.seen:.0%} of the frames"
         if seen.moving.several > MOST_SEVERAL:
-            what = f"two things move far apart in {seen.moving.several:.0%} of the frames"
-            found.append(
-                CaptureProblem(
-                    "CAP-055", what, "keep other animals and people out, or point at the animal with a prompt"
-                )
-            )
+            found["CAP-055"] = f"two things move far apart in {seen.moving.several:.0%} of the frames"
     return found

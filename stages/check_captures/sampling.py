@@ -1,6 +1,4 @@
-"""Sample a recording: a few dozen upright frames spread over it, and what can be measured without any
-map.
-"""
+"""Sample a recording: a few dozen upright frames spread over it, and what can be measured without a map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.data import images
 from pipeline.geometry import rigid
+from pipeline.geometry.subsampling import evenly
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
@@ -106,7 +104,7 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
     if recording.depth_size is None:
         return _look_at_pictures(recording, count)
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=640)
-    rows = np.unique(np.linspace(0, len(plan.chosen) - 1, count).round().astype(int))
+    rows = evenly(len(plan.chosen), count, rounded=True)
     odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[rows]
     sample = replace(
         plan,
@@ -117,9 +115,8 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
         odometry_from_camera=odometry,
     )
     shots = []
-    for position, frame in enumerate(
-        extraction.frames(recording, sample, max_depth_m=max_depth_m, jpeg_quality=50)
-    ):
+    frames = extraction.frames(recording, sample, max_depth_m=max_depth_m, jpeg_quality=50)
+    for position, frame in enumerate(frames):
         if frame is not None:
             raw = recording.read_depth(int(recording.index[sample.chosen[position]]))
             beyond = float((np.isfinite(raw) & (raw >= max_depth_m)).mean())
@@ -149,26 +146,25 @@ def _shot(plan: ExtractionPlan, row: int, frame: extraction.ExtractedFrame, beyo
 
 
 def _look_at_pictures(recording: Recording, count: int) -> RecordingSample:
-    rows = np.unique(np.linspace(0, len(recording.index) - 1, count).round().astype(int))
-    nothing, shots = np.zeros((0, 0), np.float32), []
+    rows, shots = evenly(len(recording.index), count, rounded=True), []
     for row in rows:
-        stored = recording.read_color(int(recording.index[row]))
-        if stored is not None:
-            color = images.decode_color(stored, recording.where) if isinstance(stored, bytes) else stored
-            sharpness, brightness = extraction.picture_statistics(color)
-            shots.append(
-                SampledFrame(
-                    timestamp_s=float(recording.timestamp_s[row]),
-                    gray=cv2.cvtColor(color, cv2.COLOR_RGB2GRAY),
-                    intrinsics=np.eye(3),
-                    depth=nothing,
-                    depth_intrinsics=np.eye(3),
-                    odometry_from_camera=None,
-                    sharpness=sharpness,
-                    brightness=brightness,
-                    beyond=0.0,
-                )
+        color = extraction.picture(recording, row)
+        if color is None:
+            continue
+        sharpness, brightness = extraction.picture_statistics(color)
+        shots.append(
+            SampledFrame(
+                timestamp_s=float(recording.timestamp_s[row]),
+                gray=cv2.cvtColor(color, cv2.COLOR_RGB2GRAY),
+                intrinsics=np.eye(3),
+                depth=np.zeros((0, 0), np.float32),
+                depth_intrinsics=np.eye(3),
+                odometry_from_camera=None,
+                sharpness=sharpness,
+                brightness=brightness,
+                beyond=0.0,
             )
+        )
     _refuse_empty(recording, shots)
     return RecordingSample(recording, None, shots, 1 - len(shots) / len(rows))
 

@@ -67,18 +67,14 @@ def _seen(
 ) -> CaptureMeasurements:
     """Measure what a role asks for; a walk-through's described frames are added to ``room``."""
     if sample.plan is None:
-        return CaptureMeasurements(
-            sample, parallax=parallax.parallax(sample.shots) if role == "walkthrough" else None
-        )
+        shifted = parallax.parallax(sample.shots) if role == "walkthrough" else None
+        return CaptureMeasurements(sample, parallax=shifted)
     drift_m = pose_drift.drift_m(sample.shots)
     if role == "walkthrough":
         room += overlap.describe(sample.shots)
         return CaptureMeasurements(sample, drift_m)
-    # A turnaround may be filmed anywhere: it makes the animal's template, not the room's.
-    if role == "turnaround" or not room:
-        placed = None
-    else:
+    placed = None
+    if room and role != "turnaround":  # that may be filmed anywhere: it makes the animal's template alone
         placed = overlap.placed_share(room, overlap.describe(sample.shots), rng)
-    return CaptureMeasurements(
-        sample, drift_m, moving_objects.find_motion(sample.shots) if role == "session" else None, placed
-    )
+    moving = moving_objects.find_motion(sample.shots) if role == "session" else None
+    return CaptureMeasurements(sample, drift_m, moving, placed)

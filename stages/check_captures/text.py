@@ -21,10 +21,8 @@ def describe_capture(
     ]
     lines.append(f"  pictures: dark {sample.dark:.0%}, blurred {sample.blurred:.0%}")
     if sample.plan is not None:
-        lines[-1] += (
-            f"; depth: typically {sample.depth_m:.1f} m, known {sample.depth_valid:.0%}, "
-            f"beyond range {sample.beyond:.0%}"
-        )
+        lines[-1] += f"; depth: typically {sample.depth_m:.1f} m, known {sample.depth_valid:.0%}"
+        lines[-1] += f", beyond range {sample.beyond:.0%}"
         lines.append(f"  device poses: {_poses(seen)}")
     if seen.placed is not None:
         lines.append(f"  found in the walk-through: {seen.placed:.0%} of the frames")
@@ -38,10 +36,8 @@ def describe_capture(
 def refused(path: Path, role: Role, error: InputError) -> str:
     """Return why a recording cannot be used, and for which of its files."""
     file = error.where.removeprefix(str(path)).lstrip("/:") if error.where.startswith(str(path)) else ""
-    return (
-        f"{path.name}  {role}\n  {error.code} {f'{file}: ' if file else ''}{error.what}\n "
-        f"   -> {error.remedy}"
-    )
+    what = f"{file}: {error.what}" if file else error.what
+    return f"{path.name}  {role}\n  {error.code} {what}\n    -> {error.remedy}"
 
 
 def _turn(seen: CaptureMeasurements) -> str:
@@ -55,10 +51,8 @@ def _poses(seen: CaptureMeasurements) -> str:
     if plan.odometry_from_camera is None:
         return "none usable"
     check = plan.pose_check
-    residual = (
-        f"{1000 * check.residual_m:.0f} mm against depth" if math.isfinite(check.residual_m) else check.reason
-    )
-    drift = (
-        "no place seen twice" if math.isnan(seen.drift_m) else f"{100 * seen.drift_m:.1f} cm between visits"
-    )
+    measured = math.isfinite(check.residual_m)
+    residual = f"{1000 * check.residual_m:.0f} mm against depth" if measured else check.reason
+    drift = f"{100 * seen.drift_m:.1f} cm between visits"
+    drift = "no place seen twice" if math.isnan(seen.drift_m) else drift
     return f"{residual}, {drift}, gravity {'known' if plan.gravity_known else 'unknown'}"

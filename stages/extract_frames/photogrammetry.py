@@ -1,10 +1,7 @@
-"""A video without depth, filmed through a room in which nothing moves.
+"""Poses, lens and depth of a video without depth, filmed through a room in which nothing moves.
 
-Poses, lens and depth from its pictures alone.
-
-Keyframes (`structure`) are posed by COLMAP, `sweep` gives them depth, `scaling` metres where a recording
-with depth shows the same room. What comes out is a plan and frames like any other's; frames that were not
-registered are left out and reported.
+Keyframes (`structure`) are posed by COLMAP, `plane_sweep` gives depth, `scaling` metres where a recording
+with depth shows the same room. Keyframes that were not registered are left out and reported.
 """
 
 from collections.abc import Iterator, Mapping
@@ -48,19 +45,13 @@ class PicturesMapped:
 
     plan: ExtractionPlan
     frames: Iterator[ExtractedFrame]
-    placed: float
-    """Share (0..1) of the keyframes that found a place."""
     summary: str
-    """One sentence."""
 
 
 def map_pictures(
     recording: Recording, measured: Mapping[str, Recording], settings: Config, workspace: Path
 ) -> PicturesMapped:
-    """Map a video without depth; ``measured`` are recordings with depth that may supply metric scale, by id.
-
-    Raises MAP-004.
-    """
+    """Map a video without depth; ``measured`` recordings, by id, may supply metric scale. Raises MAP-004."""
     config, max_depth_m = settings.without_depth, settings.max_depth_m
     size = extraction.reduced_size(recording.color_size, settings.max_side_px)
     rows = _write_keyframes(recording, size, settings.rate_hz, config, workspace / "pictures")
@@ -78,8 +69,7 @@ def map_pictures(
     plan = _plan(recording, solved, views, world_from_camera, turns, size, scale)
     upright_frames = zip(pictures, depth, confidence, strict=True)
     frames = (_frame(*each, turns, settings.jpeg_quality) for each in upright_frames)
-    placed = len(sparse.frame) / len(rows)
-    return PicturesMapped(plan, frames, placed, _summary(recording, rows, solved, scale))
+    return PicturesMapped(plan, frames, _summary(recording, rows, solved, scale))
 
 
 def _write_keyframes(
@@ -89,7 +79,7 @@ def _write_keyframes(
     folder.mkdir()
     motion, rows, sharpness = structure.PictureMotion(), [], []
     for row in track(choose_frames(recording.timestamp_s, rate_hz).tolist(), "looking at pictures"):
-        color = _picture(recording, row, size)
+        color = extraction.picture(recording, row, size)
         if color is not None:
             motion.add(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
             rows.append(row)
@@ -99,38 +89,26 @@ def _write_keyframes(
     keys = structure.choose_keyframes(np.array(motion.travelled), np.array(sharpness), config)
     chosen = np.array(rows)[keys]
     for row in chosen.tolist():
-        color = _picture(recording, row, size)
+        color = extraction.picture(recording, row, size)
         assert color is not None, "a picture that could be read before"
         (folder / f"{row:06d}.jpg").write_bytes(images.encode_jpeg(color, KEYFRAME_JPEG_QUALITY))
     return chosen
 
 
-def _picture(
-    recording: Recording, row: int, size: tuple[int, int]
-) -> UInt8[np.ndarray, "height width 3"] | None:
-    stored = recording.read_color(int(recording.index[row]))
-    if stored is None:
-        return None
-    color = images.decode_color(stored, recording.where) if isinstance(stored, bytes) else stored
-    return color if color.shape[:2] == size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
-
-
 def _solved(
     recording: Recording,
-    rows: np.ndarray,
+    rows: Int[np.ndarray, "key"],
     size: tuple[int, int],
     config: PhotogrammetryConfig,
     workspace: Path,
 ) -> Structure:
     if len(rows) < structure.LEAST_KEYFRAMES:
         raise no_map(recording, "the camera hardly moves")
-    known_intrinsics = None
-    if recording.intrinsics is not None:
-        known_intrinsics = np.median(
-            cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size), axis=0
-        )
+    known = recording.intrinsics
+    if known is not None:
+        known = np.median(cameras.scale_intrinsics(known, recording.color_size, size), axis=0)
     names = [f"{row:06d}.jpg" for row in rows]
-    solved = structure.solve(workspace / "pictures", names, known_intrinsics, config, workspace, SEED)
+    solved = structure.solve(workspace / "pictures", names, known, config, workspace, SEED)
     if solved is None:
         raise no_map(recording, "its pictures do not fit together to one model")
     if len(solved.sparse.frame) < LEAST_MAPPED * len(rows):
@@ -140,10 +118,7 @@ def _solved(
 
 def no_map(recording: Recording, why: str) -> InputError:
     """Make the error for pictures from which no map can be made."""
-    remedy = (
-        "walk sideways through the room instead of turning on the spot, slowly, "
-        "in good light; or record with a LiDAR phone"
-    )
+    remedy = "walk sideways, slowly, in good light, do not turn on the spot; or record with a LiDAR phone"
     return InputError("MAP-004", f"no map can be made from pictures alone: {why}", recording.where, remedy)
 
 
@@ -169,22 +144,14 @@ def _depths(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return depth (model units, 0 = unknown) and confidence (0..2) of every view."""
     others = plane_sweep.neighbours(sparse, config.depth_sources)
-    swept = [
-        plane_sweep.sweep(
-            view,
-            [views[other] for other in others[key]],
-            plane_sweep.depth_range(sparse, key),
-            config.depth_planes,
-        )
-        if len(others[key])
-        else np.zeros_like(view.gray)
-        for key, view in enumerate(track(views, "depth from pictures"))
-    ]
-    depth, confidence = [], []
+    swept, depth, confidence = [], [], []
+    for key, view in enumerate(track(views, "depth from pictures")):
+        near, reach = [views[other] for other in others[key]], plane_sweep.depth_range(sparse, key)
+        empty = np.zeros_like(view.gray)
+        swept.append(plane_sweep.sweep(view, near, reach, config.depth_planes) if near else empty)
     for key, view in enumerate(views):
-        agree = plane_sweep.agreement(
-            swept[key], view, [(swept[other], views[other]) for other in others[key]]
-        )
+        near = [(swept[other], views[other]) for other in others[key]]
+        agree = plane_sweep.agreement(swept[key], view, near)
         depth.append(np.where(agree >= LEAST_AGREEING, swept[key], 0))
         confidence.append(np.clip(agree.astype(int) - LEAST_AGREEING + 1, 0, 2).astype(np.uint8))
     return depth, confidence
@@ -198,28 +165,19 @@ def _unit_m(
     measured: Mapping[str, Recording],
     config: PhotogrammetryConfig,
 ) -> tuple[float, str]:
-    """Return metres per unit of the model, and how they were found.
-
-    The id of a recording with depth, or `relative`.
-    """
-    known = np.concatenate([each[each > 0] for each in depth])
-    nominal = TYPICAL_DEPTH_M / float(np.median(known)) if len(known) else 1.0
+    """Return metres per unit of the model, and the id of the recording that gave them, or `relative`."""
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
     mapped = [
-        sift.sift_points(
-            cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY),
-            solved.intrinsics,
-            each,
-            view.intrinsics,
-            scaling.POINTS,
-        )
-        for picture, view, each in zip(pictures, views, depth, strict=True)
+        sift.sift_points(picture, solved.intrinsics, each, view.intrinsics, scaling.POINTS)
+        for picture, view, each in zip(gray, views, depth, strict=True)
         if measured
     ]
     for name, recording in measured.items():
         unit_m = scaling.meters_per_unit(mapped, recording, SEED)
         if unit_m is not None:
             return unit_m, name
-    return nominal, extraction.RELATIVE
+    known = np.concatenate([each[each > 0] for each in depth])
+    return TYPICAL_DEPTH_M / float(np.median(known)) if len(known) else 1.0, extraction.RELATIVE
 
 
 def _plan(
@@ -232,17 +190,15 @@ def _plan(
     scale: str,
 ) -> ExtractionPlan:
     rows = solved.sparse.frame
+    intrinsics = cameras.turn_intrinsics(solved.intrinsics, size, turns)
+    depth_intrinsics = [cameras.turn_intrinsics(view.intrinsics, view.gray.shape, turns) for view in views]
     reason = "poses and depth from the pictures alone"
     return ExtractionPlan(
         chosen=rows,
         timestamp_s=recording.timestamp_s[rows],
         stored_size=size,
-        intrinsics=np.repeat(
-            cameras.turn_intrinsics(solved.intrinsics, size, turns)[None], len(rows), axis=0
-        ),
-        depth_intrinsics=np.stack(
-            [cameras.turn_intrinsics(view.intrinsics, view.gray.shape, turns) for view in views]
-        ),
+        intrinsics=np.repeat(intrinsics[None], len(rows), axis=0),
+        depth_intrinsics=np.stack(depth_intrinsics),
         odometry_from_camera=cameras.turn_camera(world_from_camera, turns),
         gravity_known=False,
         quarter_turns=turns,
@@ -256,33 +212,20 @@ def _frame(
 ) -> ExtractedFrame:
     confidence = np.where(depth > 0, confidence, 0).astype(np.uint8)
     color, depth, confidence = (cameras.turn_image(image, turns) for image in (picture, depth, confidence))
-    statistics = extraction.picture_statistics(color)
-    return ExtractedFrame(
-        color,
-        images.encode_jpeg(color, jpeg_quality),
-        depth,
-        confidence,
-        *statistics,
-        float((depth > 0).mean()),
-    )
+    jpeg, statistics = images.encode_jpeg(color, jpeg_quality), extraction.picture_statistics(color)
+    return ExtractedFrame(color, jpeg, depth, confidence, *statistics, float((depth > 0).mean()))
 
 
 def _summary(recording: Recording, rows: np.ndarray, solved: Structure, scale: str) -> str:
     lost = np.setdiff1d(rows, solved.sparse.frame)
     seconds = ", ".join(f"{recording.timestamp_s[row]:.1f}" for row in lost[:12])
-    left_out = ""
-    if len(lost):
-        left_out = f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > 12 else ''} s"
+    left_out = f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > 12 else ''} s"
     split = f", the largest of {solved.models} models" if solved.models > 1 else ""
-    if scale == extraction.RELATIVE:
-        metres = "the scale is relative: lengths are no metres"
-    else:
-        metres = f"metres from the depth of {scale}"
-    focal = solved.intrinsics[0, 0]
+    relative = "the scale is relative: lengths are no metres"
+    metres = relative if scale == extraction.RELATIVE else f"metres from the depth of {scale}"
     focal_source = "given" if recording.intrinsics is not None else "calibrated"
-    return (
-        f"{recording.where}: {recording.kind}, mapped from {len(solved.sparse.frame)} "
-        f"of {len(rows)} pictures{split}{left_out}; "
-        f"focal length {focal:.0f} px ({focal_source}), reprojection "
-        f"{solved.sparse.reprojection_px:.2f} px; {metres}"
-    )
+    mapped = f"mapped from {len(solved.sparse.frame)} of {len(rows)} pictures{split}"
+    lens = f"focal length {solved.intrinsics[0, 0]:.0f} px ({focal_source})"
+    reprojection = f"reprojection {solved.sparse.reprojection_px:.2f} px"
+    mapped += left_out if len(lost) else ""
+    return f"{recording.where}: {recording.kind}, {mapped}; {lens}, {reprojection}; {metres}"

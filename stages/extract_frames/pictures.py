@@ -19,25 +19,16 @@ SHEET_FRAMES, SHEET_HEIGHT_PX = 12, 200
 
 
 def write(folder: Path, recording: Recording, config: Config) -> None:
-    """Write the pictures of one recording. Raises InputError CAP-001 where most are damaged, CAP-007 where
-    hardly any are left.
-    """
+    """Write a recording's pictures. Raises CAP-001 where most are damaged, CAP-007 where few are left."""
     rows = extraction.choose_frames(recording.timestamp_s, config.rate_hz)
-    size, chosen, statistics, strip = (
-        extraction.reduced_size(recording.color_size, config.max_side_px),
-        [],
-        [],
-        [],
-    )
+    size = extraction.reduced_size(recording.color_size, config.max_side_px)
+    chosen, statistics, strip = [], [], []
     shown = set(rows[np.linspace(0, len(rows) - 1, SHEET_FRAMES).astype(int)].tolist())
     (folder / "color").mkdir()
     for row in track(rows.tolist(), "pictures"):
-        stored = recording.read_color(int(recording.index[row]))
-        if stored is None:
+        color = extraction.picture(recording, row, size)
+        if color is None:
             continue
-        color = images.decode_color(stored, recording.where) if isinstance(stored, bytes) else stored
-        if color.shape[:2] != size:
-            color = cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
         color = cameras.turn_image(color, recording.quarter_turns)
         images.write_color(folder / "color" / f"{len(chosen):06d}.jpg", color, config.jpeg_quality)
         chosen.append(row)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 
+from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import sift
 from pipeline.mapping.sift import SiftPoints
 from pipeline.recordings import extraction
@@ -37,14 +38,10 @@ RATE_HZ, MAX_DEPTH_M, MAX_SIDE_PX, JPEG_QUALITY = 10.0, 5.0, 640, 50
 
 
 def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int) -> float | None:
-    """Return how many metres a unit of the map is by one recording with depth.
-
-    None where too few frames agree.
-    """
+    """Return how many metres a unit of the map is by one recording with depth, None where too few agree."""
     scales = []
     for frame in _described(measured):
-        found = [scale for known in mapped if (scale := _scale(known, frame, seed)) is not None]
-        scales += found
+        scales += [scale for known in mapped if (scale := _scale(known, frame, seed)) is not None]
     if not scales:
         return None
     centre = float(np.median(scales))
@@ -56,18 +53,13 @@ def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int
 
 def _described(recording: Recording) -> Iterator[SiftPoints]:
     plan = extraction.understand(recording, rate_hz=RATE_HZ, max_depth_m=MAX_DEPTH_M, max_side_px=MAX_SIDE_PX)
-    rows = np.unique(np.linspace(0, len(plan.chosen) - 1, FRAMES).round().astype(int))
+    rows = evenly(len(plan.chosen), FRAMES, rounded=True)
     sample = replace(plan, chosen=plan.chosen[rows])
-    for row, frame in zip(
-        rows,
-        extraction.frames(recording, sample, max_depth_m=MAX_DEPTH_M, jpeg_quality=JPEG_QUALITY),
-        strict=True,
-    ):
+    frames = extraction.frames(recording, sample, max_depth_m=MAX_DEPTH_M, jpeg_quality=JPEG_QUALITY)
+    for row, frame in zip(rows, frames, strict=True):
         if frame is not None:
-            gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-            yield sift.sift_points(
-                gray, plan.intrinsics[row], frame.depth, plan.depth_intrinsics[row], POINTS
-            )
+            gray, lens = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), plan.depth_intrinsics[row]
+            yield sift.sift_points(gray, plan.intrinsics[row], frame.depth, lens, POINTS)
 
 
 def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:

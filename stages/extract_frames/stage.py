@@ -1,17 +1,13 @@
-"""The stage: one recording -> upright frames with metric depth, intrinsics and odometry, and the quality
-page.
-"""
+"""The stage: one recording -> upright frames with depth, intrinsics, odometry, and the quality page."""
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.core import progress
 from pipeline.core.videos import Video
-from pipeline.recordings import extraction, formats
-from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan
-from pipeline.recordings.formats import open_recording
+from pipeline.recordings import extraction
+from pipeline.recordings.formats import open_recording, scale_sources
 from pipeline.recordings.recording import Recording
 from stages.extract_frames import photogrammetry, pictures, writing
 from stages.extract_frames.config import Config
@@ -44,7 +40,12 @@ def run(
             mapped = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
         plan, frames, summary = mapped.plan, mapped.frames, mapped.summary
     else:
-        plan, frames, summary = _measured(recording, config)
+        reach = {"max_depth_m": config.max_depth_m}
+        plan = extraction.understand(
+            recording, rate_hz=config.rate_hz, max_side_px=config.max_side_px, **reach
+        )
+        frames = extraction.frames(recording, plan, jpeg_quality=config.jpeg_quality, **reach)
+        summary = extraction.summary(recording, plan)
     progress.log(summary)
     total = len(plan.chosen)
     tracked = progress.track(frames, "frames", total=total)
@@ -56,26 +57,11 @@ def run(
     writing.report_quality(out, plan, written, rate_hz=config.rate_hz)
 
 
-def _measured(
-    recording: Recording, config: Config
-) -> tuple[ExtractionPlan, Iterator[ExtractedFrame | None], str]:
-    """Return plan, frames and a sentence of a recording with depth."""
-    plan = extraction.understand(
-        recording, rate_hz=config.rate_hz, max_depth_m=config.max_depth_m, max_side_px=config.max_side_px
-    )
-    frames = extraction.frames(
-        recording, plan, max_depth_m=config.max_depth_m, jpeg_quality=config.jpeg_quality
-    )
-    return plan, frames, extraction.summary(recording, plan)
-
-
 def _scale_sources(
     folder: Path | None, video: Video | None, videos: tuple[Video, ...]
 ) -> dict[str, Recording]:
     """Open the recordings whose depth may supply metric scale to one without, by id."""
     if video is None or folder is None:
         return {}
-    return {
-        other.id: open_recording(folder / other.file)
-        for other in formats.scale_sources(folder, video, videos)
-    }
+    sources = scale_sources(folder, video, videos)
+    return {other.id: open_recording(folder / other.file) for other in sources}

@@ -1,9 +1,7 @@
-"""Where the camera stood, from pictures alone.
+"""Where the camera stood, from pictures alone: COLMAP on one thread with fixed seeds.
 
-Keyframes by their motion, then COLMAP, on one thread with fixed seeds.
-
-`choose_keyframes` thins a video by what its pictures show, `solve` finds poses and, where it is unknown,
-the lens. The model's scale is its own.
+`choose_keyframes` thins a video by motion in its pictures, `solve` finds poses and, if unknown, the
+lens. The model's scale is its own.
 """
 
 import itertools
@@ -56,15 +54,9 @@ class PictureMotion:
         self._last: UInt8[np.ndarray, "height width"] | None = None
 
     def add(self, gray: UInt8[np.ndarray, "height width"]) -> None:
-        """Follow corners into the next picture.
-
-        Where too few survive, it counts as moved by a tenth of its width.
-        """
-        small = cv2.resize(
-            gray,
-            (MOTION_WIDTH_PX, round(MOTION_WIDTH_PX * gray.shape[0] / gray.shape[1])),
-            interpolation=cv2.INTER_AREA,
-        )
+        """Follow corners into the next picture; where too few survive it counts as moved by `LOST_STEP`."""
+        size = MOTION_WIDTH_PX, round(MOTION_WIDTH_PX * gray.shape[0] / gray.shape[1])
+        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         step = 0.0 if self._last is None else self._step(self._last, small)
         self.travelled.append(step + (self.travelled[-1] if self.travelled else 0.0))
         self._last = small
@@ -103,19 +95,15 @@ def solve(
     workspace: Path,
     seed: int,
 ) -> Structure | None:
-    """Pose the pictures ``names`` (six digits, in time order).
-
-    None where no model of enough of them comes out.
-    """
+    """Pose the pictures ``names`` (six digits, in time order); None where no model of enough comes out."""
     colmap.seed_everything(seed)
     database = workspace / "database.db"
     reader = pycolmap.ImageReaderOptions(
         camera_model="SIMPLE_RADIAL", default_focal_length_factor=config.focal_share
     )
     sift = {"max_num_features": config.features, "peak_threshold": PEAK_THRESHOLD}
-    colmap.extract(
-        database, pictures, names, reader if intrinsics is None else colmap.pinhole(intrinsics), sift
-    )
+    reader = reader if intrinsics is None else colmap.pinhole(intrinsics)
+    colmap.extract(database, pictures, names, reader, sift)
     pairs = _pairs(_descriptors(database, names), config, seed)
     colmap.match(database, ((names[first], names[second]) for first, second in pairs), seed)
     if _parallax_share(database) < LEAST_PARALLAX_PAIRS:
@@ -136,15 +124,10 @@ def solve(
 
 def _parallax_share(database: Path) -> float:
     """Return the share of matched pairs that only two different places explain."""
-    places = (
-        pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
-        pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED,
-    )
+    kind = pycolmap.TwoViewGeometryConfiguration
     with pycolmap.Database.open(database) as table:
-        kinds = [geometry.config for geometry in table.read_two_view_geometries()[1]]
-    if kinds:
-        return float(np.mean([pycolmap.TwoViewGeometryConfiguration(kind) in places for kind in kinds]))
-    return 0.0
+        found = [kind(geometry.config) for geometry in table.read_two_view_geometries()[1]]
+    return float(np.mean([each in (kind.CALIBRATED, kind.UNCALIBRATED) for each in found])) if found else 0.0
 
 
 def _descriptors(database: Path, names: list[str]) -> list[UInt8[np.ndarray, "feature 128"]]:
@@ -156,19 +139,15 @@ def _descriptors(database: Path, names: list[str]) -> list[UInt8[np.ndarray, "fe
 def _pairs(
     descriptors: list[np.ndarray], config: PhotogrammetryConfig, seed: int
 ) -> Int[np.ndarray, "pair 2"]:
-    """Pair each keyframe with its successors and with those that share the most words (weighted by
-    rarity).
-    """
+    """Pair each keyframe with its successors and with those that share the most words."""
     count = len(descriptors)
     first, second = np.triu_indices(count, 1)
     chosen = second - first <= config.overlap
-    similarity = _bag_of_words_similarity(
-        [np.sqrt(rows.astype(np.float32)) for rows in descriptors], VISUAL_WORDS, seed
-    )
+    rooted = [np.sqrt(rows.astype(np.float32)) for rows in descriptors]
+    similarity = _bag_of_words_similarity(rooted, VISUAL_WORDS, seed)
     for key in range(count):
-        others = np.argsort(
-            -np.where(np.abs(np.arange(count) - key) <= config.overlap, -1.0, similarity[key]), kind="stable"
-        )
+        near = np.abs(np.arange(count) - key) <= config.overlap
+        others = np.argsort(-np.where(near, -1.0, similarity[key]), kind="stable")
         for other in others[: config.retrieved]:
             if similarity[key, other] > 0 and abs(other - key) > config.overlap:
                 chosen |= (first == min(key, other)) & (second == max(key, other))
@@ -178,9 +157,7 @@ def _pairs(
 def _bag_of_words_similarity(
     descriptors: list[np.ndarray], words: int, seed: int
 ) -> Float[np.ndarray, "key key"]:
-    """Return the cosine of the keyframes' word histograms, words weighted by their rarity (Sivic and
-    Zisserman 2003).
-    """
+    """Return the cosine of word histograms, words weighted by rarity (Sivic and Zisserman 2003)."""
     everything = np.concatenate(descriptors)
     sample = everything[np.random.default_rng(seed).permutation(len(everything))[: 40 * words]]
     if len(sample) < words:
@@ -189,12 +166,8 @@ def _bag_of_words_similarity(
     no_guess, rounds = np.zeros(0, np.int32), (cv2.TERM_CRITERIA_MAX_ITER, 8, 0)
     centres = cv2.kmeans(sample, words, no_guess, rounds, 1, cv2.KMEANS_PP_CENTERS)[2]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    counts = np.stack(
-        [
-            np.bincount([match.trainIdx for match in matcher.match(rows, centres)], minlength=words)
-            for rows in descriptors
-        ]
-    )
+    nearest = ([match.trainIdx for match in matcher.match(rows, centres)] for rows in descriptors)
+    counts = np.stack([np.bincount(held, minlength=words) for held in nearest])
     weighted = np.sqrt(counts) * np.log(len(counts) / np.maximum((counts > 0).sum(0), 1))
     weighted /= np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-9)
     return weighted @ weighted.T

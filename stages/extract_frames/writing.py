@@ -11,14 +11,8 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.core.errors import InputError
 from pipeline.data import images, ply, qa
 from pipeline.data.clips import FRAMES
-from pipeline.recordings.extraction import (
-    DARK,
-    MEASURED,
-    RELATIVE,
-    ExtractedFrame,
-    ExtractionPlan,
-    quality_of,
-)
+from pipeline.recordings import extraction
+from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, ExtractedFrame, ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
 
 MOST_LOST = 0.5
@@ -49,8 +43,7 @@ def write_frames(
 ) -> WrittenFrames:
     """Write the frames that have enough depth, numbered without gaps.
 
-    Raises InputError CAP-007 when fewer than five have, CAP-001 when the file is damaged in more than
-    half of them.
+    Raises CAP-007 when fewer than five have, CAP-001 when the file is damaged in more than half of them.
     """
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir()
@@ -73,12 +66,10 @@ def write_frames(
     if lost > MOST_LOST * total:
         raise damaged(where, f"{lost} of {total} pictures cannot be decoded")
     if len(statistics) < LEAST_FRAMES:
-        what = (
-            f"{min_depth_valid:.0%} of the depth is known in {len(statistics)} of "
-            f"{total} frames; {LEAST_FRAMES} are the least"
-        )
+        known = f"{min_depth_valid:.0%} of the depth is known in {len(statistics)} of {total} frames"
+        what = f"{known}; {LEAST_FRAMES} are the least"
         remedy = "record some seconds at least, things within 5 m, in light, with the LiDAR camera"
-        raise InputError("CAP-007", what=what, where=where, remedy=remedy)
+        raise InputError("CAP-007", what, where, remedy)
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))
     sharpness, brightness, depth_valid = np.array(statistics).T
     return WrittenFrames(kept, lost / total, sharpness, brightness, depth_valid, color_strip, depth_strip)
@@ -101,14 +92,12 @@ def write_table(folder: Path, recording: Recording, plan: ExtractionPlan, writte
         sharpness=written.sharpness,
         brightness=written.brightness,
         depth_valid=written.depth_valid,
-        quality=quality_of(written.sharpness, written.brightness, written.depth_valid),
+        quality=extraction.quality_of(written.sharpness, written.brightness, written.depth_valid),
     )
 
 
 def write_mesh(folder: Path, recording: Recording, plan: ExtractionPlan) -> None:
-    """Write the app's own surface of the room as ``mesh.ply`` where it has one and device poses give its
-    place.
-    """
+    """Write the app's own surface of the room as ``mesh.ply`` where device poses give its place."""
     if recording.read_mesh is not None and plan.odometry_from_camera is not None:
         ply.write_ply(folder / "mesh.ply", recording.read_mesh())
 
@@ -117,7 +106,9 @@ def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *
     """Write the stage's own judgement: what was understood, how much of it is usable, a contact sheet."""
     timestamp_s = plan.timestamp_s[written.kept]
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
-    median_sharpness = max(float(np.median(written.sharpness)), 1e-6)
+    blurred = written.sharpness < 0.4 * max(float(np.median(written.sharpness)), 1e-6)
+    dropped = float((~written.kept).mean()) - written.lost
+    with_poses = float(plan.odometry_from_camera is not None)
     missing = 1 - len(timestamp_s) / max(round(duration_s * rate_hz) + 1, 1)
     checks = [
         qa.Check("duration", duration_s, "s", warn=5.0, better="higher"),
@@ -125,21 +116,12 @@ def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *
         qa.Check("frames a second", (len(timestamp_s) - 1) / max(duration_s, 1e-6), "Hz"),
         qa.Check("missing ticks", 100 * missing, "%", warn=20.0),
         qa.Check("dark frames", 100 * float((written.brightness < DARK).mean()), "%", warn=20.0),
-        qa.Check(
-            "blurred frames", 100 * float((written.sharpness < 0.4 * median_sharpness).mean()), "%", warn=25.0
-        ),
+        qa.Check("blurred frames", 100 * float(blurred.mean()), "%", warn=25.0),
         qa.Check("known depth", 100 * float(written.depth_valid.mean()), "%", warn=50.0, better="higher"),
-        qa.Check(
-            "frames dropped for lack of depth",
-            100 * (float((~written.kept).mean()) - written.lost),
-            "%",
-            warn=10.0,
-        ),
+        qa.Check("frames dropped for lack of depth", 100 * dropped, "%", warn=10.0),
         qa.Check("damaged frames", 100 * written.lost, "%", warn=0.0),
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
-        qa.Check(
-            "device poses usable", float(plan.odometry_from_camera is not None), "", warn=0.5, better="higher"
-        ),
+        qa.Check("device poses usable", with_poses, "", warn=0.5, better="higher"),
         _check_of_poses(plan),
     ]
     pictures = [
@@ -156,34 +138,21 @@ def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *
 
 
 def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
-    """Say how well device poses fit the depth.
-
-    Where both were made from pictures, what its lengths are worth.
-    """
+    """Say how well device poses fit the depth, or, of a map from pictures, what its lengths are worth."""
     check = plan.pose_check
     if plan.scale != MEASURED:
-        if plan.scale == RELATIVE:
-            scale_text = "relative: lengths are no metres"
-        else:
-            scale_text = f"metres from the depth of {plan.scale}"
-        return qa.Check(
-            f"scale known ({check.reason}; {scale_text})",
-            float(plan.scale != RELATIVE),
-            "",
-            warn=0.5,
-            better="higher",
-        )
+        relative = plan.scale == RELATIVE
+        scale = "relative: lengths are no metres" if relative else f"metres from the depth of {plan.scale}"
+        name = f"scale known ({check.reason}; {scale})"
+        return qa.Check(name, float(not relative), "", warn=0.5, better="higher")
     residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None
-    return qa.Check(
-        f"device poses against depth ({check.reason})", residual_mm, "mm", warn=1000 * check.tolerance_m
-    )
+    name = f"device poses against depth ({check.reason})"
+    return qa.Check(name, residual_mm, "mm", warn=1000 * check.tolerance_m)
 
 
 def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
-    scale = SHEET_HEIGHT_PX / image.shape[0]
-    return cv2.resize(
-        image, (max(round(image.shape[1] * scale), 1), SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA
-    )
+    width = max(round(image.shape[1] * SHEET_HEIGHT_PX / image.shape[0]), 1)
+    return cv2.resize(image, (width, SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA)
 
 
 def _colored_depth(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "_ _ 3"]:
