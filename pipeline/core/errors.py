@@ -8,7 +8,9 @@ import contextlib
 import errno
 import os
 import re
-from collections.abc import Iterator
+import signal
+import sys
+from collections.abc import Callable, Iterator
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """No space, a quota, or a limit of the shell (`ulimit -f`)."""
@@ -37,10 +39,7 @@ class InputError(Exception):
 
 
 def printable(text: str) -> str:
-    """Return text whose control characters are spelled out.
-
-    Names of files may hold ESC, which terminals obey.
-    """
+    """Return text whose control characters are spelled out: names of files may hold ESC, terminals obey."""
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -57,20 +56,31 @@ def coded_disk_errors(where: str) -> Iterator[None]:
             raise
         place = str(cause.filename or where)
         if cause.errno in _FULL:
-            raise InputError(
-                "SYS-001", "the disk is full", place, "free some space and run the same again"
-            ) from error
+            remedy = "free some space and run the same again"
+            raise InputError("SYS-001", "the disk is full", place, remedy) from error
         if cause.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
             remedy = "look at who owns it and whether the disk is mounted read-only, then run the same again"
             raise InputError("SYS-003", f"cannot be used: {cause.strerror}", place, remedy) from error
         raise
 
 
+def exit_code(program: Callable[[], int], where: str = "build") -> int:
+    """Run a program and return its exit code: 2 after an `InputError`, which is printed, 130 after Ctrl-C."""
+    try:
+        with coded_disk_errors(where):
+            return program()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        return 2
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+
+
 @contextlib.contextmanager
 def other_versions_refused(what: str, where: str) -> Iterator[None]:
     """Turn what reading a file of another version raises into an `InputError` ART-007.
 
-    By hand any artifact may be given. ``what`` is expected (`behavior model`), at ``where``.
+    ``what`` is expected (`behavior model`), at ``where``: by hand any artifact may be given.
     """
     try:
         yield
@@ -78,9 +88,8 @@ def other_versions_refused(what: str, where: str) -> Iterator[None]:
         raise
     except Exception as error:  # a parser's own errors have no common base
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:QUOTED]}"
-        raise InputError(
-            "ART-007", f"is no {what} as this version writes it ({reason})", where, MAKE_AGAIN
-        ) from error
+        found = f"is no {what} as this version writes it ({reason})"
+        raise InputError("ART-007", found, where, MAKE_AGAIN) from error
 
 
 def _of_the_system(error: Exception) -> OSError | None:
@@ -90,5 +99,5 @@ def _of_the_system(error: Exception) -> OSError | None:
     behind = error.__context__
     if isinstance(error, RuntimeError) and isinstance(behind, OSError) and behind.errno in _FULL:
         return behind
-    told = _OF_RUST.search(str(error))
-    return OSError(int(told[1]), os.strerror(int(told[1]))) if told else None
+    number = _OF_RUST.search(str(error))
+    return OSError(int(number[1]), os.strerror(int(number[1]))) if number else None

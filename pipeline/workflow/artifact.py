@@ -61,28 +61,23 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 def _is_sound(manifest: Manifest) -> bool:
     """Tell whether every field holds what it should."""
-    tables = (manifest.inputs, manifest.versions, manifest.files)
+    texts, tables = (manifest.stage, manifest.content), (manifest.inputs, manifest.versions, manifest.files)
     return (
-        isinstance(manifest.stage, str)
-        and isinstance(manifest.content, str)
+        all(isinstance(text, str) for text in texts)
         and isinstance(manifest.key, str | None)
         and isinstance(manifest.config, dict)
         and isinstance(manifest.version, int)
-        and all(
-            isinstance(table, dict) and all(isinstance(v, str) for v in table.values()) for table in tables
-        )
+        and all(isinstance(table, dict) for table in tables)
+        and all(isinstance(value, str) for table in tables for value in table.values())
     )
 
 
 def opened(folder: Path, name: str) -> Manifest:
-    """Return the manifest of the finished artifact at `folder`; raise `InputError` ART-001 where there is
-    none, ART-007 where another version wrote it.
-    """
+    """Return the manifest of the finished artifact at `folder`. Raises ART-001, ART-007 (other version)."""
     manifest = read_manifest(folder)
     if manifest is None:
-        raise InputError(
-            "ART-001", f"{name} is missing or unfinished", str(folder), "build it first with `make`"
-        )
+        what = f"{name} is missing or unfinished"
+        raise InputError("ART-001", what, str(folder), "build it first with `make`")
     refuse_other_version(folder)
     return manifest
 
@@ -101,9 +96,7 @@ def refuse_other_version(folder: Path) -> None:
 
 
 def require(build: Path, *names: str, remedy: str) -> None:
-    """Raise `InputError` ART-003 with ``remedy`` where the folder `build` lacks one of the artifacts
-    ``names``, ART-007 where another version wrote it.
-    """
+    """Raise ART-003 with ``remedy`` where a build lacks an artifact, ART-007 for one of another version."""
     for name in names:
         if not (build / name).is_dir():
             raise InputError("ART-003", f"has no {name}", str(build), remedy)
@@ -126,19 +119,10 @@ def create(
         yield temporary
         files = digests(temporary)
         if not files:
-            raise InputError(
-                "ART-002", f"{stage} wrote nothing", str(out), "this is a fault of the stage: report it"
-            )
-        manifest = Manifest(
-            stage,
-            key,
-            content_of(files),
-            dict(sorted(inputs.items())),
-            dict(config),
-            versions(),
-            files,
-            version_of(stage),
-        )
+            remedy = "this is a fault of the stage: report it"
+            raise InputError("ART-002", f"{stage} wrote nothing", str(out), remedy)
+        content, ordered = content_of(files), dict(sorted(inputs.items()))
+        manifest = Manifest(stage, key, content, ordered, dict(config), versions(), files, version_of(stage))
         (temporary / MANIFEST).write_text(json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
         sync_disk(temporary)
     except BaseException:
@@ -148,9 +132,7 @@ def create(
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Return the sha256 of every file under `folder` by its relative path; manifest and stamp do not
-    count.
-    """
+    """Return the sha256 of every file under `folder` by its relative path, but manifest and stamp."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return {name: digest_of_file(folder / name) for name in names if name not in (MANIFEST, STAMP)}
 
@@ -178,9 +160,7 @@ def digest_of(value: Any) -> str:
 
 
 def clean(*outs: Path) -> None:
-    """Remove what writers of these artifacts and small files that died have left; the caller holds the job's
-    lock.
-    """
+    """Remove what writers of these artifacts and files that died have left; the caller holds the lock."""
     for out in outs:
         for left in (*out.parent.glob(f".{out.name}.tmp*"), *out.parent.glob(f".{out.name}.old.*")):
             if left.is_dir():
@@ -236,9 +216,7 @@ def write_if_changed(path: Path, text: str, *, sync: bool = True) -> bool:
 
 
 def _replace(temporary: Path, out: Path) -> None:
-    """Give `temporary` its final name; a reader sees the old artifact, none, or the new one, never a
-    mixture.
-    """
+    """Give `temporary` its final name; a reader sees the old artifact, none, or the new one, no mixture."""
     old = out.with_name(f".{out.name}.old.{os.getpid()}")
     if out.exists():
         out.rename(old)

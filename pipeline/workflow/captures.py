@@ -1,6 +1,4 @@
-"""What lies in `captures/<agent>/`.
-
-From file names and the recipe's `[videos]` to recordings with roles and a split.
+"""What lies in `captures/<agent>/`: from names and the recipe's `[videos]` to recordings with roles.
 
 `find` looks at the disk, `assign` decides roles and split; both raise `InputError` before anything is
 written. User file names go into `videos.json` and nowhere else. Standard library only.
@@ -41,10 +39,7 @@ TABLES = (".csv", ".npz")
 
 @dataclass(frozen=True)
 class Remarks:
-    """What the user says about one recording, in the recipe's `[videos]` or in a sidecar.
-
-    None where nothing.
-    """
+    """What the user says about one recording, in the recipe's `[videos]` or in a sidecar; None: nothing."""
 
     role: str | None = None
     """`walkthrough`, `turnaround`, `session` or `heldout`; otherwise the name decides."""
@@ -59,26 +54,23 @@ class Remarks:
 
 
 def find(folder: Path, flow: Flow = "recordings") -> list[str]:
-    """Return the names of the recordings in `folder`, of every format that is understood, or of the
-    tables of motion.
-    """
-    if not folder.is_dir():
-        return []
+    """Return the names of the recordings in `folder` that are understood, or of the tables of motion."""
     understood = format_of if flow == "recordings" else _is_table
-    return sorted(
-        path.name for path in folder.iterdir() if not path.name.startswith(".") and understood(path)
-    )
+    return [path.name for path in _shown(folder) if understood(path)]
+
+
+def _shown(folder: Path) -> list[Path]:
+    """Return what lies in a folder, by name, but hidden files."""
+    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [path for path in found if not path.name.startswith(".")]
 
 
 def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
     """Return the names of whatever else lies there."""
     found, kinds = find(folder, flow), {"", *(f".{kind}" for node in dag.FLOW for kind in node.sidecars)}
-    known = {*found, *(f"{name}{kind}{SIDECAR}" for name in found for kind in kinds)} | {
-        name for node in dag.FLOW for name in node.extra_inputs
-    }
-    return sorted(
-        path.name for path in folder.iterdir() if path.name not in known and not path.name.startswith(".")
-    )
+    known = {*found, *(f"{name}{kind}{SIDECAR}" for name in found for kind in kinds)}
+    known |= {name for node in dag.FLOW for name in node.extra_inputs}
+    return [path.name for path in _shown(folder) if path.name not in known]
 
 
 def named(path: Path, flow: Flow = "recordings") -> str:
@@ -91,25 +83,15 @@ def named(path: Path, flow: Flow = "recordings") -> str:
 
 def refuse_strangers(folder: Path, flow: Flow = "recordings") -> None:
     """Raise CAP-003 where something was put into `folder`, but nothing that a flow can begin with."""
-    strangers = (
-        [name for name in not_understood(folder, flow) if not name.endswith(SIDECAR)]
-        if folder.is_dir()
-        else []
-    )
+    strangers = [name for name in not_understood(folder, flow) if not name.endswith(SIDECAR)]
     if strangers:
-        what = (
-            "holds no recording of a known format, only "
-            f"{', '.join(named(folder / name, flow) for name in strangers)}"
-        )
-        tables = "tables of motion, CSV or NPZ"
-        known = (
-            f"{UNDERSTOOD}; {tables}, where the recipe's [flow] begins at trajectories"
-            if flow == "recordings"
-            else tables
-        )
-        raise InputError(
-            "CAP-003", what, str(folder), f"known: {known}; or empty the folder for the built-in capture"
-        )
+        named_all = ", ".join(named(folder / name, flow) for name in strangers)
+        what = f"holds no recording of a known format, only {named_all}"
+        known = "tables of motion, CSV or NPZ"
+        if flow == "recordings":
+            known = f"{UNDERSTOOD}; {known}, where the recipe's [flow] begins at trajectories"
+        remedy = f"known: {known}; or empty the folder for the built-in capture"
+        raise InputError("CAP-003", what, str(folder), remedy)
 
 
 def extra_inputs(agent: str, names: Sequence[str], *, artifacts: bool = True) -> list[Path]:
@@ -136,9 +118,8 @@ def remarks(
             raise InputError("CAP-041", what, str(folder), "give it a shorter name")
         sidecar = folder / f"{name}{SIDECAR}"
         table = config.read_table(sidecar) if sidecar.is_file() else {}
-        remark = config.from_table(
-            Remarks, {**table, **overrides.get(name, {})}, where=f"{where}: [videos.{name!r}]"
-        )
+        table = {**table, **overrides.get(name, {})}
+        remark = config.from_table(Remarks, table, where=f"{where}: [videos.{name!r}]")
         if remark.offset_s is not None and not math.isfinite(remark.offset_s):
             raise InputError("CAP-041", f"{name!r} has no finite offset_s", where, "give seconds")
         said[name] = remark
@@ -154,9 +135,8 @@ def assign(
 ) -> tuple[Video, ...]:
     """Give every recording its id, role, split and clock.
 
-    `known_ids` are the ids handed out before, by file name: they stay, and none is ever given to another
-    file. Raises `InputError` CAP-040 (something is missing), CAP-041 (a remark that cannot be), CAP-043 (two
-    turnarounds that do not name two animals).
+    `known_ids`, by file name, stay; none is given to another file. Raises CAP-040 (something is missing),
+    CAP-041 (a remark that cannot be), CAP-043 (two turnarounds that do not name two animals).
     """
     roles: dict[str, Role] = {name: role_of(name, remark, where) for name, remark in said.items()}
     for role, what in missing_roles(list(roles.values()), flow):
@@ -186,10 +166,7 @@ def is_mapped(folder: Path, video: Video) -> bool:
 
 
 def role_of(name: str, remark: Remarks, where: str) -> Role:
-    """Return a recording's role: the user's word, else the beginning of its name.
-
-    Raises CAP-041 for an unknown one.
-    """
+    """Return a recording's role: the user's word, else the beginning of its name. Raises CAP-041."""
     for role in ROLES:
         if role == remark.role or (remark.role is None and name.lower().startswith(role)):
             return role
@@ -207,19 +184,14 @@ def missing_roles(roles: Sequence[Role], flow: Flow = "recordings") -> list[tupl
 def builtin(
     session_count: int, heldout_of: int, foreign_sessions: int = 0, companion: str = "none"
 ) -> dict[str, Remarks]:
-    """Return the recordings that `synthesize_capture` writes.
-
-    `heldout_of` counts sessions from 1, 0 is none; `companion` is the second animal's name.
-    """
+    """Return what `synthesize_capture` writes; `heldout_of` counts sessions from 1."""
     sessions = [f"session-{i}.r3d" for i in range(1, session_count + foreign_sessions + 1)]
     two = ("turnaround_cat.r3d", f"turnaround_{companion}.r3d")
     turnarounds = ("turnaround.r3d",) if companion == "none" else two
     plain = dict.fromkeys(("walkthrough.r3d", *turnarounds, *sessions), Remarks())
     if foreign_sessions:  # the test video stays the last one that is filmed at home
-        plain |= {
-            name: Remarks(split="test" if name == sessions[session_count - 1] else "train")
-            for name in sessions
-        }
+        plain |= {name: Remarks(split="train") for name in sessions}
+        plain[sessions[session_count - 1]] = Remarks(split="test")
     if not heldout_of:
         return plain
     return {**plain, "heldout.r3d": Remarks(synchronized_with=f"session-{heldout_of}.r3d", offset_s=0.0)}
@@ -246,10 +218,9 @@ def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) ->
             what = f"{name!r} cannot be in the split {remark.split!r}"
             raise InputError("CAP-041", what, where, "sessions: train or test")
     tested = any(wanted[name] == "test" for name in sessions) or len(sessions) < 2
-    return {
-        name: wanted[name] or ("test" if name == sessions[-1] and not tested else "train")
-        for name in sessions
-    }
+    if not tested and wanted[sessions[-1]] is None:
+        wanted[sessions[-1]] = "test"
+    return {name: wanted[name] or "train" for name in sessions}
 
 
 def _animals(turnarounds: Sequence[str], said: Mapping[str, Remarks], where: str) -> dict[str, str]:
@@ -287,10 +258,6 @@ def _partner(name: str, said: Mapping[str, Remarks], ids: Mapping[str, str], whe
     if partner is None:
         return None
     if partner not in ids or partner == name:
-        raise InputError(
-            "CAP-041",
-            f"{name!r} shares no clock with {partner!r}",
-            where,
-            f"recordings: {', '.join(sorted(ids))}",
-        )
+        what, remedy = f"{name!r} shares no clock with {partner!r}", f"recordings: {', '.join(sorted(ids))}"
+        raise InputError("CAP-041", what, where, remedy)
     return ids[partner]

@@ -11,7 +11,6 @@ import dataclasses
 import inspect
 import itertools
 import os
-import signal
 import sys
 import tempfile
 import textwrap
@@ -24,9 +23,10 @@ from typing import Any
 
 from pipeline.core import config as configuration
 from pipeline.core import devices, videos
-from pipeline.core.errors import InputError, coded_disk_errors
-from pipeline.core.videos import Role, Split, Video
+from pipeline.core.errors import InputError, coded_disk_errors, exit_code
+from pipeline.core.videos import Video
 from pipeline.workflow import artifact, dag, recipes
+from pipeline.workflow.dag import Need
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,10 +67,6 @@ class Task:
         """`cpu` or `cuda`; raises DEP-002 as `devices.choose` does."""
         return devices.choose(self.requested_device)
 
-    def has(self, name: str) -> bool:
-        """Tell whether the optional input `name` was given."""
-        return name in self.paths
-
     def input(self, name: str) -> Path:
         """Return the folder of the finished artifact `name`, or the plain file or folder where it is none."""
         path = self.paths[name]
@@ -81,32 +77,26 @@ class Task:
         return path
 
     def field(self, field: InputField) -> Path | dict[str, Path] | None:
-        """Return what a field of the stage's `Inputs` holds; None for an optional input that was not
-        given.
-        """
-        if not self.has(field.name):
+        """Return what a field of the stage's `Inputs` holds; None for an optional one that was not given."""
+        if field.name not in self.paths:
             return None
         if not field.several:
             return self.input(field.name)
-        needs = [need for node in dag.FLOW if node.stage == self.stage for need in dag.needs_of(node)]
+        folder, needs = self.paths[field.name], dag.needs_of_stage(self.stage)
+        named = [need for need in needs if field.name == (need.option or need.artifact)]
         if field.name == "variants":
-            several = [need for need in needs if need.variants]
-            return self.per_variant(several[0].artifact, several[0].variants)
-        others = [
-            need.artifact for need in needs if need.others and field.name == (need.option or need.artifact)
-        ]
-        if others:
-            return self.per_animal(field.name, others[0], self.config.others)
-        if of_homes := [
-            need.artifact for need in needs if need.homes == "other" and need.option == field.name
-        ]:
-            return self.per_home(self.paths[field.name], of_homes)
+            need = next(need for need in needs if need.variants)
+            return self._below(self.input("variants"), need.variants, need.artifact)
+        if others := [need.artifact for need in named if need.others]:
+            return self._below(folder, self.config.others, others[0])
+        if of_homes := [need.artifact for need in named if need.homes == "other"]:
+            for artifact_name in of_homes:
+                self._below(folder, self.config.homes, artifact_name)
+            return {name: folder / name for name in self.config.homes}
         if dag.NODES[field.name].trials == "each":
-            return self.per_trial(field.name, recipes.trial_ids(self.config.methods, self.config.seeds))
-        for need in needs:
-            if need.artifact == field.name:
-                return self.per_video(field.name, need.roles, need.splits, measured=need.measured)
-        return self.per_video(field.name)
+            trials = recipes.trial_ids(self.config.methods, self.config.seeds)
+            return {id: self._opened(folder / id, f"{field.name}/{id}") for id in trials}
+        return self._per_video(next((need for need in named if not need.option), Need(field.name)))
 
     def recording(self) -> Video | None:
         """Return the recording to treat; None where the stage was run by hand without saying which."""
@@ -115,89 +105,44 @@ class Task:
         for video in self.videos:
             if video.id == self.video:
                 return video
-        raise InputError(
-            "ART-004",
-            f"which recording is {self.video!r}?",
-            self.stage,
-            "give --videos build/<agent>/plan/videos.json that lists it",
-        )
+        remedy = "give --videos build/<agent>/plan/videos.json that lists it"
+        raise InputError("ART-004", f"which recording is {self.video!r}?", self.stage, remedy)
 
-    def per_video(
-        self,
-        name: str,
-        roles: tuple[Role, ...] | None = None,
-        splits: tuple[Split, ...] | None = None,
-        *,
-        measured: bool = False,
-    ) -> dict[str, Path]:
-        """Return the folder of `name` for every recording of `roles` and `splits`, by id, in id order; if
-        ``measured``, without those whose depth comes from the map.
+    def _per_video(self, need: Need) -> dict[str, Path]:
+        """Return the folder of an artifact for every recording of its need's roles and splits, in id order.
 
-        By default: every recording for which the flow makes this artifact.
+        Roles are by default those of recordings for which the flow makes it.
         """
         if not self.videos:
-            raise InputError(
-                "ART-004",
-                f"which recordings of {name}?",
-                self.stage,
-                "give --videos build/<agent>/plan/videos.json",
-            )
-        chosen_roles = dag.NODES[name].roles if roles is None else roles
-        chosen = [
-            v
-            for v in sorted(self.videos, key=lambda video: video.id)
-            if v.role in chosen_roles
-            and (splits is None or v.split in splits)
-            and not (measured and v.mapped)
-        ]
-        kept = {v.id: dag.folder_of(name, v) for v in chosen}
-        folder = {
-            made: self.paths[name] if made == name else self.paths[name].parent / made
-            for made in kept.values()
-        }
-        return {id: self._opened(folder[made] / id, f"{made}/{id}") for id, made in kept.items()}
+            remedy = "give --videos build/<agent>/plan/videos.json"
+            raise InputError("ART-004", f"which recordings of {need.artifact}?", self.stage, remedy)
+        found, folder = {}, self.paths[need.artifact]
+        for video in sorted(self.videos, key=lambda video: video.id):
+            if need.wants(video, dag.NODES[need.artifact].roles):
+                made = dag.folder_of(need.artifact, video)
+                holding = folder if made == need.artifact else folder.parent / made
+                found[video.id] = self._opened(holding / video.id, f"{made}/{video.id}")
+        return found
 
-    def per_trial(self, name: str, trials: Sequence[str]) -> dict[str, Path]:
-        """Return the folder of `name` for every one of the trials, by id."""
-        return {id: self._opened(self.paths[name] / id, f"{name}/{id}") for id in trials}
-
-    def per_variant(self, name: str, variants: Sequence[str]) -> dict[str, Path]:
-        """Return the folder of `name` in every one of the agent's variants, by the variant's name."""
-        folder = self.input("variants")
-        return {variant: self._opened(folder / variant / name, f"{variant}/{name}") for variant in variants}
-
-    def per_animal(self, name: str, artifact: str, animals: Sequence[str]) -> dict[str, Path]:
-        """Return the folder of `artifact` of every one of these animals of the home, by the animal's name."""
-        folder = self.paths[name]
-        return {
-            animal: self._opened(folder / animal / artifact, f"{animal}/{artifact}") for animal in animals
-        }
-
-    def per_home(self, builds: Path, artifacts: Sequence[str]) -> dict[str, Path]:
-        """Return the folder of every further build that the configuration names; each has these artifacts."""
-        for name, artifact_name in itertools.product(self.config.homes, artifacts):
-            self._opened(builds / name / artifact_name, f"{name}/{artifact_name}")
-        return {name: builds / name for name in self.config.homes}
+    def _below(self, folder: Path, names: Sequence[str], artifact: str) -> dict[str, Path]:
+        """Return the folder of `artifact` in every one of these variants or animals, by its name."""
+        return {name: self._opened(folder / name / artifact, f"{name}/{artifact}") for name in names}
 
     @contextmanager
     def create(self) -> Iterator[Path]:
         """Yield the folder to fill; it becomes the artifact if, and only if, the block ends well."""
-        settings = dataclasses.asdict(self.config)
-        stage = self.stage.rpartition(".")[2]
-        with artifact.create(
-            self.out, stage=stage, config=settings, inputs=self.contents, key=self.key
-        ) as folder:
+        stage, settings = self.stage.rpartition(".")[2], dataclasses.asdict(self.config)
+        made = artifact.create(self.out, stage=stage, config=settings, inputs=self.contents, key=self.key)
+        with made as folder:
             yield folder
 
     def _opened(self, path: Path, name: str) -> Path:
         made, kind = artifact.opened(path, name), name.partition("/")[0]
-        makers = [
-            node.stage.rpartition(".")[2] for node in dag.FLOW if kind in (node.artifact, node.stands_in_for)
-        ]
+        nodes = [node for node in dag.FLOW if kind in (node.artifact, node.stands_in_for)]
+        makers = [node.stage.rpartition(".")[2] for node in nodes]
         if makers and made.stage not in makers:
-            raise InputError(
-                "ART-006", f"is no {kind}: {made.stage} wrote it", str(path), f"give what {makers[0]} wrote"
-            )
+            what = f"is no {kind}: {made.stage} wrote it"
+            raise InputError("ART-006", what, str(path), f"give what {makers[0]} wrote")
         self.contents[name] = made.content
         return path
 
@@ -216,29 +161,26 @@ def main(
     """
     fields = input_fields(inputs)
     helping = not {"-h", "--help"}.isdisjoint(sys.argv)
-    settings = (
-        ["settings of the stage's table, with their defaults:", *_settings(config())] if helping else []
-    )
+    settings = ["settings of the stage's table, with their defaults:"] if helping else []
+    settings += _settings(config()) if helping else []
     required = tuple(field.name for field in fields if field.required)
     optional = tuple(field.name for field in fields if not field.required)
     parser = _parser(_program(run), doc, "\n".join(settings) or None, required, optional)
     for name in options:
         _add_option(parser, name, typing.get_type_hints(config)[name])
-    try:
+
+    def program() -> int:
         given = parser.parse_args()
         with coded_disk_errors(str(given.out)):
             _run(run, inputs, fields, _task(given, _program(run), config, required + optional, options))
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(128 + signal.SIGINT)
+        return 0
+
+    if code := exit_code(program):
+        sys.exit(code)
 
 
 def input_fields(inputs: type) -> tuple[InputField, ...]:
-    """Return the fields of a stage's `Inputs`; a field of any other type than those `main` knows is a
-    fault.
-    """
+    """Return the fields of a stage's `Inputs`; one of a type that `main` does not know is a fault."""
     kinds = {Path: False, Mapping[str, Path]: True}
     found = []
     for name, hint in typing.get_type_hints(inputs).items():
@@ -276,21 +218,15 @@ def _leads() -> bool:
 
 
 def _settings(defaults: Any, table: str = "") -> Iterator[str]:
-    """Yield a line per setting, name, default and what the source says beneath it; those of inner tables
-    after their names.
-    """
+    """Yield a line per setting, inner tables' too: name, default and what the source says beneath it."""
     documented: dict[str, str] = {}
     for cls in (cls for cls in reversed(type(defaults).__mro__) if dataclasses.is_dataclass(cls)):
         definition = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
         assert isinstance(definition, ast.ClassDef), cls
-        for line, beneath in itertools.pairwise(definition.body):
-            if (
-                isinstance(line, ast.AnnAssign)
-                and isinstance(line.target, ast.Name)
-                and isinstance(beneath, ast.Expr)
-                and isinstance(beneath.value, ast.Constant)
-            ):
-                documented[line.target.id] = " ".join(str(beneath.value.value).split())
+        for pair in itertools.pairwise(definition.body):
+            match pair:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=text)):
+                    documented[name] = " ".join(str(text).split())
     for name, default in vars(defaults).items():
         if dataclasses.is_dataclass(default):
             yield from _settings(default, f"{table}{name}.")
@@ -301,33 +237,22 @@ def _settings(defaults: Any, table: str = "") -> Iterator[str]:
 def _parser(
     stage: str, doc: str | None, epilog: str | None, reads: tuple[str, ...], optional: tuple[str, ...]
 ) -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog=f"python -m stages.{stage}",
-        description=doc,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    for name in reads + optional:
+    prog, layout = f"python -m stages.{stage}", argparse.RawDescriptionHelpFormatter
+    parser = _Parser(prog=prog, description=doc, epilog=epilog, formatter_class=layout)
+
+    def path(name: str, metavar: str, text: str, *, required: bool = False) -> None:
         option = f"--{name.replace('_', '-')}"
-        parser.add_argument(
-            option, dest=name, type=Path, required=name in reads, metavar="PATH", help=_what(name)
-        )
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="this stage's table, JSON or TOML (default: all defaults)"
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="artifact to write; appears when complete"
-    )
+        parser.add_argument(option, dest=name, type=Path, required=required, metavar=metavar, help=text)
+
+    for name in reads + optional:
+        path(name, "PATH", _what(name), required=name in reads)
+    path("config", "FILE", "this stage's table, JSON or TOML (default: all defaults)")
+    path("out", "DIR", "artifact to write; appears when complete", required=True)
     parser.add_argument("--video", metavar="ID", help="the recording to treat, for example v002")
-    parser.add_argument(
-        "--videos", type=Path, metavar="FILE", help="the agent's recordings: build/<agent>/plan/videos.json"
-    )
-    parser.add_argument(
-        "--resume", type=Path, metavar="DIR", help="folder for checkpoints (default: none are kept)"
-    )
-    parser.add_argument(
-        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute (default: auto)"
-    )
+    path("videos", "FILE", "the agent's recordings: build/<agent>/plan/videos.json")
+    path("resume", "DIR", "folder for checkpoints (default: none are kept)")
+    devices_known, where = ("auto", "cpu", "cuda"), "where to compute (default: auto)"
+    parser.add_argument("--device", choices=devices_known, default="auto", help=where)
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads to use (default: 1)")
     parser.add_argument("--key", help=argparse.SUPPRESS)
     return parser

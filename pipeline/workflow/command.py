@@ -13,7 +13,7 @@ import runpy
 import sys
 from collections.abc import Sequence
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, exit_code
 
 MODULES = {
     "plan": "pipeline.workflow.plan",
@@ -25,16 +25,16 @@ MODULES = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one of the commands in this process; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if not given or given[0] in ("-h", "--help"):
-        print(__doc__)
-        return 0
-    try:
+
+    def program() -> int:
         module, rest = _module(given)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    sys.argv = [f"agent-to-sim {' '.join(given[: len(given) - len(rest)])}", *rest]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+        sys.argv = [f"agent-to-sim {' '.join(given[: len(given) - len(rest)])}", *rest]
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        return 0
+
+    if given and given[0] not in ("-h", "--help"):
+        return exit_code(program)
+    print(__doc__)
     return 0
 
 
@@ -48,9 +48,8 @@ def _module(given: list[str]) -> tuple[str, list[str]]:
             raise InputError("RUN-002", named, "agent-to-sim stage", "names: the folders of stages/")
         case [command, *rest] if command in MODULES:
             return MODULES[command], rest
-    raise InputError(
-        "RUN-003", f"there is no command {given[0]!r}", "agent-to-sim", f"one of: stage, {', '.join(MODULES)}"
-    )
+    what, remedy = f"there is no command {given[0]!r}", f"one of: stage, {', '.join(MODULES)}"
+    raise InputError("RUN-003", what, "agent-to-sim", remedy)
 
 
 def _is_stage(name: str) -> bool:

@@ -10,8 +10,7 @@ from typing import Literal
 from pipeline.core.videos import Role, Split, Video
 
 Flow = Literal["recordings", "trajectories"]
-"""Where an agent's flow begins: at recordings of it, or at tables of its motion, which spares all that comes
-before behaviour."""
+"""Where an agent's flow begins: at recordings of it, or at tables of its motion."""
 BUILTIN: dict[Flow, str] = {"recordings": "synthetic_capture", "trajectories": "synthetic_lives"}
 """What stands in where `captures/<agent>/` is empty."""
 VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
@@ -61,6 +60,11 @@ class Need:
     homes: Literal["any", "own", "other"] = "any"
     """Only where the table of the node names further `homes`, builds of the same animal: one's own, or each
     of theirs, of which the folder of all builds is given."""
+
+    def wants(self, video: Video, made_of: tuple[Role, ...]) -> bool:
+        """Return whether a recording is meant; `made_of` are the artifact's own roles."""
+        roles = made_of if self.roles is None else self.roles
+        return video.role in roles and video.split in self.splits and not (self.measured and video.mapped)
 
 
 @dataclass(frozen=True)
@@ -113,12 +117,18 @@ class Node:
     begins_animal: bool = False
     """In a home of several animals each of them has its own, and its own of all that is made from it."""
 
+    @property
+    def several(self) -> bool:
+        """Whether there is one job per recording or trial."""
+        return bool(self.roles) or self.trials == "each"
+
 
 def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Need, ...]:
     """Return one need per artifact, over the recordings of `roles`."""
     return tuple(Need(artifact, roles) for artifact in artifacts)
 
 
+TRUTH = Need("synthetic_capture", part="truth", option="truth", per_animal=True)
 RECORDING = Need("synthetic_capture", part="recordings", option="recording")
 OF_HOMES = (
     *(Need(name, homes="own", flow="recordings") for name in HOME_ARTIFACTS[1:]),
@@ -312,14 +322,8 @@ FLOW: tuple[Node, ...] = (
         "evaluate",
         (
             *merging("frames", "masks", "flow"),
-            *TEMPLATES,
-            "scene_localizer",
-            "registration",
-            "reconstruction",
-            "splats",
-            "behavior_data",
-            "behavior",
-            Need("synthetic_capture", part="truth", option="truth", per_animal=True),
+            *(*TEMPLATES, "scene_localizer", "registration", *READ_BY_PAGES),
+            TRUTH,
         ),
         role_dependencies=("session", "heldout"),
         gpu=1,
@@ -332,39 +336,24 @@ FLOW: tuple[Node, ...] = (
             Need("registration", variants=REGISTRATION_VARIANTS),
             "scene_template",
             *merging("frames", roles=("walkthrough", "session")),
-            Need("synthetic_capture", part="truth", option="truth", per_animal=True),
+            TRUTH,
         ),
         on_demand=True,
     ),
     Node(
         "reconstruction_tables",
         "evaluate.reconstruction_tables",
-        (
-            Need("reconstruction", variants=RECONSTRUCTION_VARIANTS),
-            *TEMPLATES,
-            *merging("frames"),
-            Need("synthetic_capture", part="truth", option="truth", per_animal=True),
-        ),
+        (Need("reconstruction", variants=RECONSTRUCTION_VARIANTS), *TEMPLATES, *merging("frames"), TRUTH),
         on_demand=True,
     ),
     Node(
         "report",
         "report",
         (
-            *merging("frames", "flow", "masks"),
-            "feature_basis",
-            *merging("features"),
-            *TEMPLATES,
-            *LOCALIZERS,
-            *merging("video_poses"),
-            "registration",
-            "reconstruction",
-            "splats",
-            "behavior_data",
-            "behavior",
-            "longterm",
-            "simulator",
-            "evaluation",
+            *(*merging("frames", "flow", "masks"), "feature_basis", *merging("features")),
+            *(*TEMPLATES, *LOCALIZERS, *merging("video_poses"), "registration"),
+            *("reconstruction", "splats", "behavior_data", "behavior"),
+            *("longterm", "simulator", "evaluation"),
         ),
     ),
 )
@@ -372,9 +361,7 @@ NODES = {node.artifact: node for node in FLOW}
 
 
 def table_of(node: Node) -> str:
-    """Return the name of the recipe's table that configures `node`: its program's, or its own where they
-    share one.
-    """
+    """Return the recipe's table that configures `node`: its program's, or its own where they share one."""
     shared = sum(other.stage == node.stage and other.table is None for other in FLOW) > 1
     return node.table or (node.artifact if shared or "." in node.stage else node.stage)
 
@@ -398,3 +385,8 @@ def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
     """Return the node's inputs, in declared order; those of one flow only, if given."""
     needs = tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
     return tuple(need for need in needs if flow is None or need.flow in (None, flow))
+
+
+def needs_of_stage(stage: str) -> list[Need]:
+    """Return the inputs of all nodes of one program."""
+    return [need for node in FLOW if node.stage == stage for need in needs_of(node)]

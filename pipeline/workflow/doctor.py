@@ -19,26 +19,9 @@ from pipeline.core.errors import InputError
 from pipeline.workflow import captures, recipes
 
 LIBRARIES = (
-    "torch",
-    "numpy",
-    "scipy",
-    "cv2",
-    "pycolmap",
-    "OpenEXR",
-    "av",
-    "lzfse",
-    "numba",
-    "embreex",
-    "trimesh",
-    "kornia",
-    "onnxruntime",
-    "onnxscript",
-    "pygltflib",
-    "skimage",
-    "safetensors",
-    "matplotlib",
-    "jinja2",
-)
+    "torch", "numpy", "scipy", "cv2", "pycolmap", "OpenEXR", "av", "lzfse", "numba", "embreex", "trimesh",
+    "kornia", "onnxruntime", "onnxscript", "pygltflib", "skimage", "safetensors", "matplotlib", "jinja2",
+)  # fmt: skip
 NEEDED_DISK_GB = 10
 NEEDED_MEMORY_GB = 8
 
@@ -55,11 +38,8 @@ class Finding:
 def python() -> Finding:
     """Check the interpreter."""
     good = (3, 11) <= sys.version_info[:2] < (3, 14)
-    return Finding(
-        "python",
-        "ok" if good else "fail",
-        f"{sys.version.split()[0]} (3.11 to 3.13 {'will do' if good else 'is needed'})",
-    )
+    text = f"{sys.version.split()[0]} (3.11 to 3.13 {'will do' if good else 'is needed'})"
+    return Finding("python", "ok" if good else "fail", text)
 
 
 def libraries() -> Finding:
@@ -74,13 +54,20 @@ def libraries() -> Finding:
     return Finding("libraries", "fail" if missing else "ok", text)
 
 
+def opengl() -> Finding:
+    """Look for the system libraries that meshes need."""
+    missing = [name for name in ("GL", "OpenGL") if ctypes.util.find_library(name) is None]
+    text = f"missing lib{', lib'.join(missing)}" if missing else "found"
+    return Finding("OpenGL", "fail" if missing else "ok", text)
+
+
 def meshes() -> Finding:
     """Import pymeshlab, in a process of its own, as the stage that uses it does."""
     found = subprocess.run([sys.executable, "-c", "import pymeshlab"], capture_output=True, text=True)
+    if found.returncode == 0:
+        return Finding("pymeshlab", "ok", "imports")
     remedy = "missing system libraries; remedy: apt-get install libgl1 libopengl0"
-    return Finding(
-        "pymeshlab", "fail" if found.returncode else "ok", remedy if found.returncode else "imports"
-    )
+    return Finding("pymeshlab", "fail", remedy)
 
 
 def processors() -> Finding:
@@ -109,52 +96,35 @@ def lock() -> Finding:
 def memory() -> Finding:
     """Check the machine's memory."""
     total_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    state = "ok" if total_gb >= NEEDED_MEMORY_GB else "warn"
-    return Finding(
-        "memory", state, f"{total_gb:.1f} GB (a full build wants {NEEDED_MEMORY_GB}; with less, use -j1)"
-    )
+    text = f"{total_gb:.1f} GB (a full build wants {NEEDED_MEMORY_GB}; with less, use -j1)"
+    return Finding("memory", "ok" if total_gb >= NEEDED_MEMORY_GB else "warn", text)
 
 
 def disk() -> Finding:
     """Check the free space where builds stand."""
     free_gb = shutil.disk_usage(".").free / 2**30
-    return Finding(
-        "disk",
-        "ok" if free_gb >= NEEDED_DISK_GB else "warn",
-        f"{free_gb:.0f} GB free (wanted: {NEEDED_DISK_GB})",
-    )
+    text = f"{free_gb:.0f} GB free (wanted: {NEEDED_DISK_GB})"
+    return Finding("disk", "ok" if free_gb >= NEEDED_DISK_GB else "warn", text)
 
 
 def browser() -> Finding:
     """Look for the browser that the page test drives; builds do without."""
     found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    return Finding(
-        "browser",
-        "ok" if found else "warn",
-        found or "none: the page test cannot run; remedy: apt-get install chromium",
-    )
+    missing = "none: the page test cannot run; remedy: apt-get install chromium"
+    return Finding("browser", "ok" if found else "warn", found or missing)
 
 
 def recordings() -> Finding:
     """Count the recordings of every agent."""
-    counts = {}
+    counts = []
     for recipe in sorted(Path("agents").glob("*.toml")):
         try:
             flow = recipes.flow(config.read_table(recipe).get(recipes.FLOW_TABLE, {}), str(recipe))
         except InputError as error:
             return Finding("recordings", "warn", str(error))
-        counts[recipe.stem] = len(captures.find(Path("captures", recipe.stem), flow))
-    return Finding(
-        "recordings", "ok", ", ".join(f"{name}: {count or 'built-in'}" for name, count in counts.items())
-    )
-
-
-def opengl() -> Finding:
-    """Look for the system libraries that meshes need."""
-    missing = [name for name in ("GL", "OpenGL") if ctypes.util.find_library(name) is None]
-    return Finding(
-        "OpenGL", "fail" if missing else "ok", f"missing lib{', lib'.join(missing)}" if missing else "found"
-    )
+        count = len(captures.find(Path("captures", recipe.stem), flow))
+        counts.append(f"{recipe.stem}: {count or 'built-in'}")
+    return Finding("recordings", "ok", ", ".join(counts))
 
 
 CHECKS: tuple[Callable[[], Finding], ...] = (

@@ -31,9 +31,7 @@ HOME = r"[a-z0-9][a-z0-9_-]*(?:/(?:variants|animals)/[a-z0-9][a-z0-9_-]*)?"
 
 
 def homes(config: Mapping[str, Any]) -> list[str]:
-    """Return the homes to build: `agents=[...]`, a table `homes=homes.tsv` (agent, variant), or one
-    `agent=`.
-    """
+    """Return the homes to build: `agents=[...]`, a table `homes=` (agent, variant), or one `agent=`."""
     variant = config.get("variant")
     if config.get("homes"):
         path = Path(config["homes"])
@@ -68,34 +66,24 @@ def targets(homes: list[str]) -> list[str]:
 
 def output(node: dag.Node) -> str:
     """Return the stamp of a node's jobs, as a pattern."""
-    return f"build/{{home}}/{node.artifact}/{'{part}/' if is_several(node) else ''}{artifact.STAMP}"
+    return f"build/{{home}}/{node.artifact}/{'{part}/' if node.several else ''}{artifact.STAMP}"
 
 
 def benchmark(node: dag.Node) -> str:
     """Return the file for Snakemake's own measurements of a node's jobs, as a pattern."""
-    return f"build/{{home}}/benchmarks/{node.artifact}{'.{part}' if is_several(node) else ''}.tsv"
-
-
-def is_several(node: dag.Node) -> bool:
-    """Return whether there is one job per recording or trial."""
-    return bool(node.roles) or node.trials == "each"
-
-
-def job_id(node: dag.Node) -> Callable[[Any], str]:
-    """Return a function from a rule's wildcards to the id of the job."""
-    return lambda wildcards: f"{node.artifact}.{wildcards.part}" if is_several(node) else node.artifact
+    return f"build/{{home}}/benchmarks/{node.artifact}{'.{part}' if node.several else ''}.tsv"
 
 
 def job_pattern(node: dag.Node) -> str:
     """Return the id of a node's jobs, as a pattern."""
-    return f"{node.artifact}.{{part}}" if is_several(node) else node.artifact
+    return f"{node.artifact}.{{part}}" if node.several else node.artifact
 
 
 def inputs(node: dag.Node) -> Callable[[Any], list[str]]:
     """Return a function from a rule's wildcards to the stamps that its job waits for."""
 
     def of(wildcards: Any) -> list[str]:
-        return _job(wildcards.home, job_id(node)(wildcards))["after"]
+        return _job(wildcards.home, _id(node, wildcards))["after"]
 
     return of
 
@@ -104,7 +92,7 @@ def memory_mb(node: dag.Node) -> Callable[..., int]:
     """Return a function from wildcards and attempt to the memory that the job reserves."""
 
     def of(wildcards: Any, attempt: int) -> int:
-        frames = _frames(wildcards.home, job_id(node)(wildcards)) if node.memory_mb_per_1000_frames else 0
+        frames = _frames(wildcards.home, _id(node, wildcards)) if node.memory_mb_per_1000_frames else 0
         needed = node.memory_mb + node.memory_mb_per_1000_frames * frames / 1000
         return math.ceil(needed * MEMORY_GROWTH ** (attempt - 1))
 
@@ -115,12 +103,14 @@ def runtime_min(node: dag.Node) -> Callable[..., int]:
     """Return a function from wildcards and attempt to the time that the job is granted, minutes."""
 
     def of(wildcards: Any, attempt: int) -> int:
-        frames = _frames(wildcards.home, job_id(node)(wildcards))
-        return math.ceil(
-            (LEAST_RUNTIME_MIN + RUNTIME_FACTOR * node.seconds_per_frame * frames / 60) * attempt
-        )
+        seconds = RUNTIME_FACTOR * node.seconds_per_frame * _frames(wildcards.home, _id(node, wildcards))
+        return math.ceil((LEAST_RUNTIME_MIN + seconds / 60) * attempt)
 
     return of
+
+
+def _id(node: dag.Node, wildcards: Any) -> str:
+    return job_pattern(node).replace("{part}", getattr(wildcards, "part", ""))
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import InputError
-from pipeline.core.videos import Video
+from pipeline.core.videos import SPLITS, Video
 from pipeline.recordings import formats
 from pipeline.workflow import artifact, captures, dag
 from pipeline.workflow.dag import Flow, Need, Node
@@ -18,29 +18,23 @@ from pipeline.workflow.recipes import HOMES, NAME, NAME_RULE, Trial
 
 @dataclass(frozen=True)
 class Home:
-    """Where artifacts stand: an agent's own folder, one of its variants', or one of its animals' where it is
-    a home of several.
-    """
+    """Where artifacts stand: an agent's own folder, one of its variants', or one of its several animals'."""
 
     agent: str
     variant: str | None = None
     tables: bool = False
-    """A plan of its own, with the trials of `make behavior-tables`, whose artifacts stand among the
-    agent's."""
+    """A plan of its own, for `make behavior-tables`, whose artifacts stand among the agent's."""
     animal: str | None = None
 
     @classmethod
     def parse(cls, text: str) -> "Home":
-        """Read `agent`, `agent/tables`, `agent/variants/name` or `agent/animals/name`; raises REC-004 for
-        names that are no plain names.
-        """
+        """Read `agent`, `agent/tables`, `agent/variants/name` or `agent/animals/name`. Raises REC-004."""
         kind = "animals" if "/animals/" in text else "variants"
         agent, *rest = text.removesuffix("/tables").split(f"/{kind}/", 1)
         for name in (agent, *rest):
             if not NAME.match(name):
-                raise InputError(
-                    "REC-004", f"{name!r} is no name for an agent or a variant", remedy=NAME_RULE
-                )
+                what = f"{name!r} is no name for an agent or a variant"
+                raise InputError("REC-004", what, remedy=NAME_RULE)
         if kind == "animals":
             return cls(agent, animal=rest[0])
         return cls(agent, *rest, tables=text.endswith("/tables"))
@@ -145,9 +139,7 @@ class Plan:
 
 
 def of_animal() -> frozenset[str]:
-    """Return the artifacts that each of several animals has of its own: where it begins, and all that is made
-    from that.
-    """
+    """Return the artifacts that each of several animals has of its own: the first, and all made from it."""
     found: set[str] = set()
     for node in dag.FLOW:
         needs = [need.artifact for need in dag.needs_of(node) if not need.others]
@@ -157,8 +149,9 @@ def of_animal() -> frozenset[str]:
 
 
 def touched_by(tables: Mapping[str, Any], changed: Mapping[str, Any], mapped: bool) -> frozenset[str]:
-    """Return what an overlay changes: the artifacts with another table, and all that is made from them; of
-    recordings that are ``mapped``, also what their artifacts stand in for, so that both lie in one home.
+    """Return what an overlay changes: the artifacts with another table, and all that is made from them.
+
+    Of ``mapped`` recordings also what their artifacts stand in for, so that both lie in one home.
     """
     found: set[str] = set()
     for _ in range(2 if mapped else 1):
@@ -178,25 +171,17 @@ def with_animals(plan: Plan) -> Plan:
         what = f"{plan.home.agent} is a home of several animals, of which there are no variants and tables"
         raise InputError("REC-008", what, str(plan.home), f"make {plan.home.agent}")
     reading = [node.artifact for node in dag.FLOW if any(need.others for need in dag.needs_of(node))]
-    each = []
-    for name in names:
+
+    def tables(others: Sequence[str]) -> dict[str, dict[str, Any]]:
+        return plan.tables | {each: {**plan.tables[each], "others": list(others)} for each in reading}
+
+    def own(name: str) -> Plan:
         others = tuple(other for other in names if other != name)
-        each.append(
-            replace(
-                plan,
-                home=replace(plan.home, animal=name),
-                videos=tuple(video for video in plan.videos if video.animal in (None, name)),
-                tables=_named(plan, reading, others),
-                touched=of_animal(),
-                others=others,
-            )
-        )
-    return replace(plan, animals=tuple(each), others=tuple(names), tables=_named(plan, reading, names))
+        videos = tuple(video for video in plan.videos if video.animal in (None, name))
+        home, touched = replace(plan.home, animal=name), of_animal()
+        return replace(plan, home=home, videos=videos, tables=tables(others), touched=touched, others=others)
 
-
-def _named(plan: Plan, reading: Sequence[str], others: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the plan's tables with the names of ``others`` for the artifacts that read theirs."""
-    return plan.tables | {name: {**plan.tables[name], "others": list(others)} for name in reading}
+    return replace(plan, animals=tuple(map(own, names)), others=tuple(names), tables=tables(names))
 
 
 def jobs(plan: Plan) -> list[Job]:
@@ -220,8 +205,7 @@ def jobs(plan: Plan) -> list[Job]:
 def followed(all_jobs: Sequence[Job]) -> dict[str, list[str]]:
     """Return per stamp the stamps that an engine waits for: of its inputs those that no other input has.
 
-    An input of an input is older than that, so that it need not be told; thousands of recordings have tens of
-    thousands of such inputs.
+    An input of an input is older anyway; thousands of recordings have tens of thousands of such inputs.
     """
     inputs = {job.stamp: dict.fromkeys(f"{i.path}/{artifact.STAMP}" for i in job.inputs) for job in all_jobs}
     found = {}
@@ -237,15 +221,11 @@ def deciding_videos(plan: Plan, node: Node) -> list[Video]:
     """Return the recordings whose set and split decide the result of a node that is one job for all."""
     if node.roles:
         return []
-    roles, splits = (
-        set(node.role_dependencies),
-        {role: {"train", "test", "none"} for role in node.role_dependencies},
-    )
+    deciding = {(role, split) for role in node.role_dependencies for split in SPLITS}
     for need in dag.needs_of(node, plan.flow):
-        for role in need.roles or dag.NODES[need.artifact].roles:
-            roles.add(role)
-            splits.setdefault(role, set()).update(need.splits)
-    return [video for video in plan.videos if video.role in roles and video.split in splits[video.role]]
+        roles = need.roles or dag.NODES[need.artifact].roles
+        deciding |= {(role, split) for role in roles for split in need.splits}
+    return [video for video in plan.videos if (video.role, video.split) in deciding]
 
 
 def job_file(home: str, job_id: str) -> Path:
@@ -274,10 +254,8 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     listed = (home if home.animal else home.base).plan / "videos.json"
     arguments += ["--videos", str(listed), *(["--video", video.id] if video else [])]
     keys_folder = home.base.plan / "keys"
-    keys = [
-        str(home.plan / f"keys/{named}.json"),
-        *(str(keys_folder / f"video.{id}.json") for id in deciding),
-    ]
+    keys = [str(home.plan / f"keys/{named}.json")]
+    keys += [str(keys_folder / f"video.{id}.json") for id in deciding]
     own = home.variant is None and home.animal is None
     for file in captures.extra_inputs(plan.home.agent, node.extra_inputs, artifacts=own):
         keys.append(str(keys_folder / f"extra.{file.name}"))
@@ -307,9 +285,7 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
 
 
 def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[Input], list[str], list[str]]:
-    """Return the artifacts that a job reads, the part of its command line that names them and the recording,
-    and the ids of the recordings that decide its result.
-    """
+    """Return what a job reads, the options that name it, and ids of the recordings that decide its result."""
     folder, video = Path("captures", plan.home.agent), part if isinstance(part, Video) else None
     inputs: list[Input] = []
     arguments: list[str] = []
@@ -329,9 +305,8 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
         found = list(_inputs(plan, need, node, part))
         inputs += found
         source = dag.NODES[need.artifact]
-        several = (source.roles and (need.roles or not node.roles)) or (
-            source.trials == "each" and not isinstance(part, Trial)
-        )
+        several = source.roles and (need.roles or not node.roles)
+        several = several or (source.trials == "each" and not isinstance(part, Trial))
         whole = plan.home_of(need.artifact).folder / need.artifact
         path = whole if several else Path(found[0].path, found[0].part or "")
         path = plan.home.base.folder / "animals" if need.others else path
@@ -364,17 +339,10 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
     if not source.roles:
         inner = f"{need.part}/{part.file}" if need.part and isinstance(part, Video) else need.part
         yield Input(need.artifact, str(folder), inner)
-        others = [Home(plan.home.agent, variant) for variant in need.variants]
-        yield from (
-            Input(f"{other}/{need.artifact}", str(other.folder / need.artifact), inner) for other in others
-        )
+        for other in (Home(plan.home.agent, variant) for variant in need.variants):
+            yield Input(f"{other}/{need.artifact}", str(other.folder / need.artifact), inner)
         return
-    roles = set(source.roles).intersection(need.roles or source.roles)
-    several = [
-        video
-        for video in plan.videos
-        if video.role in roles and video.split in need.splits and not (need.measured and video.mapped)
-    ]
+    several = [video for video in plan.videos if need.wants(video, source.roles)]
     for video in [part] if isinstance(part, Video) and not need.roles else several:
         made = dag.folder_of(need.artifact, video)
         yield Input(f"{made}/{video.id}", str(plan.home_of(made).folder / made / video.id), need.part)

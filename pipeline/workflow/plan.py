@@ -13,15 +13,16 @@ Every check of the user's input happens before anything is written. Where what d
 changed, its stamp is removed, so that an engine looks at it. Standard library only: it runs at every `make`.
 """
 
+import functools
 import json
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.core.errors import InputError, coded_disk_errors
+from pipeline.core.errors import InputError, exit_code
 from pipeline.workflow import artifact, captures, dag, recipes, sources, stamps
 from pipeline.workflow.jobs import (
     Home,
@@ -57,8 +58,9 @@ def read(home: Home, cache: sources.Cache) -> Plan:
     folder = Path("captures", home.agent)
     names = captures.find(folder, flow)
     if names:
+        digest_of = functools.partial(cache.get, read=artifact.digest_of_file)
         said = captures.remarks(folder, names, recipe.get(recipes.VIDEOS_TABLE, {}), where)
-        hashes = {name: _digest_of_recording(folder / name, cache) for name in names}
+        hashes = {name: sources.recording_digest(folder / name, digest_of) for name in names}
     else:
         captures.refuse_strangers(folder, flow)
         said = recipes.builtin_remarks(flow, recipe, where)
@@ -78,23 +80,15 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     """Write the plan's files, each only if it changed."""
     all_jobs = jobs(plan)
     base = plan.home.base.plan
-    _write(
-        base / "ids.json", _json(_known_ids(plan.home.base) | {video.file: video.id for video in plan.videos})
-    )
+    ids = _known_ids(plan.home.base) | {video.file: video.id for video in plan.videos}
+    _write(base / "ids.json", _json(ids))
     _write(base / "videos.json", _json([asdict(video) for video in plan.videos]))
     for video in plan.videos:
         _write(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
-    for file in (
-        file for node in dag.FLOW for file in captures.extra_inputs(plan.home.agent, node.extra_inputs)
-    ):
+    for name, file in _beside_recordings(plan):
         digested = file / artifact.MANIFEST if file.is_dir() else file
         digest = cache.get(digested, artifact.digest_of_file)
-        _write(base / f"keys/extra.{file.name}", _json({"sha256": digest}))
-    with_sidecars = [node for node in dag.FLOW if node.sidecars]
-    for node, video in ((node, video) for node in with_sidecars for video in plan.videos):
-        for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items():
-            digest = cache.get(file, artifact.digest_of_file)
-            _write(base / f"keys/{name}.{video.id}.json", _json({"sha256": digest}))
+        _write(base / "keys" / name, _json({"sha256": digest}))
     for each in (plan, *plan.animals):
         for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(each.home)}:
             _write_key(each, cache, name, trial)
@@ -114,6 +108,17 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     stamps.remove_outdated(all_jobs)
 
 
+def _beside_recordings(plan: Plan) -> Iterator[tuple[str, Path]]:
+    """Yield the user's further files that decide something, each with the name of its key file."""
+    agent = plan.home.agent
+    for node in dag.FLOW:
+        for file in captures.extra_inputs(agent, node.extra_inputs):
+            yield f"extra.{file.name}", file
+        for video in plan.videos:
+            for name, file in captures.sidecars(agent, video.file, node.sidecars).items():
+                yield f"{name}.{video.id}.json", file
+
+
 def _write_dag(home: Home, its_jobs: Sequence[Job]) -> None:
     lines = [json.dumps(job.as_dict(), sort_keys=True) for job in its_jobs]
     _write(home.plan / "dag.json", "[\n" + ",\n".join(lines) + "\n]\n")
@@ -125,16 +130,13 @@ def _write(path: Path, text: str) -> None:
 
 
 def _write_key(plan: Plan, cache: sources.Cache, name: str, trial: str | None) -> None:
-    """Write the table of one artifact, or of one trial of it, and what decides its content beside its
-    inputs.
-    """
+    """Write the table of one artifact, or of one trial of it, and what decides it beside its inputs."""
     node, table = dag.NODES[name], plan.tables[name]
     overlay = next((each.overlay for each in plan.trials if each.id == trial), {})
     if trial and dag.table_of(node) == recipes.TRIED_TABLE:
         table = recipes.merged(table, overlay)
     name = f"{name}.{trial}" if trial else name
     _write(plan.home.plan / f"configs/{name}.json", _json(table))
-    deciding = deciding_videos(plan, node)
     key = {
         "stage": node.stage,
         "version": node.version,
@@ -142,7 +144,7 @@ def _write_key(plan: Plan, cache: sources.Cache, name: str, trial: str | None) -
         "table": table,
         "videos": [
             [v.id, v.role, v.split, v.synchronized_with, v.offset_s, *([v.animal] if v.animal else [])]
-            for v in deciding
+            for v in deciding_videos(plan, node)
         ],
     }
     if plan.home.animal:
@@ -162,8 +164,9 @@ def mark_redo(home: Home, name: str) -> None:
 
 
 def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
-    """Return `--name path` of finished artifacts, each where a variant or the agent it stands on has it; in a
-    home of several animals ``together`` gives `--animals` instead. Raises REC-007, REC-008.
+    """Return `--name path` of finished artifacts, each where a variant or its agent has it.
+
+    In a home of several animals ``together`` gives `--animals` instead. Raises REC-007, REC-008.
     """
     animals = [str(each.animal) for each in _animal_homes(home.base)]
     if home.animal and home.animal not in animals:
@@ -171,9 +174,8 @@ def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
     known = {job["artifact"]: Path(job["out"]) for job in json.loads((home.plan / "dag.json").read_text())}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise InputError(
-            "REC-007", f"no artifact {unknown[0]!r}", str(home), f"artifacts: {', '.join(known)}"
-        )
+        remedy = f"artifacts: {', '.join(known)}"
+        raise InputError("REC-007", f"no artifact {unknown[0]!r}", str(home), remedy)
     own = home.folder / "animals"
     if not home.animal and any(known[name].is_relative_to(own) for name in names):
         if together:
@@ -203,28 +205,15 @@ def new_agent(name: str, taken: Sequence[str] = ()) -> None:
     print(f"recipe {recipe}; put recordings into captures/{home.agent}/, then: make {home.agent}")
 
 
-def _digest_of_recording(path: Path, cache: sources.Cache) -> str:
-    if path.is_file():
-        return cache.get(path, artifact.digest_of_file)
-    files = sorted(file for file in path.rglob("*") if file.is_file())
-    return artifact.digest_of(
-        {file.relative_to(path).as_posix(): cache.get(file, artifact.digest_of_file) for file in files}
-    )
-
-
 def _known_ids(base: Home) -> dict[str, str]:
-    """Return the ids handed out so far, by file name; a file that holds anything else is written anew, as a
-    lost one is.
-    """
+    """Return the ids handed out so far, by file name; a file that holds anything else counts as lost."""
     try:
         known = json.loads((base.plan / "ids.json").read_text())
     except (FileNotFoundError, ValueError):
         return {}
     ids = list(known.values()) if isinstance(known, dict) else [None]
-    sound = all(isinstance(id, str) and re.fullmatch(r"v[0-9]{3,}", id) for id in ids) and len(
-        set(ids)
-    ) == len(ids)
-    return known if sound else {}
+    sound = all(isinstance(id, str) and re.fullmatch(r"v[0-9]{3,}", id) for id in ids)
+    return known if sound and len(set(ids)) == len(ids) else {}
 
 
 def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) -> str:
@@ -236,32 +225,22 @@ def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) 
         stamped.setdefault(job.artifact, []).append(job.stamp)
         lines += [f"{job.stamp}: {' '.join(after[job.stamp])}", f"\t@$(RUN) {job.home} {job.id}"]
     for node, made in stamped.items():
-        lines += [f".PHONY: {name}.{node} {name}.{node}.redo", f"{name}.{node}: {' '.join(made)}"]
-        lines += [
-            f"{name}.{node}.redo:",
-            f"\t@$(PLAN) redo {home} {node}",
-            f"\t@$(MAKE) $(NESTING) {name}.{node}",
-        ]
+        target = f"{name}.{node}"
+        lines += [f".PHONY: {target} {target}.redo", f"{target}: {' '.join(made)}"]
+        lines += [f"{target}.redo:", f"\t@$(PLAN) redo {home} {node}", f"\t@$(MAKE) $(NESTING) {target}"]
     if not home.tables:
-        shown = [
+        wanted = [job.stamp for job in all_jobs if not dag.NODES[job.artifact].on_demand]
+        pages = dict.fromkeys(
             f"{each.home_of(node).folder}/{node}/index.html"
             for each in plan.animals or (plan,)
             for node in ("home_simulator", "report", "simulator")
             if node in stamped
-        ]
-        pages = list(dict.fromkeys(shown))
-        lines += [
-            f".PHONY: {name}",
-            f"{name}: {' '.join(job.stamp for job in all_jobs if not dag.NODES[job.artifact].on_demand)}",
-        ]
-        lines += [
-            f"\t@echo '[{home}] done.{' Open:' if pages else ''}'",
-            *(f"\t@echo '  {page}'" for page in pages),
-        ]
-        following = (
-            f"make {name}.<artifact>[.redo], make {name} VARIANT=no_scene, make new AGENT=<name>, make help"
         )
-        lines += [f"\t@echo 'Next: {following}'"]
+        following = f"make {name}.<artifact>[.redo], make {name} VARIANT=no_scene"
+        lines += [f".PHONY: {name}", f"{name}: {' '.join(wanted)}"]
+        lines += [f"\t@echo '[{home}] done.{' Open:' if pages else ''}'"]
+        lines += [f"\t@echo '  {page}'" for page in pages]
+        lines += [f"\t@echo 'Next: {following}, make new AGENT=<name>, make help'"]
     return "\n".join(lines) + "\n"
 
 
@@ -270,9 +249,7 @@ def _json(value: Any) -> str:
 
 
 def _cache(home: Home) -> sources.Cache:
-    """Return what earlier runs of the planner read, by size and times of the files; lost, it only costs
-    time.
-    """
+    """Return what earlier runs of the planner read; lost, it only costs time."""
     known: dict[str, Any] = {}
     for path in (CODE_CACHE, home.plan / "cache.json"):
         try:
@@ -294,13 +271,8 @@ def _keep(cache: sources.Cache, home: Home) -> None:
 
 def _read_marks(home: Home) -> str:
     """Hash name, size and time of all that a plan is made from."""
-    folders = (
-        sources.CODE / "pipeline",
-        sources.CODE / "stages",
-        Path("agents"),
-        Path("captures", home.agent),
-    )
-    return artifact.digest_of([sources.marks(folder) for folder in folders])
+    code, own = (sources.CODE / "pipeline", sources.CODE / "stages"), Path("captures", home.agent)
+    return artifact.digest_of([sources.marks(folder) for folder in (*code, Path("agents"), own)])
 
 
 def _written_marks(home: Home) -> str:
@@ -321,9 +293,7 @@ def _animal_homes(base: Home) -> list[Home]:
 
 
 def _plan(home: Home, cache: sources.Cache) -> None:
-    """Plan `home`, unless nothing that a plan is made from has changed; a variant stands on a plan of its
-    agent.
-    """
+    """Plan `home`, and its agent, unless nothing that a plan is made from has changed."""
     home = home.base if home.animal else home
     for each in dict.fromkeys((home.base, home, *_animal_homes(home.base))):
         stamps.remove_impossible(each)
@@ -355,41 +325,32 @@ def _messages(plan: Plan, home: Home) -> list[str]:
         return [f"[{home}] nothing in {folder}/: building from the built-in synthetic capture"]
     strangers = captures.not_understood(folder, plan.flow)
     unused = [v.file for v in plan.videos if v.role == "heldout" and v.synchronized_with is None]
+    named = (captures.named(folder / stranger, plan.flow) for stranger in strangers)
+    clock = "measures nothing until the recipe's [videos] sets its synchronized_with"
     return [
-        *(
-            f"[{home}] not a recording, left alone: {captures.named(folder / n, plan.flow)}"
-            for n in strangers
-        ),
-        *(
-            f"[{home}] {file!r} measures nothing until the recipe's [videos] sets its synchronized_with"
-            for file in unused
-        ),
+        *(f"[{home}] not a recording, left alone: {name}" for name in named),
+        *(f"[{home}] {file!r} {clock}" for file in unused),
     ]
 
 
 def main(arguments: list[str]) -> int:
     """Run the command line of the planner; returns its exit code."""
-    try:
-        with coded_disk_errors("build"):
-            match arguments:
-                case ["plan", *homes] if homes:
-                    cache = sources.Cache()
-                    for home in map(Home.parse, homes):
-                        _plan(home, cache)
-                case ["redo", home, name]:
-                    mark_redo(Home.parse(home), name)
-                case ["inputs" | "together" as kind, home, *names]:
-                    print(inputs(Home.parse(home), names, together=kind == "together"))
-                case ["new", name, *taken]:
-                    new_agent(name, taken)
-                case _:
-                    print(__doc__, file=sys.stderr)
-                    return 2
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    match arguments:
+        case ["plan", *homes] if homes:
+            cache = sources.Cache()
+            for home in map(Home.parse, homes):
+                _plan(home, cache)
+        case ["redo", home, name]:
+            mark_redo(Home.parse(home), name)
+        case ["inputs" | "together" as kind, home, *names]:
+            print(inputs(Home.parse(home), names, together=kind == "together"))
+        case ["new", name, *taken]:
+            new_agent(name, taken)
+        case _:
+            print(__doc__, file=sys.stderr)
+            return 2
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

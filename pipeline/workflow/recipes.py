@@ -1,5 +1,4 @@
-"""The recipe of an agent and the overlays of its variants: which tables and keys there may be, and what they
-mean.
+"""The recipe of an agent and the overlays of its variants: which tables and keys there may be.
 
 `read` refuses what no stage knows; `flow`, `builtin_remarks` and `trials` draw from it what the planner must
 know before any stage runs. Standard library only.
@@ -45,9 +44,8 @@ def read(path: Path) -> tuple[dict[str, Any], str]:
     """
     if not path.is_file():
         known = ", ".join(sorted(other.stem for other in path.parent.glob("*.toml"))) or "none"
-        remedy = f"known: {known}" + (
-            "" if path.parent.name == "variants" else "; a new animal: make new AGENT=..."
-        )
+        new = "" if path.parent.name == "variants" else "; a new animal: make new AGENT=..."
+        remedy = f"known: {known}{new}"
         raise InputError("REC-005", "there is no such recipe", str(path), remedy)
     recipe = config.read_table(path)
     base = recipe.pop(BASE, None) if path.parent.name == "variants" else None
@@ -60,9 +58,8 @@ def _base(name: object, path: Path) -> dict[str, Any]:
     """Return the keys of the variant that the one at `path` starts from, which has no base itself."""
     other = path.with_name(f"{name}.toml")
     if not isinstance(name, str) or not other.is_file() or BASE in config.read_table(other):
-        known = sorted(
-            each.stem for each in path.parent.glob("*.toml") if BASE not in config.read_table(each)
-        )
+        others = path.parent.glob("*.toml")
+        known = sorted(each.stem for each in others if BASE not in config.read_table(each))
         what = f"{BASE}: {config.shown(name)} is no variant without a {BASE} of its own"
         raise InputError("REC-002", what, str(path), f"known: {', '.join(known)}")
     return read(other)[0]
@@ -76,7 +73,8 @@ def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
         if not isinstance(table, dict):
             raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
         if name == VIDEOS_TABLE:
-            _refuse_impossible_remarks(table, f"{path}: [{name}]")
+            for recording, remarks in table.items():
+                _remarks(recording, remarks, f"{path}: [{name}]")
         if name not in stages:
             continue
         declared = sources.config_of(stages[name].stage)
@@ -86,13 +84,12 @@ def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
     return recipe
 
 
-def _refuse_impossible_remarks(table: Mapping[str, Any], where: str) -> None:
-    """Raise REC-001 or REC-002 for unknown keys and values of wrong types in what is said of recordings."""
-    for recording, remarks in table.items():
-        if not isinstance(remarks, dict):
-            what = f"{recording!r}: {config.shown(remarks)} is no table"
-            raise InputError("REC-002", what, where, f"write [{VIDEOS_TABLE}.{recording!r}]")
-        config.from_table(captures.Remarks, remarks, where=f"{where}: {recording!r}")
+def _remarks(recording: str, table: Any, where: str) -> captures.Remarks:
+    """Return what is said of a recording. Raises REC-001 and REC-002 for unknown keys and wrong types."""
+    if not isinstance(table, dict):
+        what = f"{recording!r}: {config.shown(table)} is no table"
+        raise InputError("REC-002", what, where, f"write [{VIDEOS_TABLE}.{recording!r}]")
+    return config.from_table(captures.Remarks, table, where=f"{where}: {recording!r}")
 
 
 def flow(table: Mapping[str, Any], where: str) -> Flow:
@@ -100,12 +97,8 @@ def flow(table: Mapping[str, Any], where: str) -> Flow:
     config.refuse_unknown(table, ("begins_at",), where=f"{where}: [flow]")
     begins = table.get("begins_at", "recordings")
     if not isinstance(begins, str) or begins not in dag.BUILTIN:
-        raise InputError(
-            "REC-002",
-            f"no flow begins at {config.shown(begins)}",
-            f"{where}: [flow]",
-            f"begins_at: {' or '.join(dag.BUILTIN)}",
-        )
+        what, remedy = f"no flow begins at {config.shown(begins)}", f"begins_at: {' or '.join(dag.BUILTIN)}"
+        raise InputError("REC-002", what, f"{where}: [flow]", remedy)
     return begins
 
 
@@ -113,10 +106,9 @@ def refuse_homes(agent: str, table: Mapping[str, Any], where: str) -> None:
     """Raise REC-002 for `homes` that are no other builds, ART-003 for builds that are not there yet."""
     for name in table.get(HOMES, ()):
         if not NAME.match(name) or name == agent:
+            what = f"{HOMES}: {name!r} is no other build"
             remedy = "name other builds of the same animal, folders below build/"
-            raise InputError(
-                "REC-002", f"{HOMES}: {name!r} is no other build", f"{where}: [{TRIED_TABLE}]", remedy
-            )
+            raise InputError("REC-002", what, f"{where}: [{TRIED_TABLE}]", remedy)
         artifact.require(Path("build", name), *dag.HOME_ARTIFACTS, remedy=f"make {name}")
 
 
@@ -125,20 +117,12 @@ def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
     settings = {**_defaults(TABLES_STAGE), **table}
     count, methods = _count(settings, "seeds", TABLES_STAGE), settings.get("methods", ())
     if not isinstance(methods, list | tuple) or not all(isinstance(method, str) for method in methods):
-        raise InputError(
-            "REC-002",
-            f"{methods!r} is no list of methods",
-            f"[{TABLES_STAGE}]: methods",
-            'write ["ats", ...]',
-        )
+        what, remedy = f"{methods!r} is no list of methods", 'write ["ats", ...]'
+        raise InputError("REC-002", what, f"[{TABLES_STAGE}]: methods", remedy)
     if OURS not in methods or not count:
         what = f"{count} trainings of {', '.join(methods) or 'no method'} make no tables"
-        raise InputError(
-            "REC-002",
-            what,
-            f"[{TABLES_STAGE}]: methods, seeds",
-            f"one seed at least, and {OURS!r} among the methods",
-        )
+        remedy = f"one seed at least, and {OURS!r} among the methods"
+        raise InputError("REC-002", what, f"[{TABLES_STAGE}]: methods, seeds", remedy)
     for method in methods:
         path = Path("agents", "variants", f"{method}.toml")
         overlay, _ = read(path)
@@ -170,25 +154,18 @@ def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], where: str) -> dict
         counts = (_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions"))
         said = captures.builtin(*counts, companion=settings["companion"])
     else:
-        said = captures.builtin_lives(
-            *(
-                _count(settings, key, where)
-                for key in ("homes", "sessions_per_home", "test_homes", "test_sessions")
-            )
-        )
+        keys = ("homes", "sessions_per_home", "test_homes", "test_sessions")
+        said = captures.builtin_lives(*(_count(settings, key, where) for key in keys))
     for name in (name for name in overrides if name not in said):
         known = ", ".join(said)
         remedy = f"copy it into captures/, beside the others; without any, the built-in capture has {known}"
         raise InputError("REC-001", f"unknown recording {name!r}", f"{where}: [videos]", remedy)
-    given = {
-        name: {k: v for k, v in asdict(remark).items() if v is not None} for name, remark in said.items()
-    }
-    return {
-        name: config.from_table(
-            captures.Remarks, {**given[name], **overrides.get(name, {})}, where=f"{where}: [videos]"
-        )
-        for name in said
-    }
+
+    def changed(name: str, remark: captures.Remarks) -> captures.Remarks:
+        given = {key: value for key, value in asdict(remark).items() if value is not None}
+        return _remarks(name, {**given, **overrides.get(name, {})}, f"{where}: [videos]")
+
+    return {name: changed(name, remark) for name, remark in said.items()}
 
 
 def _defaults(stage: str) -> dict[str, Any]:
@@ -197,7 +174,6 @@ def _defaults(stage: str) -> dict[str, Any]:
 
 def _count(settings: Mapping[str, Any], key: str, where: str) -> int:
     if type(settings[key]) is not int or settings[key] < 0:
-        raise InputError(
-            "REC-002", f"{settings[key]!r} is no count", f"{where}: {key}", "give a whole number"
-        )
+        what = f"{settings[key]!r} is no count"
+        raise InputError("REC-002", what, f"{where}: {key}", "give a whole number")
     return settings[key]

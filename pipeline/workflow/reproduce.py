@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, exit_code
 from pipeline.workflow import artifact, dag
+from pipeline.workflow.sources import recording_digest
 
 FILE = "ro-crate-metadata.json"
 SHOWN_METRICS = 20
@@ -69,9 +70,7 @@ def read(path: Path) -> Crate:
 
 
 def begin(crate: Crate, agents: Path, captures: Path) -> str:
-    """Write the recipe, link the recordings, and return the new animal's name. Raises CRT-002 for a missing
-    recording.
-    """
+    """Write the recipe, link the recordings, return the new animal's name. Raises CRT-002."""
     name = "again_" + artifact.digest_of([each.content for each in crate.artifacts])[:8]
     wanted = {file: _found(digest, captures) for file, digest in crate.recordings.items() if digest}
     found = {file: path for file, path in wanted.items() if path}
@@ -89,9 +88,7 @@ def begin(crate: Crate, agents: Path, captures: Path) -> str:
 
 
 def recipe(crate: Crate) -> str:
-    """Return the settings of all artifacts as a recipe; what differs between recordings the plan sets by
-    itself.
-    """
+    """Return the settings of all artifacts as a recipe; the plan sets what differs between recordings."""
     tables: dict[str, dict[str, Any]] = {}
     for each in crate.artifacts:
         node = dag.NODES.get(each.name.partition("/")[0])
@@ -100,20 +97,18 @@ def recipe(crate: Crate) -> str:
             table = tables.setdefault(dag.table_of(node), settings)
             for key in [key for key, value in table.items() if settings.get(key) != value]:
                 del table[key]
-    return "# Written by `make reproduce`.\n" + "".join(
-        _toml(table, [name]) for name, table in tables.items()
-    )
+    written = (_toml(table, [name]) for name, table in tables.items())
+    return "# Written by `make reproduce`.\n" + "".join(written)
 
 
 def differing(crate: Crate, build: Path) -> list[str]:
     """Return the names of artifacts whose content is not the crate's, or that are missing, in flow order."""
     order = {name: place for place, name in enumerate(dag.NODES)}
-    made = {each.name: artifact.read_manifest(build / each.name) for each in crate.artifacts}
-    wrong = [
-        each.name
-        for each in crate.artifacts
-        if (manifest := made[each.name]) is None or manifest.content != each.content
-    ]
+    wrong = []
+    for each in crate.artifacts:
+        made = artifact.read_manifest(build / each.name)
+        if made is None or made.content != each.content:
+            wrong.append(each.name)
     return sorted(wrong, key=lambda name: (order.get(name.partition("/")[0], len(order)), name))
 
 
@@ -155,21 +150,11 @@ def _found(digest: str, captures: Path) -> Path | None:
     return None
 
 
-def recording_digest(path: Path) -> str:
-    """Return the hash of a recording as the plan takes it: of the file, or of all files of a folder."""
-    if path.is_file():
-        return artifact.digest_of_file(path)
-    files = sorted(file for file in path.rglob("*") if file.is_file())
-    return artifact.digest_of({f.relative_to(path).as_posix(): artifact.digest_of_file(f) for f in files})
-
-
 def _toml(table: Mapping[str, Any], path: list[str]) -> str:
     """Write a table and those within it; what is None keeps its default."""
-    plain = {
-        key: value for key, value in table.items() if not isinstance(value, Mapping) and value is not None
-    }
-    lines = [f"\n[{'.'.join(path)}]", *(f"{key} = {_value(value)}" for key, value in plain.items())]
     inner = [_toml(value, [*path, key]) for key, value in table.items() if isinstance(value, Mapping)]
+    plain = {key: value for key, value in table.items() if not isinstance(value, Mapping | None)}
+    lines = [f"\n[{'.'.join(path)}]", *(f"{key} = {_value(value)}" for key, value in plain.items())]
     return "\n".join(lines) + "\n" + "".join(inner)
 
 
@@ -181,22 +166,17 @@ def _value(value: Any) -> str:
 
 def main(arguments: list[str]) -> int:
     """Run one of the two commands of the module's docstring."""
-    try:
-        match arguments:
-            case ["begin", path]:
-                print(begin(read(Path(path)), Path("agents"), Path("captures")))
-                return 0
-            case ["compare", path, agent]:
-                lines = list(compare(read(Path(path)), Path("build", agent)))
-                print("\n".join(lines) or "every artifact is equal, bit for bit")
-                return 1 if lines else 0
-            case _:
-                print(__doc__, file=sys.stderr)
-                return 2
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    match arguments:
+        case ["begin", path]:
+            print(begin(read(Path(path)), Path("agents"), Path("captures")))
+            return 0
+        case ["compare", path, agent]:
+            lines = list(compare(read(Path(path)), Path("build", agent)))
+            print("\n".join(lines) or "every artifact is equal, bit for bit")
+            return 1 if lines else 0
+    print(__doc__, file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

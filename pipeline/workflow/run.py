@@ -31,7 +31,7 @@ from types import FrameType
 from typing import Any, TextIO
 
 from pipeline.core import processes
-from pipeline.core.errors import InputError, coded_disk_errors, printable
+from pipeline.core.errors import InputError, exit_code, printable
 from pipeline.workflow import artifact, jobs, sources, stamps
 
 LEAST_FREE_BYTES = 1 << 29
@@ -49,8 +49,7 @@ EXPLAINED = {
     76: "training diverged; its diagnosis stands above",
     128 + signal.SIGINT: "stopped; run the same again to go on",
     128 + signal.SIGTERM: "stopped; run the same again to go on",
-    128
-    + signal.SIGKILL: "killed; if nobody did it, memory was full: close other programs, or build with -j1",
+    128 + signal.SIGKILL: "killed; if nobody did it, memory was full: close programs, or build with -j1",
 }
 
 
@@ -85,9 +84,7 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
         made = artifact.read_manifest(out)
         if made is None or made.key != key or redo.exists():
             if engine.attempt > 1 and (code := _failed_before(job, key)):
-                _say(
-                    job_id, f"not tried again: it ended with exit code {code}, and nothing has changed since"
-                )
+                _say(job_id, f"not tried again: it ended with exit code {code}, and nothing has changed")
                 return code
             if redo.exists() or _other_key(resume, key):
                 shutil.rmtree(resume, ignore_errors=True)
@@ -152,13 +149,11 @@ def _key(job: dict[str, Any]) -> str:
     contents = {}
     for entry in job["inputs"]:
         manifest = artifact.opened(Path(entry["path"]), entry["name"])
-        part = entry["part"]
-        chosen = {
-            n: digest
-            for n, digest in manifest.files.items()
-            if part and (n == part or n.startswith(f"{part}/"))
-        }
-        contents[entry["name"]] = artifact.content_of(chosen) if part else manifest.content
+        contents[entry["name"]] = manifest.content
+        if part := entry["part"]:
+            files = manifest.files.items()
+            chosen = {name: digest for name, digest in files if f"{name}/".startswith(f"{part}/")}
+            contents[entry["name"]] = artifact.content_of(chosen)
     return artifact.digest_of([contents, [json.loads(Path(path).read_text()) for path in job["keys"]]])
 
 
@@ -172,19 +167,13 @@ def _other_key(resume: Path, key: str) -> bool:
 
 def _do(job: dict[str, Any], key: str, resume: Path, engine: Engine) -> int:
     """Run the stage program and, if its artifact stands, record how it went."""
-    out = Path(job["out"])
     if not sources.CODE.joinpath("stages", *job["stage"].split("."), "__main__.py").is_file():
-        raise InputError(
-            "RUN-002", f"there is no stage program {job['stage']!r}", "stages/", "this build is incomplete"
-        )
+        what = f"there is no stage program {job['stage']!r}"
+        raise InputError("RUN-002", what, "stages/", "this build is incomplete")
     free = shutil.disk_usage("build").free
     if free < LEAST_FREE_BYTES:
-        raise InputError(
-            "SYS-001",
-            f"only {free >> 20} MB free on the disk",
-            str(out),
-            "free some space and run the same again",
-        )
+        what, remedy = f"only {free >> 20} MB free on the disk", "free some space and run the same again"
+        raise InputError("SYS-001", what, job["out"], remedy)
     arguments = [*job["arguments"], "--key", key, "--threads", str(job["threads"])]
     if job["resumable"]:
         resume.mkdir(parents=True, exist_ok=True)
@@ -240,10 +229,8 @@ def _log(job: dict[str, Any]) -> Path:
     """Return the next log file of a job; all but the latest `LOGS_KEPT` are removed."""
     folder = Path("build", job["home"], "logs")
     folder.mkdir(parents=True, exist_ok=True)
-    names = (
-        path.name.removeprefix(f"{job['id']}.").removesuffix(".log")
-        for path in folder.glob(f"{job['id']}.*.log")
-    )
+    logs = folder.glob(f"{job['id']}.*.log")
+    names = (path.name.removeprefix(f"{job['id']}.").removesuffix(".log") for path in logs)
     numbers = sorted(int(name) for name in names if name.isdigit())
     for old in numbers[: max(0, len(numbers) - LOGS_KEPT + 1)]:
         (folder / f"{job['id']}.{old}.log").unlink(missing_ok=True)
@@ -254,10 +241,8 @@ def _report_damage(job: dict[str, Any], log: TextIO) -> None:
     """Report which inputs are not what was written, for which alone a stage may have failed."""
     for folder in (Path(entry["path"]) for entry in job["inputs"]):
         if changed := artifact.damaged(folder):
-            what = "has been damaged, changed or deleted since it was made"
-            error = InputError(
-                "ART-005", what, str(folder / changed[0]), f"rm -r {folder}, and run the same again"
-            )
+            what, remedy = "has been damaged, changed or deleted", f"rm -r {folder}, and run the same again"
+            error = InputError("ART-005", what, str(folder / changed[0]), remedy)
             for line in f"error: {error}".splitlines():
                 _say(job["id"], line, log)
 
@@ -280,9 +265,8 @@ def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, s
         killer.start()
 
     old = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
-    old[signal.SIGINT] = signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # the child has its own; what it saves is waited for
+    # The child has its own SIGINT; what it saves is waited for.
+    old[signal.SIGINT] = signal.signal(signal.SIGINT, signal.SIG_IGN)
     reader = threading.Thread(target=_forward, args=(job["id"], child.stdout, log), daemon=True)
     reader.start()
     watchdog = threading.Timer(LONGEST_S, child.kill)
@@ -307,9 +291,7 @@ def _bind_to_parent() -> None:
 
 
 def _environment(threads: int) -> dict[str, str]:
-    """Return the environment of a stage: fixed hashing, as many threads as declared, no spinning, bounded
-    decoders.
-    """
+    """Return a stage's environment: fixed hashing, threads as declared, no spinning, bounded decoders."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     return {
         **os.environ,
@@ -340,32 +322,25 @@ def _quality(out: Path) -> str:
         report = json.loads((out / "qa.json").read_text())
     except (FileNotFoundError, ValueError):
         return ""
-    worries = [
-        f"{check['name']} {_short(check['value'])} {check['unit']}".strip()
-        for check in report["checks"]
-        if check["status"] != "ok"
-    ]
+    worries = []
+    for check in (check for check in report["checks"] if check["status"] != "ok"):
+        value = "unknown" if check["value"] is None else f"{check['value']:.3g}"
+        worries.append(f"{check['name']} {value} {check['unit']}".strip())
     return f", quality {report['status']}" + (f": {'; '.join(worries)}" if worries else "")
 
 
-def _short(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.3g}"
-
-
 def _commit() -> str | None:
+    command = ["git", "rev-parse", "HEAD"]
     try:
-        return subprocess.run(
-            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        ).stdout.strip()
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
 
 
 def main(arguments: list[str]) -> int:
     """Run the command line of the runner; returns its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--launcher", default="")
     parser.add_argument("--attempt", type=int, default=1)
@@ -373,14 +348,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("job")
     given = parser.parse_args(arguments)
     engine = Engine(given.processes, tuple(shlex.split(given.launcher)), given.attempt)
-    try:
-        with coded_disk_errors(given.job):
-            return run(given.home, given.job, engine)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 128 + signal.SIGINT
+    return exit_code(lambda: run(given.home, given.job, engine), given.job)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import ast
 import functools
 import importlib
 import os
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,7 @@ READER = 4
 
 @dataclass
 class Cache:
-    """What was read before, by path, for as long as size and times of a file stay the same: of its content,
-    and of its entry in the file system, which no program sets."""
+    """What was read before, by path, for as long as size and times of a file and its entry stay the same."""
 
     known: dict[str, Any] = field(default_factory=dict)
     fresh: dict[str, Any] = field(default_factory=dict)
@@ -76,9 +76,7 @@ def fits(known: Any) -> bool:
 
 
 def digest(stage: str, cache: Cache) -> str:
-    """Hash the program `stage`, the local modules below it, and the other files of its room (pages,
-    templates).
-    """
+    """Hash the program `stage`, the local modules below it, and its folder's other files (pages)."""
     if stage in cache.digests:
         return cache.digests[stage]
     waiting, seen = [f"stages.{stage}.__main__"], {}
@@ -95,9 +93,7 @@ def digest(stage: str, cache: Cache) -> str:
 
 
 def marks(folder: Path) -> list[list[Any]]:
-    """Return path, size and times of every file below `folder`, in order; what changes them has the planner
-    look again.
-    """
+    """Return path, size and times of every file below `folder`; where they change, one looks again."""
     found: list[list[Any]] = []
     try:
         entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
@@ -142,6 +138,14 @@ def _assets(room: Path, cache: Cache) -> dict[str, str]:
     return found
 
 
+def recording_digest(path: Path, digest_of: Callable[[Path], str] = artifact.digest_of_file) -> str:
+    """Return the hash of a recording: of the file, or of all files of a folder."""
+    if path.is_file():
+        return digest_of(path)
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    return artifact.digest_of({file.relative_to(path).as_posix(): digest_of(file) for file in files})
+
+
 def _read(path: Path) -> dict[str, Any]:
     try:
         tree = ast.parse(path.read_bytes(), str(path))
@@ -156,9 +160,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _imported(node: ast.AST) -> list[str]:
-    """Return the modules that a statement may import; `from a import b` may mean `a.b`, and imports package
-    `a`.
-    """
+    """Return the modules that a statement may import: `from a import b` imports `a`, and may mean `a.b`."""
     if isinstance(node, ast.Import):
         names = [alias.name for alias in node.names]
     elif isinstance(node, ast.ImportFrom) and node.module:

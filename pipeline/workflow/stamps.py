@@ -5,6 +5,7 @@ run the job. Their own question, which of two stamps is younger, is answered by 
 never goes back: every stamp gets a later time than all before. Standard library only.
 """
 
+import contextlib
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -20,7 +21,10 @@ TICK_NS = 1_000_000
 def put(stamp: Path, keys: Sequence[str]) -> None:
     """Stamp an artifact that is known to be up to date; `keys` are its job's key files."""
     stamp.write_text(text(keys))
-    later_ns = _tick(Home(stamp.parts[1]))
+    clock = _clock(Home(stamp.parts[1]))
+    with artifact.held(clock):
+        later_ns = max(time.time_ns(), clock.stat().st_mtime_ns + TICK_NS)
+        os.utime(clock, ns=(later_ns, later_ns))
     os.utime(stamp, ns=(later_ns, later_ns))
 
 
@@ -34,44 +38,29 @@ def remove_outdated(jobs: Sequence[Job]) -> None:
     digests = {key: artifact.digest_of_file(Path(key)) for job in jobs for key in job.keys}
     for job in jobs:
         expected = artifact.digest_of([digests[key] for key in job.keys]) + "\n"
-        try:
-            if Path(job.stamp).read_text(errors="replace") == expected:
-                continue
-        except FileNotFoundError:
-            continue
-        Path(job.stamp).unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            if Path(job.stamp).read_text(errors="replace") != expected:
+                Path(job.stamp).unlink()
 
 
 def remove_impossible(home: Home) -> None:
     """Remove stamps from after the present, which were not put by `put`: they would hide every change."""
-    try:
-        now_ns = max(time.time_ns(), _clock(home).stat().st_mtime_ns)
-    except FileNotFoundError:
-        now_ns = time.time_ns()
+    now_ns = time.time_ns()
+    with contextlib.suppress(FileNotFoundError):
+        now_ns = max(now_ns, _clock(home).stat().st_mtime_ns)
     for stamp in _all_stamps(home):
-        try:
+        with contextlib.suppress(FileNotFoundError):
             if os.stat(stamp).st_mtime_ns > now_ns:
                 os.unlink(stamp)
-        except FileNotFoundError:
-            continue
 
 
 def _all_stamps(home: Home) -> Iterator[str]:
     for node in dag.FLOW:
         folder = f"{home.folder}/{node.artifact}"
-        if not (node.roles or node.trials == "each"):
+        if not node.several:
             yield f"{folder}/{artifact.STAMP}"
         elif os.path.isdir(folder):
             yield from (f"{each.path}/{artifact.STAMP}" for each in os.scandir(folder))
-
-
-def _tick(home: Home) -> int:
-    """Return a time later than all that were returned before, and than now if the clock says so, ns."""
-    clock = _clock(home)
-    with artifact.held(clock):
-        time_ns = max(time.time_ns(), clock.stat().st_mtime_ns + TICK_NS)
-        os.utime(clock, ns=(time_ns, time_ns))
-    return time_ns
 
 
 def _clock(home: Home) -> Path:

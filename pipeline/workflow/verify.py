@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.core import videos
-from pipeline.core.errors import InputError, coded_disk_errors
+from pipeline.core.errors import InputError, exit_code
 from pipeline.workflow import artifact
 from pipeline.workflow.jobs import Home
-from pipeline.workflow.reproduce import recording_digest
+from pipeline.workflow.sources import recording_digest
 
 
 def differences(home: Home) -> Iterator[InputError]:
@@ -47,12 +47,7 @@ def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
         print(__doc__, file=sys.stderr)
         return 2
-    try:
-        with coded_disk_errors("build"):
-            found = list(differences(Home.parse(arguments[0])))
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    found = list(differences(Home.parse(arguments[0])))
     for error in found:
         print(f"error: {error}", file=sys.stderr)
     if not found:
@@ -61,4 +56,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))
