@@ -1,10 +1,8 @@
-"""Clicked correspondences between frames of recordings and the walk-through.
+"""Clicked correspondences between frames of recordings and the walk-through: stored, lifted, fitted.
 
-On disk, lifted by depth, fitted.
-
-The paper's protocol: about seven clicked pairs, both pixels back-projected by their depth, Procrustes.
-Files and frames are named by recording and recorded frame number, pixels by shares of the upright
-picture, so that a file of clicks outlives builds.
+The paper's protocol: about seven clicked pairs, both pixels back-projected by their depth, Procrustes. Frames
+are named by recording and recorded number, pixels by shares of the upright picture, so that clicks outlive
+builds.
 """
 
 import json
@@ -68,18 +66,14 @@ class ClickedClip:
         return int(found[0]) if len(found) else None
 
     def lift(self, spot: ClickedPixel) -> Float[np.ndarray, "3"] | None:
-        """Back-project a spot by the median of the known depth around it: camera axes, metres.
-
-        None without depth.
-        """
+        """Back-project a spot by the median depth around it: camera axes, metres; None without depth."""
         frame = self.frame_of(spot)
         if frame is None:
             return None
         depth = self.clip.depth(frame)
         height, width = depth.shape
-        column, row = (
-            min(int(share * size), size - 1) for share, size in zip(spot.pixel, (width, height), strict=True)
-        )
+        x, y = spot.pixel
+        column, row = min(int(x * width), width - 1), min(int(y * height), height - 1)
         around = depth[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
         if not (around > 0).any():
             return None
@@ -107,17 +101,11 @@ def fit(
     reference: ClickedClip,
     world_from_reference: Float[np.ndarray, "frame 4 4"],
 ) -> ClickFit | None:
-    """Fit the camera of the frame that all ``pairs`` are in.
-
-    None with fewer than four pairs that have depth.
-    """
+    """Fit the camera of the frame that all ``pairs`` are in; None with fewer than four that have depth."""
     camera, world = np.full((len(pairs), 3), np.nan), np.full((len(pairs), 3), np.nan)
     for row, pair in enumerate(pairs):
-        mine, theirs, frame = (
-            seen.lift(pair.seen),
-            reference.lift(pair.reference),
-            reference.frame_of(pair.reference),
-        )
+        mine, theirs = seen.lift(pair.seen), reference.lift(pair.reference)
+        frame = reference.frame_of(pair.reference)
         if mine is not None and theirs is not None and np.isfinite(world_from_reference[frame]).all():
             camera[row], world[row] = mine, rigid.apply(world_from_reference[frame], theirs[None])[0]
     known = np.isfinite(camera).all(1)
@@ -142,12 +130,8 @@ def read(path: Path) -> list[ClickedPair]:
         data = path.read_bytes()
         return parse(json.loads(data) if len(data) <= MAX_BYTES else None)
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            "EVA-001",
-            f"not a file of clicks: {error}",
-            str(path),
-            "click again with `make annotate`, or remove the file",
-        ) from error
+        remedy = "click again with `make annotate`, or remove the file"
+        raise InputError("EVA-001", f"not a file of clicks: {error}", str(path), remedy) from error
 
 
 def parse(table: Any) -> list[ClickedPair]:

@@ -54,9 +54,7 @@ STEP_SHARE = 0.25
 
 @dataclass(frozen=True)
 class Clip:
-    """One recording at 10 Hz: upright colour, depth in metres, confidence, intrinsics, the phone's
-    odometry.
-    """
+    """One recording at 10 Hz: upright colour, depth in metres, confidence, intrinsics, odometry."""
 
     folder: Path
     timestamp_s: Float[np.ndarray, "frame"]
@@ -82,19 +80,13 @@ class Clip:
     @classmethod
     def open(cls, folder: Path) -> "Clip":
         """Open a finished ``frames/<id>`` artifact."""
-        table = FRAMES.load(folder / "frames.npz", *CLIP_KEYS)
-        return cls(
-            folder=folder,
-            timestamp_s=table["timestamp_s"],
-            intrinsics=table["intrinsics"],
-            depth_intrinsics=table["depth_intrinsics"],
-            odometry_from_camera=table.get("odometry_from_camera"),
-            gravity_known=bool(table["gravity_known"]),
-            quality=table["quality"],
-            color_size=images.read_color(folder / "color" / "000000.jpg").shape[:2],
-            depth_size=images.read_depth(folder / "depth" / "000000.exr").shape,
-            scale=str(table.get("scale", "measured")),
-        )
+        table: dict = FRAMES.load(folder / "frames.npz", *CLIP_KEYS)
+        table["odometry_from_camera"] = table.get("odometry_from_camera")
+        table["gravity_known"] = bool(table["gravity_known"])
+        table["scale"] = str(table.get("scale", "measured"))
+        color_size = images.read_color(folder / "color" / "000000.jpg").shape[:2]
+        depth_size = images.read_depth(folder / "depth" / "000000.exr").shape
+        return cls(folder, color_size=color_size, depth_size=depth_size, **table)
 
     def __len__(self) -> int:
         return len(self.timestamp_s)

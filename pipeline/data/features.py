@@ -36,7 +36,5 @@ def writer(folder: Path, frames: int, color_size: tuple[int, int]) -> npz.Rows:
 def cell_of(
     pixel: Int[np.ndarray, "*batch"] | Float[np.ndarray, "*batch"], cells: int
 ) -> Int[np.ndarray, "*batch"]:
-    """Return the cell along one axis that holds each colour pixel, of ``cells`` (the last one takes the
-    rest).
-    """
+    """Return the cell along one axis that holds each colour pixel, of ``cells``; the last takes the rest."""
     return np.minimum(np.asarray(pixel).astype(np.int64) // STRIDE_PX, cells - 1)

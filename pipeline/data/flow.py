@@ -35,20 +35,13 @@ def open_confidence(
 
 
 def writer(folder: Path, gap: int, frames: int, size: tuple[int, int], *, backward: bool = False) -> npz.Rows:
-    """Begin the file of one gap, to which ``frames`` rows are appended.
-
-    ``size`` is (height, width) in cells.
-    """
-    shape = (frames, *size)
-    return npz.Rows(
-        path_of(folder, gap, backward=backward), flow=((*shape, 2), np.float16), confidence=(shape, np.uint8)
-    )
+    """Begin the file of one gap, to which ``frames`` rows of ``size`` (height, width) in cells are added."""
+    path, shape = path_of(folder, gap, backward=backward), (frames, *size)
+    return npz.Rows(path, flow=((*shape, 2), np.float16), confidence=(shape, np.uint8))
 
 
 def cell_of(
     pixel: Int[np.ndarray, "*batch"] | Float[np.ndarray, "*batch"], cells: int
 ) -> Int[np.ndarray, "*batch"]:
-    """Return the cell along one axis that holds each colour pixel, of ``cells`` (the last one takes the
-    rest).
-    """
+    """Return the cell along one axis that holds each colour pixel, of ``cells``; the last takes the rest."""
     return np.minimum(np.asarray(pixel).astype(np.int64) // STRIDE_PX, cells - 1)

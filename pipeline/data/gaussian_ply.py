@@ -1,6 +1,4 @@
-"""Standard files of 3D Gaussians: binary PLY of 62 floats (248 bytes) a row, as every viewer of 3DGS
-reads them.
-"""
+"""Standard files of 3D Gaussians: binary PLY of 62 floats (248 bytes) a row, as viewers of 3DGS read them."""
 
 from pathlib import Path
 
@@ -28,13 +26,8 @@ _END = b"end_header\n"
 
 def write(path: Path, rows: Float[np.ndarray, "point 62"]) -> None:
     """Write rows of `COLUMNS`."""
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(rows)}",
-        *(f"property float {name}" for name in COLUMNS),
-        "",
-    ]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [*(f"property float {name}" for name in COLUMNS), ""]
     Path(path).write_bytes("\n".join(header).encode() + _END + rows.astype("<f4").tobytes())
 
 
@@ -44,7 +37,6 @@ def read(path: Path) -> Float[np.ndarray, "point 62"]:
     lines = head.decode("ascii", "replace").splitlines()
     names = [line.split()[-1] for line in lines if line.startswith("property ")]
     if "format binary_little_endian 1.0" not in lines or names != COLUMNS or len(data) % (4 * len(COLUMNS)):
-        raise InputError(
-            "ART-021", "not a file of 3D Gaussians with 62 floats a row", str(path), "rebuild `splats`"
-        )
+        what = "not a file of 3D Gaussians with 62 floats a row"
+        raise InputError("ART-021", what, str(path), "rebuild `splats`")
     return np.frombuffer(data, "<f4").reshape(-1, len(COLUMNS))

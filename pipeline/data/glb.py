@@ -61,15 +61,13 @@ def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agen
     document.file.nodes.append(gltf.Node(name=f"{name}_surface", mesh=0, skin=0))
     translations, quaternions = _translation_quaternion(skin.agent_from_bone_rest)
     for bone, translation, quaternion in zip(skin.bone_names, translations, quaternions, strict=True):
-        document.file.nodes.append(
-            gltf.Node(name=bone, translation=_floats(translation), rotation=_floats(quaternion))
-        )
+        place, turn = translation.tolist(), quaternion.tolist()
+        document.file.nodes.append(gltf.Node(name=bone, translation=place, rotation=turn))
     inverse_bind = rigid.inverse(skin.agent_from_bone_rest).astype(np.float32)
     columns = np.ascontiguousarray(inverse_bind.transpose(0, 2, 1)).reshape(-1, 16)  # glTF is column-major
     matrices = document.add(columns, "MAT4", _FLOAT)
-    document.file.skins = [
-        gltf.Skin(name="skin", joints=joints, skeleton=_ROOT_NODE, inverseBindMatrices=matrices)
-    ]
+    bound = gltf.Skin(name="skin", joints=joints, skeleton=_ROOT_NODE, inverseBindMatrices=matrices)
+    document.file.skins = [bound]
     document.file.animations = [document.animation(action) for action in actions]
     document.file.scenes = [gltf.Scene(nodes=[_ROOT_NODE, _MESH_NODE])]
     return document.packed()
@@ -83,24 +81,16 @@ class _Document:
         self.blob = bytearray()
 
     def add(
-        self,
-        values: np.ndarray,
-        kind: str,
-        component: int,
-        *,
-        target: int | None = None,
-        bounds: bool = False,
+        self, values: np.ndarray, kind: str, type: int, *, target: int | None = None, bounds: bool = False
     ) -> int:
         """Append an array and return its accessor."""
         values = np.ascontiguousarray(values)
         self.blob.extend(b"\0" * (-len(self.blob) % 4))
-        self.file.bufferViews.append(
-            gltf.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=values.nbytes, target=target)
-        )
+        start, number = len(self.blob), len(self.file.bufferViews)
+        view = gltf.BufferView(buffer=0, byteOffset=start, byteLength=values.nbytes, target=target)
+        self.file.bufferViews.append(view)
         self.blob.extend(values.tobytes())
-        accessor = gltf.Accessor(
-            bufferView=len(self.file.bufferViews) - 1, componentType=component, count=len(values), type=kind
-        )
+        accessor = gltf.Accessor(bufferView=number, componentType=type, count=len(values), type=kind)
         if bounds:
             rows = values.reshape(len(values), -1)
             accessor.min, accessor.max = rows.min(0).tolist(), rows.max(0).tolist()
@@ -122,40 +112,29 @@ class _Document:
                 weights = self.add(skin.weights[:, four], "VEC4", _FLOAT, target=target)
                 setattr(attributes, f"JOINTS_{number}", joints)
                 setattr(attributes, f"WEIGHTS_{number}", weights)
-        indices = self.add(
-            mesh.faces.astype(np.uint32).reshape(-1), "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER
-        )
+        corners = mesh.faces.astype(np.uint32).reshape(-1)
+        indices = self.add(corners, "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER)
         matte = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)
         self.file.materials = [gltf.Material(name="surface", doubleSided=True, pbrMetallicRoughness=matte)]
-        self.file.meshes = [
-            gltf.Mesh(
-                name=name, primitives=[gltf.Primitive(attributes=attributes, indices=indices, material=0)]
-            )
-        ]
+        primitive = gltf.Primitive(attributes=attributes, indices=indices, material=0)
+        self.file.meshes = [gltf.Mesh(name=name, primitives=[primitive])]
 
     def animation(self, action: Action) -> gltf.Animation:
         """Turn an action into channels: translation and rotation of the root and of every joint."""
         animation = gltf.Animation(name=action.name)
         keys = self.add(action.time_s.astype(np.float32), "SCALAR", _FLOAT, bounds=True)
         tracks = [(_ROOT_NODE, action.world_from_agent)]
-        tracks += [
-            (_FIRST_JOINT + bone, action.agent_from_bone[:, bone])
-            for bone in range(action.agent_from_bone.shape[1])
-        ]
+        tracks += enumerate(np.swapaxes(action.agent_from_bone, 0, 1), start=_FIRST_JOINT)
         for node, parent_from_node in tracks:
             translation, quaternion = _translation_quaternion(parent_from_node)
-            for path, values, kind in (
-                ("translation", translation, "VEC3"),
-                ("rotation", _without_flips(quaternion), "VEC4"),
-            ):
+            turns = _without_flips(quaternion)
+            for path, values, kind in (("translation", translation, "VEC3"), ("rotation", turns, "VEC4")):
                 output = self.add(values.astype(np.float32), kind, _FLOAT)
-                animation.samplers.append(
-                    gltf.AnimationSampler(input=keys, output=output, interpolation="LINEAR")
-                )
+                sampler = gltf.AnimationSampler(input=keys, output=output, interpolation="LINEAR")
                 target = gltf.AnimationChannelTarget(node=node, path=path)
-                animation.channels.append(
-                    gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target)
-                )
+                channel = gltf.AnimationChannel(sampler=len(animation.samplers), target=target)
+                animation.samplers.append(sampler)
+                animation.channels.append(channel)
         return animation
 
     def packed(self) -> bytes:
@@ -172,10 +151,7 @@ def _translation_quaternion(parent_from_node: Float[np.ndarray, "n 4 4"]) -> tup
 
 
 def _without_flips(quaternion: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "frame 4"]:
-    """Choose signs so that neighbouring keys lie on one side.
-
-    Viewers interpolate the shorter arc either way.
-    """
+    """Choose signs so that neighbouring keys lie on one side: viewers interpolate the shorter arc."""
     flips = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
     return quaternion * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
@@ -194,14 +170,9 @@ def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "v
     return np.concatenate([linear, np.ones_like(linear[:, :1])], 1).astype(np.float32)
 
 
-def _floats(values: np.ndarray) -> list[float]:
-    return [float(value) for value in values]
-
-
 def read_static(data: bytes) -> Mesh:
     """Read back what `static` made."""
-    document = _Opened(data)
-    return document.mesh()
+    return _Opened(data).mesh()
 
 
 def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
@@ -209,27 +180,17 @@ def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
     document = _Opened(data)
     attributes = document.file.meshes[0].primitives[0].attributes
     table = document.file.skins[0]
-    matrices = (
-        document.values(table.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
-    )
+    columns = document.values(table.inverseBindMatrices).reshape(-1, 4, 4)
+    rest = rigid.inverse(columns.transpose(0, 2, 1).astype(np.float64))
     names = tuple(_given(document.file.nodes[joint].name) for joint in _given(table.joints))
-    joints, weights = (
-        np.concatenate(
-            [
-                document.values(getattr(attributes, f"{kind}_{n}"))
-                for n in (0, 1)
-                if hasattr(attributes, f"{kind}_{n}")
-            ],
-            1,
-        )
-        for kind in ("JOINTS", "WEIGHTS")
-    )
-    skin = Skin(joints, weights, rigid.inverse(matrices), names)
-    return (
-        document.mesh(),
-        skin,
-        [document.action(animation, len(names)) for animation in document.file.animations],
-    )
+
+    def influences(kind: str) -> np.ndarray:
+        stored = [getattr(attributes, f"{kind}_{number}", None) for number in (0, 1)]
+        return np.concatenate([document.values(each) for each in stored if each is not None], 1)
+
+    skin = Skin(influences("JOINTS"), influences("WEIGHTS"), rest, names)
+    actions = [document.action(animation, len(names)) for animation in document.file.animations]
+    return document.mesh(), skin, actions
 
 
 def _given(value: T | None) -> T:
@@ -265,13 +226,8 @@ class _Opened:
         """Channels stand in the order in which `_Document.animation` writes them."""
         outputs = [self.values(sampler.output) for sampler in animation.samplers]
         places, turns = np.stack(outputs[::2], 1), np.roll(np.stack(outputs[1::2], 1), 1, axis=-1)
-        poses = rigid.make(
-            rigid.rotation_from_quaternion(turns.astype(np.float64)), places.astype(np.float64)
-        )
+        rotation = rigid.rotation_from_quaternion(turns.astype(np.float64))
+        poses = rigid.make(rotation, places.astype(np.float64))
         assert poses.shape[1] == 1 + bones, poses.shape
-        return Action(
-            _given(animation.name),
-            self.values(animation.samplers[0].input).ravel().astype(np.float64),
-            poses[:, 0],
-            poses[:, 1:],
-        )
+        time_s = self.values(animation.samplers[0].input).ravel().astype(np.float64)
+        return Action(_given(animation.name), time_s, poses[:, 0], poses[:, 1:])

@@ -1,5 +1,4 @@
-"""Images on disk: colour (JPEG, PNG, WebP), 8-bit labels (PNG) and depth (EXR, one HALF channel ``Z``,
-metres).
+"""Images on disk: colour (JPEG, PNG, WebP), 8-bit labels (PNG), depth (EXR, one HALF channel ``Z``, metres).
 
 The only file that decodes OpenEXR and OpenCV images. Sizes are checked before pixels are decoded:
 a few hundred bytes can ask for gigabytes.
@@ -19,31 +18,22 @@ from jaxtyping import Float, Shaped, UInt8
 from pipeline.core.errors import InputError
 
 MAX_PIXELS = 32 << 20
-"""of a colour picture.
-
-Of a depth picture, all channels together: 8K video, larger than any phone's picture
-"""
+"""of a colour picture, and of all channels of a depth picture: 8K video, larger than a phone's picture"""
 SRGB_SLOPE, SRGB_OFFSET, SRGB_GAMMA, SRGB_KNEE = 12.92, 0.055, 2.4, 0.0031308
 """The transfer curve of sRGB (IEC 61966-2-1); the knee in linear intensity."""
 MAX_DEPTH_M = 1000.0
 """depth beyond this is no measurement, metres"""
 MAX_EXR_HEADER_BYTES = 1 << 16
+EXPORT_AGAIN = "export the recording again"
 _EXR_DEEP, _EXR_MULTIPART, _EXR_CHANNEL_BYTES, _EXR_ZIP_ROWS = 0x800, 0x1000, 16, 16
-"""flags of OpenEXR's version field, what follows a channel's name, rows of a ZIP block (OpenEXR file
-layout)
-"""
+"""flags of OpenEXR's version field, bytes after a channel's name, rows of a ZIP block"""
 
 
 def decode_color(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Decode an image file's bytes to RGB.
-
-    Raises InputError CAP-020 when the bytes are not a readable image.
-    """
+    """Decode an image file's bytes to RGB. Raises InputError CAP-020 when they are not a readable image."""
     image = decoded(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise InputError(
-            "CAP-020", what="the picture cannot be decoded", where=where, remedy="export the recording again"
-        )
+        raise InputError("CAP-020", "the picture cannot be decoded", where, EXPORT_AGAIN)
     return image
 
 
@@ -59,10 +49,9 @@ def encode_jpeg(color: UInt8[np.ndarray, "height width 3"], quality: int = 92) -
 
 def write_color(path: Path, color: UInt8[np.ndarray, "height width 3"], quality: int = 92) -> None:
     """Write RGB; the ending chooses JPEG, PNG or WebP, ``quality`` counts for JPEG and WebP."""
-    flags = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, quality], ".webp": [cv2.IMWRITE_WEBP_QUALITY, quality]}.get(
-        Path(path).suffix, []
-    )
-    encoded, data = cv2.imencode(Path(path).suffix, np.ascontiguousarray(color[..., ::-1]), flags)
+    flags = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, quality], ".webp": [cv2.IMWRITE_WEBP_QUALITY, quality]}
+    kind = Path(path).suffix
+    encoded, data = cv2.imencode(kind, np.ascontiguousarray(color[..., ::-1]), flags.get(kind, []))
     assert encoded, path
     Path(path).write_bytes(data.tobytes())
 
@@ -71,12 +60,8 @@ def read_gray(path: Path) -> UInt8[np.ndarray, "height width"]:
     """Read an 8-bit single-channel PNG (masks, confidence) with its values as they are."""
     image = decoded(Path(path).read_bytes(), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
-        raise InputError(
-            "CAP-021",
-            what="not a readable 8-bit single-channel picture",
-            where=str(path),
-            remedy="rebuild the stage that wrote it",
-        )
+        what = "not a readable 8-bit single-channel picture"
+        raise InputError("CAP-021", what, str(path), "rebuild the stage that wrote it")
     return image
 
 
@@ -98,12 +83,8 @@ def read_depth(path: Path, channel: str | None = "Z") -> Float[np.ndarray, "heig
             (name,) = [channel] if channel else file.channels()
             pixels = file.channels()[name].pixels.astype(np.float32)
     except (RuntimeError, KeyError, ValueError, TypeError, MemoryError) as error:
-        raise InputError(
-            "CAP-022",
-            what=f"not a depth EXR with a channel {channel!r} ({error})",
-            where=str(path),
-            remedy="export the recording again",
-        ) from error
+        what = f"not a depth EXR with a channel {channel!r} ({error})"
+        raise InputError("CAP-022", what, str(path), EXPORT_AGAIN) from error
     return np.where(np.isfinite(pixels) & (pixels > 0) & (pixels < MAX_DEPTH_M), pixels, np.float32(0))
 
 
@@ -147,9 +128,7 @@ def decoded(data: bytes, flags: int) -> Shaped[np.ndarray, "height width *channe
 
 
 def _declared_pixels(data: bytes) -> int:
-    """Return the pixels that the header of a PNG or JPEG asks for; 0 for other kinds, too many for a broken
-    PNG.
-    """
+    """Return the pixels that a PNG or JPEG asks for; 0 for other kinds, too many for a broken PNG."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         at, kind = 8, b""
         while kind != b"IEND":  # OpenCV allocates what a chunk declares before it looks for its bytes
@@ -170,9 +149,7 @@ def _declared_pixels(data: bytes) -> int:
 
 
 def _check_exr_size(path: Path) -> None:
-    """Read size and channels from the header and refuse what no depth picture has, before pixels are
-    decoded.
-    """
+    """Refuse sizes and channels that no depth picture has by the header, before pixels are decoded."""
     try:
         with open(path, "rb") as file:
             head = file.read(MAX_EXR_HEADER_BYTES)
@@ -183,19 +160,11 @@ def _check_exr_size(path: Path) -> None:
     except (OSError, struct.error, ValueError, KeyError):
         good = False
     if not good:
-        raise InputError(
-            "CAP-022",
-            what="not an EXR picture of a sensible size",
-            where=str(path),
-            remedy="export the recording again",
-        )
+        raise InputError("CAP-022", "not an EXR picture of a sensible size", str(path), EXPORT_AGAIN)
 
 
 def _exr_attributes(head: bytes) -> tuple[dict[str, bytes], int]:
-    """Return the attributes of a flat EXR's header by name, and where it ends.
-
-    Raises ValueError for other files.
-    """
+    """Return a flat EXR's attributes by name, and where its header ends. Raises ValueError for others."""
     version = struct.unpack_from("<I", head, 4)[0] if head[:4] == b"\x76\x2f\x31\x01" else 0
     if version & 0xFF != 2 or version & (_EXR_DEEP | _EXR_MULTIPART):
         raise ValueError("no single flat picture")

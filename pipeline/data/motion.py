@@ -1,8 +1,7 @@
 """The time-varying structure D: where camera, agent and bones are in every frame.
 
-`Motion` is one video's result as files hold it (`save`, `load`). `MotionTable` holds the same for all
-frames of all videos while it is being optimised: initial poses and small learned se(3) corrections on
-their right side.
+`Motion` is one video's result as files hold it (`save`, `load`), `MotionTable` all videos' while it is being
+optimised: initial poses and small learned se(3) corrections on their right side.
 """
 
 from collections.abc import Sequence
@@ -35,10 +34,7 @@ INTERPOLATED = 0.05
 
 @dataclass(frozen=True)
 class Motion:
-    """One video: poses of camera, agent and bones.
-
-    NaN where the agent's pose is not known; confidence is low where it is interpolated.
-    """
+    """One video: poses, the agent's NaN where it is not known; confidence is low where it is interpolated."""
 
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -82,10 +78,7 @@ def load(path: Path) -> Motion:
 def gaps_s(
     timestamp_s: Float[np.ndarray, "frame"], good: Bool[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame"]:
-    """Tell how far apart in time the good frames around each frame are.
-
-    0 for good ones, without end where one side has none.
-    """
+    """Return how far apart in time the good frames around each are: 0 for good ones, infinite at the ends."""
     when = np.concatenate([[-np.inf], timestamp_s[good], [np.inf]])
     after = np.searchsorted(when, timestamp_s)
     return np.where(good, 0.0, when[after] - when[after - 1])
@@ -123,15 +116,16 @@ class MotionTable(nn.Module):
             share.append(place - place.floor())
             free.append(torch.full((frames,), float(is_free)))
             knots += (frames - 1) // knot_frames + 2
-        for name, value in (
-            ("knot", torch.cat(before)),
-            ("knot_share", torch.cat(share)),
-            ("camera_free", torch.cat(free)),
-        ):
+        fixed = {
+            "knot": torch.cat(before),
+            "knot_share": torch.cat(share),
+            "camera_free": torch.cat(free),
+            "initial_camera": world_from_camera.float(),
+            "initial_agent": world_from_agent.float(),
+            "agent_from_bone_rest": agent_from_bone_rest.float(),
+        }
+        for name, value in fixed.items():
             self.register_buffer(name, value, persistent=False)
-        self.register_buffer("initial_camera", world_from_camera.float(), persistent=False)
-        self.register_buffer("initial_agent", world_from_agent.float(), persistent=False)
-        self.register_buffer("agent_from_bone_rest", agent_from_bone_rest.float(), persistent=False)
         self.camera = nn.Parameter(torch.zeros(knots, 6))
         self.root = nn.Parameter(torch.zeros(len(world_from_camera), 6))
         self.bone = nn.Parameter(torch.zeros(len(world_from_camera), len(agent_from_bone_rest), 6))

@@ -50,16 +50,10 @@ def save(path: Path, *, compress: bool = False, **arrays: np.ndarray) -> None:
 
 
 class Rows:
-    """Arrays written row by row, for as long as a ``with`` block lasts.
-
-    The file is the one that `save` would write.
-    """
+    """Arrays written row by row in a ``with`` block; the file is the one that `save` would write."""
 
     def __init__(self, path: Path, **arrays: tuple[tuple[int, ...], type]) -> None:
-        """Begin a file of arrays of these shapes and dtypes.
-
-        The first axis of a shape is the number of rows to come.
-        """
+        """Begin a file of arrays of these shapes, the number of rows to come first, and dtypes."""
         self._path = path
         self._kinds = {name: (shape, np.dtype(kind)) for name, (shape, kind) in arrays.items()}
         self._parts = {name: tempfile.TemporaryFile(dir=path.parent) for name in arrays}
@@ -86,24 +80,16 @@ class Rows:
                 part = self._parts[name]
                 assert part.tell() == int(np.prod(shape)) * dtype.itemsize, (name, part.tell(), shape)
                 part.seek(0)
-                with archive.open(
-                    zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), "w", force_zip64=True
-                ) as member:
-                    header = {
-                        "descr": np.lib.format.dtype_to_descr(dtype),
-                        "fortran_order": False,
-                        "shape": shape,
-                    }
+                kind = np.lib.format.dtype_to_descr(dtype)
+                header = {"descr": kind, "fortran_order": False, "shape": shape}
+                info = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
+                with archive.open(info, "w", force_zip64=True) as member:
                     np.lib.format.write_array_header_1_0(member, header)
                     shutil.copyfileobj(part, member, 1 << 20)
 
 
 class Column:
-    """Rows of one array in an unnamed file that vanishes with it, mapped into memory.
-
-    Of any number of rows, those that are looked at are read, and the system drops them again where memory
-    is short.
-    """
+    """Rows of one array in an unnamed file that vanishes with it, mapped: read as they are looked at."""
 
     def __init__(self, folder: Path | None) -> None:
         """``folder`` is where the file lies; None: where temporary files do."""
@@ -165,9 +151,8 @@ def _readable(path: Path) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(path) as archive:
             yield archive
     except _BROKEN as error:
-        raise InputError(
-            "ART-010", f"cannot be read as NPZ: {error}", str(path), "rebuild the stage that wrote it"
-        ) from error
+        what = f"cannot be read as NPZ: {error}"
+        raise InputError("ART-010", what, str(path), "rebuild the stage that wrote it") from error
 
 
 def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray:

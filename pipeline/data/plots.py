@@ -96,9 +96,7 @@ def time_series(
     absent: Bool[np.ndarray, "frame"] | None = None,
     limit: float | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw one panel of values over seconds per label; frames that are ``absent`` are red, ``limit`` is
-    dashed.
-    """
+    """Draw a panel of values over seconds per label; ``absent`` frames are red, ``limit`` is dashed."""
     figure, axes = panels(len(values), 1, width_in=9.0, height_in=1.6 * len(values))
     for axis, (label, curve) in zip(axes[:, 0], values.items(), strict=True):
         axis.fill_between(time_s, curve, color=GREEN, step="mid", linewidth=0)
@@ -181,6 +179,5 @@ def depth_colors(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Colour z depth in metres from near (yellow) to ``far_m`` (violet); unknown (0) is black."""
     nearness = np.clip(255 * (1 - depth / far_m), 0, 255).astype(np.uint8)
-    return cv2.applyColorMap(nearness, cv2.COLORMAP_VIRIDIS)[..., ::-1] * (depth > 0)[..., None].astype(
-        np.uint8
-    )
+    colors = cv2.applyColorMap(nearness, cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    return colors * (depth > 0)[..., None].astype(np.uint8)

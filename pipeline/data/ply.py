@@ -43,12 +43,8 @@ def read_ply(path: Path) -> Mesh:
     try:
         return _parse(Path(path).read_bytes())
     except (ValueError, IndexError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(
-            "ART-020",
-            what=f"not a binary PLY of triangles: {error}",
-            where=str(path),
-            remedy="export it again as binary little-endian PLY",
-        ) from error
+        what, remedy = f"not a binary PLY of triangles: {error}", "export it as binary little-endian PLY"
+        raise InputError("ART-020", what, str(path), remedy) from error
 
 
 def _parse(data: bytes) -> Mesh:

@@ -1,7 +1,4 @@
-"""Registered poses of one recording as files.
-
-`video_poses/<id>/poses.npz` and `registration/<id>/poses.npz`.
-"""
+"""Registered poses of one recording as files: `poses.npz` of `video_poses/<id>` and `registration/<id>`."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -91,12 +91,4 @@ def _beyond(value: float, limit: float | None, better: Literal["lower", "higher"
 
 def _plain(check: Check) -> dict[str, Any]:
     value = None if check.value is None or not math.isfinite(check.value) else float(check.value)
-    return {
-        "name": check.name,
-        "value": value,
-        "unit": check.unit,
-        "warn": check.warn,
-        "fail": check.fail,
-        "better": check.better,
-        "status": check.status,
-    }
+    return {**vars(check), "value": value, "status": check.status}

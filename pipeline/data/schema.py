@@ -38,20 +38,15 @@ class FileSchema:
 
     @classmethod
     def of(cls, file: str, *specs: str) -> "FileSchema":
-        """Make a schema from lines such as `world_from_camera [frame 4 4] f8`.
-
-        A final `?` marks an optional one.
-        """
-        matches = [_SPEC.fullmatch(spec) for spec in specs]
-        assert all(matches), specs
-        return cls(
-            file,
-            {
-                m["key"]: ArraySchema(tuple(m["axes"].split()), m["dtype"], bool(m["optional"]))
-                for m in matches
-                if m
-            },
-        )
+        """Make a schema from lines such as `confidence [frame] f4?`, whose `?` marks an optional array."""
+        arrays = {}
+        for spec in specs:
+            match = _SPEC.fullmatch(spec)
+            assert match, spec
+            arrays[match["key"]] = ArraySchema(
+                tuple(match["axes"].split()), match["dtype"], bool(match["optional"])
+            )
+        return cls(file, arrays)
 
     def save(self, path: Path, *, compress: bool = False, **arrays: np.ndarray | None) -> None:
         """Write the arrays in the schema's order and dtypes; None leaves an optional one out."""
@@ -71,12 +66,10 @@ class FileSchema:
         stored = npz.load(path, required, optional=wanted)
         problem = self._problem(stored, wanted)
         if problem is not None:
-            raise InputError(
-                "ART-010", f"not a {self.file}: {problem}", str(path), "rebuild the stage that wrote it"
-            )
-        return {
-            key: array.astype(self._dtype(key) or array.dtype, copy=False) for key, array in stored.items()
-        }
+            what = f"not a {self.file}: {problem}"
+            raise InputError("ART-010", what, str(path), "rebuild the stage that wrote it")
+        kinds = {key: self._dtype(key) or array.dtype for key, array in stored.items()}
+        return {key: array.astype(kinds[key], copy=False) for key, array in stored.items()}
 
     def _dtype(self, key: str) -> np.dtype | None:
         """Return the dtype on disk; None for text, whose length is its own."""
@@ -87,9 +80,9 @@ class FileSchema:
         lengths: dict[str, int] = {}
         for key in self.arrays if wanted is None else wanted:
             schema = self.arrays[key]
+            if key not in stored and schema.optional:
+                continue
             if key not in stored:
-                if schema.optional:
-                    continue
                 return f"{key} is missing"
             array = stored[key]
             if array.dtype.kind != np.dtype(schema.dtype).kind:

@@ -101,10 +101,7 @@ class SkinTable:
 
 
 def bones_at_rest(folder: Path) -> Float32[np.ndarray, "bone 4 4"]:
-    """Read `agent_from_bone_rest` of any `skin.npz`, that of a table of motion too.
-
-    Raises InputError ART-010.
-    """
+    """Read `agent_from_bone_rest` of any `skin.npz`, a table of motion's too. Raises InputError ART-010."""
     return SKIN.load(folder / "skin.npz", "agent_from_bone_rest")["agent_from_bone_rest"]
 
 

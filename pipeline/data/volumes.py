@@ -1,7 +1,4 @@
-"""The scene on voxels of the world as files.
-
-`feature_volume.npz` of a reconstruction or a table of motion.
-"""
+"""The scene on voxels of the world: `feature_volume.npz` of a reconstruction or a table of motion."""
 
 from pipeline.data.schema import FileSchema
 
