@@ -1,5 +1,4 @@
-"""What the animal of one recording looks like: a small network that learns it from the recording's own first
-masks.
+"""What the animal of one recording looks like: a small network learns it from the recording's first masks.
 
 First masks rest on geometry and miss an animal that never leaves its place, or leak where depth is poor; such
 errors differ from frame to frame while the animal's appearance stays, so the network, too small to learn the
@@ -28,8 +27,6 @@ SURROUNDINGS_PX = 32
 """pixels around a rectangle that are looked at to judge it"""
 LIMIT = 8.0
 """largest log-odds of a pixel"""
-
-
 RATE, WEIGHT_DECAY = 5e-3, 1e-3
 """highest learning rate, and decay of weights, of AdamW"""
 TRUSTING = 0.5
@@ -90,20 +87,14 @@ class Appearance(nn.Module):
         deep = levels.pop()
         for up in self.up:
             level = levels.pop()
-            deep = up(
-                torch.cat(
-                    [F.interpolate(deep, size=level.shape[-2:], mode="bilinear", align_corners=False), level],
-                    1,
-                )
-            )
+            wide = F.interpolate(deep, size=level.shape[-2:], mode="bilinear", align_corners=False)
+            deep = up(torch.cat([wide, level], 1))
         return deep
 
     def log_odds_within(
         self, color: UInt8[np.ndarray, "height width 3"], rows: slice, columns: slice
     ) -> Float[np.ndarray, "rows columns"]:
-        """Judge a rectangle of a picture, as `log_odds` of the whole would but for what lies farther than its
-        surroundings.
-        """
+        """Judge a rectangle of a picture as `log_odds` of the whole would, but by its surroundings alone."""
         top, left = max(rows.start - SURROUNDINGS_PX, 0), max(columns.start - SURROUNDINGS_PX, 0)
         top, left = top - top % ALIGNED_PX, left - left % ALIGNED_PX
         found = self.log_odds(color[top : rows.stop + SURROUNDINGS_PX, left : columns.stop + SURROUNDINGS_PX])
@@ -146,14 +137,11 @@ def learn(
         if step in (options.steps // 3, 2 * options.steps // 3):
             mistakes = [_mistake(network, example) for example in showing[::2]]
         network.train()
-        crops = [
-            _crop(
-                *_scaled(*_chosen(showing, mistakes, options.crop_px, rng), options.crop_px, scaled, rng),
-                options.crop_px,
-                rng,
-            )
-            for _ in range(options.batch)
-        ]
+        crops = []
+        for _ in range(options.batch):
+            example, middle = _chosen(showing, mistakes, options.crop_px, rng)
+            example, middle = _scaled(example, middle, options.crop_px, scaled, rng)
+            crops.append(_crop(example, middle, options.crop_px, rng))
         color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
         found = network(color)
         loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
@@ -168,17 +156,15 @@ def learn(
 
 
 def _mistake(network: Appearance, example: Example) -> UInt8[np.ndarray, "height width"]:
-    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be the
-    animal.
+    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be it.
 
     Nothing where the labelled animal does not look like one: then the label may be the mistake.
     """
     like = network.log_odds(example.color)
     if (example.labels == 255).any() and (like[example.labels == 255] > 0).mean() < 0.5:
         return np.zeros(like.shape, np.uint8)
-    return np.where(
-        (example.labels == 0) & (like < CONTRADICTION), np.clip(10 * (like + 2), 0, 255), 0
-    ).astype(np.uint8)
+    mistaken = (example.labels == 0) & (like < CONTRADICTION)
+    return np.where(mistaken, np.clip(10 * (like + 2), 0, 255), 0).astype(np.uint8)
 
 
 def _chosen(
@@ -193,9 +179,8 @@ def _chosen(
         if total.any():
             index = int(rng.choice(len(mistakes), p=total / total.sum()))
             heaped = np.cumsum(mistakes[index], dtype=np.int64)
-            return examples[2 * index], divmod(
-                int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right")), mistakes[index].shape[1]
-            )
+            place = int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right"))
+            return examples[2 * index], divmod(place, mistakes[index].shape[1])
     example = examples[int(rng.integers(len(examples)))]
     height, width = example.labels.shape
     if rng.random() >= AT_ANIMAL or not (example.labels == 255).any():
@@ -209,9 +194,7 @@ def _chosen(
 def _scaled(
     example: Example, middle: tuple[int, int], crop_px: int, scaled: float, rng: np.random.Generator
 ) -> tuple[Example, tuple[int, int]]:
-    """Show an example and the middle of a crop as from nearer or from farther away, now and then: animals
-    walk up and off.
-    """
+    """Show an example and the middle of a crop as from nearer or farther, now and then."""
     if scaled == 0 or rng.random() >= scaled:
         return example, middle
     scale = float(np.exp(rng.uniform(*np.log(SCALES))))
@@ -223,11 +206,9 @@ def _scaled(
     part = np.s_[top : top + reach + 2, left : left + reach + 2]
     color, labels = example.color[part], example.labels[part]
     size = tuple(max(1, round(scale * side)) for side in labels.shape[::-1])
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    zoomed = Example(
-        cv2.resize(color, size, interpolation=how), cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
-    )
-    return zoomed, (round(scale * (middle[0] - top)), round(scale * (middle[1] - left)))
+    color = cv2.resize(color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    return Example(color, labels), (round(scale * (middle[0] - top)), round(scale * (middle[1] - left)))
 
 
 def _crop(

@@ -1,5 +1,4 @@
-"""What the points of a window say about showing the animal: geometry first, colour where a known surface
-looks otherwise.
+"""What the points of a window say about showing the animal: geometry first, colour where it has changed.
 
 `judge_motion` serves sessions; `turnaround` makes the judge of the other recordings.
 """
@@ -18,9 +17,7 @@ from stages.segment_agent.windows import Sphere, Window
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a window's points say: log-odds of showing the animal, how much to trust them, and which are
-    beyond doubt.
-    """
+    """Log-odds that a window's points show the animal, how much to trust them, and which are beyond doubt."""
 
     log_odds: Float[np.ndarray, "height width"]
     certainty: Float[np.ndarray, "height width"]
@@ -29,14 +26,11 @@ class Evidence:
     """animal by clear motion alone, at steps of depth too"""
     room: Bool[np.ndarray, "height width"]
     recolored: Float[np.ndarray, "height width"] | float = 0.0
-    """part of `log_odds` that rests on another colour alone: thin paws and tails on what others saw, but
-    gloss and shadows too
-    """
+    """part of `log_odds` by another colour alone: thin paws and tails, but gloss and shadows too"""
 
 
 MOVING, ROOM = 3.0, 3.0
-"""log-odds that a point is worth in space that is free at other times; and on a surface that other frames saw
-"""
+"""log-odds of a point in space that is free at other times, and on a surface that other frames saw"""
 STEP_M, STEP_SPREAD_M = 0.022, 0.008
 """step in front of that surface that speaks neither way, and the step that is worth one more"""
 RECOLORED = 1.0
@@ -45,8 +39,7 @@ DISTRUSTED, DISTRUSTED_BEHIND, DISTRUSTED_MOVING = 0.5, 0.25, 0.6
 """certainty of depth of low confidence or at a step (1 is that of all other depth): on such a surface, where
 no animal is (the sensor may have looked past a tail), and in space that is free at other times"""
 FEW = 5.0
-"""references that must have seen a surface to make it half certain: one or two may have seen the animal
-itself there"""
+"""references that must have seen a surface to make it half certain: one or two may have seen the animal"""
 ASKEW_PX = 2
 """how far a texture may lie from where it was, working pixels"""
 
@@ -86,13 +79,8 @@ def either(first: Judge, second: Judge) -> Judge:
 
     def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
         preferred, other = first(frame, window, ball), second(frame, window, ball)
-        own = preferred.log_odds > 0
-        return Evidence(
-            **{
-                part.name: np.where(own, getattr(preferred, part.name), getattr(other, part.name))
-                for part in fields(Evidence)
-            }
-        )
+        own, names = preferred.log_odds > 0, [part.name for part in fields(Evidence)]
+        return Evidence(*(np.where(own, getattr(preferred, name), getattr(other, name)) for name in names))
 
     return judge
 

@@ -47,8 +47,7 @@ HALO_PX = 7
 CARRIED = 2.0
 """largest log-odds of the carried mask at first; half of it counts when the appearance is known better"""
 MOVING, STILL = 4.0, 2.5
-"""times the typical residual from which on a point moves against the background, and up to which it does not
-"""
+"""times the typical residual from which on a point moves against the background; up to which it does not"""
 
 
 @dataclass(frozen=True)
@@ -171,9 +170,7 @@ def residual(footage: Footage, frame: int) -> Float[np.ndarray, "height width"]:
 
 
 def _example(footage: Footage, frame: int, rough: Bool[np.ndarray, "height width"]) -> Example:
-    """Label a frame: what was followed or moves beside it is animal, what is far or still is not, the rest is
-    unknown.
-    """
+    """Label a frame: what was followed or moves near it is animal, what is far or still is not."""
     moves = residual(footage, frame)
     beside = _grown(rough, BESIDE_PX)
     inner = _grown(~((moves > MOVING) | rough), HALO_PX)
@@ -204,14 +201,12 @@ def _followed(
             near = np.ones_like(mask) if lost else _grown(prior > 0, reach_px)
             if allowed is not None:
                 near &= allowed(frame)
-            log_odds = network.log_odds(footage.color(frame)) + (
-                0 if lost else np.clip(prior, -carried, carried)
-            )
+            expected = 0 if lost else np.clip(prior, -carried, carried)
+            log_odds = network.log_odds(footage.color(frame)) + expected
             log_odds[~near] = -SURE
             retained = _retained_parts(log_odds > 0, prior > 0, least_px=0.3 * size if lost else 0.0)
-            before = np.where(retained, np.clip(log_odds, 1, SURE), np.clip(log_odds, -SURE, -1)).astype(
-                np.float32
-            )
+            before = np.where(retained, np.clip(log_odds, 1, SURE), np.clip(log_odds, -SURE, -1))
+            before = before.astype(np.float32)
             size = int(retained.sum()) or size
             found[frame] = _packed(retained)
     return found
@@ -224,14 +219,8 @@ def _carried(
     moved = footage.to(frame, other)
     assert moved is not None, f"flow of gap 1 is stored for frames {frame} and {other}"
     columns, rows = (np.arange(side, dtype=np.float32) for side in log_odds.shape[::-1])
-    return cv2.remap(
-        log_odds,
-        moved[..., 0] + columns,
-        moved[..., 1] + rows[:, None],
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=-SURE,
-    )
+    x, y, border = moved[..., 0] + columns, moved[..., 1] + rows[:, None], cv2.BORDER_CONSTANT
+    return cv2.remap(log_odds, x, y, cv2.INTER_LINEAR, borderMode=border, borderValue=-SURE)
 
 
 def _retained_parts(
@@ -259,13 +248,8 @@ def _allowed(rough: list[bytes]) -> Callable[[int], Bool[np.ndarray, "height wid
 
 
 def _grown(mask: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
-    return (
-        cv2.dilate(
-            mask.astype(np.uint8),
-            cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1)),
-        )
-        > 0
-    )
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
+    return cv2.dilate(mask.astype(np.uint8), disk) > 0
 
 
 def _packed(mask: Bool[np.ndarray, "height width"]) -> bytes:

@@ -15,15 +15,25 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.data.clips import Clip, usable_depth
-from pipeline.geometry import cameras, rigid
+from pipeline.geometry import cameras, rigid, subsampling
 
 MARGIN_M = 0.03
-"""a surface must lie this far, and four standard deviations of the depth noise, behind a point to prove it
-free"""
+"""a surface this far, and four standard deviations of depth noise, behind a point proves it free"""
 ACROSS_M = 0.015
 """pose error that is tolerated across the line of sight"""
+NEARLY = 0.6
+"""points up to this share of a picture from its middle are looked for in it"""
 SIGNIFICANT = 4.0
 """standard deviations of depth noise that are no chance"""
+NEAREST_M = 0.1
+"""nothing is measured nearer to a depth camera"""
+NOISE_REACH_M = 0.15
+"""largest difference that may be noise of a surface seen twice, and not another surface"""
+INNER_WIDTH_PX = 320
+"""width of a picture of which one pixel around each is looked at, in wider ones more; narrower ones are
+phones', whose confidence marks steps"""
+INNER_STEP_SHARE = 0.12
+"""share of the distance from which a difference within that window is a step between surfaces"""
 
 
 @dataclass(frozen=True)
@@ -44,9 +54,7 @@ class DepthNoise:
 
 @dataclass(frozen=True)
 class References:
-    """Depth pictures that vote; ``nearest`` is the smallest depth in a neighbourhood, which tolerates drift
-    at edges.
-    """
+    """Depth pictures that vote; ``nearest``, the least depth of a neighbourhood, tolerates drift at edges."""
 
     camera_from_world: Float[np.ndarray, "reference 4 4"]
     intrinsics: Float[np.ndarray, "reference 3 3"]
@@ -59,9 +67,7 @@ class References:
 
 @dataclass(frozen=True)
 class Votes:
-    """Per point: references that saw through it, references that saw a surface there, and the mean gap to
-    that surface.
-    """
+    """Per point: references that saw through it, that saw a surface there, and the mean gap to it."""
 
     free: Int[np.ndarray, "*shape"]
     occupied: Int[np.ndarray, "*shape"]
@@ -71,48 +77,42 @@ class Votes:
     """mean colour (0..255) of those surfaces"""
 
 
-NEAREST_M = 0.1
-"""nothing is measured nearer to a depth camera"""
-NOISE_REACH_M = 0.15
-"""largest difference that may be noise of a surface seen twice, and not another surface"""
-
-
 def steady_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     """Read usable depth without flying pixels at depth steps (metres, 0 = unknown)."""
     return usable_depth(clip, frame, keep_steps=False)
 
 
 def inner_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth away from steps, holes and what the sensor doubts (0 = unknown): there, misalignment proves
-    nothing.
-    """
+    """Read depth away from steps, holes and what the sensor doubts (0 = unknown)."""
     depth = steady_depth(clip, frame)
     kernel = np.ones((2 * (depth.shape[1] // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
     low, high = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
     return np.where((low > 0) & (high - low < INNER_STEP_SHARE * depth), depth, 0).astype(np.float32)
 
 
-INNER_WIDTH_PX = 320
-"""width of a picture of which one pixel around each is looked at, in wider ones more; narrower ones are
-phones', whose confidence marks steps"""
-INNER_STEP_SHARE = 0.12
-"""share of the distance from which a difference within that window is a step between surfaces"""
+def points_of(
+    clip: Clip,
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    depth: Float[np.ndarray, "height width"],
+    stride: int,
+) -> Float[np.ndarray, "row column 3"]:
+    """Return every ``stride``-th pixel of a depth picture in the world, metres; NaN where it is 0."""
+    every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    rays, depth = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape)[every], depth[every]
+    points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
+    points[depth == 0] = np.nan
+    return points
 
 
 def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> References:
     """Read the ``count`` depth pictures that vote."""
-    frames = np.unique(np.linspace(0, len(clip) - 1, min(count, len(clip))).round().astype(int))
+    frames = subsampling.evenly(len(clip), count, rounded=True)
     depth = np.stack([steady_depth(clip, frame) for frame in frames])
-    nearest = np.stack(
-        [
-            _nearest(picture, clip.depth_intrinsics[frame, 0, 0])
-            for picture, frame in zip(depth, frames, strict=True)
-        ]
-    )
     color = np.stack([soft_color(clip.color(frame), clip.depth_size) for frame in frames])
     camera_from_world, pinhole = rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames]
     noise = measure_noise(depth, camera_from_world, pinhole)
-    return References(camera_from_world, pinhole, depth, nearest, color, frames, noise)
+    return References(camera_from_world, pinhole, depth, _nearest(depth, pinhole), color, frames, noise)
 
 
 def measure_noise(
@@ -135,9 +135,9 @@ def measure_noise(
         points = cameras.unproject(pixel, intrinsics[first]) * depth[first][rows, columns][:, None]
         relative = camera_from_world[second] @ rigid.inverse(camera_from_world[first])
         at, z = cameras.project(rigid.apply(relative, points), intrinsics[second])
-        inside = (z > NEAREST_M) & (at >= 0).all(1) & (at < np.array(inner.shape[::-1])).all(1)
-        at, z = np.asarray(at)[inside].astype(int), np.asarray(z)[inside]
-        measured = depth[second][at[:, 1], at[:, 0]]
+        inside = cameras.in_picture(at, z, inner.shape, NEAREST_M)
+        (column, row), z = at[inside].astype(int).T, z[inside]
+        measured = depth[second][row, column]
         near = (measured > 0) & (np.abs(measured - z) < NOISE_REACH_M)
         ranges.append(z[near])
         errors.append(np.abs(measured - z)[near])
@@ -159,17 +159,12 @@ def _pairs(count: int) -> list[tuple[int, int]]:
 
 
 def without(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]]) -> References:
-    """Forget what references saw where ``hidden`` (at any resolution) says so: there, they no longer know a
-    surface.
-    """
-    size = references.depth.shape[1:][::-1]
-    depth = references.depth.copy()
-    for row, frame in enumerate(references.frame):
-        depth[row][
-            cv2.resize(hidden(int(frame)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        ] = 0
-    nearest = [_nearest(picture, k[0, 0]) for picture, k in zip(depth, references.intrinsics, strict=True)]
-    return replace(references, depth=depth, nearest=np.stack(nearest))
+    """Forget what references saw where ``hidden`` (at any resolution) says so: they know no surface there."""
+    depth, size = references.depth.copy(), references.depth.shape[1:][::-1]
+    for picture, frame in zip(depth, references.frame, strict=True):
+        forgotten = cv2.resize(hidden(int(frame)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        picture[forgotten > 0] = 0
+    return replace(references, depth=depth, nearest=_nearest(depth, references.intrinsics))
 
 
 def soft_color(
@@ -185,17 +180,10 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], fr
     points = np.ascontiguousarray(points_world[known], np.float32)
     other = np.flatnonzero((references.frame != frame) & _looking_at(references, points))
     pinhole = references.intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
-    judged = _vote(
-        points,
-        other,
-        references.camera_from_world.astype(np.float32),
-        pinhole,
-        references.depth,
-        references.nearest,
-        references.color,
-        np.float32(MARGIN_M + SIGNIFICANT * references.noise.constant_m),
-        np.float32(SIGNIFICANT * references.noise.quadratic),
-    )
+    poses, noise = references.camera_from_world.astype(np.float32), references.noise
+    margin = np.float32(MARGIN_M + SIGNIFICANT * noise.constant_m), np.float32(SIGNIFICANT * noise.quadratic)
+    pictures = references.depth, references.nearest, references.color
+    judged = _vote(points, other, poses, pinhole, *pictures, *margin)
     votes = [np.zeros(known.shape + values.shape[1:], values.dtype) for values in judged]
     for whole, values in zip(votes, judged, strict=True):
         whole[known] = values
@@ -207,32 +195,30 @@ def _looking_at(
 ) -> Bool[np.ndarray, "reference"]:
     """Return which references have any of some evenly chosen points in their picture, or nearly so."""
     chosen = points_world[:: max(1, len(points_world) // probes)].astype(float)
-    pixel, depth = cameras.project(
-        rigid.apply(references.camera_from_world, chosen[None]), references.intrinsics[:, None]
-    )
-    height, width = references.depth.shape[1:]
-    inside = (
-        (depth > 0.1)
-        & (np.abs(pixel[..., 0] / width - 0.5) < 0.6)
-        & (np.abs(pixel[..., 1] / height - 0.5) < 0.6)
-    )
-    return inside.any(1)
+    points_camera = rigid.apply(references.camera_from_world, chosen[None])
+    pixel, depth = cameras.project(points_camera, references.intrinsics[:, None])
+    share = pixel / references.depth.shape[:0:-1]
+    near = (np.abs(share - 0.5) < NEARLY).all(-1)
+    return np.any((depth > NEAREST_M) & near, axis=1)
 
 
-def _nearest(depth: Float[np.ndarray, "height width"], focal_px: float) -> Float[np.ndarray, "height width"]:
-    """Smallest depth in a window as wide as the tolerated drift at the median distance; 0 where any of it is
-    unknown.
+def _nearest(
+    depth: Float[np.ndarray, "reference height width"], intrinsics: Float[np.ndarray, "reference 3 3"]
+) -> Float[np.ndarray, "reference height width"]:
+    """Smallest depth in a window as wide as the tolerated drift at the median distance; 0 beside holes.
 
     Sensors lose thin and glossy things: what is seen beside a hole proves nothing about what stands there.
     """
-    known = depth > 0
-    distance = float(np.median(depth[known])) if known.any() else 1.0
-    radius = int(np.clip(round(focal_px * ACROSS_M / distance), 1, 4))
-    lowest = cv2.erode(
-        np.where(known, depth, np.inf).astype(np.float32), np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    )
-    whole = cv2.erode(known.astype(np.uint8), np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)) > 0
-    return np.where(whole, lowest, 0).astype(np.float32)
+    nearest = []
+    for picture, focal_px in zip(depth, intrinsics[:, 0, 0], strict=True):
+        known = picture > 0
+        distance = float(np.median(picture[known])) if known.any() else 1.0
+        radius = int(np.clip(round(focal_px * ACROSS_M / distance), 1, 4))
+        window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+        lowest = cv2.erode(np.where(known, picture, np.inf).astype(np.float32), window)
+        whole = cv2.erode(known.astype(np.uint8), window) > 0
+        nearest.append(np.where(whole, lowest, 0).astype(np.float32))
+    return np.stack(nearest)
 
 
 @numba.njit(cache=True, fastmath=True)

@@ -71,13 +71,11 @@ class Portrait:
 
 def save_portraits(folder: Path, portraits: Sequence[Portrait]) -> None:
     """Write `portraits.npz`: each cut out with its surroundings."""
-    cut = [_cut(each) for each in portraits]
-    rows = {
-        f"{row:03d}/{part}": getattr(each, part)
-        for row, each in enumerate(cut)
-        for part in ("color", "labels")
-    }
-    npz.save(folder / PORTRAITS, compress=True, animal=np.array([each.animal for each in cut]), **rows)
+    rows = {}
+    for row, each in enumerate(portraits):
+        part = around(each.labels == 255, AROUND_PX)
+        rows |= {f"{row:03d}/color": each.color[part], f"{row:03d}/labels": each.labels[part]}
+    npz.save(folder / PORTRAITS, compress=True, animal=np.array([each.animal for each in portraits]), **rows)
 
 
 def load_portraits(folder: Path) -> list[Portrait]:
@@ -87,11 +85,6 @@ def load_portraits(folder: Path) -> list[Portrait]:
         Portrait(int(animal), table[f"{row:03d}/color"], table[f"{row:03d}/labels"])
         for row, animal in enumerate(table["animal"])
     ]
-
-
-def _cut(portrait: Portrait) -> Portrait:
-    part = around(portrait.labels == 255, AROUND_PX)
-    return Portrait(portrait.animal, portrait.color[part], portrait.labels[part])
 
 
 class Identities(Appearance):
@@ -135,8 +128,9 @@ class Identities(Appearance):
 def margin(
     who: Float[np.ndarray, "class height width"], animal: int, moves: float = MOVES
 ) -> Float[np.ndarray, "height width"]:
-    """Return the log-odds that a pixel shows this animal and no other, within +-6; ``moves`` are the log-odds
-    by which it is rather one of the animals than nobody, infinite where that is known.
+    """Return the log-odds that a pixel shows this animal and no other, within +-6.
+
+    ``moves``: log-odds by which it is rather one of the animals than nobody, infinite where that is known.
     """
     others = np.delete(who, [NOBODY, animal + 1], axis=0)
     return np.clip(who[animal + 1] - np.maximum(others.max(0), who[NOBODY] - moves), -LIMIT, LIMIT)
@@ -156,9 +150,8 @@ def of_one(
     bodies touch, and the neighbourhood decides.
     """
     probability = 1 / (1 + np.exp(-margins))
-    count, part = cv2.connectedComponents(
-        cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8)), connectivity=8
-    )
+    grown = cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8))
+    count, part = cv2.connectedComponents(grown, connectivity=8)
     part = np.where(moving, part, 0)
     total = np.bincount(part.ravel(), minlength=count)
     mean = np.bincount(part.ravel(), probability.ravel(), count) / np.maximum(total, 1)
@@ -183,9 +176,8 @@ def learn_identities(
     own = [[each for each in portraits if each.animal == index] for index in range(len(names))]
     for step in range(config.steps):
         network.train()
-        crops = [
-            _crop(own, (step + index) % len(names), config.crop_px, rng) for index in range(config.batch)
-        ]
+        shown = [(step + index) % len(names) for index in range(config.batch)]
+        crops = [_crop(own, animal, config.crop_px, rng) for animal in shown]
         color, classes = (torch.stack(parts) for parts in zip(*crops, strict=True))
         logits = network.logits(color)
         error = F.cross_entropy(logits, classes, ignore_index=IGNORED, reduction="none")
@@ -203,9 +195,8 @@ def recognized(network: Identities, portraits: Sequence[Portrait]) -> Float[np.n
     for each in portraits:
         inside = each.labels == 255
         if inside.any():
-            shares[each.animal].append(
-                float((margin(network.who(each.color), each.animal)[inside] > 0).mean())
-            )
+            own = margin(network.who(each.color), each.animal)[inside] > 0
+            shares[each.animal].append(float(own.mean()))
     return np.array([np.mean(share) if share else np.nan for share in shares])
 
 
@@ -249,13 +240,10 @@ def _square(
     scale = float(np.exp(rng.uniform(*np.log(SCALES))))
     shift = rng.uniform(*REACH, 2) * side
     map_to = np.array([[1 / scale, 0, column - shift[0] / scale], [0, 1 / scale, row - shift[1] / scale]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    source = portrait.color
+    linear, nearest = (how | cv2.WARP_INVERSE_MAP for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
+    source, whose, size = portrait.color, classes.astype(np.int16), (side, side)
     if scale < 1:
         source = cv2.GaussianBlur(source, (0, 0), BLUR_PX / scale)
-    color = cv2.warpAffine(source, map_to, (side, side), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    labels = cv2.warpAffine(
-        classes.astype(np.int16), map_to, (side, side), flags=nearest, borderValue=(IGNORED,)
-    )
+    color = cv2.warpAffine(source, map_to, size, flags=linear, borderMode=cv2.BORDER_REPLICATE)
+    labels = cv2.warpAffine(whose, map_to, size, flags=nearest, borderValue=(IGNORED,))
     return color, labels.astype(np.int64)

@@ -1,6 +1,4 @@
-"""Where the animal of a session is: a ball per frame, from what moves and, once that is learned, from what
-looks like it.
-"""
+"""Where the animal of a session is: a ball per frame, by what moves and, once learned, by its looks."""
 
 import math
 from collections.abc import Callable
@@ -10,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.data.clips import Clip
-from pipeline.geometry import cameras, rigid
 from stages.segment_agent import free_space, identity, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References
@@ -19,7 +16,6 @@ from stages.segment_agent.windows import Sphere, supported_depth
 
 COARSE_PX, FINE_PX = 111, 222
 """side of the square that has as many pixels as candidates are made of: without and with known appearance"""
-
 SOLID = np.ones((2, 2), np.uint8)
 """samples that an animal fills together; rims of furniture that poses misplace are thinner"""
 
@@ -69,16 +65,12 @@ def find_mover(
 
 
 def presume(balls: list[Sphere | None], timestamp_s: Float[np.ndarray, "frame"]) -> list[Sphere | None]:
-    """Fill short gaps of a track between its ends, and a while before and after it, by where the animal may
-    still be.
-    """
+    """Fill short gaps of a track, and a while before and after it, by where the animal may still be."""
     seen = np.array([frame for frame, ball in enumerate(balls) if ball is not None])
     if not len(seen):
         return balls
     centres = np.stack([balls[frame].centre_world for frame in seen])
-    guess = np.stack(
-        [np.interp(timestamp_s, timestamp_s[seen], centres[:, axis]) for axis in range(3)], axis=1
-    )
+    guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis) for axis in centres.T], axis=1)
     after = np.minimum(np.searchsorted(seen, np.arange(len(balls))), len(seen) - 1)
     wait = np.abs(timestamp_s - timestamp_s[seen[[np.maximum(after - 1, 0), after]]]).min(0)
     radius = balls[seen[0]].radius_m
@@ -97,25 +89,21 @@ def _candidates(
     known: tuple[AppearanceOf | None, AppearanceOf | None],
     share: float,
 ) -> list[Candidate]:
-    """Group the points of one frame that move or, where its appearance is known, look more like the animal
-    than like the room.
+    """Group the points of one frame that move or, if its appearance is known, look rather like the animal.
 
     A known appearance leaves few points to judge, so all of them are: an animal may show no more than a paw
     or an ear. ``known`` are its appearance and what distinguishes it from other animals, if any.
     """
     appearance, apart = known
-    stride = max(
-        1, round(math.sqrt(math.prod(clip.depth_size)) / (COARSE_PX if appearance is None else FINE_PX))
-    )
+    wanted_px = COARSE_PX if appearance is None else FINE_PX
+    stride = max(1, round(math.sqrt(math.prod(clip.depth_size)) / wanted_px))
     chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    if appearance is None:
-        depth = free_space.inner_depth(clip, frame)[chosen]
-    else:
+    whole = free_space.inner_depth(clip, frame) if appearance is None else supported_depth(clip, frame)
+    points, depth = free_space.points_of(clip, frame, world_from_camera, whole, stride), whole[chosen]
+    if appearance is not None:
         like = _sampled(appearance(frame), clip.depth_size, chosen)
-        depth = np.where(like > -movers.CLEAR_MOTION, supported_depth(clip, frame)[chosen], 0)
-    rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)[chosen]
-    points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
-    points[depth == 0] = np.nan
+        depth = np.where(like > -movers.CLEAR_MOTION, depth, 0)
+        points[depth == 0] = np.nan
     votes = free_space.vote(references, points, frame)
     area = (depth * stride) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
     if appearance is None:
@@ -128,9 +116,8 @@ def _candidates(
         return movers.candidates(own, probability, points, area, animal)
     motion = movers.motion(votes)
     settled = (votes.occupied > 0) & (motion == 0)
-    both = (
-        np.clip(like, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT) + motion - movers.SETTLED * settled
-    )
+    limited = np.clip(like, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
+    both = limited + motion - movers.SETTLED * settled
     if apart is not None:
         both += np.minimum(_sampled(apart(frame), clip.depth_size, chosen), 0)
     both[depth == 0] = -movers.APPEARANCE_LIMIT
@@ -141,8 +128,6 @@ def _sampled(
     picture: Float[np.ndarray, "height width"], size: tuple[int, int], chosen: tuple[slice, slice]
 ) -> Float[np.ndarray, "row column"]:
     """Read a picture where the chosen pixels of a picture of another (height, width) lie."""
-    at = (
-        (np.arange(side)[part] + 0.5) * (own / side)
-        for side, own, part in zip(size, picture.shape, chosen, strict=True)
-    )
-    return picture[np.ix_(*(index.astype(int) for index in at))]
+    sides = zip(size, picture.shape, chosen, strict=True)
+    at = (((np.arange(side)[part] + 0.5) * (own / side)).astype(int) for side, own, part in sides)
+    return picture[np.ix_(*at)]

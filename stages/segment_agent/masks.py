@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
-from pipeline.geometry import cameras, rigid
+from pipeline.geometry import subsampling
 from stages.segment_agent import free_space, movers
 from stages.segment_agent import prompt as prompts
 from stages.segment_agent.appearance import Appearance, Example, learn
@@ -32,8 +32,7 @@ from stages.segment_agent.windows import Sphere, rectangle, working_picture, wor
 EMPTY_SHARE = 3
 """times as many pictures with the animal as without it are learned from"""
 KNOWN_SHARE = 0.6
-"""of the animal that a network was shown, which it must find: one that has not learned enough would only veto
-"""
+"""of the animal that a network was shown, which it must find: one that learned too little would only veto"""
 GUESSED = 2.0
 """times its size that the animal is looked for where its place is a guess, once its appearance is known"""
 STILL_STRIDE = 3
@@ -62,12 +61,9 @@ def segment(
     """
     if not _has_depth(clip):
         if hint is None:
-            raise InputError(
-                "MSK-004",
-                "there is no depth, so motion alone does not separate the animal from the room",
-                str(clip.folder),
-                "give a hint: one box around the animal in one frame (<recording>.prompt.toml)",
-            )
+            what = "there is no depth, so motion alone does not separate the animal from the room"
+            remedy = "give a hint: one box around the animal in one frame (<recording>.prompt.toml)"
+            raise InputError("MSK-004", what, str(clip.folder), remedy)
         return follow(Footage(clip, flow, config.height_px), hint, config.learning, rng), None
     path = steady(clip, flow, rng)
     poses = path.world_from_camera
@@ -118,32 +114,25 @@ def _moving(
     if network is None:
         return painter
     room = free_space.without(references, lambda frame: hidden(painter, frame, network))
-    found = find_mover(
-        clip,
-        poses,
-        room,
-        config.animal,
-        mark,
-        lambda frame: network.log_odds(working_picture(clip, frame, config.height_px)),
-    )
+    found = find_mover(clip, poses, room, config.animal, mark, appearance_of(painter, network))
     balls = resized(found, balls)
     judge = judge_motion(room) if resting is None else either(resting, judge_motion(room))
     return Painter(clip, poses, balls, judge, config.height_px, network)
 
 
 def resized(balls: list[Sphere | None], first: list[Sphere | None]) -> list[Sphere | None]:
-    """Give the balls of a track by appearance the size that motion alone found: rims of furniture may touch
-    what looks like the animal.
-    """
+    """Give the balls of a track by appearance the size that motion alone found: furniture may touch it."""
     radius_m = next(ball.radius_m for ball in first if ball is not None)
     return [ball and replace(ball, radius_m=radius_m * (GUESSED if ball.presumed else 1)) for ball in balls]
 
 
+def appearance_of(painter: Painter, network: Appearance) -> AppearanceOf:
+    """Return the log-odds of a network at working resolution, frame by frame."""
+    return lambda frame: network.log_odds(painter.working_picture(frame))
+
+
 def _has_depth(clip: Clip) -> bool:
-    return any(
-        (clip.depth(frame) > 0).any()
-        for frame in np.unique(np.linspace(0, len(clip) - 1, PROBES).astype(int)).tolist()
-    )
+    return any((clip.depth(frame) > 0).any() for frame in subsampling.evenly(len(clip), PROBES).tolist())
 
 
 @dataclass(frozen=True)
@@ -163,20 +152,19 @@ def learn_appearance(
     rng: np.random.Generator,
     known: Known | None = None,
 ) -> Appearance | None:
-    """Learn the animal's appearance from first masks of frames spread over the recording, and the room's from
-    the others; from what other recordings showed of it too, where that is known.
+    """Learn the appearance of animal and room from first masks and from what is known of other recordings.
 
     None where the animal is never seen, or not learned well enough to judge.
     """
     seen = np.array([frame for frame, ball in enumerate(painter.balls) if _certain(ball)])
     if not len(seen):
         return None
-    chosen = seen[np.unique(np.linspace(0, len(seen) - 1, config.learning.examples).round().astype(int))]
+    chosen = seen[subsampling.evenly(len(seen), config.learning.examples, rounded=True)]
     shown = []
     for frame in chosen.tolist():
         labels = painter.working_mask(frame).labels
         if known is not None:
-            unsure = (labels == 0) & _beside(painter, frame, labels.shape) & (known.recognized(frame) > 0)
+            unsure = (labels == 0) & _sought(painter, frame, labels.shape) & (known.recognized(frame) > 0)
             labels = np.where(unsure, np.uint8(128), labels)
         shown.append(Example(painter.working_picture(frame), labels))
     empty = [frame for frame, ball in enumerate(painter.balls) if not _certain(ball)]
@@ -186,9 +174,9 @@ def learn_appearance(
     ]
     elsewhere = () if known is None else known.examples
     network = learn([*shown, *elsewhere], config.learning, rng, room=room)
-    return (
-        network if network is not None and _knows(network, shown[:: max(1, len(shown) // PROBES)]) else None
-    )
+    if network is None or not _knows(network, shown[:: max(1, len(shown) // PROBES)]):
+        return None
+    return network
 
 
 def _still(painter: Painter, references: References, frame: int) -> UInt8[np.ndarray, "height width"]:
@@ -196,16 +184,11 @@ def _still(painter: Painter, references: References, frame: int) -> UInt8[np.nda
 
     An animal that rests unnoticed is outvoted by the frames in which it moves.
     """
-    clip, stride = painter.clip, STILL_STRIDE
-    chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    depth = free_space.steady_depth(clip, frame)[chosen]
-    rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)[chosen]
-    points = rigid.apply(painter.world_from_camera[frame], (rays * depth[..., None]).reshape(-1, 3))
-    points[depth.ravel() == 0] = np.nan
-    moving = movers.moving(free_space.vote(references, points.reshape(*depth.shape, 3), frame))
-    beside = cv2.dilate(moving.astype(np.uint8), RIM)
-    size = working_size(clip, painter.height_px)
-    return cv2.resize(beside, size[::-1], interpolation=cv2.INTER_NEAREST) * np.uint8(128)
+    clip, pose = painter.clip, painter.world_from_camera[frame]
+    points = free_space.points_of(clip, frame, pose, free_space.steady_depth(clip, frame), STILL_STRIDE)
+    moving = movers.moving(free_space.vote(references, points, frame))
+    size, near = working_size(clip, painter.height_px), cv2.dilate(moving.astype(np.uint8), RIM)
+    return cv2.resize(near, size[::-1], interpolation=cv2.INTER_NEAREST) * np.uint8(128)
 
 
 def _certain(ball: Sphere | None) -> bool:
@@ -223,17 +206,15 @@ def _knows(network: Appearance, examples: list[Example]) -> bool:
 
 
 def hidden(painter: Painter, frame: int, network: Appearance) -> Bool[np.ndarray, "height width"]:
-    """Mark where the animal, by its appearance and with a rim, hides the room: near where it was seen to
-    move, if it was.
-    """
+    """Mark where the animal, by its appearance, hides the room: near where it was seen to move, if it was."""
     color = painter.working_picture(frame)
-    like, ball = network.log_odds(color) > 0, painter.balls[frame]
-    if ball is not None and not ball.presumed:
-        like &= _beside(painter, frame, color.shape[:2])
+    like = network.log_odds(color) > 0
+    if _certain(painter.balls[frame]):
+        like &= _sought(painter, frame, color.shape[:2])
     return cv2.dilate(like.astype(np.uint8), RIM) > 0
 
 
-def _beside(painter: Painter, frame: int, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+def _sought(painter: Painter, frame: int, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
     """Mark the rectangle in which the animal is looked for."""
     inside, ball = np.zeros(size, bool), painter.balls[frame]
     if ball is not None:

@@ -19,19 +19,15 @@ from stages.segment_agent.free_space import Votes
 HINT_REWARD = 1000.0
 SURE_SHARES = (1.0, 0.3)
 """references that must have seen through a point to learn from it, as a share of those that saw a surface
-there; the second where nothing goes anywhere by the first: an animal that keeps to its place"""
+there; the second where nothing goes anywhere by the first"""
 TRAVEL_M = 0.2
 """way that something must go by itself to be an animal beyond doubt: what people moved stays where it is"""
 FREE_M = 0.1
 """how far a candidate's centre may jump without motion: another part of the animal is seen"""
-
-
 LEAST_VOTES, LEAST_SHARE = 2, 0.05
-"""references that must have seen through a point, and how many more as a share of those that saw a surface
-there"""
+"""references that must have seen through a point, and more as a share of those that saw a surface there"""
 LEAST_AREA_M2, LEAST_PIXELS = 0.003, 6
-"""smallest visible area of a candidate: the head of a cat; and the samples that chance does not bring
-together"""
+"""smallest visible area of a candidate, the head of a cat; samples that chance does not bring together"""
 LIKELY_AREA_M2 = 0.03
 """visible area from which on a candidate is fully convincing: a third of a cat from the side"""
 CANDIDATES = 6
@@ -79,9 +75,7 @@ def moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
 
 
 def surely_moving(votes: Votes, share: float) -> Bool[np.ndarray, "*shape"]:
-    """Return which points lie in space that is free at a good share of other times: enough to learn an
-    animal's appearance from.
-    """
+    """Return which points lie in space that is free at a good share of other times: enough to learn from."""
     return (votes.free > LEAST_VOTES) & (votes.free >= share * votes.occupied)
 
 
@@ -91,9 +85,7 @@ def clearly_moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
 
 
 def motion(votes: Votes) -> Float[np.ndarray, "*shape"]:
-    """Return the log-odds by which points that move speak for an animal whose appearance is known; 0 for the
-    others.
-    """
+    """Return the log-odds by which points that move speak for an animal of known appearance; else 0."""
     return np.where(moving(votes), np.where(clearly_moving(votes), CLEAR_MOTION, MOTION), 0.0)
 
 
@@ -104,9 +96,7 @@ def candidates(
     area_m2: Float[np.ndarray, "height width"],
     animal: AnimalConfig,
 ) -> list[Candidate]:
-    """Group moving pixels that touch, largest area first; ``area_m2`` is what each pixel covers at its
-    distance.
-    """
+    """Group moving pixels that touch, largest area first; ``area_m2`` is what each covers at its distance."""
     closed = cv2.dilate(is_moving.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, label = cv2.connectedComponents(closed, connectivity=8)
     found = []
@@ -139,9 +129,8 @@ def track(
     scores[0][1:] -= APPEAR_COST
 
     def change(index: int) -> Float[np.ndarray, "before after"]:
-        return -_transition(
-            found[index - 1], found[index], timestamp_s[index] - timestamp_s[index - 1], animal
-        )
+        seconds = timestamp_s[index] - timestamp_s[index - 1]
+        return -_transition(found[index - 1], found[index], seconds, animal)
 
     return viterbi.viterbi_decode([-score for score in scores], change) - 1
 
@@ -195,9 +184,8 @@ def self_moving(
         own = seen[piece == number]
         if timestamp_s[own[-1]] - timestamp_s[own[0]] < ABSENT_S:
             continue
-        centre = scipy.ndimage.median_filter(
-            np.array([chosen[frame].centre_world for frame in own]), (5, 1), mode="nearest"
-        )
+        centre = np.array([chosen[frame].centre_world for frame in own])
+        centre = scipy.ndimage.median_filter(centre, (5, 1), mode="nearest")
         if np.linalg.norm(np.ptp(centre, axis=0)) > TRAVEL_M:
             surely[own] = True
     return surely
@@ -209,9 +197,7 @@ def _meant(candidate: Candidate, hint: Hint) -> bool:
 
 
 def _score(candidate: Candidate, animal: AnimalConfig) -> float:
-    """Reward area up to a convincing one; halve what is larger than an animal, and count nothing that is as
-    likely as not.
-    """
+    """Reward area up to a convincing one; half if larger than an animal, none if doubtful."""
     reward = max(2 * candidate.conviction - 1, 0) * min(candidate.area_m2 / LIKELY_AREA_M2, 1.0) ** 0.5
     return reward * (0.5 if candidate.radius_m > animal.largest_m / 2 else 1.0)
 
@@ -223,11 +209,8 @@ def _transition(
     step = np.full((len(before) + 1, len(after) + 1), -APPEAR_COST)
     step[0, 0] = 0.0
     if before and after:
-        apart = np.linalg.norm(
-            np.stack([c.centre_world for c in before])[:, None]
-            - np.stack([c.centre_world for c in after])[None],
-            axis=-1,
-        )
+        first, second = (np.stack([each.centre_world for each in group]) for group in (before, after))
+        apart = np.linalg.norm(first[:, None] - second[None], axis=-1)
         excess = np.maximum(apart - FREE_M - animal.speed_m_s * seconds, 0) / 0.3
         step[1:, 1:] = -np.minimum(excess, 2 * APPEAR_COST)
     return step

@@ -15,8 +15,7 @@ FLASH_FRAMES = 3
 LOW_CONFIDENCE = 0.75
 """probability below which presence is a guess"""
 CONTRADICTED = 0.4
-"""share of a mask that looks like the room, or lies where other frames saw a surface, from which on it is
-doubtful"""
+"""share of a mask that looks like the room, or lies where others saw a surface, that makes it doubtful"""
 GREEN, BLUE = (60, 255, 90), (60, 90, 255)
 CAPTIONS = {
     "overlay": "masks over frames: outline green, unknown blue",
@@ -64,9 +63,7 @@ def interruptions(visible: Bool[np.ndarray, "frame"]) -> float:
 
 
 def checks_of(summary: Summary, residual_m: float) -> list[Check]:
-    """Return the figures that reveal wrong masks: implausible over time, contradicted by appearance or by
-    other frames.
-    """
+    """Return the figures that reveal wrong masks: implausible over time, contradicted by appearance."""
     area, visible = np.array(summary.area), np.array(summary.visible)
     confidence, contradicted = np.array(summary.confidence), np.array(summary.contradicted)
     checks = [

@@ -1,5 +1,4 @@
-"""Find an animal that rests all session long where a user points at it: nothing but the hint separates it
-from the room.
+"""Find an animal that rests all session long where a user points at it: only the hint separates it.
 
 In the hinted frame GrabCut cuts it out of what lies near the hint and above the ground; its points there fill
 cells, which show it in other frames. Of sides that were turned away nothing is known; its appearance, once
@@ -56,25 +55,19 @@ def find_resting(
     Raises InputError MSK-003 when nothing stands out from the ground there.
     """
     _, ground = surroundings(clip, world_from_camera, hint.centre_world)
-    if ground is None:
-        shown = None
-    else:
-        shown = _cut_out(clip, world_from_camera[hint.frame], hint, ground, height_px, rng)
+    pose = world_from_camera[hint.frame]
+    shown = None if ground is None else _cut_out(clip, pose, hint, ground, height_px, rng)
     if ground is None or shown is None:
-        raise InputError(
-            "MSK-003",
-            "nothing stands out from level ground where the hint points",
-            f"{clip.folder}, frame {hint.frame}",
-            "point at the middle of the animal, or draw a box, in a frame that shows the ground beside it",
-        )
+        where = f"{clip.folder}, frame {hint.frame}"
+        remedy = "point at the middle of the animal, or draw a box, in a frame that shows the ground too"
+        what = "nothing stands out from level ground where the hint points"
+        raise InputError("MSK-003", what, where, remedy)
     cluster = find_cluster(shown, hint.centre_world, least_hits=1)
     return [cluster.ball] * len(clip), judge_standing(cluster, ground, whole=False)
 
 
 def _cut_out(clip, world_from_camera, hint, ground, height_px, rng):
-    """Return the points of the animal that the hinted frame shows, in the world; None where there are hardly
-    any.
-    """
+    """Return the points of the animal that the hinted frame shows, in the world; None if hardly any."""
     color = working_picture(clip, hint.frame, height_px)
     window = cut(clip, hint.frame, world_from_camera, Sphere(hint.centre_world, 2 * hint.reach_m), color)
     if window is None:

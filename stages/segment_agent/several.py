@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
+from pipeline.geometry import subsampling
 from stages.segment_agent import free_space, masks
 from stages.segment_agent.appearance import Appearance, Example
 from stages.segment_agent.config import Config
@@ -31,8 +32,7 @@ from stages.segment_agent.windows import Sphere, Window, working_picture
 STEPS = 127 / LIMIT
 """kept log-odds are rounded to one part of so many"""
 LEAST_FRAMES, RECOGNIZED = 5, 0.75
-"""frames in which an animal must be surely tracked to be in the recording at all, and the mean probability of
-its pixels to be its"""
+"""frames in which an animal must be tracked to be in the recording, and the mean probability of its pixels"""
 ANOTHERS = -1.0
 """log-odds from which on a pixel that geometry knows nothing of is another animal's"""
 PORTRAITS_SHARE = 0.25
@@ -45,9 +45,7 @@ without a turnaround lives here; less may be people"""
 
 @dataclass
 class Margins:
-    """Per animal, and for strangers, the log-odds of a frame's pixels; each frame is judged once and kept
-    compressed.
-    """
+    """Per animal, and for strangers, the log-odds of a frame's pixels, judged once and stored compressed."""
 
     clip: Clip
     network: Identities
@@ -63,9 +61,7 @@ class Margins:
         return lambda frame: self._all(frame)[animal] - MOVES
 
     def between(self, animal: int) -> AppearanceOf:
-        """Return the log-odds of one animal against the others alone: of what geometry says is an animal, the
-        network need not know that it is one.
-        """
+        """Return the log-odds of one animal against the others alone: geometry says what is an animal."""
         return lambda frame: self._all(frame)[len(self.network.names) + 1 + animal]
 
     def _all(self, frame: int) -> Float[np.ndarray, "animal height width"]:
@@ -73,14 +69,9 @@ class Margins:
         count = 2 * len(animals) + 1
         if frame not in self.judged:
             who = self.network.who(working_picture(self.clip, frame, self.height_px))
-            found = np.stack(
-                [
-                    *(margin(who, animal) for animal in animals),
-                    stranger(who),
-                    *(margin(who, animal, np.inf) for animal in animals),
-                ]
-            )
-            rounded = np.round(found * STEPS + 128).astype(np.uint8)
+            own = [margin(who, animal) for animal in animals]
+            found = [*own, stranger(who), *(margin(who, animal, np.inf) for animal in animals)]
+            rounded = np.round(np.stack(found) * STEPS + 128).astype(np.uint8)
             self.judged[frame] = cv2.imencode(".png", rounded.reshape(-1, rounded.shape[-1]))[1].tobytes()
         stored = cv2.imdecode(np.frombuffer(self.judged[frame], np.uint8), cv2.IMREAD_GRAYSCALE)
         assert stored is not None, "a PNG of our own"
@@ -115,9 +106,7 @@ def find_all(
     margins: Margins,
     portraits: Sequence[Portrait],
 ) -> list[Painter]:
-    """Prepare the masks of every animal: what moves and is it, then the appearance that this and the
-    turnarounds teach.
-    """
+    """Prepare the masks of every animal: what moves and is it, then the appearance learned from that."""
     count = len(margins.network.names)
     judge = judge_motion(references)
     painters, networks = [], []
@@ -125,9 +114,8 @@ def find_all(
     for animal in range(count):
         apart = margins.of(animal)
         balls = find_mover(clip, poses, references, config.animal, None, apart=apart)
-        painter = Painter(
-            clip, poses, balls, judge_apart(judge, margins.between(animal)), config.height_px, Palette()
-        )
+        own = judge_apart(judge, margins.between(animal))
+        painter = Painter(clip, poses, balls, own, config.height_px, Palette())
         painter = replace(painter, appearance=learn_palette(painter))
         if not _is_here(painter, apart):
             painter = replace(painter, balls=[None] * len(clip))
@@ -137,19 +125,21 @@ def find_all(
         networks.append(masks.learn_appearance(painter, references, config, rng, known))
     room = free_space.without(references, lambda frame: _any_hidden(painters, networks, frame))
     judge = judge_motion(room)
-    return [
-        painters[animal]
-        if network is None
-        else _second(painters[animal], room, judge, network, margins, animal, config)
-        for animal, network in enumerate(networks)
-    ]
+    for animal, network in enumerate(networks):
+        if network is None:
+            continue
+        painter, own = painters[animal], judge_apart(judge, margins.between(animal))
+        like, apart = masks.appearance_of(painter, network), margins.of(animal)
+        balls = find_mover(clip, poses, room, config.animal, None, like, apart)
+        balls = masks.resized(balls, painter.balls)
+        painters[animal] = replace(painter, balls=balls, judge=own, appearance=network)
+    return painters
 
 
 def examples_of(portraits: Sequence[Portrait], animal: int, most: int) -> list[Example]:
     """Return portraits of one animal as examples, evenly chosen."""
     own = [each for each in portraits if each.animal == animal]
-    chosen = np.unique(np.linspace(0, len(own) - 1, min(most, len(own))).astype(int)).tolist()
-    return [Example(own[index].color, own[index].labels) for index in chosen]
+    return [Example(own[index].color, own[index].labels) for index in subsampling.evenly(len(own), most)]
 
 
 def judge_apart(judge: Judge, apart: AppearanceOf) -> Judge:
@@ -190,32 +180,6 @@ def joined(painters: list[Painter], margins: Margins, own: int, frame: int) -> M
     return replace(mine, labels=labels, visible=visible)
 
 
-def _second(
-    painter: Painter,
-    room: References,
-    judge: Judge,
-    network: Appearance,
-    margins: Margins,
-    animal: int,
-    config: Config,
-) -> Painter:
-    """Track an animal once more by its appearance in this recording."""
-    clip, poses = painter.clip, painter.world_from_camera
-    balls = find_mover(
-        clip,
-        poses,
-        room,
-        config.animal,
-        None,
-        lambda frame: network.log_odds(painter.working_picture(frame)),
-        margins.of(animal),
-    )
-    balls = masks.resized(balls, painter.balls)
-    return replace(
-        painter, balls=balls, judge=judge_apart(judge, margins.between(animal)), appearance=network
-    )
-
-
 def _is_here(painter: Painter, apart: AppearanceOf) -> bool:
     """Return whether what was tracked is this animal, by most of its pixels."""
     seen = [frame for frame, ball in enumerate(painter.balls) if ball is not None and not ball.presumed]
@@ -250,10 +214,7 @@ def _strangers(
     balls = find_mover(clip, poses, references, config.animal, None, apart=nobody)
     share = float(np.mean([ball is not None and not ball.presumed for ball in balls]))
     if share > STRANGER_SHARE:
-        raise InputError(
-            "MSK-007",
-            f"in {100 * share:.0f} % of the frames something moves about that none of the turnarounds shows",
-            str(clip.folder),
-            "film a turnaround of each animal that lives here, named turnaround_<name>; or leave this out",
-        )
+        what = f"in {100 * share:.0f} % of the frames something moves that none of the turnarounds shows"
+        remedy = "film a turnaround of each animal that lives here (turnaround_<name>), or leave this out"
+        raise InputError("MSK-007", what, str(clip.folder), remedy)
     return share

@@ -63,12 +63,10 @@ def motion_from_flow(
 def _lift(clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
     """Back-project colour pixels by the depth there; NaN where it is unknown or the pixel is out of view."""
     depth = steady_depth(clip, frame)
-    at = np.floor(
-        pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]
-    ).astype(int)
-    inside = np.all((at >= 0) & (at < [clip.depth_size[1], clip.depth_size[0]]), axis=1)
-    at = np.where(inside[:, None], at, 0)
-    z = np.where(inside, depth[at[:, 1], at[:, 0]], 0)
+    at = pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]
+    inside = cameras.in_picture(at, np.ones(len(at)), clip.depth_size)
+    column, row = np.floor(np.where(inside[:, None], at, 0)).astype(int).T
+    z = np.where(inside, depth[row, column], 0)
     points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
     points[z == 0] = np.nan
     return points

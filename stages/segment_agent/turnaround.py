@@ -1,11 +1,9 @@
-"""Find an animal that keeps still while the phone circles it: what stands on the floor where all cameras
-look.
+"""Find an animal that keeps still while the phone circles it: what stands where all cameras look.
 
 The optical axes meet near the animal; the level surface beneath that point is its ground; the connected
 cluster of points above that ground nearest to the axes' meeting point is the animal.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import cast
 
@@ -15,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.flying_pixels import supported
 from pipeline.geometry.ground import GroundPlane, fit_ground
 from pipeline.mapping.icp import depth_image
@@ -24,10 +22,7 @@ from stages.segment_agent.refine import Edges
 from stages.segment_agent.windows import Sphere, Window
 
 LEAST_SPREAD = 1e-3
-"""mean squared sine of the angles between optical axes and the line that they all run along; below, they meet
-nowhere"""
-
-
+"""mean squared sine of the angles between optical axes and their common line; below, they meet nowhere"""
 PICTURES = 40
 """frames that the cluster is made of"""
 REACH_M = 0.9
@@ -37,8 +32,7 @@ VOXEL_M = 0.025
 CLEARANCE_M = 0.03
 """height above the ground from which points surely do not belong to it"""
 FOOT_M, FOOT_SPREAD_M = 0.008, 0.004
-"""height above the ground from which a point under the body is rather a paw than ground, and what is worth
-one more"""
+"""height above the ground that makes a point under the body rather a paw, and what is worth one more"""
 LEAST_HITS = 3
 """pictures that must have seen a point in a cell"""
 EDGES = Edges(radius_px=2, unsure=0.4)
@@ -77,14 +71,11 @@ def find_standing(
 ) -> tuple[list[Sphere | None], Judge]:
     """Locate what stands at the focus; return a ball per frame and the judge of its points. World: +y up.
 
-    Raises InputError MSK-003 when nothing stands there, when there is no ground that it stands on, or no
-    focus.
+    Raises InputError MSK-003 when nothing stands there, there is no ground that it stands on, or no focus.
     """
 
     def refused(what: str) -> InputError:
-        remedy = (
-            "circle the resting animal with the phone pointed at it and the ground in view, or give a hint"
-        )
+        remedy = "circle the resting animal, pointing at it, with the ground in view, or give a hint"
         return InputError("MSK-003", what, str(clip.folder), remedy)
 
     if focus is None:
@@ -101,18 +92,16 @@ def find_standing(
 def surroundings(
     clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], focus: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "point 3"], GroundPlane | None]:
-    """Return the points near a focus that frames spread over the recording see, and the ground beneath it, if
-    one is seen.
-    """
-    chosen = np.unique(np.linspace(0, len(clip) - 1, PICTURES).astype(int))
-    points, level = _points_near(clip, world_from_camera, focus, chosen)
+    """Return the points that frames see near a focus, and the ground beneath it, if one is seen."""
+    points, level = _points_near(clip, world_from_camera, focus)
     seen = (points[level, 1] < focus[1] + 0.05).sum() >= LEAST_LEVEL
     return points, fit_ground(points[level], focus) if seen else None
 
 
 def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"] | None:
-    """Return the point nearest to all optical axes (robust least squares), metres; None where they meet at no
-    place that most cameras look at: they run alongside, or the phone turns on the spot.
+    """Return the point nearest to all optical axes (robust least squares), metres.
+
+    None where they run alongside, or meet behind most cameras: the phone turns on the spot.
     """
     centre, forward = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
@@ -131,9 +120,7 @@ def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np
 def find_cluster(
     points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], least_hits: int = LEAST_HITS
 ) -> Cluster:
-    """Gather points into cells and keep the connected group that is large and near the focus, grown by two
-    cells.
-    """
+    """Gather points into cells; take the connected group that is large and near the focus, grown by two."""
     reach = REACH_M + 2 * VOXEL_M
     origin, count = focus - reach, int(np.ceil(2 * reach / VOXEL_M))
     at = np.floor((points_world - origin) / VOXEL_M).astype(int)
@@ -150,12 +137,10 @@ def find_cluster(
     return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, VOXEL_M)
 
 
-def _points_near(
-    clip: Clip, world_from_camera: np.ndarray, focus: np.ndarray, frames: Iterable[int]
-) -> tuple[np.ndarray, np.ndarray]:
+def _points_near(clip: Clip, world_from_camera, focus) -> tuple[np.ndarray, np.ndarray]:
     """Read points within reach of the focus, tails and ears too, and whether they face upward."""
     points, level = [], []
-    for frame in frames:
+    for frame in subsampling.evenly(len(clip), PICTURES):
         depth = clip.depth(frame)
         depth = np.where(supported(depth), depth, 0)
         view = depth_image(depth, clip.depth_intrinsics[frame], depth > 0, 2)

@@ -1,5 +1,4 @@
-"""Grounding DINO finds the animal by its name in some frames, SAM 2 follows it from the most certain one to
-both ends.
+"""Grounding DINO finds the animal by its name in some frames, SAM 2 follows it from the most certain one.
 
 A user's hint takes the place of the detector. Masks are made as they are asked for; those before the first
 frame are kept compressed, so that memory hardly grows with the recording.
@@ -32,9 +31,7 @@ UNSURE = 1.0
 
 
 def segment(clip: Clip, hint: Prompt | None, options: FoundationConfig, device: str) -> Iterator[Mask]:
-    """Return one mask per frame, in order. Raises MSK-004 where the animal is not found, MOD-001..003 without
-    models.
-    """
+    """Return one mask per frame. Raises MSK-004 if the animal is not found, MOD-001..003 without models."""
     from pipeline.backends.grounding_dino import GroundingDino
     from pipeline.backends.sam2 import Sam2
 

@@ -13,6 +13,7 @@ from pipeline.core.progress import log
 from pipeline.core.videos import Video
 from pipeline.data import plots, qa
 from pipeline.data.clips import Clip
+from pipeline.geometry import subsampling
 from stages.segment_agent import identity, masks
 from stages.segment_agent.config import Config as MaskConfig
 from stages.segment_agent.identities.config import Config
@@ -77,10 +78,9 @@ def portraits(
     """Segment frames spread evenly over a turnaround, at working resolution."""
     clip = Clip.open(frames)
     painter = masks.painter_of_turnaround(clip, flow, MaskConfig(height_px=config.height_px), rng)
-    chosen = np.unique(np.linspace(0, len(clip) - 1, config.portraits).astype(int)).tolist()
     found = [
         Portrait(animal, painter.working_picture(frame), painter.working_mask(frame).labels)
-        for frame in chosen
+        for frame in subsampling.evenly(len(clip), config.portraits).tolist()
     ]
     return [each for each in found if (each.labels == 255).any()]
 
@@ -93,9 +93,8 @@ def sheet(
     for each in tested[:: max(1, len(tested) // (2 * columns))]:
         taken = network.who(each.color)[1:].argmax(0)
         hue = (taken * 180 / len(network.names)).astype(np.uint8)
-        tint = cv2.cvtColor(
-            np.dstack([hue, np.full_like(hue, 255), np.full_like(hue, 255)]), cv2.COLOR_HSV2RGB
-        )
+        vivid = np.full_like(hue, 255)
+        tint = cv2.cvtColor(np.dstack([hue, vivid, vivid]), cv2.COLOR_HSV2RGB)
         inside = (each.labels == 255)[..., None]
         tiles.append(np.where(inside, each.color // 3 + 2 * (tint // 3), each.color // 2).astype(np.uint8))
     return plots.grid(tiles, columns)

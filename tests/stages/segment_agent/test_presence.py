@@ -42,9 +42,8 @@ def test_depth_noise_is_measured_by_range():
 
 def references_of(depth):
     count = len(depth)
-    nearest = np.stack([free_space._nearest(picture, 80.0) for picture in depth])
     pose, k = np.tile(rigid.inverse(np.eye(4)), (count, 1, 1)), np.tile(INTRINSICS, (count, 1, 1))
-    color = np.zeros((*depth.shape, 3), np.uint8)
+    color, nearest = np.zeros((*depth.shape, 3), np.uint8), free_space._nearest(depth, k)
     return References(pose, k, depth, nearest, color, np.arange(count), DepthNoise())
 
 
