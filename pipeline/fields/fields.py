@@ -28,16 +28,16 @@ from pipeline.geometry import rigid_torch
 
 FEATURE_CHANNELS = 16
 FUSED_CHANNELS = fused.CHANNELS
-SOFTNESS_M = (0.004, 0.02)
+SOFTNESS_M = (0.003, 0.006)
 """range of the density's scale beta: sharper ones lose the gradient between samples, softer ones blur thin
-limbs"""
+limbs and give everything a rim, which is rendered between it and what lies behind"""
 START_SOFTNESS_M, START_RANGE_M = 0.1, (0.004, 0.2)
 """beta and its range where rendering alone has to find surfaces: samples lie about a decimetre apart at
 first"""
 START_SATURATION = 0.9
 """share of the truncation that an untrained distance stays below: at 1 its tanh has no gradient"""
-START_LOG_BETA = -4.0
-"""of fields supervised by distances: 18 mm, the upper end of the range"""
+START_LOG_BETA = -5.1
+"""of fields supervised by distances: the upper end of the range"""
 LEAST_FEATURE = 1e-4
 """shorter features are not brought to unit length: their gradient would explode"""
 CODE_STD = 0.1
@@ -211,6 +211,16 @@ class Field(nn.Module):
         """The scale of the Laplace distribution in `density`, metres."""
         return self.log_beta.exp().clamp(*(START_RANGE_M if self.shape.starts_as_box else SOFTNESS_M))
 
+    def density(
+        self, signed_distance: Float[Tensor, "*point"], least_beta_m: float = 0.0
+    ) -> Float[Tensor, "*point"]:
+        """Return the density of its signed distances, per metre; saturated ones are free.
+
+        A first pass of importance sampling asks for a beta of at least half the spacing of its samples, so
+        that no surface is lost between two of them.
+        """
+        return density(signed_distance, self.beta_m.clamp_min(least_beta_m), self.shape.truncation_m)
+
 
 def _head(inputs: int, width: int, outputs: int) -> tuple[nn.Sequential, nn.Linear]:
     """Return two layers, and the last of them."""
@@ -218,10 +228,19 @@ def _head(inputs: int, width: int, outputs: int) -> tuple[nn.Sequential, nn.Line
     return nn.Sequential(first, nn.ReLU(), last), last
 
 
-def density(signed_distance: Float[Tensor, "*point"], beta_m: Float[Tensor, ""]) -> Float[Tensor, "*point"]:
-    """Turn signed distance into volume density per metre: a Laplace CDF (Yariv et al., VolSDF, Eqs. 2-3)."""
+def density(
+    signed_distance: Float[Tensor, "*point"], beta_m: Float[Tensor, ""], truncation_m: float | None = None
+) -> Float[Tensor, "*point"]:
+    """Turn signed distance into volume density per metre: a Laplace CDF (Yariv et al., VolSDF, Eqs. 2-3).
+
+    Distances that saturate at ``truncation_m`` say no more than that space is free: what the CDF has left
+    there is subtracted, or metres of free space would add up to a fog.
+    """
     tail = 0.5 * torch.exp(-signed_distance.abs() / beta_m)
-    return torch.where(signed_distance > 0, tail, 1 - tail) / beta_m
+    cdf = torch.where(signed_distance > 0, tail, 1 - tail)
+    if truncation_m is not None:
+        cdf = (cdf - 0.5 * torch.exp(-truncation_m / beta_m)).clamp_min(0)
+    return cdf / beta_m
 
 
 class ArticulatedBody(nn.Module):

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Generator, Tensor
 
 from pipeline.fields import marching_cubes
-from pipeline.fields.fields import Reconstruction, density
+from pipeline.fields.fields import Reconstruction
 from pipeline.geometry import cameras, rigid_torch
 from pipeline.geometry.meshes import Mesh, RayCaster
 
@@ -62,11 +62,18 @@ def ray_weights(
 ) -> Float[Tensor, "ray sample"]:
     """Return the weight of each sample in the rendering integral (paper 001, Eq. 15); arguments as
     `composite`'s.
+
+    A sample stands for its ray up to halfway to its neighbours.
     """
-    step = torch.diff(depth_m, dim=-1)
-    step = torch.cat([step, step[:, -1:]], dim=-1) * length[:, None]
-    optical = density * step
+    optical = density * _ends(depth_m).diff(dim=-1) * length[:, None]
     return torch.exp(-(optical.cumsum(-1) - optical)) * (1 - torch.exp(-optical))
+
+
+def _ends(depth_m: Float[Tensor, "ray sample"]) -> Float[Tensor, "ray end"]:
+    """Return where the parts of a ray that its samples stand for begin and end."""
+    half = depth_m.diff(dim=-1) / 2
+    middle = depth_m[:, :-1] + half
+    return torch.cat([depth_m[:, :1] - half[:, :1], middle, depth_m[:, -1:] + half[:, -1:]], dim=-1)
 
 
 def importance_depths(
@@ -80,19 +87,19 @@ def importance_depths(
 
     Stratified with a ``generator``, else at the middle of each stratum.
     """
-    weight = ray_weights(depth_m, length, density)[:, :-1] + UNIFORM_WEIGHT
+    weight = ray_weights(depth_m, length, density) + UNIFORM_WEIGHT
     cdf = torch.nn.functional.pad((weight / weight.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
-    count = depth_m.shape[1]
+    ends, count = _ends(depth_m), depth_m.shape[1]
     offset = (
         torch.full(depth_m.shape, 0.5)
         if generator is None
         else torch.rand(depth_m.shape, generator=generator)
     )
     uniform = (torch.arange(count, device=depth_m.device) + offset.to(depth_m.device)) / count
-    after = torch.searchsorted(cdf, uniform.contiguous(), right=True).clamp(1, count - 1)
+    after = torch.searchsorted(cdf, uniform.contiguous(), right=True).clamp(1, count)
     low, high = cdf.gather(1, after - 1), cdf.gather(1, after)
     part = ((uniform - low) / (high - low).clamp_min(UNIFORM_WEIGHT / count)).clamp(0, 1)
-    return torch.lerp(depth_m.gather(1, after - 1), depth_m.gather(1, after), part)
+    return torch.lerp(ends.gather(1, after - 1), ends.gather(1, after), part)
 
 
 def composite(
@@ -159,54 +166,61 @@ def render_depth(
     agent_pose = None
     if world_from_agent is not None and agent_from_bone is not None:
         agent_pose = rigid_torch.inverse(tensor(world_from_agent)) @ pose, tensor(agent_from_bone)
+    spacing = (farthest_m - NEAREST_M) / (samples // 2)
     depths, agents = [], []
     for direction in directions.split(RAYS_AT_ONCE):
+        rays = _PosedRays(reconstruction, pose, direction, code, agent_pose)
         length, depth = direction.norm(dim=-1), even.expand(len(direction), -1)
-        scene, agent = _layers(reconstruction, pose, direction, depth, code, agent_pose)
+        scene, agent = rays.layers(depth, spacing / 2)
         both = scene.density if agent is None else scene.density + agent.density
         fine = importance_depths(depth, length, both)
         depth = torch.cat([depth, fine], dim=1).sort(dim=1).values
-        rendered = composite(
-            depth, length, *_layers(reconstruction, pose, direction, depth, code, agent_pose)
-        )
+        rendered = composite(depth, length, *rays.layers(depth))
         depths.append(torch.where(rendered.opacity >= LEAST_OPACITY, rendered.depth, 0))
         agents.append(rendered.agent)
     depth_map, agent_map = (torch.cat(part).view(height, width).cpu().numpy() for part in (depths, agents))
     return depth_map, agent_map
 
 
-def _layers(
-    reconstruction: Reconstruction,
-    world_from_camera: Float[Tensor, "4 4"],
-    direction: Float[Tensor, "ray 3"],
-    depth: Float[Tensor, "ray sample"],
-    code: int,
-    agent_pose: tuple[Float[Tensor, "4 4"], Float[Tensor, "bone 4 4"]] | None,
-) -> tuple[Layer, Layer | None]:
-    """Evaluate scene and posed agent at samples of rays (camera frame)."""
-    scene, agent, body = reconstruction.scene, reconstruction.agent, reconstruction.body
-    points_camera = (direction[:, None] * depth[..., None]).reshape(-1, 3)
-    world = rigid_torch.apply(world_from_camera, points_camera)
-    values = scene(world, torch.full((len(world),), code, device=world.device))
-    shape = depth.shape
-    scene_layer = Layer(
-        density(values.signed_distance, scene.beta_m).view(shape),
-        values.color.view(*shape, 3),
-        values.feature.view(*shape, -1),
-    )
-    if agent_pose is None:
-        return scene_layer, None
-    agent_from_camera, bones = agent_pose
-    rest = body.unpose(rigid_torch.apply(agent_from_camera, points_camera)[None], bones[None])[0]
-    low, high = (rest.new_tensor(corner) for corner in (agent.shape.low_m, agent.shape.high_m))
-    inside = ((rest > low) & (rest < high)).all(-1)
-    values = agent(rest)
-    agent_layer = Layer(
-        (density(values.signed_distance, agent.beta_m) * inside).view(shape),
-        values.color.view(*shape, 3),
-        values.feature.view(*shape, -1),
-    )
-    return scene_layer, agent_layer
+@dataclass(frozen=True)
+class _PosedRays:
+    """Rays of a camera through scene and posed agent."""
+
+    reconstruction: Reconstruction
+    world_from_camera: Float[Tensor, "4 4"]
+    direction: Float[Tensor, "ray 3"]
+    """camera frame, z = 1"""
+    code: int
+    agent_pose: tuple[Float[Tensor, "4 4"], Float[Tensor, "bone 4 4"]] | None
+    """agent from camera, and agent from bones"""
+
+    def layers(
+        self, depth: Float[Tensor, "ray sample"], least_beta_m: float = 0.0
+    ) -> tuple[Layer, Layer | None]:
+        """Evaluate scene and posed agent at samples, z in metres; `Field.density` explains the least beta."""
+        scene, agent, body = self.reconstruction.scene, self.reconstruction.agent, self.reconstruction.body
+        points_camera = (self.direction[:, None] * depth[..., None]).reshape(-1, 3)
+        world = rigid_torch.apply(self.world_from_camera, points_camera)
+        values = scene(world, torch.full((len(world),), self.code, device=world.device))
+        shape = depth.shape
+        scene_layer = Layer(
+            scene.density(values.signed_distance, least_beta_m).view(shape),
+            values.color.view(*shape, 3),
+            values.feature.view(*shape, -1),
+        )
+        if self.agent_pose is None:
+            return scene_layer, None
+        agent_from_camera, bones = self.agent_pose
+        rest = body.unpose(rigid_torch.apply(agent_from_camera, points_camera)[None], bones[None])[0]
+        low, high = (rest.new_tensor(corner) for corner in (agent.shape.low_m, agent.shape.high_m))
+        inside = ((rest > low) & (rest < high)).all(-1)
+        values = agent(rest)
+        agent_layer = Layer(
+            (agent.density(values.signed_distance, least_beta_m) * inside).view(shape),
+            values.color.view(*shape, 3),
+            values.feature.view(*shape, -1),
+        )
+        return scene_layer, agent_layer
 
 
 @dataclass(frozen=True)

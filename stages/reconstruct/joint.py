@@ -4,7 +4,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from pipeline.fields.fields import density
 from pipeline.fields.render import Layer, Rendered, composite, importance_depths
 from pipeline.geometry import cameras, rigid_torch
 from stages.reconstruct import body, losses
@@ -20,6 +19,7 @@ from stages.reconstruct.scene import (
     render_depths,
     scene_density,
     scene_layer,
+    surface_depths,
     swap,
     swap_probability,
 )
@@ -79,19 +79,26 @@ class JointLoss:
         rays = problem.store.agent.at(problem.agent_rays.pick(pose.frame, number, generator).flatten())
         has_scene = problem.has_scene[rays.frame]
         video = torch.where(has_scene, problem.video[rays.frame], 0)
-        farthest_m, videos = problem.store.farthest_m, problem.scene.shape.videos
+        farthest_m = problem.store.farthest_m
+        code_of = swap(video, problem.scene.shape.videos, probability, generator)
+        frame = torch.arange(len(pose.frame), device=problem.device).repeat_interleave(number)
+
+        def density_of(index: Tensor, depth: Tensor, least_beta_m: float = 0.0) -> Tensor:
+            there = pose.at(frame[index])
+            world, points_agent = sample_points(there, rays.at(index), depth)
+            scene = scene_density(problem, world, video[index], code_of[index], least_beta_m)
+            agent = agent_layer(problem, there, points_agent, depth.shape, least_beta_m)[0].density
+            return scene * has_scene[index, None] + agent
+
         if self.scene_loss.rendered:
-            code_of = swap(video, videos, probability, generator)
-            depth = even_depths(rays, farthest_m, samples // 2, generator)
+            coarse, half_m = even_depths(rays, farthest_m, samples // 2, generator), farthest_m / samples
             with torch.no_grad():
-                world, points_agent = sample_points(pose, rays, depth)
-                both = scene_density(problem, world, video, code_of) * has_scene[:, None]
-                both = both + agent_layer(problem, pose, points_agent, depth.shape)[0].density
-                fine = importance_depths(depth, rays.direction.norm(dim=-1), both, generator)
-            depth = torch.cat([depth, fine], dim=1).sort(dim=1).values
+                both = density_of(torch.arange(len(rays), device=problem.device), coarse, half_m)
+                fine = importance_depths(coarse, rays.direction.norm(dim=-1), both, generator)
+            depth = torch.cat([coarse, fine], dim=1).sort(dim=1).values
         else:
-            depth = render_depths(rays, farthest_m, samples, generator)
-            code_of = swap(video, videos, probability, generator)
+            surface = surface_depths(rays, farthest_m, density_of, generator)
+            depth = render_depths(rays, surface, samples, generator)
         world, points_agent = sample_points(pose, rays, depth)
         scene = scene_layer(problem, world, video, code_of)
         scene = Layer(scene.density * has_scene[:, None], scene.color, scene.feature)
@@ -112,10 +119,14 @@ def sample_points(
 
 
 def agent_layer(
-    problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"], shape: tuple[int, ...]
+    problem: Problem,
+    pose: Pose,
+    points_agent: Float[Tensor, "frame point 3"],
+    shape: tuple[int, ...],
+    least_beta_m: float = 0.0,
 ) -> tuple[Layer, Float[Tensor, "frame point 3"]]:
-    """Evaluate the agent's field along rays; also return the samples in the rest shape. It is empty outside
-    its box.
+    """Evaluate the agent's field along rays (`Field.density` explains ``least_beta_m``); also return the
+    samples in the rest shape. It is empty outside its box.
     """
     field = problem.agent
     rest = problem.body.unpose(points_agent, pose.agent_from_bone)
@@ -125,7 +136,7 @@ def agent_layer(
     inside = ((rest > low) & (rest < high)).all(-1).view(shape)
     values = field(rest.reshape(-1, 3))
     layer = Layer(
-        density(values.signed_distance, field.beta_m).view(shape) * inside,
+        field.density(values.signed_distance, least_beta_m).view(shape) * inside,
         values.color.view(*shape, 3),
         values.feature.view(*shape, -1),
     )
@@ -206,10 +217,7 @@ def field_terms(problem: Problem, weights: LossWeights, generator: Generator) ->
     color = field.color_and_feature(encoded[: len(index)][close])[0]
     return {
         "agent eikonal": (weights.eikonal, losses.eikonal(distance, torch.stack(shifted), EIKONAL_STEP_M)),
-        "template": (
-            weights.template,
-            losses.truncated_distance(distance, surface.distance[index], body.REACH_M),
-        ),
+        "template": (weights.template, losses.distance(distance, surface.distance[index], body.REACH_M)),
         "template color": (
             weights.template * weights.color,
             losses.color(color, surface.color[index][close]),

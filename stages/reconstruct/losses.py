@@ -20,14 +20,20 @@ LEAST_PROBABILITY = 1e-3
 """keeps the logarithms of opacities finite"""
 
 
+def distance(
+    distance_m: Float[Tensor, "*point"], target_m: Float[Tensor, "*point"], unit_m: float
+) -> Float[Tensor, "*point"]:
+    """Compare signed distances in units of ``unit_m``, robustly."""
+    return functional.huber_loss(
+        distance_m / unit_m, target_m / unit_m, reduction="none", delta=DISTANCE_KNEE
+    )
+
+
 def truncated_distance(
     distance_m: Float[Tensor, "*point"], target_m: Float[Tensor, "*point"], limit_m: float
 ) -> Float[Tensor, "*point"]:
-    """Compare signed distances, both cut at ``limit_m`` and in units of it, robustly."""
-    target = target_m.clamp(-limit_m, limit_m)
-    return functional.huber_loss(
-        distance_m / limit_m, target / limit_m, reduction="none", delta=DISTANCE_KNEE
-    )
+    """Compare signed distances, which saturate at ``limit_m``, with ones that do not, as `distance`."""
+    return distance(distance_m, target_m.clamp(-limit_m, limit_m), limit_m)
 
 
 def color(predicted: Float[Tensor, "*point 3"], target: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point"]:

@@ -1,12 +1,14 @@
 """The scene's losses: signed distance around measured depth, colour and features at it, and rendered rays."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
 from pipeline.data.motion import MotionTable
-from pipeline.fields.fields import Field, density
-from pipeline.fields.render import Layer, composite, importance_depths
+from pipeline.fields.fields import Field
+from pipeline.fields.render import Layer, composite, importance_depths, ray_weights
 from stages.reconstruct import losses
 from stages.reconstruct.config import LossWeights, RayBatches
 from stages.reconstruct.problem import Problem, pick
@@ -24,6 +26,9 @@ LEAST_SLOPE = 0.3
 """reach of the samples near depth grows on oblique surfaces, but no further than at this slope"""
 REACH_M = 0.15
 """half of the samples of rendered rays lie this near to measured depth"""
+SEARCH_SAMPLES = 64
+"""even samples that find the surface where no depth was measured: a fused one is about as thick as their
+spacing"""
 EIKONAL_STEP_M = 0.04
 """step of finite differences, half a cell of the finest grid"""
 EIKONAL_SHARE = 8
@@ -150,7 +155,7 @@ def scene_layer(
         points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
     )
     return Layer(
-        density(values.signed_distance, field.beta_m).view(rays, samples),
+        field.density(values.signed_distance).view(rays, samples),
         values.color.view(rays, samples, 3),
         values.feature.view(rays, samples, -1),
     )
@@ -161,26 +166,51 @@ def scene_density(
     points: Float[Tensor, "ray sample 3"],
     video: Int[Tensor, "ray"],
     code_of: Int[Tensor, "ray"],
+    least_beta_m: float = 0.0,
 ) -> Float[Tensor, "ray sample"]:
-    """Return the scene's density along rays, per metre; arguments as `scene_layer`'s."""
+    """Return the scene's density along rays, per metre; arguments as of `scene_layer` and `Field.density`."""
     field, (rays, samples) = problem.scene, points.shape[:2]
     distance = field.distance_at(
         points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
     )
-    return density(distance, field.beta_m).view(rays, samples)
+    return field.density(distance, least_beta_m).view(rays, samples)
 
 
 def render_depths(
-    rays: Rays, farthest_m: float, samples: int, generator: Generator
+    rays: Rays, surface_m: Float[Tensor, "ray"], samples: int, generator: Generator
 ) -> Float[Tensor, "ray sample"]:
-    """Place samples of rendered rays, z in metres: half around measured depth, half before it.
-
-    Where depth is unknown they reach up to ``farthest_m``.
-    """
-    end = torch.where(rays.depth > 0, rays.depth, torch.full_like(rays.depth, farthest_m))[:, None]
+    """Place samples of rendered rays, z in metres: half around a surface, half before it."""
+    end = surface_m[:, None]
     near = end + (strata(rays, samples // 2, generator) * 2 - 1) * REACH_M
     before = (end - REACH_M - FREE_FROM_M).clamp_min(0.01) * strata(rays, samples - samples // 2, generator)
     return torch.cat([FREE_FROM_M + before, near], dim=1).sort(dim=1).values
+
+
+@torch.no_grad()
+def surface_depths(
+    rays: Rays,
+    farthest_m: float,
+    density_of: Callable[[Int[Tensor, "ray"], Float[Tensor, "ray sample"]], Float[Tensor, "ray sample"]],
+    generator: Generator,
+) -> Float[Tensor, "ray"]:
+    """Return measured depth, and where it is unknown the z at which half of a ray has ended, metres.
+
+    Args:
+        rays: any.
+        farthest_m: end of the `SEARCH_SAMPLES` even samples, and the answer of rays that meet nothing.
+        density_of: density per metre of some of the rays, given by their indices, at z in metres.
+        generator: of the places of samples.
+    """
+    surface, unknown = rays.depth.clone(), torch.nonzero(rays.depth <= 0)[:, 0]
+    if not len(unknown):
+        return surface
+    some = rays.at(unknown)
+    depth = even_depths(some, farthest_m, SEARCH_SAMPLES, generator)
+    weight = ray_weights(depth, some.direction.norm(dim=-1), density_of(unknown, depth))
+    ended = weight.cumsum(-1) >= 0.5
+    first = depth.gather(1, ended.int().argmax(-1, keepdim=True))[:, 0]
+    surface[unknown] = torch.where(ended.any(-1), first, farthest_m)
+    return surface
 
 
 def even_depths(
@@ -227,7 +257,14 @@ class SceneLoss:
             swap(problem.video[some.frame], videos, probability, generator) for some in (rays, others)
         )
         terms = measured_terms(problem, rays, code_of, self.weights, generator)
-        depth = render_depths(others, store.farthest_m, batches.rendered_samples, generator)
+
+        def density_of(index: Tensor, depth: Tensor) -> Tensor:
+            origin, direction = world_rays(problem.motion, others.at(index))
+            points = origin[:, None] + direction[:, None] * depth[..., None]
+            return scene_density(problem, points, problem.video[others.frame[index]], other_code[index])
+
+        surface = surface_depths(others, store.farthest_m, density_of, generator)
+        depth = render_depths(others, surface, batches.rendered_samples, generator)
         return terms | rendered_terms(problem, others, other_code, self.weights, depth)
 
     def _rendered(self, number: int, probability: float, generator: Generator) -> Terms:
@@ -235,11 +272,13 @@ class SceneLoss:
         rays = problem.store.scene.at(pick(len(problem.store.scene), number, generator, problem.device))
         video = problem.video[rays.frame]
         code_of = swap(video, field.shape.videos, probability, generator)
-        coarse = even_depths(rays, problem.store.farthest_m, self.batches.rendered_samples // 2, generator)
+        half = self.batches.rendered_samples // 2
+        coarse = even_depths(rays, problem.store.farthest_m, half, generator)
+        spacing_m = problem.store.farthest_m / half
         origin, direction = world_rays(problem.motion, rays)
         with torch.no_grad():
             points = origin[:, None] + direction[:, None] * coarse[..., None]
-            density_ = scene_density(problem, points, video, code_of)
+            density_ = scene_density(problem, points, video, code_of, spacing_m / 2)
             fine = importance_depths(coarse, direction.norm(dim=-1), density_, generator)
         depth = torch.cat([coarse, fine], dim=1).sort(dim=1).values
         terms = rendered_terms(problem, rays, code_of, self.weights, depth)

@@ -14,7 +14,7 @@ from pipeline.fields.fields import Field, FieldShape, Reconstruction
 from pipeline.fields.fused_depth import FusedGeometry
 from pipeline.geometry import cameras, rigid, rigid_torch
 from pipeline.geometry.meshes import Mesh
-from stages.reconstruct import assemble, body, optimise, results
+from stages.reconstruct import assemble, body, joint, optimise, results
 from stages.reconstruct.assemble import AgentTemplate, FieldSizes, RegisteredVideo
 from stages.reconstruct.body import Pose
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
@@ -170,6 +170,25 @@ def test_posed_surface_comes_nearer_to_the_truth(solved):
     truth = np.stack([0.03 * np.arange(12), np.zeros(12), np.zeros(12)], axis=-1)
     before = np.linalg.norm(videos[0].world_from_agent[:, :3, 3] - truth, axis=-1).mean()
     assert np.linalg.norm(centre - truth, axis=-1).mean() < 0.6 * before
+
+
+def test_a_distance_field_of_the_template_has_no_loss_anywhere_around_it():
+    """Its terms in the second phase agree, so that distances do not end near the surface."""
+    found, _ = problem()
+
+    class Ball(torch.nn.Module):
+        def encode(self, points):
+            return points
+
+        def distance(self, points):
+            return points.norm(dim=-1) - RADIUS_M
+
+        def color_and_feature(self, points):
+            return torch.zeros(len(points), 3), torch.zeros(len(points), 16)
+
+    terms = joint.field_terms(replace(found, agent=Ball()), LossWeights(), torch.Generator().manual_seed(0))
+    assert found.surface.distance.max() > 4 * body.REACH_M
+    assert terms["template"][1].mean() < 0.01 and terms["agent eikonal"][1].max() < 0.01
 
 
 def test_long_gaps_are_interpolated_with_low_confidence(solved):

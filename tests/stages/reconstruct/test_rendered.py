@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pipeline.fields.fields import Reconstruction, density
-from pipeline.fields.render import importance_depths, render_depth
+from pipeline.fields.render import importance_depths, ray_weights, render_depth
 from stages.reconstruct import assemble, optimise
 from stages.reconstruct.config import LearningRates, LossWeights, RayBatches
 from stages.reconstruct.problem import Problem
@@ -80,3 +80,21 @@ def test_importance_samples_lie_at_the_surface():
     assert ((fine - torch.tensor([[1.5], [3.0]])).abs() < 0.25).float().mean() > 0.9
     empty = importance_depths(depth, torch.ones(2), torch.zeros_like(depth))
     torch.testing.assert_close(empty, depth, atol=0.11, rtol=0)
+
+
+def test_a_fused_wall_thinner_than_the_spacing_of_samples_is_met_by_every_ray():
+    """What is fused ends 6 cm behind a surface; the first pass has a sample every 9 cm."""
+    wall_m = torch.linspace(1, 4, 500)[:, None]
+    depth = torch.linspace(0.1, 5.9, 65).expand(500, -1)
+
+    def wall(at: torch.Tensor, beta_m: float) -> torch.Tensor:
+        before = (wall_m - at).clamp_max(0.06)
+        behind = 2 * (at - wall_m - 0.06) - 0.06
+        return density(torch.maximum(before, behind.clamp_max(0.06)), torch.tensor(beta_m), 0.06)
+
+    spacing_m = float(depth[0, 1] - depth[0, 0])
+    fine = importance_depths(depth, torch.ones(500), wall(depth, spacing_m / 2))
+    both = torch.cat([depth, fine], dim=1).sort(dim=1).values
+    weight = ray_weights(both, torch.ones(500), wall(both, 0.005))
+    assert (weight.sum(1) > 0.99).all()
+    assert ((weight * both).sum(1) / weight.sum(1) - wall_m[:, 0]).abs().max() < 0.02, "metres"

@@ -10,6 +10,7 @@ from pipeline.fields.render import Layer, composite
 from pipeline.geometry import rigid
 from stages.reconstruct import losses, results, scene
 from stages.reconstruct.config import RayBatches
+from stages.reconstruct.rays import Rays
 
 
 def layer(value: torch.Tensor, color: tuple[float, float, float]) -> Layer:
@@ -38,6 +39,33 @@ def test_composite_mixes_by_density():
         layer(torch.full((1, 50), 1.0), (1, 0, 0)),
     )
     torch.testing.assert_close(seen.color[0, 0] / seen.color[0, 2], torch.tensor(1 / 3))
+
+
+def test_free_space_is_clear_however_far_it_reaches():
+    """Fused distances saturate 6 cm before a wall 4 m away."""
+    depth = torch.linspace(0.1, 4.5, 800)[None]
+    distance, beta_m = (4.0 - depth).clamp(-0.06, 0.06), torch.tensor(0.02)
+    clear, fog = (density(distance, beta_m, truncation_m) for truncation_m in (0.06, None))
+    seen, veiled = (composite(depth, torch.ones(1), layer(each, (0, 0, 1))) for each in (clear, fog))
+    torch.testing.assert_close(seen.depth, torch.tensor([4.0]), atol=0.02, rtol=0)
+    assert seen.opacity > 0.99 and veiled.depth < 2, "metres"
+
+
+def test_surfaces_are_found_where_no_depth_was_measured():
+    depth, none = torch.tensor([0.0, 1.2, 0.0, 0.0]), torch.zeros(4)
+    rays = Rays(
+        none.long(), torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3), depth, none + 1, none[:, None].byte().expand(4, 3),
+        none[:, None].to(torch.int8).expand(4, 16), none.byte(), none[:, None].expand(4, 2), none.byte(), none.to(torch.int8),
+    )  # fmt: skip
+    wall_m = torch.tensor([2.0, 9.0, 3.1, 9.0])
+
+    def density_of(index: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+        distance = ((depth - wall_m[index, None]).abs() - 0.06).clamp(-0.06, 0.06)
+        return density(distance, torch.tensor(0.007), 0.06)
+
+    found = scene.surface_depths(rays, 5.0, density_of, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(found[[1, 3]], torch.tensor([1.2, 5.0]))
+    torch.testing.assert_close(found[[0, 2]], wall_m[[0, 2]], atol=scene.REACH_M, rtol=0)
 
 
 def test_eikonal_is_zero_on_a_distance_field_and_not_on_a_scaled_one():
