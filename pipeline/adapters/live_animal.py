@@ -43,22 +43,12 @@ class LiveAnimal:
     def open(
         cls, build: Path, *, home: Path | None = None, seed: int = 0, device: str = "cpu"
     ) -> "LiveAnimal":
-        """Open `build/<agent>`, in the home of another build where ``home`` is given; raises as
-        `AnimalWorld.load`.
-        """
-        world = AnimalWorld.load(
-            build, EnvironmentConfig(), homes=() if home is None else (home,), device=device
-        )
-        animals = world.animals
-        simulator = Simulator(
-            animals.sampler,
-            world.data,
-            world.scenes,
-            animals.ego,
-            sampling=animals.sampling,
-            chaining=animals.chaining,
-        )
-        return cls(simulator, seed)
+        """Open `build/<agent>`, in the home of another build if given; raises as `AnimalWorld.load`."""
+        homes = () if home is None else (home,)
+        world = AnimalWorld.load(build, EnvironmentConfig(), homes=homes, device=device)
+        animals, where = world.animals, (world.data, world.scenes)
+        settings = {"sampling": animals.sampling, "chaining": animals.chaining}
+        return cls(Simulator(animals.sampler, *where, animals.ego, **settings), seed)
 
     def reset(self, seed: int) -> None:
         """Begin again at time 0."""
@@ -84,9 +74,8 @@ class LiveAnimal:
         place = np.asarray(observer_world, float)
         if not np.isfinite([seconds, *place]).all() or seconds < 0:
             what = f"cannot let {seconds} s pass with an observer at {place.tolist()}"
-            raise InputError(
-                "SIM-012", what, "advance", "give seconds and a position of three finite numbers"
-            )
+            remedy = "give seconds and a position of three finite numbers"
+            raise InputError("SIM-012", what, "advance", remedy)
         self.time_s += seconds
         while self.after.time_s < self.time_s - 1e-9:
             self.before, self.after = self.after, self.simulator.step(place)

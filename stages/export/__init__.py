@@ -1,3 +1,1 @@
-"""Files for other programs, one format at a time: what is lost on the way and what opens them stands beside
-them.
-"""
+"""Files for other programs, one format at a time, with what is lost on the way and what opens them."""

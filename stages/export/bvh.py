@@ -1,11 +1,10 @@
-"""Motion capture files, two kinds: flat (six channels a joint, exact) and a fitted tree (rotations about
-pivots).
+"""Motion capture files: flat (six channels a joint, exact), and a fitted tree (rotations about pivots).
 
-The tree: for each pair of bones the point that both carry along most alike over all motions (least squares)
-is their pivot; a minimum spanning tree over what is left apart joins the bones; what the tree loses is
-reported.
+The tree: for each pair of bones the point that both carry most alike over all motions (least squares) is
+their pivot; a minimum spanning tree over what is left apart joins the bones; its loss is reported.
 """
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from stages.export.writing import ExportRecord
 _ORDER = "ZXY"
 _ROOT_CHANNELS = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
 _TURN_CHANNELS = "CHANNELS 3 Zrotation Xrotation Yrotation"
+_END_SITE = ("End Site", "{", "OFFSET 0 0 0.02", "}")
 _PULL_TO_MIDDLE = 1e-4
 _FITTED_FRAMES = 400
 
@@ -45,56 +45,41 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
     tree = fitted_tree(recorded[chosen] @ rigid.inverse(rest), rest)
     exact, lost = [], []
     for action in agent.actions:
-        (folder / f"{action.name}.flat.bvh").write_text(flat(action, names))
-        (folder / f"{action.name}.tree.bvh").write_text(treelike(action, tree, rest, names))
-        truth = action.world_from_agent[:, None] @ action.agent_from_bone
-        exact.append(read_places(folder / f"{action.name}.flat.bvh", names) - truth[..., :3, 3])
-        lost.append(
-            read_places(folder / f"{action.name}.tree.bvh", [f"{name}_centre" for name in names])
-            - truth[..., :3, 3]
-        )
-    distances = {"flat": np.concatenate(exact), "tree": np.concatenate(lost)}
+        flat_file, tree_file = (folder / f"{action.name}.{kind}.bvh" for kind in ("flat", "tree"))
+        flat_file.write_text(flat(action, names))
+        tree_file.write_text(treelike(action, tree, rest, names))
+        truth = (action.world_from_agent[:, None] @ action.agent_from_bone)[..., :3, 3]
+        exact.append(read_places(flat_file, names) - truth)
+        lost.append(read_places(tree_file, [f"{name}_centre" for name in names]) - truth)
     loss: dict[str, float] = dict(agent.retargeting_loss_mm)
-    for kind, apart in distances.items():
-        apart_mm = 1000 * np.linalg.norm(apart, axis=-1)
-        loss |= {
-            f"{kind}_mean": round(float(apart_mm.mean()), 4),
-            f"{kind}_max": round(float(apart_mm.max()), 4),
-        }
-    remark = (
-        "metres, +y up, rotations in the order Z X Y; give 1.0 as the scale; distances of the bones' centres"
-    )
+    for kind, apart in (("flat", exact), ("tree", lost)):
+        apart_mm = 1000 * np.linalg.norm(np.concatenate(apart), axis=-1)
+        loss[f"{kind}_mean"] = round(float(apart_mm.mean()), 4)
+        loss[f"{kind}_max"] = round(float(apart_mm.max()), 4)
+    remark = "metres, +y up, rotations in the order Z X Y; give 1.0 as the scale; distances of bones' centres"
     return ExportRecord("own writer", loss, "own reader, with forward kinematics", remark)
 
 
 def fitted_tree(
     posed_from_rest: Float[np.ndarray, "frame bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
 ) -> Tree:
-    """Find pivots and the tree that is torn least."""
+    """Find pivots and the tree whose joints are left least apart."""
     count = posed_from_rest.shape[1]
-    pivots, torn = np.zeros((count, count, 3)), np.zeros((count, count))
-    for first in range(count):
-        for second in range(first + 1, count):
-            pivots[first, second], torn[first, second] = _pivot(
-                posed_from_rest[:, first], posed_from_rest[:, second], rest[[first, second]]
-            )
-    links = minimum_spanning_tree(torn)
+    pivots, gap = np.zeros((count, count, 3)), np.zeros((count, count))
+    for first, second in itertools.combinations(range(count), 2):
+        moved = posed_from_rest[:, first], posed_from_rest[:, second]
+        pivots[first, second], gap[first, second] = _pivot(*moved, rest[[first, second]])
+    links = minimum_spanning_tree(gap)
     root = int(np.linalg.norm(rest[:, :3, 3], axis=1).argmin())
     order, before = breadth_first_order(links, root, directed=False)
     parent = [int(before[bone]) if bone != root else -1 for bone in range(count)]
-    pivot = np.stack(
-        [
-            rest[root, :3, 3] if bone == root else pivots[min(bone, parent[bone]), max(bone, parent[bone])]
-            for bone in range(count)
-        ]
-    )
-    return Tree(parent, [int(bone) for bone in order], pivot)
+    pivot = np.stack([pivots[min(pair), max(pair)] for pair in enumerate(parent)])
+    pivot[root] = rest[root, :3, 3]
+    return Tree(parent, order.tolist(), pivot)
 
 
 def _pivot(first: np.ndarray, second: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point at rest that two moving bones keep nearest together, and the squared distance left,
-    metres².
-    """
+    """Return the point at rest that two moving bones keep nearest together, and what is left, metres²."""
     turn, shift = first[:, :3, :3] - second[:, :3, :3], first[:, :3, 3] - second[:, :3, 3]
     middle = rest[:, :3, 3].mean(0)
     gram = np.einsum("fki,fkj->ij", turn, turn) / len(turn) + _PULL_TO_MIDDLE * np.eye(3)
@@ -108,26 +93,14 @@ def flat(action: Action, names: list[str]) -> str:
     """Every bone beneath the root with six channels: nothing is lost."""
     lines = ["HIERARCHY", "ROOT agent", "{", "OFFSET 0 0 0", _ROOT_CHANNELS]
     for name in names:
-        lines += [
-            f"JOINT {name}",
-            "{",
-            "OFFSET 0 0 0",
-            _ROOT_CHANNELS,
-            "End Site",
-            "{",
-            "OFFSET 0 0 0.02",
-            "}",
-            "}",
-        ]
+        lines += [f"JOINT {name}", "{", "OFFSET 0 0 0", _ROOT_CHANNELS, *_END_SITE, "}"]
     poses = np.concatenate([action.world_from_agent[:, None], action.agent_from_bone], 1)
     channels = np.concatenate([poses[..., :3, 3], _turns(poses[..., :3, :3])], -1)
     return _text([*lines, "}"], action, channels.reshape(len(poses), -1))
 
 
 def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], names: list[str]) -> str:
-    """A joint per bone, at its pivot; all zero is the pose at rest. Each bone's centre is an end named
-    `<bone>_centre`.
-    """
+    """A joint per bone, at its pivot; all zero is the pose at rest. An end `<bone>_centre` is its centre."""
     lines = ["HIERARCHY"]
     root = tree.order[0]
     written: list[int] = []
@@ -138,22 +111,17 @@ def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], na
         lines.extend([f"{kind} {names[bone]}", "{", _offset(offset), channels])
         for child in (other for other in tree.order if tree.parent[other] == bone):
             put(child, tree.pivot_agent[child] - tree.pivot_agent[bone])
-        lines.extend(
-            [f"JOINT {names[bone]}_centre", "{", _offset(rest[bone, :3, 3] - tree.pivot_agent[bone])]
-        )
-        lines.extend(["CHANNELS 0", "End Site", "{", "OFFSET 0 0 0.02", "}", "}", "}"])
+        centre = _offset(rest[bone, :3, 3] - tree.pivot_agent[bone])
+        lines.extend([f"JOINT {names[bone]}_centre", "{", centre, "CHANNELS 0", *_END_SITE, "}", "}"])
 
     put(root, np.zeros(3))
     motion = action.agent_from_bone @ rigid.inverse(rest)
     world = action.world_from_agent[:, None, :3, :3] @ motion[..., :3, :3]
-    columns = [action.world_from_agent[:, :3, :3] @ action.agent_from_bone[:, root, :3, 3, None]]
-    columns = [columns[0][..., 0] + action.world_from_agent[:, :3, 3]]
+    centre = action.world_from_agent[:, :3, :3] @ action.agent_from_bone[:, root, :3, 3, None]
+    columns = [centre[..., 0] + action.world_from_agent[:, :3, 3]]
     for bone in written:
-        if bone == root:
-            local = world[:, bone]
-        else:
-            local = np.swapaxes(world[:, tree.parent[bone]], 1, 2) @ world[:, bone]
-        columns.append(_turns(local))
+        parent = np.eye(3) if bone == root else np.swapaxes(world[:, tree.parent[bone]], 1, 2)
+        columns.append(_turns(parent @ world[:, bone]))
     return _text(lines, action, np.concatenate(columns, 1))
 
 
@@ -177,11 +145,9 @@ def read_places(path: Path, names: list[str]) -> Float[np.ndarray, "frame joint 
             case "CHANNELS":
                 count = int(rest[0])
                 values, column = rows[:, column : column + count], column + count
-                place = values[:, :3] if count == 6 else np.zeros((len(rows), 3))
+                place, turn = values[:, :3] if count == 6 else np.zeros((len(rows), 3)), np.eye(3)
                 if count:
                     turn = Rotation.from_euler(_ORDER, values[:, -3:], degrees=True).as_matrix()
-                else:
-                    turn = np.eye(3)
                 stack[-1] = stack[-1] @ rigid.make(np.broadcast_to(turn, (len(rows), 3, 3)), place)
                 places[name] = stack[-1][:, :3, 3]
             case "}":

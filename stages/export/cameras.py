@@ -1,5 +1,4 @@
-"""Pictures with their cameras, for training radiance fields elsewhere: nerfstudio's `transforms.json` and
-COLMAP's model.
+"""Pictures with their cameras, for training radiance fields: nerfstudio's `transforms.json`, COLMAP's model.
 
 Both copy recorded pictures: they are written only where asked for by name.
 """
@@ -15,6 +14,7 @@ from jaxtyping import Float
 from pipeline.data import images
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.subsampling import evenly
 from stages.export.reading import CameraFrame
 from stages.export.writing import ExportRecord, version
 
@@ -24,9 +24,7 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_nerfstudio(folder: Path, frames: list[CameraFrame]) -> ExportRecord:
-    """Write `transforms.json` (OpenGL camera-to-world), pictures, depth in millimetres (0 = unknown), masks
-    without the animal.
-    """
+    """Write `transforms.json` (OpenGL camera-to-world), pictures, depth in millimetres, masks of the room."""
     for name in ("images", "depth", "masks"):
         (folder / name).mkdir()
     entries = []
@@ -34,10 +32,8 @@ def write_nerfstudio(folder: Path, frames: list[CameraFrame]) -> ExportRecord:
         height, width = _write_picture(folder, frame)
         _write_depth(folder / f"depth/{frame.name}.png", frame.depth, width, height)
         agent = frame.agent_mask
-        images.write_gray(
-            folder / f"masks/{frame.name}.png",
-            np.full((height, width), 255, np.uint8) if agent is None else 255 - agent,
-        )
+        mask = np.full((height, width), 255, np.uint8) if agent is None else 255 - agent
+        images.write_gray(folder / f"masks/{frame.name}.png", mask)
         k = frame.intrinsics
         entries.append(
             {
@@ -50,19 +46,13 @@ def write_nerfstudio(folder: Path, frames: list[CameraFrame]) -> ExportRecord:
         )  # fmt: skip
     table = {"camera_model": "OPENCV", "k1": 0, "k2": 0, "p1": 0, "p2": 0, "frames": entries}
     (folder / "transforms.json").write_text(json.dumps(table, indent=1) + "\n")
-    for entry in json.loads((folder / "transforms.json").read_bytes())["frames"]:
-        assert (folder / entry["file_path"]).exists() and (folder / entry["depth_file_path"]).exists()
-    remark = (
-        "OpenGL cameras, metres, +y up; depth PNG in millimetres, 0 = unknown, at the picture's size; "
-        "masks are black on the animal"
-    )
+    depth = "depth PNG in millimetres, 0 = unknown, at the picture's size"
+    remark = f"OpenGL cameras, metres, +y up; {depth}; masks are black on the animal"
     return ExportRecord("own writer", {}, "own reader", remark)
 
 
 def write_colmap(folder: Path, frames: list[CameraFrame], room: Mesh) -> ExportRecord:
-    """Write `images/`, `masks/` and `sparse/0/` (text model, world-to-camera), with points of the room's
-    surface.
-    """
+    """Write `images/`, `masks/` and `sparse/0/` (text model, world-to-camera), with points of the room."""
     for name in ("images", "masks", "sparse/0"):
         (folder / name).mkdir(parents=True)
     cameras, pictures = [], []
@@ -72,15 +62,12 @@ def write_colmap(folder: Path, frames: list[CameraFrame], room: Mesh) -> ExportR
         if agent is not None:
             images.write_gray(folder / f"masks/{frame.name}.jpg.png", 255 - agent)
         k = frame.intrinsics
-        cameras.append(
-            f"{number} PINHOLE {width} {height} {k[0, 0]:.9g} {k[1, 1]:.9g} {k[0, 2]:.9g} {k[1, 2]:.9g}"
-        )
+        lens = f"{k[0, 0]:.9g} {k[1, 1]:.9g} {k[0, 2]:.9g} {k[1, 2]:.9g}"
+        cameras.append(f"{number} PINHOLE {width} {height} {lens}")
         camera_from_world = rigid.inverse(frame.world_from_camera)
         pose = [*rigid.quaternion_from_rotation(camera_from_world[:3, :3]), *camera_from_world[:3, 3]]
         pictures += [f"{number} {' '.join(f'{value:.12g}' for value in pose)} {number} {frame.name}.jpg", ""]
-    chosen = np.unique(
-        np.linspace(0, len(room.vertices) - 1, min(COLMAP_POINTS, len(room.vertices))).astype(int)
-    )
+    chosen = evenly(len(room.vertices), COLMAP_POINTS)
     color = np.full((len(room.vertices), 3), 128, np.uint8) if room.color is None else room.color
     cloud = [
         " ".join([str(number), *(f"{value:.6f}" for value in room.vertices[at]), *map(str, color[at]), "0"])
@@ -88,13 +75,9 @@ def write_colmap(folder: Path, frames: list[CameraFrame], room: Mesh) -> ExportR
     ]
     for name, lines in {"cameras": cameras, "images": pictures, "points3D": cloud}.items():
         (folder / f"sparse/0/{name}.txt").write_text("\n".join([*lines, ""]))
-    loss_mm = 1000 * _opened(folder / "sparse/0", frames)
-    return ExportRecord(
-        "own writer",
-        {"camera_places": round(loss_mm, 6)},
-        version("pycolmap"),
-        "COLMAP's masks are black where features are ignored",
-    )
+    loss = {"camera_places": round(1000 * _opened(folder / "sparse/0", frames), 6)}
+    remark = "COLMAP's masks are black where features are ignored"
+    return ExportRecord("own writer", loss, version("pycolmap"), remark)
 
 
 def _opened(model: Path, frames: list[CameraFrame]) -> float:
@@ -102,10 +85,8 @@ def _opened(model: Path, frames: list[CameraFrame]) -> float:
     found = pycolmap.Reconstruction(str(model))
     places = {image.name: image.projection_center() for image in found.images.values()}
     assert len(places) == len(frames), (len(places), len(frames))
-    return max(
-        float(np.linalg.norm(places[f"{frame.name}.jpg"] - frame.world_from_camera[:3, 3]))
-        for frame in frames
-    )
+    apart = [places[f"{frame.name}.jpg"] - frame.world_from_camera[:3, 3] for frame in frames]
+    return float(np.linalg.norm(apart, axis=1).max())
 
 
 def _write_picture(folder: Path, frame: CameraFrame) -> tuple[int, int]:
@@ -118,7 +99,5 @@ def _write_picture(folder: Path, frame: CameraFrame) -> tuple[int, int]:
 
 def _write_depth(path: Path, depth: Float[np.ndarray, "height width"], width: int, height: int) -> None:
     enlarged = cv2.resize(depth.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
-    millimetres = np.clip(np.rint(np.where(np.isfinite(enlarged), enlarged, 0) * 1000), 0, 65535).astype(
-        np.uint16
-    )
-    path.write_bytes(cv2.imencode(".png", millimetres)[1].tobytes())
+    millimetres = np.clip(np.rint(np.where(np.isfinite(enlarged), enlarged, 0) * 1000), 0, 65535)
+    path.write_bytes(cv2.imencode(".png", millimetres.astype(np.uint16))[1].tobytes())

@@ -16,8 +16,6 @@ class Config:
     rate_hz: float = 30.0
     """keys of animations, per second"""
     influences: Influences = "4"
-    """bones that move a vertex in glb and usd: four, which every player blends, or eight, with a smaller loss
-    """
+    """bones that move a vertex in glb and usd: four, which every player blends, or eight, with less loss"""
     pictures_per_video: int = 150
-    """frames of each recording for nerfstudio and colmap, evenly spread; only these two formats hold pictures
-    """
+    """frames of each recording, evenly spread, for nerfstudio and colmap, which alone hold pictures"""

@@ -18,10 +18,6 @@ def write(folder: Path, agent: Agent, scene: bytes) -> ExportRecord:
     for content in (data, scene):
         opened = trimesh.load_scene(io.BytesIO(content), file_type="glb")
         assert len(opened.geometry) == 1, "one surface a file"
-    loss = agent.loss_mm
-    influences = agent.skin.joints.shape[1]
-    remark = (
-        f"metres, +y up; joints are siblings under one root; {influences} influences a vertex; "
-        "one action per motion"
-    )
-    return ExportRecord(version("pygltflib"), loss, version("trimesh"), remark)
+    influences = f"{agent.skin.joints.shape[1]} influences a vertex"
+    remark = f"metres, +y up; joints are siblings under one root; {influences}; one action per motion"
+    return ExportRecord(version("pygltflib"), agent.loss_mm, version("trimesh"), remark)

@@ -15,38 +15,30 @@ from pipeline.geometry import rigid
 from stages.export.reading import Agent, Occupancy
 from stages.export.writing import ExportRecord, extra, version
 
-_ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def write(folder: Path, agent: Agent, occupancy: Occupancy) -> ExportRecord:
     """Write `agent.xml` (z up, as MuJoCo has it) and `motions.npz`; compile the model and pose it."""
     mujoco = extra("mujoco", "mujoco")
-    poses = {
-        action.name: _ZUP_FROM_WORLD @ action.world_from_agent[:, None] @ action.agent_from_bone
-        for action in agent.actions
-    }
-    first = next(iter(poses.values()))[0]
-    (folder / "agent.xml").write_text(model(agent, first, boxes(occupancy.solid), occupancy))
-    motions: dict[str, np.ndarray] = {}
+    motions, poses = {}, []
     for action in agent.actions:
+        poses.append(ZUP_FROM_WORLD @ action.world_from_agent[:, None] @ action.agent_from_bone)
         motions[f"{action.name}/time_s"] = action.time_s
-        motions[f"{action.name}/mocap_pos"] = poses[action.name][..., :3, 3]
-        motions[f"{action.name}/mocap_quat"] = rigid.quaternion_from_rotation(poses[action.name][..., :3, :3])
-    npz.save(folder / "motions.npz", compress=False, **motions)
+        motions[f"{action.name}/mocap_pos"] = poses[-1][..., :3, 3]
+        motions[f"{action.name}/mocap_quat"] = rigid.quaternion_from_rotation(poses[-1][..., :3, :3])
+    (folder / "agent.xml").write_text(model(agent, poses[0][0], boxes(occupancy.solid), occupancy))
+    npz.save(folder / "motions.npz", **motions)
     loss = agent.loss_mm
     loss["bodies"] = round(1000 * _posed(mujoco, folder / "agent.xml", motions, agent.actions[0].name), 4)
     loss["room_voxel"] = 1000 * occupancy.voxel_m
-    remark = (
-        "metres, +z up; drive data.mocap_pos and data.mocap_quat with motions.npz; "
-        "the room's boxes are as coarse as its voxels"
-    )
+    driven = "drive data.mocap_pos and data.mocap_quat with motions.npz"
+    remark = f"metres, +z up; {driven}; the room's boxes are as coarse as its voxels"
     return ExportRecord(version("mujoco"), loss, version("mujoco"), remark)
 
 
 def boxes(solid: Bool[np.ndarray, "x y z"]) -> Int[np.ndarray, "box 2 3"]:
-    """Cover solid voxels by few boxes that do not overlap: lowest and highest voxel (exclusive) of each,
-    greedily.
-    """
+    """Cover solid voxels greedily by few disjoint boxes: lowest and highest voxel (exclusive) of each."""
     left, found = solid.copy(), []
     while left.any():
         low = np.array(np.unravel_index(left.argmax(), left.shape))
@@ -85,26 +77,19 @@ def model(
         if len(moved):
             bound = f'bindpos="{_row(rest[bone, :3, 3])}" bindquat="{_row(rest_turns[bone])}"'
             vertices = " ".join(map(str, moved))
-            bones.append(
-                f'<bone body="{name}" {bound} vertid="{vertices}" vertweight="{_row(weight[moved])}"/>'
-            )
+            moving = f'vertid="{vertices}" vertweight="{_row(weight[moved])}"'
+            bones.append(f'<bone body="{name}" {bound} {moving}/>')
     vertices, faces = _row(agent.mesh.vertices.ravel()), " ".join(map(str, agent.mesh.faces.ravel()))
     color = _row((np.full(3, 150) if agent.mesh.color is None else agent.mesh.color.mean(0)) / 255)
-    return "\n".join(
-        [
-            '<mujoco model="agent">',
-            '<visual><headlight ambient="0.4 0.4 0.4"/></visual>',
-            f'<deformable><skin name="agent" rgba="{color} 1" vertex="{vertices}" face="{faces}">',
-            *bones,
-            "</skin></deformable>",
-            "<worldbody>",
-            *_room(room, occupancy),
-            *bodies,
-            "</worldbody>",
-            "</mujoco>",
-            "",
-        ]
-    )
+    lines = [
+        '<mujoco model="agent">',
+        '<visual><headlight ambient="0.4 0.4 0.4"/></visual>',
+        f'<deformable><skin name="agent" rgba="{color} 1" vertex="{vertices}" face="{faces}">',
+        *(*bones, "</skin></deformable>"),
+        *("<worldbody>", *_room(room, occupancy), *bodies, "</worldbody>"),
+        *("</mujoco>", ""),
+    ]
+    return "\n".join(lines)
 
 
 def _room(room: Int[np.ndarray, "box 2 3"], occupancy: Occupancy) -> list[str]:
@@ -112,15 +97,13 @@ def _room(room: Int[np.ndarray, "box 2 3"], occupancy: Occupancy) -> list[str]:
     for low, high in room:
         middle = occupancy.origin + (low + high) / 2 * occupancy.voxel_m
         half = (high - low) / 2 * occupancy.voxel_m
-        place, size = _row(_ZUP_FROM_WORLD[:3, :3] @ middle), _row(half[[0, 2, 1]])
+        place, size = _row(ZUP_FROM_WORLD[:3, :3] @ middle), _row(half[[0, 2, 1]])
         lines.append(f'<geom type="box" pos="{place}" size="{size}" rgba="0.8 0.78 0.74 1"/>')
     return lines
 
 
 def _posed(mujoco: Any, path: Path, motions: dict[str, np.ndarray], name: str) -> float:
-    """Compile the file, put a key of a motion into it, and return how far bodies are from where they belong,
-    metres.
-    """
+    """Compile the file, pose it, return how far bodies are from where they belong, metres."""
     compiled = mujoco.MjModel.from_xml_path(str(path))
     assert compiled.nskin == 1, "the animal's skin"
     data = mujoco.MjData(compiled)

@@ -1,6 +1,4 @@
-"""Open what is exported: the skinned animal with its motions, sessions frame by frame, pictures with their
-cameras.
-"""
+"""Open what is exported: the skinned animal with its motions, sessions, pictures with their cameras."""
 
 import json
 from collections.abc import Mapping
@@ -11,11 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.errors import other_versions_refused
-from pipeline.data import gaussian_ply, images, npz
+from pipeline.data import gaussian_ply, images, motion, npz
 from pipeline.data import glb as gltf
 from pipeline.data.glb import Action, Skin
+from pipeline.data.motion import Motion
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.subsampling import evenly
 from stages.export.config import Influences
 
 
@@ -34,23 +34,8 @@ class Agent:
     @property
     def loss_mm(self) -> dict[str, float]:
         """Return what any format loses of the reconstruction."""
-        return {
-            f"skinning_{name}": value for name, value in self.skinning_loss_mm.items()
-        } | self.retargeting_loss_mm
-
-
-@dataclass(frozen=True)
-class Session:
-    """One recording, frame by frame, as reconstructed."""
-
-    video: str
-    timestamp_s: Float[np.ndarray, " frame"]
-    world_from_agent: Float[np.ndarray, "frame 4 4"]
-    """NaN where the animal was never recoverable"""
-    world_from_camera: Float[np.ndarray, "frame 4 4"]
-    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
-    confidence: Float[np.ndarray, " frame"]
-    visible: Bool[np.ndarray, " frame"]
+        skinning = {f"skinning_{name}": value for name, value in self.skinning_loss_mm.items()}
+        return skinning | self.retargeting_loss_mm
 
 
 @dataclass(frozen=True)
@@ -97,9 +82,7 @@ class Occupancy:
 
 
 def agent(simulator: Path, take: Path | None, rate_hz: float, influences: Influences = "4") -> Agent:
-    """Read the animal from `agent.glb`; a generated take becomes one motion more. Keys are resampled to
-    `rate_hz`.
-    """
+    """Read the animal from `agent.glb`, keys resampled to `rate_hz`; a generated take is one motion more."""
     with other_versions_refused("simulator", str(simulator)):
         mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
         residual_mm = json.loads((simulator / "simulator.json").read_bytes())["agent"]
@@ -119,21 +102,9 @@ def room(simulator: Path) -> Mesh:
         return gltf.read_static((simulator / "scene.glb").read_bytes())
 
 
-def sessions(reconstruction: Path) -> list[Session]:
-    """Read every session's motion, in id order."""
-    found = []
-    for file in sorted(reconstruction.glob("*/motion.npz")):
-        table = npz.load(file)
-        keys = (
-            "timestamp_s",
-            "world_from_agent",
-            "world_from_camera",
-            "agent_from_bone",
-            "confidence",
-            "agent_visible",
-        )
-        found.append(Session(file.parent.name, *(table[key] for key in keys)))
-    return found
+def sessions(reconstruction: Path) -> dict[str, Motion]:
+    """Read every session's motion, in id order; NaN where the animal was never recoverable."""
+    return {file.parent.name: motion.load(file) for file in sorted(reconstruction.glob("*/motion.npz"))}
 
 
 def camera_frames(
@@ -142,23 +113,16 @@ def camera_frames(
     """Choose frames with a known camera from the walk-through and all sessions, evenly spread over each."""
     found = []
     for video, folder in frames.items():
-        motion = reconstruction / video / "motion.npz"
-        motion = motion if motion.exists() else reconstruction / "templates" / f"{video}.npz"
-        if not motion.exists() or (
-            video in masks and motion.parent.name == "templates"
-        ):  # the turnaround has a world of its own
+        file = reconstruction / video / "motion.npz"
+        if not file.exists() and video not in masks:  # the turnaround has a world of its own
+            file = reconstruction / "templates" / f"{video}.npz"
+        if not file.exists():
             continue
-        cameras = npz.load(motion, ("world_from_camera",))["world_from_camera"]
+        cameras = npz.load(file, ("world_from_camera",))["world_from_camera"]
         intrinsics = npz.load(folder / "frames.npz", ("intrinsics",))["intrinsics"]
         known = np.flatnonzero(np.isfinite(cameras).all((1, 2)))
-        chosen = (
-            known[np.unique(np.linspace(0, len(known) - 1, min(per_video, len(known))).round().astype(int))]
-            if len(known)
-            else known
-        )
-        found += [
-            CameraFrame(video, int(i), cameras[i], intrinsics[i], folder, masks.get(video)) for i in chosen
-        ]
+        chosen, mask = known[evenly(len(known), per_video, rounded=True)], masks.get(video)
+        found += [CameraFrame(video, int(i), cameras[i], intrinsics[i], folder, mask) for i in chosen]
     return found
 
 
@@ -176,9 +140,7 @@ def gaussians(splats: Path) -> dict[str, Float[np.ndarray, "point 62"]]:
 def _resampled(action: Action, rate_hz: float) -> Action:
     count = int(np.floor((action.time_s[-1] - action.time_s[0]) * rate_hz + 1e-4)) + 1
     query_s = np.minimum(action.time_s[0] + np.arange(count) / rate_hz, action.time_s[-1])
-    bones = [
-        rigid.interpolate(action.time_s, action.agent_from_bone[:, b], query_s)
-        for b in range(action.agent_from_bone.shape[1])
-    ]
+    tracks = np.swapaxes(action.agent_from_bone, 0, 1)
+    bones = [rigid.interpolate(action.time_s, track, query_s) for track in tracks]
     root = rigid.interpolate(action.time_s, action.world_from_agent, query_s)
     return Action(action.name, query_s - query_s[0], root, np.stack(bones, 1))

@@ -13,18 +13,12 @@ _OPACITY, _ROTATION = 54, slice(58, 62)
 
 
 def write(folder: Path, clouds: dict[str, Float[np.ndarray, "point 62"]]) -> ExportRecord:
-    """Write `scene.ply` (world frame) and `agent.ply` (agent frame, at rest) without broken and invisible
-    rows.
-    """
+    """Write `scene.ply` (world frame) and `agent.ply` (agent frame, at rest) without invisible rows."""
     for name, rows in clouds.items():
         opacity = 1 / (1 + np.exp(-rows[:, _OPACITY].astype(np.float64)))
         valid = rows[np.isfinite(rows).all(1) & (opacity >= 1 / 255)].copy()
         valid[:, _ROTATION] /= np.linalg.norm(valid[:, _ROTATION], axis=1, keepdims=True)
         gaussian_ply.write(folder / f"{name}.ply", valid)
         assert len(gaussians.load_ply(folder / f"{name}.ply")) == len(valid)
-    return ExportRecord(
-        "own writer",
-        {},
-        "the project's own reader; the layout is that of the 3DGS reference viewer",
-        "metres, +y up",
-    )
+    reader = "the project's own reader; the layout is that of the 3DGS reference viewer"
+    return ExportRecord("own writer", {}, reader, "metres, +y up")

@@ -25,9 +25,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path) -> writing.ExportRecord:
-    """Write the format's files and `export.json` into ``out``. Raises InputError EXP-010 where a library is
-    missing.
-    """
+    """Write the format's files and `export.json` into ``out``. Raises EXP-010 where a library is missing."""
     match config.format:
         case "glb":
             record = glb.write(out, _agent(inputs, config), (inputs.simulator / "scene.glb").read_bytes())
@@ -64,6 +62,5 @@ def _agent(inputs: Inputs, config: Config) -> reading.Agent:
 
 
 def _frames(inputs: Inputs, config: Config) -> list[reading.CameraFrame]:
-    return reading.camera_frames(
-        inputs.reconstruction, inputs.frames, inputs.masks, config.pictures_per_video
-    )
+    per_video = config.pictures_per_video
+    return reading.camera_frames(inputs.reconstruction, inputs.frames, inputs.masks, per_video)

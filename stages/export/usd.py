@@ -1,6 +1,4 @@
-"""Universal Scene Description: the animal as SkelRoot with one SkelAnimation per motion, and the room as a
-mesh.
-"""
+"""Universal Scene Description: the animal as SkelRoot with a SkelAnimation per motion, the room as a mesh."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,9 +18,8 @@ _ROOT = "root"
 
 def write(folder: Path, agent: Agent, room: Mesh) -> ExportRecord:
     """Write `agent_<motion>.usdc`, one per motion, and `scene.usdc`."""
-    pxr = SimpleNamespace(
-        **{name: extra(f"pxr.{name}", "usd-core") for name in ("Gf", "Usd", "UsdGeom", "UsdSkel", "Vt")}
-    )
+    modules = ("Gf", "Usd", "UsdGeom", "UsdSkel", "Vt")
+    pxr = SimpleNamespace(**{name: extra(f"pxr.{name}", "usd-core") for name in modules})
     worst_mm = 0.0
     for action in agent.actions:
         path = folder / f"agent_{action.name}.usdc"
@@ -31,10 +28,8 @@ def write(folder: Path, agent: Agent, room: Mesh) -> ExportRecord:
     stage = _stage(pxr, folder / "scene.usdc")
     stage.SetDefaultPrim(_mesh(pxr, stage, "/scene", room).GetPrim())
     stage.Save()
-    loss = agent.loss_mm | {"joints": round(worst_mm, 4)}
-    return ExportRecord(
-        version("usd-core"), loss, f"UsdSkel of {version('usd-core')}", "metres, +y up, time codes in frames"
-    )
+    library, loss = version("usd-core"), agent.loss_mm | {"joints": round(worst_mm, 4)}
+    return ExportRecord(library, loss, f"UsdSkel of {library}", "metres, +y up, time codes in frames")
 
 
 def _stage(pxr: Any, path: Path) -> Any:
@@ -80,18 +75,16 @@ def _write_agent(pxr: Any, path: Path, agent: Agent, action: Action) -> None:
     surface = _mesh(pxr, stage, "/agent/surface", agent.mesh)
     binding = pxr.UsdSkel.BindingAPI.Apply(surface.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    binding.CreateJointIndicesPrimvar(False, agent.skin.joints.shape[1]).Set(
-        pxr.Vt.IntArray.FromNumpy(agent.skin.joints.reshape(-1).astype(np.int32) + 1)
-    )
-    binding.CreateJointWeightsPrimvar(False, agent.skin.joints.shape[1]).Set(
-        pxr.Vt.FloatArray.FromNumpy(agent.skin.weights.reshape(-1).astype(np.float32))
-    )
+    influences = agent.skin.joints.shape[1]
+    bones = pxr.Vt.IntArray.FromNumpy(agent.skin.joints.reshape(-1).astype(np.int32) + 1)
+    weights = pxr.Vt.FloatArray.FromNumpy(agent.skin.weights.reshape(-1).astype(np.float32))
+    binding.CreateJointIndicesPrimvar(False, influences).Set(bones)
+    binding.CreateJointWeightsPrimvar(False, influences).Set(weights)
     binding.CreateGeomBindTransformAttr(pxr.Gf.Matrix4d(1))
     animation = pxr.UsdSkel.Animation.Define(stage, "/agent/motion")
     _keys(pxr, animation, joints, action)
-    pxr.UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
-        [animation.GetPath()]
-    )
+    animated = pxr.UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel()
+    animated.SetTargets([animation.GetPath()])
     stage.Save()
 
 
@@ -102,16 +95,13 @@ def _keys(pxr: Any, animation: Any, joints: list[str], action: Action) -> None:
     animation.CreateScalesAttr([pxr.Gf.Vec3h(1, 1, 1)] * len(joints))
     places, rotations = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr()
     for frame in range(len(poses)):
-        places.Set(
-            pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(poses[frame, :, :3, 3], np.float32)), frame
-        )
+        place = np.ascontiguousarray(poses[frame, :, :3, 3], np.float32)
+        places.Set(pxr.Vt.Vec3fArray.FromNumpy(place), frame)
         rotations.Set(pxr.Vt.QuatfArray([pxr.Gf.Quatf(*map(float, turn)) for turn in turns[frame]]), frame)
 
 
 def _opened(pxr: Any, path: Path, action: Action) -> float:
-    """Open the file as a player would and return how far joints are from where they belong, metres, in one
-    pose.
-    """
+    """Open the file as a player would; return how far joints of one pose are from their places, metres."""
     stage = pxr.Usd.Stage.Open(str(path))
     cache = pxr.UsdSkel.Cache()
     cache.Populate(pxr.UsdSkel.Root(stage.GetPrimAtPath("/agent")), pxr.Usd.PrimDefaultPredicate)

@@ -29,12 +29,8 @@ def extra(module: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(
-            "EXP-010",
-            f"this format needs {package}: {error}",
-            "the Python environment",
-            "install it: make extras",
-        ) from error
+        what = f"this format needs {package}: {error}"
+        raise InputError("EXP-010", what, "the Python environment", "install it: make extras") from error
 
 
 def version(package: str) -> str:
@@ -44,11 +40,8 @@ def version(package: str) -> str:
 
 def write_record(folder: Path, name: str, record: ExportRecord) -> None:
     """Write `export.json` beside the files."""
-    files = {
-        path.relative_to(folder).as_posix(): path.stat().st_size
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in found}
     pictures = [file for file in files if file.endswith((".jpg", ".png"))]
     listed = {file: size for file, size in files.items() if file not in pictures}
     table = {"format": name, **asdict(record), "files": listed, "pictures": len(pictures)}

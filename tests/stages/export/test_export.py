@@ -13,6 +13,7 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.data import glb, images, npz
 from pipeline.data.glb import Action, Skin
+from pipeline.data.motion import Motion
 from pipeline.geometry import rigid
 from stages.export import bvh, cameras, mjcf, neuro, reading, retarget, splats, tables, usd, writing
 from stages.export import glb as glb_export
@@ -49,15 +50,14 @@ def tube(influences: int) -> reading.Agent:
 
 
 @pytest.fixture
-def session() -> reading.Session:
+def session() -> Motion:
     track = small_world.trajectory(15, 0)
     agent = track.world_from_agent.copy()
     agent[4] = np.nan
-    return reading.Session(
-        "v002",
+    return Motion(
         track.timestamp_s,
-        agent,
         track.world_from_camera,
+        agent,
         track.agent_from_bone,
         np.full(15, 0.9),
         np.isfinite(agent).all((1, 2)),
@@ -181,7 +181,7 @@ def test_splats_are_248_bytes_and_sound(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.frombuffer(body, "<f4").reshape(-1, 62)[:, 58], 1)
 
 
-def test_rows_of_a_session(session: reading.Session) -> None:
+def test_rows_of_a_session(session: Motion) -> None:
     table = dict(zip(tables.COLUMNS, tables.rows(session).T, strict=True))
     assert table["in_view"].sum() == 14 and np.isnan(table["x"][4]) and np.isnan(table["qw"][4])
     np.testing.assert_allclose(table["speed_m_s"][7:], 0.6, atol=0.01, err_msg="1.2 m radius at 0.5 rad/s")
@@ -262,13 +262,13 @@ def test_mjcf_compiles_and_moves(agent: reading.Agent, tmp_path: Path) -> None:
     assert mjcf.write(tmp_path, agent, occupancy).loss_mm["bodies"] < 0.01, "mm"
 
 
-def test_science_reads_the_sessions_back(session: reading.Session, tmp_path: Path) -> None:
+def test_science_reads_the_sessions_back(session: Motion, tmp_path: Path) -> None:
     pytest.importorskip("h5netcdf")
     pytest.importorskip("pynwb")
     pytest.importorskip("pyarrow")
-    assert neuro.write_movement(tmp_path, [session]).loss_mm["largest"] < 1e-6, "mm"
-    assert neuro.write_nwb(tmp_path, [session]).loss_mm["largest"] < 1e-6, "mm"
-    tables.write(tmp_path, [session])
+    assert neuro.write_movement(tmp_path, {"v002": session}).loss_mm["largest"] < 1e-6, "mm"
+    assert neuro.write_nwb(tmp_path, {"v002": session}).loss_mm["largest"] < 1e-6, "mm"
+    tables.write(tmp_path, {"v002": session})
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 16
 
 
