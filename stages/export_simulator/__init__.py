@@ -1,3 +1,1 @@
-"""The simulator page and the animated files: surfaces are thinned, weights re-fitted, motion resampled, all
-packed.
-"""
+"""The simulator page and the animated files: surfaces thinned, weights re-fitted, motion resampled."""

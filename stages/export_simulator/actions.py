@@ -1,10 +1,11 @@
 """Turn recorded motion into animation: the longest sound stretch of each session, resampled to even keys."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.data.glb import Action
 from pipeline.geometry import rigid
 
 
@@ -34,31 +35,22 @@ def longest_run(valid: Bool[np.ndarray, " frame"]) -> slice:
 def cut(motion: SessionClip, frames: slice) -> SessionClip:
     """Keep some frames and let time start at zero."""
     timestamp_s = motion.timestamp_s[frames]
-    return SessionClip(
-        motion.name,
-        timestamp_s - timestamp_s[0],
-        motion.world_from_agent[frames],
-        motion.agent_from_bone[frames],
-        motion.world_from_camera[frames],
-        float(timestamp_s[0]),
+    return replace(
+        motion,
+        timestamp_s=timestamp_s - timestamp_s[0],
+        world_from_agent=motion.world_from_agent[frames],
+        agent_from_bone=motion.agent_from_bone[frames],
+        world_from_camera=motion.world_from_camera[frames],
+        begin_s=float(timestamp_s[0]),
     )
 
 
-def resample(motion: SessionClip, rate_hz: float) -> SessionClip:
-    """Resample to even keys from the first to the last frame: slerp for rotations, linear for
-    translations.
-    """
-    count = int(np.floor((motion.timestamp_s[-1] - motion.timestamp_s[0]) * rate_hz + 1e-6)) + 1
-    query_s = motion.timestamp_s[0] + np.arange(count) / rate_hz
-
-    def at(a_from_b: np.ndarray) -> np.ndarray:
-        return rigid.interpolate(motion.timestamp_s, a_from_b, query_s)
-
-    bones = [at(motion.agent_from_bone[:, bone]) for bone in range(motion.agent_from_bone.shape[1])]
-    return SessionClip(
-        motion.name,
-        query_s - query_s[0],
-        at(motion.world_from_agent),
-        np.stack(bones, 1),
-        at(motion.world_from_camera),
-    )
+def animation(motion: SessionClip, rate_hz: float) -> Action:
+    """Resample to even keys from the first to the last frame: rotations by slerp, translations linearly."""
+    time_s = motion.timestamp_s
+    count = int(np.floor((time_s[-1] - time_s[0]) * rate_hz + 1e-6)) + 1
+    query_s = time_s[0] + np.arange(count) / rate_hz
+    root = rigid.interpolate(time_s, motion.world_from_agent, query_s)
+    tracks = np.swapaxes(motion.agent_from_bone, 0, 1)
+    bones = [rigid.interpolate(time_s, track, query_s) for track in tracks]
+    return Action(motion.name, query_s - query_s[0], root, np.stack(bones, 1))

@@ -1,16 +1,16 @@
 """Assemble in one table what the page and every other player of the simulator must know: `simulator.json`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.behavior.config import ReplanningConfig
-from pipeline.data.glb import Skin
 from pipeline.geometry import rigid
 from stages.export_simulator.actions import SessionClip
+from stages.export_simulator.export import SimulatorParts
+from stages.export_simulator.reading import BehaviorAssets
 
 VERSION = 3
 """Of the contract's keys; players refuse another."""
@@ -26,31 +26,21 @@ _DEFAULT_PACE_M_S = 0.4
 """Pace of an animal that no recording shows walking."""
 
 
-@dataclass(frozen=True)
-class RoomExtent:
-    """The room as a place to move in: world frame, metres."""
-
-    floor_m: float
-    bounds_m: Float[np.ndarray, "2 3"]
+LEAST_SUPPORTED = 0.9
+"""Share of recorded frames above something solid or filled floor below which the page and the report warn."""
+_UNSUPPORTED = "Little of this floor was recorded: the animal may float or sink."
 
 
 def contract(
-    *,
-    name: str,
-    behavior: dict[str, Any],
-    setting: RoomExtent,
-    motions: list[SessionClip],
-    skin: Skin,
-    residuals_m: Mapping[str, Float[np.ndarray, "frame vertex"]],
-    volume: dict[str, Any],
-    labels: Mapping[str, str],
-    warning: str | None,
+    parts: SimulatorParts, behavior: BehaviorAssets, name: str, labels: Mapping[str, str], remark: str | None
 ) -> dict[str, Any]:
-    """Assemble the table.
+    """Assemble the table of one animal, which passes the sampler's own contract on unchanged.
 
-    `behavior` is the sampler's own contract, passed on unchanged; `residuals_m` go by their key, `labels` of
-    recordings by their id; `warning` is what a visitor should know of the scene.
+    ``labels`` of recordings go by their id; ``remark`` is what a visitor should know of the home.
     """
+    motions, setting, skin = parts.motions, parts.setting, parts.skin
+    carried = behavior.supported is not None and behavior.supported >= LEAST_SUPPORTED
+    warning = " ".join(filter(None, (remark, None if carried else _UNSUPPORTED)))
     observers = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions])
     heights = np.concatenate([motion.world_from_agent[:, 1, 3] for motion in motions])
     starts = np.cumsum([0] + [len(motion.timestamp_s) for motion in motions])
@@ -65,7 +55,7 @@ def contract(
         "scene": {
             "floor_m": round(setting.floor_m, 4),
             "bounds_m": np.round(setting.bounds_m, 4).tolist(),
-            "warning": warning,
+            "warning": warning or None,
         },
         "observer": {
             "eye_height_m": round(float(np.median(observers[:, 1]) - setting.floor_m), 4),
@@ -76,7 +66,8 @@ def contract(
             "rest": np.round(rigid_rows(skin.agent_from_bone_rest), 6).tolist(),
             **gait(motions),
             "root_height_m": [round(float(height), 4) for height in np.percentile(heights, [0.5, 99.5])],
-            **{key: loss_mm(residual_m) for key, residual_m in residuals_m.items()},
+            "skinning_residual_mm": loss_mm(parts.residual_m),
+            "skinning_residual_8_mm": loss_mm(parts.eight_residual_m),
         },
         "clips": [
             {
@@ -87,16 +78,15 @@ def contract(
             }
             for motion, start in zip(motions, starts[:-1], strict=True)
         ],
-        "volume": volume,
-        "controls": controls(behavior["sampling"]),
+        "volume": behavior.volume,
+        "controls": controls(behavior.contract["sampling"]),
         "replanning": vars(ReplanningConfig()),
-        "behavior": behavior,
+        "behavior": behavior.contract,
     }
 
 
 def controls(sampling: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return what a visitor sets, its range and its default, which is the sampler's: the only place that has
-    one.
+    """Return what a visitor sets, its range and its default, which is the sampler's.
 
     `interactivity` is the scale of classifier-free guidance on the observer.
     """
@@ -117,26 +107,19 @@ def loss_mm(residual_m: Float[np.ndarray, "frame vertex"]) -> dict[str, float]:
 
 def rigid_rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
     """Turn rigid motions into rows of place and quaternion wxyz."""
-    return np.concatenate(
-        [a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1
-    )
+    turns = rigid.quaternion_from_rotation(a_from_b[..., :3, :3])
+    return np.concatenate([a_from_b[..., :3, 3], turns], axis=-1)
 
 
 def gait(motions: list[SessionClip]) -> dict[str, float]:
-    """Return how fast the animal walks when it walks, and how high its root then is: medians of all
-    recordings.
-    """
-    speeds, heights = [], []
-    for motion in motions:
-        place = motion.world_from_agent[:, :3, 3]
-        speed = np.linalg.norm(np.gradient(place[:, [0, 2]], motion.timestamp_s, axis=0), axis=1)
-        walking = speed > _WALKING_M_S
-        speeds.append(speed[walking])
-        heights.append(place[walking, 1])
-    speed, height = np.concatenate(speeds), np.concatenate(heights)
-    if not len(speed):
-        height = np.concatenate([motion.world_from_agent[:, 1, 3] for motion in motions])
+    """Return how fast the animal walks when it walks, and how high its root then is: medians of all."""
+    places = [motion.world_from_agent[:, :3, 3] for motion in motions]
+    steps = zip(places, motions, strict=True)
+    velocity = [np.gradient(place[:, [0, 2]], motion.timestamp_s, axis=0) for place, motion in steps]
+    speed, height = np.linalg.norm(np.concatenate(velocity), axis=1), np.concatenate(places)[:, 1]
+    walking = speed > _WALKING_M_S
+    height = height[walking] if walking.any() else height
     return {
-        "pace_m_s": round(float(np.median(speed)), 4) if len(speed) else _DEFAULT_PACE_M_S,
+        "pace_m_s": round(float(np.median(speed[walking])), 4) if walking.any() else _DEFAULT_PACE_M_S,
         "standing_m": round(float(np.median(height)), 4),
     }

@@ -1,6 +1,4 @@
-"""Turn a reconstruction and its behaviour models into the parts of a simulator: light, re-fitted,
-resampled.
-"""
+"""Turn a reconstruction and its recordings into the parts of a simulator: light, re-fitted, resampled."""
 
 from dataclasses import dataclass
 
@@ -12,16 +10,14 @@ from pipeline.fields import weight_refit
 from pipeline.geometry import rigid
 from pipeline.geometry.decimation import decimate
 from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.subsampling import evenly
 from stages.export_simulator import surfaces
-from stages.export_simulator.actions import SessionClip, resample
+from stages.export_simulator.actions import SessionClip, animation
 from stages.export_simulator.config import Config
-from stages.export_simulator.contract import RoomExtent
 from stages.export_simulator.reading import CanonicalAgent, SplatClouds
 
 FITTED_POSES = 48
-"""Recorded poses, as different as can be, that skinning weights are fitted to: more change the loss by under
-1 %.
-"""
+"""Recorded poses, as different as can be, that weights are fitted to: more change the loss by under 1 %."""
 ACTION_RATE_HZ = 30.0
 """Keys of the animations in `agent.glb`: what players interpolate without visible steps."""
 _JUDGED_POSES = 200
@@ -43,54 +39,47 @@ class SimulatorParts:
     scene: Mesh
     splat_rows: bytes
     agent_splats: surfaces.SkinnedSplats
-    setting: RoomExtent
+    setting: surfaces.RoomExtent
     motions: list[SessionClip]
 
 
 def simulator(
     body: CanonicalAgent, scene: Mesh, gaussians: SplatClouds, motions: list[SessionClip], config: Config
 ) -> SimulatorParts:
-    """Thin the surfaces, fit the weights, resample the motion;"""
+    """Thin the surfaces, fit the weights, resample the motion."""
     agent, kept = decimate(body.mesh, config.agent_faces)
     thinned = CanonicalAgent(agent, body.weights[kept], body.agent_from_bone_rest)
-    four, eight = fit_weights(thinned, motions, FITTED_POSES)
+    (four, residual_m), (eight, eight_residual_m) = fit_weights(thinned, motions)
     names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
     room, _ = decimate(scene, config.scene_faces)
     inside = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions]).mean(0)
     positions = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     return SimulatorParts(
         agent=agent,
-        skin=Skin(four.blend.joints, four.blend.weights, body.agent_from_bone_rest, names),
-        residual_m=four.residual_m,
-        eight=eight.blend,
-        eight_residual_m=eight.residual_m,
-        actions=[action(motion, ACTION_RATE_HZ) for motion in motions],
+        skin=Skin(four.joints, four.weights, body.agent_from_bone_rest, names),
+        residual_m=residual_m,
+        eight=eight,
+        eight_residual_m=eight_residual_m,
+        actions=[animation(motion, ACTION_RATE_HZ) for motion in motions],
         scene=surfaces.orient_towards(room, inside),
         splat_rows=surfaces.splat_rows(gaussians.scene, config.scene_splats),
         agent_splats=surfaces.skinned_splats(gaussians.agent, gaussians.agent_weights, config.agent_splats),
-        setting=RoomExtent(surfaces.floor_height_m(room, positions), surfaces.bounds(room)),
+        setting=surfaces.extent(room, positions),
         motions=motions,
     )
 
 
-@dataclass(frozen=True)
-class FittedWeights:
-    """Weights of a linear blend, and what is lost with them in poses that were not fitted."""
-
-    blend: weight_refit.Influences
-    residual_m: Float[np.ndarray, "frame vertex"]
-
-
 def fit_weights(
-    body: CanonicalAgent, motions: list[SessionClip], poses: int
-) -> tuple[FittedWeights, FittedWeights]:
-    """Fit four and eight weights a vertex to recorded poses that differ most."""
+    body: CanonicalAgent, motions: list[SessionClip]
+) -> list[tuple[weight_refit.Influences, Float[np.ndarray, "frame vertex"]]]:
+    """Fit four and eight weights a vertex to recorded poses that differ most.
+
+    Returns both with the distance, metres, that each leaves in poses that were not fitted.
+    """
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
-    chosen = weight_refit.different_poses(recorded, poses)
+    chosen = weight_refit.different_poses(recorded, FITTED_POSES)
     others = np.setdiff1d(np.arange(len(recorded)), chosen)
-    judged = chosen
-    if len(others):
-        judged = others[np.linspace(0, len(others) - 1, min(_JUDGED_POSES, len(others))).astype(int)]
+    judged = others[evenly(len(others), _JUDGED_POSES)] if len(others) else chosen
     vertices, rest = body.mesh.vertices.astype(np.float64), body.agent_from_bone_rest
     fit, held = (
         weight_refit.Poses(
@@ -99,13 +88,5 @@ def fit_weights(
         )
         for at in (chosen, judged)
     )
-    four, eight = weight_refit.refit_weights(vertices, body.weights, fit)
-    return FittedWeights(four, weight_refit.residual_m(vertices, four, held)), FittedWeights(
-        eight, weight_refit.residual_m(vertices, eight, held)
-    )
-
-
-def action(motion: SessionClip, rate_hz: float) -> Action:
-    """Resample a recorded motion to an animation."""
-    even = resample(motion, rate_hz)
-    return Action(motion.name, even.timestamp_s, even.world_from_agent, even.agent_from_bone)
+    blends = weight_refit.refit_weights(vertices, body.weights, fit)
+    return [(blend, weight_refit.residual_m(vertices, blend, held)) for blend in blends]

@@ -1,8 +1,6 @@
-"""Assemble the page: one HTML file that holds its scripts, the WebAssembly runtime and every asset,
-compressed.
+"""Assemble the page: one HTML file that holds scripts, WebAssembly runtime and every asset, compressed.
 
-Arrays are stored byte by byte of their records (first all first bytes, then all second ones), which
-compresses better.
+Arrays are stored byte by byte of their records (all first bytes, then all second ones) to compress better.
 """
 
 import base64
@@ -40,11 +38,8 @@ def clip_rows(motions: list[SessionClip]) -> bytes:
     """
     frames = []
     for motion in motions:
-        poses = np.concatenate(
-            [motion.world_from_agent[:, None], motion.agent_from_bone, motion.world_from_camera[:, None]],
-            axis=1,
-        )
-        frames.append(rigid_rows(poses))
+        root, camera = motion.world_from_agent[:, None], motion.world_from_camera[:, None]
+        frames.append(rigid_rows(np.concatenate([root, motion.agent_from_bone, camera], axis=1)))
     return (np.rint(np.concatenate(frames) * _STEPS) / _STEPS).astype("<f4").tobytes()
 
 
@@ -59,9 +54,8 @@ def light_page(*, contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> t
     """Return a page that loads its assets from beside it, and these files by name; it wants a static host."""
     files = compressed(contract, assets)
     tags = [_tag(name, assets, f' data-file="assets/{name}.gz"') for name in files]
-    return _assembled(contract, tags, connect="'self'"), {
-        f"assets/{name}.gz": file for name, file in files.items()
-    }
+    beside = {f"assets/{name}.gz": file for name, file in files.items()}
+    return _assembled(contract, tags, connect="'self'"), beside
 
 
 def compressed(contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> dict[str, bytes]:

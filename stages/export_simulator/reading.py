@@ -1,6 +1,4 @@
-"""Open what the simulator is made of: surfaces, skin, Gaussians, recorded motion, networks, feature
-volume.
-"""
+"""Open what the simulator is made of: surfaces, skin, Gaussians, recorded motion, networks, volume."""
 
 import json
 from collections.abc import Mapping
@@ -15,7 +13,7 @@ from pipeline.behavior.support import JUMP_KERNEL, SUPPORTED
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core.errors import InputError
 from pipeline.data import gaussian_ply, npz, ply
-from pipeline.data.templates import SKIN
+from pipeline.data.templates import SkinTable
 from pipeline.geometry.meshes import Mesh
 from stages.export_simulator.actions import SessionClip, cut, longest_run
 
@@ -60,44 +58,28 @@ class BehaviorAssets:
 
 def body(reconstruction: Path) -> CanonicalAgent:
     """Read the agent's surface and skin."""
-    skin = SKIN.load(reconstruction / "skin.npz", "weights", "agent_from_bone_rest")
-    return CanonicalAgent(
-        ply.read_ply(reconstruction / "agent.ply"),
-        skin["weights"].astype(np.float64),
-        skin["agent_from_bone_rest"].astype(np.float64),
-    )
+    skin, surface = SkinTable.open(reconstruction), ply.read_ply(reconstruction / "agent.ply")
+    rest = skin.agent_from_bone_rest.astype(np.float64)
+    return CanonicalAgent(surface, skin.weights.astype(np.float64), rest)
 
 
 def motions(behavior_data: Path) -> list[SessionClip]:
-    """Read the longest unbroken stretch of every session. Raises InputError EXP-001 where none is long
-    enough.
-    """
+    """Read the longest unbroken stretch of every session. Raises EXP-001 where none is long enough."""
     found = []
     for video, track in BehaviorData.load(behavior_data).trajectories.items():
-        whole = SessionClip(
-            video,
-            track.timestamp_s,
-            track.world_from_agent,
-            track.agent_from_bone.astype(np.float64),
-            track.world_from_camera,
-        )
-        frames = longest_run(track.valid)
+        frames, bones = longest_run(track.valid), track.agent_from_bone.astype(np.float64)
         if frames.stop - frames.start >= _SHORTEST_CLIP_FRAMES:
-            found.append(cut(whole, frames))
+            poses = track.world_from_agent, bones, track.world_from_camera
+            found.append(cut(SessionClip(video, track.timestamp_s, *poses), frames))
     if not found:
-        raise InputError(
-            "EXP-001",
-            "no session shows the animal for 1.6 s without a break",
-            str(behavior_data),
-            "record longer sessions that keep the animal in view",
-        )
+        what = "no session shows the animal for 1.6 s without a break"
+        remedy = "record longer sessions that keep the animal in view"
+        raise InputError("EXP-001", what, str(behavior_data), remedy)
     return found
 
 
 def support_contract(range_m: Float[np.ndarray, "2 2"]) -> dict[str, Any] | None:
-    """Return what puts paths on what carries the animal, where that is known; see
-    `pipeline.behavior.support`.
-    """
+    """Return what puts paths on what carries the animal, if known; see `pipeline.behavior.support`."""
     if not np.isfinite(range_m).all():
         return None
     return {"mark": SUPPORTED, "range_m": np.asarray(range_m, float).tolist(), "flight": JUMP_KERNEL.tolist()}
@@ -137,9 +119,8 @@ def behavior_assets(
     family, ego = (contract["architecture"][key] for key in ("family", "ego"))
     if family != "diffusion" or ego == "world":
         what = f"the page cannot sample a model of the family {family} with the ego frame {ego}"
-        raise InputError(
-            "EXP-002", what, str(behavior), "take another variant: family diffusion, ego yaw or full"
-        )
+        remedy = "take another variant: family diffusion, ego yaw or full"
+        raise InputError("EXP-002", what, str(behavior), remedy)
     table = npz.load(volume, names=("features", "occupancy", "allowed", "origin", "voxel_m", "stands_m"))
     return BehaviorAssets(
         contract=contract,

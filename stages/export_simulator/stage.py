@@ -25,11 +25,10 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> float:
-    """Write page, `agent.glb`, `scene.glb`, `skin_8.npz` and `simulator.json` into ``out``; return megabytes
-    of the page.
+    """Write page, `agent.glb`, `scene.glb`, `skin_8.npz`, `simulator.json`; return the page's megabytes.
 
-    Raises InputError EXP-001 where no session is long enough, EXP-002 for a model that the page cannot
-    sample, EXP-003 for another home without a take in it, ART-003 where that home lacks its surfaces.
+    Raises EXP-001 where no session is long enough, EXP-002 for a model that cannot be sampled, EXP-003 for
+    another home without a take in it, ART-003 where that home lacks its surfaces.
     """
     if inputs.home is None and inputs.take is None:
         place = surroundings.at_home(inputs.reconstruction, inputs.splats, inputs.behavior_data)

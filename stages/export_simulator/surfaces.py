@@ -18,10 +18,23 @@ _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not 
 _BAND_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
+@dataclass(frozen=True)
+class RoomExtent:
+    """The room as a place to move in: world frame, metres."""
+
+    floor_m: float
+    bounds_m: Float[np.ndarray, "2 3"]
+
+
+def extent(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3"]) -> RoomExtent:
+    """Find the floor below the agent, and the box of all but the stray 0.5 % of vertices at each end."""
+    bounds_m = np.percentile(mesh.vertices, [0.5, 99.5], axis=0)
+    return RoomExtent(floor_height_m(mesh, agent_positions_world), bounds_m)
+
+
 def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3"]) -> float:
     """Find the height of the floor: the lowest level with a fair share of the upward area below the agent."""
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners, normals = _corners_normals(mesh)
     area = np.linalg.norm(normals, axis=1)
     height = corners[..., 1].mean(1)
     level = (normals[:, 1] > _UPRIGHT * area) & (height < np.median(agent_positions_world[:, 1]))
@@ -34,21 +47,19 @@ def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3
     return float(np.average(height[near], weights=area[near]))
 
 
-def bounds(mesh: Mesh) -> Float[np.ndarray, "2 3"]:
-    """Return the box that holds all but the stray 0.5 % of vertices at each end."""
-    return np.percentile(mesh.vertices, [0.5, 99.5], axis=0)
-
-
 def orient_towards(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
-    """Orient all faces alike so that most of the area faces a point inside the room: walls then vanish from
-    behind.
-    """
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    """Turn all faces so that most of the area faces a point inside: walls then vanish from behind."""
+    corners, normals = _corners_normals(mesh)
     towards = np.einsum("fi,fi->f", normals, inside - corners.mean(1))
     if np.linalg.norm(normals, axis=1) @ np.sign(towards) >= 0:
         return mesh
     return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.color)
+
+
+def _corners_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of every face, and its normal as long as twice its area."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    return corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 @dataclass(frozen=True)
@@ -62,9 +73,7 @@ class SkinnedSplats:
 
 
 def splat_rows(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> bytes:
-    """Shrink standard Gaussian rows to 32 bytes each: place, size, colour with opacity, rotation; the
-    faintest go first.
-    """
+    """Shrink Gaussian rows to 32 bytes: place, size, colour with opacity, rotation; faint ones go first."""
     return _packed(gaussians[_weightiest(gaussians, max_points)])
 
 
@@ -77,10 +86,8 @@ def skinned_splats(
     heaviest = np.take_along_axis(weights[selected], joints, 1)
     padding = ((0, 0), (0, 4 - joints.shape[1]))
     shares = _bytes(255 * heaviest / heaviest.sum(1, keepdims=True))
-    return SkinnedSplats(
-        _packed(gaussians[selected]),
-        np.concatenate([np.pad(joints, padding), np.pad(shares, padding)], 1).astype(np.uint8).tobytes(),
-    )
+    skin = np.concatenate([np.pad(joints, padding), np.pad(shares, padding)], 1).astype(np.uint8)
+    return SkinnedSplats(_packed(gaussians[selected]), skin.tobytes())
 
 
 def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> Int[np.ndarray, " selected"]:
@@ -94,12 +101,10 @@ def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> In
 def _packed(gaussians: Float[np.ndarray, "point 62"]) -> bytes:
     rows = np.zeros(len(gaussians), _SPLAT_ROW)
     rows["position"] = np.rint(gaussians[:, _POSITION] * _STEPS) / _STEPS
-    rows["scale"] = (
-        np.maximum(np.rint(np.exp(gaussians[:, _LOG_SCALE].astype(np.float64)) * _STEPS), 1) / _STEPS
-    )
-    rows["color"] = _bytes(
-        np.concatenate([gaussians[:, _DC] * _BAND_0 + 0.5, _opacity(gaussians)[:, None]], 1) * 255
-    )
+    scale = np.exp(gaussians[:, _LOG_SCALE].astype(np.float64))
+    rows["scale"] = np.maximum(np.rint(scale * _STEPS), 1) / _STEPS
+    color = gaussians[:, _DC] * _BAND_0 + 0.5
+    rows["color"] = _bytes(np.concatenate([color, _opacity(gaussians)[:, None]], 1) * 255)
     rotation = gaussians[:, _QUATERNION] / np.linalg.norm(gaussians[:, _QUATERNION], axis=1, keepdims=True)
     rows["rotation"] = _bytes(rotation * 128 + 128)
     return rows.tobytes()

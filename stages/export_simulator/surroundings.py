@@ -41,15 +41,14 @@ def at_home(reconstruction: Path, splats: Path, behavior_data: Path) -> Surround
     """Return the animal's own home with its recordings."""
     tracks = BehaviorData.load(behavior_data).trajectories.values()
     roots = np.concatenate([track.world_from_agent[track.valid, :3, 3] for track in tracks])
-    motions = reading.motions(behavior_data)
-    return Surroundings(
-        reconstruction / "scene.ply", splats / "scene.ply", behavior_data / "volume.npz", motions, roots
-    )
+    files = reconstruction / "scene.ply", splats / "scene.ply", behavior_data / "volume.npz"
+    return Surroundings(*files, reading.motions(behavior_data), roots)
 
 
 def elsewhere(home: Path, take: Path, name: str) -> Surroundings:
-    """Return the home of another build with a take in it. Raises ART-003 where the build lacks its surfaces,
-    EXP-003 for a take of the animal's own home.
+    """Return the home of another build with a take in it.
+
+    Raises ART-003 where the build lacks its surfaces, EXP-003 for a take of the animal's own home.
     """
     surface, splats = home / "reconstruction/scene.ply", home / "splats/scene.ply"
     for file in (surface, splats):

@@ -11,13 +11,11 @@ from pipeline.data import glb, npz
 from pipeline.data.qa import Check, Picture
 from stages.export_simulator import page, pictures
 from stages.export_simulator.config import Config, Layout
-from stages.export_simulator.contract import contract
+from stages.export_simulator.contract import LEAST_SUPPORTED, contract
 from stages.export_simulator.export import SimulatorParts
 from stages.export_simulator.page import Asset
 from stages.export_simulator.reading import BehaviorAssets
 
-LEAST_SUPPORTED = 0.9
-"""Share of recorded frames above something solid or filled floor below which the page and the report warn."""
 WARN_PAGE_MB = 25.0
 """Megabytes above which the report warns about the page: some mail programs and hosts refuse more."""
 
@@ -30,12 +28,11 @@ def write_simulator(
     labels: Mapping[str, str],
     remark: str | None,
 ) -> float:
-    """Write the page, the animated agent, the scene and the contract; return megabytes that a
-    visitor loads.
+    """Write the page, the animated agent, the scene and the contract; return megabytes that a visitor loads.
 
     ``remark`` is what a visitor should know of the home beside what carries the animal.
     """
-    about = _contract(parts, behavior, config.name, labels, remark)
+    about = contract(parts, behavior, config.name, labels, remark)
     room = glb.static(parts.scene, "scene")
     size_mb = _write_page(folder, about, _room(parts, room) | _animal(parts, behavior), config.layout)
     (folder / "agent.glb").write_bytes(glb.skinned(parts.agent, parts.skin, parts.actions))
@@ -51,15 +48,14 @@ def write_home(
     config: Config,
     labels: Mapping[str, str],
 ) -> float:
-    """Write the page of several animals, by name, in the room of the first, and its contract; return
-    megabytes that a visitor loads.
+    """Write the page of several animals, by name, in the room of the first; return megabytes to load.
 
-    Assets and contract of each are those of its own page; the contract adds when clips begin in their
-    sessions, so that all begin at one moment.
+    Assets and contract of each are those of its own page, and when clips begin in their sessions, so that all
+    begin at one moment.
     """
     contracts = []
     for name, (parts, behavior) in animals.items():
-        about = _contract(parts, behavior, name, labels, None)
+        about = contract(parts, behavior, name, labels, None)
         about["assets"] = f"{name}-"
         for clip, motion in zip(about["clips"], parts.motions, strict=True):
             clip["begin_s"] = round(motion.begin_s, 4)
@@ -73,26 +69,6 @@ def write_home(
     size_mb = _write_page(folder, whole, assets, config.layout)
     (folder / "simulator.json").write_text(json.dumps(whole, indent=1) + "\n")
     return size_mb
-
-
-def _contract(
-    parts: SimulatorParts, behavior: BehaviorAssets, name: str, labels: Mapping[str, str], remark: str | None
-) -> dict[str, Any]:
-    remarks = [text for text in (remark, support_warning(behavior.supported)) if text]
-    return contract(
-        name=name,
-        behavior=behavior.contract,
-        setting=parts.setting,
-        motions=parts.motions,
-        skin=parts.skin,
-        residuals_m={
-            "skinning_residual_mm": parts.residual_m,
-            "skinning_residual_8_mm": parts.eight_residual_m,
-        },
-        volume=behavior.volume,
-        labels=labels,
-        warning=" ".join(remarks) or None,
-    )
 
 
 def _room(parts: SimulatorParts, room: bytes) -> dict[str, Asset]:
@@ -113,13 +89,6 @@ def _animal(parts: SimulatorParts, behavior: BehaviorAssets) -> dict[str, Asset]
     }
 
 
-def support_warning(supported: float | None) -> str | None:
-    """Return the warning that the page shows for a scene that carries too little of the recorded motion."""
-    if supported is not None and supported >= LEAST_SUPPORTED:
-        return None
-    return "Little of this floor was recorded: the animal may float or sink."
-
-
 def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], layout: Layout) -> float:
     """Write the page and return its megabytes."""
     match layout:
@@ -138,6 +107,7 @@ def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], l
 def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> dict[str, Any]:
     """Return checks and pictures of the simulator for `qa.write`."""
     residual_mm = parts.residual_m * 1000
+    carried = "recorded motion that the scene carries"
     visits = pictures.visits(parts.scene, parts.setting.floor_m, parts.motions)
     about = "the room from above: where the animal (amber) and the person (blue) have been"
     heat = pictures.heat_maps(parts.scene, parts.setting.floor_m, parts.motions)
@@ -150,9 +120,7 @@ def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> d
             Check("skinning loss, mean", float(residual_mm.mean()), "mm", warn=2.0, fail=10.0),
             Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
             Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),
-            Check(
-                "recorded motion that the scene carries", supported, "share", LEAST_SUPPORTED, None, "higher"
-            ),
+            Check(carried, supported, "share", LEAST_SUPPORTED, better="higher"),
             Check("sessions to replay", len(parts.motions), "", warn=1, better="higher"),
         ],
         "pictures": [Picture("visits", visits, about), Picture("heat_maps", heat, about_heat)],

@@ -9,7 +9,6 @@ import numpy as np
 from pipeline.core.videos import Video
 from pipeline.data import ply, qa
 from stages.export_simulator import export, pictures, reading, surfaces, surroundings, writing
-from stages.export_simulator.contract import RoomExtent
 from stages.export_simulator.home.config import Config
 
 WARN_MORE_MB = 10.0
@@ -27,18 +26,15 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> float:
-    """Write page and `simulator.json` into ``out``; return megabytes of the page. The room is that of the
-    first animal's reconstruction.
+    """Write page and `simulator.json`, the room that of the first animal; return the page's megabytes.
 
-    Raises InputError EXP-001 where an animal has no session that is long enough, EXP-002 for a model that the
-    page cannot sample.
+    Raises EXP-001 where an animal has no session long enough, EXP-002 for a model that the page cannot
+    sample.
     """
-    places = {
-        name: surroundings.at_home(
-            inputs.reconstruction[name], inputs.splats[name], inputs.behavior_data[name]
-        )
-        for name in inputs.behavior
-    }
+    places = {}
+    for name in inputs.behavior:
+        made = inputs.reconstruction[name], inputs.splats[name], inputs.behavior_data[name]
+        places[name] = surroundings.at_home(*made)
     first = next(iter(places.values()))
     surface, animals = ply.read_ply(first.surface), {}
     for name, place in places.items():
@@ -53,23 +49,20 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         animals[name] = (parts, behavior)
     room = next(iter(animals.values()))[0].scene
     been = np.concatenate([place.roots_world for place in places.values()])
-    setting = RoomExtent(surfaces.floor_height_m(room, been), surfaces.bounds(room))
+    setting = surfaces.extent(room, been)
     animals = {name: (replace(parts, setting=setting), assets) for name, (parts, assets) in animals.items()}
     labels = {video.id: Path(video.file).stem for video in videos}
     size_mb = writing.write_home(out, animals, config, labels)
     warn_mb = writing.WARN_PAGE_MB + WARN_MORE_MB * (len(animals) - 1)
+    sheets = {name: pictures.visits(room, setting.floor_m, places[name].motions) for name in animals}
     qa.write(
         out,
         good="the page opens within seconds and shows every animal in the same room",
         bad="an animal that floats or stands in a wall, or a page too big to send",
         checks=[qa.Check("size of the page", size_mb, "MB", warn=warn_mb, fail=2 * warn_mb)],
         pictures=[
-            qa.Picture(
-                f"visits_{name}",
-                pictures.visits(room, setting.floor_m, places[name].motions),
-                f"where {name} (amber) and the person (blue) have been",
-            )
-            for name in animals
+            qa.Picture(f"visits_{name}", sheet, f"where {name} (amber) and the person (blue) have been")
+            for name, sheet in sheets.items()
         ],
     )
     return size_mb

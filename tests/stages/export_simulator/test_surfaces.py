@@ -15,7 +15,11 @@ def test_thinning_keeps_the_shape() -> None:
     light, nearest = decimate(room, 200)
     assert len(light.faces) <= 220
     assert nearest.shape == (len(light.vertices),)
-    np.testing.assert_allclose(surfaces.bounds(light), surfaces.bounds(room), atol=0.2)
+    np.testing.assert_allclose(
+        surfaces.extent(light, np.zeros((1, 3))).bounds_m,
+        surfaces.extent(room, np.zeros((1, 3))).bounds_m,
+        atol=0.2,
+    )
 
 
 @pytest.mark.parametrize("height_m", [0.0, -1.3])
@@ -57,8 +61,8 @@ def test_resampling_passes_through_the_frames() -> None:
     motion = actions.SessionClip(
         "v", track.timestamp_s, track.world_from_agent, track.agent_from_bone, track.world_from_camera
     )
-    even = actions.resample(motion, 30.0)
-    assert len(even.timestamp_s) == 61
+    even = actions.animation(motion, 30.0)
+    assert len(even.time_s) == 61
     np.testing.assert_allclose(even.world_from_agent[::3], track.world_from_agent, atol=1e-6)
     turn = rigid.rotation_angle(even.world_from_agent[1:, :3, :3], even.world_from_agent[:-1, :3, :3])
     np.testing.assert_allclose(turn, 0.05 / 3, atol=1e-6)
