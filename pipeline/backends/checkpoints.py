@@ -28,22 +28,18 @@ def library() -> ModuleType:
     try:
         import transformers
     except ImportError as error:
-        raise InputError(
-            "MOD-002", "this backend needs the package transformers", str(error), "make extras"
-        ) from error
+        what = "this backend needs the package transformers"
+        raise InputError("MOD-002", what, str(error), "make extras") from error
     return transformers
 
 
 def folder(path: str, what: str, name: str) -> Path:
-    """Return a checkpoint's folder. Raises MOD-001 with the name of a public checkpoint where there is
-    none.
-    """
+    """Return a checkpoint's folder. Raises MOD-001 with the name of a public one where there is none."""
     fetch = f"hf download {name} --local-dir weights/{name.split('/')[-1]}"
     remedy = f"download {name} (`{fetch}`) and name its folder in the recipe"
     if not path or not (Path(path) / CONFIG).is_file():
-        raise InputError(
-            "MOD-001", f"the weights of {what} are not there", str(Path(path or ".") / CONFIG), remedy
-        )
+        where = str(Path(path or ".") / CONFIG)
+        raise InputError("MOD-001", f"the weights of {what} are not there", where, remedy)
     return Path(path)
 
 
@@ -52,9 +48,8 @@ def model(kind: str, path: Path, device: str) -> Any:
     try:
         loaded = getattr(library(), kind).from_pretrained(path, local_files_only=True)
     except (OSError, ValueError, RuntimeError, KeyError) as error:
-        raise InputError(
-            "MOD-003", f"no usable {kind} ({str(error)[:200]})", str(path), "download the checkpoint again"
-        ) from error
+        what = f"no usable {kind} ({str(error)[:200]})"
+        raise InputError("MOD-003", what, str(path), "download the checkpoint again") from error
     return loaded.to(device).eval()
 
 
@@ -86,7 +81,6 @@ class Preparation:
         height, width = size
         if color.shape[:2] != size:
             image = image.resize((width, height), self.resample)
-        scaled = (np.asarray(image, np.float32) / 255 - np.array(self.mean, np.float32)) / np.array(
-            self.std, np.float32
-        )
+        mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
+        scaled = (np.asarray(image, np.float32) / 255 - mean) / std
         return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])

@@ -1,9 +1,8 @@
-"""Dense, weight-free picture features: DAISY descriptors (Tola et al. 2010) on a grid, then a shared linear
-basis.
+"""Dense, weight-free picture features: DAISY (Tola et al. 2010) on a grid, in a shared linear basis.
 
-`describe` turns a picture into raw descriptors, `fit_basis` finds the basis on descriptors of many
-recordings, and `FeatureBasis.project` gives the 16 unit-length channels that fields, templates and losses
-use. Gradients normalised per patch make them blind to exposure and white balance.
+`describe` turns a picture into raw descriptors, `fit_basis` finds the basis on those of many recordings, and
+`FeatureBasis.project` gives the 16 unit-length channels that fields, templates and losses use. Gradients
+normalised per patch make them blind to exposure and white balance.
 
 Chosen by measurement (`benchmarks.descriptors`: share of cells whose likest cell in a view 5-45 degrees away
 is the true one or touches it; raw, then with 16 channels). 12 pairs each of a real kitchen, of the same with
@@ -103,8 +102,7 @@ def fit_basis(
     components = sign * axes / np.maximum(variance, 1e-12)[:, None] ** (whitening / 2)
     length = np.linalg.norm((samples - mean) @ components.T, axis=1)
     explained = variance / np.var(samples, axis=0, ddof=1).sum()
-    as_stored = (part.astype(np.float32) for part in (mean, components, explained))
-    mean, components, explained = as_stored
+    mean, components, explained = (part.astype(np.float32) for part in (mean, components, explained))
     return FeatureBasis(mean, components, float(np.float32(np.median(length))), explained)
 
 

@@ -1,6 +1,4 @@
-"""Which descriptor an agent's features are made of: one choice, kept beside the basis that was fitted to
-it.
-"""
+"""Which descriptor an agent's features are made of: one choice, beside the basis that was fitted to it."""
 
 import json
 from collections.abc import Callable

@@ -1,6 +1,4 @@
-"""DINOv2 (Oquab et al. 2023) as dense descriptors: one patch per cell, so that cells need no
-interpolation.
-"""
+"""DINOv2 (Oquab et al. 2023) as dense descriptors: a patch per cell, so that cells need no interpolation."""
 
 from pathlib import Path
 
@@ -18,9 +16,7 @@ class Dinov2:
     """A loaded network that describes pictures one at a time."""
 
     def __init__(self, weights: str, device: str) -> None:
-        """Load a checkpoint folder. Raises MOD-001 (missing), MOD-002 (no transformers), MOD-003 (another
-        model).
-        """
+        """Load a checkpoint folder. Raises MOD-001, MOD-002 and MOD-003 as `checkpoints` does."""
         path: Path = checkpoints.folder(weights, "DINOv2", CHECKPOINT)
         self._model = checkpoints.model("Dinov2Model", path, device)
         self._preparation = checkpoints.Preparation.read(path, Image.Resampling.BICUBIC)
@@ -34,9 +30,7 @@ class Dinov2:
         rows, columns = color.shape[0] // stride_px, color.shape[1] // stride_px
         whole = color[: rows * stride_px, : columns * stride_px]
         patch = self._model.config.patch_size
-        pixels = torch.from_numpy(self._preparation.pixels(whole, (rows * patch, columns * patch))).to(
-            self._device
-        )
-        tokens = self._model(pixel_values=pixels).last_hidden_state[0, 1:]
+        pixels = torch.from_numpy(self._preparation.pixels(whole, (rows * patch, columns * patch)))
+        tokens = self._model(pixel_values=pixels.to(self._device)).last_hidden_state[0, 1:]
         tokens = torch.nn.functional.normalize(tokens.float(), dim=-1)
         return tokens.reshape(rows, columns, -1).cpu().numpy()

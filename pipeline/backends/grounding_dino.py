@@ -27,9 +27,7 @@ class GroundingDino:
     """A loaded detector."""
 
     def __init__(self, weights: str, device: str) -> None:
-        """Load a checkpoint folder. Raises MOD-001 (missing), MOD-002 (no transformers), MOD-003 (another
-        model).
-        """
+        """Load a checkpoint folder. Raises MOD-001, MOD-002 and MOD-003 as `checkpoints` does."""
         path = checkpoints.folder(weights, "Grounding DINO", CHECKPOINT)
         self._model = checkpoints.model("GroundingDinoForObjectDetection", path, device)
         self._tokenizer = checkpoints.library().AutoTokenizer.from_pretrained(path, local_files_only=True)
@@ -41,15 +39,13 @@ class GroundingDino:
         """Find what is described; every phrase ends with a full stop (``a cat.``)."""
         height, width = color.shape[:2]
         pixels = self._preparation.pixels(color, fitted((height, width), self._preparation.size or {}))
-        words = self._tokenizer(description.lower().strip().rstrip(".") + ".", return_tensors="pt").to(
-            self._device
-        )
+        sentence = description.lower().strip().rstrip(".") + "."
+        words = self._tokenizer(sentence, return_tensors="pt").to(self._device)
         answer = self._model(pixel_values=torch.from_numpy(pixels).to(self._device), **words)
         score = answer.logits[0].sigmoid().amax(-1)
         center, size = answer.pred_boxes[0].split(2, dim=-1)
-        boxes = torch.cat([center - size / 2, center + size / 2], dim=-1) * torch.tensor(
-            [width, height] * 2, device=center.device
-        )
+        corners = torch.cat([center - size / 2, center + size / 2], dim=-1)
+        boxes = corners * torch.tensor([width, height] * 2, device=center.device)
         order = torch.argsort(score, descending=True, stable=True)
         order = order[score[order] > threshold]
         return Found(boxes[order].cpu().numpy(), score[order].cpu().numpy())

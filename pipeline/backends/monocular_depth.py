@@ -29,9 +29,7 @@ class MonocularDepth:
     """A loaded network that looks at pictures one at a time."""
 
     def __init__(self, kind: Kind, weights: str, device: str) -> None:
-        """Load a checkpoint folder. Raises MOD-001 (missing), MOD-002 (no transformers), MOD-003 (another
-        model).
-        """
+        """Load a checkpoint folder. Raises MOD-001, MOD-002 and MOD-003 as `checkpoints` does."""
         path: Path = checkpoints.folder(weights, kind, CHECKPOINTS[kind])
         self._kind: Kind = kind
         self._device = device

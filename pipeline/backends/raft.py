@@ -20,10 +20,7 @@ HIDDEN = 128
 LEVELS, RADIUS = 4, 4
 CELL_PX = 8
 """pixels per cell in which flow is searched"""
-REMEDY = (
-    "download raft-things.pth from the authors (github.com/princeton-vl/RAFT) and name it in the recipe "
-    "as `weights`"
-)
+REMEDY = "download raft-things.pth (github.com/princeton-vl/RAFT) and name it as `weights` in the recipe"
 
 
 class Raft(nn.Module):
@@ -42,9 +39,7 @@ class Raft(nn.Module):
         iterations: int,
         start: Float[Tensor, "batch 2 rows columns"] | None = None,
     ) -> Float[Tensor, "batch 2 height width"]:
-        """Return the flow in pixels; colours 0..255, sides divisible by 8. ``start`` is a guess in cells, at
-        cell resolution.
-        """
+        """Return the flow in pixels; colours 0..255, sides divisible by 8, ``start`` a guess in cells."""
         first, second = (2 * (picture / 255) - 1 for picture in (first, second))
         here, there = self.fnet(torch.cat([first, second])).float().chunk(2)
         pyramid = correlation_pyramid(here, there)
@@ -69,9 +64,8 @@ def load(path: Path, device: str = "cpu") -> Raft:
         # `norm3` is the second name of what `downsample.1` holds.
         network.load_state_dict({name: value for name, value in stored.items() if ".norm3." not in name})
     except (RuntimeError, AttributeError, EOFError, ValueError) as error:
-        raise InputError(
-            "MOD-003", f"these are not weights of the basic RAFT ({str(error)[:200]})", str(path), REMEDY
-        ) from error
+        what = f"these are not weights of the basic RAFT ({str(error)[:200]})"
+        raise InputError("MOD-003", what, str(path), REMEDY) from error
     except Exception as error:
         if type(error).__name__ == "UnpicklingError":
             raise InputError("MOD-003", "these are not plain weights", str(path), REMEDY) from error
@@ -87,20 +81,15 @@ def flow_between(
     iterations: int,
     guess: Float[np.ndarray, "height width 2"] | None = None,
 ) -> Float[np.ndarray, "height width 2"]:
-    """Return the flow in pixels between RGB pictures of any size; they are padded by repeating their
-    borders.
-    """
+    """Return the flow in pixels between RGB pictures of any size, padded by repeating their borders."""
     device = next(network.parameters()).device
     height, width = first.shape[:2]
     down, across = -height % CELL_PX, -width % CELL_PX
     padding = (across // 2, across - across // 2, down // 2, down - down // 2)
 
     def padded(image: np.ndarray) -> Tensor:
-        return F.pad(
-            torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None].to(device),
-            padding,
-            mode="replicate",
-        )
+        pixels = torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None].to(device)
+        return F.pad(pixels, padding, mode="replicate")
 
     start = None if guess is None else F.avg_pool2d(padded(guess), CELL_PX) / CELL_PX
     flow = network(padded(first), padded(second), iterations, start)[0].permute(1, 2, 0)
@@ -125,9 +114,8 @@ def look_up(
     """Read the correlations in a window around each cell's target, in cells, on every level (RAFT, Eq. 2)."""
     batch, _, rows, columns = target.shape
     reach = torch.linspace(-RADIUS, RADIUS, 2 * RADIUS + 1, device=target.device)
-    window = torch.stack(
-        torch.meshgrid(reach, reach, indexing="ij"), dim=-1
-    )  # x steps along the first axis: so were weights trained
+    # x steps along the first axis: so were weights trained
+    window = torch.stack(torch.meshgrid(reach, reach, indexing="ij"), dim=-1)
     centers, seen = target.permute(0, 2, 3, 1).reshape(-1, 1, 1, 2), []
     for level, correlation in enumerate(pyramid):
         index = centers / 2**level + window
@@ -144,12 +132,8 @@ def upsampled(
     batch, _, rows, columns = flow.shape
     weight = mask.view(batch, 1, 9, CELL_PX, CELL_PX, rows, columns).softmax(dim=2)
     around = F.unfold(CELL_PX * flow, 3, padding=1).view(batch, 2, 9, 1, 1, rows, columns)
-    return (
-        (weight * around)
-        .sum(2)
-        .permute(0, 1, 4, 2, 5, 3)
-        .reshape(batch, 2, CELL_PX * rows, CELL_PX * columns)
-    )
+    pixels = (weight * around).sum(2).permute(0, 1, 4, 2, 5, 3)
+    return pixels.reshape(batch, 2, CELL_PX * rows, CELL_PX * columns)
 
 
 def _cell_index(rows: int, columns: int, device: torch.device) -> Float[Tensor, "1 2 rows columns"]:
@@ -196,15 +180,10 @@ class _Update(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.encoder, self.gru = _Motion(), _Recurrence()
-        head = {
-            "conv1": nn.Conv2d(HIDDEN, 256, 3, 1, 1),
-            "relu": nn.ReLU(),
-            "conv2": nn.Conv2d(256, 2, 3, 1, 1),
-        }
-        self.flow_head = nn.Sequential(OrderedDict(head))
-        self.mask = nn.Sequential(
-            nn.Conv2d(HIDDEN, 256, 3, 1, 1), nn.ReLU(), nn.Conv2d(256, 9 * CELL_PX**2, 1)
-        )
+        wide, flow = nn.Conv2d(HIDDEN, 256, 3, 1, 1), nn.Conv2d(256, 2, 3, 1, 1)
+        self.flow_head = nn.Sequential(OrderedDict(conv1=wide, relu=nn.ReLU(), conv2=flow))
+        wide, mask = nn.Conv2d(HIDDEN, 256, 3, 1, 1), nn.Conv2d(256, 9 * CELL_PX**2, 1)
+        self.mask = nn.Sequential(wide, nn.ReLU(), mask)
 
     def forward(self, hidden: Tensor, context: Tensor, seen: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
         hidden = self.gru(hidden, torch.cat([context, self.encoder(flow, seen)], dim=1))
@@ -214,10 +193,8 @@ class _Update(nn.Module):
 class _Motion(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.convc1, self.convc2 = (
-            nn.Conv2d(LEVELS * (2 * RADIUS + 1) ** 2, 256, 1),
-            nn.Conv2d(256, 192, 3, 1, 1),
-        )
+        seen = LEVELS * (2 * RADIUS + 1) ** 2
+        self.convc1, self.convc2 = nn.Conv2d(seen, 256, 1), nn.Conv2d(256, 192, 3, 1, 1)
         self.convf1, self.convf2 = nn.Conv2d(2, 128, 7, 1, 3), nn.Conv2d(128, 64, 3, 1, 1)
         self.conv = nn.Conv2d(64 + 192, HIDDEN - 2, 3, 1, 1)
 

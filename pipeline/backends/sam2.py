@@ -24,9 +24,7 @@ class Sam2:
     """A loaded tracker of one thing."""
 
     def __init__(self, weights: str, device: str) -> None:
-        """Load a checkpoint folder. Raises MOD-001 (missing), MOD-002 (no transformers), MOD-003 (another
-        model).
-        """
+        """Load a checkpoint folder. Raises MOD-001, MOD-002 and MOD-003 as `checkpoints` does."""
         path = checkpoints.folder(weights, "SAM 2", CHECKPOINT)
         self._model = checkpoints.model("Sam2VideoModel", path, device)
         self._preparation = checkpoints.Preparation.read(path, Image.Resampling.BILINEAR)
@@ -38,8 +36,7 @@ class Sam2:
     def track(
         self, color: Callable[[int], Picture], frames: range, box_px: Float[np.ndarray, "4"]
     ) -> Iterator[tuple[Float[np.ndarray, "height width"], float]]:
-        """Follow what the box (x0, y0, x1, y1, pixels) shows in the first of ``frames``, in their order,
-        forwards or backwards.
+        """Follow what the box (x0, y0, x1, y1, pixels) shows in the first of ``frames``, in their order.
 
         Yields (log-odds per pixel, log-odds that it is in view) per frame.
         """
@@ -48,29 +45,19 @@ class Sam2:
             picture = color(frame)
             if position == 0:
                 self._point_at(session, frame, box_px, picture.shape[:2])
-            pixels = self.prepared(picture)
-            answer = self._model(
-                inference_session=session,
-                frame=pixels,
-                frame_idx=frame,
-                reverse=position > 0 and frames.step < 0,
-            )
-            yield (
-                _enlarged(answer.pred_masks, self._side, picture.shape[:2]),
-                float(answer.object_score_logits.reshape(-1)[0]),
-            )
+            pixels, reverse = self.prepared(picture), position > 0 and frames.step < 0
+            answer = self._model(inference_session=session, frame=pixels, frame_idx=frame, reverse=reverse)
+            masks = _enlarged(answer.pred_masks, self._side, picture.shape[:2])
+            yield masks, float(answer.object_score_logits.reshape(-1)[0])
             self._forget(session, frame, frames.step)
 
     def prepared(self, picture: Picture) -> Float[torch.Tensor, "1 3 side side"]:
         """Resize with antialiasing as bytes, scale and normalise, as the checkpoint's own processor does."""
         image = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)))[None]
-        image = F.interpolate(
-            image, (self._side, self._side), mode="bilinear", antialias=True, align_corners=False
-        )
-        mean, std = (
-            torch.tensor(values).view(1, 3, 1, 1)
-            for values in (self._preparation.mean, self._preparation.std)
-        )
+        size = self._side, self._side
+        image = F.interpolate(image, size, mode="bilinear", antialias=True, align_corners=False)
+        prepared = self._preparation.mean, self._preparation.std
+        mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in prepared)
         return ((image.float() - 255 * mean) / (255 * std)).to(self._device)
 
     def _session(self) -> Any:
@@ -88,9 +75,8 @@ class Sam2:
         scale = torch.tensor([self._side / size[1], self._side / size[0]])
         corners = torch.as_tensor(np.asarray(box_px, np.float32)).reshape(1, 1, 2, 2) * scale
         labels = torch.tensor([2, 3], dtype=torch.int32).reshape(1, 1, 2)
-        session.add_point_inputs(
-            session.obj_id_to_idx(OBJECT), frame, {"point_coords": corners, "point_labels": labels}
-        )
+        prompt = {"point_coords": corners, "point_labels": labels}
+        session.add_point_inputs(session.obj_id_to_idx(OBJECT), frame, prompt)
         session.obj_with_new_inputs = [OBJECT]
 
     def _forget(self, session: Any, frame: int, step: int) -> None:

@@ -42,47 +42,33 @@ class ClickSession:
     def state(self) -> dict[str, Any]:
         """Return what the page needs to begin."""
         names = list(self.recordings)
-        frames = {
-            name: [
-                {
-                    "source_index": int(self.recordings[name].source_index[frame]),
-                    "url": f"/picture/{names.index(name)}/{frame}.jpg",
-                }
-                for frame in self.shown[name]
-            ]
-            for name in names
-        }
-        pairs = clicks.read(self.path) if self.path.exists() else []
-        return {
-            "reference": self.reference,
-            "wanted": clicks.WANTED,
-            "frames": frames,
-            "pairs": [asdict(pair) for pair in pairs],
-        }
+
+        def frame_of(name: str, frame: int) -> dict[str, Any]:
+            source_index = int(self.recordings[name].source_index[frame])
+            return {"source_index": source_index, "url": f"/picture/{names.index(name)}/{frame}.jpg"}
+
+        frames = {name: [frame_of(name, frame) for frame in self.shown[name]] for name in names}
+        pairs = [asdict(pair) for pair in clicks.read(self.path)] if self.path.exists() else []
+        return {"reference": self.reference, "wanted": clicks.WANTED, "frames": frames, "pairs": pairs}
 
     def fits(self, pairs: list[ClickedPair]) -> dict[str, Any]:
-        """Return, per frame with enough pairs, what is left of each pair in millimetres (null without
-        depth).
-        """
+        """Return, per frame with enough pairs, what is left of each in millimetres (null without depth)."""
         found = {}
         for name, recorded in self.recordings.items():
             for source_index, group in clicks.by_frame(pairs, name).items():
                 fit = clicks.fit(group, recorded, self.recordings[self.reference], self.world_from_reference)
                 if fit is not None:
                     left = [None if np.isnan(m) else round(1000 * float(m), 1) for m in fit.residual_m]
-                    found[f"{name}/{source_index}"] = {
-                        "typical_mm": round(1000 * fit.typical_m, 1),
-                        "left_mm": left,
-                    }
+                    typical_mm = round(1000 * fit.typical_m, 1)
+                    found[f"{name}/{source_index}"] = {"typical_mm": typical_mm, "left_mm": left}
         return found
 
     def keep(self, pairs: list[ClickedPair]) -> None:
         """Replace the file of clicks; names must be of recordings that are shown."""
         for pair in pairs:
             if pair.seen.recording not in self.recordings or pair.reference.recording != self.reference:
-                raise ValueError(
-                    f"{pair.seen.recording!r} and {pair.reference.recording!r} are not what is clicked on"
-                )
+                names = f"{pair.seen.recording!r} and {pair.reference.recording!r}"
+                raise ValueError(f"{names} are not what is clicked on")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         fresh = self.path.with_name(f".{self.path.name}.tmp")
         with open(fresh, "w") as file:
@@ -131,21 +117,16 @@ class Handler(BaseHTTPRequestHandler):
             found = self.server.desk.picture(int(match[1]), int(match[2])) if match else b""
         except LookupError:
             found = b""
-        return (
-            self._send(HTTPStatus.OK, found, "image/jpeg")
-            if found
-            else self._send(HTTPStatus.NOT_FOUND, b"", "text/plain")
-        )
+        if not found:
+            return self._send(HTTPStatus.NOT_FOUND, b"", "text/plain")
+        return self._send(HTTPStatus.OK, found, "image/jpeg")
 
     def do_POST(self) -> None:
         """Keep the clicks and answer with their fits."""
         stated = self.headers.get("Content-Length") or ""
         length = int(stated) if stated.isascii() and stated.isdigit() and len(stated) < MAX_DIGITS else 0
-        if (
-            not self._from_here()
-            or self.path != "/clicks"
-            or self.headers.get("Content-Type") != "application/json"
-        ):
+        wanted = self.path == "/clicks" and self.headers.get("Content-Type") == "application/json"
+        if not self._from_here() or not wanted:
             return self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
         if not 0 < length <= clicks.MAX_BYTES:
             return self._send(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, b"", "text/plain")
@@ -169,12 +150,9 @@ class Handler(BaseHTTPRequestHandler):
 
     def _send(self, code: int, body: bytes, kind: str) -> None:
         self.send_response(code)
-        for name, text in (
-            ("Content-Type", kind),
-            ("Content-Length", str(len(body))),
-            ("Cache-Control", "no-store"),
-        ):
-            self.send_header(name, text)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
         self.end_headers()
         self.wfile.write(body)
 

@@ -24,9 +24,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, clicks_file: Path) -> ClickSession:
-    """Choose the frames to click in.
-
-    `serving.server` serves the session, which keeps its clicks in ``clicks_file``.
+    """Choose the frames to click in; the session, which `serving.server` serves, keeps ``clicks_file``.
 
     Raises InputError EVA-001 where that file is there and holds no clicks.
     """
@@ -34,10 +32,8 @@ def run(inputs: Inputs, config: Config, clicks_file: Path) -> ClickSession:
         clicks.read(clicks_file)
     recordings = {name: ClickedClip.open(folder) for name, folder in inputs.frames.items()}
     cameras = SceneCameras.open(inputs.scene_template)
-    shown = {
-        name: sharpest_per_stretch(each.clip.quality, config.frames) for name, each in recordings.items()
-    }
-    shown[inputs.walkthrough] = sharpest_per_stretch(
-        recordings[inputs.walkthrough].clip.quality, config.references, cameras.registered
-    )
+    quality = {name: each.clip.quality for name, each in recordings.items()}
+    shown = {name: sharpest_per_stretch(each, config.frames) for name, each in quality.items()}
+    walk = quality[inputs.walkthrough]
+    shown[inputs.walkthrough] = sharpest_per_stretch(walk, config.references, cameras.registered)
     return ClickSession(recordings, shown, inputs.walkthrough, cameras.world_from_registered, clicks_file)

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import exit_code
 from pipeline.workflow import artifact
 from stages.compile_gallery import stage
 
@@ -21,14 +21,14 @@ def main(arguments: list[str]) -> int:
     )
     parser.add_argument("build", type=Path, help="folder of builds: build")
     given = parser.parse_args(arguments)
-    try:
-        page = stage.run(given.build)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    artifact.write_if_changed(given.build / "index.html", page)
-    print(f"written: {given.build / 'index.html'}")
-    return 0
+
+    def program() -> int:
+        index = given.build / "index.html"
+        artifact.write_if_changed(index, stage.run(given.build))
+        print(f"written: {index}")
+        return 0
+
+    return exit_code(program)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from PIL import Image
 
@@ -20,7 +20,7 @@ METRICS = (
     "registration/translation_m_median",
 )
 """Keys of `metrics.json` that a visitor can picture."""
-_CHECKS = {"sessions to replay": "sessions to replay", "size of the page": "size of the page"}
+_CHECKS = ("sessions to replay", "size of the page")
 _QUALITY = 82
 _THUMBNAIL_PX = 480
 """Longer side; twice the width of a card."""
@@ -62,32 +62,31 @@ class Card:
 def card(folder: Path, root: Path) -> Card:
     """Read the build in `folder`, whose simulator is finished, for a gallery in `root`."""
     contract = json.loads((folder / "simulator/simulator.json").read_bytes())
-    notes = [json.loads(file.read_bytes()) for file in _notes(folder)]
-    checks: list[dict[str, Any]] = [check for note in notes for check in note["checks"]]
+    files = [*folder.glob("*/qa.json"), *folder.glob("*/*/qa.json")]
+    checks = [check for file in files for check in json.loads(file.read_bytes())["checks"]]
     pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
+    homes = sorted(folder.glob("homes/*/simulator/index.html"))
+    pages = [("report", folder / "report/index.html")]
+    pages += [(f"in the home of {home.parents[1].name}", home) for home in homes]
+
+    def link(words: str, page: Path) -> Link:
+        return Link(words, page.relative_to(root).as_posix())
+
     return Card(
         name=str(contract["name"]),
         folder=folder.relative_to(root).as_posix(),
         thumbnail=_thumbnail(pictures[0]) if pictures else None,
         status=qa.worst([check["status"] for check in checks]) if checks else "none",
         figures=(*_checked(folder), *_measured(folder)),
-        page=_link("walk with it", folder / "simulator/index.html", root),
-        links=tuple(_links(folder, root)),
+        page=link("walk with it", folder / "simulator/index.html"),
+        links=tuple(link(words, page) for words, page in pages if page.is_file()),
     )
-
-
-def _notes(folder: Path) -> list[Path]:
-    return sorted([*folder.glob("*/qa.json"), *folder.glob("*/*/qa.json")])
 
 
 def _checked(folder: Path) -> list[Figure]:
     """Return figures from the simulator's own checks."""
     checks = json.loads((folder / "simulator/qa.json").read_bytes())["checks"]
-    return [
-        Figure(_CHECKS[each["name"]], each["value"], each["unit"])
-        for each in checks
-        if each["name"] in _CHECKS
-    ]
+    return [Figure(each["name"], each["value"], each["unit"]) for each in checks if each["name"] in _CHECKS]
 
 
 def _measured(folder: Path) -> list[Figure]:
@@ -96,19 +95,6 @@ def _measured(folder: Path) -> list[Figure]:
     metrics = json.loads(file.read_bytes()) if file.is_file() else {}
     known = [(words.describe(key), metrics[key]) for key in METRICS if metrics.get(key) is not None]
     return [Figure(found.text, value, found.unit) for found, value in known]
-
-
-def _links(folder: Path, root: Path) -> list[Link]:
-    links = []
-    if (folder / "report/index.html").is_file():
-        links.append(_link("report", folder / "report/index.html", root))
-    for home in sorted(folder.glob("homes/*/simulator/index.html")):
-        links.append(_link(f"in the home of {home.parents[1].name}", home, root))
-    return links
-
-
-def _link(text: str, file: Path, root: Path) -> Link:
-    return Link(text, file.relative_to(root).as_posix())
 
 
 def _thumbnail(file: Path) -> str:

@@ -26,12 +26,9 @@ def run(root: Path) -> str:
     if not folders:
         raise InputError("ART-003", "has no finished simulator", str(root), "build one: make cat")
     cards = [reading.card(folder, root) for folder in sorted(folders)]
+    loader, undefined = jinja2.PackageLoader("stages.compile_gallery", "."), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("stages.compile_gallery", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=undefined
     )
     environment.filters["number"] = number
     return environment.get_template("gallery.html").render(cards=cards, marks=qa.MARKS, words=_WORDS)

@@ -68,8 +68,9 @@ def of_session(
     length_m: float,
     learned: Learned | None,
 ) -> list[FrameDepth | None]:
-    """Return the depth of a session's frames: the room's from the map, the animal's where it stands; None
-    where the picture differs from what the map shows there nearly everywhere.
+    """Return the depth of a session's frames: the room's from the map, the animal's where it stands.
+
+    None where the picture differs from what the map shows there nearly everywhere.
     """
     by_view = {id(each.view): each for each in walk}
     times = subsampling.evenly(len(shown), foreground.OTHER_TIMES)
@@ -78,20 +79,15 @@ def of_session(
         apart = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.APART_S]
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
         before = foreground.foreground(target, seen, [shown[other] for other in apart])
-        parts, view = None if before.mean() > STRANGE_SHARE else _parts(before), target.view
-        touched = [
-            contact.find(part, view.intrinsics, view.world_from_camera, room.caster) for part in parts or ()
-        ]
+        parts = None if before.mean() > STRANGE_SHARE else _parts(before)
+        camera = target.view.intrinsics, target.view.world_from_camera
         masks.append(parts)
-        contacts.append(touched)
+        contacts.append([contact.find(part, *camera, room.caster) for part in parts or ()])
     largest = [touched[0] if touched else None for touched in contacts]
-    carried = contact.between(timestamp_s, largest, CARRIED_S)
-    return [
-        None
-        if masks[frame] is None
-        else _with_animal(frame, target, masks[frame], contacts[frame], carried[frame], length_m, learned)
-        for frame, target in enumerate(shown)
-    ]
+    carried, found = contact.between(timestamp_s, largest, CARRIED_S), []
+    for frame, seen in enumerate(zip(shown, masks, contacts, carried, strict=True)):
+        found.append(None if masks[frame] is None else _with_animal(frame, *seen, length_m, learned))
+    return found
 
 
 def _parts(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "height width"]]:
@@ -131,16 +127,13 @@ def _with_animal(frame, target: ColorView, parts, touched, carried, length_m, le
 
 
 def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[ColorView]) -> list[FrameDepth]:
-    """Return the depth of frames that circle an animal at rest: by several views, and of the map where they
-    do not tell and nothing stands before it.
-    """
+    """Return the depth of frames that circle an animal at rest: by several views, else the map's."""
     views = [_sweep_view(each) for each in shown]
     others = [_around(number, shown) for number in range(len(shown))]
     swept = []
     for number, each in enumerate(track(views, "depth by several views")):
-        farthest = FARTHEST_SHARE * float(shown[number].view.depth.max(initial=1.0))
         near = [views[other] for other in others[number]]
-        reach = (NEAREST_M, farthest)
+        reach = NEAREST_M, FARTHEST_SHARE * float(shown[number].view.depth.max(initial=1.0))
         swept.append(plane_sweep.sweep(each, near, reach, PLANES) if near else np.zeros_like(each.gray))
     by_view, found = {id(each.view): each for each in walk}, []
     for number, target in enumerate(track(shown, "what several views agree on")):

@@ -49,9 +49,7 @@ def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorV
 def difference(
     target: ColorView, source: ColorView
 ) -> tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-    """Return by how much each pixel differs from what a source shows of its place, beyond the slack, and
-    where the source shows it at all.
-    """
+    """Return by how much, beyond the slack, pixels differ from a source, and where it shows their places."""
     warped = views.warp(target.view, source.view)
     shown = cv2.remap(source.lab, warped.there[..., 0] - 0.5, warped.there[..., 1] - 0.5, cv2.INTER_LINEAR)
     known = warped.known
@@ -84,16 +82,12 @@ def _differing(by_walk, by_times, limit: float) -> Bool[np.ndarray, "height widt
     walked, seen_walk = _votes(by_walk, limit)
     timed, seen = _votes(by_times, limit)
     unlike_walk = (seen_walk == 0) | (walked >= WALK_SHARE * seen_walk)
-    unlike_times = (seen < LEAST_SEEN) | (
-        timed >= np.maximum(TIMES_SHARE * seen, np.minimum(LEAST_TIMES, seen))
-    )
+    enough = np.maximum(TIMES_SHARE * seen, np.minimum(LEAST_TIMES, seen))
+    unlike_times = (seen < LEAST_SEEN) | (timed >= enough)
     return unlike_walk & unlike_times & ((seen_walk > 0) | (seen >= LEAST_SEEN))
 
 
 def _votes(compared, limit: float):
     """Count the pictures that differ, and those that see each pixel's place."""
-    if not compared:
-        return 0, 0
-    return sum(known & (beyond > limit) for beyond, known in compared), sum(
-        known.astype(int) for _, known in compared
-    )
+    differing = sum(known & (beyond > limit) for beyond, known in compared)
+    return differing, sum(known.astype(int) for _, known in compared)

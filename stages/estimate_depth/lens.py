@@ -93,15 +93,14 @@ class Located:
 def locate(
     matches: Matches, lens: Lens, seed: int, *, within_px: float | None = None, calibrate: bool = False
 ) -> Located | None:
-    """Return a frame's camera by PnP with LO-RANSAC and refinement, its focal length too if it is to be
-    found; None where too few matches agree on any.
+    """Return a frame's camera by PnP with LO-RANSAC and refinement, to ``calibrate`` its focal length too.
+
+    None where too few matches agree on any.
     """
     if len(matches.pixel) < LEAST_MATCHES:
         return None
-    estimation, refinement = (
-        pycolmap.AbsolutePoseEstimationOptions(),
-        pycolmap.AbsolutePoseRefinementOptions(),
-    )
+    estimation = pycolmap.AbsolutePoseEstimationOptions()
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
     estimation.ransac.random_seed = seed
     estimation.ransac.max_error = within_px or PIXELS_SHARE * max(lens.size)
     estimation.estimate_focal_length = refinement.refine_focal_length = calibrate
@@ -150,9 +149,8 @@ def adjusted(lens: Lens, located: Sequence[Located], *, bend: bool = True) -> Le
         flat = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
         distorted = flat * (1 + radial * (flat**2).sum(1, keepdims=True))
         off_px = (scale * lens.focal_px * distorted + centre - pixel).ravel()
-        return np.append(
-            off_px, (radial - lens.radial) * np.sqrt(len(pixel)) / (RADIAL_SIGMA if bend else 1e-6)
-        )
+        sigma = RADIAL_SIGMA if bend else 1e-6
+        return np.append(off_px, (radial - lens.radial) * np.sqrt(len(pixel)) / sigma)
 
     sparsity = scipy.sparse.lil_matrix((2 * len(pixel) + 1, 2 + 6 * len(located)), dtype=int)
     sparsity[:, :2] = 1

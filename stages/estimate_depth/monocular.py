@@ -18,9 +18,8 @@ def aligned(
 ) -> Float[np.ndarray, "height width"]:
     """Return depth in metres from numbers that grow with inverse depth: 1 / depth = scale * number + shift.
 
-    Scale and shift are fitted to the map's depth (metres) where it ``counts``, robustly (Cauchy weights at
-    the median residual); 0 where there is none, and everywhere where too little counts or the scale is not
-    positive.
+    Scale and shift are fitted to the map's depth (metres) where it ``counts``, Cauchy weights at the median
+    residual; 0 where there is none, and everywhere where too little counts or the scale is not positive.
     """
     if counts.sum() < LEAST_PIXELS:
         return np.zeros(inverse.shape, np.float32)

@@ -44,18 +44,17 @@ class Inputs:
 def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", video: Video | None = None
 ) -> writing.Estimated:
-    """Estimate cameras and depth of one recording into `out`. Raises InputError MAP-007 where the map
-    does not show what the recording does, MOD-001 to MOD-003 for a network's checkpoint.
+    """Estimate cameras and depth of one recording into `out`.
+
+    Raises MAP-007 where the map does not show what the recording does, MOD-001 to MOD-003 for a checkpoint.
     """
     pictures, walk = Pictures.open(inputs.pictures), Clip.open(next(iter(inputs.frames.values())))
     walk_cameras = SceneCameras.open(inputs.scene_template)
     caster = RayCaster(ply.read_ply(inputs.scene_template / "mesh.ply"))
     network = None if config.backend == "contact" else MonocularDepth(config.backend, config.weights, device)
     known = landmarks.build(walk, walk_cameras, caster)
-    walked = [
-        _walk_view(walk, walk_cameras, int(frame), caster)
-        for frame in landmarks.keyframe_numbers(walk_cameras)
-    ]
+    keyframes = landmarks.keyframe_numbers(walk_cameras).tolist()
+    walked = [_walk_view(walk, walk_cameras, frame, caster) for frame in keyframes]
     room = MapViews(caster, [each.view for each in walked])
     found, tracked = _placed(pictures, known, room, config)
     placed = np.flatnonzero(tracked.placed)
@@ -72,9 +71,7 @@ def run(
             depths = depth.of_turnaround(shown, room, walked)
         case "session":
             time_s = pictures.timestamp_s[placed]
-            learned = None
-            if network is not None:
-                learned = _learned(network, pictures, placed, found)
+            learned = None if network is None else _learned(network, pictures, placed, found)
             depths = depth.of_session(shown, time_s, room, walked, config.length_m, learned)
         case role:
             assert_never(role)
@@ -107,16 +104,14 @@ def _placed(
     pictures: Pictures, known: landmarks.Landmarks, room: MapViews, config: Config
 ) -> tuple[Lens, Tracked]:
     """Calibrate the lens and place the frames."""
-    keypoints, gray = [], []
-    for frame in track(range(len(pictures)), "describing pictures"):
-        keypoints.append(landmarks.describe(pictures.color(frame)))
+    frames = range(len(pictures))
+    keypoints = [landmarks.describe(pictures.color(each)) for each in track(frames, "describing pictures")]
     matches = [known.match(each) for each in track(keypoints, "recognizing the room")]
     found = lens.calibrate(matches, pictures.color_size, config.seed)
     if found is None:
         raise _unrecognized(pictures, "no frame shows anything that the walk-through shows as well")
     located = [lens.locate(each, found, config.seed) for each in matches]
-    for frame in range(len(pictures)):
-        gray.append(views.small_gray(found.straightened(pictures.color(frame))))
+    gray = [views.small_gray(found.straightened(pictures.color(frame))) for frame in frames]
     scale = gray[0].shape[1] / pictures.color_size[1]
     small = [Keypoints(each.pixel * scale, each.descriptors) for each in keypoints]
     footage = TrackingInput(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
@@ -134,8 +129,6 @@ def _learned(network: MonocularDepth, pictures: Pictures, placed: np.ndarray, fo
 
 
 def _unrecognized(pictures: Pictures, what: str) -> InputError:
-    remedy = (
-        "film it in the room of the walk-through, with furniture in view and little moved since; "
-        "or record it with depth; or take it out of the captures"
-    )
+    film = "film it in the room of the walk-through, with furniture in view and little moved since"
+    remedy = f"{film}; or record it with depth; or take it out of the captures"
     return InputError("MAP-007", what, str(pictures.folder), remedy)

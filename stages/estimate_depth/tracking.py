@@ -112,8 +112,9 @@ def forget_strays(
     poses: Float[np.ndarray, "frame 4 4"],
     sure: Bool[np.ndarray, "frame"],
 ) -> None:
-    """Forget, in place, pieces between jumps that fewer than `LEAST_SURE` frames placed by landmarks hold: on
-    floors that repeat, flow locks on to the wrong board.
+    """Forget, in place, pieces between jumps that fewer than `LEAST_SURE` frames placed by landmarks hold.
+
+    On floors that repeat, flow locks on to the wrong board.
     """
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     if len(known) < 2:
@@ -170,9 +171,8 @@ def walk_views(target: View, room: MapViews) -> list[View]:
     points = rigid.apply(target.world_from_camera, cameras.unproject(pixel, target.intrinsics) * z[:, None])
     scores = np.zeros(len(room.walk))
     for number, each in enumerate(room.walk):
-        there, theirs = cameras.project(
-            rigid.apply(rigid.inverse(each.world_from_camera), points), each.intrinsics
-        )
+        points_camera = rigid.apply(rigid.inverse(each.world_from_camera), points)
+        there, theirs = cameras.project(points_camera, each.intrinsics)
         at = np.floor(there).astype(int)
         inside = (theirs > 0.1) & ((at >= 0) & (at < each.gray.shape[::-1])).all(1)
         seen = each.depth[at[inside, 1], at[inside, 0]]
@@ -216,11 +216,10 @@ def _adjusted(
 
     poses = optimize_poses(poses, find, None, reach_m=REACH_M).world_from_camera
     mapped = [tie for tie in ties if tie.second == MAP and len(tie.pixel)]
-    chosen = [mapped[number] for number in subsampling.evenly(len(mapped), lenses.FRAMES)]
-    placed = [
-        Located(poses[tie.first], Matches(tie.pixel, tie.points), 1.0, footage.lens.focal_px)
-        for tie in chosen
-    ]
+    placed = []
+    for tie in (mapped[number] for number in subsampling.evenly(len(mapped), lenses.FRAMES)):
+        matches = Matches(tie.pixel, tie.points)
+        placed.append(Located(poses[tie.first], matches, 1.0, footage.lens.focal_px))
     return poses, lenses.adjusted(footage.lens, placed, bend=False) if placed else footage.lens
 
 

@@ -52,15 +52,10 @@ class Warped:
 
 def small_gray(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height small_width"]:
     """Reduce a picture and equalise its contrast."""
-    size = small_size(color.shape[:2])
+    scale = min(1.0, SHORTER_PX / min(color.shape[:2]))
+    size = round(color.shape[0] * scale), round(color.shape[1] * scale)
     gray = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
     return cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES).apply(gray)
-
-
-def small_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Return the (height, width) at which pictures are compared."""
-    scale = min(1.0, SHORTER_PX / min(size))
-    return round(size[0] * scale), round(size[1] * scale)
 
 
 def view_of(
@@ -88,8 +83,7 @@ def warp(target: View, source: View) -> Warped:
 def flow_matches(target: View, source: View) -> Matches:
     """Match a target's pixels with points of the world by what the source shows of them.
 
-    The target's camera is a guess: the source's picture is brought there, and optical flow tells how far off
-    it is. Points are those of the surface where the source sees them.
+    The target's camera is a guess: the source's picture is brought there, flow measures how far off it is.
     """
     warped = warp(target, source)
     if warped.known.mean() < LEAST_KNOWN:

@@ -68,29 +68,22 @@ def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: 
 def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> None:
     """Write the stage's own judgement: what is measured, what inferred."""
     chosen, depths = estimated.placed, estimated.depths
-    alone = float(estimated.tracked.by_landmarks[chosen].mean())
+    placed = 100 * len(chosen) / len(pictures)
+    alone = 100 * float(estimated.tracked.by_landmarks[chosen].mean())
     known = np.mean([(each.depth > 0).mean() for each in depths])
     certain = np.mean([(each.confidence == 2).mean() for each in depths])
     checks = [
-        qa.Check(
-            "frames placed in the map", 100 * len(chosen) / len(pictures), "%", warn=80.0, better="higher"
-        ),
-        qa.Check(
-            "placed by landmarks alone, the others tracked", 100 * alone, "%", warn=30.0, better="higher"
-        ),
+        qa.Check("frames placed in the map", placed, "%", warn=80.0, better="higher"),
+        qa.Check("placed by landmarks alone, the others tracked", alone, "%", warn=30.0, better="higher"),
         qa.Check("focal length, calibrated", estimated.lens.focal_px, "px"),
         qa.Check("radial distortion, calibrated", estimated.lens.radial),
         qa.Check("known depth", 100 * float(known), "%", warn=50.0, better="higher"),
         qa.Check("depth of the map, or confirmed by several views", 100 * float(certain), "%"),
         qa.Check("frames with inferred depth", 100 * float(np.mean([each.inferred for each in depths])), "%"),
     ]
-    shown = plots.sample(len(chosen), SHOWN)
-    size = depths[0].depth.shape
-    sheet = plots.grid(
-        [plots.resized(pictures.color(int(chosen[number])), size) for number in shown]
-        + [plots.depth_colors(depths[number].depth) for number in shown],
-        len(shown),
-    )
+    shown, size = plots.sample(len(chosen), SHOWN), depths[0].depth.shape
+    colors = [plots.resized(pictures.color(int(chosen[number])), size) for number in shown]
+    sheet = plots.grid([*colors, *(plots.depth_colors(depths[number].depth) for number in shown)], len(shown))
     qa.write(
         folder,
         good="depth follows the pictures' edges; the animal stands out of it on its feet",

@@ -1,6 +1,4 @@
-"""Estimate the optical flow of one video between frames 1, 2, 4 and 8 apart, forward and backward, with
-confidence.
-"""
+"""Estimate the optical flow of one video between frames 1, 2, 4 and 8 apart, both ways, with confidence."""
 
 from pipeline.workflow import cli
 from stages.estimate_flow import stage

@@ -16,7 +16,6 @@ from jaxtyping import Float, UInt8
 
 from pipeline.data.flow import STRIDE_PX
 
-"""colour pixels per stored flow vector"""
 MATCH_WINDOW_PX = 5
 """side of the window over which two candidates are compared, pixels at half the reduced size"""
 MATCH_MARGIN = 2.0
@@ -51,9 +50,7 @@ class Estimator:
     """Flow between pictures of one size."""
 
     def __init__(self, color_size: tuple[int, int], working_side_px: int) -> None:
-        """Prepare for pictures of (height, width), reduced until the longer side is at most
-        ``working_side_px``.
-        """
+        """Prepare for pictures of (height, width), the longer side reduced to ``working_side_px`` or less."""
         scale = min(1.0, working_side_px / max(color_size))
         self.dense_size = tuple(max(round(side * scale / 2), 8) for side in color_size)
         self.grid_px = grid_centers(color_size)
@@ -94,10 +91,8 @@ class Estimator:
 
     def _better(self, first: Gray, second: Gray, candidates: Sequence[Dense]) -> Dense:
         """Keep the first candidate but where the second one clearly makes the pictures look more alike."""
-        first, second = (
-            cv2.resize(gray, self.dense_size[::-1], interpolation=cv2.INTER_AREA) for gray in (first, second)
-        )
-        mismatch = []
+        size, mismatch = self.dense_size[::-1], []
+        first, second = (cv2.resize(gray, size, interpolation=cv2.INTER_AREA) for gray in (first, second))
         for candidate in candidates:
             difference = cv2.absdiff(_sampled(second, self._pixel + candidate), first).astype(np.float32)
             mismatch.append(cv2.blur(np.minimum(difference, MATCH_CLIP), (MATCH_WINDOW_PX, MATCH_WINDOW_PX)))
@@ -146,9 +141,8 @@ def flows(
 
 def chain(first_to_middle: Dense, middle_to_last: Dense) -> Dense:
     """Follow one flow, then the other."""
-    return first_to_middle + _sampled(
-        middle_to_last, _index_grid(*first_to_middle.shape[:2]) + first_to_middle
-    )
+    middle = _index_grid(*first_to_middle.shape[:2]) + first_to_middle
+    return first_to_middle + _sampled(middle_to_last, middle)
 
 
 def grid_centers(color_size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:

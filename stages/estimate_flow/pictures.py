@@ -54,15 +54,11 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
         name, least = f"both directions agree, {each.gap} apart", 100 * LEAST_AGREEMENT[each.gap]
         checks.append(qa.Check(name, 100 * each.agreement, "%", warn=least, better="higher"))
     checks += [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
-    pictures = [
-        qa.Picture(
-            f"gap_{each.gap}",
-            each.strip,
-            f"frames, flow to {each.gap} later (hue = direction, as the disc shows), dark where uncertain",
-        )
-        for each in reviews
-        if each.strip is not None
-    ]
+    pictures, key = [], "(hue = direction, as the disc shows), dark where uncertain"
+    for each in reviews:
+        caption = f"frames, flow to {each.gap} later {key}"
+        if each.strip is not None:
+            pictures.append(qa.Picture(f"gap_{each.gap}", each.strip, caption))
     qa.write(
         folder,
         good="one smooth colour for the moving camera, another inside the animal, dark only at edges",
@@ -84,9 +80,7 @@ def flow_wheel(
 
 
 def _key(height: int, edge: int = 96) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw what the colours mean: the disc shows at each place the colour of motion towards it, brighter when
-    faster.
-    """
+    """Draw what colours mean: a disc with, at each place, the colour of motion towards it, bright if fast."""
     key = np.full((height, edge, 3), 255, np.uint8)
     along = np.arange(edge) - (edge - 1) / 2
     towards = np.stack(np.meshgrid(along, along), axis=-1)

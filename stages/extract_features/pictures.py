@@ -18,9 +18,8 @@ def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame 
     size = (HEIGHT_PX, max(round(clip.color_size[1] * HEIGHT_PX / clip.color_size[0]), 1))
     images = [clip.color(int(i)) for i in shown] + [as_colors(features[i]) for i in shown]
     sheet = plots.grid([plots.resized(image, size) for image in images], len(shown))
-    steady = [
-        np.einsum("hwc,hwc->hw", *features[i : i + 2].astype(np.float32)) for i in range(len(features) - 1)
-    ]
+    pairs = (features[i : i + 2].astype(np.float32) for i in range(len(features) - 1))
+    steady = [np.einsum("hwc,hwc->hw", *pair) for pair in pairs]
     similarity = float(np.median(steady))
     qa.write(
         folder,

@@ -29,7 +29,6 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     describe = Describer.load(inputs.feature_basis).open(device)
     with features.writer(out, len(clip), clip.color_size) as table:
         for frame in progress.track(range(len(clip)), "features: frames"):
-            table.append(
-                features=basis.project(describe(clip.color(frame), features.STRIDE_PX)).astype(np.float16)
-            )
+            raw = describe(clip.color(frame), features.STRIDE_PX)
+            table.append(features=basis.project(raw).astype(np.float16))
     pictures.report_quality(out, clip, features.open_features(out))

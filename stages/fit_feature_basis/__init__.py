@@ -1,3 +1,1 @@
-"""Fit one linear feature basis to all recordings that models may learn from; `sampling` draws the
-descriptors.
-"""
+"""Fit one linear feature basis to all recordings that models may learn from."""

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.data.clips import Clip
+from pipeline.geometry.subsampling import evenly
 
 Describe = Callable[[np.ndarray, int], np.ndarray]
 FRAMES_PER_RECORDING = 16
@@ -21,6 +22,6 @@ def sample_descriptors(clips: Iterable[Clip], describe: Describe) -> Float[np.nd
 
 
 def _of_clip(clip: Clip, describe: Describe) -> Float[np.ndarray, "sample channel"]:
-    chosen = np.unique(np.linspace(0, len(clip) - 1, FRAMES_PER_RECORDING).round().astype(int))
+    chosen = evenly(len(clip), FRAMES_PER_RECORDING, rounded=True)
     described = (describe(clip.color(int(frame)), STRIDE_PX) for frame in chosen)
     return np.concatenate([raw.reshape(-1, raw.shape[-1]) for raw in described])

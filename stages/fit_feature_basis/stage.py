@@ -28,9 +28,8 @@ class Inputs:
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu") -> None:
     """Fit the 16 feature channels of one agent into `out`."""
-    clips = [
-        Clip.open(folder) for folder in progress.track(inputs.frames.values(), "feature basis: recordings")
-    ]
+    folders = progress.track(inputs.frames.values(), "feature basis: recordings")
+    clips = [Clip.open(folder) for folder in folders]
     describer = Describer(config.backend, config.weights)
     descriptors = sample_descriptors(clips, describer.open(device))
     basis = fit_basis(descriptors)

@@ -1,3 +1,1 @@
-"""The report of a build: what every stage said about itself, on pages that can be sent; nothing is computed
-again.
-"""
+"""The report of a build: what every stage said about itself, on pages that can be sent."""

@@ -75,10 +75,10 @@ def judge(metrics: Metrics, reasons: Mapping[str, str]) -> list[Judged]:
 
 
 def _judged(bar: Bar, metrics: Metrics, reasons: Mapping[str, str]) -> Judged:
-    value = _known(metrics.get(bar.metric))
-    limit = bar.limit
+    value, limit = _known(metrics.get(bar.metric)), bar.limit
     if isinstance(limit, str):
-        limit = _scaled(_known(metrics.get(limit)), bar.factor)
+        other = _known(metrics.get(limit))
+        limit = None if other is None else bar.factor * other
     if value is None or limit is None:
         missing = bar.metric if value is None else str(bar.limit)
         return Judged(bar, value, limit, "none", reasons.get(missing, "not measured"))
@@ -99,10 +99,6 @@ def grouped(metrics: Metrics) -> dict[str, dict[str, float | None]]:
         group, _, rest = name.partition("/")
         groups.setdefault(group, {})[rest or name] = _known(value)
     return groups
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value
 
 
 def _known(value: float | None) -> float | None:

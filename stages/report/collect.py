@@ -43,9 +43,9 @@ class EmbeddedPicture:
 class RecordingLabel:
     """How a recording is called."""
 
-    name: str
+    name: str = ""
     """its file's name; its id where names may reveal people"""
-    role: str
+    role: str = ""
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,6 @@ class Note:
     bad: str
     checks: list[dict[str, Any]]
     pictures: list[EmbeddedPicture]
-
-
-NO_LABEL = RecordingLabel("", "")
 
 
 @dataclass(frozen=True)
@@ -94,13 +91,9 @@ class ChapterReport:
     @property
     def worries(self) -> list[tuple[Note, dict[str, Any]]]:
         """Checks that are not fine, worst first."""
-        found = [
-            (note, check)
-            for note in self.notes
-            for check in note.checks
-            if check["status"] in ("warn", "fail")
-        ]
-        return sorted(found, key=lambda pair: -LIGHTS.index(pair[1]["status"]))
+        found = [(note, check) for note in self.notes for check in note.checks]
+        worrying = [pair for pair in found if pair[1]["status"] in ("warn", "fail")]
+        return sorted(worrying, key=lambda pair: -LIGHTS.index(pair[1]["status"]))
 
     @property
     def cover(self) -> EmbeddedPicture | None:
@@ -109,9 +102,7 @@ class ChapterReport:
 
 
 def label(video: Video, safe: bool) -> RecordingLabel:
-    """Return how a recording is called; names of files may reveal people, so not where the report is to be
-    ``safe``.
-    """
+    """Return how a recording is called, by its file's name where the report need not be ``safe``."""
     role = f"{video.role}, {video.split}" if video.role == "session" else video.role
     return RecordingLabel(video.id if safe else video.file, role)
 
@@ -129,11 +120,7 @@ def read_chapter(
     """
     raw = {video: _read(folder) for video, folder in folders.items()}
     manifests = [manifest for folder in folders.values() if (manifest := read_manifest(folder))]
-    files = [
-        folder / entry["file"]
-        for folder, qa in zip(folders.values(), raw.values(), strict=True)
-        for entry in qa["pictures"]
-    ]
+    files = [folders[video] / entry["file"] for video, qa in raw.items() for entry in qa["pictures"]]
     total = sum(file.stat().st_size for file in files)
     shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
 
@@ -141,7 +128,7 @@ def read_chapter(
         return safe and not any(fnmatch(Path(file).stem, name) for name in chapter.nobody_in)
 
     notes = [
-        _note(video, labels.get(video or "", NO_LABEL), folders[video], qa, shrink, blurred)
+        _note(video, labels.get(video or "", RecordingLabel()), folders[video], qa, shrink, blurred)
         for video, qa in raw.items()
     ]
     stands_on = frozenset(name.partition("/")[0] for manifest in manifests for name in manifest["inputs"])
@@ -149,9 +136,7 @@ def read_chapter(
 
 
 def with_verdicts(chapters: Sequence[ChapterReport], bars: Mapping[str, str]) -> list[ChapterReport]:
-    """Give every chapter the light of its bars, and that of what it stands on; chapters come in flow
-    order.
-    """
+    """Give every chapter the light of its bars, and of what it stands on; chapters come in flow order."""
     found: dict[str, ChapterReport] = {}
     reached: dict[str, frozenset[str]] = {}
     for each in chapters:
@@ -211,7 +196,6 @@ def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> Embedded
 def _beyond_recognition(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
     """Keep one colour per 24 pixels: layout and light stay, faces, pictures and writing go."""
     height, width, _ = color.shape
-    few = cv2.resize(
-        color, (max(1, width // _BLUR_PX), max(1, height // _BLUR_PX)), interpolation=cv2.INTER_AREA
-    )
+    size = max(1, width // _BLUR_PX), max(1, height // _BLUR_PX)
+    few = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
     return cv2.resize(few, (width, height), interpolation=cv2.INTER_LINEAR)

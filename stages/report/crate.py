@@ -1,8 +1,6 @@
-"""The build as a research object (RO-Crate 1.1): recordings, settings, versions, keys, contents, metrics,
-times.
+"""The build as a research object (RO-Crate 1.1): recordings, settings, versions, contents, metrics, times.
 
-`describe` writes what `make reproduce` reads. Times and the machine are in the records beside the artifacts,
-where the runner leaves them; they vary between runs.
+`describe` writes what `make reproduce` reads; times come from the runner's records beside the artifacts.
 """
 
 import json
@@ -30,9 +28,7 @@ def describe(
     safe: bool = False,
     times: bool = True,
 ) -> Entity:
-    """Return the content of `ro-crate-metadata.json`; `safe` leaves out names of files, which may reveal
-    people.
-    """
+    """Return the content of `ro-crate-metadata.json`; `safe` leaves out names of files."""
     recordings = [_recording(video, safe) for video in videos]
     artifacts = list(_artifacts(folders, times))
     root = {
@@ -41,7 +37,7 @@ def describe(
         "name": f"Report of {name}",
         "hasPart": [{"@id": file} for file in ("index.html", "methods.md", "references.bib")],
         "mentions": [{"@id": entity["@id"]} for entity in (*recordings, *artifacts)],
-        "variableMeasured": [_property(key, value) for key, value in sorted(metrics.items())],
+        "variableMeasured": _properties(**dict(sorted(metrics.items()))),
     }
     if times:
         root["locationCreated"] = _machine()
@@ -60,11 +56,7 @@ def _recording(video: Video, safe: bool) -> Entity:
         "@id": f"#recording/{video.id}",
         "@type": "CreativeWork",
         "name": video.id if safe else video.file,
-        "additionalProperty": [
-            _property("role", video.role),
-            _property("split", video.split),
-            _property("sha256", video.sha256),
-        ],
+        "additionalProperty": _properties(role=video.role, split=video.split, sha256=video.sha256),
     }
 
 
@@ -76,9 +68,8 @@ def _artifacts(folders: Mapping[str, Mapping[str | None, Path]], times: bool) ->
             if manifest is not None:
                 base = folder.parent if video is None else folder.parent.parent
                 named = artifact if video is None else f"{artifact}.{video}"
-                yield _artifact(
-                    named.replace(".", "/", 1), manifest, base / "records" / f"{named}.json", times
-                )
+                record = base / "records" / f"{named}.json"
+                yield _artifact(named.replace(".", "/", 1), manifest, record, times)
 
 
 def _artifact(name: str, manifest: Mapping[str, Any], record: Path, times: bool) -> Entity:
@@ -86,29 +77,20 @@ def _artifact(name: str, manifest: Mapping[str, Any], record: Path, times: bool)
     properties |= {key: json.dumps(manifest[key], sort_keys=True) for key in ("config", "versions", "inputs")}
     if times and record.exists():
         known = json.loads(record.read_bytes())
-        properties |= {
-            key: known.get(key)
-            for key in ("seconds", "cpu_seconds", "peak_memory_mb", "threads", "commit", "finished")
-        }
+        keys = ("seconds", "cpu_seconds", "peak_memory_mb", "threads", "commit", "finished")
+        properties |= {key: known.get(key) for key in keys}
     return {
         "@id": f"#artifact/{name}",
         "@type": "Dataset",
         "name": name,
-        "additionalProperty": [_property(key, value) for key, value in properties.items()],
+        "additionalProperty": _properties(**properties),
     }
 
 
-def _property(name: str, value: str | float | None) -> Entity:
-    return {"@type": "PropertyValue", "name": name, "value": value}
+def _properties(**values: str | float | None) -> list[Entity]:
+    return [{"@type": "PropertyValue", "name": name, "value": value} for name, value in values.items()]
 
 
 def _machine() -> Entity:
-    return {
-        "@type": "Place",
-        "name": "machine",
-        "additionalProperty": [
-            _property("system", platform.system()),
-            _property("architecture", platform.machine()),
-            _property("cores", os.cpu_count()),
-        ],
-    }
+    found = {"system": platform.system(), "architecture": platform.machine(), "cores": os.cpu_count()}
+    return {"@type": "Place", "name": "machine", "additionalProperty": _properties(**found)}

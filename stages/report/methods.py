@@ -1,6 +1,4 @@
-"""The methods of a build in words, with BibTeX entries of what was really used, by the settings in its
-manifests.
-"""
+"""The methods of a build in words, with BibTeX entries of what was used by the settings in its manifests."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -25,9 +23,7 @@ class Method:
     when: Mapping[str, Any] = field(default_factory=dict)
 
     def holds(self, settings: Mapping[str, Any]) -> bool:
-        """Return whether the artifact was made in this way; a setting that it does not have decides
-        nothing.
-        """
+        """Return whether the artifact was made in this way; a setting that it lacks decides nothing."""
         return all(settings.get(key, value) == value for key, value in self.when.items())
 
 
@@ -64,9 +60,8 @@ def bibliography(folders: Folders) -> str:
 
 def _used(folders: Folders) -> Iterator[tuple[Method, Mapping[str, Any]]]:
     for method in METHODS:
-        manifest = next(
-            (m for f in folders.get(method.artifact, {}).values() if (m := read_manifest(f))), None
-        )
+        made = map(read_manifest, folders.get(method.artifact, {}).values())
+        manifest = next(filter(None, made), None)
         if manifest is not None and method.holds(manifest["config"]):
             yield method, _Settings(manifest["config"])
 

@@ -24,29 +24,22 @@ def render(
     methods: str,
 ) -> dict[str, str]:
     """Return the text of every page by file name."""
+    loader, undefined = jinja2.PackageLoader("stages.report"), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("stages.report"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=undefined
     )
-    environment.filters["number"] = number
-    environment.filters["in_words"] = in_words
-    environment.globals["describe"] = metric_words.describe
-    environment.globals["remedy"] = remedy
+    environment.filters |= {"number": number, "in_words": in_words}
+    environment.globals |= {"describe": metric_words.describe, "remedy": remedy}
     shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": qa.MARKS}
     index = environment.get_template("index.html").render(
         **shared, judged=judged, metrics=metrics, reasons=reasons, methods=methods
     )
     pages = {"index.html": index}
     chapter = environment.get_template("chapter.html")
-    for place, shown in enumerate(chapters):
-        before = chapters[place - 1] if place else None
-        after = chapters[place + 1] if place + 1 < len(chapters) else None
-        pages[f"{shown.chapter.artifact}.html"] = chapter.render(
-            **shared, shown=shown, before=before, after=after
-        )
+    around = zip((None, *chapters), chapters, (*chapters[1:], None), strict=False)
+    for before, shown, after in around:
+        text = chapter.render(**shared, shown=shown, before=before, after=after)
+        pages[f"{shown.chapter.artifact}.html"] = text
     return pages
 
 

@@ -1,6 +1,4 @@
-"""The stage: notes of every artifact and the metrics -> pages, a crate to rebuild from, the methods in
-words.
-"""
+"""The stage: notes of every artifact, and the metrics -> pages, a crate to rebuild from, the methods."""
 
 import json
 from collections.abc import Mapping

@@ -1,6 +1,4 @@
-"""RAFT as an estimator: pictures in colour at the working size, flow from a guess where a longer gap has
-one.
-"""
+"""RAFT as an estimator: pictures in colour at the working size, flow from a guess where there is one."""
 
 import cv2
 import numpy as np
@@ -37,10 +35,8 @@ class RaftEstimator(Estimator):
         return self._estimated(first, last, chain(first_to_middle, middle_to_last))
 
     def _estimated(self, first: Color, second: Color, guess: Dense | None) -> Dense:
-        start = (
-            None
-            if guess is None
-            else 2 * cv2.resize(guess.astype(np.float32), first.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-        )
+        start, size = None, first.shape[1::-1]
+        if guess is not None:
+            start = 2 * cv2.resize(guess.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
         flow = raft.flow_between(self._network, first, second, UPDATES, start)
         return cv2.resize(flow, self.dense_size[::-1], interpolation=cv2.INTER_AREA) / 2

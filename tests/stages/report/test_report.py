@@ -102,7 +102,7 @@ def test_every_note_is_shown_and_nothing_is_asked_for(tmp_path: Path) -> None:
 
 def chapter_report(artifact_name: str, light: str, *stands_on: str) -> collect.ChapterReport:
     chapter = next(chapter for chapter in CHAPTERS if chapter.artifact == artifact_name)
-    note = collect.Note(None, collect.NO_LABEL, light, "", "", [], [])
+    note = collect.Note(None, collect.RecordingLabel(), light, "", "", [], [])
     return collect.ChapterReport(chapter, [note], {}, frozenset(stands_on))
 
 
