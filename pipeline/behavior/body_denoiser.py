@@ -70,9 +70,8 @@ class BodyDenoiser(nn.Module):
         step = self.steps(x, t, control)
         heading = self.headings(step, root)
         root = (rotated_to_heading(root, heading) - self.root_mean[:, None]) / self.root_std[:, None]
-        held = nn.functional.pad(
-            torch.cat([root, held[:, ROOT_CHANNELS:]], dim=1), (0, 0, x.shape[1] - self.posture, 0)
-        )
+        held = torch.cat([root, held[:, ROOT_CHANNELS:]], dim=1)
+        held = nn.functional.pad(held, (0, 0, x.shape[1] - self.posture, 0))
         unet_control = torch.cat([control, step * self.rate_hz, heading], dim=1)
         return self.unet(x - self.share[t.long()][:, None, None] * held, t, condition, unet_control, keep)
 
@@ -100,17 +99,15 @@ class BodyDenoiser(nn.Module):
         square = level.square().sum(1, keepdim=True)
         level = level * (square / (square + PATH_NOISE_M**2))
         way = (level.square().sum(1) + 1e-12).sqrt().cumsum(-1)
-        kept = torch.exp((way[:, None, :] - way[:, :, None]).clamp(max=0) / HEADING_MEMORY_M) * self.past
-        gone = level @ kept.mT
+        since = (way[:, None, :] - way[:, :, None]).clamp(max=0)
+        gone = level @ (torch.exp(since / HEADING_MEMORY_M) * self.past).mT
         return soft_unit(
             gone + HEADING_MEMORY_M * torch.exp(-way / HEADING_MEMORY_M)[:, None] * horizontal_forward(root)
         )
 
 
 class OneStageDenoiser(BodyDenoiser):
-    """Denoise path and body as one sequence, path first; the heading is that of the path, as far as noise
-    leaves it known.
-    """
+    """Denoise path and body as one sequence, path first; the heading is that of the noisy path."""
 
     velocity_std: Tensor
 
@@ -156,7 +153,5 @@ def rotated_to_heading(
 
 
 def soft_unit(vector: Float[Tensor, "batch 2 frame"]) -> Float[Tensor, "batch 2 frame"]:
-    """Return vectors of about length 1, shorter ones where there is hardly a direction: rounding must not
-    turn a body.
-    """
+    """Return vectors of about length 1, shorter where there is hardly a direction."""
     return vector / (vector.square().sum(1, keepdim=True) + MIN_DIRECTION**2).sqrt()

@@ -1,6 +1,4 @@
-"""Choices that recipes make about the behaviour model, and how plans are sampled and chained. Standard
-library only.
-"""
+"""Choices that recipes make about the behaviour model, and how plans are sampled. Standard library only."""
 
 from dataclasses import dataclass
 from typing import Literal

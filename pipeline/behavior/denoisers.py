@@ -21,12 +21,8 @@ TIME_CHANNELS, EMBEDDING = 64, 128
 
 def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
     """Return sines and cosines of the step number at 32 frequencies from 1 down to 1e-4."""
-    frequency = torch.exp(
-        -math.log(1e4)
-        / (TIME_CHANNELS // 2)
-        * torch.arange(TIME_CHANNELS // 2, dtype=torch.float32, device=t.device)
-    )
-    angle = t[:, None] * frequency
+    number = torch.arange(TIME_CHANNELS // 2, dtype=torch.float32, device=t.device)
+    angle = t[:, None] * torch.exp(-math.log(1e4) / (TIME_CHANNELS // 2) * number)
     return torch.cat([angle.sin(), angle.cos()], dim=-1)
 
 
@@ -50,18 +46,14 @@ class NoiseFromVelocity(nn.Module):
 
 
 class TrailingLinear(nn.Linear):
-    """A linear layer that reads the last numbers of a longer row: codes and posture come after the maps,
-    which only goals read.
-    """
+    """A linear layer that reads the last numbers of a longer row: what follows the maps."""
 
     def forward(self, row: Float[Tensor, "batch number"]) -> Float[Tensor, "batch out"]:
         return super().forward(row[:, -self.in_features :])
 
 
 class Embedding(nn.Module):
-    """Step and code as one vector, which conditions every block of a UNet; ``read`` makes so many numbers of
-    the code.
-    """
+    """Step and code as one vector, which conditions every block; ``read`` maps the code to its numbers."""
 
     def __init__(self, read: nn.Module):
         super().__init__()
@@ -97,9 +89,7 @@ class TemporalBlock(nn.Module):
 
 
 class UNet1d(nn.Module):
-    """A 1-D UNet over 56 frames (14 at the bottom of three levels) that takes features to add to
-    each block.
-    """
+    """A 1-D UNet of three levels over frames that takes features to add to each block."""
 
     def __init__(self, channels: int, widths: tuple[int, ...], embedding: int):
         super().__init__()
@@ -141,9 +131,7 @@ class UNet1d(nn.Module):
 
 
 class ControlUNet(nn.Module):
-    """Denoise a sequence under a control sequence (or one vector for all frames); ``keep`` 0 stands for no
-    control.
-    """
+    """Denoise a sequence under a control sequence or vector; ``keep`` 0 stands for no control."""
 
     def __init__(
         self,
@@ -191,9 +179,7 @@ class ControlUNet(nn.Module):
 
 
 class UncontrolledUNet(nn.Module):
-    """Denoise a sequence that nothing steers; called as `ControlUNet` is, and as good as one whose control is
-    never kept.
-    """
+    """Denoise a sequence that nothing steers; called as `ControlUNet` is."""
 
     def __init__(
         self,
@@ -234,9 +220,7 @@ class ConcatenationUNet(UncontrolledUNet):
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
     ):
-        """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of what is known of a
-        path.
-        """
+        """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of a path."""
         read = nn.Sequential(
             nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING)
         )

@@ -36,9 +36,7 @@ class Schedule:
 
     @property
     def method(self) -> Literal["ddpm", "ddim"]:
-        """Return how goals are best drawn (measured on homes kept from training): straight ways ask for no
-        fresh noise.
-        """
+        """Return how goals are best drawn (measured on homes kept from training)."""
         return "ddim" if self.course == "rectified" else "ddpm"
 
     @property
@@ -68,9 +66,7 @@ STANDARD = Schedule()
 
 
 def noised(clean: Array, noise: Array, alpha_bar: Array) -> Array:
-    """Return x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise; ``alpha_bar`` broadcasts
-    against both.
-    """
+    """Return x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise; ``alpha_bar`` broadcasts."""
     return alpha_bar**0.5 * clean + (1 - alpha_bar) ** 0.5 * noise
 
 

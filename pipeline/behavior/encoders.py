@@ -35,9 +35,7 @@ def beings(
     companions: Float[Tensor, "batch companion past_frame 4"],
     new_from_ego: Float[Tensor, "batch 3 3"],
 ) -> Float[Tensor, "batch other past_frame 10"]:
-    """Return what encoders read of an observer, whose pose is given, and of companions turned alike; zeros
-    stand for rotations that are not known.
-    """
+    """Return what encoders read of an observer's poses and of companions, whose rotations are unknown (0)."""
     first = nn.functional.pad(torch.cat([position, rigid_torch.rotation_to_6d(rotation)], dim=-1), (0, 1))
     place = companions[..., :3] @ new_from_ego.mT[:, None]
     unknown = place.new_zeros(*place.shape[:3], POSE_CHANNELS - 3)
@@ -122,9 +120,7 @@ class OtherPosesEncoder(SetEncoder):
 
 
 class PastEncoder(nn.Module):
-    """Encode the agent's own past: root poses in the ego frame, their changes, and bones (Eq. 13), normalised
-    inside.
-    """
+    """Encode the agent's past: root poses in the ego frame, their changes, and bones (Eq. 13)."""
 
     CHANGE = 3.0
     """scale of changes from frame to frame, and their bound"""

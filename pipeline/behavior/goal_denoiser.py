@@ -38,28 +38,19 @@ class GoalMLP(nn.Module):
         map_cells: int = 0, map_lookup: MapLookup = "attention",
     ):  # fmt: skip
         super().__init__()
-        self.noise, self.code, self.ensemble_size, self.map_numbers = (
-            NoiseFromVelocity(schedule),
-            code,
-            ensemble_size,
-            2 * MAP_KEY_CHANNELS * map_cells**2,
-        )
+        self.noise, self.code, self.ensemble_size = NoiseFromVelocity(schedule), code, ensemble_size
+        self.map_numbers = 2 * MAP_KEY_CHANNELS * map_cells**2
         code_channels = TIME_CHANNELS + HORIZON_CHANNELS + code
         self.clean, self.staying = CleanGoalEstimate(schedule), RestLikelihood()
-        pointwise = map_lookup == "pointwise"
-        self.map = (
-            None
-            if not map_cells
-            else MapAtGoal()
-            if pointwise
-            else MapAttention(map_cells, code_channels, ensemble_size)
-        )
-        sizes = [3 + code_channels + RestLikelihood.NUMBERS + (self.map.NUMBERS if self.map else 0)] + [
-            hidden
-        ] * (layers - 1)
-        inner = [
-            layer for i, o in pairwise(sizes) for layer in (EnsembleLinear(ensemble_size, i, o), nn.SiLU())
-        ]
+        self.map: MapAtGoal | MapAttention | None = None
+        if map_cells and map_lookup == "pointwise":
+            self.map = MapAtGoal()
+        elif map_cells:
+            self.map = MapAttention(map_cells, code_channels, ensemble_size)
+        inputs = 3 + code_channels + RestLikelihood.NUMBERS + (self.map.NUMBERS if self.map else 0)
+        sizes, inner = [inputs] + [hidden] * (layers - 1), []
+        for narrow, wide in pairwise(sizes):
+            inner += [EnsembleLinear(ensemble_size, narrow, wide), nn.SiLU()]
         self.layers = nn.Sequential(*inner, EnsembleLinear(ensemble_size, sizes[-1], 3))
 
     def forward(
@@ -78,24 +69,18 @@ class GoalMLP(nn.Module):
         condition: Float[Tensor, "batch condition"],
         horizon: Float[Tensor, "draw"],
     ) -> Float[Tensor, "member draw 3"]:
-        """Return what each member makes of it: they are trained apart and only averaged to sample. A batch
-        has its draws together.
-        """
+        """Return what each member makes of it. A batch has its draws together."""
         angle = horizon[:, None] * torch.tensor([1.0, 2.0, 4.0, 8.0], device=x.device)
         asked = torch.cat([time_embedding(t), angle.sin(), angle.cos()], dim=-1)
         each = [self.ensemble_size * self.map_numbers, self.ensemble_size * self.code]
-        maps, codes = (
-            part.unflatten(1, (self.ensemble_size, -1))
-            for part in condition[:, : sum(each)].split(each, dim=1)
-        )
+        parts = condition[:, : sum(each)].split(each, dim=1)
+        maps, codes = (part.unflatten(1, (self.ensemble_size, -1)) for part in parts)
         draws = 1 if x.shape[0] == condition.shape[0] else x.shape[0] // condition.shape[0]
         code = codes.transpose(0, 1)[:, :, None].expand(-1, -1, draws, -1).flatten(1, 2)
         code_channels = torch.cat([asked.expand(self.ensemble_size, -1, -1), code], dim=-1)
         clean = self.clean(x, t)
-        seen = [
-            torch.cat([x, self.staying(*clean)], dim=-1).expand(self.ensemble_size, -1, -1),
-            code_channels,
-        ]
+        point = torch.cat([x, self.staying(*clean)], dim=-1)
+        seen = [point.expand(self.ensemble_size, -1, -1), code_channels]
         if self.map is not None:
             seen.append(self.map(*clean, code_channels, maps))
         return self.noise(x, self.layers(torch.cat(seen, dim=-1)), t)
@@ -153,10 +138,8 @@ class RestLikelihood(nn.Module):
         """Return likelihoods (not normalised), their logarithms, and where the goal would be expected."""
         odds = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.spread))
         shrunk = mean[:, None] * (odds.exp() * self.spread / (variance + self.spread))[..., None]
-        return torch.cat(
-            [odds.exp(), (odds / 5).clamp_min(self.LEAST), shrunk.flatten(1).clamp(-self.MOST, self.MOST)],
-            dim=-1,
-        )
+        likelihood, logarithm = odds.exp(), (odds / 5).clamp_min(self.LEAST)
+        return torch.cat([likelihood, logarithm, shrunk.flatten(1).clamp(-self.MOST, self.MOST)], dim=-1)
 
 
 class MapAttention(nn.Module):
@@ -219,6 +202,5 @@ class MapAttention(nn.Module):
         read, looked = (
             (weight @ rows).flatten(1, 2).unflatten(1, (-1, self.HEADS)) for rows in (value.mT, scaled)
         )
-        return torch.cat(
-            [read.flatten(2), looked.flatten(2), (looked[:, :, : self.LOCAL] - mean).flatten(2)], dim=-1
-        )
+        read, place = read.flatten(2), looked.flatten(2)
+        return torch.cat([read, place, (looked[:, :, : self.LOCAL] - mean).flatten(2)], dim=-1)

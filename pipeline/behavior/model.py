@@ -99,9 +99,7 @@ class Architecture:
 
     @property
     def scene_stride(self) -> int:
-        """How many cells of the ego grid the scene encoder averages along each axis before it begins; all of
-        the height where it reads none.
-        """
+        """Cells of the ego grid that are averaged along each axis before encoding; all of a height unread."""
         match self.scene:
             case "pillars":
                 return self.scene_block
@@ -130,20 +128,9 @@ class Architecture:
     @property
     def perception(self) -> PerceptionConfig:
         """Return the sizes of the perception network."""
-        return PerceptionConfig(
-            self.scene,
-            self.observed_past,
-            self.scene_width,
-            self.scene_block,
-            self.scene_channels,
-            self.hidden,
-            self.code,
-            self.past,
-            9 + 6 * self.bones,
-            self.observer_radius_m,
-            self.rate_hz,
-            self.ablated_input,
-        )
+        names = {field.name for field in fields(PerceptionConfig)} & vars(self).keys()
+        shared = {name: getattr(self, name) for name in names}
+        return PerceptionConfig(**shared, past_frames=self.past, past_channels=9 + 6 * self.bones)
 
 
 @dataclass(frozen=True)
@@ -181,12 +168,8 @@ class Scaling:
         path: Float[np.ndarray, "plan frame 3"],
     ) -> Float[np.ndarray, "plan 4 frame"]:
         """Return scaled strides that lead along other paths."""
-        return np.swapaxes(
-            warped_path(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, path, self.rate_hz)
-            / self.velocity_std,
-            1,
-            2,
-        )
+        strides = np.swapaxes(scaled, 1, 2) * self.velocity_std
+        return np.swapaxes(warped_path(strides, start, path, self.rate_hz) / self.velocity_std, 1, 2)
 
     def scaled_path(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan 3 frame"]:
         """Return paths in metres as they control a body."""
@@ -213,9 +196,8 @@ class BehaviorNets(nn.Module):
         match a.control:
             case "unet":
                 if a.map_cells and a.map_lookup == "pointwise":
-                    self.path = WaypointUNet(
-                        a.ensemble_size, a.map_cells, a.future, 3, *sizes, rate_hz=a.rate_hz
-                    )
+                    maps = a.ensemble_size, a.map_cells, a.future
+                    self.path = WaypointUNet(*maps, 3, *sizes, rate_hz=a.rate_hz)
                 else:
                     self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
                 along = ControlUNet(a.body_channels, CONTROL_CHANNELS, *sizes)
@@ -235,9 +217,7 @@ class BehaviorNets(nn.Module):
 def channels_from_bones(
     agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
 ) -> Float[np.ndarray, "*batch channel"]:
-    """Return per bone the rotation vector of ``agent_from_bone rest^-1`` and the shift of its origin from
-    rest.
-    """
+    """Return per bone the rotation vector of ``agent_from_bone rest^-1`` and its origin's shift."""
     turn = agent_from_bone[..., :3, :3] @ np.swapaxes(rest[..., :3, :3], -1, -2)
     shift = agent_from_bone[..., :3, 3] - rest[..., :3, 3]
     return np.concatenate([rigid.vector_from_rotation(turn), shift], axis=-1).reshape(*turn.shape[:-3], -1)
@@ -248,9 +228,8 @@ def bones_from_channels(
 ) -> Float[np.ndarray, "*batch bone 4 4"]:
     """Undo `channels_from_bones`."""
     twist = channels.reshape(*channels.shape[:-1], len(rest), 6)
-    return rigid.make(
-        rigid.rotation_from_vector(twist[..., :3]) @ rest[..., :3, :3], rest[..., :3, 3] + twist[..., 3:]
-    )
+    turn = rigid.rotation_from_vector(twist[..., :3])
+    return rigid.make(turn @ rest[..., :3, :3], rest[..., :3, 3] + twist[..., 3:])
 
 
 def other_channels(
@@ -276,10 +255,12 @@ def past_channels(
     bones: Float[np.ndarray, "batch past_frame channel"],
 ) -> Float[np.ndarray, "batch past"]:
     """Return per past frame: root position, root rotation (6), bones; oldest frame first."""
-    root = np.concatenate(
-        [ego_from_agent[..., :3, 3], rigid.rotation_to_6d(ego_from_agent[..., :3, :3])], axis=-1
+    rotation = rigid.rotation_to_6d(ego_from_agent[..., :3, :3])
+    return (
+        np.concatenate([ego_from_agent[..., :3, 3], rotation, bones], axis=-1)
+        .reshape(len(bones), -1)
+        .astype(np.float32)
     )
-    return np.concatenate([root, bones], axis=-1).reshape(len(root), -1).astype(np.float32)
 
 
 def contract(
@@ -355,14 +336,9 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
         document = json.loads((folder / "behavior.json").read_text())
         shape = document["architecture"]
         architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
-        scaling = Scaling(
-            **{
-                name: np.asarray(value, np.float64)
-                for name, value in document["scaling"].items()
-                if name != "rate_hz"
-            },
-            rate_hz=float(document["rate_hz"]),
-        )
+        scales = {name: value for name, value in document["scaling"].items() if name != "rate_hz"}
+        arrays = {name: np.asarray(value, np.float64) for name, value in scales.items()}
+        scaling = Scaling(**arrays, rate_hz=float(document["rate_hz"]))
         schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
         rest = np.asarray(document["agent_from_bone_rest"], np.float64)
         expected = json.loads(json.dumps(contract(architecture, scaling, schedule, rest)))

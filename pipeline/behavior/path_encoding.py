@@ -92,9 +92,7 @@ def goal_error(
     start: Float[np.ndarray, "*batch 3"],
     goal: Float[np.ndarray, "*batch 3"],
 ) -> Float[np.ndarray, "*batch"]:
-    """Return how far from their goals paths end, in parts of what still counts as there: more than 1 does
-    not.
-    """
+    """Return how far from their goals paths end, in parts of the tolerance: more than 1 is a miss."""
     reach = np.maximum(GOAL_TOLERANCE_M, GOAL_TOLERANCE_SHARE * np.linalg.norm(goal - start, axis=-1))
     return np.linalg.norm(path[..., -1, :] - goal, axis=-1) / reach
 

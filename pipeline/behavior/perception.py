@@ -57,9 +57,8 @@ def world_from_ego(
     forward = np.where(lying[..., None], -np.sign(head[..., 1:2]) * back, head) * [1.0, 0.0, 1.0]
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     up = np.broadcast_to([0.0, 1.0, 0.0], forward.shape)
-    return rigid.make(
-        np.stack([np.cross(up, forward), up, forward], axis=-1), np.asarray(world_from_agent)[..., :3, 3]
-    )
+    axes = np.stack([np.cross(up, forward), up, forward], axis=-1)
+    return rigid.make(axes, np.asarray(world_from_agent)[..., :3, 3])
 
 
 @dataclass(frozen=True)
@@ -89,9 +88,7 @@ class FeatureVolume:
         return clamped, (index == clamped).all(-1)
 
     def around(self, ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch channel 64 8 64"]:
-        """Sample the nearest voxels on the ego grid (Eq. 11): centred at the root, axes x y z,
-        zero outside.
-        """
+        """Sample the nearest voxels on the ego grid (Eq. 11), centred at the root; zero outside."""
         index, inside = self.voxel(rigid.apply(ego, grid_points_ego().reshape(-1, 3)))
         features = self.features.reshape(len(self.features), -1)
         cell = np.asarray(np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), self.occupancy.shape))
@@ -152,12 +149,9 @@ class VolumeScene(nn.Module):
         super().__init__()
         strides = [(1, 1, 1), (2, 1, 2), (2, 2, 2), (2, 2, 2), (2, 2, 2), (2, 1, 2)]
         inputs = [channels] + [width] * 5
-        self.convolutions = nn.ModuleList(
-            nn.Conv3d(i, width, 3, s, 1) for i, s in zip(inputs, strides, strict=True)
-        )
-        self.shortcuts = nn.ModuleList(
-            nn.Conv3d(i, width, 1, s) for i, s in zip(inputs, strides, strict=True)
-        )
+        pairs = list(zip(inputs, strides, strict=True))
+        self.convolutions = nn.ModuleList(nn.Conv3d(i, width, 3, s, 1) for i, s in pairs)
+        self.shortcuts = nn.ModuleList(nn.Conv3d(i, width, 1, s) for i, s in pairs)
         self.out = nn.Linear(width, code)
 
     def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> SceneEncoding:
@@ -201,9 +195,7 @@ class PerceptionConfig:
 
 
 class Perception(nn.Module):
-    """The perception code: scene, others and past, each of which ``keep`` can replace by its
-    learned null.
-    """
+    """The code of scene, others and past, each of which ``keep`` can replace by its learned null."""
 
     condition_mask: Tensor
 
@@ -251,9 +243,7 @@ class Perception(nn.Module):
         keep: Float[Tensor, "batch 3"],
         bones_keep: Float[Tensor, "batch"],
     ) -> PerceptionCode:
-        """Return map and code of a scene that is already averaged over blocks; ``bones_keep`` 0 hides
-        remembered bones.
-        """
+        """Encode a scene already averaged over blocks; ``bones_keep`` 0 hides remembered bones."""
         return self.join(self.scene.encode(pooled), others, self.past(past, bones_keep), keep)
 
     def join(
@@ -263,9 +253,7 @@ class Perception(nn.Module):
         past: Float[Tensor, "batch code"],
         keep: Float[Tensor, "batch 3"],
     ) -> PerceptionCode:
-        """Put the codes side by side, nulls where ``keep`` is 0 and for what the model is blind to; a map's
-        null is zero.
-        """
+        """Put the codes side by side, nulls where ``keep`` is 0 or the model is blind; a map's null is 0."""
         chart, scene = map_lookup
         keep = keep * self.condition_mask
         set_code = self.others(others, keep[:, 1])
@@ -275,9 +263,7 @@ class Perception(nn.Module):
 
 
 class PerceptionEnsemble(nn.Module):
-    """Several perceptions side by side; the code of the whole is the maps of all, their codes, pace and
-    posture.
-    """
+    """Several perceptions; the code of the whole is all maps, their codes, velocity and posture."""
 
     POSTURE_FRAMES = 3
     """last frames, which give the velocity and whose mean is the posture"""
@@ -303,9 +289,8 @@ class PerceptionEnsemble(nn.Module):
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, others and past."""
         frames = past.unflatten(1, (self.first.past.frames, -1))[:, -self.POSTURE_FRAMES :]
-        return self.condition(
-            [member(scene_grid, others, past, keep) for member in self], self.now(frames, keep[:, 2])
-        )
+        readings = [member(scene_grid, others, past, keep) for member in self]
+        return self.condition(readings, self.now(frames, keep[:, 2]))
 
     def condition(
         self, readings: list[PerceptionCode], now: Float[Tensor, "batch state"]
@@ -317,15 +302,10 @@ class PerceptionEnsemble(nn.Module):
     def now(
         self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch state"]:
-        """Return velocity, encoded as paths are, and posture, in scaled numbers; zeros where the past is
-        not remembered.
-        """
+        """Return velocity, encoded as paths are, and scaled posture; zeros where the past is dropped."""
         member = self.first
-        velocity = (frames[:, -1, :POSITION] - frames[:, 0, :POSITION]) * (
-            member.rate_hz / (self.POSTURE_FRAMES - 1)
-        )
+        per_frame = member.rate_hz / (self.POSTURE_FRAMES - 1)
+        velocity = (frames[:, -1, :POSITION] - frames[:, 0, :POSITION]) * per_frame
         posture = ((frames.mean(1) - member.past.mean) / member.past.std)[:, POSITION:]
-        return (
-            torch.cat([with_powered_length(velocity, VELOCITY_POWER), posture], dim=-1)
-            * (keep * member.condition_mask[2])[:, None]
-        )
+        state = torch.cat([with_powered_length(velocity, VELOCITY_POWER), posture], dim=-1)
+        return state * (keep * member.condition_mask[2])[:, None]

@@ -43,9 +43,7 @@ class Networks(Protocol):
         ...
 
     def goal(self, x: Array, t: Array, condition: Array) -> Array:
-        """Return the noise in x; a row of the condition is for as many rows of x, one after another, as it
-        takes.
-        """
+        """Return the noise in x; a row of the condition is for as many rows of x as it takes."""
         ...
 
     def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
@@ -107,9 +105,7 @@ class Observation:
         return replace(self, others=others)
 
     def boneless(self, mean: Float[np.ndarray, "body"]) -> "Observation":
-        """Return the same with the bones of a mean body, of which goals and paths make no more than of hidden
-        ones.
-        """
+        """Return the same with the bones of a mean body, which goals and paths take for hidden ones."""
         past = self.past.reshape(len(self), self.others.shape[2], -1).copy()
         past[..., POSITION + ROOT_CHANNELS :] = mean[ROOT_CHANNELS:]
         return replace(self, past=past.reshape(len(self), -1))
@@ -142,13 +138,11 @@ def observe(
         companions = nearest(companions, context.world_from_agent[:, -1, :3, 3])
         companions[..., :3] = rigid.apply(ego_from_world[:, None], companions[..., :3])
     others = other_channels(ego_from_world[:, None] @ context.world_from_observer, companions)
-    past = past_channels(
-        ego_from_world[:, None] @ context.world_from_agent, channels_from_bones(context.agent_from_bone, rest)
-    )
+    bones = channels_from_bones(context.agent_from_bone, rest)
+    past = past_channels(ego_from_world[:, None] @ context.world_from_agent, bones)
     scenes = scenes if isinstance(scenes, Scenes) else Scenes.of(scenes)
-    return Observation(
-        scenes.around(frame, context.video), others, past, SceneConstraint(scenes, frame, context.video)
-    )
+    constraint = SceneConstraint(scenes, frame, context.video)
+    return Observation(scenes.around(frame, context.video), others, past, constraint)
 
 
 @dataclass(frozen=True)
@@ -198,9 +192,7 @@ class Sampler:
         goal: Float[np.ndarray, "plan 3"] | None = None,
         path: Float[np.ndarray, "plan frame 3"] | None = None,
     ) -> SampledPlan:
-        """Draw ``count`` plans for each row, those of a row together; a given goal or path replaces its
-        level.
-        """
+        """Draw ``count`` plans for each row, together; a given goal or path replaces its level."""
         return self.draw_plans(self.codes(observation, sampling, count), sampling, rng, goal, path)
 
     def course(
@@ -260,14 +252,9 @@ class Sampler:
         def denoise(code: Array) -> Denoise:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
-        x = self._drawn(
-            [denoise(code[:: codes.count]) for code in (codes.full, *codes.less)],
-            (len(codes.full), 3),
-            sampling,
-            sampling.goal_steps,
-            rng,
-            lambda x: self.goals_out_of_solid(codes, x),
-        )
+        denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.less)]
+        shape, steps = (len(codes.full), 3), sampling.goal_steps
+        x = self._drawn(denoisers, shape, sampling, steps, rng, lambda x: self.goals_out_of_solid(codes, x))
         return self.scaling.goal(x)
 
     def paths(
@@ -277,9 +264,7 @@ class Sampler:
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw paths to goals, and others for those that do not get there although the goal is all that
-        guidance follows.
-        """
+        """Draw paths to goals, again where they miss although guidance follows the goal alone."""
         path = self.draw_paths(codes, goal, sampling, rng)
         for _ in range(sampling.max_path_draws - 1 if sampling.goal and sampling.guidance >= 1 else 0):
             off = goal_error(path, codes.start, goal)
@@ -330,14 +315,9 @@ class Sampler:
             )
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
-        body = self._drawn(
-            [denoise(codes.full, 1.0), *map(denoise, codes.less)],
-            shape,
-            replace(sampling, method="ddim"),
-            sampling.sequence_steps,
-            rng,
-            spread=sampling.body_noise_std,
-        )
+        along = [denoise(codes.full, 1.0), *map(denoise, codes.less)]
+        drawn, spread = replace(sampling, method="ddim"), sampling.body_noise_std
+        body = self._drawn(along, shape, drawn, sampling.sequence_steps, rng, spread=spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def goals_out_of_solid(
@@ -355,9 +335,8 @@ class Sampler:
         """Move scaled paths to where the agent may be."""
         if codes.constraint is None:
             return scaled
-        return self.scaling.warped_path(
-            scaled, codes.start, codes.constraint.out_of_solid(self.scaling.path(scaled, codes.start))
-        )
+        path = codes.constraint.out_of_solid(self.scaling.path(scaled, codes.start))
+        return self.scaling.warped_path(scaled, codes.start, path)
 
     def finished_paths(
         self,
@@ -366,16 +345,10 @@ class Sampler:
         goal: Float[np.ndarray, "plan 3"],
         sampling: PlanSamplingConfig,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Return scaled paths in metres, snapped to their goals as far as these condition, and kept where the
-        agent may be.
-        """
-        path = snapped_to_goal(
-            self.scaling.path(scaled, codes.start),
-            codes.start,
-            goal,
-            float(sampling.goal) * min(sampling.guidance, 1.0),
-        )
-        return codes.constrained(path, self.scaling.rate_hz)
+        """Return paths in metres, snapped to their goals as far as these condition, and constrained."""
+        pull = float(sampling.goal) * min(sampling.guidance, 1.0)
+        path = self.scaling.path(scaled, codes.start)
+        return codes.constrained(snapped_to_goal(path, codes.start, goal, pull), self.scaling.rate_hz)
 
     def _drawn(
         self,

@@ -29,9 +29,7 @@ READ = 2 * MAP_KEY_CHANNELS
 def read_at(
     maps: Float[Tensor, "batch member map"], points: Float[Tensor, "batch point 3"]
 ) -> Float[Tensor, "batch member channel point"]:
-    """Return what maps say at points in metres of the ego frame, between cells by their distance; zeros
-    beyond the edge.
-    """
+    """Return what maps say, bilinear, at points in metres of the ego frame; zeros beyond the edge."""
     cells = round((maps.shape[-1] / READ) ** 0.5)
     chart = maps.flatten(0, 1).unflatten(1, (READ, cells, cells))
     where = (points[:, None, :, None, ::2] / HALF_M).expand(-1, maps.shape[1], -1, -1, -1).flatten(0, 1)

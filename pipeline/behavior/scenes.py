@@ -37,9 +37,7 @@ class Scenes:
 
     @classmethod
     def load(cls, folder: Path, videos: tuple[str, ...]) -> "Scenes":
-        """Read `volume.npz`, or else `volumes/<id>.npz` of every recording. Raises InputError ART-010 when
-        damaged.
-        """
+        """Read `volume.npz`, or `volumes/<id>.npz` of every recording. Raises InputError ART-010."""
         one = folder / "volume.npz"
         files = [one] if one.is_file() else [folder / "volumes" / f"{video}.npz" for video in videos]
         tables = [npz.load(file, ("allowed", "stands_m")) for file in files]
@@ -67,9 +65,7 @@ class Scenes:
         return len(self.volumes[0].features)
 
     def number(self, video: Int[np.ndarray, "window"] | None, windows: int) -> Int[np.ndarray, "window"]:
-        """Return the volume of each window, given the numbers of their recordings (None: there is one
-        volume).
-        """
+        """Return the volume of each window, given the numbers of their recordings (None: one volume)."""
         if len(self.volumes) == 1 or video is None:
             assert len(self.volumes) == 1, "windows of several scenes must name their recording"
             return np.zeros(windows, int)
@@ -92,9 +88,7 @@ class Scenes:
     def inside_solid(
         self, points_world: Float[np.ndarray, "window *some 3"], video: Int[np.ndarray, "window"] | None
     ) -> Bool[np.ndarray, "window *some"]:
-        """Return which points lie inside something solid or outside the mapped space; none where nothing was
-        mapped.
-        """
+        """Return which points are in something solid or outside the mapped space; none without a map."""
         number = self.number(video, len(points_world))
         solid = np.zeros(points_world.shape[:-1], bool)
         for scene in np.unique(number):
@@ -106,9 +100,7 @@ class Scenes:
 
     @cached_property
     def nearest_allowed(self) -> tuple[Int[np.ndarray, "3 x y z"] | None, ...]:
-        """Per volume, the allowed voxel nearest to each voxel; None where nothing was mapped or nothing is
-        allowed.
-        """
+        """Per volume, the allowed voxel nearest to each voxel; None where there is none, or no map."""
         return tuple(
             np.asarray(distance_transform_edt(~allowed, return_distances=False, return_indices=True))
             if allowed.any() and not (volume.occupancy == 2).all()
@@ -139,15 +131,12 @@ class Scenes:
         moves: Bool[np.ndarray, "window *some"],
         video: Int[np.ndarray, "window"] | None,
     ) -> Float[np.ndarray, "window *some"]:
-        """Return the heights at which what carries the agent bears its root, nearest to those of
-        the points.
-        """
+        """Return the heights, nearest to the points', at which something carries the agent's root."""
         number, height = self.number(video, len(points_world)), np.array(points_world[..., 1])
         for scene, support in enumerate(self.supports):
             if support is not None:
-                height[number == scene] = support.heights(
-                    points_world[number == scene], moves[number == scene]
-                )
+                mine = number == scene
+                height[mine] = support.heights(points_world[mine], moves[mine])
         return height
 
 
@@ -161,9 +150,8 @@ class SceneConstraint:
 
     def __getitem__(self, index: slice | np.ndarray) -> "SceneConstraint":
         """Return some of the agents."""
-        return SceneConstraint(
-            self.scenes, self.world_from_ego[index], None if self.video is None else self.video[index]
-        )
+        video = None if self.video is None else self.video[index]
+        return SceneConstraint(self.scenes, self.world_from_ego[index], video)
 
     def out_of_solid(
         self, points_ego: Float[np.ndarray, "plan point 3"]
@@ -172,9 +160,8 @@ class SceneConstraint:
         agent together.
         """
         frame, video = self._of_plans(len(points_ego))
-        return rigid.apply(
-            rigid.inverse(frame), self.scenes.out_of_solid(rigid.apply(frame, points_ego), video)
-        )
+        moved = self.scenes.out_of_solid(rigid.apply(frame, points_ego), video)
+        return rigid.apply(rigid.inverse(frame), moved)
 
     def goals_on_support(self, goals_ego: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Put goals on what carries an agent that rests there."""
@@ -202,6 +189,5 @@ class SceneConstraint:
     def _of_plans(self, plans: int) -> tuple[Float[np.ndarray, "plan 4 4"], Int[np.ndarray, "plan"] | None]:
         """Return ego frame and recording of every plan."""
         count = plans // len(self.world_from_ego)
-        return np.repeat(self.world_from_ego, count, axis=0), None if self.video is None else np.repeat(
-            self.video, count
-        )
+        video = None if self.video is None else np.repeat(self.video, count)
+        return np.repeat(self.world_from_ego, count, axis=0), video

@@ -129,10 +129,8 @@ class AnimalBatch:
         due = np.flatnonzero(self._due())
         if len(due):
             self._follow(due)
-        now = np.arange(len(self.played))
-        self.past.append(
-            PoseFrames(self.plan.root[now, self.played][:, None], self.plan.bones[now, self.played][:, None])
-        )
+        now = np.arange(len(self.played)), self.played
+        self.past.append(PoseFrames(self.plan.root[now][:, None], self.plan.bones[now][:, None]))
         self.played += 1
         return self.past[-1]
 
@@ -154,9 +152,7 @@ class AnimalBatch:
     def _companions(
         self, some: Int[np.ndarray, "some"]
     ) -> Float[np.ndarray, "some companion past_frame 4"] | None:
-        """Return past positions and kinds of all but the observer, NaN those that are not in the life of
-        ``some``.
-        """
+        """Return past positions and kinds of all but the observer; NaN outside of the life of ``some``."""
         found = [] if self.companions is None else [self.companions[some]]
         together = self._together(some)
         if together is not None:
@@ -173,9 +169,7 @@ class AnimalBatch:
         return np.concatenate([observer, companions[:, :, -1, :3]], axis=1)
 
     def _due(self) -> Bool[np.ndarray, "animal"]:
-        """Return whose plan ends, or was made before one of the others moved noticeably, where these are
-        perceived.
-        """
+        """Return whose plan ends, or was made before somebody who is perceived moved noticeably."""
         others = self._others_now()
         moved = np.linalg.norm(others - self.planned_others, axis=-1)
         away = np.linalg.norm(others - self.past[-1].root[:, :1, :3, 3], axis=-1)
@@ -192,34 +186,25 @@ class AnimalBatch:
         """Let some of the animals go over to a new plan."""
         plan, self.goal[some], self.blocked[some] = self._planned(some)
         for mine, animal in enumerate(some):
-            left = PoseFrames(
-                self.plan.root[animal, self.played[animal] :], self.plan.bones[animal, self.played[animal] :]
-            )
-            new = blended_frames(
-                left, PoseFrames(plan.root[mine], plan.bones[mine]), self.chaining.blend_frames
-            )
+            rest = animal, slice(self.played[animal], None)
+            left = PoseFrames(self.plan.root[rest], self.plan.bones[rest])
+            begun = PoseFrames(plan.root[mine], plan.bones[mine])
+            new = blended_frames(left, begun, self.chaining.blend_frames)
             self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
     def _planned(
         self, some: Int[np.ndarray, "some"]
     ) -> tuple[PoseFrames, Float[np.ndarray, "some 3"], Float[np.ndarray, "some"]]:
-        """Draw a plan for some of the animals, and more where it is blocked, of which the first that is
-        blocked least is taken.
-        """
-        root = np.concatenate([frame.root for frame in self.past], axis=1)[some]
-        bones = bones_from_channels(
-            np.concatenate([frame.bones for frame in self.past], axis=1)[some], self.rest
+        """Draw plans for some of the animals, and others where they are blocked; the least blocked count."""
+        root, channels = (
+            np.concatenate([getattr(frame, name) for frame in self.past], axis=1)[some]
+            for name in ("root", "bones")
         )
+        bones, observer = bones_from_channels(channels, self.rest), np.stack(self.observer, axis=1)[some]
         video = None if self.video is None else self.video[some]
-        observation = observe(
-            Context(
-                root, bones, np.stack(self.observer, axis=1)[some], video, companions=self._companions(some)
-            ),
-            self.scenes,
-            self.rest,
-            self.ego,
-        )
+        context = Context(root, bones, observer, video, companions=self._companions(some))
+        observation = observe(context, self.scenes, self.rest, self.ego)
         frame = world_from_ego(root[:, -1], self.ego)
         bare = observation.boneless(self.sampler.scaling.body_mean)
         self.plans_drawn += len(some)
@@ -227,13 +212,8 @@ class AnimalBatch:
         goal, path, blocked = self._courses(bare, frame, video, 1, commanded)
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
-            others = self._courses(
-                bare[again],
-                frame[again],
-                None if video is None else video[again],
-                self.chaining.candidates - 1,
-                commanded[again],
-            )
+            count, where = self.chaining.candidates - 1, None if video is None else video[again]
+            others = self._courses(bare[again], frame[again], where, count, commanded[again])
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]
@@ -252,9 +232,7 @@ class AnimalBatch:
         start_world: Float[np.ndarray, "some 3"],
         some: Int[np.ndarray, "some"],
     ) -> Float[np.ndarray, "some frame 3"]:
-        """Lead paths in ego frames around the bodies of the others, one after the other, the observer last,
-        whatever the guidance is.
-        """
+        """Lead paths in ego frames around the bodies of the others, the observer's last."""
         video = None if self.video is None else self.video[some]
 
         def clear(points: Float[np.ndarray, "some 3"]) -> Float[np.ndarray, "some 3"]:
@@ -311,9 +289,7 @@ class Simulator:
         self.flock = AnimalBatch(sampler, scenes, self.rest, ego, sampling=sampling, chaining=chaining)
 
     def reset(self, seed: int, observer: Float[np.ndarray, "3"] | None = None) -> SimulatorState:
-        """Begin at a random training window, with the observer of then or one that has stood at
-        ``observer``.
-        """
+        """Begin at a random training window, with its observer or one that has stood at ``observer``."""
         rng = np.random.default_rng(seed)
         return self.begin(rng.choice(self.data.indices(TRAIN), 1), rng, observer)
 
@@ -326,11 +302,9 @@ class Simulator:
     ) -> SimulatorState:
         """Begin at this window, beside ``companions`` where there are others."""
         context, _ = self.data.windows(window)
-        seen = (
-            context.observer_world
-            if observer is None
-            else np.tile(np.asarray(observer, float), (1, self.data.past, 1))
-        )
+        seen = context.observer_world
+        if observer is not None:
+            seen = np.tile(np.asarray(observer, float), (1, self.data.past, 1))
         context = replace(context, observer_world=seen, observer_rotation=None)
         self.flock.begin(context, rng, companions=None if companions is None else companions[None])
         self.frame = 0
@@ -360,13 +334,8 @@ class Simulator:
 
     def _state(self, now: PoseFrames) -> SimulatorState:
         bones = bones_from_channels(now.bones[0, 0], self.rest)
-        return SimulatorState(
-            self.frame / self.data.rate_hz,
-            now.root[0, 0],
-            bones,
-            self.flock.goal[0].copy(),
-            float(self.flock.blocked[0]),
-        )
+        time_s, goal = self.frame / self.data.rate_hz, self.flock.goal[0].copy()
+        return SimulatorState(time_s, now.root[0, 0], bones, goal, float(self.flock.blocked[0]))
 
 
 def as_companions(

@@ -53,9 +53,7 @@ class Support:
     def heights(
         self, points_world: Float[np.ndarray, "*batch 3"], moves: Bool[np.ndarray, "*batch"]
     ) -> Float[np.ndarray, "*batch"]:
-        """Return the heights nearest to those of the points at which roots are found; their own where nothing
-        carries.
-        """
+        """Return the nearest heights at which roots are found; the points' own where nothing carries."""
         column = np.floor((points_world[..., [0, 2]] - self.corner) / self.voxel_m).astype(int)
         inside = ((column >= 0) & (column < self.tops.shape[:2])).all(-1)
         column = np.clip(column, 0, np.array(self.tops.shape[:2]) - 1)
@@ -85,16 +83,13 @@ def floor_level(carries: Bool[np.ndarray, "x y z"]) -> int | None:
 def height_ranges(
     scenes: list[tuple[FeatureVolume, Float[np.ndarray, "frame 3"], Bool[np.ndarray, "frame"]]],
 ) -> Float[np.ndarray, "2 2"]:
-    """Return `Support.range_m` of all recordings: per scene, where the root was and whether it moved; NaN
-    where unknown.
-    """
+    """Return `Support.range_m` given, per scene, root positions and whether it moved; NaN: unknown."""
     above, moved = [np.zeros(0)], [np.zeros(0, bool)]
     for volume, points, moves in scenes:
         voxel, inside = volume.voxel(points)
         solid = (volume.occupancy == 1)[voxel[:, 0], :, voxel[:, 2]]
-        level = np.where(
-            solid & (np.arange(solid.shape[1]) < voxel[:, 1:2]), np.arange(1, solid.shape[1] + 1), -np.inf
-        ).max(1)
+        number = np.arange(solid.shape[1])
+        level = np.where(solid & (number < voxel[:, 1:2]), number + 1, -np.inf).max(1)
         above.append(np.where(inside, points[:, 1] - volume.origin[1] - level * volume.voxel_m, np.inf))
         moved.append(moves)
     height, moves = np.concatenate(above), np.concatenate(moved)
@@ -102,24 +97,16 @@ def height_ranges(
     if known.sum() <= MIN_SUPPORTED_SHARE * len(known):
         return np.full((2, 2), np.nan)
     some = (known & kind if (known & kind).any() else known for kind in (~moves, moves))
-    return np.array(
-        [
-            np.percentile(height[part], [rare, 100 - rare])
-            for part, rare in zip(some, HEIGHT_TAIL_PERCENT, strict=True)
-        ]
-    )
+    both = zip(some, HEIGHT_TAIL_PERCENT, strict=True)
+    return np.array([np.percentile(height[part], [rare, 100 - rare]) for part, rare in both])
 
 
 def smoothed_jumps(
     height: Float[np.ndarray, "*batch frame"], before: Float[np.ndarray, "*batch"]
 ) -> Float[np.ndarray, "*batch frame"]:
-    """Make jumps of steps: heights averaged over half a second where that is higher, so that nothing gets
-    into an edge.
-    """
+    """Make jumps of steps: heights averaged over half a second where that is higher."""
     reach = len(JUMP_KERNEL) // 2
-    padded = np.concatenate(
-        [np.repeat(before[..., None], reach, -1), height, np.repeat(height[..., -1:], reach, -1)], axis=-1
-    )
-    return np.maximum(
-        height, np.lib.stride_tricks.sliding_window_view(padded, len(JUMP_KERNEL), axis=-1) @ JUMP_KERNEL
-    )
+    first, last = np.repeat(before[..., None], reach, -1), np.repeat(height[..., -1:], reach, -1)
+    padded = np.concatenate([first, height, last], axis=-1)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, len(JUMP_KERNEL), axis=-1)
+    return np.maximum(height, windows @ JUMP_KERNEL)

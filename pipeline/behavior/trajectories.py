@@ -147,17 +147,9 @@ class BehaviorData:
             )
             for video in videos
         }
-        return cls(
-            trajectories,
-            tracks["agent_from_bone_rest"],
-            windows["video"],
-            windows["start"],
-            windows["split"],
-            videos,
-            int(windows["future"]),
-            int(windows["past"]),
-            float(windows["rate_hz"]),
-        )
+        lists = windows["video"], windows["start"], windows["split"], videos
+        lengths = int(windows["future"]), int(windows["past"]), float(windows["rate_hz"])
+        return cls(trajectories, tracks["agent_from_bone_rest"], *lists, *lengths)
 
     def save(self, folder: Path) -> None:
         """Write ``trajectories.npz`` and ``windows.npz``."""
@@ -224,14 +216,8 @@ class BehaviorData:
         agent, camera = gathered("world_from_agent"), gathered("world_from_camera")
         bone = gathered("agent_from_bone", slice(None) if bones else slice(0, 0))
         observer, companions = camera[:, : self.past], self._companions(index, frames[:, : self.past])
-        context = Context(
-            agent[:, : self.past],
-            bone[:, : self.past],
-            observer[..., :3, 3],
-            self.video[index],
-            observer[..., :3, :3],
-            companions,
-        )
+        past, others = (agent[:, : self.past], bone[:, : self.past]), (observer[..., :3, :3], companions)
+        context = Context(*past, observer[..., :3, 3], self.video[index], *others)
         return context, Future(agent[:, self.past :], bone[:, self.past :])
 
     def _companions(

@@ -130,9 +130,8 @@ def _straight(
     shape = (len(context), count, mean.shape[1])
     rotation = np.broadcast_to(context.world_from_agent[:, -1, :3, :3][:, None, None], (*shape, 3, 3))
     bones = context.agent_from_bone[:, -1]
-    return Samples(
-        path[:, :, -1], path, rotation, np.broadcast_to(bones[:, None, None], (*shape, *bones.shape[1:]))
-    )
+    bones = np.broadcast_to(bones[:, None, None], (*shape, *bones.shape[1:]))
+    return Samples(path[:, :, -1], path, rotation, bones)
 
 
 @dataclass(frozen=True)
@@ -155,13 +154,8 @@ class Ats:
             volume = (volume if isinstance(volume, Scenes) else Scenes.of(volume)).without_features()
         sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
         knows = architecture.ablated_input != "scene" and architecture.scene != "none"
-        return cls(
-            sampler,
-            volume,
-            rest,
-            architecture.ego,
-            replace(sampling, avoid_solid=sampling.avoid_solid and knows),
-        )
+        sampling = replace(sampling, avoid_solid=sampling.avoid_solid and knows)
+        return cls(sampler, volume, rest, architecture.ego, sampling)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` plans for each window; goal and path are each as sampled."""
@@ -198,14 +192,10 @@ class Ats:
         plan = self.sampler.plan(self._observe(context), self.sampling, rng, count=count)
         frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
         root = plan.world_from_agent(frame)
-        bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest).astype(
-            np.float32
-        )
+        bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest)
         goal = rigid.apply(frame, plan.goal[:, None])[:, 0]
-        split = (len(context), count)
-        return Samples(
-            *(a.reshape(*split, *a.shape[1:]) for a in (goal, root[..., :3, 3], root[..., :3, :3], bones))
-        )
+        rows = goal, root[..., :3, 3], root[..., :3, :3], bones.astype(np.float32)
+        return Samples(*(part.reshape(len(context), count, *part.shape[1:]) for part in rows))
 
     @cached_property
     def scenes(self) -> Scenes:

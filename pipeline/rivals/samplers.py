@@ -53,9 +53,9 @@ class GaussianSampler(Sampler):
     ) -> SampledPlan:
         """Draw plans; the means lead from level to level."""
         towards = self.scaling.goal(self._goal(codes)[0]) if goal is None else goal
-        along = (
-            self.scaling.path(self._path(codes, towards, sampling)[0], codes.start) if path is None else path
-        )
+        along = path
+        if along is None:
+            along = self.scaling.path(self._path(codes, towards, sampling)[0], codes.start)
         goal = self.goals(codes, sampling, rng) if goal is None else goal
         path = self.paths(codes, towards, sampling, rng) if path is None else path
         return SampledPlan(goal, path, self.bodies(codes, along, sampling, rng))
@@ -80,9 +80,8 @@ class GaussianSampler(Sampler):
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path towards each goal, metres, ego frame."""
-        return self.finished_paths(
-            codes, self._drawn_from(self._path(codes, goal, sampling), rng), goal, sampling
-        )
+        scaled = self._drawn_from(self._path(codes, goal, sampling), rng)
+        return self.finished_paths(codes, scaled, goal, sampling)
 
     def bodies(
         self,
@@ -98,10 +97,8 @@ class GaussianSampler(Sampler):
             self.networks.body(nothing, _step(nothing, t), codes.full, control, _keep_mask(nothing, 1.0))
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
-        return (
-            np.swapaxes(self._drawn_from(outputs, rng, sampling.body_noise_std), 1, 2) * self.scaling.body_std
-            + self.scaling.body_mean
-        )
+        scaled = np.swapaxes(self._drawn_from(outputs, rng, sampling.body_noise_std), 1, 2)
+        return scaled * self.scaling.body_std + self.scaling.body_mean
 
     def _goal(self, codes: PlanCondition) -> list[Array]:
         nothing = np.zeros((len(codes.full), 3), np.float32)
@@ -120,9 +117,8 @@ class GaussianSampler(Sampler):
 
     def _drawn_from(self, outputs: list[Array], rng: np.random.Generator, spread: float = 1.0) -> Array:
         mean, log_std = outputs
-        return mean + spread * np.exp(np.clip(log_std, *LOG_STD_BOUNDS)) * rng.standard_normal(
-            mean.shape, dtype=np.float32
-        )
+        noise = rng.standard_normal(mean.shape, dtype=np.float32)
+        return mean + spread * np.exp(np.clip(log_std, *LOG_STD_BOUNDS)) * noise
 
 
 @dataclass(frozen=True)
@@ -168,23 +164,14 @@ class OneStageSampler(Sampler):
             return lambda x, t: self.networks.body(x, _step(x, t), code, control, _keep_mask(x, 0.0))
 
         def correct(x: Array) -> Array:
-            return np.concatenate(
-                [self.paths_out_of_solid(codes, x[:, :PATH_CHANNELS]), x[:, PATH_CHANNELS:]], axis=1
-            )
+            path = self.paths_out_of_solid(codes, x[:, :PATH_CHANNELS])
+            return np.concatenate([path, x[:, PATH_CHANNELS:]], axis=1)
 
-        shape = (len(codes.full), PATH_CHANNELS + len(self.scaling.body_mean), frames)
-        spread = np.array([1.0] * PATH_CHANNELS + [sampling.body_noise_std] * len(self.scaling.body_mean))[
-            :, None
-        ]
-        return self._drawn(
-            [denoise(code) for code in (codes.full, *codes.less)],
-            shape,
-            sampling,
-            sampling.sequence_steps,
-            rng,
-            correct,
-            spread,
-        )
+        body = len(self.scaling.body_mean)
+        shape, steps = (len(codes.full), PATH_CHANNELS + body, frames), sampling.sequence_steps
+        spread = np.array([1.0] * PATH_CHANNELS + [sampling.body_noise_std] * body)[:, None]
+        denoisers = [denoise(code) for code in (codes.full, *codes.less)]
+        return self._drawn(denoisers, shape, sampling, steps, rng, correct, spread)
 
 
 def _step(x: Array, t: float) -> Array:

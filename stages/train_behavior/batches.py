@@ -87,9 +87,8 @@ class TrainingWindows:
         companions = self.companions_world[index]
         place = rigid_torch.apply(ego_from_world[:, None], companions[..., :3])
         companions = torch.cat([place, companions[..., 3:]], dim=-1)
-        return EgoTracks(
-            ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3], ego_from_observer, companions
-        )
+        root, rotation = ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3]
+        return EgoTracks(root, rotation, ego_from_observer, companions)
 
 
 @dataclass(frozen=True)
@@ -137,18 +136,16 @@ def windows_from_data(homes: TrainingHomes, architecture: Architecture) -> Train
     tracks = [data.trajectories[video] for video in data.videos]
     agent = np.concatenate([track.world_from_agent for track in tracks])
     observer = np.concatenate([track.world_from_camera for track in tracks])
-    bones = np.concatenate(
-        [channels_from_bones(track.agent_from_bone, data.agent_from_bone_rest) for track in tracks]
-    )
+    rest = data.agent_from_bone_rest
+    bones = np.concatenate([channels_from_bones(track.agent_from_bone, rest) for track in tracks])
     first = np.cumsum([0, *(len(track.timestamp_s) for track in tracks[:-1])])
     rows = (first[data.video[index]] + data.start[index])[:, None] + np.arange(data.past + data.future)
     frame = world_from_ego(agent[rows[:, data.past - 1]], architecture.ego)
     number = homes.scenes.number(data.video[index], len(index))
     now = agent[rows[:, data.past - 1], :3, 3]
     companions = data.nearest_companions(index, now)
-    tables = (
-        torch.from_numpy(table.astype(np.float32)) for table in (agent, observer, companions, bones, frame)
-    )
+    arrays = agent, observer, companions, bones, frame
+    tables = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
     met = approached(now, observer[rows[:, : data.past], :3, 3], data.rate_hz)
     met = met[:0] if architecture.ablated_input == "observer" else met
     known = homes.home[data.video[index]] == 0
@@ -170,9 +167,8 @@ def approached(
     away = (agent[:, None] - observer)[..., [0, 2]]
     distance = np.linalg.norm(away[:, -1], axis=-1)
     walked = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (rate_hz / (observer.shape[1] - 1))
-    met = np.flatnonzero(
-        (distance < APPROACH_DISTANCE_M) & ((walked * away[:, -1]).sum(-1) > APPROACH_SPEED_M_S * distance)
-    )
+    comes = (walked * away[:, -1]).sum(-1) > APPROACH_SPEED_M_S * distance
+    met = np.flatnonzero((distance < APPROACH_DISTANCE_M) & comes)
     each = (distance[met] / BIN_M).astype(int)
     most = np.bincount(each).max(initial=0)
     parts = [met[each == number] for number in np.unique(each)]
@@ -199,19 +195,10 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(0.02)
     path_std = np.stack([level, height, level])
     whole = body_statistics(tracks.rotation[:, past:], windows.bones[rows[known, past:].unique()], turn_rad)
-    strides = (
-        velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)[..., :3]
-        .double()
-        .numpy()
-    )
-    velocity_std = np.array([[*_spread(strides.reshape(-1, 3)), 1.0]])
-    scaling = Scaling(
-        _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER)),
-        velocity_std,
-        path_std,
-        *whole,
-        rate_hz,
-    )
+    strides = velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)
+    velocity_std = np.array([[*_spread(strides[..., :3].double().numpy().reshape(-1, 3)), 1.0]])
+    goal_std = _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER))
+    scaling = Scaling(goal_std, velocity_std, path_std, *whole, rate_hz)
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
     position = tracks.root[:, :past].std().clip(0.05).expand(3)
     return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
@@ -253,12 +240,8 @@ def with_posture_noise(
     size, channels = len(bones), bones.shape[-1]
     some = (torch.rand(size, 1, generator=generator) < augmentation.posture_offset).float()
     tilt = torch.randn(size, 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0]) * POSTURE_TILT_RAD * some
-    bend = (
-        torch.randn(size, channels, generator=generator)
-        * statistics.past_std[-channels:]
-        * POSTURE_BEND
-        * some
-    )
+    bend = torch.randn(size, channels, generator=generator) * statistics.past_std[-channels:]
+    bend = bend * POSTURE_BEND * some
     return rigid_torch.so3_exp(tilt)[:, None] @ rotation, bones + bend[:, None]
 
 
@@ -310,31 +293,23 @@ def draw_batch(
     tracks = windows.tracks(index)
     root = tracks.root @ new_from_old.mT
     rotation = new_from_old[:, None] @ tracks.rotation @ flip[:, None]
-    shift = torch.randn(size, 1, 3, generator=generator) * (
-        OBSERVER_SHIFT_M if augmentation.past > 0 else 0.0
-    )
+    shift_m = OBSERVER_SHIFT_M if augmentation.past > 0 else 0.0
+    shift = torch.randn(size, 1, 3, generator=generator) * shift_m
     observer = (tracks.ego_from_observer[..., :3, 3] + shift) @ new_from_old.mT
     facing = new_from_old[:, None] @ tracks.ego_from_observer[..., :3, :3] @ flip[:, None]
     frames = windows.frame[index]
-    remembered = body_channels(
-        *with_posture_noise(
-            rotation[:, :count], windows.bones[frames[:, :count]], statistics, augmentation, generator
-        )
-    )
+    known = rotation[:, :count], windows.bones[frames[:, :count]]
+    remembered = body_channels(*with_posture_noise(*known, statistics, augmentation, generator))
     past = torch.cat([root[:, :count], remembered], dim=-1)
     held = past[:, -PerceptionEnsemble.POSTURE_FRAMES :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
-    body = (
-        body_channels(rotation[:, posed], windows.bones[frames[:, posed]])
-        - torch.from_numpy(scaling.body_mean).float()
-    )
+    body = body_channels(rotation[:, posed], windows.bones[frames[:, posed]])
+    body = body - torch.from_numpy(scaling.body_mean).float()
     device, future = scene.points.device, root[:, count:]
     track = with_powered_length(future, GOAL_LENGTH_POWER) / torch.from_numpy(scaling.goal_std).float()
-    strides = (
-        velocity_channels_from_path(future, root[:, count - 1], windows.rate_hz)
-        / torch.from_numpy(scaling.velocity_std).float()
-    )
+    strides = velocity_channels_from_path(future, root[:, count - 1], windows.rate_hz)
+    strides = strides / torch.from_numpy(scaling.velocity_std).float()
     return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
         beings(observer, facing, tracks.companions, new_from_old),

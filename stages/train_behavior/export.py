@@ -1,6 +1,4 @@
-"""The trained model as files: ONNX networks, weights, the sampler's contract, one golden plan to test
-samplers with.
-"""
+"""The trained model as files: ONNX networks, weights, the sampler's contract, one golden plan."""
 
 import json
 import logging
@@ -56,16 +54,13 @@ def write_contract(
     """Write weights, `behavior.json` and, of the model that other samplers know, `golden.json`, in which an
     ``accompanied`` animal has a companion.
     """
-    save_file(
-        {name: value.contiguous() for name, value in nets.state_dict().items()},
-        folder / "behavior.safetensors",
-    )
+    state = {name: value.contiguous() for name, value in nets.state_dict().items()}
+    save_file(state, folder / "behavior.safetensors")
     document = contract(architecture, scaling, schedule, rest)
     (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
     if architecture.family == "diffusion":
-        golden = golden_plan(
-            Sampler(TorchNetworks(nets), schedule, scaling), architecture, accompanied=accompanied
-        )
+        sampler = Sampler(TorchNetworks(nets), schedule, scaling)
+        golden = golden_plan(sampler, architecture, accompanied=accompanied)
         (folder / "golden.json").write_text(json.dumps(golden) + "\n")
 
 
@@ -108,15 +103,9 @@ def export_network(
             verbose=False,
         )
     assert program is not None, "dynamo always returns the program"
-    model = program.model_proto
-    for item in (
-        model,
-        model.graph,
-        *model.graph.node,
-        *model.graph.value_info,
-        *model.graph.input,
-        *model.graph.output,
-    ):
+    model = program.model_proto  # made anew whenever it is asked for
+    graph = model.graph
+    for item in (model, graph, *graph.node, *graph.value_info, *graph.input, *graph.output):
         del item.metadata_props[:]
         item.doc_string = ""
     path.write_bytes(model.SerializeToString(deterministic=True))
@@ -143,10 +132,8 @@ def signature(
         case "path":
             return {"x": (PATH_CHANNELS, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
         case _:
-            return {"x": (a.body_channels, a.future)} | step | {
-                "control": (3, a.future),
-                "keep": (1,),
-            }, "epsilon"
+            steered = {"control": (3, a.future), "keep": (1,)}
+            return {"x": (a.body_channels, a.future)} | step | steered, "epsilon"
 
 
 def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observation:
@@ -155,23 +142,18 @@ def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observa
     """
 
     def wave(*shape: int, amplitude: float, frequency: float) -> np.ndarray:
-        return (
-            (amplitude * np.sin(frequency * np.arange(np.prod(shape), dtype=np.float64)))
-            .reshape(1, *shape)
-            .astype(np.float32)
-        )
+        number = np.arange(np.prod(shape), dtype=np.float64)
+        return (amplitude * np.sin(frequency * number)).reshape(1, *shape).astype(np.float32)
 
-    observer = np.stack(
-        [np.linspace(0.5, 0.2, a.past), np.full(a.past, 1.2), np.linspace(1.8, 1.1, a.past)], axis=-1
-    )
+    left, ahead = np.linspace(0.5, 0.2, a.past), np.linspace(1.8, 1.1, a.past)
+    observer = np.stack([left, np.full(a.past, 1.2), ahead], axis=-1)
     facing = rigid.look_at(observer, np.zeros(3), UP)
     scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
     past = wave(a.past * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
     walk = np.linspace(0.5, 1.0, a.past)
     companion = np.stack([walk, np.full(a.past, 0.1), 0.5 * walk, np.ones(a.past)], axis=-1)
-    return Observation(
-        scene, other_channels(facing[None], companion[None, None] if accompanied else None), past
-    )
+    others = other_channels(facing[None], companion[None, None] if accompanied else None)
+    return Observation(scene, others, past)
 
 
 def golden_plan(sampler: Sampler, architecture: Architecture, *, accompanied: bool = False) -> dict:
@@ -203,8 +185,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture, *, accompanied: bo
         },
         "noise": {name: _plain(value) for name, value in drawn.items()},
         "plans": {
-            name: {level: _plain(value) for level, value in vars(plan).items()}
-            for name, plan in plans.items()
+            name: {k: _plain(value) for k, value in vars(plan).items()} for name, plan in plans.items()
         },
     }
 
@@ -225,13 +206,9 @@ def difference(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int,
         drawn[name][-1] = np.broadcast_to(still[:, :1], still.shape).reshape(drawn[name][-1].shape)
     if "keep" in drawn:
         drawn["keep"][-1] = 1
-    session = onnxruntime.InferenceSession(path, _one_thread(), providers=["CPUExecutionProvider"])
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     with torch.inference_mode():
         expected = module(*(torch.from_numpy(value) for value in drawn.values())).numpy()
     return float(np.abs(session.run(None, drawn)[0] - expected).max())
-
-
-def _one_thread() -> onnxruntime.SessionOptions:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    return options

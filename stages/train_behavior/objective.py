@@ -89,18 +89,15 @@ def sequence_rows(
     Both are always as many in every step, for kernels are made anew for every size. Windows whose bones are
     unknown (mirrored, of other homes) come last among the bodies.
     """
-    paths, bodies = (
-        max(round(len(batch.goal) * share), 1) for share in (objective.path_share, objective.body_share)
-    )
+    shares = objective.path_share, objective.body_share
+    paths, bodies = (max(round(len(batch.goal) * share), 1) for share in shares)
     bodies = bodies if objective.body_share > 0 else 0
     body = torch.argsort((~batch.bones_known).int(), stable=True)[:bodies]
     return torch.arange(paths, device=body.device), body, batch.bones_known[body]
 
 
 def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor, "row"]) -> Float[Tensor, ""]:
-    """Return the mean over the rows that are known (0 where none is), in which root and bones count for a
-    half each; over those of all processes.
-    """
+    """Return the mean over known rows of all processes; root and bones count for a half each."""
     each = (error[:, :ROOT_CHANNELS].mean((1, 2)) + error[:, ROOT_CHANNELS:].mean((1, 2))) / 2
     return (each * known).sum() / distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
 
@@ -151,9 +148,7 @@ def goal_error(
     objective: ObjectiveConfig,
     generator: torch.Generator,
 ) -> Float[Tensor, "draw 3"]:
-    """Return the error of the goals, each member's on its own, averaged; some of the draws ask for earlier
-    times.
-    """
+    """Return the error of the goals, mean over members; some of the draws ask for earlier times."""
     draws, frames = objective.goal_draws, batch.track.shape[-1]
     count = len(code) * draws
     earlier = torch.rand(count, generator=generator) < objective.earlier_share
@@ -161,13 +156,11 @@ def goal_error(
     frame = torch.where(earlier, drawn, frames - 1).to(code.device)
     row = torch.arange(count, device=code.device) // draws
     horizon = (frame + 1) / frames
-    return squared_error(
-        lambda x, t: nets.goal.per_member(x, t, code, horizon),
-        batch.track[row, :, frame],
-        schedule,
-        objective.weighting,
-        generator,
-    ).mean(0)
+    clean, weighting = batch.track[row, :, frame], objective.weighting
+    error = squared_error(
+        lambda x, t: nets.goal.per_member(x, t, code, horizon), clean, schedule, weighting, generator
+    )
+    return error.mean(0)
 
 
 def keep_mask(size: int, count: int, generator: torch.Generator) -> Float[Tensor, "batch count"]:
@@ -198,9 +191,8 @@ def squared_error(
     All three are the error of the noise, for the noisy sample is given, by a factor of the step.
     """
     t = torch.randint(schedule.steps, (len(clean),), generator=generator)
-    share = (
-        torch.from_numpy(schedule.alpha_bar).float()[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
-    )
+    alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
+    share = alpha_bar[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
     noise = torch.randn(clean.shape, generator=generator).to(clean.device)
     error = (denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise) ** 2
     match weighting:

@@ -1,6 +1,4 @@
-"""What comes of a training: the model's own files and, where the simulator is to have it, its networks and
-its pictures.
-"""
+"""What comes of a training: the model's files and, for the simulator, its networks and pictures."""
 
 from pathlib import Path
 
@@ -78,12 +76,10 @@ def write_exported(
     sampler = sampler_of(architecture, TorchNetworks(fitted.nets), schedule, fitted.scaling)
     difference = export.write_networks(folder, fitted.nets, architecture, accompanied=data.accompanied)
     moments = reactions.moments(data, scenes, architecture)
-    reaction = reactions.measure(
-        sampler, moments.observation, radius_m=architecture.observer_radius_m, seed=seed
-    )
-    progress.log(
-        f"an approaching observer shifts goals {reaction.away_m:.2f} m away, a far one {reaction.far_m:.3f} m"
-    )
+    radius_m = architecture.observer_radius_m
+    reaction = reactions.measure(sampler, moments.observation, radius_m=radius_m, seed=seed)
+    shifts = f"{reaction.away_m:.2f} m away, a far one {reaction.far_m:.3f} m"
+    progress.log(f"an approaching observer shifts goals {shifts}")
     qa.write(
         folder,
         good="goals that spread over where the animal could go and shift away from a close observer",

@@ -14,7 +14,7 @@ from pipeline.core.training import FitRecord
 from pipeline.data import plots
 from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid
-from stages.train_behavior.reactions import SIDES, Reactions, SampledMoments, approach
+from stages.train_behavior.reactions import CLOSE_M, SIDES, WALK_M_S, Reactions, SampledMoments, approach
 
 FAN_GOALS = 64
 SHOWN_WINDOWS = 4
@@ -47,7 +47,9 @@ def pictures(
     }
     strength = {f"interactivity {s:g}": PlanSamplingConfig(guidance=s) for s in (0.0, 0.5, 1.0)}
     with_scene = {name: removed[name] for name in ("all", "no scene")}
-    coming = approach(SIDES[0], 0.8, 1.0, frames=some.others.shape[2], rate_hz=sampler.scaling.rate_hz)
+    coming = approach(
+        SIDES[0], CLOSE_M, WALK_M_S, frames=some.others.shape[2], rate_hz=sampler.scaling.rate_hz
+    )
     close = replace(some, others=np.tile(coming, (len(chosen), 1, 1, 1)))
     return captioned(
         CAPTIONS,
@@ -93,9 +95,9 @@ def fans(
     for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
         rng, codes = np.random.default_rng(seed), sampler.codes(observation, sampling, count)
         goals = sampler.goals(codes, sampling, rng)
-        lines = (
-            sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3) if paths else None
-        )
+        lines = None
+        if paths:
+            lines = sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3)
         goals = goals.reshape(len(frame), count, 3)
         for column, axis in enumerate(row):
             rooms[column].window(axis, frame[column], observation.others[column, :, :, :3], goals[column])
@@ -123,9 +125,8 @@ def guided_paths(
     windows, scales = len(frame), (1, 0.5, 0)
     figure, grid = windows_panels(len(scales), windows)
     plain = PlanSamplingConfig(guided=guided, max_path_draws=1)
-    sampled = sampler.goals(
-        sampler.codes(observation, plain, GUIDED_PATHS), plain, np.random.default_rng(seed)
-    )
+    codes = sampler.codes(observation, plain, GUIDED_PATHS)
+    sampled = sampler.goals(codes, plain, np.random.default_rng(seed))
     sampled = sampled.reshape(windows, GUIDED_PATHS, 3)
     goal = sampled[np.arange(windows), np.linalg.norm(sampled, axis=-1).argmax(1)]
     for row, scale in zip(grid, scales, strict=True):
@@ -159,14 +160,8 @@ class RoomMap:
         for seen in rigid.apply(frame, others):
             axis.plot(seen[:, 0], seen[:, 2], color=plots.GREEN, linewidth=2)
             axis.scatter(*seen[-1, [0, 2]], color=plots.GREEN, s=25)
-        axis.quiver(
-            *frame[[0, 2], 3],
-            *(frame[[0, 2], 2] * [1, 1]),
-            angles="xy",
-            color=plots.BLUE,
-            scale=8,
-            width=0.02,
-        )
+        arrow = *frame[[0, 2], 3], *frame[[0, 2], 2]
+        axis.quiver(*arrow, angles="xy", color=plots.BLUE, scale=8, width=0.02)
         self.base(axis, frame)
 
     def steered(
@@ -189,10 +184,8 @@ class RoomMap:
             high = self.low + np.array(self.solid.shape) * self.voxel_m
             axis.set(xlim=(self.low[0], high[0]), ylim=(high[1], self.low[1]))
         else:  # nothing is known of the scene
-            axis.set(
-                xlim=frame[0, 3] + [-WINDOW_HALF_M, WINDOW_HALF_M],
-                ylim=frame[2, 3] + [WINDOW_HALF_M, -WINDOW_HALF_M],
-            )
+            half = np.array([-WINDOW_HALF_M, WINDOW_HALF_M])
+            axis.set(xlim=frame[0, 3] + half, ylim=frame[2, 3] - half)
 
     def lines(
         self, axis, frame: Float[np.ndarray, "4 4"], paths: Float[np.ndarray, "sample frame 3"]

@@ -19,6 +19,8 @@ from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, UP, BehaviorDat
 from pipeline.geometry import rigid
 
 SAMPLES = 16
+CLOSE_M, WALK_M_S = 0.8, 1.0
+"""How near an observer is who comes close, and its speed."""
 SIDES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 """where the observer comes from, ego frame: ahead, its left, behind, its right"""
 
@@ -57,9 +59,8 @@ def moments(
     context, _ = data.windows(train[np.linspace(0, len(train) - 1, min(count, len(train))).astype(int)])
     observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)
     number = scenes.number(context.video, len(context))
-    return SampledMoments(
-        observation, world_from_ego(context.world_from_agent[:, -1], architecture.ego), number
-    )
+    frame = world_from_ego(context.world_from_agent[:, -1], architecture.ego)
+    return SampledMoments(observation, frame, number)
 
 
 def approach(
@@ -70,26 +71,15 @@ def approach(
     frames: int = PAST,
     rate_hz: float = RATE_HZ,
 ) -> Float[np.ndarray, "1 past_frame 10"]:
-    """Return an observer's past in the ego frame: it walks up from ``side``, is now ``distance_m`` away, and
-    looks at the animal.
-    """
+    """Return an observer's past, ego frame: it walks up from ``side`` and looks at the animal."""
     before_s = np.arange(frames - 1, -1, -1)[:, None] / rate_hz
     eye = (distance_m + speed_m_s * before_s) * side + UP
     return other_channels(rigid.look_at(eye, np.zeros(3), UP)[None])[0]
 
 
-def measure(
-    sampler: Sampler,
-    observation: Observation,
-    *,
-    radius_m: float,
-    seed: int,
-    distance_m: float = 0.8,
-    speed_m_s: float = 1.0,
-) -> Reactions:
+def measure(sampler: Sampler, observation: Observation, *, radius_m: float, seed: int) -> Reactions:
     """Sample goals of some windows under scripted observers, always with the same noise."""
     sampling = PlanSamplingConfig(avoid_solid=False)
-
     how = {"frames": observation.others.shape[2], "rate_hz": sampler.scaling.rate_hz}
 
     def mean_goals(
@@ -100,9 +90,8 @@ def measure(
         return goals.reshape(len(observation), SAMPLES, 3).mean(1)
 
     none = mean_goals(approach(SIDES[0], 1.0, 0.0, **how), replace(sampling, observer=False))
-    shift = np.stack(
-        [mean_goals(approach(side, distance_m, speed_m_s, **how), sampling) - none for side in SIDES]
-    )
+    coming = [approach(side, CLOSE_M, WALK_M_S, **how) for side in SIDES]
+    shift = np.stack([mean_goals(observer, sampling) - none for observer in coming])
     away = -np.einsum("swc,sc->sw", shift, SIDES)
     opposite = np.roll(shift, -2, axis=0)
     reversal = -np.einsum("swc,sc->sw", shift - opposite, SIDES)

@@ -16,50 +16,29 @@ def check_settings(config: Config, data: BehaviorData, architecture: Architectur
         where: the data stand, for messages.
     """
     optimization, staged = config.training.optimization, architecture.family != "one_stage"
+    goal_steps, steps, table = optimization.goal_steps, optimization.steps, "[train_behavior]"
+    off = "set it to false"
     if config.map_lookup == "pointwise" and not architecture.map_cells:
-        raise InputError(
-            "REC-002",
-            "only the 2.5-D encoder makes a map",
-            "[train_behavior]: map_lookup",
-            'scene = "pillars" makes one',
-        )
+        what, remedy = "only the 2.5-D encoder makes a map", 'scene = "pillars" makes one'
+        raise InputError("REC-002", what, f"{table}: map_lookup", remedy)
     if config.export and not staged:
         what = "a model without goals cannot be exported: page and samplers ask for them"
-        raise InputError(
-            "REC-002",
-            what,
-            "[train_behavior]: export",
-            "set it to false; `make behavior-tables` judges such models",
-        )
+        remedy = f"{off}; `make behavior-tables` judges such models"
+        raise InputError("REC-002", what, f"{table}: export", remedy)
     if config.export and config.scene == "none":
-        raise InputError(
-            "REC-002",
-            "a model without a scene encoder cannot be exported: the page shows it a scene",
-            "[train_behavior]: export",
-            "set it to false, or choose an encoder",
-        )
+        what = "a model without a scene encoder cannot be exported: the page shows it a scene"
+        raise InputError("REC-002", what, f"{table}: export", f"{off}, or choose an encoder")
     if config.export and data.rate_hz != RATE_HZ:
-        raise InputError(
-            "REC-002",
-            f"plans of {data.rate_hz:g} frames a second cannot be played: page and simulator have {RATE_HZ}",
-            "[train_behavior]: export",
-            "set it to false, or leave out `rate_hz` of [slice_behavior]",
-        )
-    if staged and optimization.steps <= optimization.goal_steps:
         what = (
-            f"{optimization.goal_steps} steps of goals leave none of {optimization.steps} to paths and bodies"
+            f"plans of {data.rate_hz:g} frames a second cannot be played: page and simulator have {RATE_HZ}"
         )
-        raise InputError(
-            "REC-002",
-            what,
-            "[train_behavior.training.optimization]: steps",
-            "take more steps, or fewer `goal_steps`",
-        )
+        remedy = f"{off}, or leave out `rate_hz` of [slice_behavior]"
+        raise InputError("REC-002", what, f"{table}: export", remedy)
+    if staged and steps <= goal_steps:
+        what = f"{goal_steps} steps of goals leave none of {steps} to paths and bodies"
+        remedy = "take more steps, or fewer `goal_steps`"
+        raise InputError("REC-002", what, "[train_behavior.training.optimization]: steps", remedy)
     if not len(data.indices(TRAIN)):
         what = f"no {(data.past + data.future) / data.rate_hz:.1f} s of uninterrupted motion to learn from"
-        raise InputError(
-            "BEH-001",
-            what,
-            where,
-            "film longer sessions in which the animal stays in view, or foretell less (`horizon_s`)",
-        )
+        remedy = "film longer sessions in which the animal stays in view, or foretell less (`horizon_s`)"
+        raise InputError("BEH-001", what, where, remedy)

@@ -44,9 +44,7 @@ def gaussian_losses(
 def negative_log_likelihood(
     predict: Denoise, clean: Float[Tensor, "batch ..."]
 ) -> Float[Tensor, "batch ..."]:
-    """Return -log N(clean; mean, std), of which ``predict`` returns mean and log std at two steps, shown no
-    sample.
-    """
+    """Return -log N(clean; mean, std) of mean and log std that ``predict`` returns at two steps."""
     nothing = torch.zeros_like(clean)
     mean, log_std = (
         predict(nothing, torch.full((len(clean),), step, device=clean.device))
@@ -65,9 +63,7 @@ def one_stage_losses(
     *,
     phase: TrainingPhase = "all",
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return the denoising errors of path and body as one sequence without control; perception learns with
-    them.
-    """
+    """Return the denoising errors of path and body as one sequence without control."""
     assert phase == "all", "a model of one stage has no goals that could learn before"
     code = perceive(nets, batch, objective, generator, joint_mask(batch, objective, generator))
     known = batch.bones_known

@@ -26,9 +26,8 @@ class SceneSampler:
         self.points = torch.from_numpy(grid_points_ego(stride).astype(np.float32)).to(device)
         first = np.cumsum([0, *(len(part) for part in flat[:-1])])
         self.first = torch.from_numpy(first).to(device)
-        self.origin = torch.from_numpy(np.stack([volume.origin for volume in volumes]).astype(np.float32)).to(
-            device
-        )
+        origin = np.stack([volume.origin for volume in volumes]).astype(np.float32)
+        self.origin = torch.from_numpy(origin).to(device)
         self.shape = torch.tensor([volume.occupancy.shape for volume in volumes], device=device)
         self.voxel_m = torch.tensor([volume.voxel_m for volume in volumes], device=device)
 
@@ -39,18 +38,13 @@ class SceneSampler:
         scene: Int[Tensor, "batch"],
     ) -> Float[Tensor, "batch channel x y z"]:
         """Sample the grid in the volumes ``scene``; ``side`` is -1 where left and right are exchanged."""
-        points = (
-            self.points.flatten(0, 2)
-            * torch.stack([side, side.new_ones(len(side)), side.new_ones(len(side))], dim=-1)[:, None]
-        )
+        one = side.new_ones(len(side))
+        points = self.points.flatten(0, 2) * torch.stack([side, one, one], dim=-1)[:, None]
         away = rigid_torch.apply(world_from_ego, points) - self.origin[scene][:, None]
         index, shape = (away / self.voxel_m[scene][:, None, None]).floor().long(), self.shape[scene][:, None]
         inside = ((index >= 0) & (index < shape)).all(-1)
-        row = (
-            (index[..., 0] * shape[..., 1] + index[..., 1]) * shape[..., 2]
-            + index[..., 2]
-            + self.first[scene][:, None]
-        )
+        row = (index[..., 0] * shape[..., 1] + index[..., 1]) * shape[..., 2] + index[..., 2]
+        row = row + self.first[scene][:, None]
         features = self.features[torch.where(inside, row, len(self.features) - 1)]
         return features.transpose(1, 2).unflatten(2, self.points.shape[:3])
 

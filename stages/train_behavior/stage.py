@@ -68,8 +68,7 @@ def _homes(inputs: Inputs, config: Config) -> tuple[ReconstructedHome | None, li
         return None, []
     if inputs.feature_basis is None or inputs.scene_template is None or inputs.homes is None:
         what = "homes are learned from reconstructions; here the flow begins at trajectories"
-        raise InputError(
-            "REC-002", what, "[train_behavior]: homes", "leave it out: put all tables into one folder"
-        )
+        remedy = "leave it out: put all tables into one folder"
+        raise InputError("REC-002", what, "[train_behavior]: homes", remedy)
     own = ReconstructedHome.load(inputs.behavior_data, inputs.feature_basis, inputs.scene_template)
     return own, [inputs.homes[name] for name in config.homes]

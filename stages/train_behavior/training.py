@@ -64,9 +64,8 @@ def train(
 
     Several processes (`pipeline.core.distributed`) share each step's batch; all hold the same networks.
     """
-    minimised = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}[
-        architecture.family
-    ]
+    of_family = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}
+    minimised = of_family[architecture.family]
     windows = windows_from_data(homes, architecture)
     statistics = statistics_from_windows(windows, largest_turn_rad(settings.augmentation))
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
@@ -122,9 +121,7 @@ def _average(
 
 
 def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device: str) -> None:
-    """Let path and body compute in the precision that is asked for, compiled if that is; weights stay in
-    float32.
-    """
+    """Let path and body compute in the precision asked for, compiled if asked for; weights stay float32."""
     kind = torch.device(device).type
     for net in (nets.path, nets.body):
         if optimization.precision == "bfloat16":
@@ -134,9 +131,7 @@ def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device
 
 
 def rounded(nets: BehaviorNets) -> BehaviorNets:
-    """Round weights to 12 significant bits: nearly half of what a page sends of them, and far finer than
-    training resolves.
-    """
+    """Round weights to 12 significant bits, which halves what a page sends of them."""
     with torch.no_grad():
         for weight in nets.parameters():
             mantissa, exponent = torch.frexp(weight)
@@ -154,15 +149,9 @@ def initial_nets(
     for member in nets.perception:
         member.past.mean[:], member.past.std[:] = statistics.past_mean, statistics.past_std
     scaling, body = statistics.scaling, nets.body
-    statistics_buffers = (
-        scaling.path_std,
-        scaling.body_mean[:ROOT_CHANNELS],
-        scaling.body_std[:ROOT_CHANNELS],
-    )
-    for buffer, numbers in zip(
-        (body.path_std, body.root_mean, body.root_std), statistics_buffers, strict=True
-    ):
-        buffer[:] = torch.from_numpy(numbers)
+    body.path_std[:] = torch.from_numpy(scaling.path_std)
+    body.root_mean[:] = torch.from_numpy(scaling.body_mean[:ROOT_CHANNELS])
+    body.root_std[:] = torch.from_numpy(scaling.body_std[:ROOT_CHANNELS])
     if nets.goal.map is not None:
         nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
     for net in (nets.path, nets.body):
