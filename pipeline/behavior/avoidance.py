@@ -43,7 +43,7 @@ def around_person(
     level = [0, 2]
     person = person_world[:, level]
     reach = np.minimum(clearance_m, np.linalg.norm(start_world[:, level] - person, axis=1))
-    here, before, led = np.array(start_world, float), start_world, []
+    here, before, clear_path = np.array(start_world, float), start_world, []
     for wish in np.moveaxis(path_world, 1, 0):
         step = np.maximum(LEAST_STEP_M, HURRY * np.linalg.norm((wish - before)[:, level], axis=1))
         before = wish
@@ -52,12 +52,12 @@ def around_person(
         following = np.where([[True, False, True]], here + share * (wish - here), wish)
         meets = _crosses(here[:, level], following[:, level], person, reach)
         if meets.any():
-            following[meets] = clear(_slid(here, wish, step, person, reach))[meets]
+            following[meets] = clear(_along_circle(here, wish, step, person, reach))[meets]
             waits = meets & _crosses(here[:, level], following[:, level], person, reach)
             following[waits] = np.where([[True, False, True]], here, wish)[waits]
         here = following
-        led.append(following)
-    return np.stack(led, axis=1)
+        clear_path.append(following)
+    return np.stack(clear_path, axis=1)
 
 
 def _crosses(
@@ -72,7 +72,7 @@ def _crosses(
     return np.linalg.norm(towards - share[:, None] * along, axis=1) < reach - 1e-9
 
 
-def _slid(
+def _along_circle(
     here: Points,
     wish: Points,
     step: Float[np.ndarray, "plan"],

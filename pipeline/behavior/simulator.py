@@ -206,14 +206,14 @@ class AnimalBatch:
         context = Context(root, bones, observer, video, companions=self._companions(some))
         observation = observe(context, self.scenes, self.rest, self.ego)
         frame = world_from_ego(root[:, -1], self.ego)
-        bare = observation.boneless(self.sampler.scaling.body_mean)
+        boneless = observation.boneless(self.sampler.scaling.body_mean)
         self.plans_drawn += len(some)
         commanded = rigid.apply(rigid.inverse(frame), self.goal_command[some][:, None])[:, 0]
-        goal, path, blocked = self._courses(bare, frame, video, 1, commanded)
+        goal, path, blocked = self._courses(boneless, frame, video, 1, commanded)
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
             count, where = self.chaining.candidates - 1, None if video is None else video[again]
-            others = self._courses(bare[again], frame[again], where, count, commanded[again])
+            others = self._courses(boneless[again], frame[again], where, count, commanded[again])
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]

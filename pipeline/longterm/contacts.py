@@ -150,7 +150,7 @@ def enforce_swing_time(
     A foot that glides on for more than `STRIDE_M` should stand more than once; from one place to another d
     metres away it takes sqrt(6 d / `SWING_M_S2`) seconds at least (a cubic in time, at rest at both ends).
     """
-    kept = np.zeros_like(stance)
+    standing = np.zeros_like(stance)
     for foot, centres in enumerate(np.moveaxis(centres_world, 1, 0)):
         phases: list[range] = []
         for phase in _split_phases(stance[:, foot], centres):
@@ -164,8 +164,8 @@ def enforce_swing_time(
                 phases.append(phase)
             elif pair is not None:
                 phases[-1:] = pair
-        kept[[frame for phase in phases for frame in phase], foot] = True
-    return kept
+        standing[[frame for phase in phases for frame in phase], foot] = True
+    return standing
 
 
 def _split_phases(

@@ -43,12 +43,12 @@ class MotionDataset:
 
     def subset(self, chosen: Sequence[int] | Int[np.ndarray, "some"]) -> "MotionDataset":
         """Return some of the stretches, with the scenes that they need."""
-        kept = sorted({self.scene_of[index] for index in chosen})
+        needed = sorted({self.scene_of[index] for index in chosen})
         return MotionDataset(
             self.body,
             tuple(self.stretches[index] for index in chosen),
-            tuple(kept.index(self.scene_of[index]) for index in chosen),
-            tuple(self.scenes[index] for index in kept),
+            tuple(needed.index(self.scene_of[index]) for index in chosen),
+            tuple(self.scenes[index] for index in needed),
         )
 
     @property
@@ -69,7 +69,8 @@ class DatasetSplit:
     @classmethod
     def of(cls, dataset: MotionDataset, kinds: Sequence[str]) -> "DatasetSplit":
         """Part a dataset by what each stretch is for: to `train`, or else."""
-        learned, rest = (np.flatnonzero((np.array(kinds) == "train") == kept) for kept in (True, False))
+        is_train = np.array(kinds) == "train"
+        learned, rest = np.flatnonzero(is_train), np.flatnonzero(~is_train)
         held_out = dataset.subset(rest) if len(rest) else None
         return cls(dataset.subset(learned), held_out, tuple(kinds[index] for index in rest.tolist()))
 

@@ -85,7 +85,7 @@ class LongTerm:
             **CONVENTIONS,
             "bones": len(self.poses.rest),
             "sizes": asdict(self.sizes),
-            "sees_scene": self.route.sees_scene,
+            "sees_scene": self.route.with_scene,
             "motion_prior": asdict(self.motion_prior),
             "contact_vertices": self.contacts.vertices.tolist(),
             "foot_of_contact_vertex": self.contacts.foot.tolist(),
@@ -106,8 +106,8 @@ class LongTerm:
         state, sizes = load_file(folder / "longterm.safetensors"), LongTermSizes(**document["sizes"])
         poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
         static = StaticBody(sizes)
-        route = RouteNet(sizes, sees_scene=document["sees_scene"])
-        pose = PoseNet(sizes, sees_scene=document["sees_scene"])
+        route = RouteNet(sizes, with_scene=document["sees_scene"])
+        pose = PoseNet(sizes, with_scene=document["sees_scene"])
         for name, module in zip(("poses", *NETWORKS), (poses, static, route, pose), strict=True):
             own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
             module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})

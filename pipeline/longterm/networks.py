@@ -39,12 +39,12 @@ IDLE_M_S = 0.1
 class PointNet(nn.Module):
     """A code for a set of points: shared layers, then the maximum (no transformation nets)."""
 
-    def __init__(self, code: int, sees_scene: bool = True):
+    def __init__(self, code: int, with_scene: bool = True):
         super().__init__()
-        self.sees_scene, self.code = sees_scene, code
+        self.with_scene, self.code = with_scene, code
         self.layers = (
             nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 64), nn.ReLU(), nn.Linear(64, code))
-            if sees_scene
+            if with_scene
             else None
         )
 
@@ -113,9 +113,9 @@ class StaticBody(nn.Module):
 class InbetweenNet(nn.Module):
     """A bi-LSTM over start and end, the scene's code, two linear layers."""
 
-    def __init__(self, channels: int, extra: int, sizes: LongTermSizes, sees_scene: bool):
+    def __init__(self, channels: int, extra: int, sizes: LongTermSizes, with_scene: bool):
         super().__init__()
-        self.point_net = PointNet(sizes.scene, sees_scene)
+        self.point_net = PointNet(sizes.scene, with_scene)
         self.lstm = nn.LSTM(3 * channels + extra + 2, sizes.hidden, batch_first=True, bidirectional=True)
         self.out = nn.Sequential(
             nn.Linear(2 * sizes.hidden + sizes.scene, sizes.width),
@@ -153,9 +153,9 @@ class CoarseToFine(nn.Module):
     be found.
     """
 
-    def __init__(self, channels: int, extra: int, sizes: LongTermSizes, sees_scene: bool):
+    def __init__(self, channels: int, extra: int, sizes: LongTermSizes, with_scene: bool):
         super().__init__()
-        self.sees_scene = sees_scene
+        self.with_scene = with_scene
         self.coarse = InbetweenNet(channels, extra, sizes, False)
         smaller = replace(sizes, hidden=max(1, 2 * sizes.hidden // 3))
         self.fine = InbetweenNet(
@@ -174,7 +174,7 @@ class CoarseToFine(nn.Module):
         still = coarse.detach()
         read = (
             local_scene.read_distances(seen.field, still[..., :3])
-            if self.sees_scene
+            if self.with_scene
             else still.new_zeros(*still.shape[:2], local_scene.READ_CHANNELS)
         )
         known = torch.cat([read, still, with_velocity(still[..., :ROOT_CHANNELS])], dim=-1)
@@ -206,16 +206,16 @@ class RouteNet(nn.Module):
         self,
         sizes: LongTermSizes,
         *,
-        sees_scene: bool = True,
+        with_scene: bool = True,
         predicts_rotation: bool = True,
         blind: bool = False,
     ):
         super().__init__()
-        self.predicts_rotation, self.blind, self.sees_scene = predicts_rotation, blind, sees_scene
+        self.predicts_rotation, self.blind, self.with_scene = predicts_rotation, blind, with_scene
         self.between: InbetweenNet | CoarseToFine = (
-            InbetweenNet(ROOT_CHANNELS, 0, sizes, sees_scene)
+            InbetweenNet(ROOT_CHANNELS, 0, sizes, with_scene)
             if blind
-            else CoarseToFine(ROOT_CHANNELS, 2 * sizes.pose, sizes, sees_scene)
+            else CoarseToFine(ROOT_CHANNELS, 2 * sizes.pose, sizes, with_scene)
         )
 
     def stages(
@@ -296,7 +296,7 @@ class PoseNet(nn.Module):
         self,
         sizes: LongTermSizes,
         *,
-        sees_scene: bool = True,
+        with_scene: bool = True,
         follows_route: bool = True,
         predicts_rotation: bool = False,
         strides: bool = True,
@@ -305,7 +305,7 @@ class PoseNet(nn.Module):
         self.follows_route, self.predicts_rotation = follows_route, predicts_rotation
         self.strides = GaitPhase(sizes.pose) if follows_route and strides else None
         extra = 2 * ROOT_CHANNELS * follows_route + (self.strides.channels if self.strides is not None else 0)
-        self.between = InbetweenNet(sizes.pose + (6 if predicts_rotation else 0), extra, sizes, sees_scene)
+        self.between = InbetweenNet(sizes.pose + (6 if predicts_rotation else 0), extra, sizes, with_scene)
         self.short = nn.Linear(self.strides.channels, sizes.pose) if self.strides is not None else None
 
     def forward(
@@ -349,9 +349,9 @@ def gait_progress(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch
 class BaseNet(nn.Module):
     """Route and poses from one network (ablation), its draft corrected by the distances beside it."""
 
-    def __init__(self, sizes: LongTermSizes, *, sees_scene: bool = True):
+    def __init__(self, sizes: LongTermSizes, *, with_scene: bool = True):
         super().__init__()
-        self.between = CoarseToFine(ROOT_CHANNELS + sizes.pose, 0, sizes, sees_scene)
+        self.between = CoarseToFine(ROOT_CHANNELS + sizes.pose, 0, sizes, with_scene)
 
     def stages(
         self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene

@@ -41,11 +41,11 @@ class BodyMotion:
 def concatenate_motions(parts: Sequence[BodyMotion]) -> BodyMotion:
     """Put stretches one after the other; frames in which one ends and the next begins count once."""
     first, *rest = parts
-    kept = [first, *(part[1:] for part in rest)]
-    return BodyMotion(
-        np.concatenate([part.world_from_agent for part in kept]),
-        np.concatenate([part.agent_from_bone for part in kept]),
+    every = [first, *(part[1:] for part in rest)]
+    roots, bones = (
+        [getattr(part, name) for part in every] for name in ("world_from_agent", "agent_from_bone")
     )
+    return BodyMotion(np.concatenate(roots), np.concatenate(bones))
 
 
 def jump_between_levels(motion: BodyMotion, hop_m: float = 0.08) -> BodyMotion:
@@ -77,8 +77,8 @@ def smooth_seams(motion: BodyMotion, every: int = STEPS, reach: int = 6) -> Body
         return motion
     seam = np.clip(np.round(frame / every), 1, last) * every
     away = np.abs(frame - seam)
-    kept = np.flatnonzero((away == 0) | (away > reach))
-    return _interpolate(kept, motion[kept], frame)
+    anchors = np.flatnonzero((away == 0) | (away > reach))
+    return _interpolate(anchors, motion[anchors], frame)
 
 
 def limit_turn_rate(motion: BodyMotion, most_rad: float) -> BodyMotion:

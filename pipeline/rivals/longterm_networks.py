@@ -21,7 +21,7 @@ from pipeline.longterm.networks import ROOT_CHANNELS, BaseNet, PoseNet, RouteNet
 class AblationSpec:
     """What one of them may do."""
 
-    sees_scene: bool = True
+    with_scene: bool = True
     """see the scene"""
     route_turns: bool = True
     """RouteNet predicts orientations; else PoseNet does"""
@@ -36,14 +36,14 @@ class AblationSpec:
 
 
 ABLATIONS: dict[str, AblationSpec] = {
-    "ours_no_scene": AblationSpec(sees_scene=False),
+    "ours_no_scene": AblationSpec(with_scene=False),
     "as_paper": AblationSpec(paper=True),
     "route_t_pose": AblationSpec(route_turns=False, follows_route=False),
-    "route_t_pose_no_scene": AblationSpec(sees_scene=False, route_turns=False, follows_route=False),
+    "route_t_pose_no_scene": AblationSpec(with_scene=False, route_turns=False, follows_route=False),
     "route_tr_pose": AblationSpec(follows_route=False),
-    "route_tr_pose_no_scene": AblationSpec(sees_scene=False, follows_route=False),
+    "route_tr_pose_no_scene": AblationSpec(with_scene=False, follows_route=False),
     "base": AblationSpec(one=True),
-    "base_no_scene": AblationSpec(sees_scene=False, one=True),
+    "base_no_scene": AblationSpec(with_scene=False, one=True),
 }
 
 RIVALS = ("ours_no_scene", "base")
@@ -76,11 +76,11 @@ class AblatedNetworks(nn.Module):
 def build(kind: AblationSpec, sizes: LongTermSizes) -> AblatedNetworks:
     """Make untrained networks."""
     if kind.one:
-        return AblatedNetworks(None, None, BaseNet(sizes, sees_scene=kind.sees_scene))
-    route = RouteNet(sizes, sees_scene=kind.sees_scene, predicts_rotation=kind.route_turns, blind=kind.paper)
+        return AblatedNetworks(None, None, BaseNet(sizes, with_scene=kind.with_scene))
+    route = RouteNet(sizes, with_scene=kind.with_scene, predicts_rotation=kind.route_turns, blind=kind.paper)
     pose = PoseNet(
         sizes,
-        sees_scene=kind.sees_scene,
+        with_scene=kind.with_scene,
         follows_route=kind.follows_route,
         predicts_rotation=not kind.route_turns,
         strides=not kind.paper,

@@ -21,7 +21,7 @@ OPTIMIZED = ("ours", "base", "route_cvae", "nearest")
 WITHOUT_SCENE = {"ours": "ours_no_scene", "route_t_pose": "route_t_pose_no_scene", "base": "base_no_scene"}
 """Methods that see the scene, and the same that do not; the routes of `route_tr_pose` are those of ours."""
 COMPARED_WITH = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {
-    blind: sees_scene for sees_scene, blind in WITHOUT_SCENE.items()
+    blind: with_scene for with_scene, blind in WITHOUT_SCENE.items()
 }
 """Methods whose errors beyond another's are reported clip by clip, with intervals."""
 

@@ -61,7 +61,7 @@ def score(
     worth = reference.judge.plausibility(made, stance)
     mesh = reference.judge.surface(*motion_tensors(made))
     apart = (mesh - reference.mesh).norm(dim=-1)
-    beside = float((mesh[NEXT_TO_ENDS] - reference.mesh[ENDS]).norm(dim=-1).mean())
+    next_to_ends = float((mesh[NEXT_TO_ENDS] - reference.mesh[ENDS]).norm(dim=-1).mean())
     turn = np.abs(made.world_from_agent - truth.world_from_agent)[:, :3, :2].mean()
     joints = [each.world_from_agent[:, None] @ each.agent_from_bone for each in (made, truth)]
     rest = poses.rest.double().numpy()
@@ -76,8 +76,8 @@ def score(
             1000 * np.linalg.norm((joints[0] - joints[1])[..., :3, 3], axis=-1).mean(),
             1000 * float(apart.mean()),
             float(apart[ENDS].mean()) / body.length_m,
-            1000 * beside,
-            beside / body.length_m,
+            1000 * next_to_ends,
+            next_to_ends / body.length_m,
             seam_m.mean() / body.length_m,
             1000 * seam_m.max(),
             worth.non_collision,

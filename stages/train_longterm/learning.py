@@ -61,8 +61,8 @@ def train_networks(
     stills = sample_static_bodies(dataset, poses, sizes.points, rng, most=config.most_bodies)
     trainer = NetworkTrainer(poses, LongTermLossWeights(), config.seed, resume)
     static = initialized(lambda: StaticBody(sizes), config)
-    route = initialized(lambda: RouteNet(sizes, sees_scene=config.scene), config)
-    pose = initialized(lambda: PoseNet(sizes, sees_scene=config.scene), config)
+    route = initialized(lambda: RouteNet(sizes, with_scene=config.scene), config)
+    pose = initialized(lambda: PoseNet(sizes, with_scene=config.scene), config)
     records = {
         "static": training.fit_body(static, stills, dataset, contacts, trainer, config.body),
         "route": training.fit_route(route, clips, trainer, config.route),
@@ -86,7 +86,7 @@ def train_ablations(
         if made.base is not None:
             training.fit_base(made.base, clips, trainer, config.pose, name)
         elif made.route is not None and made.pose is not None:
-            key = (spec.sees_scene, spec.route_turns, spec.paper)
+            key = (spec.with_scene, spec.route_turns, spec.paper)
             if key not in routes:
                 training.fit_route(made.route, clips, trainer, config.route, f"{name}_route")
                 routes[key] = made.route
@@ -115,7 +115,7 @@ def initialized(make: Callable[[], Network], config: Config) -> Network:
         net = make()
     if config.point_net is not None:
         for part in net.modules():
-            if isinstance(part, PointNet) and part.sees_scene:
+            if isinstance(part, PointNet) and part.with_scene:
                 _load_point_net(part, Path(config.point_net))
     return net
 

@@ -120,7 +120,7 @@ def test_blind_networks_do_not_see_and_seeing_ones_do(clips):
             net.between(clips.channels[:, 0], clips.channels[:, -1], seen) for seen in (clips.seen, moved)
         ]
         assert (not torch.equal(*pair)) == differs, name
-    assert not any(isinstance(p, torch.nn.Parameter) for p in PointNet(4, sees_scene=False).parameters())
+    assert not any(isinstance(p, torch.nn.Parameter) for p in PointNet(4, with_scene=False).parameters())
 
 
 def test_a_saved_model_is_the_same_model(model, clips, tmp_path):
