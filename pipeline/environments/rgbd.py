@@ -60,12 +60,9 @@ class RgbdCamera:
             remedy = "make it: make <agent>.reconstruction, or leave `rgbd` out of `observations`"
             artifact.require(folder, "reconstruction", remedy=remedy)
         skin = SKIN.load(build / "reconstruction/skin.npz", "weights", "agent_from_bone_rest")
-        return cls(
-            [ply.read_ply(home / "reconstruction/scene.ply") for home in homes],
-            ply.read_ply(build / "reconstruction/agent.ply"),
-            skin["weights"],
-            skin["agent_from_bone_rest"],
-        )
+        scenes = [ply.read_ply(home / "reconstruction/scene.ply") for home in homes]
+        body = ply.read_ply(build / "reconstruction/agent.ply")
+        return cls(scenes, body, skin["weights"], skin["agent_from_bone_rest"])
 
     def picture(
         self,

@@ -292,12 +292,9 @@ def checked(
     numbers = np.asarray(action, float)
     if numbers.shape != shape or not np.isfinite(numbers).all():
         received = f"shape {numbers.shape}" if numbers.shape != shape else f"{numbers.tolist()}"
-        raise InputError(
-            "SIM-012",
-            f"actions are no {shape[0]} x {shape[1]} finite numbers: {received}",
-            "step",
-            "look for what made the policy diverge: learning rate, rewards, observations",
-        )
+        what = f"actions are no {shape[0]} x {shape[1]} finite numbers: {received}"
+        remedy = "look for what made the policy diverge: learning rate, rewards, observations"
+        raise InputError("SIM-012", what, "step", remedy)
     return numbers
 
 

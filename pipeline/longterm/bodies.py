@@ -52,12 +52,8 @@ class SkinnedBody:
 def load_body(reconstruction: Path) -> SkinnedBody:
     """Read the reconstructed animal: `agent.ply` and `skin.npz`. Raises InputError where they are damaged."""
     skin = SKIN.load(reconstruction / "skin.npz", "weights", "agent_from_bone_rest")
-    return SkinnedBody(
-        ply.read_ply(reconstruction / "agent.ply"),
-        skin["weights"],
-        skin["agent_from_bone_rest"].astype(np.float64),
-        np.zeros(0),
-    )
+    mesh, rest = ply.read_ply(reconstruction / "agent.ply"), skin["agent_from_bone_rest"].astype(np.float64)
+    return SkinnedBody(mesh, skin["weights"], rest, np.zeros(0))
 
 
 class PosedSurface(nn.Module):
@@ -68,10 +64,8 @@ class PosedSurface(nn.Module):
     def __init__(self, body: SkinnedBody, vertices: Int[np.ndarray, "vertex"] | None = None):
         super().__init__()
         index = np.arange(len(body.mesh.vertices)) if vertices is None else vertices
-        bone_from_rest = rigid.inverse(body.agent_from_bone_rest)
-        in_bone = rigid.apply(
-            bone_from_rest, np.asarray(body.mesh.vertices, np.float64)[index]
-        )  # bone vertex 3
+        vertices_agent = np.asarray(body.mesh.vertices, np.float64)[index]
+        in_bone = rigid.apply(rigid.inverse(body.agent_from_bone_rest), vertices_agent)  # bone vertex 3
         homogeneous = np.concatenate([in_bone, np.ones_like(in_bone[..., :1])], axis=-1)
         blend = np.einsum("vb,bvk->vbk", body.weights[index], homogeneous).reshape(len(index), -1)
         self.register_buffer("blend", torch.from_numpy(blend).float(), persistent=False)
@@ -134,6 +128,5 @@ class PoseSpace(nn.Module):
     def bones(self, channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch bone 4 4"]:
         """Turn channels into `agent_from_bone`."""
         twist = channels.unflatten(-1, (len(self.rest), 6))
-        return rigid_torch.make(
-            rigid_torch.so3_exp(twist[..., :3]) @ self.rest[:, :3, :3], self.rest[:, :3, 3] + twist[..., 3:]
-        )
+        turn = rigid_torch.so3_exp(twist[..., :3])
+        return rigid_torch.make(turn @ self.rest[:, :3, :3], self.rest[:, :3, 3] + twist[..., 3:])

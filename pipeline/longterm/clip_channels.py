@@ -57,9 +57,8 @@ def pose_channels(
 ) -> Float[Tensor, "*batch pose"]:
     """Return p of LTM 3.2: numbers of the pose, without unit."""
     rest = poses.rest.double().numpy()
-    return poses.encode(
-        torch.from_numpy(channels_from_bones(np.asarray(agent_from_bone, np.float64), rest)).float()
-    )
+    channels = channels_from_bones(np.asarray(agent_from_bone, np.float64), rest)
+    return poses.encode(torch.from_numpy(channels).float())
 
 
 def clip_frames(
@@ -114,9 +113,8 @@ def decode_clip(
             left = given - poses.decode(poses.encode(given))
             posed = posed + torch.lerp(left[0], left[1], torch.linspace(0, 1, len(channels))[:, None])
         bones = poses.bones(posed)
-        clip_from_agent = rigid_torch.make(
-            rigid_torch.rotation_from_6d(channels[..., 3:ROOT_CHANNELS]), channels[..., :3]
-        )
+        rotation = rigid_torch.rotation_from_6d(channels[..., 3:ROOT_CHANNELS])
+        clip_from_agent = rigid_torch.make(rotation, channels[..., :3])
     return BodyMotion(world_from_clip @ clip_from_agent.double().numpy(), bones.double().numpy())
 
 

@@ -61,18 +61,14 @@ class ContactVertices:
 
     def centres(self, vertices_world: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "frame foot 3"]:
         """Return the mean of each foot's vertices, given the contact vertices."""
-        share = torch.zeros(
-            self.feet, len(self.foot), dtype=vertices_world.dtype, device=vertices_world.device
-        )
+        share = vertices_world.new_zeros(self.feet, len(self.foot))
         share[torch.from_numpy(self.foot), torch.arange(len(self.foot))] = 1
         return (share / share.sum(1, keepdim=True)) @ vertices_world
 
     def lowest(self, distance_m: Float[Tensor, "frame vertex"]) -> Float[Tensor, "frame foot"]:
         """Return how far each foot is from the scene, given the contact vertices' distances."""
-        return torch.stack(
-            [distance_m[:, np.flatnonzero(self.foot == foot)].min(1).values for foot in range(self.feet)],
-            dim=1,
-        )
+        of_foot = (distance_m[:, np.flatnonzero(self.foot == foot)] for foot in range(self.feet))
+        return torch.stack([distance.min(1).values for distance in of_foot], dim=1)
 
 
 def find_contact_vertices(

@@ -44,12 +44,9 @@ class MotionDataset:
     def subset(self, chosen: Sequence[int] | Int[np.ndarray, "some"]) -> "MotionDataset":
         """Return some of the stretches, with the scenes that they need."""
         needed = sorted({self.scene_of[index] for index in chosen})
-        return MotionDataset(
-            self.body,
-            tuple(self.stretches[index] for index in chosen),
-            tuple(needed.index(self.scene_of[index]) for index in chosen),
-            tuple(self.scenes[index] for index in needed),
-        )
+        stretches = tuple(self.stretches[index] for index in chosen)
+        scene_of = tuple(needed.index(self.scene_of[index]) for index in chosen)
+        return MotionDataset(self.body, stretches, scene_of, tuple(self.scenes[index] for index in needed))
 
     @property
     def distances(self) -> list[SignedDistance]:
@@ -137,11 +134,9 @@ def select_clips(
     """Choose short motions: those that travel and a share ``resting`` of clips that rest."""
     starts = [np.arange(0, len(stretch) - STEPS, stride) for stretch in dataset.stretches]
     stretch, start = np.repeat(np.arange(len(starts)), list(map(len, starts))), np.concatenate(starts)
-    roots = [each.world_from_agent[:, :3, 3] for each in dataset.stretches]
-    way = [
-        np.linalg.norm(root[first + STEPS] - root[first], axis=1)
-        for root, first in zip(roots, starts, strict=True)
-    ]
+    roots = (each.world_from_agent[:, :3, 3] for each in dataset.stretches)
+    both = zip(roots, starts, strict=True)
+    way = [np.linalg.norm(root[first + STEPS] - root[first], axis=1) for root, first in both]
     moves = np.concatenate(way) > MOVED_M
     still = np.flatnonzero(~moves)
     if moves.any():
@@ -158,9 +153,8 @@ def encode_selection(
     """Encode short motions; the poses of each stretch are encoded once."""
     p = [pose_channels(stretch.agent_from_bone, poses) for stretch in dataset.stretches]
     pairs = list(zip(cuts.stretch, cuts.start, strict=True))
-    root = np.stack(
-        [dataset.stretches[stretch].world_from_agent[start : start + STEPS + 1] for stretch, start in pairs]
-    )
+    roots = [stretch.world_from_agent for stretch in dataset.stretches]
+    root = np.stack([roots[stretch][start : start + STEPS + 1] for stretch, start in pairs])
     pose = torch.stack([p[stretch][start : start + STEPS + 1] for stretch, start in pairs])
     return encode_clips(root, pose, np.asarray(dataset.scene_of)[cuts.stretch], dataset.scenes, points, rng)
 
@@ -200,6 +194,5 @@ def fit_pose_space(
     stretches: Sequence[BodyMotion], rest: Float[np.ndarray, "bone 4 4"], components: int
 ) -> PoseSpace:
     """Find the pose space of some motion."""
-    return PoseSpace(rest, components).fit(
-        np.concatenate([part.agent_from_bone[::POSE_STRIDE] for part in stretches])
-    )
+    bones = np.concatenate([part.agent_from_bone[::POSE_STRIDE] for part in stretches])
+    return PoseSpace(rest, components).fit(bones)

@@ -25,16 +25,9 @@ NEAREST_M, FARTHEST_M = -0.15, 0.45
 CLOSE_M = 0.15
 """What is nearer than this is in the way."""
 PROBES_M = (
-    (0, 0, 0),
-    (0.15, 0, 0),
-    (-0.15, 0, 0),
-    (0.3, 0, 0),
-    (-0.3, 0, 0),
-    (0, 0.1, 0),
-    (0, -0.1, 0),
-    (0, 0, 0.15),
-    (0, 0, -0.15),
-)
+    (0, 0, 0), (0.15, 0, 0), (-0.15, 0, 0), (0.3, 0, 0), (-0.3, 0, 0), (0, 0.1, 0), (0, -0.1, 0),
+    (0, 0, 0.15), (0, 0, -0.15),
+)  # fmt: skip
 """Where distances are read: at the root, on both sides, above, beneath, ahead and behind."""
 READ_CHANNELS = 2 * len(PROBES_M)
 """How many numbers `read_distances` gives per frame."""
@@ -63,10 +56,8 @@ def distance_fields(
     """Measure the signed distance around clips, ``most`` at a time; without scenes it is 0."""
     axes = [low + VOXEL_M * torch.arange(count) for low, count in zip(LOW_M, SHAPE, strict=True)]
     voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
-    frames, field = (
-        torch.from_numpy(np.asarray(world_from_clip)).float(),
-        torch.zeros(1, *SHAPE, dtype=torch.half),
-    )
+    frames = torch.from_numpy(np.asarray(world_from_clip)).float()
+    field = torch.zeros(1, *SHAPE, dtype=torch.half)
     field = field.expand(len(frames), *SHAPE) if not scenes else field.repeat(len(frames), 1, 1, 1)
     for index, each in enumerate(scenes):
         for rows in torch.from_numpy(np.flatnonzero(np.asarray(scene) == index)).split(most):
@@ -84,7 +75,5 @@ def read_distances(
     grid = 2 * (places - torch.tensor(LOW_M, dtype=route.dtype, device=route.device)) / last - 1
     grid = grid.flip(-1)[:, None]  # grid_sample counts the last axis first
     values = field.to(route)[:, None]
-    read = functional.grid_sample(values, grid, mode="bilinear", padding_mode="border", align_corners=True)[
-        :, 0, 0
-    ]
+    read = functional.grid_sample(values, grid, padding_mode="border", align_corners=True)[:, 0, 0]
     return torch.cat([4 * read, 10 * (CLOSE_M - read).clamp_min(0)], dim=-1)

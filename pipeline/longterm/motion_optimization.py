@@ -89,10 +89,8 @@ class _Correction(torch.nn.Module):
     def __init__(self, moving: BodyMotion, poses: PoseSpace):
         super().__init__()
         self.root, _ = motion_tensors(moving)
-        rest = poses.rest.double().numpy()
-        self.channels = torch.from_numpy(
-            channels_from_bones(np.asarray(moving.agent_from_bone, np.float64), rest)
-        ).float()
+        bones, rest = np.asarray(moving.agent_from_bone, np.float64), poses.rest.double().numpy()
+        self.channels = torch.from_numpy(channels_from_bones(bones, rest)).float()
         self.poses = poses
         self.shift = torch.nn.Parameter(torch.zeros(len(moving), 3))
         self.turn = torch.nn.Parameter(torch.zeros(len(moving), 3))
@@ -234,15 +232,13 @@ def lift_out_of_solid(
     within `HIGHEST_LIFT_M` is a wall. Rising and sinking is spread over ``reach`` frames on both sides.
     """
     heights = torch.arange(0, HIGHEST_LIFT_M, LIFT_STEP_M)
-    inside = torch.stack(
-        [scene.at(touching + height * torch.tensor([0.0, 1.0, 0.0])) < 0 for height in heights]
-    )  # height frame vertex
+    up = torch.tensor([0.0, 1.0, 0.0])
+    inside = torch.stack([scene.at(touching + height * up) < 0 for height in heights])  # height frame vertex
     first = torch.where(inside.all(0), 0, (~inside).float().argmax(0))
     needed = heights[first].amax(1).numpy()
     if reach:
-        needed = ndimage.gaussian_filter1d(
-            ndimage.maximum_filter1d(needed, 2 * reach + 1, mode="nearest"), reach, mode="nearest"
-        )
+        needed = ndimage.maximum_filter1d(needed, 2 * reach + 1, mode="nearest")
+        needed = ndimage.gaussian_filter1d(needed, reach, mode="nearest")
     return torch.from_numpy(needed)
 
 

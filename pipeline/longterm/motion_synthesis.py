@@ -78,9 +78,8 @@ class LongTerm:
         state = {f"poses.{name}": value for name, value in self.poses.state_dict().items()}
         for name in NETWORKS:
             state |= {f"{name}.{key}": value for key, value in getattr(self, name).state_dict().items()}
-        save_file(
-            {name: value.contiguous() for name, value in state.items()}, folder / "longterm.safetensors"
-        )
+        state = {name: value.contiguous() for name, value in state.items()}
+        save_file(state, folder / "longterm.safetensors")
         document = {
             **CONVENTIONS,
             "bones": len(self.poses.rest),
@@ -111,9 +110,8 @@ class LongTerm:
         for name, module in zip(("poses", *NETWORKS), (poses, static, route, pose), strict=True):
             own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
             module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})
-        contacts = ContactVertices(
-            np.array(document["contact_vertices"]), np.array(document["foot_of_contact_vertex"])
-        )
+        numbers = (np.array(document[name]) for name in ("contact_vertices", "foot_of_contact_vertex"))
+        contacts = ContactVertices(*numbers)
         motion_prior = MotionPrior(**document["motion_prior"])
         return cls(sizes, poses, contacts, motion_prior, static.eval(), route.eval(), pose.eval())
 
@@ -135,9 +133,8 @@ class LongTerm:
 
         A good body touches the scene, is not inside it, and stays near its place.
         """
-        places = encode_places(
-            world_from_agent, np.zeros(len(world_from_agent), int), [scene], self.sizes.points, rng
-        )
+        first = np.zeros(len(world_from_agent), int)
+        places = encode_places(world_from_agent, first, [scene], self.sizes.points, rng)
         shape = torch.from_numpy(body.shape).float().expand(len(world_from_agent), -1)
         judge = PlausibilityMeter(body, self.contacts, scene.distance)
         best, least = None, np.full(len(world_from_agent), np.inf)
@@ -193,22 +190,16 @@ class LongTerm:
         """
         number = np.arange(len(world_from_agent))
         stays = np.append(False, np.isclose(world_from_agent[1:], world_from_agent[:-1]).all((1, 2)))
-        bodies = self.bodies(world_from_agent, body, scene, rng)[
-            np.maximum.accumulate(np.where(stays, 0, number))
-        ]
-        drawn = (
-            np.isin(number, number if stops is None else [0, *stops, number[-1]])
-            | stays
-            | np.append(stays[1:], False)
-        )
+        since = np.maximum.accumulate(np.where(stays, 0, number))
+        bodies = self.bodies(world_from_agent, body, scene, rng)[since]
+        drawn = np.isin(number, number if stops is None else [0, *stops, number[-1]])
+        drawn |= stays | np.append(stays[1:], False)
         for _ in range(SWEEPS if not drawn.all() else 0):
             bodies = self._passed(bodies, np.flatnonzero(~drawn), scene, rng)
         rise = np.abs(np.diff(world_from_agent[:, 1, 3]))
         parts = zip(self.short_motions(bodies[:-1], bodies[1:], scene, rng), rise > JUMP_M, strict=True)
-        made = smooth_seams(
-            concatenate_motions([jump_between_levels(part) if leaps else part for part, leaps in parts])
-        )
-        return limit_turn_rate(made, self.motion_prior.turn_rad), bodies
+        joined = concatenate_motions([jump_between_levels(part) if leaps else part for part, leaps in parts])
+        return limit_turn_rate(smooth_seams(joined), self.motion_prior.turn_rad), bodies
 
     def _passed(
         self,

@@ -132,17 +132,15 @@ class InbetweenNet(nn.Module):
         coarse: Float[Tensor, "batch frame channel"] | None = None,
     ) -> Float[Tensor, "batch frame channel"]:
         """Return the channels of all k + 1 frames: a draft, or the line between the ends, and an offset."""
-        share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)[None, :, None].expand(
-            len(start), -1, 1
-        )
+        share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)
+        share = share[None, :, None].expand(len(start), -1, 1)
         line = torch.lerp(start[:, None], end[:, None], share)
         both = torch.cat([start, end], dim=-1)[:, None].expand(-1, STEPS + 1, -1)
         parts = [line, both, share, 4 * share * (1 - share)] + ([] if extra is None else [extra])
         features, _ = self.lstm(torch.cat(parts, dim=-1))
         code = self.point_net(points)[:, None].expand(-1, STEPS + 1, -1)
-        return (line if coarse is None else coarse) + end_window(line) * self.out(
-            torch.cat([features, code], dim=-1)
-        )
+        offset = self.out(torch.cat([features, code], dim=-1))
+        return (line if coarse is None else coarse) + end_window(line) * offset
 
 
 class CoarseToFine(nn.Module):
@@ -158,9 +156,8 @@ class CoarseToFine(nn.Module):
         self.with_scene = with_scene
         self.coarse = InbetweenNet(channels, extra, sizes, False)
         smaller = replace(sizes, hidden=max(1, 2 * sizes.hidden // 3))
-        self.fine = InbetweenNet(
-            channels, local_scene.READ_CHANNELS + channels + 2 * ROOT_CHANNELS, smaller, False
-        )
+        known = local_scene.READ_CHANNELS + channels + 2 * ROOT_CHANNELS
+        self.fine = InbetweenNet(channels, known, smaller, False)
 
     def stages(
         self,
@@ -226,10 +223,8 @@ class RouteNet(nn.Module):
         if isinstance(self.between, InbetweenNet):
             routes = [orthonormalized(self.between(first, last, seen.points))]
         else:
-            poses = torch.cat([start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:]], -1)[:, None].expand(
-                -1, STEPS + 1, -1
-            )
-            routes = self.between.stages(first, last, seen, poses)
+            poses = torch.cat([start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:]], -1)[:, None]
+            routes = self.between.stages(first, last, seen, poses.expand(-1, STEPS + 1, -1))
         if self.predicts_rotation:
             return routes
         share = torch.linspace(0, 1, STEPS + 1, device=first.device)[None, :, None]
@@ -255,11 +250,8 @@ class GaitPhase(nn.Module):
         super().__init__()
         self.code = nn.Linear(pose, 2 * waves)
         step = torch.linspace(0, 1, waves)
-        self.rate = nn.Parameter(
-            2
-            * torch.pi
-            * torch.stack([FEWEST_TURNS + 2 * step, FEWEST_TURNS + 2 * ((7 * step) % 1), 0 * step], dim=-1)
-        )
+        turns = [FEWEST_TURNS + 2 * step, FEWEST_TURNS + 2 * ((7 * step) % 1), 0 * step]
+        self.rate = nn.Parameter(2 * torch.pi * torch.stack(turns, dim=-1))
 
     @property
     def channels(self) -> int:

@@ -106,8 +106,7 @@ def seams(
     """
     surface = PosedSurface(body, None if vertices is None else body.sample_vertices(vertices))
     at = np.arange(every, len(motion) - 2, every)
-    points = surface(*motion_tensors(motion[(at[:, None] + np.arange(-2, 3)).reshape(-1)])).unflatten(
-        0, (len(at), 5)
-    )
+    around = motion[(at[:, None] + np.arange(-2, 3)).reshape(-1)]
+    points = surface(*motion_tensors(around)).unflatten(0, (len(at), 5))
     step = (points[:, 1:] - points[:, :-1]).norm(dim=-1).numpy()
     return (step[:, 1:3].max(1) - np.maximum(step[:, 0], step[:, 3])).clip(0)

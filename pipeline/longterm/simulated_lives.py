@@ -42,9 +42,7 @@ def save(
     npz.save(
         folder / "motion.npz",
         frames=np.array([len(session) for session in sessions], np.int64),
-        world_from_agent=np.concatenate([session.world_from_agent for session in sessions]).astype(
-            np.float64
-        ),
+        world_from_agent=np.concatenate([session.world_from_agent for session in sessions], dtype=np.float64),
         agent_from_bone=np.concatenate([session.agent_from_bone for session in sessions]).astype(np.float32),
         scene=np.asarray(scene_of, np.int64),
         split=np.array(split, np.str_),
@@ -53,23 +51,16 @@ def save(
 
 def load(folder: Path) -> DatasetSplit:
     """Read what `save` wrote. Raises InputError ART-010, ART-020 when damaged."""
-    stored = npz.load(
-        folder / "motion.npz", ("frames", "world_from_agent", "agent_from_bone", "scene", "split")
-    )
+    names = ("frames", "world_from_agent", "agent_from_bone", "scene", "split")
+    stored = npz.load(folder / "motion.npz", names)
     ends = np.cumsum(stored["frames"])[:-1]
-    parts = zip(
-        np.split(stored["world_from_agent"], ends), np.split(stored["agent_from_bone"], ends), strict=True
-    )
+    roots_and_bones = (np.split(stored[name], ends) for name in ("world_from_agent", "agent_from_bone"))
+    sessions = tuple(BodyMotion(*part) for part in zip(*roots_and_bones, strict=True))
     roots = stored["world_from_agent"][:, :3, 3]
     count = int(stored["scene"].max()) + 1
     scenes = tuple(
         MotionScene.for_motion(ply.read_ply(folder / "scenes" / f"{number}.ply"), roots)
         for number in range(count)
     )
-    dataset = MotionDataset(
-        load_body(folder / "body"),
-        tuple(BodyMotion(*part) for part in parts),
-        tuple(stored["scene"].tolist()),
-        scenes,
-    )
+    dataset = MotionDataset(load_body(folder / "body"), sessions, tuple(stored["scene"].tolist()), scenes)
     return DatasetSplit.of(dataset, stored["split"].tolist())

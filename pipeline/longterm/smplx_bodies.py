@@ -55,19 +55,14 @@ def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> 
         remedy = "install it beside the others: .venv/bin/pip install --no-deps smplx"
         raise InputError("LTM-003", "SMPL-X bodies need the package smplx", str(model), remedy) from error
     if not model.is_file():
-        raise InputError(
-            "LTM-004",
-            "there is no such SMPL-X model",
-            str(model),
-            "get SMPLX_NEUTRAL.npz from its authors' site",
-        )
+        remedy = "get SMPLX_NEUTRAL.npz from its authors' site"
+        raise InputError("LTM-004", "there is no such SMPL-X model", str(model), remedy)
     file = npz.load(model, (*SURFACE, *HANDS))
     try:
         layer = smplx.SMPLXLayer(str(model), ext="npz", num_betas=SHAPES, use_pca=False)
     except (KeyError, AttributeError, ValueError, RuntimeError, AssertionError, IndexError) as error:
-        raise InputError(
-            "LTM-004", f"not a model of SMPL-X: {error!r}", str(model), "give SMPLX_NEUTRAL.npz as it came"
-        ) from error
+        what = f"not a model of SMPL-X: {error!r}"
+        raise InputError("LTM-004", what, str(model), "give SMPLX_NEUTRAL.npz as it came") from error
     shape = np.zeros(SHAPES) if betas is None else np.asarray(betas, float)[:SHAPES]
     with torch.no_grad():
         known = layer.shapedirs[:, :, : len(shape)]

@@ -96,24 +96,17 @@ class WalkableFloor:
         low, span = grid.origin.double().numpy(), (np.array(grid.values.shape) - 1) * grid.voxel_m
         count = np.floor(span[[0, 2]] / CELL_M).astype(int) + 1
         x, z = (low[axis] + CELL_M * np.arange(n) for axis, n in zip((0, 2), count, strict=True))
-        levels = floor + np.linspace(
-            LOWEST_ROOT * root_m, root_m + max(motion_prior.above_m, 0.5 * root_m), 5
-        )
+        top_m = root_m + max(motion_prior.above_m, 0.5 * root_m)
+        levels = floor + np.linspace(LOWEST_ROOT * root_m, top_m, 5)
         points = np.stack(np.meshgrid(x, levels, z, indexing="ij"), axis=-1)
         above = grid.at(torch.from_numpy(points).float()).numpy()
         beneath = grid.at(torch.from_numpy(points[:, 0] * [1, 0, 1] + [0, floor, 0]).float()).numpy()
         free = (above.min(1) > np.minimum(breadth_m / 2, NARROW * root_m)) & (np.abs(beneath) < 0.1)
         _, area = cv2.connectedComponents(free.astype(np.uint8))
         free &= area == np.bincount(area[free], minlength=1).argmax()
-        heights = np.asarray(scene.mesh.vertices)[:, 1]
-        return cls(
-            free,
-            CELL_M * np.asarray(distance_transform_edt(free)),
-            low[[0, 2]],
-            floor,
-            heights.min() - BEYOND_M,
-            heights.max() + BEYOND_M,
-        )
+        room_m, heights = CELL_M * np.asarray(distance_transform_edt(free)), scene.mesh.vertices[:, 1]
+        ends = np.asarray(heights).min() - BEYOND_M, np.asarray(heights).max() + BEYOND_M
+        return cls(free, room_m, low[[0, 2]], floor, *ends)
 
     def cell(self, position: Float[np.ndarray, "3"]) -> tuple[int, int]:
         """Return the free cell (x, z) nearest to a world position, metres."""
@@ -140,20 +133,15 @@ class WalkableFloor:
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way[:, [0, 2]], axis=0), axis=1))])
         where = np.arange(0, along[-1], CELL_M / 4)
         points = np.stack([np.interp(where, along, way[:, axis]) for axis in (0, 2)], axis=-1)
-        cells = np.clip(
-            np.rint((points - self.corner) / CELL_M).astype(int), 0, np.array(self.free.shape) - 1
-        )
+        cells = np.rint((points - self.corner) / CELL_M).astype(int)
+        cells = np.clip(cells, 0, np.array(self.free.shape) - 1)
         return float((~self.free[tuple(cells.T)]).sum() * CELL_M / 4)
 
     def _cells(self, wanted: Bool[np.ndarray, "x z"]) -> Int[np.ndarray, "cell 2"]:
         cells = np.argwhere(wanted)
         if not len(cells):
-            raise InputError(
-                "SIM-003",
-                "there is no free floor in this scene",
-                "",
-                "give sub-goals in a scene that shows its floor",
-            )
+            remedy = "give sub-goals in a scene that shows its floor"
+            raise InputError("SIM-003", "there is no free floor in this scene", "", remedy)
         return cells
 
     def _nearest(self, wanted: Bool[np.ndarray, "x z"], position: Float[np.ndarray, "3"]) -> tuple[int, int]:
@@ -174,11 +162,8 @@ class WalkableFloor:
             low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
             heights = f"y {self.lowest_m:.1f} .. {self.highest_m:.1f} m (floor {self.height_m:.1f} m)"
             room = f"x {low[0]:.1f} .. {high[0]:.1f} m, {heights}, z {low[1]:.1f} .. {high[1]:.1f} m"
-            where = ", ".join(
-                f"{axis} {value:g}"
-                for axis, value in zip("xyz", position, strict=True)
-                if not np.isnan(value)
-            )
+            axes = zip("xyz", position, strict=True)
+            where = ", ".join(f"{axis} {value:g}" for axis, value in axes if not np.isnan(value))
             raise InputError("SIM-003", "a sub-goal lies outside the scene", where, f"the scene: {room}")
 
     def path(
@@ -186,9 +171,7 @@ class WalkableFloor:
     ) -> Float[np.ndarray, "point 2"]:
         """Return a smooth way over the ground between two positions, away from furniture; x and z, metres."""
         cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / NEAR_FURNITURE_M), BLOCKED_COST)
-        cells, _ = route_through_array(
-            cost, self.cell(start), self.cell(end), fully_connected=True, geometric=True
-        )
+        cells, _ = route_through_array(cost, self.cell(start), self.cell(end))
         way = self.corner + CELL_M * np.array(cells, float)
         return gaussian_filter1d(way, WAY_SMOOTHING_CELLS, axis=0, mode="nearest") if len(way) > 2 else way
 
@@ -201,9 +184,8 @@ def plan_waypoints(
 ) -> Waypoints:
     """Return places two seconds apart through all sub-goals, from ``start`` or the first of them."""
     if len(subgoals) < (1 if start is not None else 2):
-        raise InputError(
-            "SIM-001", "too few sub-goals", f"{len(subgoals)}", "give at least two, or a start and one"
-        )
+        remedy = "give at least two, or a start and one"
+        raise InputError("SIM-001", "too few sub-goals", f"{len(subgoals)}", remedy)
     floor = WalkableFloor.of(scene, motion_prior)
     for goal in subgoals:
         floor.refuse_outside(goal.position_world)
@@ -243,16 +225,14 @@ def sample_visited_subgoals(
     apart_m: float = 0.5,
 ) -> list[Subgoal]:
     """Draw sub-goals from visited cells, often visited ones more often, consecutive ones well apart."""
-    cells, number, visits = np.unique(
-        np.floor(positions_world[:, [0, 2]] / cell_m), axis=0, return_inverse=True, return_counts=True
-    )
+    places = np.floor(positions_world[:, [0, 2]] / cell_m)
+    cells, number, visits = np.unique(places, axis=0, return_inverse=True, return_counts=True)
     number, found = number.reshape(-1), []
     for _ in range(count):
         weight = visits.astype(float)
         if found:
-            weight *= (
-                np.linalg.norm((cells + 0.5) * cell_m - found[-1].position_world[[0, 2]], axis=1) > apart_m
-            )
+            away = (cells + 0.5) * cell_m - found[-1].position_world[[0, 2]]
+            weight *= np.linalg.norm(away, axis=1) > apart_m
         weight = weight if weight.sum() > 0 else visits.astype(float)
         chosen = rng.choice(len(cells), p=weight / weight.sum())
         found.append(Subgoal(np.median(positions_world[number == chosen], axis=0)))
@@ -281,9 +261,8 @@ def _height_on_support(
     not perfect.
     """
     heights = position[1] - clearance_m + np.arange(-SUPPORT_SEARCH_M, SUPPORT_SEARCH_M, 0.01)
-    column = np.stack(
-        [np.full_like(heights, position[0]), heights, np.full_like(heights, position[2])], axis=-1
-    )
+    x, z = (np.full_like(heights, position[axis]) for axis in (0, 2))
+    column = np.stack([x, heights, z], axis=-1)
     both = np.stack([column, column + np.array([0, clearance_m, 0])])
     under, root = scene.distance.at(torch.from_numpy(both).float()).numpy()
     carries = np.flatnonzero((under[:-1] < 0) & (under[1:] >= 0) & (root[1:] > clearance_m / 2)) + 1
@@ -305,21 +284,15 @@ def _leg_ends(
 ) -> list[Float[np.ndarray, "3"]]:
     """Return the ends of the legs from one root position to another; onto and off furniture in one leap."""
     leaps = [abs(place[1] - root_m) > 1e-6 for place in (start, end)]
-    ground = floor.path(
-        *(
-            floor.landing(place, root_m) if leap else place
-            for place, leap in zip((start, end), leaps, strict=True)
-        )
+    both = zip((start, end), leaps, strict=True)
+    way = floor.path(*(floor.landing(place, root_m) if leap else place for place, leap in both))
+    ground = np.column_stack([way[:, 0], np.full(len(way), root_m), way[:, 1]])
+    first, last = (
+        ground[:0] if leap else place[None] for place, leap in zip((start, end), leaps, strict=True)
     )
-    ground = np.column_stack([ground[:, 0], np.full(len(ground), root_m), ground[:, 1]])
-    walked = np.concatenate(
-        [ground[:0] if leaps[0] else start[None], ground, ground[:0] if leaps[1] else end[None]]
-    )
-    return [
-        *([walked[0]] if leaps[0] else []),
-        *_split_path(floor, walked, longest_m),
-        *([end] if leaps[1] else []),
-    ]
+    walked = np.concatenate([first, ground, last])
+    off, onto = [walked[0]] if leaps[0] else [], [end] if leaps[1] else []
+    return [*off, *_split_path(floor, walked, longest_m), *onto]
 
 
 def _split_path(

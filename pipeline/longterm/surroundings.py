@@ -87,10 +87,8 @@ class MotionScene:
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "batch point 3"]:
         """Draw points within ``reach_m`` of each centre, in the given frames; zeros where there are none."""
-        points, standing = (
-            self.surface.points.astype(np.float32),
-            np.abs(self.surface.normals[:, 1]) < VERTICAL_SURFACE,
-        )
+        points = self.surface.points.astype(np.float32)
+        standing = np.abs(self.surface.normals[:, 1]) < VERTICAL_SURFACE
         frame_from_world = rigid.inverse(world_from_frame)
         drawn = np.zeros((len(centre_world), count, 3), np.float32)
         if not count:

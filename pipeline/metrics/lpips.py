@@ -18,18 +18,16 @@ from pipeline.core.errors import InputError
 
 ALEXNET_FILE, CHANNELS_FILE = "alexnet.pth", "lpips_alex.pth"
 CONVOLUTIONS = (
-    (0, 64, 11, 4, 2),
-    (3, 192, 5, 1, 2),
-    (6, 384, 3, 1, 1),
-    (8, 256, 3, 1, 1),
-    (10, 256, 3, 1, 1),
-)
+    (0, 64, 11, 4, 2), (3, 192, 5, 1, 2), (6, 384, 3, 1, 1), (8, 256, 3, 1, 1), (10, 256, 3, 1, 1)
+)  # fmt: skip
 """Of AlexNet: index in torchvision's `features`, channels, kernel, stride, padding."""
 POOLED_BEFORE = (3, 6)
 """Convolutions that a maximum over 3 pixels with a stride of 2 comes before."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """ImageNet's mean and deviation, for colours in -1 .. 1."""
 EPSILON = 1e-10
+MOST_LETTERS = 200
+"""Of what torch says of a damaged file."""
 SMALLEST_PX = 63
 """Pictures must be at least so high and wide: below, AlexNet's last maps are empty."""
 
@@ -40,14 +38,11 @@ class Lpips(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         inner = [3] + [channels for _, channels, *_ in CONVOLUTIONS[:-1]]
-        self.layers = nn.ModuleDict(
-            {
-                str(index): nn.Conv2d(before, channels, kernel, stride, padding)
-                for before, (index, channels, kernel, stride, padding) in zip(
-                    inner, CONVOLUTIONS, strict=True
-                )
-            }
-        )
+        layers = {
+            str(index): nn.Conv2d(before, channels, kernel, stride, padding)
+            for before, (index, channels, kernel, stride, padding) in zip(inner, CONVOLUTIONS, strict=True)
+        }
+        self.layers = nn.ModuleDict(layers)
         self.weights = nn.ParameterList(torch.ones(channels) for _, channels, *_ in CONVOLUTIONS)
 
     @classmethod
@@ -58,18 +53,13 @@ class Lpips(nn.Module):
         try:
             for index, *_ in CONVOLUTIONS:
                 prefix = f"features.{index}."
-                model.layers[str(index)].load_state_dict(
-                    {name: features[prefix + name] for name in ("weight", "bias")}
-                )
+                own = {name: features[prefix + name] for name in ("weight", "bias")}
+                model.layers[str(index)].load_state_dict(own)
             for number, weight in enumerate(model.weights):
                 weight.data.copy_(channels[f"lin{number}.model.1.weight"].reshape(weight.shape))
         except (KeyError, RuntimeError) as error:
-            raise InputError(
-                "MOD-003",
-                f"no weights of LPIPS with AlexNet ({str(error)[:200]})",
-                str(folder),
-                "download them again",
-            ) from error
+            what = f"no weights of LPIPS with AlexNet ({str(error)[:MOST_LETTERS]})"
+            raise InputError("MOD-003", what, str(folder), "download them again") from error
         return model.to(device).eval().requires_grad_(False)
 
     def features(
@@ -119,4 +109,4 @@ def _read(path: Path) -> dict[str, Tensor]:
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a damaged file makes torch raise
-        raise InputError("MOD-003", f"no weights ({str(error)[:200]})", str(path), remedy) from error
+        raise InputError("MOD-003", f"no weights ({str(error)[:MOST_LETTERS]})", str(path), remedy) from error

@@ -19,7 +19,7 @@ from pipeline.metrics.metrics import Metrics, median
 from pipeline.metrics.pose_errors import PoseErrors
 
 RETRIEVAL_STRIDE_PX = 40
-REPROJECTION_PX = 4.0
+REPROJECTION_PX, PNP_ITERATIONS = 4.0, 2000
 FAILED = "more than half of the frames were not placed"
 
 
@@ -94,7 +94,7 @@ def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> Float[n
             pixel,
             clip.intrinsics[frame],
             None,
-            iterationsCount=2000,
+            iterationsCount=PNP_ITERATIONS,
             reprojectionError=REPROJECTION_PX,
         )
         if ok and inliers is not None and len(inliers) >= 8:
@@ -104,9 +104,8 @@ def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> Float[n
 
 def gallery(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> Gallery:
     """Describe walk-through frames as a whole."""
-    return Gallery(
-        np.stack([_whole(clip.color(frame)) for frame in frames]), world_from_camera[np.array(frames)]
-    )
+    descriptors = np.stack([_whole(clip.color(frame)) for frame in frames])
+    return Gallery(descriptors, world_from_camera[np.array(frames)])
 
 
 def placed_by_retrieval(known: Gallery, clip: Clip, frames: Sequence[int]) -> Float[np.ndarray, "frame 4 4"]:

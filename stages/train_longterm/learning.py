@@ -122,15 +122,10 @@ def initialized(make: Callable[[], Network], config: Config) -> Network:
 
 def _load_point_net(part: PointNet, path: Path) -> None:
     if not path.is_file():
-        raise InputError(
-            "LTM-002",
-            "the weights of PointNet are not there",
-            str(path),
-            "give an existing safetensors file, or none",
-        )
+        remedy = "give an existing safetensors file, or none"
+        raise InputError("LTM-002", "the weights of PointNet are not there", str(path), remedy)
     try:
         part.load_state_dict(load_file(path))
     except (RuntimeError, ValueError) as error:
-        raise InputError(
-            "LTM-002", f"these weights do not fit: {error}", str(path), "they must have the widths of `sizes`"
-        ) from error
+        what, remedy = f"these weights do not fit: {error}", "they must have the widths of `sizes`"
+        raise InputError("LTM-002", what, str(path), remedy) from error

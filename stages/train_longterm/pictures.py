@@ -87,23 +87,14 @@ def routes(
     for axis, index in zip(axes.ravel(), np.linspace(0, len(clips) - 1, SHOWN).astype(int), strict=True):
         points = where.scenes[clips.scene[index]].surface.points
         local = rigid.apply(rigid.inverse(clips.world_from_clip[index]), points)
-        near = (
-            (np.abs(local[:, [0, 2]]) < SHOWN_M).all(1)
-            & (local[:, 1] > SLICE_M[0])
-            & (local[:, 1] < SLICE_M[1])
-        )
+        near = (local[:, 1] > SLICE_M[0]) & (local[:, 1] < SLICE_M[1])
+        near &= (np.abs(local[:, [0, 2]]) < SHOWN_M).all(1)
         axis.plot(*local[near][:, [0, 2]].T, ".", color=plots.GREY, markersize=1)
         for channels, color in ((clips.channels[index], plots.BLUE), (made[index], plots.ORANGE)):
             axis.plot(*channels[:, [0, 2]].T.numpy(), color=color)
-            head = channels[::ARROW_FRAMES, :3] + ARROW_M * torch.linalg.cross(
-                channels[::ARROW_FRAMES, 3:6], channels[::ARROW_FRAMES, 6:ROOT_CHANNELS]
-            )
-            axis.plot(
-                *np.stack([channels[::ARROW_FRAMES, [0, 2]].numpy(), head[:, [0, 2]].numpy()]).transpose(
-                    2, 0, 1
-                ),
-                color=color,
-                linewidth=LINE_WIDTH,
-            )
+            some = channels[::ARROW_FRAMES]
+            head = some[:, :3] + ARROW_M * torch.linalg.cross(some[:, 3:6], some[:, 6:ROOT_CHANNELS])
+            arrows = torch.stack([some[:, [0, 2]], head[:, [0, 2]]]).permute(2, 0, 1).numpy()
+            axis.plot(*arrows, color=color, linewidth=LINE_WIDTH)
         axis.set(xlim=(-SHOWN_M, SHOWN_M), ylim=(-SHOWN_M, SHOWN_M), xticks=[], yticks=[], aspect="equal")
     return plots.pixels(figure)

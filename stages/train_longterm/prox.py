@@ -139,17 +139,9 @@ def _recording(
     world_from_scan = rigid.make(_upright(up), np.zeros(3))
     moving = BodyMotion(world_from_scan @ roots, moving.agent_from_bone)
     parts = np.split(np.arange(len(clock)), np.flatnonzero(np.diff(clock) > GAP_S) + 1)
-    return PersonRecording(
-        scene,
-        tuple(
-            resample_motion(
-                clock[part], BodyMotion(moving.world_from_agent[part], moving.agent_from_bone[part])
-            )
-            for part in parts
-            if clock[part[-1]] - clock[part[0]] >= SHORTEST_S
-        ),
-        world_from_scan,
-    )
+    parts = [part for part in parts if clock[part[-1]] - clock[part[0]] >= SHORTEST_S]
+    motions = tuple(resample_motion(clock[part], moving[part]) for part in parts)
+    return PersonRecording(scene, motions, world_from_scan)
 
 
 def _upright(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
