@@ -7,14 +7,14 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 61_913,
+    "lines": 58_000,
     "lines over 110 columns": 0,
     "recipe keys": 325,
     "packages over 16 modules": 0,
-    "private words in identifiers": 131,
-    "tell, told": 12,
+    "private words in identifiers": 39,
+    "tell, told": 5,
     "class names used twice": 3,
-    "unnamed numbers": 136,
+    "unnamed numbers": 121,
     "unshaped public functions": 0,
     "modules in import cycles": 0,
 }
