@@ -88,26 +88,19 @@ def refuse_unknown(
     """Raise REC-001 naming the known ones when `table` has a key outside `known`."""
     for key in table:
         if key not in known:
-            raise InputError(
-                "REC-001",
-                f"unknown {kind} {shown(key)}",
-                where,
-                f"known: {', '.join(sorted(known)) or 'none'}",
-            )
+            remedy = f"known: {', '.join(sorted(known)) or 'none'}"
+            raise InputError("REC-001", f"unknown {kind} {shown(key)}", where, remedy)
 
 
 def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
-    """Raise REC-002 where the default is a number and `value` not finite, negative where that is above 0
-    or a count, or a rate of 0.
-    """
+    """Raise REC-002 for numbers that are not finite, negative unlike the default, or a rate of 0."""
     if not isinstance(value, int | float) or not isinstance(default, int | float):
         return
     stands_still = where.endswith("_hz") and value == 0
     counts = default > 0 or (default == 0 and isinstance(default, int))
     if not math.isfinite(value) or (counts and value < 0) or (default > 0 and stands_still):
-        raise InputError(
-            "REC-002", f"{shown(value)} cannot be", where, f"give a number as the default is, {default!r}"
-        )
+        remedy = f"give a number as the default is, {default!r}"
+        raise InputError("REC-002", f"{shown(value)} cannot be", where, remedy)
 
 
 def shown(value: Any) -> str:
@@ -132,10 +125,8 @@ def _checked(hint: Any, value: Any, where: str, default: Any = None) -> Any:
     if origin is tuple and isinstance(value, (list, tuple)):
         each = [arguments[0]] * len(value) if arguments[1:] == (...,) else list(arguments)
         if len(each) == len(value):
-            return tuple(
-                _checked(kind, item, f"{where}[{i}]")
-                for i, (kind, item) in enumerate(zip(each, value, strict=True))
-            )
+            pairs = enumerate(zip(each, value, strict=True))
+            return tuple(_checked(kind, item, f"{where}[{i}]") for i, (kind, item) in pairs)
     if origin is dict and isinstance(value, Mapping):
         return {key: _checked(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
@@ -144,12 +135,11 @@ def _checked(hint: Any, value: Any, where: str, default: Any = None) -> Any:
         return value
     if hint in (None, types.NoneType) and value is None:
         return None
-    expected = (
-        hint.__name__ if isinstance(hint, type) and origin is None else str(hint).replace("typing.", "")
-    )
-    raise InputError(
-        "REC-002", f"{shown(value)} is not {expected}", where, f"give a value of type {expected}"
-    )
+    expected = str(hint).replace("typing.", "")
+    if isinstance(hint, type) and origin is None:
+        expected = hint.__name__
+    what, remedy = f"{shown(value)} is not {expected}", f"give a value of type {expected}"
+    raise InputError("REC-002", what, where, remedy)
 
 
 def _first_fitting(kinds: tuple[Any, ...], value: Any, hint: Any, where: str) -> Any:

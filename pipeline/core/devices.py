@@ -24,12 +24,8 @@ def choose(requested: Literal["auto", "cpu", "cuda"] | str) -> Device:
         if torch.cuda.is_available():
             return "cuda"
     if requested == "cuda":
-        raise InputError(
-            "DEP-002",
-            "there is no CUDA device that torch can use",
-            "--device cuda",
-            "give --device cpu, or see make doctor",
-        )
+        what, remedy = "there is no CUDA device that torch can use", "give --device cpu, or see make doctor"
+        raise InputError("DEP-002", what, "--device cuda", remedy)
     return "cpu"
 
 

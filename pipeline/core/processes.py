@@ -12,9 +12,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """In a child: ask the kernel for SIGKILL when the parent dies, however it dies (Linux; elsewhere
-    nothing).
-    """
+    """In a child: ask the kernel for SIGKILL when the parent dies, however it dies (on Linux)."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "prctl"):
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -29,9 +27,8 @@ def unordered(function: Callable[..., T], jobs: Sequence[tuple], workers: int) -
     """
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=die_with_parent)
     try:
-        before = signal.pthread_sigmask(
-            signal.SIG_BLOCK, {signal.SIGINT}
-        )  # inherited; what comes meanwhile comes afterwards
+        # Inherited; what comes meanwhile comes afterwards.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             number = {pool.submit(function, *job): index for index, job in enumerate(jobs)}
         finally:

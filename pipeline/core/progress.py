@@ -33,13 +33,13 @@ def track(iterable: Iterable[T], label: str, total: int | None = None) -> Iterat
         now = time.monotonic()
         if now - reported >= pause:
             reported = now
-            _tell(label, done, total, now - start, on_terminal)
+            _report(label, done, total, now - start, on_terminal)
     if on_terminal and reported > start:
-        _tell(label, done, total, time.monotonic() - start, on_terminal)
+        _report(label, done, total, time.monotonic() - start, on_terminal)
         print(file=sys.stderr)
 
 
-def _tell(label: str, done: int, total: int | None, seconds: float, on_terminal: bool) -> None:
+def _report(label: str, done: int, total: int | None, seconds: float, on_terminal: bool) -> None:
     if total:
         left_s = seconds / done * (total - done)
         text = f"{label} {done}/{total} ({100 * done // total} %), {left_s:.0f} s left"

@@ -16,9 +16,7 @@ B = TypeVar("B")
 
 @contextlib.contextmanager
 def alone() -> Iterator[None]:
-    """Let torch work with one thread: small steps take longer with two, and sums would depend on how many
-    there are.
-    """
+    """Let torch work with one thread: small steps take longer with two, and sums depend on their number."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -48,6 +48,5 @@ def read(path: Path) -> tuple[Video, ...]:
         entries = json.loads(path.read_text())
         return tuple(config.from_table(Video, dict(entry), where=str(path)) for entry in entries)
     except (OSError, ValueError, TypeError, RecursionError, InputError) as error:
-        raise InputError(
-            "ART-003", "is no list of recordings", str(path), "give build/<agent>/plan/videos.json"
-        ) from error
+        remedy = "give build/<agent>/plan/videos.json"
+        raise InputError("ART-003", "is no list of recordings", str(path), remedy) from error
