@@ -1,16 +1,15 @@
-"""Set the problem up: join the videos' rays, place the boxes of the fields, start the motion at the
-registered poses.
-"""
+"""Set the problem up: join the videos' rays, place the fields' boxes, start the motion as registered."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from pipeline.data.motion import MotionTable, gaps_s
 from pipeline.fields.fields import ArticulatedBody, Field, FieldShape
@@ -54,11 +53,9 @@ SCENE_TRUNCATION_M = 0.08
 SCENE_MARGIN_M, AGENT_MARGIN_M = 0.2, 0.12
 """space around all that was measured, and around the agent template"""
 SOLID_START_M, FREE_START_M = -0.03, 0.1
-"""signed distance of untrained fields: a scene is carved free at measured depth, an agent grows in free
-space"""
+"""signed distance of untrained fields: a scene is carved free, an agent grows in free space"""
 BOX_QUANTILE = 0.002
 """share of the measured points that may lie outside the box on each side: stray depth"""
-
 
 Corner = tuple[float, float, float]
 
@@ -84,6 +81,11 @@ class RegisteredVideo:
     """its frames; None where the store holds all that is needed of them"""
     agent_confidence: Float[np.ndarray, "frame"] | None = None
     """that the agent's root is right, 0..1; None: certain"""
+
+    @property
+    def certain_cameras(self) -> Bool[np.ndarray, "frame"]:
+        """Return the frames whose camera is known and not doubtful."""
+        return np.isfinite(self.world_from_camera).all((1, 2)) & (self.confidence >= LEAST_CONFIDENCE)
 
 
 @dataclass(frozen=True)
@@ -120,18 +122,22 @@ def build(
     height, width = (max(video.store.views.depth.shape[axis] for video in videos) for axis in (1, 2))
     store = join((usable(video) for video in videos), scratch, (height, width))
     lengths = [len(video.timestamp_s) for video in videos]
-    start = _starting_poses(videos)
+    camera = [interpolated(video.timestamp_s, video.world_from_camera) for video in videos]
+    roots, inliers = zip(*(without_outliers(video) for video in videos), strict=True)
+    root = [interpolated(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)]
+    camera, root = (torch.from_numpy(np.concatenate(poses)) for poses in (camera, root))
+    rooted = torch.from_numpy(np.isfinite(np.concatenate(roots)).all((1, 2)))
+    trust = torch.from_numpy(np.where(np.concatenate(inliers), 1.0, OUTLIER_MASK_WEIGHT)).float()
     vertices = template.mesh.vertices
     low, high = corner(vertices.min(0) - AGENT_MARGIN_M), corner(vertices.max(0) + AGENT_MARGIN_M)
-    agent_shape = FieldShape(
-        low, high, sizes.agent_voxel_m, GRID_CHANNELS, sizes.width, encoding=sizes.encoding
-    )
+    fine = sizes.agent_voxel_m
+    agent_shape = FieldShape(low, high, fine, GRID_CHANNELS, sizes.width, encoding=sizes.encoding)
     rest = torch.from_numpy(template.agent_from_bone_rest).float()
     by_frame = RaysByFrame.of(store.agent.frame, sum(lengths))
-    usable_frames = torch.nonzero(start.rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
+    usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
     free = [video.camera_free for video in videos]
-    motion = MotionTable(start.camera, start.agent, rest, lengths, free, KNOT_FRAMES)
+    motion = MotionTable(camera, root, rest, lengths, free, KNOT_FRAMES)
     body = ArticulatedBody(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape)
     surface = TemplateSurface.of(template.mesh, template.feature, np.random.default_rng(seed))
     with torch.no_grad():
@@ -150,37 +156,11 @@ def build(
         tree=tree,
         agent_frames=usable_frames,
         agent_rays=by_frame,
-        trust=start.trust * mask_weights(store.views),
+        trust=trust * mask_weights(store.views),
         camera_precision=prior_precision(motion, np.concatenate([video.confidence for video in videos])),
         floor_m=floor_m,
     )
-    return problem if device == "cpu" else _moved(problem, device)
-
-
-@dataclass(frozen=True)
-class _StartingPoses:
-    """Registered poses of all videos' frames in one row, unknown ones interpolated."""
-
-    camera: Float[Tensor, "frame 4 4"]
-    agent: Float[Tensor, "frame 4 4"]
-    rooted: Bool[Tensor, "frame"]
-    """the agent's root is known"""
-    trust: Float[Tensor, "frame"]
-    """weight of the mask: small where the root was an outlier"""
-
-
-def _starting_poses(videos: Sequence[RegisteredVideo]) -> _StartingPoses:
-    camera = [interpolated(video.timestamp_s, video.world_from_camera) for video in videos]
-    roots, inliers = zip(*(without_outliers(video) for video in videos), strict=True)
-    agent = [interpolated(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)]
-    rooted = [np.all(np.isfinite(root), axis=(1, 2)) for root in roots]
-    trust = np.where(np.concatenate(inliers), 1.0, OUTLIER_MASK_WEIGHT)
-    return _StartingPoses(
-        torch.from_numpy(np.concatenate(camera)),
-        torch.from_numpy(np.concatenate(agent)),
-        torch.from_numpy(np.concatenate(rooted)),
-        torch.from_numpy(trust).float(),
-    )
+    return problem if device == "cpu" else moved(problem, device)
 
 
 def corner(point: Float[np.ndarray, "3"]) -> Corner:
@@ -198,10 +178,7 @@ def scene_field(
     never saturates, so that rendering finds surfaces and the eikonal loss holds everywhere. Otherwise it
     starts solid and saturates (`SCENE_TRUNCATION_M`), for losses at measured depth.
     """
-    if fused:
-        truncation_m = fused.truncation_m
-    else:
-        truncation_m = None if rendered else SCENE_TRUNCATION_M
+    truncation_m = fused.truncation_m if fused else None if rendered else SCENE_TRUNCATION_M
     shape = FieldShape(
         *measured_box(videos),
         sizes.scene_voxel_m,
@@ -228,10 +205,7 @@ def scene_ids(videos: Sequence[RegisteredVideo]) -> tuple[str, ...]:
 
 def usable(video: RegisteredVideo) -> RayStore:
     """Drop the rays of frames whose camera is unknown or doubtful."""
-    good = torch.from_numpy(
-        np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= LEAST_CONFIDENCE)
-    )
-    store = video.store
+    good, store = torch.from_numpy(video.certain_cameras), video.store
     scene, agent = (rays.at(torch.nonzero(good[rays.frame])[:, 0]) for rays in (store.scene, store.agent))
     return RayStore(scene, agent, store.views)
 
@@ -260,9 +234,7 @@ def without_outliers(
 
 
 def mask_weights(views: Views) -> Float[Tensor, "frame"]:
-    """Return each frame's mask weight, 0..1: how much of the animal it shows, by the mask's area at its
-    distance.
-    """
+    """Return each frame's mask weight, 0..1: how much of the animal it shows, by area at its distance."""
     area = torch.zeros(len(views.depth))
     for frame in torch.nonzero(views.agent_seen)[:, 0].tolist():
         inside = views.outside_px[frame] < 0
@@ -286,50 +258,26 @@ def interpolated(
 
 
 def measured_box(videos: Sequence[RegisteredVideo], most: int = 200_000) -> tuple[Corner, Corner]:
-    """Return the box, world, metres, of nearly all measured points of the scene and of the cameras that saw
-    them.
-
-    About ``most`` points are looked at.
-    """
+    """Return the box, world, metres, of nearly all of about ``most`` measured points and of their cameras."""
     step = max(7, sum(len(video.store.scene) for video in videos) // most)
     stores = (usable(video).scene for video in videos)
     rays = [store.at(torch.nonzero(store.depth > 0)[:, 0][::step]) for store in stores]
-    points = [
-        rigid.apply(
-            video.world_from_camera[some.frame.numpy()],
-            (some.direction * some.depth[:, None]).numpy()[:, None],
-        )[:, 0]
-        for video, some in zip(videos, rays, strict=True)
-    ]
-    eyes = [
-        video.world_from_camera[np.unique(some.frame.numpy()), :3, 3]
-        for video, some in zip(videos, rays, strict=True)
-    ]
+    points, eyes = [], []
+    for video, some in zip(videos, rays, strict=True):
+        poses, frame = video.world_from_camera, some.frame.numpy()
+        points_camera = (some.direction * some.depth[:, None]).numpy()
+        points.append(rigid.apply(poses[frame], points_camera[:, None])[:, 0])
+        eyes.append(poses[np.unique(frame), :3, 3])
     points, eyes = np.concatenate(points), np.concatenate(eyes)
     low = np.minimum(np.quantile(points, BOX_QUANTILE, axis=0), eyes.min(0)) - SCENE_MARGIN_M
     high = np.maximum(np.quantile(points, 1 - BOX_QUANTILE, axis=0), eyes.max(0)) + SCENE_MARGIN_M
     return corner(low), corner(high)
 
 
-def _moved(problem: Problem, device: str) -> Problem:
-    """Return the problem on another device."""
-    for module in problem.modules().values():
-        module.to(device)
-    store = RayStore(
-        problem.store.scene.to(device), problem.store.agent.to(device), problem.store.views.to(device)
-    )
-    by_frame = RaysByFrame(problem.agent_rays.start.to(device), problem.agent_rays.count.to(device))
-    moved = {
-        name: getattr(problem, name).to(device)
-        for name in (
-            "video",
-            "has_scene",
-            "surface",
-            "joints",
-            "tree",
-            "agent_frames",
-            "trust",
-            "camera_precision",
-        )
-    }
-    return Problem(store=store, **problem.modules(), agent_rays=by_frame, floor_m=problem.floor_m, **moved)
+def moved(value: Any, device: str) -> Any:
+    """Return modules, tensors and dataclasses of them on another device; what is none of them stays."""
+    if isinstance(value, Tensor | nn.Module):
+        return value.to(device)
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    return replace(value, **{part.name: moved(getattr(value, part.name), device) for part in fields(value)})

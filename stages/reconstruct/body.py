@@ -1,11 +1,11 @@
-"""The agent's losses: masked depth against its field, its posed surface against picture and mask, and priors
-on motion.
+"""The agent's losses: masked depth against its field, its posed surface against the mask, priors on motion.
 
 They serve twice: `posing` poses the template to the frames before the field learns, and the joint phase uses
 the same terms while everything learns.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,8 +24,7 @@ DECIMETRE = 0.1
 REACH_M = 0.05
 """signed distances on the agent are compared up to here"""
 OUTLIER_M = 0.1
-"""measured points this far from the agent count half; all keep pulling, or the body could hide behind the
-scene"""
+"""measured points this far from the agent count half; all pull, or the body could hide behind the scene"""
 ROOT_M, ROOT_RAD = 0.05, 0.05
 """accuracy of registered roots"""
 EDGE_M = 0.01
@@ -33,8 +32,7 @@ EDGE_M = 0.01
 STILL = 0.01
 """steps of bones and root below this, radians and decimetres, count as none"""
 TOUCH_M, STRIDE_M = 0.02, 0.06
-"""soles this near to something touch it; those that move by more than this from frame to frame are not
-held"""
+"""soles this near to something touch it; those that move by more than this between frames are not held"""
 COVER_M = 0.015
 """a masked pixel is covered when a sample of the posed surface is seen this near to it"""
 MARGIN_M = 0.03
@@ -67,8 +65,7 @@ class Pose:
     world_from_agent: Float[Tensor, "frame 4 4"]
     agent_from_bone: Float[Tensor, "frame bone 4 4"]
     world_from_initial: Float[Tensor, "frame 4 4"]
-    """where the agent's root starts, to which priors draw it: as registered, or leaning in a sitting
-    stance"""
+    """where the agent's root starts, to which priors draw it: as registered, or leaning as one that sits"""
 
     @property
     def agent_from_camera(self) -> Float[Tensor, "frame 4 4"]:
@@ -90,15 +87,12 @@ class Pose:
 def measured_terms(
     problem: Problem, pose: Pose, rays: Rays, weights: LossWeights, generator: Generator, near: int = 2
 ) -> Terms:
-    """Fit the agent where the sensor measured it: masked rays ``[frame * ray]`` of known depth, mapped back
-    to rest.
-    """
+    """Fit the agent where the sensor measured it: masked rays ``[frame * ray]`` mapped back to rest."""
     frames, number = len(pose.frame), len(rays) // len(pose.frame)
     offset = (torch.rand(len(rays), near, generator=generator).to(problem.device) * 2 - 1) * REACH_M
     depth = torch.cat([rays.depth[:, None], rays.depth[:, None] + offset], dim=1)
-    points = rigid_torch.apply(
-        pose.agent_from_camera, (rays.direction[:, None] * depth[..., None]).view(frames, -1, 3)
-    )
+    points_camera = (rays.direction[:, None] * depth[..., None]).view(frames, -1, 3)
+    points = rigid_torch.apply(pose.agent_from_camera, points_camera)
     rest = problem.body.unpose(points, pose.agent_from_bone)
     encoded = problem.agent.encode(rest.reshape(-1, 3))
     distance = problem.agent.distance(encoded).view(len(rays), 1 + near)
@@ -106,18 +100,14 @@ def measured_terms(
     color, feature = problem.agent.color_and_feature(encoded.view(len(rays), 1 + near, -1)[:, 0])
     good = (rays.label == AGENT) & (rays.depth > 0)
     trust = problem.trust[rays.frame] / (1 + distance[:, 0].detach().abs() / OUTLIER_M)
+    distance_loss = trust[:, None] * losses.truncated_distance(distance, target, REACH_M)
     terms = {
-        "agent distance": (
-            weights.agent_distance,
-            (trust[:, None] * losses.truncated_distance(distance, target, REACH_M))[good],
-        ),
+        "agent distance": (weights.agent_distance, distance_loss[good]),
         "agent color": (weights.color, (trust * losses.color(color, rays.color / 255))[good]),
     }
     if weights.feature:
-        terms["agent feature"] = (
-            weights.feature,
-            (trust * losses.feature(feature, rays.feature / 127))[good],
-        )
+        feature_loss = trust * losses.feature(feature, rays.feature / 127)
+        terms["agent feature"] = weights.feature, feature_loss[good]
     if weights.cycle:
         at_depth, back_to = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
         back = problem.body.pose(back_to, pose.agent_from_bone)
@@ -142,17 +132,19 @@ def surface_terms(
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
     size_px = views.size_px[pose.frame]
-    outside_px = _bilinear(views.outside_px[pose.frame].float(), pixel, size_px)
+    # Outside the picture its border holds, not the padding.
+    last = (size_px // THUMBNAIL - 0.5)[:, None] * THUMBNAIL
+    within = torch.minimum(pixel.clamp_min(0.5 * THUMBNAIL), last)
+    outside_px = _sampled(views.outside_px[pose.frame], within, "bilinear", "border")
     with torch.no_grad():
         measured, nearest = (
-            _nearest(each[pose.frame].float(), pixel) for each in (views.depth, views.occluder)
+            _sampled(each[pose.frame], pixel, "nearest", "zeros") for each in (views.depth, views.occluder)
         )
         inside_picture = ((pixel >= 0) & (pixel <= size_px[:, None])).all(-1)
         in_view = inside_picture & (depth > NEAREST_M)
         occluded = (nearest > 0) & (nearest < depth - MARGIN_M)
-    outside_m = functional.relu(
-        outside_px * depth.detach() / views.intrinsics[pose.frame, 0, 0][:, None] - EDGE_M
-    )
+    focal_px = views.intrinsics[pose.frame, 0, 0][:, None]
+    outside_m = functional.relu(outside_px * depth.detach() / focal_px - EDGE_M)
     before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
@@ -163,10 +155,8 @@ def surface_terms(
     }
     if problem.scene.fused:
         depth_m = penetration_depth_m(problem, pose, posed[:, ::FLOOR_EVERY])
-        terms["penetration"] = (
-            PENETRATION_WEIGHT,
-            (trust * depth_m / DECIMETRE)[problem.has_scene[pose.frame]],
-        )
+        with_scene = problem.has_scene[pose.frame]
+        terms["penetration"] = PENETRATION_WEIGHT, (trust * depth_m / DECIMETRE)[with_scene]
     if masked is not None:
         terms["uncovered"] = UNCOVERED_WEIGHT, trust * silhouette_residual_m(points, masked) / DECIMETRE
     return {name: (weights.posed_surface * weight, values) for name, (weight, values) in terms.items()}
@@ -184,8 +174,7 @@ def height_m(
 ) -> Float[Tensor, "frame point"]:
     """Return the signed distance of world points from the scene as each frame's video saw it, metres.
 
-    Fused geometry knows it near surfaces alone and takes unseen space as free; below the floor, the floor
-    counts.
+    Fused geometry knows it near surfaces alone and takes unseen space as free; the floor is below everything.
     """
     video = problem.video[pose.frame][:, None].expand(world.shape[:2])
     video = torch.where(problem.has_scene[pose.frame, None], video, -1)
@@ -196,26 +185,21 @@ def height_m(
 def silhouette_residual_m(
     points_camera: Float[Tensor, "frame point 3"], masked: Rays
 ) -> Float[Tensor, "frame ray"]:
-    """Return how far from each masked ray the nearest surface point is seen, metres beyond `COVER_M`, at most
-    0.2 m.
-    """
+    """Return how far from each masked ray the nearest surface point is seen, metres beyond `COVER_M`."""
     target = masked.direction[:, :2].view(len(points_camera), -1, 2)
     depth = points_camera[..., 2:].clamp_min(NEAREST_M)
     image_point = points_camera[..., :2] / depth
     with torch.no_grad():
         near = torch.cdist(target, image_point).argmin(-1, keepdim=True)
     gap = image_point.gather(1, near.expand(-1, -1, 2)) - target
-    return functional.relu(gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach() - COVER_M).clamp_max(
-        2 * DECIMETRE
-    )
+    gap_m = gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach()
+    return functional.relu(gap_m - COVER_M).clamp_max(2 * DECIMETRE)
 
 
 def prior_terms(
     problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: LossWeights
 ) -> Terms:
-    """Keep joints together, bones near rest and their motion smooth and sparse in runs of frames, soles
-    planted.
-    """
+    """Keep joints together, bones near rest, motion smooth and sparse in runs of frames, soles planted."""
     rest, joints = problem.body.agent_from_bone_rest, problem.joints
     motion = pose.agent_from_bone @ rigid_torch.inverse(rest)
 
@@ -252,14 +236,11 @@ def foot_skate(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run ste
 
     Occluded legs would otherwise follow the body. Soles in the air give 0.
     """
-    world = rigid_torch.apply(
-        pose.world_from_agent, problem.body.pose(problem.surface.sole, pose.agent_from_bone)
-    )
+    posed = problem.body.pose(problem.surface.sole, pose.agent_from_bone)
+    world = rigid_torch.apply(pose.world_from_agent, posed)
     with torch.no_grad():
-        near = (
-            torch.exp(-(height_m(problem, pose, world).clamp_min(0) / TOUCH_M).square())
-            * problem.has_scene[pose.frame, None]
-        )
+        near = torch.exp(-(height_m(problem, pose, world).clamp_min(0) / TOUCH_M).square())
+        near = near * problem.has_scene[pose.frame, None]
     contact = near.view(-1, run, near.shape[1])
     squared = torch.diff(world.view(-1, run, *world.shape[1:]), dim=1).square().sum(-1)
     return torch.minimum(contact[:, 1:], contact[:, :-1]) * squared / (squared + STRIDE_M**2)
@@ -275,33 +256,16 @@ def _smooth_length(squared: Float[Tensor, "*step"]) -> Float[Tensor, "*step"]:
     return (squared.clamp_min(0) + STILL**2).sqrt() - STILL
 
 
-def _bilinear(
+def _sampled(
     images: Float[Tensor, "frame height width"],
     pixel: Float[Tensor, "frame point 2"],
-    size_px: Float[Tensor, "frame 2"],
+    mode: Literal["bilinear", "nearest"],
+    padding: Literal["border", "zeros"],
 ) -> Float[Tensor, "frame point"]:
-    """Interpolate thumbnails, with gradients towards the pixel; outside the picture its border holds, not the
-    padding.
-    """
-    last = (size_px // THUMBNAIL - 0.5)[:, None] * THUMBNAIL
-    place = _normalized(images, torch.minimum(pixel.clamp_min(0.5 * THUMBNAIL), last))
-    return functional.grid_sample(
-        images[:, None], place[:, :, None], padding_mode="border", align_corners=False
-    )[:, 0, :, 0]
-
-
-def _nearest(
-    images: Float[Tensor, "frame height width"], pixel: Float[Tensor, "frame point 2"]
-) -> Float[Tensor, "frame point"]:
-    """Read thumbnails at the nearest pixel."""
-    place = _normalized(images, pixel)
-    return functional.grid_sample(
-        images[:, None], place[:, :, None], mode="nearest", padding_mode="zeros", align_corners=False
-    )[:, 0, :, 0]
-
-
-def _normalized(images: Tensor, pixel: Float[Tensor, "frame point 2"]) -> Float[Tensor, "frame point 2"]:
-    size = (
-        torch.tensor([images.shape[2], images.shape[1]], device=pixel.device, dtype=torch.float32) * THUMBNAIL
+    """Read thumbnails at colour pixels, with gradients towards the pixel where bilinear."""
+    size = torch.tensor(images.shape[:0:-1], device=pixel.device, dtype=torch.float32) * THUMBNAIL
+    place = (pixel / size * 2 - 1).clamp(-4, 4)[:, :, None]
+    read = functional.grid_sample(
+        images[:, None].float(), place, mode=mode, padding_mode=padding, align_corners=False
     )
-    return (pixel / size * 2 - 1).clamp(-4, 4)
+    return read[:, 0, :, 0]

@@ -19,8 +19,7 @@ class FieldSizes:
     """Sizes of the fields."""
 
     scene_voxel_m: tuple[float, ...] = (0.32, 0.16, 0.08)
-    """edges of the cells of the scene's grids, metres; the finest is also the shortest wavelength of `mlp`
-    halved"""
+    """edges of the cells of the scene's grids, metres; `mlp` has waves down to twice the finest"""
     agent_voxel_m: tuple[float, ...] = (0.06, 0.03, 0.015)
     """edges of the cells of the agent's grids, metres"""
     encoding: Literal["grid", "mlp"] = "grid"
@@ -68,8 +67,7 @@ class LossWeights:
     template: float = 10.0
     """the agent's field stays near its template, in shape and color"""
     posed_surface: float = 1.0
-    """factor of the losses of the posed surface against mask, free space and solid things (weights in
-    `body`)"""
+    """factor of the posed surface's losses against mask, free space and solid things (weights in `body`)"""
     motion_prior: float = 1.0
     """factor of the priors on joints, rest pose and smooth motion (weights in `body`)"""
     planted: float = 0.3
@@ -87,8 +85,7 @@ class PhaseSteps:
     body: int = 60
     """steps per segment that pose the template to the masked depth"""
     stance: int = 20
-    """steps per segment and stance that decide before posing whether the agent sits; 0 = every segment starts
-    level"""
+    """steps per segment and stance that decide before posing whether the agent sits; 0 = all start level"""
     joint: int = 1000
     """steps of the second phase: everything"""
     save_every: int = 200

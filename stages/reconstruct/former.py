@@ -26,7 +26,6 @@ from stages.reconstruct.problem import Problem
 
 SHARE = 0.3
 """Of the steps of the phases in which everything is optimized: the fields are nearly right."""
-
 OWN = ("grid.levels.", "codes.", "fused.")
 """Parts of the scene's field whose size depends on the recordings: box, codes, fused depth."""
 
@@ -72,9 +71,8 @@ def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> 
             bones.append(_twists(rest, former[video.id].agent_from_bone))
     count = len(problem.motion.agent_from_bone_rest)
     nothing = torch.zeros(0, dtype=torch.long), torch.zeros(0, 6), torch.zeros(0, count, 6)
-    return KnownMotion(
-        *(torch.cat([empty, *parts]) for empty, parts in zip(nothing, (frames, roots, bones), strict=True))
-    )
+    parts = zip(nothing, (frames, roots, bones), strict=True)
+    return KnownMotion(*(torch.cat([empty, *found]) for empty, found in parts))
 
 
 def shorter(steps: PhaseSteps) -> PhaseSteps:

@@ -18,12 +18,11 @@ from pipeline.core import progress, threads
 from pipeline.data import npz
 from pipeline.fields.fused_depth import CELLS, CHANNELS, NODES, NOWHERE, FusedGeometry
 from pipeline.geometry.tsdf import Volume
-from stages.reconstruct.assemble import LEAST_CONFIDENCE, Corner, RegisteredVideo, measured_box, scene_first
+from stages.reconstruct.assemble import Corner, RegisteredVideo, measured_box, scene_first
 from stages.reconstruct.config import SceneFusion
 from stages.reconstruct.rays import AGENT, UNKNOWN, near_agent, trusted_depth
 
 Box = tuple[Corner, Corner]
-
 
 FRAME_STEP = 5
 """one frame in so many is fused"""
@@ -61,8 +60,7 @@ def fuse_depth(
 
 def _fused(volume: Volume, video: RegisteredVideo) -> Volume:
     """Add what one video saw."""
-    good = np.isfinite(video.world_from_camera).all((1, 2)) & (video.confidence >= LEAST_CONFIDENCE)
-    for frame in np.flatnonzero(good)[::FRAME_STEP].tolist():
+    for frame in np.flatnonzero(video.certain_cameras)[::FRAME_STEP].tolist():
         _integrate(volume, video, frame)
     return volume
 
@@ -77,13 +75,8 @@ def _integrate(volume: Volume, video: RegisteredVideo, frame: int) -> None:
         agent = near_agent(mask, RING_PX) if masks.visible[frame] else mask == AGENT
         left_out = ((mask == UNKNOWN) | agent).astype(np.uint8)
         depth[cv2.resize(left_out, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = 0
-    volume.integrate(
-        depth,
-        clip.depth_intrinsics[frame],
-        clip.color(frame),
-        clip.intrinsics[frame],
-        video.world_from_camera[frame],
-    )
+    depth_camera, color_camera = clip.depth_intrinsics[frame], clip.intrinsics[frame]
+    volume.integrate(depth, depth_camera, clip.color(frame), color_camera, video.world_from_camera[frame])
 
 
 @dataclass(frozen=True)
@@ -115,9 +108,8 @@ class SceneFuser:
         """Take over one video."""
         shared = self.shared
         for value, weight in (("distance", "weight"), ("color", "color_weight")):
-            mean, total, new, gain = (
-                getattr(which, name) for which in (shared, volume) for name in (value, weight)
-            )
+            mean, total = getattr(shared, value), getattr(shared, weight)
+            new, gain = getattr(volume, value), getattr(volume, weight)
             total += gain
             share = gain / np.maximum(total, 1e-9)
             mean += (new - mean) * (share if mean.ndim == 3 else share[..., None])
@@ -131,11 +123,9 @@ class SceneFuser:
         seen = shared.weight > LEAST_WEIGHT
         shared.distance[~seen] = 1
         occupied = self._count(shared.distance < LEAST_SURFACE) > 0
-        blocks = [
-            np.stack([np.ones(NODES**3)] + [np.zeros(NODES**3)] * 4, axis=-1).reshape(
-                1, NODES, NODES, NODES, CHANNELS
-            )
-        ]
+        empty = np.zeros((1, NODES, NODES, NODES, CHANNELS))
+        empty[..., 0] = 1
+        blocks = [empty]
         table = np.full((len(self.videos) + 1, *self.size), NOWHERE, np.int32)
         table[:, occupied] = 1 + np.arange(occupied.sum())
         blocks += list(self._cut(occupied, shared.distance, shared.color / 255, shared.color_weight > 0))
@@ -149,24 +139,19 @@ class SceneFuser:
             takes = (other > 0.5) & video.colored
             color = np.where(takes[..., None], video.color, shared.color) / np.float32(255)
             blocks += list(self._cut(changed, distance, color, takes | (shared.color_weight > 0)))
-        stacked = torch.from_numpy(np.concatenate(blocks).astype(np.float16))
-        truncation_m = TRUNCATION_VOXELS * self.voxel_m
-        return FusedGeometry(
-            torch.from_numpy(self.low), self.voxel_m, truncation_m, torch.from_numpy(table), stacked
-        )
+        stacked = np.concatenate(blocks).astype(np.float16)
+        low, rows, stacked = (torch.from_numpy(array) for array in (self.low, table, stacked))
+        return FusedGeometry(low, self.voxel_m, TRUNCATION_VOXELS * self.voxel_m, rows, stacked)
 
     def _count(self, marked: np.ndarray) -> np.ndarray:
         """Count marked cells in each block, by their lower nodes."""
         x, y, z = self.size
         return marked[:-1, :-1, :-1].reshape(x, CELLS, y, CELLS, z, CELLS).sum((1, 3, 5))
 
-    def _cut(
-        self, which: np.ndarray, distance: np.ndarray, color: np.ndarray, colored: np.ndarray
-    ) -> Iterator[np.ndarray]:
+    def _cut(self, which, distance, color, colored) -> Iterator[np.ndarray]:
         """Yield the chosen blocks, one array each."""
         for place in np.argwhere(which) * CELLS:
             part = tuple(slice(start, start + NODES) for start in place)
             known = colored[part][..., None].astype(np.float32)
-            yield np.concatenate([distance[part][..., None], color[part] * known, known], axis=-1)[
-                None
-            ].astype(np.float16)
+            block = np.concatenate([distance[part][..., None], color[part] * known, known], axis=-1)
+            yield block[None].astype(np.float16)

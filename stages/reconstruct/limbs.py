@@ -1,8 +1,6 @@
-"""The kinematic tree of the bones: a thigh's rotation carries the whole leg, so that one parameter lifts a
-tail.
+"""The kinematic tree of the bones: a thigh's rotation carries the leg, and one parameter lifts a tail.
 
-Gaussian bones come without parents. The minimum spanning tree over shared skin gives them, from the body's
-middle out.
+Gaussian bones come without parents: the minimum spanning tree over shared skin gives them.
 """
 
 from dataclasses import dataclass
@@ -60,8 +58,7 @@ class KinematicTree:
         return cls(order, order.argsort()[parent], both.T @ points / both.sum(0)[:, None])
 
     def motion(self, turn: Float[Tensor, "frame bone 3"]) -> Float[Tensor, "frame bone 4 4"]:
-        """Return each bone's motion in the agent frame: its own rotation vector about its joint after its
-        ancestors'.
+        """Return each bone's motion in the agent frame: its rotation about its joint, after its ancestors'.
 
         The root bone stays: it moves with the agent's root.
         """
@@ -72,22 +69,14 @@ class KinematicTree:
             moved.append(moved[parent] @ local[:, place])
         return torch.stack(moved, dim=1)[:, self.order.argsort()]
 
-    def to(self, device: str) -> "KinematicTree":
-        """Move all to a device."""
-        return KinematicTree(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
-
 
 def legs(
     limbs: KinematicTree, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]
 ) -> Bool[Tensor, "bone"]:
-    """Return which bones are the uppermost of legs: they and their descendants are low, and one reaches the
-    ground.
-    """
+    """Return the uppermost bones of legs: they and their descendants are low, and one reaches the ground."""
     height = (points[:, 1] - points[:, 1].min()) / (points[:, 1].max() - points[:, 1].min())
-    low = weights.T @ height < LOW * weights.sum(0)
-    stands = torch.stack(
-        [(height[weights.argmax(1) == bone] < GROUND).any() for bone in range(weights.shape[1])]
-    )
+    low, bones = weights.T @ height < LOW * weights.sum(0), range(weights.shape[1])
+    stands = torch.stack([(height[weights.argmax(1) == bone] < GROUND).any() for bone in bones])
     low, stands, parent = low[limbs.order], stands[limbs.order], limbs.parent.tolist()
     for place in range(len(parent) - 1, 0, -1):
         low[parent[place]] &= low[place]
@@ -96,8 +85,7 @@ def legs(
 
 
 class MultiscaleTurns(nn.Module):
-    """Rotations over consecutive frames, coarse to fine: sums of linear splines with knots on several time
-    scales.
+    """Rotations over consecutive frames, coarse to fine: sums of linear splines on several time scales.
 
     Slow motion is found by few coarse parameters; frame by frame it would take many steps.
     """

@@ -50,31 +50,26 @@ def feature(
 
 def silhouette(predicted: Float[Tensor, "*ray"], agent: Float[Tensor, "*ray"]) -> Float[Tensor, "*ray"]:
     """Compare the agent's rendered opacity with the mask (0 or 1)."""
-    return functional.binary_cross_entropy(
-        predicted.clamp(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY), agent, reduction="none"
-    )
+    finite = predicted.clamp(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+    return functional.binary_cross_entropy(finite, agent, reduction="none")
 
 
 def flow(pixel_px: Float[Tensor, "*ray 2"], target_px: Float[Tensor, "*ray 2"]) -> Float[Tensor, "*ray"]:
     """Compare where points are seen later, in units of `FLOW_UNIT_PX`, robustly."""
-    return functional.huber_loss(
-        pixel_px / FLOW_UNIT_PX, target_px / FLOW_UNIT_PX, reduction="none", delta=FLOW_KNEE
-    ).sum(-1)
+    pixel, target = pixel_px / FLOW_UNIT_PX, target_px / FLOW_UNIT_PX
+    return functional.huber_loss(pixel, target, reduction="none", delta=FLOW_KNEE).sum(-1)
 
 
 def depth(depth_m: Float[Tensor, "*ray"], target_m: Float[Tensor, "*ray"]) -> Float[Tensor, "*ray"]:
     """Compare rendered and measured depth in units of `DEPTH_UNIT_M`, robustly."""
-    return functional.huber_loss(
-        depth_m / DEPTH_UNIT_M, target_m / DEPTH_UNIT_M, reduction="none", delta=DEPTH_KNEE
-    )
+    depth, target = depth_m / DEPTH_UNIT_M, target_m / DEPTH_UNIT_M
+    return functional.huber_loss(depth, target, reduction="none", delta=DEPTH_KNEE)
 
 
 def eikonal(
     distance: Float[Tensor, "point"], shifted: Float[Tensor, "3 point"], step_m: float
 ) -> Float[Tensor, "point"]:
-    """Penalize gradients whose length is not 1, by differences of ``step_m`` along the three axes (Gropp et
-    al. 2020).
-    """
+    """Penalize gradients whose length is not 1, by differences along three axes (Gropp et al. 2020)."""
     return (((shifted - distance) / step_m).square().sum(0).clamp_min(1e-8).sqrt() - 1).square()
 
 
@@ -83,14 +78,9 @@ def weighted(
 ) -> dict[str, Float[Tensor, ""]]:
     """Average each term over its elements and weigh it; terms without elements vanish.
 
-    With ``shared``, the elements of all processes count (`pipeline.core.distributed`), whose gradients will
-    be averaged.
+    With ``shared``, the elements of all processes count, whose gradients will be averaged.
     """
     counts = torch.tensor([float(values.numel()) for _, values in terms.values()])
-    counts = (
-        distributed.total(counts).clamp_min(1) / distributed.size() if shared else counts.clamp_min(1)
-    ).tolist()
-    return {
-        name: weight * (values.sum() / count)
-        for (name, (weight, values)), count in zip(terms.items(), counts, strict=True)
-    }
+    counts = distributed.total(counts).clamp_min(1) / distributed.size() if shared else counts.clamp_min(1)
+    averaged = zip(terms.items(), counts.tolist(), strict=True)
+    return {name: weight * (values.sum() / count) for (name, (weight, values)), count in averaged}

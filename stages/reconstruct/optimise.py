@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from pipeline.core import distributed, progress, threads
 from pipeline.core.training import FitRecord, fit, generator_for, termination
-from stages.reconstruct import stances
+from stages.reconstruct import posing
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from stages.reconstruct.former import KnownMotion
 from stages.reconstruct.joint import JointLoss, TemplateLoss
@@ -35,8 +35,7 @@ LAST_RATE = 0.05
 CLIP_NORM = 10.0
 """largest norm of the gradient"""
 MOTION_RATE, SKIN_RATE = 5e-4, 2e-3
-"""learning rates of root and bones in the second phase, metres and radians, and of bone sizes and skinning
-weights"""
+"""learning rates of the second phase: of root and bones, metres and radians, and of the skin"""
 JOINT_SCENE, JOINT_AGENT, JOINT_CAMERA = 0.25, 0.2, 0.3
 """shares of the first phase's learning rates in the second: fields and cameras are nearly right"""
 STANCE_SHARE = 0.5
@@ -87,11 +86,10 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     loss = SceneLoss(problem, plan.weights, plan.batches, steps.scene, plan.rendered)
     records["scene"] = _run(problem, plan, "scene", loss, steps.scene, scene)
     if len(everything.agent_frames):
-        segments = [
-            frame
-            for frame in chunks(everything, SEGMENT_FRAMES)
-            if plan.known is None or not torch.isin(frame, plan.known.frame.to(frame)).any()
-        ]
+        segments = list(chunks(everything, SEGMENT_FRAMES))
+        if plan.known:
+            known = plan.known.frame.to(problem.device)
+            segments = [frame for frame in segments if not torch.isin(frame, known).any()]
         if steps.stance and segments:
             _choose_stances(problem, plan, segments)
         if steps.body:
@@ -146,22 +144,20 @@ def _pose(problem: Problem, plan: OptimizationPlan, segments: Sequence[torch.Ten
 
 def _choose_stances(problem: Problem, plan: OptimizationPlan, segments: Sequence[torch.Tensor]) -> None:
     """Find the stance in all segments with usable frames, from which roots and bones start."""
-    choices, chosen = stances.candidates(problem), torch.zeros_like(problem.video)
+    choices, chosen = posing.candidates(problem), torch.zeros_like(problem.video)
 
-    def losses_of(
-        index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]
-    ) -> tuple[torch.Tensor, np.ndarray]:
+    def losses_of(index: int, frame: Tensor, asked_to_stop: Callable[[], bool]) -> tuple[Tensor, np.ndarray]:
         losses = []
         for number, stance in enumerate(choices):
             chunk, name = Chunk(problem, frame, stance), f"stance_{index:04d}_{number}"
             loss = _fit_chunk(problem, plan, name, chunk, plan.steps.stance, asked_to_stop, STANCE_SHARE)
-            losses.append(loss.of_parts(stances.PART, generator_for(plan.seed, index)))
+            losses.append(loss.of_parts(posing.PART, generator_for(plan.seed, index)))
         return frame, torch.stack(losses, dim=-1).cpu().numpy()
 
     losses = list(_in_each(problem, plan, segments, losses_of, "stances"))
     usual = float(np.nanmedian(np.concatenate([loss[:, 0] for _, loss in losses])))
     for frame, loss in losses:
-        chosen[frame] = stances.by_frame(stances.most_likely(loss, usual), len(frame)).to(chosen)
+        chosen[frame] = posing.by_frame(posing.most_likely(loss, usual), len(frame)).to(chosen)
     lean, bone = (torch.stack([getattr(stance, name) for stance in choices]) for name in ("lean", "bone"))
     problem.motion.start(lean[distributed.total(chosen)], bone[chosen])
 
@@ -174,19 +170,13 @@ def _in_each(
     label: str,
 ) -> Iterator[Result]:
     """Yield the result of ``work`` for each segment with usable frames; only its poses learn."""
-    held = [problem.agent, problem.body, problem.scene]
-    own = [
-        (index, frame)
-        for index, frame in enumerate(segments)
-        if torch.isin(frame, problem.agent_frames).any()
-    ]
-    for module in held:
-        module.requires_grad_(False)
+    held = nn.ModuleList([problem.agent, problem.body, problem.scene]).requires_grad_(False)
+    numbered = enumerate(segments)
+    own = [(index, frame) for index, frame in numbered if torch.isin(frame, problem.agent_frames).any()]
     with termination() as asked_to_stop:
-        results = threads.ordered(lambda numbered: work(*numbered, asked_to_stop), own, plan.workers)
+        results = threads.ordered(lambda segment: work(*segment, asked_to_stop), own, plan.workers)
         yield from progress.track(results, label, total=len(own))
-    for module in held:
-        module.requires_grad_(True)
+    held.requires_grad_(True)
 
 
 def _fit_chunk(
@@ -217,8 +207,10 @@ def _fit_chunk(
 
 def field_groups(field: nn.Module, rates: LearningRates) -> list[dict]:
     """Return a field's parameter groups: grids learn fast, networks slowly."""
-    heads = [parameter for name, parameter in field.named_parameters() if not name.startswith("grid.levels.")]
-    grid = [parameter for name, parameter in field.named_parameters() if name.startswith("grid.levels.")]
+    heads, grid = (
+        [value for name, value in field.named_parameters() if name.startswith("grid.levels.") == is_grid]
+        for is_grid in (False, True)
+    )
     return [
         {"params": grid, "lr": rates.grid, "weight_decay": 0.0, "betas": (BETA1, BETA2)},
         {"params": heads, "lr": rates.heads, "weight_decay": HEAD_DECAY},
@@ -233,17 +225,15 @@ def _motion_group(parameters: list[nn.Parameter], rate: float, momentum: float =
 def joint_groups(problem: Problem, rates: LearningRates) -> list[dict]:
     """Return the parameter groups of the second phase."""
     motion = problem.motion
-    shares = ((problem.scene, JOINT_SCENE), (problem.agent, JOINT_AGENT))
-    groups = [
-        {**group, "lr": group["lr"] * share}
-        for field, share in shares
-        for group in field_groups(field, rates)
-    ]
-    groups += [
+    groups = []
+    for field, share in ((problem.scene, JOINT_SCENE), (problem.agent, JOINT_AGENT)):
+        groups += [{**group, "lr": group["lr"] * share} for group in field_groups(field, rates)]
+    return [
+        *groups,
         _motion_group([motion.camera], rates.camera * JOINT_CAMERA, momentum=BETA1),
         _motion_group([motion.root, motion.bone], MOTION_RATE),
+        {"params": list(problem.body.parameters()), "lr": SKIN_RATE, "weight_decay": 0.0},
     ]
-    return [*groups, {"params": list(problem.body.parameters()), "lr": SKIN_RATE, "weight_decay": 0.0}]
 
 
 def _seed(seed: int, name: str) -> int:

@@ -35,32 +35,19 @@ def report_quality(
     masks: Mapping[str, Path],
     records: Mapping[str, FitRecord],
 ) -> None:
-    """Write qa.json: agreement with the sensor on a few frames of the first sessions, pictures of three of
-    them.
-    """
+    """Write qa.json: agreement with the sensor on a few frames of the first sessions, with pictures."""
     rows, pictures = [], []
     for id, motion in list(motions.items())[:SESSIONS]:
         clip, labels = Clip.open(frames[id]), Masks.open(masks[id])
-        renderer = Renderer(reconstruction, id)
-        compared = [
-            compare(renderer, clip, labels[frame], motion, frame) for frame in chosen_frames(motion, FRAMES)
-        ]
+        renderer, chosen = Renderer(reconstruction, id), chosen_frames(motion, FRAMES)
+        compared = [compare(renderer, clip, labels[frame], motion, frame) for frame in chosen]
         rows += [metrics for metrics, _ in compared]
         if compared and len(pictures) < 3:
-            pictures.append(
-                qa.Picture(
-                    f"{id}_frames",
-                    np.vstack([image for _, image in compared[:3]]),
-                    f"{id}: picture, render, depth measured and rendered, opposite view, bones",
-                )
-            )
-    pictures.append(
-        qa.Picture(
-            "losses",
-            plots.loss_curves({name: {"total": record.total()} for name, record in records.items()}),
-            "losses of each phase, running mean, logarithmic",
-        )
-    )
+            image = np.vstack([image for _, image in compared[:3]])
+            caption = f"{id}: picture, render, depth measured and rendered, opposite view, bones"
+            pictures.append(qa.Picture(f"{id}_frames", image, caption))
+    curves = plots.loss_curves({name: {"total": record.total()} for name, record in records.items()})
+    pictures.append(qa.Picture("losses", curves, "losses of each phase, running mean, logarithmic"))
     psnr, depth, iou = (np.mean(column) for column in zip(*rows, strict=True)) if rows else (np.nan,) * 3
     checks = [
         qa.Check("PSNR of rendered training frames", float(psnr), "dB", 20, 15, "higher"),
@@ -92,21 +79,15 @@ def compare(
     """Render one frame; return (PSNR, share of depth within 0.1 m, IoU) and one row of pictures."""
     height, width = (round(side * LONG_SIDE_PX / max(clip.color_size)) for side in clip.color_size)
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, (height, width))
-    camera = motion.world_from_camera[frame]
-    root = motion.world_from_agent[frame]
-    bones = motion.agent_from_bone[frame]
+    camera, root, bones = (
+        poses[frame] for poses in (motion.world_from_camera, motion.world_from_agent, motion.agent_from_bone)
+    )
     drawn = renderer.draw(camera, intrinsics, height, width, root, bones)
     color = plots.resized(clip.color(frame), (height, width))
     measured = cv2.resize(clip.depth(frame), (width, height), interpolation=cv2.INTER_NEAREST)
     opposite = renderer.draw(_opposite(camera, root), intrinsics, height, width, root, bones)
-    row = [
-        color,
-        drawn.color,
-        plots.depth_colors(measured),
-        plots.depth_colors(drawn.depth),
-        opposite.color,
-        draw_bones(color, camera, intrinsics, root, bones),
-    ]
+    depths = [plots.depth_colors(depth) for depth in (measured, drawn.depth)]
+    row = [color, drawn.color, *depths, opposite.color, draw_bones(color, camera, intrinsics, root, bones)]
     known = (measured > 0.1) & (measured < 5)
     agent = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) == 255
     error = np.mean((color.astype(float) - drawn.color)[drawn.depth > 0] ** 2)
@@ -118,9 +99,7 @@ def compare(
 def _opposite(
     world_from_camera: Float[np.ndarray, "4 4"], world_from_agent: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Return a camera on the other side of the agent, at the same height, at most 0.8 m away so that no wall
-    comes between.
-    """
+    """Return a camera on the other side of the agent, at the same height and near, so before any wall."""
     target, eye = world_from_agent[:3, 3], world_from_camera[:3, 3]
     beyond = (target - eye)[[0, 2]]
     beyond *= min(1.0, ACROSS_M / max(np.linalg.norm(beyond), 1e-6))
@@ -136,19 +115,9 @@ def draw_bones(
     """Draw each bone's axes (x red, y green, z blue) over a picture."""
     camera_from_bone = rigid.inverse(world_from_camera) @ world_from_agent @ agent_from_bone
     tips = np.concatenate([np.zeros((1, 3)), AXIS_M * np.eye(3)])
-    pixel = np.rint(cameras.project(rigid.apply(camera_from_bone, tips[None]), intrinsics)[0] * 16).astype(
-        int
-    )
-    drawn = np.ascontiguousarray(image)
-    for bone in np.clip(pixel, -FARTHEST_PX, FARTHEST_PX):
-        for axis in range(3):
-            cv2.line(
-                drawn,
-                bone[0].tolist(),
-                bone[1 + axis].tolist(),
-                [255 * (k == axis) for k in range(3)],
-                1,
-                cv2.LINE_AA,
-                shift=4,
-            )
+    pixel = cameras.project(rigid.apply(camera_from_bone, tips[None]), intrinsics)[0]
+    ends, drawn = np.rint(np.clip(pixel * 16, -FARTHEST_PX, FARTHEST_PX)).astype(int), image.copy()
+    for bone in ends.tolist():
+        for axis, color in enumerate(np.diag([255] * 3).tolist()):
+            cv2.line(drawn, bone[0], bone[1 + axis], color, 1, cv2.LINE_AA, shift=4)
     return drawn

@@ -1,20 +1,25 @@
-"""Pose the template in consecutive frames: root, limbs and bones move, field and skin are fixed."""
+"""Pose the template in consecutive frames: root, limbs and bones move, field and skin are fixed.
 
-from dataclasses import replace
+An animal that sits raises its front. Registered roots are level, and gradients hardly find the lean: each
+segment of frames is posed briefly from every `Stance`, and posing starts from the one with the lowest loss.
+"""
 
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from pipeline.geometry import rigid, rigid_torch
-from stages.reconstruct import losses
+from pipeline.geometry import rigid, rigid_torch, viterbi
+from stages.reconstruct import limbs, losses
 from stages.reconstruct.body import Pose, measured_terms, prior_terms, surface_terms
 from stages.reconstruct.config import LossWeights
 from stages.reconstruct.limbs import MultiscaleTurns
 from stages.reconstruct.problem import Problem, RaysByFrame
 from stages.reconstruct.rays import AGENT
-from stages.reconstruct.stances import Stance
 
 KNOT_FRAMES = (32, 8)
 """distances of the knots of limbs' rotations, which also change frame by frame"""
@@ -23,10 +28,59 @@ ROOT_SHARE = 0.25
 POSED_RAYS, POSED_POINTS = 96, 384
 """masked rays and surface points per frame and step"""
 SLOW_RATE, FRAME_RATE = 2e-2, 1e-2
-"""learning rates of the root and of slow rotations of limbs, and of what changes from frame to frame; metres
-and radians a step of Adam"""
+"""learning rates, metres and radians: of the root and limbs' slow rotations, and of what changes by frame"""
 MOMENTUM = (0.8, 0.99)
 """Adam's, shorter than usual for few steps"""
+RAISED_RAD = math.radians(30)
+"""lean of an animal that sits; posing finds the rest"""
+PART = 10
+"""frames that share a stance"""
+SURE = 0.03
+"""a stance that is not level must lower the loss by so much; measured on the built-in cat"""
+CHANGE = 0.03
+"""and a change of stance by so much more"""
+FITS = 1.25
+"""and the loss must be at most so many times the median of level poses: a better misfit is no evidence"""
+
+
+@dataclass(frozen=True)
+class Stance:
+    """How posing may start."""
+
+    lean: Float[Tensor, "4 4"]
+    """the root relative to a level one"""
+    bone: Float[Tensor, "bone 6"]
+    """twists of bones from rest"""
+
+
+def candidates(problem: Problem) -> tuple[Stance, ...]:
+    """Return level first, then with the front raised over legs that stay upright."""
+    rest, points = problem.motion.agent_from_bone_rest, problem.surface.points
+    with torch.no_grad():
+        leg = limbs.legs(problem.tree, points, problem.body.weights(points))
+    raised = torch.tensor([-RAISED_RAD, 0.0, 0.0], device=problem.device)
+    carried = problem.tree.motion(-raised * leg[None, :, None])[0]
+    bone = rigid.log((rigid_torch.inverse(rest) @ carried @ rest).double().cpu().numpy())
+    lean = rigid_torch.make(rigid_torch.so3_exp(raised), torch.zeros(3, device=problem.device))
+    level = Stance(torch.eye(4, device=problem.device), torch.zeros(len(rest), 6, device=problem.device))
+    return level, Stance(lean, torch.from_numpy(bone).to(level.bone))
+
+
+def most_likely(loss: Float[np.ndarray, "part stance"], usual: float) -> Int[np.ndarray, "part"]:
+    """Return the stances of consecutive parts by the Viterbi algorithm: low losses, few changes, level first.
+
+    Parts without the agent have a loss of NaN. ``usual`` is the median loss of level poses.
+    """
+    stances = np.arange(loss.shape[1])
+    cost = np.nan_to_num(loss) + SURE * (stances > 0)
+    cost[:, 1:][loss[:, 1:] > FITS * usual] = np.inf
+    change = CHANGE * (stances[:, None] != stances)
+    return viterbi.viterbi_decode(cost, lambda _: change)
+
+
+def by_frame(stance: Int[np.ndarray, "part"], frames: int) -> Int[Tensor, "frame"]:
+    """Repeat the stances of parts for their frames."""
+    return torch.from_numpy(stance).repeat_interleave(PART)[:frames]
 
 
 class Chunk(nn.Module):
@@ -40,9 +94,8 @@ class Chunk(nn.Module):
         self.frame, motion = frame, problem.motion
         self.initial = motion.initial_agent[frame] @ stance.lean if stance else motion.initial_agent[frame]
         self.root = nn.Parameter(motion.root.detach()[frame].clone())
-        self.bone = nn.Parameter(
-            stance.bone.repeat(len(frame), 1, 1) if stance else motion.bone.detach()[frame].clone()
-        )
+        bone = stance.bone.repeat(len(frame), 1, 1) if stance else motion.bone.detach()[frame].clone()
+        self.bone = nn.Parameter(bone)
         self.turn = MultiscaleTurns(len(frame), motion.bone.shape[1], KNOT_FRAMES).to(problem.device)
 
     def groups(self) -> list[dict]:
@@ -60,19 +113,17 @@ class Chunk(nn.Module):
             world_from_camera = motion.world_from_camera(self.frame)
         root = self.initial @ rigid_torch.se3_exp(self.root)
         bones = problem.tree.motion(turn) @ motion.agent_from_bone_rest @ rigid_torch.se3_exp(bone)
-        return Pose(self.frame, world_from_camera, root, bones, self.initial), torch.cat(
-            [bone, functional.pad(turn, (0, 3))], dim=1
-        )
+        twists = torch.cat([bone, functional.pad(turn, (0, 3))], dim=1)
+        return Pose(self.frame, world_from_camera, root, bones, self.initial), twists
 
     @torch.no_grad()
     def write(self, problem: Problem) -> None:
         """Write root and bones into the motion table."""
         pose, _ = self.pose(problem)
         bone = rigid_torch.inverse(problem.motion.agent_from_bone_rest) @ pose.agent_from_bone
+        twists = torch.from_numpy(rigid.log(bone.double().cpu().numpy()))
         problem.motion.root[self.frame] = self.root
-        problem.motion.bone[self.frame] = torch.from_numpy(rigid.log(bone.double().cpu().numpy())).to(
-            self.bone
-        )
+        problem.motion.bone[self.frame] = twists.to(self.bone)
 
 
 class ChunkLoss:
@@ -104,19 +155,12 @@ class ChunkLoss:
         totals = [sum(each.values(), start=torch.zeros(())) for each in terms]
         return torch.stack(totals).where(seen, torch.nan)
 
-    def _terms(
-        self,
-        pose: Pose,
-        twist: Float[Tensor, "frame twist 6"],
-        seen: Bool[Tensor, "frame"],
-        generator: Generator,
-    ) -> dict[str, Tensor]:
+    def _terms(self, pose: Pose, twist, seen, generator: Generator) -> dict[str, Tensor]:
         problem, terms = self.problem, {}
         if seen.any():
             shown = pose.at(seen)
-            rays = problem.store.agent.at(
-                self.masked[self.masked_rays.pick(shown.frame, self.rays, generator).flatten()]
-            )
+            picked = self.masked_rays.pick(shown.frame, self.rays, generator).flatten()
+            rays = problem.store.agent.at(self.masked[picked])
             terms = measured_terms(problem, shown, rays, self.weights, generator, near=0)
             terms |= surface_terms(problem, shown, self.points, self.weights, generator, rays)
         return losses.weighted(terms | prior_terms(problem, pose, twist, len(pose.frame), self.weights))

@@ -20,7 +20,7 @@ TRUSTED = 0.1
 """frames whose mask weighs less are left out of runs of consecutive frames"""
 MOST_PRECISE = 100.0
 """prior precision of a camera that registration is certain of, relative to one at even odds; losses alone err
-by a millimetre and a twentieth of a degree"""
+by a millimetre and 0.05 degrees"""
 MOST_JOINTS, LEAST_SKIN = 4, 0.02
 """joints of a bone, and the share of skin that two bones must have in common to be tied"""
 SOLE, SOLES = 0.07, 32
@@ -53,8 +53,7 @@ class Problem:
     """frames with a known root, a trusted mask and rays on the agent"""
     agent_rays: "RaysByFrame"
     trust: Float[Tensor, "frame"]
-    """weight of each frame's mask, 0..1: less where the root was an outlier or little of the agent is in
-    view"""
+    """weight of each frame's mask, 0..1: less where the root was an outlier or little is in view"""
     camera_precision: Float[Tensor, "knot"]
     """prior precision of each knot's camera correction, relative to that of a camera at even odds"""
     floor_m: float
@@ -70,24 +69,17 @@ class Problem:
         return {"scene": self.scene, "agent": self.agent, "body": self.body, "motion": self.motion}
 
     def share(self, rank: int, size: int) -> "Problem":
-        """Return the same problem with the measurements of one process's videos alone; the longest are dealt
-        out first.
+        """Return the problem with the measurements of one process's videos, the longest dealt out first.
 
         Raises `InputError` RCN-002 where a process would get no video in which the agent is seen.
         """
         frames = torch.bincount(self.video)
         with_agent = torch.bincount(self.video[self.agent_frames], minlength=len(frames)) > 0
-        with_scene = torch.bincount(self.video[self.has_scene], minlength=len(frames)) > 0
-        order = sorted(
-            range(len(frames)), key=lambda video: (not (with_agent & with_scene)[video], -int(frames[video]))
-        )
-        if int((with_agent & with_scene).sum()) < size:
-            raise InputError(
-                "RCN-002",
-                what=f"{size} processes, but fewer recordings that show the agent in its home",
-                where="PROCESSES",
-                remedy="take fewer processes",
-            )
+        both = with_agent & (torch.bincount(self.video[self.has_scene], minlength=len(frames)) > 0)
+        order = sorted(range(len(frames)), key=lambda video: (not both[video], -int(frames[video])))
+        if int(both.sum()) < size:
+            what = f"{size} processes, but fewer recordings that show the agent in its home"
+            raise InputError("RCN-002", what, "PROCESSES", "take fewer processes")
         own = torch.isin(self.video, torch.tensor(order[rank::size], device=self.device))
         scene, agent = (
             rays.at(torch.nonzero(own[rays.frame])[:, 0]) for rays in (self.store.scene, self.store.agent)
@@ -107,10 +99,8 @@ class Problem:
         usable = torch.zeros(len(self.video) + length, dtype=torch.bool)
         usable[first] = True
         video = torch.cat([self.video.cpu(), torch.full((length,), -1)])
-        good = torch.stack(
-            [usable[first + k] & (video[first + k] == video[first]) for k in range(length)]
-        ).all(0)
-        return first[good]
+        good = [usable[first + k] & (video[first + k] == video[first]) for k in range(length)]
+        return first[torch.stack(good).all(0)]
 
 
 @dataclass(frozen=True)
@@ -145,22 +135,14 @@ class Joints:
 
     @classmethod
     def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> "Joints":
-        """Tie each bone to the `MOST_JOINTS` with which it shares most skin, at least `LEAST_SKIN`, but
-        always to one.
-        """
+        """Tie each bone to at most `MOST_JOINTS` with which it shares most skin, but always to one."""
         share = shared_skin(weights)
         ranked = share.argsort(dim=1, descending=True)
-        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MOST_JOINTS], True) & (
-            share > LEAST_SKIN
-        )
-        tied = tied.scatter_(1, ranked[:, :1], True)
+        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MOST_JOINTS], True)
+        tied = (tied & (share > LEAST_SKIN)).scatter_(1, ranked[:, :1], True)
         first, second = torch.nonzero((tied | tied.T).triu(1), as_tuple=True)
         both = weights[:, first] * weights[:, second]
         return cls(first, second, both.T @ points / both.sum(0).clamp_min(1e-9)[:, None])
-
-    def to(self, device: str) -> "Joints":
-        """Move all to a device."""
-        return Joints(self.first.to(device), self.second.to(device), self.place.to(device))
 
 
 @dataclass(frozen=True)
@@ -183,9 +165,7 @@ class TemplateSurface:
     def of(
         cls, mesh: Mesh, feature: Float[np.ndarray, "vertex 16"], rng: np.random.Generator
     ) -> "TemplateSurface":
-        """Sample a template mesh; distances are to the nearest of many surface samples, signed by their
-        normals.
-        """
+        """Sample a mesh; distances are to the nearest of many surface samples, signed by their normals."""
         corner = mesh.vertices[mesh.faces].astype(np.float64)
         area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1)
         face = rng.choice(len(mesh.faces), 8 * ON_SURFACE, p=area / area.sum())
@@ -200,34 +180,20 @@ class TemplateSurface:
         near_m, near = map(np.asarray, KDTree(points).query(around, 8))
         side = ((around[:, None] - points[near]) * normal[near]).sum(-1).mean(-1)
         distance = near_m[:, 0] * np.where(side < 0, -1, 1)
-        vertex = mesh.faces[face[near[:, 0]]]
-        mix = bary[near[:, 0]]
-        color = np.einsum(
-            "pk,pkc->pc",
-            mix,
-            (mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128))[vertex] / 255,
-        )
+        vertex, mix = mesh.faces[face[near[:, 0]]], bary[near[:, 0]]
+        shade = mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128)
+        color = np.einsum("pk,pkc->pc", mix, shade[vertex] / 255)
         features = np.einsum("pk,pkc->pc", mix, feature[vertex].astype(np.float64))
         features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-6)
         points, normal = points[:ON_SURFACE], normal[:ON_SURFACE]
         height = points[:, 1] - points[:, 1].min()
         sole = points[height < SOLE * height.max()][:SOLES]
-        return cls(
-            *(
-                torch.from_numpy(array).float()
-                for array in (points, normal, around, distance, color, features, sole)
-            )
-        )
-
-    def to(self, device: str) -> "TemplateSurface":
-        """Move all to a device."""
-        return TemplateSurface(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        parts = (points, normal, around, distance, color, features, sole)
+        return cls(*(torch.from_numpy(array).float() for array in parts))
 
 
 def prior_precision(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Float[Tensor, "knot"]:
-    """Return the prior precision of each camera knot: 1 up to even odds of its frames, `MOST_PRECISE` if
-    certain.
-    """
+    """Return the prior precision of each camera knot: 1 up to even odds, `MOST_PRECISE` if certain."""
     precision = 1 + (MOST_PRECISE - 1) * (2 * torch.from_numpy(confidence).float() - 1).clamp(0, 1).square()
     total, count = torch.zeros(2, len(motion.camera))
     for knot in (motion.knot, motion.knot + 1):

@@ -6,7 +6,7 @@ losses of the posed surface. `join` puts the videos on one frame axis.
 """
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -34,8 +34,7 @@ RING_PX, RING_SHARE = 10, 0.25
 LEAST_SLOPE = 0.15
 """surfaces are taken as no more oblique than this: normals of noisy depth err"""
 EDGE_M, EDGE_SHARE = 0.1, 0.05
-"""depth that changes by more than this within 3 pixels, plus this share of itself, is an edge and not
-trusted"""
+"""depth that changes by more than this within 3 pixels, plus this share of itself, is an edge"""
 THUMBNAIL = 4
 """colour pixels along the edge of a thumbnail's pixel"""
 FAR_PX = 255.0
@@ -75,10 +74,6 @@ class Rays:
         """Select rays."""
         return Rays(*(getattr(self, field.name)[index] for field in fields(self)))
 
-    def to(self, device: str) -> "Rays":
-        """Move all to a device."""
-        return Rays(*(getattr(self, field.name).to(device) for field in fields(self)))
-
 
 @dataclass(frozen=True)
 class Views:
@@ -91,16 +86,11 @@ class Views:
     depth: Float[Tensor, "frame height width"]
     """metres, half precision; 0 = unknown"""
     outside_px: Float[Tensor, "frame height width"]
-    """colour pixels outside the agent's mask, negative inside, half precision; `FAR_PX` = farther or no
-    mask"""
+    """colour pixels outside the mask, negative inside, half precision; `FAR_PX` = farther or no mask"""
     occluder: Float[Tensor, "frame height width"]
     """depth of what may occlude the agent (`occluder_depth`)"""
     agent_seen: Bool[Tensor, "frame"]
     """the mask of this frame can be trusted"""
-
-    def to(self, device: str) -> "Views":
-        """Move all to a device."""
-        return Views(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -135,50 +125,46 @@ class RaySource:
 
 def collect(source: RaySource, sampling: PixelSampling, rng: Generator) -> RayStore:
     """Read every frame of a video once; frames count from 0."""
-    scene, agent, depths, outsides, occluders = [], [], [], [], []
-    for frame in range(len(source.clip)):
-        depth, slope = trusted_depth(source.clip, frame)
-        mask = source.masks[frame] if source.masks is not None else np.zeros(source.clip.color_size, np.uint8)
-        seen = source.masks is not None and source.masks.visible[frame]
-        near = near_agent(mask, RING_PX) if seen else np.zeros(mask.shape, bool)
+    clip, masks, scene, agent, thumbnails = source.clip, source.masks, [], [], []
+    visible = np.zeros(len(clip), bool) if masks is None else masks.visible.astype(bool)
+    for frame in range(len(clip)):
+        depth, slope = trusted_depth(clip, frame)
+        mask = np.zeros(clip.color_size, np.uint8) if masks is None else masks[frame]
         if source.has_scene:
-            reader = _Reader(source, frame, mask, depth, slope)
-            scene.append(reader.read(_choose(mask == NOT_AGENT, sampling.scene_per_frame, rng), rng))
-        if seen:
-            reader = _Reader(source, frame, mask, thin_depth(source.clip, frame), slope)
-            agent.append(reader.read(choose_on_agent(mask, near, sampling.agent_per_frame, rng), rng))
+            place = _choose(mask == NOT_AGENT, sampling.scene_per_frame, rng)
+            scene.append(_read(source, frame, mask, depth, slope, place, rng))
+        if visible[frame]:
+            place = choose_on_agent(mask, near_agent(mask, RING_PX), sampling.agent_per_frame, rng)
+            agent.append(_read(source, frame, mask, thin_depth(clip, frame), slope, place, rng))
         small = (mask.shape[0] // THUMBNAIL, mask.shape[1] // THUMBNAIL)
-        depths.append(
-            cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
-        )
-        outsides.append(distance_outside(mask, small) if seen else np.full(small, FAR_PX, np.float16))
-        occluders.append(occluder_depth(depths[-1], outsides[-1]))
-    visible = source.masks.visible if source.masks is not None else np.zeros(len(source.clip), bool)
-    views = Views(
-        torch.from_numpy(source.clip.intrinsics).float(),
-        torch.tensor(source.clip.color_size[::-1]).float().expand(len(source.clip), 2),
-        torch.from_numpy(np.stack(depths)),
-        torch.from_numpy(np.stack(outsides)),
-        torch.from_numpy(np.stack(occluders)),
-        torch.from_numpy(visible.astype(bool)),
+        outside_px = distance_outside(mask, small) if visible[frame] else np.full(small, FAR_PX, np.float16)
+        depth = cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
+        thumbnails.append((depth, outside_px, occluder_depth(depth, outside_px)))
+    depths, outsides, occluders = (torch.from_numpy(np.stack(part)) for part in zip(*thumbnails, strict=True))
+    size_px = torch.tensor(clip.color_size[::-1]).float().expand(len(clip), 2)
+    intrinsics = torch.from_numpy(clip.intrinsics).float()
+    views = Views(intrinsics, size_px, depths, outsides, occluders, torch.from_numpy(visible))
+    none = torch.zeros(0, dtype=torch.int64)
+    parts = (scene or [agent[0].at(none)], agent or [scene[0].at(none)])
+    scene, agent = (
+        Rays(*(torch.cat([getattr(some, field.name) for some in part]) for field in fields(Rays)))
+        for part in parts
     )
-    return RayStore(_concatenate(scene), _concatenate(agent), views)
+    return RayStore(scene, agent, views)
 
 
 def join(stores: Iterable[RayStore], folder: Path | None, size: tuple[int, int] | None = None) -> RayStore:
     """Put videos on one frame axis; frame indices of later videos are shifted by the frames before them.
 
     The result lies in unnamed files in ``folder``, so that memory does not grow with the frames
-    (`npz.Column`).
-
-    Args:
-        size: height and width of all thumbnails; those of the first store if None.
+    (`npz.Column`). All thumbnails get the ``size`` (height, width), by default that of the first store.
     """
     parts = [[npz.Column(folder) for _ in fields(kind)] for kind in (Rays, Rays, Views)]
     frames = 0
     for store in stores:
         height, width = size = size or (store.views.depth.shape[1], store.views.depth.shape[2])
-        tables = _shift(store.scene, frames), _shift(store.agent, frames), _padded(store.views, height, width)
+        scene, agent = (replace(rays, frame=rays.frame + frames) for rays in (store.scene, store.agent))
+        tables = scene, agent, _padded(store.views, height, width)
         for columns, table in zip(parts, tables, strict=True):
             for column, field in zip(columns, fields(table), strict=True):
                 column.append(getattr(table, field.name).numpy())
@@ -188,45 +174,17 @@ def join(stores: Iterable[RayStore], folder: Path | None, size: tuple[int, int] 
 
 
 def _padded(views: Views, height: int, width: int) -> Views:
-    """Widen thumbnails to the right and below with unknown depth and no mask: recordings may be upright or
-    wide.
-    """
+    """Widen thumbnails to the right and below with unknown depth and no mask: some are upright, some wide."""
     edge = (0, width - views.depth.shape[2], 0, height - views.depth.shape[1])
     depth, occluder = functional.pad(views.depth, edge), functional.pad(views.occluder, edge)
-    return replace(
-        views, depth=depth, occluder=occluder, outside_px=functional.pad(views.outside_px, edge, value=FAR_PX)
-    )
-
-
-def _shift(rays: Rays, start: int) -> Rays:
-    return Rays(rays.frame + start, *(getattr(rays, field.name) for field in fields(rays)[1:]))
-
-
-def _concatenate(parts: Sequence[Rays]) -> Rays:
-    if not parts:
-        floats, bytes_ = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
-        features, signed = torch.zeros(0, 16, dtype=torch.int8), torch.zeros(0, dtype=torch.int8)
-        return Rays(
-            torch.zeros(0, dtype=torch.int64),
-            floats,
-            floats[:, 0],
-            floats[:, 0],
-            bytes_,
-            features,
-            bytes_[:, 0],
-            floats[:, :2],
-            bytes_[:, 0],
-            signed,
-        )
-    return Rays(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Rays)))
+    outside_px = functional.pad(views.outside_px, edge, value=FAR_PX)
+    return replace(views, depth=depth, occluder=occluder, outside_px=outside_px)
 
 
 def occluder_depth(
     depth: Float[np.ndarray, "height width"], outside_px: Float[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "height width"]:
-    """Fill unknown depth of a thumbnail with the nearest depth of its neighbours off the agent: edges have
-    none.
-    """
+    """Fill unknown depth of a thumbnail, as at edges, with the nearest depth of neighbours off the agent."""
     off_agent = np.where((depth > 0) & (outside_px > 0), depth, np.inf)
     nearest = minimum_filter(off_agent.astype(np.float32), 3, mode="constant", cval=np.inf)
     return np.where((depth > 0) | np.isinf(nearest), depth, nearest).astype(depth.dtype)
@@ -235,32 +193,25 @@ def occluder_depth(
 def trusted_depth(
     clip: Clip, frame: int
 ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """Return depth, metres (0 where its confidence is 0 or at edges), and each pixel's slope from its
-    normals.
-    """
+    """Return depth, metres (0 where its confidence is 0 or at edges), and each pixel's slope."""
     depth = usable_depth(clip, frame, nearest_m=NEAREST_M)
     if clip.mapped:
         depth[clip.confidence(frame) < CONFIRMED] = 0
     directions = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape).astype(np.float32)
-    smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(
-        cv2.blur((depth > 0).astype(np.float32), (3, 3)), 1e-6
-    )
+    known = cv2.blur((depth > 0).astype(np.float32), (3, 3))
+    smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(known, 1e-6)
     points = directions * smooth[..., None]
     across, down = np.zeros_like(points), np.zeros_like(points)
     across[:, 1:-1], down[1:-1] = points[:, 2:] - points[:, :-2], points[2:] - points[:-2]
     normal = np.cross(across, down)
     slope = np.abs((normal * directions).sum(-1)) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
-    jump = (
-        cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3))) > EDGE_M + EDGE_SHARE * depth
-    )
-    depth[jump] = 0
+    change = cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3)))
+    depth[change > EDGE_M + EDGE_SHARE * depth] = 0
     return depth, np.clip(slope, LEAST_SLOPE, None).astype(np.float32)
 
 
 def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Return depth, metres (0 = unknown), that neighbours support, of any confidence: thin limbs are all
-    edge.
-    """
+    """Return depth, metres (0 = unknown), that neighbours support, even doubtful: thin limbs are all edge."""
     depth = clip.depth(frame).astype(np.float32)
     if clip.mapped:
         depth[clip.confidence(frame) < CONFIRMED] = 0
@@ -276,11 +227,9 @@ def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np
 def distance_outside(
     mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]
 ) -> Float[np.ndarray, "small_height small_width"]:
-    """Return how many colour pixels the middles of a thumbnail's pixels lie outside the mask's edge, negative
-    inside.
+    """Return how many colour pixels a thumbnail's pixels lie outside the mask's edge, negative inside.
 
-    The edge runs between pixels. It is found at full resolution; the thumbnail averages a distance, not
-    labels.
+    The edge runs between pixels of the full resolution; the thumbnail averages a distance, not labels.
     """
     outside = (mask == NOT_AGENT).astype(np.uint8)
     if outside.all():
@@ -290,9 +239,8 @@ def distance_outside(
     )
     signed = np.where(outside, beyond - 0.5, 0.5 - within)
     height, width = (size * THUMBNAIL for size in small)
-    return cv2.resize(
-        np.clip(signed[:height, :width], -FAR_PX, FAR_PX), small[::-1], interpolation=cv2.INTER_AREA
-    ).astype(np.float16)
+    limited = np.clip(signed[:height, :width], -FAR_PX, FAR_PX)
+    return cv2.resize(limited, small[::-1], interpolation=cv2.INTER_AREA).astype(np.float16)
 
 
 def _choose(
@@ -310,9 +258,7 @@ def choose_on_agent(
     count: int,
     rng: Generator,
 ) -> Int[np.ndarray, "ray 2"]:
-    """Choose ``count`` pixels (row, column) on the agent, where it is thin more densely, and in the ring
-    around it.
-    """
+    """Choose ``count`` pixels (row, column) on the agent, densely where it is thin, and around it."""
     inside = cv2.distanceTransform((mask == AGENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3).ravel()
     flat = np.flatnonzero(inside)
     number = min(count - int(count * RING_SHARE), len(flat))
@@ -323,47 +269,34 @@ def choose_on_agent(
     return np.stack(np.unravel_index(np.sort(np.concatenate([on_mask, in_ring])), mask.shape), axis=-1)
 
 
-class _Reader:
-    """Reads what is known at chosen pixels of one frame."""
+def _read(source: RaySource, frame: int, mask, depth, slope, place, rng: Generator) -> Rays:
+    """Collect what is known at pixels (row, column) ``place`` of one frame."""
+    clip, features, (row, column) = source.clip, source.features, place.T
+    pixel = np.stack([column, row], axis=-1) + 0.5
+    direction = cameras.unproject(pixel, clip.intrinsics[frame])
+    at_depth = cameras.project(direction, clip.depth_intrinsics[frame])[0].astype(int)
+    x, y = np.clip(at_depth, 0, np.array(depth.shape[::-1]) - 1).T
+    cell = feature_cell(row, features.shape[1]), feature_cell(column, features.shape[2])
+    feature = np.rint(np.asarray(features[frame])[cell].astype(np.float32) * 127).astype(np.int8)
+    flow, confidence, gap = _read_flow(source, frame, place, rng)
+    measured = (
+        direction.astype(np.float32),
+        depth[y, x],
+        slope[y, x],
+        clip.color(frame)[row, column],
+        feature,
+    )
+    measured += (mask[row, column], (pixel + flow).astype(np.float32), confidence, gap)
+    tensors = (torch.from_numpy(np.ascontiguousarray(array)) for array in measured)
+    return Rays(torch.full((len(place),), frame), *tensors)
 
-    def __init__(self, source: RaySource, frame: int, mask: np.ndarray, depth: np.ndarray, slope: np.ndarray):
-        self.source, self.frame, self.mask, self.depth, self.slope = source, frame, mask, depth, slope
-        self.color = source.clip.color(frame)
 
-    def read(self, place: Int[np.ndarray, "ray 2"], rng: Generator) -> Rays:
-        """Collect the measurements at pixels (row, column)."""
-        clip, (row, column) = self.source.clip, place.T
-        pixel = np.stack([column, row], axis=-1) + 0.5
-        direction = cameras.unproject(pixel, clip.intrinsics[self.frame])
-        at_depth = cameras.project(direction, clip.depth_intrinsics[self.frame])[0].astype(int)
-        x = np.clip(at_depth[:, 0], 0, self.depth.shape[1] - 1)
-        y = np.clip(at_depth[:, 1], 0, self.depth.shape[0] - 1)
-        features = self.source.features
-        feature = np.asarray(features[self.frame])[
-            feature_cell(row, features.shape[1]), feature_cell(column, features.shape[2])
-        ]
-        flow, confidence, gap = self._flow(place, rng)
-        measured = (
-            direction.astype(np.float32),
-            self.depth[y, x],
-            self.slope[y, x],
-            self.color[row, column],
-            np.rint(feature.astype(np.float32) * 127).astype(np.int8),
-        )
-        measured += (self.mask[row, column], (pixel + flow).astype(np.float32), confidence, gap)
-        return Rays(
-            torch.full((len(place),), self.frame),
-            *(torch.from_numpy(np.ascontiguousarray(array)) for array in measured),
-        )
-
-    def _flow(
-        self, place: Int[np.ndarray, "ray 2"], rng: Generator
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return displacement, confidence and gap, one gap for all pixels of the frame."""
-        possible = [flow for flow in self.source.flows if self.frame < len(flow[1])]
-        if not possible:
-            return np.zeros((len(place), 2)), np.zeros(len(place), np.uint8), np.ones(len(place), np.int8)
-        gap, forward, confidence = possible[rng.integers(len(possible))]
-        row, column = (flow_cell(place[:, 0], forward.shape[1]), flow_cell(place[:, 1], forward.shape[2]))
-        found = np.asarray(forward[self.frame])[row, column].astype(np.float64)
-        return found, np.asarray(confidence[self.frame])[row, column], np.full(len(place), gap, np.int8)
+def _read_flow(source: RaySource, frame: int, place, rng: Generator):
+    """Return displacement, confidence and gap at pixels (row, column), one gap for all of a frame."""
+    possible = [flow for flow in source.flows if frame < len(flow[1])]
+    if not possible:
+        return np.zeros((len(place), 2)), np.zeros(len(place), np.uint8), np.ones(len(place), np.int8)
+    gap, forward, confidence = possible[rng.integers(len(possible))]
+    cell = flow_cell(place[:, 0], forward.shape[1]), flow_cell(place[:, 1], forward.shape[2])
+    found = np.asarray(forward[frame])[cell].astype(np.float64)
+    return found, np.asarray(confidence[frame])[cell], np.full(len(place), gap, np.int8)

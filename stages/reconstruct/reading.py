@@ -15,7 +15,7 @@ from pipeline.data.poses import RegisteredPoses
 from pipeline.data.templates import AgentCameras, SceneCameras, SkinTable
 from stages.reconstruct.assemble import AgentTemplate, RegisteredVideo
 from stages.reconstruct.config import PixelSampling
-from stages.reconstruct.rays import RaySource, collect, join
+from stages.reconstruct.rays import RaySource, RayStore, collect, join
 
 
 @dataclass(frozen=True)
@@ -45,79 +45,52 @@ class _Reader:
 
     def walkthrough(self, id: str) -> RegisteredVideo:
         """Read the walk-through, in which there is no agent."""
-        table = SceneCameras.open(self.inputs.scene_template)
+        table, source = SceneCameras.open(self.inputs.scene_template), self._source(id, masked=False)
         cameras = table.world_from_registered
-        source = RaySource(
-            Clip.open(self.inputs.frames[id]), features.open_features(self.inputs.features[id])
-        )
+        nowhere, certain = np.full_like(cameras, np.nan), np.ones(len(cameras))
         return RegisteredVideo(
-            id,
-            table.timestamp_s,
-            cameras,
-            np.full_like(cameras, np.nan),
-            np.ones(len(cameras)),
-            np.zeros(len(cameras), bool),
-            camera_free=False,
-            has_scene=True,
-            store=join([collect(source, self.sampling, self._rng(id))], self.scratch),
-            source=source,
-        )
+            id, table.timestamp_s, cameras, nowhere, certain, np.zeros(len(cameras), bool),
+            camera_free=False, has_scene=True, store=self._rays(id, source), source=source,
+        )  # fmt: skip
 
     def turnaround(self, id: str) -> RegisteredVideo:
-        """Read the turnaround; its world is the agent, so the root is the identity wherever the camera is
-        known.
-        """
-        table, source = AgentCameras.open(self.inputs.agent_template), self._masked(id, has_scene=False)
+        """Read the turnaround; its world is the agent: the root is the identity where the camera is known."""
+        table, source = AgentCameras.open(self.inputs.agent_template), self._source(id, has_scene=False)
         cameras = table.agent_from_registered
         known = np.all(np.isfinite(cameras), axis=(1, 2))
+        root = np.where(known[:, None, None], np.eye(4), np.nan)
         return RegisteredVideo(
-            id,
-            table.timestamp_s,
-            cameras,
-            np.where(known[:, None, None], np.eye(4), np.nan),
-            known.astype(float),
-            known,
-            camera_free=False,
-            has_scene=False,
-            store=join([collect(source, self.sampling, self._rng(id))], self.scratch),
-        )
+            id, table.timestamp_s, cameras, root, known.astype(float), known,
+            camera_free=False, has_scene=False, store=self._rays(id, source),
+        )  # fmt: skip
 
     def session(self, id: str) -> RegisteredVideo:
         """Read a registered session."""
         table = RegisteredPoses.open(self.inputs.registration / id)
         assert table is not None, f"{id} was refused"
-        source = self._masked(id, has_scene=True)
+        source = self._source(id)
         return RegisteredVideo(
-            id,
-            table.timestamp_s,
-            table.world_from_camera,
-            table.world_from_agent,
-            table.confidence,
-            table.agent_visible,
-            camera_free=True,
-            has_scene=True,
-            store=join([collect(source, self.sampling, self._rng(id))], self.scratch),
-            source=source,
-            agent_confidence=table.agent_confidence,
-        )
+            id, table.timestamp_s, table.world_from_camera, table.world_from_agent,
+            table.confidence, table.agent_visible, camera_free=True, has_scene=True,
+            store=self._rays(id, source), source=source, agent_confidence=table.agent_confidence,
+        )  # fmt: skip
 
-    def _masked(self, id: str, has_scene: bool) -> RaySource:
-        inputs = self.inputs
+    def _source(self, id: str, has_scene: bool = True, masked: bool = True) -> RaySource:
+        clip = Clip.open(self.inputs.frames[id])
+        feature = features.open_features(self.inputs.features[id])
+        if not masked:
+            return RaySource(clip, feature)
+        folder = self.inputs.flow[id]
         flows = tuple(
-            (gap, flow.open_flow(inputs.flow[id], gap), flow.open_confidence(inputs.flow[id], gap))
+            (gap, flow.open_flow(folder, gap), flow.open_confidence(folder, gap))
             for gap in flow.GAPS
-            if flow.path_of(inputs.flow[id], gap).exists()
+            if flow.path_of(folder, gap).exists()
         )
-        return RaySource(
-            Clip.open(inputs.frames[id]),
-            features.open_features(inputs.features[id]),
-            Masks.open(inputs.masks[id]),
-            flows,
-            has_scene,
-        )
+        return RaySource(clip, feature, Masks.open(self.inputs.masks[id]), flows, has_scene)
 
-    def _rng(self, id: str) -> np.random.Generator:
-        return np.random.default_rng([self.seed, *id.encode()])
+    def _rays(self, id: str, source: RaySource) -> RayStore:
+        rng = np.random.default_rng([self.seed, *id.encode()])
+        return join([collect(source, self.sampling, rng)], self.scratch)
 
 
 def read_videos(
@@ -141,18 +114,12 @@ def read_videos(
     Raises:
         InputError: RCN-001 when no session was registered.
     """
-    sessions = [
-        id
-        for id in sorted(inputs.frames)
-        if (inputs.registration / id / "poses.npz").exists() and (not only or id in only)
-    ]
+    registered = inputs.registration
+    sessions = [id for id in sorted(inputs.frames) if (registered / id / "poses.npz").exists()]
+    sessions = [id for id in sessions if not only or id in only]
     if not sessions:
-        raise InputError(
-            "RCN-001",
-            "no session was registered",
-            str(inputs.registration),
-            "see registration/summary.json for the reasons",
-        )
+        remedy = "see registration/summary.json for the reasons"
+        raise InputError("RCN-001", "no session was registered", str(registered), remedy)
     reader = _Reader(inputs, sampling, seed, scratch)
     if only is not None:
         return [reader.turnaround(turnaround), reader.session(sessions[0])]
@@ -164,9 +131,8 @@ def read_videos(
 def read_template(folder: Path) -> AgentTemplate:
     """Read the agent template."""
     skin, feature = SkinTable.open(folder), templates.read_vertex_features(folder)
-    return AgentTemplate(
-        ply.read_ply(folder / "agent.ply"), feature, skin.agent_from_bone_rest, skin.bone_scale_m
-    )
+    mesh = ply.read_ply(folder / "agent.ply")
+    return AgentTemplate(mesh, feature, skin.agent_from_bone_rest, skin.bone_scale_m)
 
 
 def read_floor(folder: Path) -> float:

@@ -1,7 +1,8 @@
-"""Read the results off a solved problem: motion per video, surfaces, skin, feature volume, track points."""
+"""Read the results off a solved problem and write them: motion, surfaces, skin, features, track points."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,9 +10,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from pipeline.data.motion import INTERPOLATED, Motion, gaps_s
-from pipeline.fields import marching_cubes
-from pipeline.geometry import rigid
+from pipeline.data import motion, ply
+from pipeline.data.motion import INTERPOLATED, TRACKS, Motion, gaps_s
+from pipeline.data.templates import SkinTable
+from pipeline.data.volumes import FEATURE_VOLUME
+from pipeline.fields import fields, marching_cubes
+from pipeline.fields.fields import Reconstruction
+from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh
 from stages.reconstruct.assemble import RegisteredVideo, scene_first
 from stages.reconstruct.problem import Problem
@@ -75,9 +80,7 @@ def bridged(
     bones: Float[np.ndarray, "frame bone 4 4"],
     good: Bool[np.ndarray, "frame"],
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame bone 4 4"]]:
-    """Interpolate poses between good frames and hold them before the first and after the last; roots are NaN
-    without any.
-    """
+    """Interpolate poses between good frames, held beyond the first and last; roots are NaN without any."""
     root, bones = root.copy(), bones.copy()
     if not good.any():
         root[:] = np.nan
@@ -90,9 +93,7 @@ def bridged(
 
 
 def scene_surface(problem: Problem) -> Mesh:
-    """Return the shared scene's surface in the world, metres, cut where nothing was measured within
-    `SEEN_WITHIN_M`.
-    """
+    """Return the shared scene's surface in the world, metres, cut where nothing was measured near."""
     mesh = marching_cubes.extract_scene(problem.scene, -1, problem.scene.lattice_m)
     near, _ = KDTree(measured_points(problem)).query(mesh.vertices, distance_upper_bound=SEEN_WITHIN_M)
     return marching_cubes.keep_vertices(mesh, np.isfinite(near))
@@ -116,9 +117,7 @@ def measured_points(problem: Problem) -> Float[np.ndarray, "point 3"]:
 
 @torch.no_grad()
 def feature_volume(problem: Problem) -> SceneFeatures:
-    """Sample the shared scene on a lattice of `VOXEL_M`: surface from its field, free space from measured
-    depth.
-    """
+    """Sample the shared scene on a lattice of `VOXEL_M`: surface by its field, free space by depth."""
     field = problem.scene
     low = np.floor(np.array(field.shape.low_m) / VOXEL_M) * VOXEL_M
     size = np.ceil((np.array(field.shape.high_m) - low) / VOXEL_M).astype(int)
@@ -128,9 +127,8 @@ def feature_volume(problem: Problem) -> SceneFeatures:
     distance = field.distance(encoded).cpu().numpy()
     feature = field.color_and_feature(encoded)[1].cpu().numpy()
     free = seen_free(problem, points).cpu().numpy()
-    measured = np.isfinite(
-        KDTree(measured_points(problem)).query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)[0]
-    )
+    near, _ = KDTree(measured_points(problem)).query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)
+    measured = np.isfinite(near)
     solid = (distance < 0.5 * VOXEL_M) & measured | (distance < 0) & ~free
     occupancy = np.where(solid, SURFACE, np.where(free, FREE, UNSEEN)).astype(np.uint8)
     features = np.where(measured & solid, feature.T, 0).astype(np.float16)
@@ -139,9 +137,7 @@ def feature_volume(problem: Problem) -> SceneFeatures:
 
 @torch.no_grad()
 def seen_free(problem: Problem, points_world: Float[Tensor, "point 3"]) -> Bool[Tensor, "point"]:
-    """Return which points some trusted camera saw through: measured depth at their pixel lies clearly behind
-    them.
-    """
+    """Return which points some trusted camera saw through: depth at their pixel lies clearly behind them."""
     views, frames = problem.store.views, torch.unique(problem.store.scene.frame).long()
     frames = frames[:: max(1, len(frames) // MOST_FRAMES)]
     camera_from_world = torch.linalg.inv(problem.motion.world_from_camera(frames).double()).float()
@@ -149,15 +145,11 @@ def seen_free(problem: Problem, points_world: Float[Tensor, "point 3"]) -> Bool[
     height, width = views.depth.shape[1:]
     for frame, matrix in zip(frames, camera_from_world, strict=True):
         camera = points_world @ matrix[:3, :3].T + matrix[:3, 3]
-        z = camera[:, 2].clamp_min(1e-3)
-        pixel = (camera[:, :2] / z[:, None]) @ views.intrinsics[frame, :2, :2].T + views.intrinsics[
-            frame, :2, 2
-        ]
-        cell = (pixel / THUMBNAIL).floor().long()
-        inside = (
-            (camera[:, 2] > NEAREST_M) & (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
-        )
-        depth = views.depth[frame][cell[:, 1].clamp(0, height - 1), cell[:, 0].clamp(0, width - 1)].float()
+        z, intrinsics = camera[:, 2].clamp_min(1e-3), views.intrinsics[frame]
+        cell = ((camera[:, :2] / z[:, None]) @ intrinsics[:2, :2].T + intrinsics[:2, 2]) / THUMBNAIL
+        inside = cameras.in_picture(cell, camera[:, 2], (height, width), NEAREST_M)
+        column, row = cell.floor().long().unbind(-1)
+        depth = views.depth[frame][row.clamp(0, height - 1), column.clamp(0, width - 1)].float()
         through |= inside & (depth > camera[:, 2] + 0.5 * VOXEL_M)
     return through
 
@@ -178,3 +170,31 @@ def track_points(
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(mesh.vertices - mesh.vertices[chosen[-1]], axis=-1))
     return np.array(chosen), mesh.vertices[chosen]
+
+
+def write(
+    folder: Path,
+    problem: Problem,
+    reconstruction: Reconstruction,
+    motions: Mapping[str, Motion],
+    sessions: Collection[str],
+) -> None:
+    """Write motion per video (the templates' apart), surfaces, skin, fields, feature volume, track points."""
+    (folder / "templates").mkdir()
+    for id, of_video in motions.items():
+        path = folder / id / "motion.npz" if id in sessions else folder / "templates" / f"{id}.npz"
+        path.parent.mkdir(exist_ok=True)
+        motion.save(path, of_video)
+    agent = agent_surface(problem)
+    ply.write_ply(folder / "scene.ply", scene_surface(problem))
+    ply.write_ply(folder / "agent.ply", agent)
+    body, skin = reconstruction.body, skin_weights(problem, agent)
+    rest, scale_m = (part.detach().cpu().numpy() for part in (body.agent_from_bone_rest, body.bone_scale_m))
+    SkinTable(skin, rest, scale_m).write(folder)
+    fields.save(folder, reconstruction)
+    volume = feature_volume(problem)
+    FEATURE_VOLUME.save(
+        folder / "feature_volume.npz", compress=True, voxel_m=np.asarray(VOXEL_M, np.float64), **vars(volume)
+    )
+    index, rest = track_points(agent)
+    TRACKS.save(folder / "tracks.npz", vertex_index=index, rest_agent=rest)

@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.core import devices, distributed, progress
 from pipeline.core.videos import Video
 from pipeline.fields.fields import Reconstruction
-from stages.reconstruct import assemble, former, fuse, optimise, pictures, reading, results, writing
+from stages.reconstruct import assemble, former, fuse, optimise, pictures, reading, results
 from stages.reconstruct.config import Config
 from stages.reconstruct.reading import Inputs
 
@@ -30,16 +30,12 @@ def run(
     if config.scene_geometry == "fused":
         fused = fuse.fuse_depth(registered, config.fusion, resume, workers)
     rendered = config.supervision == "rendered"
-    problem = assemble.build(
-        registered,
+    template, floor_m = (
         reading.read_template(inputs.agent_template),
-        config.fields,
-        config.seed,
-        device,
-        fused,
-        resume,
         reading.read_floor(inputs.scene_template),
-        rendered,
+    )
+    problem = assemble.build(
+        registered, template, config.fields, config.seed, device, fused, resume, floor_m, rendered
     )
     rays = problem.store
     progress.log(f"reconstruct: {len(problem.video)} frames, {len(rays.scene)} + {len(rays.agent)} rays")
@@ -53,12 +49,11 @@ def run(
     records = optimise.optimise(problem, plan)
     if not distributed.leave():
         return
-    reconstruction = Reconstruction(
-        problem.scene, problem.agent, problem.body, assemble.scene_ids(registered)
-    )
+    ids = assemble.scene_ids(registered)
+    reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, ids)
     motions = results.motions(problem, registered, config.certain_gap_s)
     sessions = {video.id: motions[video.id] for video in registered if video.camera_free}
-    writing.write(out, problem, reconstruction, motions, sessions)
+    results.write(out, problem, reconstruction, motions, sessions)
     pictures.report_quality(out, reconstruction, sessions, inputs.frames, inputs.masks, records)
 
 
@@ -70,13 +65,5 @@ def _read(
     only = None
     if config.sessions == "filmed_twice":
         only = [video.synchronized_with for video in videos if video.role == "heldout"]
-    return reading.read_videos(
-        inputs,
-        by_role["walkthrough"],
-        by_role["turnaround"],
-        config.sampling,
-        config.seed,
-        only,
-        scratch,
-        workers,
-    )
+    templates = by_role["walkthrough"], by_role["turnaround"]
+    return reading.read_videos(inputs, *templates, config.sampling, config.seed, only, scratch, workers)

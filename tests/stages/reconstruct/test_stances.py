@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from stages.reconstruct import assemble, optimise, stances
+from stages.reconstruct import assemble, optimise, posing
 from tests.stages.reconstruct.test_optimise import SHAPES, film_animal, plan, template
 
 FRAMES, SITS = 40, slice(20, 40)
@@ -15,20 +15,20 @@ HALF_M = np.array([0.1, 0.1, 0.3])
 def test_a_stance_must_be_sure_and_lasts():
     level, raised = np.full(6, 0.2), np.full(6, 0.2)
     raised[[1, 3, 4]] -= [0.05, 0.08, 0.08]
-    assert stances.most_likely(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
-    assert stances.most_likely(np.stack([level, level - stances.SURE], -1), 0.2).tolist() == [0] * 6
+    assert posing.most_likely(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
+    assert posing.most_likely(np.stack([level, level - posing.SURE], -1), 0.2).tolist() == [0] * 6
 
 
 def test_the_better_of_two_misfits_tells_nothing():
     loss = np.tile([0.8, 0.5], (6, 1))
-    assert stances.most_likely(loss, 0.39).tolist() == [0] * 6
-    assert stances.most_likely(loss, 0.5).tolist() == [1] * 6
+    assert posing.most_likely(loss, 0.39).tolist() == [0] * 6
+    assert posing.most_likely(loss, 0.5).tolist() == [1] * 6
     loss[2] = np.nan
-    assert stances.most_likely(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
+    assert posing.most_likely(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
 
 
 def test_parts_are_told_by_frame():
-    found = stances.by_frame(np.array([0, 1, 0]), 25)
+    found = posing.by_frame(np.array([0, 1, 0]), 25)
     assert found.tolist() == [0] * 10 + [1] * 10 + [0] * 5
 
 
