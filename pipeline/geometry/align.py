@@ -17,8 +17,7 @@ def kabsch(
     target: Float[np.ndarray, "*batch point 3"],
     weights: Float[np.ndarray, "*batch point"] | None = None,
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """Return ``target_from_source`` that minimises the weighted squared distance, without scale (Kabsch
-    1976)."""
+    """Return ``target_from_source`` of least weighted squared distance, without scale (Kabsch 1976)."""
     source, target = np.asarray(source, float), np.asarray(target, float)
     share = np.ones(source.shape[:-1]) if weights is None else np.asarray(weights, float)
     share = share / share.sum(-1, keepdims=True)

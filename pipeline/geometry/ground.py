@@ -1,5 +1,4 @@
-"""The level surface under something that stands on it, in a world with +y up; and where up is, by the planes
-of a room."""
+"""The level surface under what stands on it, in a world with +y up; and where up is, by a room's planes."""
 
 from dataclasses import dataclass
 

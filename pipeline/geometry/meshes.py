@@ -1,5 +1,4 @@
-"""Triangle meshes and rays: `Mesh` holds one, `RayCaster` answers ray queries with Embree, `render_view`
-draws depth."""
+"""Triangle meshes and rays: `Mesh`, `RayCaster` with Embree, and `render_view`, which draws depth."""
 
 from dataclasses import dataclass
 

@@ -10,8 +10,7 @@ from torch import Tensor
 
 
 def so3_exp(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Turn rotation vectors (radians) into matrices by Rodrigues' formula, with its Taylor series near
-    zero."""
+    """Turn rotation vectors (radians) into matrices: Rodrigues' formula, near zero its Taylor series."""
     return conversions.axis_angle_to_rotation_matrix(vector)
 
 

@@ -21,8 +21,7 @@ would be carved away."""
 
 
 class Volume:
-    """A dense grid of signed distance (positive in free space, in units of the truncation), weight and
-    colour."""
+    """A dense grid of signed distance (positive in free space, in truncations), weight and colour."""
 
     def __init__(
         self, origin: Float[np.ndarray, "3"], shape: tuple[int, int, int], voxel_m: float, truncation_m: float
@@ -66,8 +65,7 @@ class Volume:
         )
 
     def surface(self, least_weight: float) -> Mesh:
-        """Extract the zero crossing between voxels that were seen often enough; what was never seen stays
-        open."""
+        """Extract the zero crossing between voxels seen often enough; what was never seen stays open."""
         seen = self.weight > least_weight
         if not seen.any() or self.distance[seen].min() > 0:
             return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))

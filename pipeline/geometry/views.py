@@ -1,5 +1,4 @@
-"""Pictures of a scene for people: a bird's-eye view with paths drawn on it, and shaded views from any
-camera."""
+"""Pictures of a scene for people: a bird's-eye view with paths drawn on it, and shaded views."""
 
 from dataclasses import dataclass
 
@@ -43,8 +42,7 @@ class Overview:
 
 
 def bird_view(mesh: Mesh, *, floor_m: float, height_m: float = 1.7, width_px: int = 480) -> Overview:
-    """Look straight down at a mesh (+y up) from ``height_m`` above the floor, so that ceilings do not hide
-    the room."""
+    """Look straight down at a mesh (+y up) from ``height_m`` above the floor, below ceilings."""
     low, high = np.quantile(mesh.vertices[:, [0, 2]], EXTENT, axis=0)
     low, high = low - MARGIN_M, high + MARGIN_M
     meter_px = width_px / (high[0] - low[0])

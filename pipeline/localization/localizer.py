@@ -19,10 +19,15 @@ from torch import nn
 
 from pipeline.backends.descriptors import Describer
 from pipeline.geometry import align, rigid
-from pipeline.localization.patch_bank import PatchBank
-from pipeline.localization.patches import Describe, Patches, PatchSampling, PcaBasis, extract_patches
-from pipeline.localization.pose_regressor import PoseRegressor
-from pipeline.localization.scene_coordinates import SceneCoordinateNet
+from pipeline.localization.networks import PoseRegressor, SceneCoordinateNet
+from pipeline.localization.patches import (
+    Describe,
+    PatchBank,
+    Patches,
+    PatchSampling,
+    PcaBasis,
+    extract_patches,
+)
 
 Net = TypeVar("Net", bound=nn.Module)
 Kind = Literal["bank", "coordinates", "regression"]
@@ -48,12 +53,8 @@ class Calibration:
 
     def probability(self, inlier_ratio: Float[np.ndarray, "*any"] | float) -> Float[np.ndarray, "*any"]:
         """Return probabilities of inlier ratios."""
-        return 1.0 / (
-            1.0
-            + np.exp(
-                -np.clip(self.bias + self.slope * np.asarray(inlier_ratio, float), -LOGIT_LIMIT, LOGIT_LIMIT)
-            )
-        )
+        logit = self.bias + self.slope * np.asarray(inlier_ratio, float)
+        return 1.0 / (1.0 + np.exp(-np.clip(logit, -LOGIT_LIMIT, LOGIT_LIMIT)))
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,8 @@ class Localizer:
     ) -> list[PoseHypothesis]:
         """Return poses, best first; the scene's localizer gives at most one. Depth in metres; mask: where the
         target may be."""
-        patches = extract_patches(
-            color, depth, depth_intrinsics, intrinsics, mask, self.sampling, self.describe
-        )
+        lenses = depth_intrinsics, intrinsics
+        patches = extract_patches(color, depth, *lenses, mask, self.sampling, self.describe)
         return [] if patches is None else self.localize_patches(patches)
 
     def localize_patches(self, patches: Patches) -> list[PoseHypothesis]:
@@ -128,9 +128,8 @@ class Localizer:
                 answers = [self._regressed(patches, *net.regress(query, patches.cell, self._anchor(patches)))]
             case _:
                 assert_never(self.model)
-        return sorted(
-            (answer for answer in answers if answer is not None), key=lambda answer: -answer.inlier_ratio
-        )
+        found = [answer for answer in answers if answer is not None]
+        return sorted(found, key=lambda answer: -answer.inlier_ratio)
 
     def _solve(self, patches, matched, weight) -> PoseHypothesis | None:
         solver = self.solver
@@ -145,9 +144,8 @@ class Localizer:
         )
         if inlier.sum() < LEAST_INLIERS:
             return None
-        return self._hypothesis(
-            map_from_camera, float(inlier.mean()), matched[inlier], patches.points_camera[inlier]
-        )
+        ratio, points_camera = float(inlier.mean()), patches.points_camera[inlier]
+        return self._hypothesis(map_from_camera, ratio, matched[inlier], points_camera)
 
     def _anchor(self, patches) -> Float[np.ndarray, "3"]:
         """Return the point whose position a regressor predicts: the camera's centre, or the middle of the
@@ -159,9 +157,8 @@ class Localizer:
         return self._hypothesis(map_from_camera, certainty, rigid.apply(map_from_camera, some), some)
 
     def _hypothesis(self, map_from_camera, ratio, points_map, points_camera) -> PoseHypothesis:
-        return PoseHypothesis(
-            map_from_camera, ratio, float(self.calibration.probability(ratio)), points_map, points_camera
-        )
+        probability = float(self.calibration.probability(ratio))
+        return PoseHypothesis(map_from_camera, ratio, probability, points_map, points_camera)
 
 
 def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample"]) -> Calibration:
@@ -199,10 +196,8 @@ def save(folder: Path, localizer: Localizer, report: dict) -> None:
         case _:
             assert_never(localizer.model)
     basis = {f"basis.{name}": value for name, value in vars(localizer.basis).items()}
-    save_file(
-        {name: np.ascontiguousarray(value) for name, value in (arrays | basis).items()},
-        folder / "localizer.safetensors",
-    )
+    contiguous = {name: np.ascontiguousarray(value) for name, value in (arrays | basis).items()}
+    save_file(contiguous, folder / "localizer.safetensors")
     table = {"kind": kind, "arguments": arguments, "held_out": report}
     parts = ("sampling", "solver", "calibration", "describer")
     table |= {name: asdict(getattr(localizer, name)) for name in parts}
@@ -210,8 +205,7 @@ def save(folder: Path, localizer: Localizer, report: dict) -> None:
 
 
 def load(folder: Path, device: str = "cpu") -> Localizer:
-    """Open a trained localizer; a descriptor network runs on ``device``. Raises InputError MOD-001 to
-    MOD-003."""
+    """Open a trained localizer, a descriptor network on ``device``. Raises InputError MOD-001 to MOD-003."""
     table = json.loads((folder / "localizer.json").read_text())
     arrays = load_file(folder / "localizer.safetensors")
     basis = PcaBasis(arrays.pop("basis.mean"), arrays.pop("basis.components"))
@@ -228,9 +222,8 @@ def load(folder: Path, device: str = "cpu") -> Localizer:
     sampling = PatchSampling(**{**table["sampling"], "radii_px": tuple(table["sampling"]["radii_px"])})
     calibration, solver = Calibration(**table["calibration"]), RansacSolver(**table["solver"])
     describer = Describer(**table["describer"])
-    return Localizer(
-        sampling, basis, model, calibration, solver, describer, open_describer(describer, device)
-    )
+    describe = open_describer(describer, device)
+    return Localizer(sampling, basis, model, calibration, solver, describer, describe)
 
 
 def open_describer(describer: Describer, device: str) -> Describe | None:

@@ -1,7 +1,7 @@
 """From a picture with depth to patches: resized to one scale, described by DAISY or DINOv2, lifted by depth.
 
-`extract_patches` treats one picture; `PcaBasis` reduces its descriptors. Views of the agent are scaled by
-their depth.
+`extract_patches` treats one picture, `PcaBasis` reduces its descriptors, `PatchBank` finds the nearest
+neighbours among patches of rendered views. Views of the agent are scaled by their depth.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from typing import Literal, assert_never
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from pipeline.geometry import cameras
 
@@ -32,6 +32,10 @@ KEYPOINT_PX = 8.0
 BASIS_SAMPLES = 20_000
 """Descriptors that fit the principal axes."""
 LEAST_NORM = 1e-6
+BLOCK = 4096
+"""Patches of the bank compared at once: their similarities stay in the processor's cache."""
+LEAST_SIMILARITY = 0.05
+"""Cosine similarities below count as this, so that every match keeps some weight."""
 
 
 @dataclass(frozen=True)
@@ -84,22 +88,61 @@ def fit_pca(descriptors: Float[np.ndarray, "patch channel"], axes: int, rng: np.
     return PcaBasis(mean.astype(np.float32), components)
 
 
+@dataclass(frozen=True)
+class PatchBank:
+    """All patches of all rendered views."""
+
+    descriptors: Float[np.ndarray, "patch axis"]
+    """Unit length."""
+    points_map: Float[np.ndarray, "patch 3"]
+    """Metres."""
+    view: Int[np.ndarray, "patch"]
+    map_from_camera: Float[np.ndarray, "view 4 4"]
+
+    def match(
+        self, query: Float[np.ndarray, "query axis"], part: Int[np.ndarray, "part"] | None = None
+    ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
+        """Return the map's point of each query's nearest neighbour and its weight (squared cosine), among all
+        or some."""
+        descriptors, points = self.descriptors, self.points_map
+        if part is not None:
+            descriptors, points = descriptors[part], points[part]
+        nearest, similarity = np.zeros(len(query), int), np.full(len(query), -np.inf, np.float32)
+        for first in range(0, len(descriptors), BLOCK):
+            table = query @ descriptors[first : first + BLOCK].T
+            best = table.argmax(1)
+            score = table[np.arange(len(query)), best]
+            nearest = np.where(score > similarity, best + first, nearest)
+            similarity = np.maximum(similarity, score)
+        return points[nearest].astype(float), np.clip(similarity, LEAST_SIMILARITY, 1).astype(float) ** 2
+
+    def sectors(self, count: int) -> list[Int[np.ndarray, "part"]]:
+        """Split the patches by the azimuth their view was taken from."""
+        eye = self.map_from_camera[:, :3, 3]
+        sector = np.floor((np.arctan2(eye[:, 0], eye[:, 2]) / (2 * np.pi) + 0.5) * count).astype(int) % count
+        return [np.flatnonzero(sector[self.view] == index) for index in range(count)]
+
+    def arrays(self) -> dict[str, Shaped[np.ndarray, "..."]]:
+        """Return the arrays to store."""
+        return vars(self) | {"descriptors": self.descriptors.astype(np.float16)}
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, Shaped[np.ndarray, "..."]]) -> "PatchBank":
+        """Rebuild a bank from stored arrays."""
+        return PatchBank(**arrays | {"descriptors": arrays["descriptors"].astype(np.float32)})
+
+
 def describe_daisy(
     picture: UInt8[np.ndarray, "height width 3"], sampling: PatchSampling
 ) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
-    """Return DAISY descriptors on the grid of a resized picture and their centres, pixels (Tola et al.
-    2010)."""
+    """Return DAISY descriptors on a resized picture's grid and their centres, pixels (Tola et al. 2010)."""
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     offset = sampling.stride_px // 2
     y, x = np.mgrid[offset : gray.shape[0] : sampling.stride_px, offset : gray.shape[1] : sampling.stride_px]
     pixel = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float32)
     keypoints = [cv2.KeyPoint(float(column), float(row), KEYPOINT_PX) for column, row in pixel]
-    parts = [
-        cv2.xfeatures2d.DAISY.create(radius, 2, 6, 8, cv2.xfeatures2d.DAISY_NRM_PARTIAL).compute(
-            gray, keypoints
-        )[1]
-        for radius in sampling.radii_px
-    ]
+    create, norm = cv2.xfeatures2d.DAISY.create, cv2.xfeatures2d.DAISY_NRM_PARTIAL
+    parts = [create(radius, 2, 6, 8, norm).compute(gray, keypoints)[1] for radius in sampling.radii_px]
     return np.concatenate(parts, axis=1), pixel + 0.5
 
 
@@ -180,7 +223,6 @@ def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
 
 
 def _lift(pixel, depth, depth_intrinsics, intrinsics):
-    """Lift colour pixels to camera axes by the depth image, whose camera is the same; z = 0 where depth is
-    unknown."""
+    """Lift colour pixels to camera axes by depth of the same camera centre; z = 0 where it is unknown."""
     ray = cameras.unproject(pixel, intrinsics)
     return ray * cameras.read_depth(depth, depth_intrinsics, ray)[:, None]

@@ -1,6 +1,5 @@
 """Summarise what was registered and what was rejected, and draw all paths into one picture."""
 
-import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -9,7 +8,10 @@ from jaxtyping import UInt8
 
 from pipeline.data.poses import RegisteredPoses
 from pipeline.data.qa import Check
+from pipeline.geometry import views
 
+EDGE_PX, MARGIN_PX = 560, 20
+"""Size of the picture of all paths, and what is left free around them."""
 COLORS = ((220, 60, 50), (50, 110, 210), (60, 160, 80), (200, 140, 30), (140, 80, 180), (40, 160, 170))
 
 
@@ -56,38 +58,20 @@ def checks(outcomes: list[SessionOutcome]) -> list[Check]:
     ]
 
 
-def paths(outcomes: list[SessionOutcome], edge_px: int = 560) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw all registered paths from above in one picture: phones thin, animals thick, one colour a
-    recording."""
-    known = [outcome for outcome in outcomes if outcome.poses is not None]
-    image = np.full((edge_px, edge_px, 3), 252, np.uint8)
+def paths(outcomes: list[SessionOutcome]) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw all registered paths from above: phones thin, animals thick, one colour a recording."""
+    image = np.full((EDGE_PX, EDGE_PX, 3), views.BACKGROUND, np.uint8)
+    known = {each.video: each.poses for each in outcomes if each.poses is not None}
     if not known:
         return image
-    ground = {
-        outcome.video: [
-            pose[:, [0, 2], 3] for pose in (outcome.poses.world_from_camera, outcome.poses.world_from_agent)
-        ]
-        for outcome in known
-        if outcome.poses is not None
-    }
-    everything = np.concatenate([points for pair in ground.values() for points in pair])
-    low, high = np.nanmin(everything, axis=0), np.nanmax(everything, axis=0)
-    scale = (edge_px - 40) / max(float((high - low).max()), 0.1)
-    for index, (video, pair) in enumerate(ground.items()):
-        color = COLORS[index % len(COLORS)]
-        for points, thickness in zip(pair, (1, 3), strict=True):
-            pixel = (points - low) * scale + 20
-            for start, end in itertools.pairwise(pixel):
-                if np.isfinite(start).all() and np.isfinite(end).all():
-                    cv2.line(
-                        image,
-                        tuple(np.round(start).astype(int).tolist()),
-                        tuple(np.round(end).astype(int).tolist()),
-                        color,
-                        thickness,
-                        cv2.LINE_AA,
-                    )
-        cv2.putText(
-            image, video, (10, 18 + 16 * index), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, 1, cv2.LINE_AA
-        )
+    pairs = {video: (poses.world_from_camera, poses.world_from_agent) for video, poses in known.items()}
+    ground = np.concatenate([each[:, [0, 2], 3] for pair in pairs.values() for each in pair])
+    low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
+    meter_px = (EDGE_PX - 2 * MARGIN_PX) / max(float((high - low).max()), 0.1)
+    overview = views.Overview(image, low - MARGIN_PX / meter_px, meter_px)
+    for index, (video, (cameras, agents)) in enumerate(pairs.items()):
+        color, place = COLORS[index % len(COLORS)], (10, 16 * (index + 1))
+        overview.draw(cameras[:, :3, 3], color, 1)
+        overview.draw(agents[:, :3, 3], color, 3)
+        cv2.putText(image, video, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, 1, cv2.LINE_AA)
     return image

@@ -1,2 +1,1 @@
-"""Register one session to the scene template: frame votes, one motion per video, pose graph, alignment, agent
-roots."""
+"""Register one session to the scene template: votes, one motion per video, alignment, agent roots."""

@@ -17,8 +17,6 @@ from pipeline.geometry import cameras, contact, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
 
 UP = np.array([0.0, 1.0, 0.0])
-
-
 POINTS, MODEL_POINTS = 220, 700
 """Depth points per frame and vertices of the template that are used; more fit no better."""
 COARSE_ROUNDS, FIRST_REACH_M, REACH_M = 5, 0.18, 0.07
@@ -99,25 +97,14 @@ class AgentObservation:
 
 def make_model(mesh: Mesh, rng: np.random.Generator) -> AgentModel:
     """Subsample the template evenly by area."""
-    normals = mesh.vertex_normals()
-    area = mesh.face_areas()
-    weight = np.bincount(mesh.faces.ravel(), np.repeat(area, 3), len(mesh.vertices))
-    chosen = np.sort(
-        rng.choice(
-            len(mesh.vertices), min(MODEL_POINTS, (weight > 0).sum()), replace=False, p=weight / weight.sum()
-        )
-    )
+    weight = np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas(), 3), len(mesh.vertices))
+    count = min(MODEL_POINTS, (weight > 0).sum())
+    chosen = np.sort(rng.choice(len(mesh.vertices), count, replace=False, p=weight / weight.sum()))
     points = mesh.vertices[chosen].astype(float)
     color = np.full((len(chosen), 3), 0.5) if mesh.color is None else mesh.color[chosen] / 255.0
     extent = np.ptp(points[:, [0, 2]], axis=0)
-    return AgentModel(
-        points,
-        normals[chosen],
-        color,
-        KDTree(points),
-        float(extent.max()),
-        float(-np.quantile(points[:, 1], 0.01)),
-    )
+    stand_m, normals = float(-np.quantile(points[:, 1], 0.01)), mesh.vertex_normals()[chosen]
+    return AgentModel(points, normals, color, KDTree(points), float(extent.max()), stand_m)
 
 
 def observe(
@@ -149,8 +136,7 @@ def observe(
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1) < RADIUS * model.length_m
     if near.sum() < LEAST_POINTS:
         return None
-    points = points[near]
-    points = points[subsampling.evenly(len(points), POINTS)]
+    points = points[near][subsampling.evenly(near.sum(), POINTS)]
     pixel, z = cameras.project(points, clip.intrinsics[frame])
     limit = np.array(mask.shape[::-1]) - 1
     column, row = np.clip(pixel.astype(int), 0, limit).T
@@ -273,12 +259,11 @@ class PriorFit:
 def fit_near(observation: AgentObservation, model: AgentModel, prior: PosePrior, *, rounds: int) -> PriorFit:
     """Fit from a predicted pose, standing or not, whichever costs less."""
     reach, start = np.full(rounds, REACH_M), prior.world_from_agent[None]
-    poses = np.concatenate(
-        [
-            _fit(observation, model, start, reach, TILT_SIGMA_RAD, stands=stands, near=prior)
-            for stands in (True, False)
-        ]
+    fits = (
+        _fit(observation, model, start, reach, TILT_SIGMA_RAD, stands=stands, near=prior)
+        for stands in (True, False)
     )
+    poses = np.concatenate(list(fits))
     own = cost(observation, model, poses)
     total = own + LEAVING_COST_M * (prior.twist(poses) ** 2).sum(-1)
     best = int(total.argmin())
@@ -304,13 +289,11 @@ def _fit(observation, model, world_from_agent, reaches, prior, *, stands=True, n
 
 
 def _normal_equations(local, target, normal, weight):
-    """Sum plane and point terms over the points; the twist moves the body, so it moves points the other
-    way."""
+    """Sum plane and point terms; the twist moves the body, so it moves points the other way."""
     gap = local - target
     curvature, gradient = np.zeros((6, 6)), np.zeros(6)
-    for direction, share in [(normal, 1.0)] + [
-        (np.broadcast_to(axis, gap.shape), POINT_SHARE) for axis in np.eye(3)
-    ]:
+    axes = [(np.broadcast_to(axis, gap.shape), POINT_SHARE) for axis in np.eye(3)]
+    for direction, share in [(normal, 1.0), *axes]:
         jacobian = -np.concatenate([np.cross(local, direction), direction], axis=-1)
         residual = (gap * direction).sum(-1)
         scaled = jacobian * (share * weight)[..., None]
@@ -344,19 +327,16 @@ def _keep_standing(placed, curvature, gradient, standing_m):
 def cost(
     observation: AgentObservation, model: AgentModel, world_from_agent: Float[np.ndarray, "pose 4 4"]
 ) -> Float[np.ndarray, "pose"]:
-    """Return the cost of each pose, metres: truncated distance of points, colour difference, template outside
-    the mask."""
+    """Return each pose's cost, metres: truncated distance, colour difference, template outside the mask."""
     local = rigid.apply(rigid.inverse(world_from_agent), observation.points_world[None])
     distance, nearest = model.tree.query(local)
     seen, expected = observation.color - observation.color.mean(0), model.color[nearest]
     shade = np.abs(seen - (expected - expected.mean(1, keepdims=True))).mean((1, 2))
-    geometry = np.minimum(distance, TRUNCATION * REACH_M).mean(1)
     height = np.nan_to_num(world_from_agent[:, 1, 3] - observation.standing_m)
     lifted = height**2 / (height**2 + STAND_REACH_M**2)
-    geometry = geometry + STAND_COST_M * lifted
-    return (
-        geometry + COLOR_WEIGHT_M * shade + OUTSIDE_WEIGHT_M * _outside(observation, model, world_from_agent)
-    )
+    geometry = np.minimum(distance, TRUNCATION * REACH_M).mean(1) + STAND_COST_M * lifted
+    outside = _outside(observation, model, world_from_agent)
+    return geometry + COLOR_WEIGHT_M * shade + OUTSIDE_WEIGHT_M * outside
 
 
 def _outside(observation, model, world_from_agent):

@@ -27,8 +27,7 @@ COST_SCALE_M = 0.004
 FINE_ROUNDS = 12
 """Gauss-Newton steps of the hypotheses that remain."""
 LOCALIZER_EVERY_FRAMES, LOCALIZER_WEIGHT = 2, 8.0
-"""The agent's localizer is queried in one visible frame of so many; a certain pose of it is worth so many
-units of cost."""
+"""The agent's localizer is queried in one visible frame of so many; a certain pose is worth so many units."""
 MOST_LOCALIZED, LOCALIZER_SIGMA_RAD = 2, float(np.deg2rad(30.0))
 """Poses of the localizer that become hypotheses, and spread of the bonus around their heading, radians."""
 SMOOTHING_PASSES, SMOOTHING_REACH = 2, 3
@@ -54,9 +53,8 @@ class Roots:
     @staticmethod
     def unseen(frames: int) -> "Roots":
         """Return roots of a recording without a visible animal."""
-        return Roots(
-            np.full((frames, 4, 4), np.nan), np.zeros(frames, bool), np.full(frames, np.nan), np.zeros(frames)
-        )
+        none, unknown = np.zeros(frames), np.full(frames, np.nan)
+        return Roots(np.full((frames, 4, 4), np.nan), none > 0, unknown, none)
 
 
 def find_roots(
@@ -90,8 +88,7 @@ def find_roots(
         pose = agent_fit.fit_fine(observation, model, start, rounds=FINE_ROUNDS, tilt=True)
         poses[frame], share[frame] = pose[0], observation.share
         cost[frame] = agent_fit.cost(observation, model, pose)[0]
-    tracked = Tracker(clip.timestamp_s, poses, cost, share, observe, model).track()
-    poses, cost = tracked.world_from_agent, tracked.cost_m
+    poses, cost = Tracker(clip.timestamp_s, poses, cost, share, observe, model).track()
     smoothed = smooth(clip.timestamp_s, poses, cost, share, config.smooth_s)
     return Roots(smoothed, np.isfinite(cost), cost, share)
 
@@ -107,14 +104,9 @@ def _hypotheses(
     """Fit from all headings and from the localizer's poses; keep the best that differ."""
     start, answers = agent_fit.initial_poses(observation, model, config.headings), []
     if index % LOCALIZER_EVERY_FRAMES == 0:
-        frame = observation.frame
-        answers = localizer.localize(
-            clip.color(frame),
-            observation.depth,
-            clip.depth_intrinsics[frame],
-            clip.intrinsics[frame],
-            observation.mask,
-        )
+        frame, depth = observation.frame, observation.depth
+        lenses = clip.depth_intrinsics[frame], clip.intrinsics[frame]
+        answers = localizer.localize(clip.color(frame), depth, *lenses, observation.mask)
     localized = [
         upright(observation.world_from_camera @ rigid.inverse(answer.map_from_camera))
         for answer in answers[:MOST_LOCALIZED]
@@ -177,10 +169,8 @@ def smooth(
                 / (1 + outlier**2)
                 * np.exp(-(cost_m[index] - best) / COST_DECAY_M)
             )
-            moment = np.array(
-                [weight.sum(), (weight * gap).sum(), (weight * gap**2).sum() + SLOPE_RIDGE_S2 * weight.sum()]
-            )
-            slope = moment[2] - moment[1] * gap
-            filtered = weight * slope / max(moment[0] * moment[2] - moment[1] ** 2, 1e-12)
+            total, first = weight.sum(), (weight * gap).sum()
+            second = (weight * gap**2).sum() + SLOPE_RIDGE_S2 * total
+            filtered = weight * (second - first * gap) / max(total * second - first**2, 1e-12)
             result[frame] = before[frame] @ rigid.exp(filtered @ offset)
     return result

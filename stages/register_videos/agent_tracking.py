@@ -28,14 +28,6 @@ ROUNDS = 12
 """Gauss-Newton steps."""
 
 
-@dataclass(frozen=True)
-class TrackedRoots:
-    """Roots of the frames that stand by themselves or are tracked from one that does; NaN elsewhere."""
-
-    world_from_agent: Float[np.ndarray, "frame 4 4"]
-    cost_m: Float[np.ndarray, "frame"]
-
-
 def excess(cost_m: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
     """Return by how much each cost exceeds the usual one, metres; infinite where there is none."""
     known = np.isfinite(cost_m)
@@ -62,15 +54,16 @@ class Tracker:
     observe: Callable[[int], AgentObservation | None]
     model: AgentModel
 
-    def track(self) -> TrackedRoots:
+    def track(self) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
         """Track through the frames that do not stand by themselves, forward and backward.
 
-        Of both directions the one of least cost is taken. It replaces the frame's own pose unless that fits
-        better by more than `WORSE_M`. What no direction reaches is not placed: it may be wrong.
+        Returns roots and their costs, NaN where none is placed. Of both directions the one of least cost is
+        taken. It replaces the frame's own pose unless that fits better by more than `WORSE_M`. What no
+        direction reaches is not placed: it may be wrong.
         """
         seen = np.flatnonzero(np.isfinite(self.cost_m))
         if not len(seen):
-            return TrackedRoots(self.world_from_agent, self.cost_m)
+            return self.world_from_agent, self.cost_m
         enough = min(SURE_SHARE, float(np.median(self.share[seen])))
         stands = (self.share >= enough) & (excess(self.cost_m) <= WORSE_M)
         found: dict[int, PriorFit] = {}
@@ -84,7 +77,7 @@ class Tracker:
             alone = fit.cost_m >= self.cost_m[frame] + WORSE_M
             poses[frame] = self.world_from_agent[frame] if alone else fit.world_from_agent
             costs[frame] = self.cost_m[frame] if alone else fit.cost_m
-        return TrackedRoots(poses, costs)
+        return poses, costs
 
     def _sweep(
         self, order: Int[np.ndarray, "seen"], stands: Bool[np.ndarray, "frame"]

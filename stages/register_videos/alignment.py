@@ -21,7 +21,7 @@ from pipeline.mapping.pose_optimization import Correspondences, RelativePoseFact
 from stages.register_videos.config import AlignmentConfig
 from stages.register_videos.feature_alignment import FeatureMap, feature_correspondences
 from stages.register_videos.flow_alignment import flow_correspondences
-from stages.register_videos.votes import Votes
+from stages.register_videos.votes import FrameVotes
 
 MOST_POINTS, LEAST_POINTS = 400_000, 40
 """Depth points of a recording that take part, so that memory stays bounded, and least number per frame."""
@@ -50,7 +50,6 @@ class AlignedCameras:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     pose_covariance: Float[np.ndarray, "frame 6 6"]
     """Covariance of each camera's right-hand twist (rotation in radians, translation in metres)."""
-    scans: list[depth_scans.Scan]
     gap_m: Float[np.ndarray, "frame"]
     """Median distance of the static depth from the surface; NaN where nothing was in reach."""
     fit: Float[np.ndarray, "frame"]
@@ -75,12 +74,11 @@ def align(
     features: FeatureMap | None,
     world_from_camera: Float[np.ndarray, "frame 4 4"],
     odometry: RelativePoseFactors,
-    votes: Votes,
+    votes: FrameVotes,
     supports: Bool[np.ndarray, "vote"],
     config: AlignmentConfig,
 ) -> AlignedCameras:
-    """Optimize all frames: votes and odometry, then depth from coarse to fine, then flow, then features as
-    well."""
+    """Optimize all frames: votes and odometry, then depth from coarse to fine, then flow, then features."""
     surface, frames = depth_scans.SurfaceMap(caster.mesh), np.arange(len(clip))
     most = max(MOST_POINTS // len(clip), LEAST_POINTS)
     scans = [
@@ -118,7 +116,7 @@ def align(
     covariance = pose_optimization.marginal_covariance(
         poses, find(poses, LAST_REACH_M), odometry, LAST_REACH_M
     )
-    return AlignedCameras(poses, covariance, scans, *measure_fit(surface, scans, poses))
+    return AlignedCameras(poses, covariance, *measure_fit(surface, scans, poses))
 
 
 def keep(
@@ -137,14 +135,12 @@ def keep(
     found = (flow_correspondences(clip, masks, caster, frame, world_from_camera[frame]) for frame in chosen)
     ties = [tie for tie in found if tie is not None]
     unknown = np.full(len(clip), np.nan)
-    scans = [depth_scans.Scan(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))] * len(clip)
-    if not ties:
-        wide = np.repeat(np.eye(6)[None], len(clip), axis=0)
-        return AlignedCameras(world_from_camera, wide, scans, unknown, unknown)
-    covariance = pose_optimization.marginal_covariance(
-        world_from_camera, Correspondences.join(*ties), odometry, LAST_REACH_M
-    )
-    return AlignedCameras(world_from_camera, covariance, scans, unknown, unknown)
+    covariance = np.repeat(np.eye(6)[None], len(clip), axis=0)
+    if ties:
+        covariance = pose_optimization.marginal_covariance(
+            world_from_camera, Correspondences.join(*ties), odometry, LAST_REACH_M
+        )
+    return AlignedCameras(world_from_camera, covariance, unknown, unknown)
 
 
 def measure_fit(

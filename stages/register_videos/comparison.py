@@ -1,4 +1,4 @@
-"""A recorded picture beside the template rendered from its pose, at half size."""
+"""A recorded picture beside the template rendered from its pose, at half size, and how alike they are."""
 
 from dataclasses import dataclass
 
@@ -16,8 +16,13 @@ LEAST_VARIANCE = 9.0
 """Variance of grey values below which a neighbourhood is noise."""
 GREY, CONTRAST = 128, 48
 """Grey value of the local mean, and grey values per standard deviation."""
-LEAST_SHARE = 1e-3
+SHARE_FLOOR = 1e-3
 """Added to the share of known pixels in a neighbourhood."""
+FITS_M, LEAST_SHARE = 0.05, 0.1
+"""Pixels are correlated where depth and rendering agree within the first, metres; frames with a smaller share
+of such pixels have no score."""
+SOFTNESS_PX, LEAST_NORM = 1.5, 1e-9
+"""Blur before the correlation, half-size pixels: the template's colours are that soft."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +55,10 @@ def compare(
 def local_contrast_normalization(
     color: Num[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Remove differences of light: grey minus its local mean over its local deviation (Jarrett et al.
-    2009)."""
+    """Remove differences of light: grey minus its local mean over its deviation (Jarrett et al. 2009)."""
     gray = cv2.cvtColor(color.astype(np.float32), cv2.COLOR_RGB2GRAY)
     weight = known.astype(np.float32)
-    share = _blur(weight) + LEAST_SHARE
+    share = _blur(weight) + SHARE_FLOOR
     mean = _blur(gray * weight) / share
     deviation = np.sqrt(np.maximum(_blur((gray - mean) ** 2 * weight) / share, LEAST_VARIANCE))
     return np.clip(GREY + CONTRAST * (gray - mean) / deviation * weight, 0, 255).astype(np.uint8)
@@ -62,3 +66,22 @@ def local_contrast_normalization(
 
 def _blur(picture):
     return cv2.GaussianBlur(picture, (0, 0), BLUR_PX)
+
+
+def ncc(
+    clip: Clip, masks: Masks, caster: RayCaster, frame: int, world_from_camera: Float[np.ndarray, "4 4"]
+) -> float:
+    """Return the normalized cross-correlation, -1..1, of one frame with its rendering where both have the
+    same shape, for flats differ only in looks; NaN where too little is comparable."""
+    pair = compare(clip, masks, caster, frame, world_from_camera)
+    depth = cv2.resize(clip.depth(frame), pair.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    same = pair.known & (np.abs(depth - pair.depth) < FITS_M)
+    if same.mean() < LEAST_SHARE:
+        return np.nan
+    normalized = [
+        local_contrast_normalization(picture, pair.known).astype(np.float64)
+        for picture in (pair.rendered, pair.recorded)
+    ]
+    first, second = (cv2.GaussianBlur(each, (0, 0), SOFTNESS_PX)[same] for each in normalized)
+    first, second = first - first.mean(), second - second.mean()
+    return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), LEAST_NORM))

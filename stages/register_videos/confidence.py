@@ -15,18 +15,15 @@ from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import RayCaster
 from stages.register_videos.agent_roots import Roots
 from stages.register_videos.agent_tracking import excess
+from stages.register_videos.comparison import ncc
 from stages.register_videos.config import ConfidenceConfig
-from stages.register_videos.ncc import ncc
 
 NEAR_RAD, NEAR_M = np.deg2rad(2.0), 0.05
 """Within which a camera's pose counts as right."""
-
-
 DECOY_SIZE = (1.5, 10.0)
 """Decoys are wrong by between these multiples of `NEAR_RAD` or `NEAR_M`."""
 ATTEMPTS = 3
-"""A frame is held against the best of so many decoys, since alignment has taken the best pose that it could
-reach."""
+"""A frame is held against the best of so many decoys, since alignment took the best pose in reach."""
 AVERAGING_S = 1.0
 """Time constant over which scores are averaged, seconds: neighbouring poses err together."""
 UNANCHORED = 0.2
@@ -59,20 +56,15 @@ def score_appearance(
     rng: np.random.Generator,
 ) -> NccScores:
     """Score frames against renderings from their poses and from poses that are wrong on purpose (decoys)."""
-
     chosen = subsampling.evenly(len(clip), max(len(clip) // config.every_frames, LEAST_SCORED))
     wrong = rng.integers(0, len(clip), config.decoys)
-    twist = rigid.exp(_wrong_twists(config.decoys, rng))
-    return NccScores(
-        chosen,
-        np.array([ncc(clip, masks, caster, int(frame), world_from_camera[frame]) for frame in chosen]),
-        np.array(
-            [
-                ncc(clip, masks, caster, int(frame), world_from_camera[frame] @ off)
-                for frame, off in zip(wrong, twist, strict=True)
-            ]
-        ),
-    )
+    decoys = world_from_camera[wrong] @ rigid.exp(_wrong_twists(config.decoys, rng))
+
+    def scored(frames, poses) -> Float[np.ndarray, "_"]:
+        pairs = zip(frames.tolist(), poses, strict=True)
+        return np.array([ncc(clip, masks, caster, frame, pose) for frame, pose in pairs])
+
+    return NccScores(chosen, scored(chosen, world_from_camera[chosen]), scored(wrong, decoys))
 
 
 def _wrong_twists(count, rng):
@@ -102,8 +94,7 @@ def camera_confidence(
     anchored: Bool[np.ndarray, "frame"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "frame"]:
-    """Return P(camera within 2 deg and 5 cm): by its covariance, times that of the right place by
-    appearance."""
+    """Return P(camera within 2 deg and 5 cm): by its covariance, times P(right place) by appearance."""
     return near_probability(pose_covariance, rng) * appearance * np.where(anchored, 1.0, UNANCHORED)
 
 
@@ -143,8 +134,7 @@ def averaged(
     values: Float[np.ndarray, "known"],
     sigma_s: float,
 ) -> Float[np.ndarray, "frame"]:
-    """Average values known at some times with Gaussian weights, cut at four sigma; NaN beyond. Linear in the
-    frames."""
+    """Average values known at some times with Gaussian weights, cut at four sigma; NaN beyond."""
     low = np.searchsorted(known_s, timestamp_s - 4 * sigma_s)
     high = np.searchsorted(known_s, timestamp_s + 4 * sigma_s, side="right")
     result = np.full(len(timestamp_s), np.nan)

@@ -36,8 +36,7 @@ LEAST_CELLS = 20
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """The template with a feature per vertex, and a session's features [frame rows columns 16] at stride
-    8."""
+    """The template with a feature per vertex, and a session's features at stride 8."""
 
     caster: RayCaster
     vertex_features: Float[np.ndarray, "vertex channel"]

@@ -1,5 +1,4 @@
-"""Photometric correspondences: optical flow from the rendered template to the picture, across the viewing
-rays."""
+"""Photometric correspondences: optical flow from the rendered template to the picture."""
 
 import cv2
 import numpy as np
@@ -14,8 +13,7 @@ from stages.register_videos.comparison import compare, local_contrast_normalizat
 SIGMA_PX = 16.0
 """Standard deviation of the flow, half-size pixels: neighbouring pixels err together by hundreds."""
 RETURN_PX = 1.0
-"""Flow there and back must return to within this, half-size pixels: on mirrors and moved things it does
-not."""
+"""Flow there and back must return to within this, half-size pixels: on mirrors it does not."""
 STRIDE_PX, MARGIN_PX = 9, 4
 """One pixel in so many, each way, takes part, away from the margin, half-size pixels."""
 LONGEST_PX = 12

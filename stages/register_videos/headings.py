@@ -38,8 +38,7 @@ SHORTEST_S, LONGEST_S = 0.15, 1.2
 
 @dataclass(frozen=True)
 class RootHypotheses:
-    """Hypotheses of one frame and their costs, in units; pictures are read again when they are needed
-    again."""
+    """Hypotheses of one frame and their costs, in units; pictures are read again when needed."""
 
     frame: int
     world_from_agent: Float[np.ndarray, "hypothesis 4 4"]
@@ -100,8 +99,7 @@ def path(
 
 
 def weights(candidates: list[RootHypotheses]) -> Float[np.ndarray, "observation"]:
-    """Return the weight of each frame, 0..1: less where little is seen and where nothing fits, as under a
-    wrong mask."""
+    """Return the weight of each frame, 0..1: less where little is seen and where nothing fits."""
     misfit, share = (
         np.array([getattr(each, name) for each in candidates]) for name in ("least_misfit", "share")
     )

@@ -16,12 +16,12 @@ from pipeline.mapping import pose_optimization, visual_odometry
 from pipeline.mapping.odometry import find_jumps, repair
 from pipeline.mapping.visual_odometry import JUMP_INFLATION, Odometry
 from stages.register_videos.config import VoteConfig
-from stages.register_videos.votes import Votes, close
+from stages.register_videos.votes import FrameVotes, close
 
 DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.15), 0.01
 """Drift of a phone's odometry, radians and metres per second."""
 NEAR_S = 6.0
-"""Votes of broken odometry must agree with others as near as this, seconds."""
+"""FrameVotes of broken odometry must agree with others as near as this, seconds."""
 ACROSS_JUMP = 1e-3
 """Weight of a vote on the other side of a jump against one on this side."""
 SHORTEST_S = 1e-3
@@ -51,15 +51,12 @@ def of_device(clip: Clip) -> Odometry:
         clip.timestamp_s, poses, drift_rad_s=DRIFT_RAD_S, drift_m_s=DRIFT_M_S
     )
     inflation = np.where(jumps, JUMP_INFLATION, 1.0)[1:]
-    return Odometry(
-        poses,
-        jumps,
-        replace(factors, sigma_rad=inflation * factors.sigma_rad, sigma_m=inflation * factors.sigma_m),
-    )
+    turning, moving = inflation * factors.sigma_rad, inflation * factors.sigma_m
+    return Odometry(poses, jumps, replace(factors, sigma_rad=turning, sigma_m=moving))
 
 
 def consistent_votes(
-    votes: Votes, timestamp_s: Float[np.ndarray, "frame"], motion: Odometry, config: VoteConfig
+    votes: FrameVotes, timestamp_s: Float[np.ndarray, "frame"], motion: Odometry, config: VoteConfig
 ) -> Bool[np.ndarray, "vote"]:
     """Return which votes most of the others near in time confirm, carried along by what was motion."""
     voted = votes.world_from_camera
@@ -79,20 +76,21 @@ def consistent_votes(
     return supports
 
 
-def anchored(votes: Votes, supports: Bool[np.ndarray, "vote"], motion: Odometry) -> Bool[np.ndarray, "frame"]:
+def anchored(
+    votes: FrameVotes, supports: Bool[np.ndarray, "vote"], motion: Odometry
+) -> Bool[np.ndarray, "frame"]:
     """Return which frames lie in a piece with at least one agreeing vote; the others are interpolated."""
     piece = np.cumsum(motion.jumps)
     return np.isin(piece, piece[votes.frame[supports]])
 
 
 def propagate_votes(
-    votes: Votes,
+    votes: FrameVotes,
     supports: Bool[np.ndarray, "vote"],
     timestamp_s: Float[np.ndarray, "frame"],
     motion: Odometry,
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Return poses propagated from the votes before and after each frame and blended; across a jump,
-    interpolated."""
+    """Return poses propagated from the votes around each frame and blended; across a jump, interpolated."""
     frame, voted = votes.frame[supports], votes.world_from_camera[supports]
     odometry, piece = motion.odometry_from_camera, np.cumsum(motion.jumps)
     world_from_odometry = voted @ rigid.inverse(odometry[frame])

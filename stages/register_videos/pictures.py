@@ -9,13 +9,9 @@ from pipeline.data.clips import Clip
 from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid, views
 from pipeline.geometry.meshes import RayCaster, render_view
-from pipeline.mapping.depth_scans import SurfaceMap
 from stages.register_videos.registration import Maps, Registered, Rejected
 
 EDGE, PHONE, ANIMAL, HEAD = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
-FAR, CLOSE = (210, 50, 40), (50, 170, 80)
-"""colors of poses further from the others than `SAME_M`, and of poses as near"""
-SAME_M = 0.05
 DEPTH_EDGE_M, OUTLINE = 0.08, 1.0
 """steps that are drawn as edges: of depth, and of the animal's silhouette (any step is larger)"""
 HEADING_M = 0.2
@@ -25,20 +21,17 @@ WALK_FRAMES, WALK_M = 5, 0.2
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
-    "depth": "Static depth on the map from above: green within 5 cm of the surface, red further away.",
 }
 
 
 def status(
     result: Registered | Rejected, walk_time_s: Float[np.ndarray, "walk"], walk: Float[np.ndarray, "walk 4 4"]
 ) -> dict:
-    """Describe the outcome for ``status.json``; the nearest view is also given as a moment of the
-    walk-through."""
+    """Describe the outcome for ``status.json``; the nearest view also as a moment of the walk-through."""
     votes = result.votes
     figures = {"frames_localized": votes.asked, "votes": len(votes.frame)}
-    if votes.nearest is None:
-        nearest = None
-    else:
+    nearest = None
+    if votes.nearest is not None:
         nearest = {
             "inlier_ratio": votes.nearest.inlier_ratio,
             "walkthrough_s": float(walk_time_s[nearest_frame(walk, votes.nearest.map_from_camera)]),
@@ -46,16 +39,15 @@ def status(
         }
     if isinstance(result, Rejected):
         return {"registered": False, "reason": result.reason, "nearest_view": nearest, "figures": figures}
+    placed = result.agent_confidence[result.roots.visible]
     figures |= {
         "votes_agreeing": int(result.supports.sum()),
         "depth_gap_m": _finite(result.aligned.median_gap_m),
         "depth_fit": _finite(result.aligned.median_fit),
         "appearance": result.appearance,
         "confidence": float(result.confidence.mean()),
-        "agent_frames": int(result.roots.visible.sum()),
-        "agent_confidence": float(result.agent_confidence[result.roots.visible].mean())
-        if result.roots.visible.any()
-        else 0.0,
+        "agent_frames": len(placed),
+        "agent_confidence": float(placed.mean()) if len(placed) else 0.0,
     }
     return {"registered": True, "reason": None, "nearest_view": nearest, "figures": figures}
 
@@ -66,8 +58,7 @@ def _finite(figure):
 
 
 def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[np.ndarray, "4 4"]) -> int:
-    """Return the frame of the walk-through that was taken most nearly from there: a metre counts as much as a
-    radian."""
+    """Return the walk-through's frame taken most nearly from there: a metre counts as much as a radian."""
     away = np.linalg.norm(walk[:, :3, 3] - world_from_camera[:3, 3], axis=1)
     return int(np.argmin(away + rigid.rotation_angle(walk[:, :3, :3], world_from_camera[:3, :3])))
 
@@ -110,7 +101,7 @@ def pictures(result: Registered | Rejected, clip: Clip, maps: Maps) -> list[Pict
     scene, agent = RayCaster(maps.scene), RayCaster(maps.agent)
     chosen = np.linspace(0, len(clip) - 1, 9).astype(int)[1:-1]
     edges = plots.grid([outlined(result, clip, scene, agent, int(frame)) for frame in chosen], len(chosen))
-    return captioned(CAPTIONS, edges=edges, bird=paths(result, maps), depth=depth_on_map(result, maps))
+    return captioned(CAPTIONS, edges=edges, bird=paths(result, maps))
 
 
 def outlined(
@@ -141,40 +132,17 @@ def paths(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]
     picture.draw(result.aligned.world_from_camera[:, :3, 3], PHONE)
     picture.draw(root[:, :3, 3], ANIMAL)
     for frame in np.flatnonzero(result.roots.visible)[::10]:
-        picture.draw(
-            np.stack([root[frame, :3, 3], root[frame, :3, 3] + HEADING_M * root[frame, :3, 2]]), HEAD
-        )
-    return picture.image
-
-
-def depth_on_map(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the static depth of some frames over the room, coloured by its distance from the surface."""
-    picture = views.bird_view(maps.scene, floor_m=maps.floor_m)
-    surface = SurfaceMap(maps.scene)
-    for frame in range(0, len(result.aligned.scans), 10):
-        points = rigid.apply(
-            result.aligned.world_from_camera[frame], result.aligned.scans[frame].points_camera[::3]
-        )
-        distance = np.abs(surface.distance(points))
-        for pixel, far in zip(np.round(picture.pixel(points)).astype(int), distance, strict=True):
-            cv2.circle(
-                picture.image, tuple(int(value) for value in pixel), 1, FAR if far > SAME_M else CLOSE, -1
-            )
+        middle = root[frame, :3, 3]
+        picture.draw(np.stack([middle, middle + HEADING_M * root[frame, :3, 2]]), HEAD)
     return picture.image
 
 
 def _refused(result, clip, maps):
-    middle = clip.color(len(clip) // 2)
+    frame = len(clip) // 2
+    middle = clip.color(frame)
     if result.votes.nearest is None:
         return [Picture("frame", middle, "A frame of the recording; no view of the template is like it.")]
-    frame = len(clip) // 2
-    near = views.view(
-        RayCaster(maps.scene), result.votes.nearest.map_from_camera, clip.intrinsics[frame], *clip.color_size
-    )
-    return [
-        Picture(
-            "nearest",
-            plots.grid([middle, near], 2),
-            "A frame of the recording, and the nearest view of the template.",
-        )
-    ]
+    camera, lens = result.votes.nearest.map_from_camera, clip.intrinsics[frame]
+    near = views.view(RayCaster(maps.scene), camera, lens, *clip.color_size)
+    caption = "A frame of the recording, and the nearest view of the template."
+    return [Picture("nearest", plots.grid([middle, near], 2), caption)]

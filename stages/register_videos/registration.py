@@ -1,5 +1,4 @@
-"""Register one recording: votes, alignment, verification, confidence, agent roots, or the reason why it does
-not fit."""
+"""Register one recording, or give the reason why it does not fit."""
 
 from dataclasses import dataclass
 from typing import assert_never
@@ -27,7 +26,7 @@ from stages.register_videos.confidence import (
 )
 from stages.register_videos.config import Config
 from stages.register_videos.feature_alignment import FeatureMap
-from stages.register_videos.votes import LEAST_VOTES, Votes
+from stages.register_videos.votes import LEAST_VOTES, FrameVotes
 
 LEAST_MEASURED = 0.2
 """Share of the frames that must have static depth."""
@@ -66,7 +65,7 @@ class Registered:
     """P(camera within 2 deg and 5 cm)."""
     roots: Roots
     agent_confidence: Float[np.ndarray, "frame"]
-    votes: Votes
+    votes: FrameVotes
     supports: Bool[np.ndarray, "vote"]
     appearance: float
     """Share of the frames that look more like their rendering than like renderings from wrong poses."""
@@ -88,7 +87,7 @@ class Rejected:
     """A recording that does not fit, and why."""
 
     reason: str
-    votes: Votes
+    votes: FrameVotes
 
 
 def register(
@@ -164,7 +163,7 @@ def _aligned(
     scene: FeatureMap | None,
     start: _Start,
     motion: Odometry,
-    votes: Votes,
+    votes: FrameVotes,
     config: Config,
 ) -> AlignedCameras:
     """Align the cameras with the scene; where they come from the map, keep them."""
@@ -209,7 +208,7 @@ def _initialize(clip, votes, motion, config) -> _Start | None:
 def rejection_reason(
     fit: Float[np.ndarray, "frame"],
     appearance: float,
-    votes: Votes,
+    votes: FrameVotes,
     supports: Bool[np.ndarray, "vote"],
     config: Config,
 ) -> str | None:

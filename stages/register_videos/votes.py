@@ -16,7 +16,7 @@ from pipeline.localization.localizer import Localizer, PoseHypothesis
 from stages.register_videos.config import VoteConfig
 
 LEAST_VOTES, LEAST_SHARE = 3, 0.25
-"""Votes that must agree, and their share of all: two may agree by chance."""
+"""FrameVotes that must agree, and their share of all: two may agree by chance."""
 LEAST_LOCALIZED = 20
 """Short recordings are localized more often, so that so many frames may vote."""
 MOST_PROPOSALS = 400
@@ -26,7 +26,7 @@ REFIT_ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Votes:
+class FrameVotes:
     """Localized frames."""
 
     frame: np.ndarray
@@ -58,40 +58,34 @@ class Agreement:
     supports: Bool[np.ndarray, "vote"]
 
 
-def none_cast() -> Votes:
+def none_cast() -> FrameVotes:
     """Return what there is where no frame was asked."""
-    return Votes(np.zeros(0, int), [], 0, None)
+    return FrameVotes(np.zeros(0, int), [], 0, None)
 
 
-def collect(clip: Clip, masks: Masks, localizer: Localizer, config: VoteConfig) -> Votes:
+def collect(clip: Clip, masks: Masks, localizer: Localizer, config: VoteConfig) -> FrameVotes:
     """Localize one frame in so many, with the agent masked out."""
     step = min(config.every_frames, max(len(clip) // LEAST_LOCALIZED, 1))
     asked = np.arange(min(step // 2, len(clip) - 1), len(clip), step)
     frames, answers, nearest = [], [], None
     for frame in track(asked.tolist(), "localizing frames"):
-        poses = localizer.localize(
-            clip.color(frame),
-            clip.depth(frame),
-            clip.depth_intrinsics[frame],
-            clip.intrinsics[frame],
-            masks[frame] == 0,
-        )
+        lenses = clip.depth_intrinsics[frame], clip.intrinsics[frame]
+        poses = localizer.localize(clip.color(frame), clip.depth(frame), *lenses, masks[frame] == 0)
         if poses and (nearest is None or poses[0].inlier_ratio > nearest.inlier_ratio):
             nearest = poses[0]
         if poses and poses[0].probability >= config.least_probability:
             frames.append(frame)
             answers.append(poses[0])
-    return Votes(np.array(frames, int), answers, len(asked), nearest)
+    return FrameVotes(np.array(frames, int), answers, len(asked), nearest)
 
 
 def agree(
-    votes: Votes,
+    votes: FrameVotes,
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     gravity_known: bool,
     config: VoteConfig,
 ) -> Agreement | None:
-    """Find ``world_from_odometry`` by letting each vote propose one and weighing who supports it (4 DoF where
-    gravity is known)."""
+    """Find the ``world_from_odometry`` that one vote proposes and most support (4 DoF with known gravity)."""
     if not len(votes.frame):
         return None
     odometry, voted = odometry_from_camera[votes.frame], votes.world_from_camera
@@ -138,7 +132,7 @@ def close(
     )
 
 
-def rejection_reason(votes: Votes, supports: Bool[np.ndarray, "vote"] | None) -> str | None:
+def rejection_reason(votes: FrameVotes, supports: Bool[np.ndarray, "vote"] | None) -> str | None:
     """Return why the votes are not enough, None when they are."""
     if len(votes.frame) < LEAST_VOTES:
         recognised = f"only {len(votes.frame)} of {votes.asked} frames were recognised"

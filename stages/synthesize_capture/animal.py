@@ -112,19 +112,11 @@ def _blend(vertices, bone, weight, motion):
     return out
 
 
-@njit(cache=True)
-def normals_of(points, faces):
-    """Return unit vertex normals ``[vertex 3]`` of a closed surface."""
-    out = np.zeros_like(points)
-    for index in range(len(faces)):
-        a, b, c = points[faces[index, 0]], points[faces[index, 1]], points[faces[index, 2]]
-        u, v = b - a, c - a
-        for axis in range(3):
-            normal = u[(axis + 1) % 3] * v[(axis + 2) % 3] - u[(axis + 2) % 3] * v[(axis + 1) % 3]
-            for k in range(3):
-                out[faces[index, k], axis] += normal
-    for index in range(len(out)):
-        length = np.sqrt(out[index, 0] ** 2 + out[index, 1] ** 2 + out[index, 2] ** 2)
-        for axis in range(3):
-            out[index, axis] /= max(length, 1e-12)
-    return out
+def normals_of(
+    points: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
+) -> Float[np.ndarray, "vertex 3"]:
+    """Return unit vertex normals of a closed surface."""
+    corner, vertex = points[faces], faces.ravel()
+    normal = np.repeat(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), 3, axis=0)
+    out = np.stack([np.bincount(vertex, part, len(points)) for part in normal.T], axis=-1)
+    return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12)

@@ -27,24 +27,14 @@ def walkthrough(room: Room, rng: np.random.Generator, duration_s: float) -> Came
     rounds = 2.0 + 0.5 * (duration_s > 30)
     angle = 2 * np.pi * rounds * share + rng.uniform(0, 2 * np.pi)
     # The person stands across the room from what is filmed, so that near walls do not fill the picture.
-    wanted = (
-        np.stack([-0.24 * WIDTH_M * np.sin(angle), -0.2 * DEPTH_M * np.cos(angle)], axis=-1)
-        * (0.75 + 0.25 * np.sin(2 * np.pi * 1.3 * share))[:, None]
-    )
+    wanted = np.stack([-0.24 * WIDTH_M * np.sin(angle), -0.2 * DEPTH_M * np.cos(angle)], axis=-1)
+    wanted *= (0.75 + 0.25 * np.sin(2 * np.pi * 1.3 * share))[:, None]
     position = np.array([floor.nearest(point) for point in wanted[::10]])
-    position = np.stack(
-        [
-            np.interp(timestamp_s, timestamp_s[::10], gaussian_filter1d(position[:, axis], 2.0))
-            for axis in range(2)
-        ],
-        axis=-1,
-    )
+    smooth = gaussian_filter1d(position, 2.0, axis=0)
+    x, z = (np.interp(timestamp_s, timestamp_s[::10], smooth[:, axis]) for axis in range(2))
     swing = angle + 0.45 * np.sin(2 * np.pi * 4.3 * share)
     down = 0.28 + 0.42 * np.sin(2 * np.pi * (3.2 * rounds) * share)
-    eye = np.stack(
-        [position[:, 0], np.full(len(share), 1.42) + 0.12 * np.sin(2 * np.pi * 2.1 * share), position[:, 1]],
-        axis=-1,
-    )
+    eye = np.stack([x, 1.42 + 0.12 * np.sin(2 * np.pi * 2.1 * share), z], axis=-1)
     forward = np.stack([np.sin(swing) * np.cos(down), -np.sin(down), np.cos(swing) * np.cos(down)], axis=-1)
     return _handheld(eye, eye + forward, rng, calm=0.8)
 
@@ -62,17 +52,14 @@ def turnaround(course: AnimalCourse, rng: np.random.Generator) -> Cameras:
 
 
 def filming(session: SessionTrajectories, rng: np.random.Generator) -> Cameras:
-    """Return the filming person's phone: in front of the body, at chest height, on what the person looks
-    at."""
+    """Return the filming phone: in front of the body, at chest height, on what the person looks at."""
     looks_at, ground = session.observer_looks_at, session.observer_position
     toward = looks_at[:, [0, 2]] - ground
     toward = gaussian_filter1d(toward, 0.15 / STEP_S, axis=0)
     toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 0.2)
     height = rng.uniform(1.28, 1.42) + 0.05 * _wander(rng, len(ground), 2.0)[:, 0]
-    eye = np.stack(
-        [ground[:, 0] + ARM_M * toward[:, 0], height, ground[:, 1] + ARM_M * toward[:, 1]], axis=-1
-    )
-    eye = gaussian_filter1d(eye, 0.08 / STEP_S, axis=0)
+    ground = ground + ARM_M * toward
+    eye = gaussian_filter1d(np.insert(ground, 1, height, axis=1), 0.08 / STEP_S, axis=0)
     sideways = 0.10 * _wander(rng, len(ground), 0.9)
     return _handheld(_inside(eye), looks_at + sideways, rng, calm=1.0)
 
@@ -86,22 +73,16 @@ def bystanding(session: SessionTrajectories, room: Room, rng: np.random.Generato
     every = round(1.0 / STEP_S)
     stands = []
     for at, target in zip(animal[::every], opposite[::every], strict=True):
-        cost = np.linalg.norm(centers - target, axis=-1) + 3 * np.maximum(
-            1.3 - np.linalg.norm(centers - at, axis=-1), 0
-        )
+        near = np.maximum(1.3 - np.linalg.norm(centers - at, axis=-1), 0)
+        cost = np.linalg.norm(centers - target, axis=-1) + 3 * near
         cost += 0.6 * np.linalg.norm(centers - stands[-1], axis=-1) if stands else 0
         stands.append(centers[np.argmin(cost)])
     slow = gaussian_filter1d(np.array(stands), 1.6, axis=0)
     count = len(animal)
-    ground = np.stack(
-        [np.interp(np.arange(count), np.arange(len(slow)) * every, slow[:, axis]) for axis in range(2)],
-        axis=-1,
-    )
-    eye = np.stack([ground[:, 0], 1.36 + 0.06 * _wander(rng, count, 2.0)[:, 0], ground[:, 1]], axis=-1)
-    target = gaussian_filter1d(
-        session.animal.position + np.array([0, 0.25, 0]), 0.35 / STEP_S, axis=0
-    ) + 0.08 * _wander(rng, count, 0.9)
-    return _handheld(_inside(eye), target, rng, calm=0.7)
+    x, z = (np.interp(np.arange(count), np.arange(len(slow)) * every, slow[:, axis]) for axis in range(2))
+    eye = np.stack([x, 1.36 + 0.06 * _wander(rng, count, 2.0)[:, 0], z], axis=-1)
+    target = gaussian_filter1d(session.animal.position + np.array([0, 0.25, 0]), 0.35 / STEP_S, axis=0)
+    return _handheld(_inside(eye), target + 0.08 * _wander(rng, count, 0.9), rng, calm=0.7)
 
 
 def _handheld(eye: np.ndarray, target: np.ndarray, rng: np.random.Generator, *, calm: float) -> Cameras:

@@ -33,8 +33,7 @@ APART_M, PUSH_M_S = 0.62, 1.2
 MINDED_M = 1.0
 """The cat minds a dog that comes nearer."""
 FOCUS_PERIOD_S, BOTH_M = 9.0, 1.5
-"""The phone goes from one animal to the other and back in this time; both are filmed when they are as
-near."""
+"""The phone goes from one animal to the other and back in this time; both are filmed when so near."""
 
 
 class Companion(Policy):

@@ -126,8 +126,7 @@ def _neutral(anatomy: Anatomy) -> Float[np.ndarray, "foot 3"]:
 def footfalls(
     course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"], anatomy: Anatomy = CAT
 ) -> Float[np.ndarray, "frame foot 3"]:
-    """Return the four feet's world positions (bone heads of hands and toes) from the rhythm of the gait
-    alone."""
+    """Return the feet's world positions (bone heads of hands and toes) from the rhythm of the gait alone."""
     phase, duty, offset, lift = _rhythm(course, anatomy.gait)
     neutral = _neutral(anatomy)
     neutral[:, 1] = anatomy.gait.sole_m

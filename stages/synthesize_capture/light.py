@@ -35,8 +35,7 @@ class Light:
 
 
 def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
-    """Draw a light: by day the window rules, in the evening the lamp, at sunset one low red sun and hardly
-    anything else."""
+    """Draw a light: by day the window rules, in the evening the lamp, at sunset one low red sun."""
     warm, cool = np.array([1.0, 0.82, 0.6]), np.array([0.9, 0.98, 1.08])
     if hour == "evening":
         window, lamp, ambient = 0.10 * cool, rng.uniform(0.75, 0.95) * warm, 0.16 * np.array([1.0, 0.9, 0.78])
@@ -47,12 +46,8 @@ def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
     sun = np.array([1.0, rng.uniform(0.3, 0.7), rng.uniform(-0.8, 0.8)])
     if hour == "sunset":  # as many draws as by day, so that life goes on as it would have
         red = np.array([1.3, 0.7, 0.4])
-        window, lamp, ambient, sun[1:] = (
-            3.0 * window * red,
-            0.0 * warm,
-            0.4 * ambient * red,
-            sun[1:] * (0.2, 1.5),
-        )
+        window, lamp, ambient = 3.0 * window * red, 0.0 * warm, 0.4 * ambient * red
+        sun[1:] *= (0.2, 1.5)
     return Light(window, lamp, ambient, sun / np.linalg.norm(sun))
 
 
@@ -130,37 +125,28 @@ def _irradiance(
     for i in range(2):
         for j in range(3):
             jitter = rng.uniform(-0.12, 0.12, 2)
-            sample = (
-                corner
-                + (j + 0.5 + jitter[0]) / 3 * right
-                + (i + 0.5 + jitter[1]) / 2 * down
-                - np.array([0.06, 0, 0])
-            )
+            sample = corner + (j + 0.5 + jitter[0]) / 3 * right + (i + 0.5 + jitter[1]) / 2 * down
+            sample -= np.array([0.06, 0, 0])
             area = np.linalg.norm(right) * np.linalg.norm(down) / 6
-            total += (
-                _from_source(
-                    points, normals, sample, caster, facing=np.array([-1.0, 0, 0]), toward=light.toward_sun
-                )[:, None]
-                * light.window
-                * area
-            )
+            factor = _from_source(points, normals, sample, caster, toward_sun=light.toward_sun)
+            total += factor[:, None] * light.window * area
     for shift in ((0.0, 0.22, 0.0), (0.0, -0.2, 0.0)):
-        total += (
-            _from_source(points, normals, np.asarray(room.lamp) + shift, caster)[:, None] * light.lamp * 0.6
-        )
+        factor = _from_source(points, normals, np.asarray(room.lamp) + shift, caster)
+        total += factor[:, None] * light.lamp * 0.6
     return total
 
 
 def _from_source(
-    points, normals, source, caster: RayCaster, *, facing=None, toward=None
+    points, normals, source, caster: RayCaster, *, toward_sun=None
 ) -> Float[np.ndarray, "point"]:
-    """Return form factors of a small source; a window faces one way and shines strongest along ``toward``."""
+    """Return form factors of a small source; a window faces -x and shines strongest from the sun's side."""
     away = source - points
     distance = np.linalg.norm(away, axis=-1)
     ray = away / distance[:, None]
     factor = np.maximum((normals * ray).sum(-1), 0) / np.maximum(distance, 0.25) ** 2
-    if facing is not None:
-        factor *= np.maximum(-(ray @ facing), 0) / np.pi * (0.5 + 1.5 * np.maximum(ray @ toward, 0) ** 3)
+    if toward_sun is not None:
+        from_sun = 0.5 + 1.5 * np.maximum(ray @ toward_sun, 0) ** 3
+        factor *= np.maximum(-(ray @ np.array([-1.0, 0, 0])), 0) / np.pi * from_sun
     clear = factor > 1e-4
     blocked = caster.cast(points[clear], ray[clear]).distance < distance[clear] - 0.05
     factor[clear] *= ~blocked
@@ -178,10 +164,8 @@ def _around(normals: np.ndarray, sine_cosine: np.ndarray, turn: np.ndarray) -> n
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     second = np.cross(normals, first)
-    return (
-        sine_cosine[0] * (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second)
-        + sine_cosine[1] * normals
-    )
+    across = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+    return sine_cosine[0] * across + sine_cosine[1] * normals
 
 
 def light_on_body(
@@ -191,19 +175,14 @@ def light_on_body(
     up = 0.5 + 0.5 * normals[:, 1:2]
     total = (0.35 + 0.6 * up) * light.ambient
     corner, right, down = room.window
-    sources = (
-        (
-            corner + 0.5 * right + 0.5 * down,
-            light.window * np.linalg.norm(right) * np.linalg.norm(down) / np.pi,
-        ),
-        (np.asarray(room.lamp), light.lamp * 1.2),
-    )
-    for source, strength in sources:
+    window = light.window * np.linalg.norm(right) * np.linalg.norm(down) / np.pi
+    middle, lamp = corner + 0.5 * right + 0.5 * down, np.asarray(room.lamp)
+    for source, strength in ((middle, window), (lamp, light.lamp * 1.2)):
         away = source - points.mean(0)
         distance = max(float(np.linalg.norm(away)), 0.4)
         ray = away / distance
         fall = 1.0 / distance**2
-        if source is not sources[1][0]:
+        if source is middle:
             fall *= max(float(ray[0]), 0.0) * (0.5 + 1.5 * max(float(ray @ light.toward_sun), 0.0) ** 3)
         total = total + np.clip((normals @ ray + 0.25) / 1.25, 0, 1)[:, None] * fall * strength
     return total.astype(np.float32)

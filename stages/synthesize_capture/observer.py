@@ -100,23 +100,16 @@ class Observer:
             case "watch":
                 self.left_s = self.rng.uniform(*style.watch_s)
             case "approach":
-                self.left_s, self.speed_m_s = (
-                    self.rng.uniform(*style.approach_s),
-                    self.rng.uniform(*style.approach_m_s),
-                )
+                self.left_s = self.rng.uniform(*style.approach_s)
+                self.speed_m_s = self.rng.uniform(*style.approach_m_s)
                 self._plan_approach(animal)
             case "retreat":
-                self.left_s, self.speed_m_s = (
-                    self.rng.uniform(*style.retreat_s),
-                    self.rng.uniform(*style.retreat_m_s),
-                )
-                self._go_by(
-                    animal,
-                    lambda center: (
-                        0.9 * np.linalg.norm(center - animal, axis=-1)
-                        - 0.5 * np.linalg.norm(center - self.walker.position, axis=-1)
-                    ),
-                )
+                self.left_s = self.rng.uniform(*style.retreat_s)
+                self.speed_m_s = self.rng.uniform(*style.retreat_m_s)
+                centers = self.walker.floor.centers()
+                away = np.linalg.norm(centers - animal, axis=-1)
+                far = np.linalg.norm(centers - self.walker.position, axis=-1)
+                self.walker.go(centers[np.argmax(0.9 * away - 0.5 * far)], avoid=animal)
             case "stroll":
                 self.left_s, self.speed_m_s = self.rng.uniform(2.4, 3.8), self.rng.uniform(0.5, 0.8)
                 from_animal = self.walker.position - animal
@@ -127,21 +120,12 @@ class Observer:
         self.since_plan_s = 0.0
         self.walker.go(animal)
 
-    def _go_by(self, animal: Ground, score) -> None:
-        centers = self.walker.floor.centers()
-        self.walker.go(centers[np.argmax(score(centers))], avoid=animal)
-
     def _look(self, seconds: float, animal: Float[np.ndarray, "3"]) -> None:
         """Follow the animal with a lag; sometimes glance elsewhere for a moment."""
         target = animal + np.array([0.0, 0.12, 0.0])
-        if self._glance is None and self.rng.random() < 0.02 * seconds * (
-            3.0 if self.mode == "stroll" else 1.0
-        ):
-            self._glance = (
-                self.rng.uniform(0.5, 1.0),
-                target
-                + np.array([self.rng.uniform(-1, 1), self.rng.uniform(0, 0.6), self.rng.uniform(-1, 1)]),
-            )
+        often = 3.0 if self.mode == "stroll" else 1.0
+        if self._glance is None and self.rng.random() < 0.02 * seconds * often:
+            self._glance = (self.rng.uniform(0.5, 1.0), target + self.rng.uniform((-1, 0, -1), (1, 0.6, 1)))
         if self._glance is not None:
             left, sideways = self._glance
             target = sideways

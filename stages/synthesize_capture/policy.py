@@ -85,9 +85,8 @@ class Policy:
                     self._arrive()
         rate = 1 - np.exp(-seconds / 0.22)
         standing = self.walker.speed > 0.12 or self.leap is not None
-        self.posture += rate * (
-            np.where(standing, np.array([0, 0, self.wanted[2]]), self.wanted) - self.posture
-        )
+        wanted = np.where(standing, np.array([0, 0, self.wanted[2]]), self.wanted)
+        self.posture += rate * (wanted - self.posture)
         self._look(seconds, seen)
 
     def _feel(self, seconds: float, seen: SeenWalker) -> None:
@@ -115,13 +114,8 @@ class Policy:
             return
         self.rest_s -= seconds
         rested = self.reason == "own" or self.rest_s <= 0
-        willing = (
-            self.reason != "approach"
-            and rested
-            and 1.35 < self.distance < NOTICE_M + 0.5
-            and self.calm_s > 0.9
-        )
-        if willing and self.rng.random() < 1.8 * seconds:
+        willing = self.reason != "approach" and rested and self.calm_s > 0.9
+        if willing and 1.35 < self.distance < NOTICE_M + 0.5 and self.rng.random() < 1.8 * seconds:
             self._approach(seen)
         elif self.rest_s <= -2.5 and self.rng.random() < 0.5 * seconds:
             self._visit()
@@ -135,12 +129,8 @@ class Policy:
         away = away / max(float(np.linalg.norm(away)), 1e-6)
         straight = (off @ away) / np.maximum(length, 1e-6)
         clear = np.minimum(np.linalg.norm(centers - seen.position, axis=-1), 3.0)
-        score = (
-            0.5 * clear
-            + 3.0 * straight
-            - 1.6 * np.abs(length - FLIGHT_M)
-            + self.rng.gumbel(0, 0.02, len(centers))
-        )
+        noise = self.rng.gumbel(0, 0.02, len(centers))
+        score = 0.5 * clear + 3.0 * straight - 1.6 * np.abs(length - FLIGHT_M) + noise
         self.reason, self.fear_s, self.speed_m_s = "flee", 0.9, self.rng.uniform(1.7, 2.3)
         self._leave()
         goal = centers[np.argmax(score)]
@@ -174,11 +164,9 @@ class Policy:
 
     def _visit(self) -> None:
         """Go to a favourite place, or just somewhere."""
-        weight = np.array(
-            [0.5 if self.perch is not None and place is self.perch else 1.0 for place in self.places]
-        )
-        weight *= np.exp(
-            -0.25 * np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places])
+        away = np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places])
+        weight = np.array([0.5 if place is self.perch else 1.0 for place in self.places]) * np.exp(
+            -0.25 * away
         )
         self.reason, self.speed_m_s = "own", self.rng.choice([0.5, 0.7, 0.9, 1.3], p=[0.2, 0.4, 0.25, 0.15])
         self._leave()
@@ -202,17 +190,15 @@ class Policy:
             self._jump(np.asarray(self.place.position, float))
         sit, lie = {"flee": (0.15, 0.0), "approach": (0.65, 0.1), "own": (0.4, 0.25)}[self.reason]
         draw = self.rng.random()
-        self.wanted = np.array(
-            [float(draw < sit), float(sit <= draw < sit + lie), 0.3 if self.reason == "flee" else 0.0]
-        )
+        crouch = 0.3 if self.reason == "flee" else 0.0
+        self.wanted = np.array([float(draw < sit), float(sit <= draw < sit + lie), crouch])
 
     def _jump(self, end: Float[np.ndarray, "3"]) -> None:
         self.leap = Leap(self.position, end)
         self.walker.speed = 0.0
 
     def _faces(self, seen: SeenWalker) -> float | None:
-        """Return where it turns to while it rests: out from a perch, towards a person that it minds, or
-        nowhere."""
+        """Return what it turns to at rest: out from a perch, towards a person that it minds, or nothing."""
         if self.perch is not None:
             return self.perch.yaw
         if self.reason == "own" or self.distance > NOTICE_M or self.posture[:2].max() > 0.3:
@@ -227,9 +213,8 @@ class Policy:
         share = min(leap.elapsed_s / JUMP_S, 1.0)
         course = share * share * (3 - 2 * share)
         self.walker.position = (leap.start + course * (leap.end - leap.start))[[0, 2]]
-        self.height = float(
-            leap.start[1] + course * (leap.end[1] - leap.start[1]) + 4 * 0.16 * share * (1 - share)
-        )
+        straight = leap.start[1] + course * (leap.end[1] - leap.start[1])
+        self.height = float(straight + 4 * 0.16 * share * (1 - share))
         toward = (leap.end - leap.start)[[0, 2]]
         error = wrapped(np.arctan2(toward[0], toward[1]) - self.walker.yaw)
         self.walker.yaw += float(np.clip(error, -9 * seconds, 9 * seconds))
@@ -246,8 +231,6 @@ class Policy:
             self._gaze_s = self.rng.uniform(0.6, 2.2)
             watch = self.distance < NOTICE_M and self.rng.random() < (0.8 if self.reason != "own" else 0.4)
             person = np.array([seen.position[0], 1.2, seen.position[1]])
-            around = ahead + np.array(
-                [self.rng.uniform(-1, 1), self.rng.uniform(-0.2, 0.3), self.rng.uniform(-1, 1)]
-            )
+            around = ahead + self.rng.uniform((-1, -0.2, -1), (1, 0.3, 1))
             self._gaze_goal = person if watch else around
         self.gaze = self.gaze + (self._gaze_goal - self.gaze) * (1 - np.exp(-seconds / 0.18))

@@ -36,14 +36,8 @@ def see(
     inverse_depth = np.zeros((height, width), np.float32)
     inverse_corners = np.zeros((len(faces), 3, 3), np.float64)
     focal_center = np.array([intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]])
-    _scan(
-        np.ascontiguousarray(points_camera, np.float64),
-        faces,
-        focal_center,
-        inverse_corners,
-        face,
-        inverse_depth,
-    )
+    points = np.ascontiguousarray(points_camera, np.float64)
+    _scan(points, faces, focal_center, inverse_corners, face, inverse_depth)
     return RasterView(face, inverse_depth, inverse_corners)
 
 
@@ -105,8 +99,7 @@ def _invert(a, b, c, out):
 
 @njit(cache=True, error_model="numpy")
 def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height, width):
-    """Return exact z-depth ``[height width]`` (0 = nothing) at the pixel centres of the view in another
-    size."""
+    """Return exact z-depth ``[height width]`` (0 = nothing) at the view's pixel centres in another size."""
     depth = np.zeros((height, width), np.float32)
     fx, fy, cx, cy = focal_center
     rows, columns = face_of.shape
@@ -116,13 +109,9 @@ def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height,
             face = face_of[row, column]
             if face >= 0:
                 x, y = (j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy
-                total = 0.0
+                total, inverse = 0.0, inverse_corners[face]
                 for k in range(3):
-                    total += (
-                        inverse_corners[face, k, 0] * x
-                        + inverse_corners[face, k, 1] * y
-                        + inverse_corners[face, k, 2]
-                    )
+                    total += inverse[k, 0] * x + inverse[k, 1] * y + inverse[k, 2]
                 near = inverse_depth[row, column]
                 depth[i, j] = 1.0 / min(max(total, 0.97 * near), 1.03 * near)
     return depth

@@ -22,8 +22,7 @@ _TONE = (np.clip(1.06 * (1 - np.exp(-1.9 * np.linspace(0, 2.5, 4096))), 0, 1) **
 
 @dataclass(frozen=True)
 class Exposure:
-    """How one recording is exposed: gain on linear light and its slow wander, white balance, noise at unit
-    signal."""
+    """How a recording is exposed: gain and its slow wander, white balance, noise at unit signal."""
 
     gain: float
     gain_wander: float
@@ -33,8 +32,7 @@ class Exposure:
 
 
 def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
-    """Draw an exposure; the evening is lifted by gain, stays darker, noisier and more blurred, the sunset is
-    overexposed."""
+    """Draw an exposure; the evening stays darker, noisier and more blurred, the sunset is overexposed."""
     balance = 1.0 + rng.uniform(-0.07, 0.07, 3)
     balance[1] = 1.0
     if hour == "sunset":
@@ -45,8 +43,7 @@ def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
 
 
 def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float[np.ndarray, "frame"]:
-    """Return recorded times from 0: nominal rate, a millisecond of jitter, now and then one to three frames
-    lost."""
+    """Return recorded times from 0: nominal rate, a millisecond of jitter, now and then lost frames."""
     times = np.arange(int(duration_s * fps + 1e-6) + 1) / fps
     times[1:] += np.clip(rng.normal(0, 0.0012, len(times) - 1), -0.004, 0.004)
     keep = np.ones(len(times), bool)
@@ -64,9 +61,8 @@ def lens(
     center = np.array([width, height]) / 2 + rng.normal(0, 0.004 * width, 2)
     wander = [_slow(rng, timestamp_s, 1.2) for _ in range(3)]
     fx = focal * (1 + 0.0012 * wander[0])
-    return np.stack(
-        [fx, fx, center[0] + 0.0022 * width * wander[1], center[1] + 0.0022 * width * wander[2]], axis=-1
-    )
+    cx, cy = (center[axis] + 0.0022 * width * wander[1 + axis] for axis in range(2))
+    return np.stack([fx, fx, cx, cy], axis=-1)
 
 
 def odometry(
@@ -89,10 +85,9 @@ def odometry(
     scale = 1 + rng.normal(0, 0.004)
     position = world_from_camera[:, :3, 3]
     step = np.diff(position, axis=0)
+    astray = np.stack([_slow(rng, timestamp_s, 2.0)[1:] for _ in range(3)], axis=-1)
     moved = scale * np.einsum("fij,fj->fi", turn[1:], step)
-    moved = moved + 0.004 * np.linalg.norm(step, axis=-1, keepdims=True) * np.stack(
-        [_slow(rng, timestamp_s, 2.0)[1:] for _ in range(3)], axis=-1
-    )
+    moved = moved + 0.004 * np.linalg.norm(step, axis=-1, keepdims=True) * astray
     track = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)]) + rng.normal(0, 0.02, 3)
     jitter = rigid.rotation_from_vector(rng.normal(0, np.deg2rad(0.03), (count, 3)))
     return rigid.make(turn @ world_from_camera[:, :3, :3] @ jitter, track + rng.normal(0, 0.0006, (count, 3)))
@@ -108,9 +103,8 @@ def picture(
     """Expose linear light: motion blur along ``blur_px``, vignette, photon and read noise, tone curve."""
     image = _smeared(linear, blur_px)
     height, width, _ = image.shape
-    image = (
-        image * (exposure.gain * gain * exposure.white_balance).astype(np.float32) * _vignette(height, width)
-    )
+    gains = (exposure.gain * gain * exposure.white_balance).astype(np.float32)
+    image = image * gains * _vignette(height, width)
     noise = rng.standard_normal(image.shape, dtype=np.float32)
     image += exposure.noise * np.sqrt(0.02 + image) * noise
     return _TONE[np.clip(image * (4095 / 2.5), 0, 4095).astype(np.uint16)].astype(np.uint8)
@@ -125,27 +119,18 @@ def lidar(
     into mixed pixels, holes along some edges, nothing past 5 m.
     """
     height, width = depth.shape
-    bend = cv2.resize(
-        rng.standard_normal((height // 6 + 1, width // 6 + 1, 2), dtype=np.float32),
-        (width, height),
-        interpolation=cv2.INTER_LINEAR,
-    )
+    bend = rng.standard_normal((height // 6 + 1, width // 6 + 1, 2), dtype=np.float32)
+    bend = cv2.resize(bend, (width, height), interpolation=cv2.INTER_LINEAR)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    seen = cv2.remap(
-        depth,
-        x + 0.7 * bend[..., 0],
-        y + 0.7 * bend[..., 1],
-        cv2.INTER_NEAREST,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    x, y = x + 0.7 * bend[..., 0], y + 0.7 * bend[..., 1]
+    seen = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     mixed = cv2.blur(seen, (3, 3))
     jump = cv2.morphologyEx(seen, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     edge = jump > 0.05 + 0.03 * seen
     seen = np.where(edge & (bend[..., 0] > 0.1), mixed, seen)
     grain = cv2.GaussianBlur(rng.standard_normal((height, width), dtype=np.float32), (0, 0), 1.6) * 5.6
-    measured = seen + (0.005 * seen + 0.004) * (
-        0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)
-    ).astype(np.float32)
+    noise = 0.8 * grain + 0.3 * rng.standard_normal((height, width), dtype=np.float32)
+    measured = seen + (0.005 * seen + 0.004) * noise.astype(np.float32)
     slope = jump / np.maximum(seen, 0.3)
     confidence = np.where(slope > 0.09, 0, np.where((slope > 0.035) | (seen > 3.8), 1, 2)).astype(np.uint8)
     confidence = cv2.erode(confidence, np.ones((3, 3), np.uint8))
@@ -163,8 +148,7 @@ def motion_blur_px(
     focal_px: float,
     shutter_s: float,
 ) -> Float[np.ndarray, "frame 2"]:
-    """Return how far (x, y) the picture's centre moves while the shutter is open, from the camera's
-    turning."""
+    """Return how far (x, y) the turning camera moves the picture's centre while the shutter is open."""
     turn = rigid.vector_from_rotation(
         np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
     )

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numba import njit
 
+from pipeline.geometry.meshes import Mesh
 from stages.synthesize_capture.sheets import Sheet, triangles
 
 RADIANCE_RANGE = 2.0
@@ -47,26 +48,12 @@ def backdrop(sheets: list[Sheet], lit: list[UInt8[np.ndarray, "height width 3"]]
             levels[index, level] = start, height, width
             parts.append(picture.reshape(-1))
             start += picture.size
-            picture = cv2.resize(
-                picture, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA
-            )
-    density = np.array(
-        [picture.shape[1] / max(sheet.size_m()[1], 1e-3) for sheet, picture in zip(sheets, lit, strict=True)],
-        np.float32,
-    )
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    return Backdrop(
-        vertices,
-        faces,
-        coordinates[faces],
-        owner,
-        normal.astype(np.float32),
-        np.concatenate(parts),
-        levels,
-        density,
-    )
+            half = (max(1, width // 2), max(1, height // 2))
+            picture = cv2.resize(picture, half, interpolation=cv2.INTER_AREA)
+    widths = [max(sheet.size_m()[1], 1e-3) for sheet in sheets]
+    density = np.array([picture.shape[1] / m for picture, m in zip(lit, widths, strict=True)], np.float32)
+    normals, atlas = Mesh(vertices, faces).face_normals().astype(np.float32), np.concatenate(parts)
+    return Backdrop(vertices, faces, coordinates[faces], owner, normals, atlas, levels, density)
 
 
 class Coat(NamedTuple):
@@ -164,13 +151,11 @@ def _sample(face, a, b, c, x, y, z, fx, sheet, room, pixel):
         j0, i0 = int(p), int(q)
         j1, i1 = min(j0 + 1, columns - 1), min(i0 + 1, rows - 1)
         s, t = p - j0, q - i0
+        above, below = start + i0 * columns * 3, start + i1 * columns * 3
         for channel in range(3):
-            upper = (1 - s) * atlas[start + (i0 * columns + j0) * 3 + channel] + s * atlas[
-                start + (i0 * columns + j1) * 3 + channel
-            ]
-            lower = (1 - s) * atlas[start + (i1 * columns + j0) * 3 + channel] + s * atlas[
-                start + (i1 * columns + j1) * 3 + channel
-            ]
+            left, right = j0 * 3 + channel, j1 * 3 + channel
+            upper = (1 - s) * atlas[above + left] + s * atlas[above + right]
+            lower = (1 - s) * atlas[below + left] + s * atlas[below + right]
             pixel[channel] += weight * ((1 - t) * upper + t * lower)
     for channel in range(3):
         root = pixel[channel] / 255.0
@@ -184,22 +169,16 @@ def _fur(corner, a, b, c, coat, footprint, pixel):
     a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
     total = a + b + c
     a, b, c = a / total, b / total, c / total
-    x = a * rest[corner[0], 0] + b * rest[corner[1], 0] + c * rest[corner[2], 0]
-    y = a * rest[corner[0], 1] + b * rest[corner[1], 1] + c * rest[corner[2], 1]
-    z = a * rest[corner[0], 2] + b * rest[corner[1], 2] + c * rest[corner[2], 2]
-    strength = a * pattern[corner[0], 3] + b * pattern[corner[1], 3] + c * pattern[corner[2], 3]
-    fine = (
-        strength
-        * min(1.0, 0.004 / max(footprint, 1e-4))
-        * (_grain(x, y, z, 90.0) * 0.8 + _grain(x, y, z, 230.0) * 0.5)
-    )
+    p, q, r = corner
+    x = a * rest[p, 0] + b * rest[q, 0] + c * rest[r, 0]
+    y = a * rest[p, 1] + b * rest[q, 1] + c * rest[r, 1]
+    z = a * rest[p, 2] + b * rest[q, 2] + c * rest[r, 2]
+    strength = a * pattern[p, 3] + b * pattern[q, 3] + c * pattern[r, 3]
+    resolved, grain = min(1.0, 0.004 / max(footprint, 1e-4)), _grain(x, y, z, 90.0) * 0.8
+    fine = strength * resolved * (grain + _grain(x, y, z, 230.0) * 0.5)
     for channel in range(3):
-        base = (
-            a * pattern[corner[0], channel]
-            + b * pattern[corner[1], channel]
-            + c * pattern[corner[2], channel]
-        )
-        shine = a * light[corner[0], channel] + b * light[corner[1], channel] + c * light[corner[2], channel]
+        base = a * pattern[p, channel] + b * pattern[q, channel] + c * pattern[r, channel]
+        shine = a * light[p, channel] + b * light[q, channel] + c * light[r, channel]
         pixel[channel] = max(base * (1.0 + fine), 0.004) * shine
 
 

@@ -51,8 +51,7 @@ class NetworkConfig:
     batch_views: int = 64
     """Regression: views per step."""
     fresh_views: int = 0
-    """Regression: views rendered anew in every step, each replacing the oldest one; 0 learns from a fixed
-    set."""
+    """Regression: views rendered anew in every step, each in place of the oldest; 0: a fixed set."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 from pipeline.core.progress import track
 from pipeline.geometry import rigid
 from pipeline.localization import localizer as localizers
-from pipeline.localization.patch_bank import PatchBank
 from pipeline.localization.patches import (
     Describe,
+    PatchBank,
     Patches,
     PatchSampling,
     PcaBasis,

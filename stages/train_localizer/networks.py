@@ -12,9 +12,14 @@ from torch import Tensor
 
 from pipeline.core import distributed
 from pipeline.core.training import fit
+from pipeline.localization.networks import (
+    PoseRegressor,
+    SceneCoordinateNet,
+    coordinate_loss,
+    on_grid,
+    pose_loss,
+)
 from pipeline.localization.patches import Patches, PcaBasis, Target
-from pipeline.localization.pose_regressor import PoseRegressor, on_grid, pose_loss
-from pipeline.localization.scene_coordinates import SceneCoordinateNet, coordinate_loss
 from stages.train_localizer.config import NetworkConfig
 from stages.train_localizer.describing import DescribedViews
 
@@ -62,22 +67,19 @@ class PoseSamples:
     def replace(self, basis: PcaBasis, draw: DrawPatches, target: Target, rng: np.random.Generator) -> None:
         """Draw a view and put it in place of the oldest."""
         patches, map_from_camera = draw(rng)
-        grid = on_grid(basis.project(patches.descriptors), patches.cell)
-        self.grids[self.oldest] = torch.from_numpy(grid)
-        self.rotation[self.oldest] = torch.from_numpy(map_from_camera[:3, :3].astype(np.float32))
-        position = anchor_position(patches, map_from_camera, target)
-        self.position[self.oldest] = torch.from_numpy(position.astype(np.float32))
+        drawn = _sample(basis.project(patches.descriptors), patches, map_from_camera, target)
+        for ring, value in zip((self.grids, self.rotation, self.position), drawn, strict=True):
+            ring[self.oldest] = torch.from_numpy(value)
         self.oldest = (self.oldest + 1) % len(self.grids)
 
 
-def anchor_position(
-    patches: Patches, map_from_camera: Float[np.ndarray, "4 4"], target: Target
-) -> Float[np.ndarray, "3"]:
-    """Return the position in the map that a regressor predicts: the camera's, or the middle of what an agent
-    view shows."""
-    if target == "scene":
-        return map_from_camera[:3, 3]
-    return map_from_camera[:3, :3] @ np.median(patches.points_camera, axis=0) + map_from_camera[:3, 3]
+def _sample(descriptors, patches, map_from_camera, target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a view's grid, its rotation, and the position in the map that a regressor predicts: that of the
+    camera, or of the middle of what an agent view shows."""
+    rotation, position = map_from_camera[:3, :3], map_from_camera[:3, 3]
+    if target == "agent":
+        position = rotation @ np.median(patches.points_camera, axis=0) + position
+    return on_grid(descriptors, patches.cell), rotation.astype(np.float32), position.astype(np.float32)
 
 
 def train_regressor(
@@ -87,8 +89,7 @@ def train_regressor(
     seed: int,
     draw: DrawPatches | None = None,
 ) -> PoseRegressor:
-    """Train the paper's regressor (Eq. 5) on the described views, or on views that ``draw`` renders on the
-    fly."""
+    """Train the paper's regressor (Eq. 5) on the described views, or on views that ``draw`` renders."""
     torch.manual_seed(seed)
     net = PoseRegressor(described.descriptors.shape[1], config.pose_width)
     samples = _samples(described, target)
@@ -116,16 +117,10 @@ def train_regressor(
 def _samples(described: DescribedViews, target: Target) -> PoseSamples:
     parts = np.split(described.descriptors, np.cumsum(described.counts)[:-1])
     poses = described.map_from_camera[described.view]
-    grids = [on_grid(part, each.cell) for part, each in zip(parts, described.patches, strict=True)]
-    position = [
-        anchor_position(each, pose, target) for each, pose in zip(described.patches, poses, strict=True)
-    ]
-    rotation = poses[:, :3, :3].astype(np.float32)
-    return PoseSamples(
-        torch.from_numpy(np.stack(grids)),
-        torch.from_numpy(rotation),
-        torch.from_numpy(np.stack(position).astype(np.float32)),
-    )
+    views = zip(parts, described.patches, poses, strict=True)
+    columns = zip(*(_sample(*view, target) for view in views), strict=True)
+    grids, rotation, position = (torch.from_numpy(np.stack(column)) for column in columns)
+    return PoseSamples(grids, rotation, position)
 
 
 def _set_extent(net, points):

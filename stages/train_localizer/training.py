@@ -1,5 +1,4 @@
-"""From a template to a trained localizer: views, descriptors, the localizer of the chosen kind, its
-calibration."""
+"""From a template to a trained localizer: views, descriptors, the chosen kind, its calibration."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -37,8 +36,7 @@ SOLVERS: dict[Target, localizers.RansacSolver] = {
 RENDER_SCALE = 2
 """Agent views are rendered at so many times the resolution of the crop."""
 VIEW_MARGIN, NEAREST_M, VIEW_PX = 2.4, 0.3, (64, 240)
-"""Agent views: edge over the animal's radius, least distance to its surface (metres), bounds of the edge
-(pixels)."""
+"""Agent views: edge over the animal's radius, least distance to its surface (metres), bounds of the edge."""
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 NEAR_SHARE, NEAR_M, NEAR_YAW_RAD, NEAR_PITCH_RAD = 0.5, 0.35, 0.6, 0.2
-"""Share of scene cameras drawn near the walk-through's, and standard deviations of their offset, metres and
-radians."""
+"""Share of scene cameras near the walk-through's, standard deviations of their offset, metres and radians."""
 ROOM_MARGIN_M, HEIGHT_M = 0.8, (0.5, 1.9)
 """The other cameras: margin around the walk-through's path, and heights above the floor, metres."""
 ROLL_DEG = 12.0
@@ -29,13 +28,11 @@ ROLL_DEG = 12.0
 ELEVATION_DEG, AIM_M = (-10.0, 70.0), 0.03
 """Agent cameras: elevations (degrees), and standard deviation of the point they look at (metres)."""
 GAIN, WHITE_BALANCE, GAMMA = 0.3, 0.04, 0.25
-"""Largest relative change of brightness, standard deviation of each channel's, largest relative change of
-gamma."""
+"""Largest relative change of brightness, standard deviation of each channel's, and of gamma."""
 BLUR_PX, LEAST_BLUR_PX, PIXEL_NOISE = 1.0, 0.3, 0.015
 """Largest and least Gaussian blur, pixels, and standard deviation of pixel noise, share of full scale."""
 OCCLUDED_SHARE, OCCLUDER_DEPTH = 0.4, 0.8
-"""Share of scene queries with an occluder in front, as the animal would be, and its depth over what it
-hides."""
+"""Share of scene queries with an occluder in front, and its depth over what it hides."""
 LEAST_SEEN, NEAREST_M, NEAREST_QUANTILE, LEAST_FRONT = 0.6, 0.35, 0.05, 0.95
 """A plausible view: share of its pixels with surface, this quantile of its depth beyond this many metres, and
 share of surface seen from its front."""
@@ -98,8 +95,7 @@ def render(
     size: tuple[int, int],
     rng: np.random.Generator,
 ) -> RenderedView:
-    """Render a view (pixels, size = height, width) and augment its colour; depth stays exact (see
-    `with_depth_noise`)."""
+    """Render a view (pixels, size = height, width) and augment its colour; depth stays exact."""
     depth, hits = render_view(caster, map_from_camera, intrinsics, *size)
     seen = depth > 0
     assert caster.mesh.color is not None, "templates have colours"

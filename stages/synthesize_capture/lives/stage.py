@@ -19,8 +19,7 @@ from stages.synthesize_capture.lives.lives import RATE_HZ, SimulatedLife
 from stages.synthesize_capture.policy import REASONS
 
 TAKES = 5
-"""Takes of a session, each begun anew from anywhere in the home: else the animal is mostly met where it fled
-to."""
+"""Takes of a session, each begun anew from anywhere: else the animal is mostly met where it fled to."""
 APPROACHES = 400
 """Scripted approaches of a person in the last home, each with a twin in which the person stands still: the
 interval of a share is then 5 points wide."""

@@ -1,2 +1,1 @@
-"""Simulated motion of the built-in animal in several homes, without pictures, with the homes' surfaces: for
-long-term motion."""
+"""Simulated motion of the built-in animal in several homes with surfaces: for long-term motion."""

@@ -127,8 +127,9 @@ def test_what_shows_little_is_tracked_from_what_shows_more_or_is_not_placed():
     alone[little] = alone[little] @ rigid.make(rigid.rotation_from_vector(UP * np.pi), np.array([0, 0, -0.4]))
     cost = np.array([agent_fit.cost(o, model, pose[None])[0] for o, pose in zip(shown, alone, strict=True)])
     share = np.where(little, 0.1, 0.6)
-    found = Tracker(time, alone, cost, share, lambda frame: shown[frame], model).track()
-    assert np.isnan(found.cost_m[10:]).all() and np.isnan(found.world_from_agent[10:]).all()
-    off = np.linalg.norm(found.world_from_agent[:10, :3, 3] - truth[:10, :3, 3], axis=1)
-    turn = np.rad2deg(rigid.rotation_angle(found.world_from_agent[:10, :3, :3], truth[:10, :3, :3]))
+    tracker = Tracker(time, alone, cost, share, lambda frame: shown[frame], model)
+    world_from_agent, cost_m = tracker.track()
+    assert np.isnan(cost_m[10:]).all() and np.isnan(world_from_agent[10:]).all()
+    off = np.linalg.norm(world_from_agent[:10, :3, 3] - truth[:10, :3, 3], axis=1)
+    turn = np.rad2deg(rigid.rotation_angle(world_from_agent[:10, :3, :3], truth[:10, :3, :3]))
     assert off.max() < 0.08 and turn.max() < 30

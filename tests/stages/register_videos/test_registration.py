@@ -187,7 +187,7 @@ def test_frames_without_static_depth_do_not_speak_against_a_recording(maps):
 @pytest.mark.filterwarnings("error")
 def test_what_was_not_measured_is_null(maps):
     truth, nothing = walk(3), np.full(3, np.nan)
-    aligned = alignment.AlignedCameras(truth, np.zeros((3, 6, 6)), [], nothing, nothing)
+    aligned = alignment.AlignedCameras(truth, np.zeros((3, 6, 6)), nothing, nothing)
     found = registration.Registered(
         aligned,
         np.ones(3),

@@ -14,7 +14,7 @@ from stages.register_videos.config import VoteConfig
 from tests.stages.textured_room import UP, drifting, walk
 
 
-def cast(truth, frames, wrong, rng) -> voting.Votes:
+def cast(truth, frames, wrong, rng) -> voting.FrameVotes:
     """Return votes with 1 deg and 2 cm of noise, some of them anywhere."""
     answers = []
     for frame, bad in zip(frames, wrong, strict=True):
@@ -22,7 +22,7 @@ def cast(truth, frames, wrong, rng) -> voting.Votes:
         if bad:
             pose = rigid.exp(np.concatenate([UP * rng.uniform(-3, 3), rng.uniform(-1, 1, 3)])) @ pose
         answers.append(PoseHypothesis(pose, 0.4, 0.4 if bad else 0.8, np.zeros((0, 3)), np.zeros((0, 3))))
-    return voting.Votes(frames, answers, len(frames), answers[0])
+    return voting.FrameVotes(frames, answers, len(frames), answers[0])
 
 
 def test_one_motion_is_found_among_wrong_votes():
@@ -46,7 +46,7 @@ def test_scattered_votes_are_refused():
     votes = cast(truth, frames, np.ones(len(frames), bool), rng)
     agreement = voting.agree(votes, drifting(truth, 4), True, options)
     assert "agree" in voting.rejection_reason(votes, agreement.supports if agreement else None)
-    few = voting.Votes(frames[:1], votes.answers[:1], 12, votes.nearest)
+    few = voting.FrameVotes(frames[:1], votes.answers[:1], 12, votes.nearest)
     assert "recognised" in voting.rejection_reason(few, None)
 
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import trimesh
 
 from stages.synthesize_capture import animal, gait, produce, room, script, session
 from stages.synthesize_capture.config import Config
@@ -45,13 +44,6 @@ def test_the_dog_follows_and_makes_way():
     assert np.mean(near) > 0.3, "share of the time"
     again = session.simulate_session(HOME, np.random.default_rng(1), 40.0, with_dog=True)
     np.testing.assert_array_equal(again.companion.position, lived[0].companion.position)
-
-
-def test_a_dog_is_another_closed_surface_and_larger():
-    surface = trimesh.Trimesh(DOG.vertices, DOG.faces, process=False)
-    assert surface.is_watertight
-    assert surface.body_count == 1
-    assert np.ptp(DOG.vertices[:, 2]) > 1.2 * np.ptp(CAT.vertices[:, 2])
 
 
 def test_its_feet_stand_on_the_floor():

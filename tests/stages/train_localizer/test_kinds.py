@@ -6,8 +6,8 @@ import torch
 
 from pipeline.geometry import rigid
 from pipeline.localization import localizer as model
+from pipeline.localization.networks import GRID, on_grid, pose_loss
 from pipeline.localization.patches import Patches, PatchSampling, PcaBasis
-from pipeline.localization.pose_regressor import GRID, on_grid, pose_loss
 from stages.train_localizer.config import NetworkConfig
 from stages.train_localizer.describing import DescribedViews
 from stages.train_localizer.networks import train_coordinates, train_regressor

@@ -1,9 +1,12 @@
-"""The paper's localizer: a ResNet-18 over dense descriptors regresses the camera's rotation and position (Eq.
-5).
+"""The localizers that are networks: scene-coordinate regression and the paper's pose regressor.
 
-The rotation is a unit quaternion. The expected error is predicted per picture, learned from the errors
-themselves, so that frames can be ranked. A width of 64 is the paper's ResNet-18, with group normalisation.
+`SceneCoordinateNet` maps each patch by itself, so that its neighbours cannot spoil it, to the point of the
+map under it (ACE, Brachmann et al. 2023). `PoseRegressor`, a ResNet-18 over dense descriptors with group
+normalisation, regresses the camera's rotation (a unit quaternion) and position (Eq. 5). Both predict their
+expected error, learned from the errors themselves.
 """
+
+import itertools
 
 import numpy as np
 import torch
@@ -12,6 +15,8 @@ from torch import Tensor, nn
 
 from pipeline.geometry import rigid, rigid_torch
 
+LEAST_LOG_M, MOST_LOG_M = -4.0, 3.0
+"""Bounds of the predicted log distance (2 cm to 20 m)."""
 GRID = 16
 """The descriptors are laid on a square grid of so many cells."""
 GROUPS, HIDDEN = 8, 256
@@ -20,6 +25,45 @@ LEAST_LOG, MOST_LOG = -6.0, 3.0
 """Bounds of the predicted log error (radians + metres)."""
 IDENTITY_BIAS = 1e-3
 """Added to the quaternion's real part, so that zero output is a rotation."""
+
+
+class SceneCoordinateNet(nn.Module):
+    """Patch descriptor -> point of the map in metres and the logarithm of the expected distance from it."""
+
+    middle: Tensor
+    extent: Tensor
+
+    def __init__(self, axes: int, width: int, layers: int):
+        super().__init__()
+        self.arguments = {"axes": axes, "width": width, "layers": layers}
+        sizes = [axes] + [width] * layers
+        hidden = [part for i, o in itertools.pairwise(sizes) for part in (nn.Linear(i, o), nn.ReLU())]
+        self.net = nn.Sequential(*hidden, nn.Linear(width, 4))
+        self.register_buffer("middle", torch.zeros(3))
+        self.register_buffer("extent", torch.ones(()))
+
+    def forward(
+        self, descriptors: Float[Tensor, "patch axis"]
+    ) -> tuple[Float[Tensor, "patch 3"], Float[Tensor, "patch"]]:
+        """Return points (metres) and log distances."""
+        out = self.net(descriptors * descriptors.shape[-1] ** 0.5)
+        return self.middle + self.extent * out[:, :3], out[:, 3].clamp(LEAST_LOG_M, MOST_LOG_M)
+
+    @torch.no_grad()
+    def match(
+        self, query: Float[np.ndarray, "query axis"]
+    ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
+        """Return the map's point under each patch (metres) and its precision as weight."""
+        points, log_m = self(torch.from_numpy(np.ascontiguousarray(query, np.float32)))
+        return points.double().numpy(), torch.exp(-2 * log_m).double().numpy()
+
+
+def coordinate_loss(
+    points: Float[Tensor, "patch 3"], log_m: Float[Tensor, "patch"], truth: Float[Tensor, "patch 3"]
+) -> Float[Tensor, "patch"]:
+    """Return the negative log likelihood |x - y| / b + log b of a Laplace law with predicted width b
+    (metres)."""
+    return (points - truth).norm(dim=-1) * torch.exp(-log_m) + log_m
 
 
 class _Block(nn.Module):
