@@ -32,8 +32,7 @@ def ray_directions(
 
 
 def unproject(pixel: Array, intrinsics: Array) -> Array:
-    """Return ray directions ``[... 3]`` with z = 1 through pixels ``[... 2]``; intrinsics ``[... 3 3]`` of
-    the same batch."""
+    """Return rays ``[... 3]`` with z = 1 through pixels ``[... 2]``; intrinsics ``[... 3 3]``, same batch."""
     x = (pixel[..., 0] - intrinsics[..., 0, 2]) / intrinsics[..., 0, 0]
     y = (pixel[..., 1] - intrinsics[..., 1, 2]) / intrinsics[..., 1, 1]
     return _stack([x, y, x * 0 + 1])

@@ -36,11 +36,10 @@ class GroundPlane:
 def fit_ground(
     points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], reach_m: float = 0.5
 ) -> GroundPlane:
-    """Fit the surface below the focus that most upward-facing points near it lie on; ``reach_m`` is how far
-    aside counts."""
-    aside = np.linalg.norm((points_world - focus)[:, [0, 2]], axis=1)
+    """Fit the surface below the focus that most points within about ``reach_m`` of it lie on."""
+    distance_m = np.linalg.norm((points_world - focus)[:, [0, 2]], axis=1)
     height = points_world[:, 1]
-    weight = np.exp(-((aside / reach_m) ** 2)) * (height < focus[1] + FOCUS_MARGIN_M)
+    weight = np.exp(-((distance_m / reach_m) ** 2)) * (height < focus[1] + FOCUS_MARGIN_M)
     counts, edges = np.histogram(
         height, np.arange(height.min() - BIN_M, height.max() + 2 * BIN_M, BIN_M), weights=weight
     )

@@ -48,8 +48,7 @@ def _doubled_areas(corner: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays met: ``distance`` in units of the direction's length (inf = nothing), ``face`` (-1 =
-    nothing), ``barycentric``."""
+    """What rays met: ``distance`` in lengths of the direction (inf: nothing), ``face`` (-1: nothing)."""
 
     distance: Float[np.ndarray, "ray"]
     face: Int[np.ndarray, "ray"]
@@ -58,8 +57,7 @@ class Hits:
     def interpolate(
         self, mesh: Mesh, attribute: Num[np.ndarray, "vertex channel"]
     ) -> Float[np.ndarray, "ray channel"]:
-        """Blend a vertex attribute at the hit points; rays that missed get the values of face 0 and must be
-        masked."""
+        """Blend a vertex attribute at the hit points; rays that missed get face 0's and must be masked."""
         return np.einsum(
             "rk,rkc->rc", self.barycentric, attribute[mesh.faces[np.maximum(self.face, 0)]].astype(np.float32)
         )
@@ -80,8 +78,7 @@ class RayCaster:
         origins: Float[np.ndarray, "ray 3"] | Float[np.ndarray, "3"],
         directions: Float[np.ndarray, "ray 3"],
     ) -> Hits:
-        """Return the first hit of each ray, from origins of its own or one of all, in the mesh's frame,
-        metres."""
+        """Return the first hit of each ray, from origins of its own or one of all, mesh frame, metres."""
         origins = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), np.float32)
         found = self._scene.run(origins, np.ascontiguousarray(directions, np.float32), output=True)
         hit = found["primID"] >= 0

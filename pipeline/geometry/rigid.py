@@ -66,8 +66,7 @@ def log(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 
 def accumulate(
     steps: Float[np.ndarray, "step 4 4"], start: Float[np.ndarray, "4 4"] | None = None
 ) -> Float[np.ndarray, "pose 4 4"]:
-    """Chain relative motions ``first_from_second`` to poses in the start's frame (default: the first
-    one's)."""
+    """Chain motions ``first_from_second`` to poses in the start's frame (default: the first one's)."""
     poses = [np.eye(4) if start is None else start]
     for step in steps:
         poses.append(poses[-1] @ step)
@@ -125,8 +124,7 @@ def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
 
 
 def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15); parallel columns give one of
-    many."""
+    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15), parallel ones into any."""
     first = _normalized(columns[..., :3])
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
     parallel = np.linalg.norm(second, axis=-1, keepdims=True) < PARALLEL
@@ -157,8 +155,7 @@ def interpolate(
 def smoothed(
     a_from_b: Float[np.ndarray, "frame 4 4"], sigma_frames: float, places: bool = True
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Smooth transforms in time: positions (where ``places``) by a Gaussian, rotations by the Gaussian mean
-    of their matrices."""
+    """Smooth transforms in time: positions (if ``places``) by a Gaussian, rotations by its chordal mean."""
     if sigma_frames <= 0:
         return a_from_b
     mean = gaussian_filter1d(a_from_b[:, :3], sigma_frames, axis=0, mode="nearest")

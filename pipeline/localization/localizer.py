@@ -148,8 +148,7 @@ class Localizer:
         return self._hypothesis(map_from_camera, ratio, matched[inlier], points_camera)
 
     def _anchor(self, patches) -> Float[np.ndarray, "3"]:
-        """Return the point whose position a regressor predicts: the camera's centre, or the middle of the
-        animal."""
+        """Return the point whose position a regressor predicts: the camera's or the animal's middle."""
         return np.zeros(3) if self.sampling.target == "scene" else np.median(patches.points_camera, axis=0)
 
     def _regressed(self, patches, map_from_camera, certainty) -> PoseHypothesis:

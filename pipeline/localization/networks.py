@@ -61,8 +61,7 @@ class SceneCoordinateNet(nn.Module):
 def coordinate_loss(
     points: Float[Tensor, "patch 3"], log_m: Float[Tensor, "patch"], truth: Float[Tensor, "patch 3"]
 ) -> Float[Tensor, "patch"]:
-    """Return the negative log likelihood |x - y| / b + log b of a Laplace law with predicted width b
-    (metres)."""
+    """Return |x - y| / b + log b, the negative log likelihood of a Laplace law of width b (metres)."""
     return (points - truth).norm(dim=-1) * torch.exp(-log_m) + log_m
 
 
@@ -84,8 +83,7 @@ class _Block(nn.Module):
 
 
 class PoseRegressor(nn.Module):
-    """Grid of descriptors -> quaternion, position of the anchor in the map (metres), log of the expected
-    error."""
+    """Grid of descriptors -> quaternion, the anchor's position in the map (metres), log of expected error."""
 
     middle: Tensor
     extent: Tensor
@@ -110,8 +108,7 @@ class PoseRegressor(nn.Module):
     def forward(
         self, grid: Float[Tensor, "batch axis row column"]
     ) -> tuple[Float[Tensor, "batch 3 3"], Float[Tensor, "batch 3"], Float[Tensor, "batch"]]:
-        """Return rotations ``map_from_camera``, positions of the anchor in the map (metres), and log
-        errors."""
+        """Return rotations ``map_from_camera``, positions of the anchor in the map (metres), log errors."""
         out = self.head(self.trunk(grid * grid.shape[1] ** 0.5))
         quaternion = out[:, :4] + out.new_tensor([IDENTITY_BIAS, 0, 0, 0])
         return (
@@ -139,8 +136,7 @@ class PoseRegressor(nn.Module):
 def on_grid(
     query: Float[np.ndarray, "patch axis"], cell: Int[np.ndarray, "patch 2"]
 ) -> Float[np.ndarray, "axis row column"]:
-    """Arrange patches on the network's grid, centred; zero where there is none. Larger pictures are
-    subsampled to fit."""
+    """Arrange patches on the network's grid, centred, zero where there is none, subsampled to fit."""
     extent = cell.max(0) + 1
     place = (
         cell * GRID // max(int(extent.max()), GRID)
@@ -156,8 +152,7 @@ def pose_loss(
     log_error: Float[Tensor, "batch"],
     true_rotation: Float[Tensor, "batch 3 3"], true_position: Float[Tensor, "batch 3"],
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:  # fmt: skip
-    """Return geodesic angle + distance (radians + metres; Eq. 5), and the negative log likelihood of that
-    error."""
+    """Return angle + distance (radians + metres; Eq. 5), and the negative log likelihood of that error."""
     chord = (rotation - true_rotation).flatten(1).norm(dim=1) / 8**0.5
     error = 2 * torch.asin(chord.clamp(max=1 - 1e-6)) + (position - true_position).norm(dim=-1)
     return error, error.detach() * torch.exp(-log_error) + log_error

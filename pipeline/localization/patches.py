@@ -102,8 +102,7 @@ class PatchBank:
     def match(
         self, query: Float[np.ndarray, "query axis"], part: Int[np.ndarray, "part"] | None = None
     ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
-        """Return the map's point of each query's nearest neighbour and its weight (squared cosine), among all
-        or some."""
+        """Return the map's point of each query's nearest neighbour, among all or some, and its weight."""
         descriptors, points = self.descriptors, self.points_map
         if part is not None:
             descriptors, points = descriptors[part], points[part]
@@ -202,8 +201,7 @@ def extract_patches(
 
 
 def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
-    """Cut a square of fixed size in metres around the mask, grey outside it; None without depth in the
-    mask."""
+    """Cut a square of fixed size in metres around the mask, grey outside it; None without depth in it."""
     row, column = np.nonzero(mask)
     if len(row) < LEAST_MASK_PX:
         return None

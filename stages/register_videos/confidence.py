@@ -39,8 +39,7 @@ no longer counts."""
 
 @dataclass(frozen=True)
 class NccScores:
-    """Normalized cross-correlation of frames with renderings from their poses and from wrong ones; NaN where
-    incomparable."""
+    """Normalized cross-correlation of frames with renderings, from their poses and wrong ones; NaN: none."""
 
     frame: Int[np.ndarray, "compared"]
     targets: Float[np.ndarray, "compared"]

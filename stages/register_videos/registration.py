@@ -128,8 +128,8 @@ def register(
     appearance = appearance_probability(clip.timestamp_s, scores)
     if clip.mapped:
         if appearance.mean() < config.gate.least_appearance:
-            alike = f"only {appearance.mean():.0%} of the frames"
-            return Rejected(f"{alike} look more like the room than like wrong places in it", votes)
+            share = f"only {appearance.mean():.0%} of the frames"
+            return Rejected(f"{share} look more like the room than like wrong places in it", votes)
     elif config.initialization == "votes":
         reason = rejection_reason(aligned.fit, float(appearance.mean()), votes, start.supports, config)
         if reason is not None:

@@ -88,8 +88,7 @@ def _skin(
 
 
 def surface(animal: Animal, a_from_bone: Float[np.ndarray, "bone 4 4"]) -> Float[np.ndarray, "vertex 3"]:
-    """Blend the bones' motions linearly and return the vertices in frame a (at rest, bones sit at their
-    heads)."""
+    """Blend the bones' motions linearly; return vertices in frame a (at rest, bones sit at their heads)."""
     a_from_rest = a_from_bone.copy()
     a_from_rest[:, :3, 3] -= np.einsum(
         "bij,bj->bi", a_from_bone[:, :3, :3], animal.anatomy.size * animal.anatomy.heads

@@ -73,9 +73,8 @@ class Rig:
 
     def mostly_level(self, parent: str) -> Float[np.ndarray, "frame 3 3"]:
         """Keep a paw nearly level: a quarter of its parent's turn."""
-        return rigid.rotation_from_vector(
-            0.25 * rigid.vector_from_rotation(self.bones[:, INDEX[parent], :3, :3])
-        )
+        turn = rigid.vector_from_rotation(self.bones[:, INDEX[parent], :3, :3])
+        return rigid.rotation_from_vector(0.25 * turn)
 
     def _axis(self, name: str) -> Float[np.ndarray, "3"]:
         return self.anatomy.tails[INDEX[name]] - self.anatomy.heads[INDEX[name]]
@@ -118,9 +117,8 @@ def poses(
 def _neutral(anatomy: Anatomy) -> Float[np.ndarray, "foot 3"]:
     """Return where the feet stand under the body, agent frame."""
     fore, hind = anatomy.gait.forward
-    return anatomy.heads[[INDEX[name] for name in FEET]] + np.array(
-        [[0, 0, fore], [0, 0, fore], [0, 0, hind], [0, 0, hind]]
-    )
+    forward = np.repeat([[0, 0, fore], [0, 0, hind]], 2, axis=0)
+    return anatomy.heads[[INDEX[name] for name in FEET]] + forward
 
 
 def footfalls(
@@ -138,17 +136,15 @@ def footfalls(
         index = np.floor(now)
         share = np.clip((now - index - carry) / (1 - carry), 0, 1)
         share = share * share * (3 - 2 * share)
-        here, there = (
-            _planted(course, cycle, index + k, 0.5 * np.median(duty), neutral[foot]) for k in (0, 1)
-        )
+        half = 0.5 * np.median(duty)
+        here, there = (_planted(course, cycle, index + k, half, neutral[foot]) for k in (0, 1))
         placed[:, foot] = here + share[:, None] * (there - here)
         placed[:, foot, 1] += 4 * share * (1 - share) * np.interp(timestamp_s, course.timestamp_s, lift)
     return placed
 
 
 def _rhythm(course: AnimalCourse, gait: Gait) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return stride phase, share of the stride on the ground, phase offset per foot and lift of the feet in
-    metres."""
+    """Return phase and share on the ground of strides, phase offset per foot, lift of the feet (metres)."""
     step = float(course.timestamp_s[1] - course.timestamp_s[0])
     speed = gaussian_filter1d(np.where(course.airborne > 0.5, 0.0, course.speed()), 0.08 / step)
     turn = gaussian_filter1d(np.abs(np.gradient(course.yaw, step)), 0.08 / step)
@@ -157,32 +153,21 @@ def _rhythm(course: AnimalCourse, gait: Gait) -> tuple[np.ndarray, np.ndarray, n
     phase = np.cumsum(frequency) * step
     trot = gaussian_filter1d(np.clip((speed - 0.8) / 0.5, 0, 1), 0.25 / step)[:, None]
     duty = np.clip(gait.duty[0] - 0.16 * drive, *gait.duty[1:])
-    return (
-        phase,
-        duty,
-        np.array(gait.walk_offset) * (1 - trot) + np.array(gait.trot_offset) * trot,
-        np.clip(0.03 + 0.025 * speed, 0.03, 0.07) * np.clip(drive / 0.15, 0, 1),
-    )
+    offset = np.array(gait.walk_offset) * (1 - trot) + np.array(gait.trot_offset) * trot
+    return phase, duty, offset, np.clip(0.03 + 0.025 * speed, 0.03, 0.07) * np.clip(drive / 0.15, 0, 1)
 
 
 def _planted(
     course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, neutral: np.ndarray
 ) -> Float[np.ndarray, "frame 3"]:
-    """Return where a foot stands in stride ``index``: under its neutral place at the middle of that
-    stance."""
+    """Return where a foot stands in a stride: under its neutral place at the middle of that stance."""
     rising = cycle + 1e-9 * np.arange(len(cycle))
     when = np.interp(index + half_duty, rising, course.timestamp_s)
     yaw = np.interp(when, course.timestamp_s, course.yaw)
     x, y, z = (np.interp(when, course.timestamp_s, course.position[:, axis]) for axis in range(3))
     side, sole, forward = neutral
-    return np.stack(
-        [
-            x + np.cos(yaw) * side + np.sin(yaw) * forward,
-            y + sole,
-            z - np.sin(yaw) * side + np.cos(yaw) * forward,
-        ],
-        axis=-1,
-    )
+    x, z = x + np.cos(yaw) * side + np.sin(yaw) * forward, z - np.sin(yaw) * side + np.cos(yaw) * forward
+    return np.stack([x, y + sole, z], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -204,9 +189,8 @@ def _sampled(course: AnimalCourse, timestamp_s: np.ndarray, gait: Gait) -> _Stat
     def at(values: np.ndarray, smooth_s: float = 0.0) -> np.ndarray:
         values = values if values.ndim > 1 else values[:, None]
         if smooth_s:
-            values = gaussian_filter1d(
-                values, smooth_s / (course.timestamp_s[1] - course.timestamp_s[0]), axis=0
-            )
+            step_s = course.timestamp_s[1] - course.timestamp_s[0]
+            values = gaussian_filter1d(values, smooth_s / step_s, axis=0)
         columns = [np.interp(timestamp_s, course.timestamp_s, values[:, k]) for k in range(values.shape[1])]
         return np.stack(columns, axis=-1) if len(columns) > 1 else columns[0]
 
@@ -230,26 +214,19 @@ def _sampled(course: AnimalCourse, timestamp_s: np.ndarray, gait: Gait) -> _Stat
 def _root(state: _State, timestamp_s: np.ndarray, gait: Gait) -> Float[np.ndarray, "frame 4 4"]:
     height = gait.stand_m - 0.012 - 0.012 * np.clip(state.speed, 0, 1.5) - 0.05 * state.crouch
     stand = 1 - state.sit - state.lie
-    height = (
-        height * stand
-        + gait.sit_m * state.sit
-        + gait.lie_m * state.lie
-        + 0.006 * np.sin(4 * np.pi * state.phase) * np.clip(state.speed, 0, 1)
-    )
+    bob = 0.006 * np.sin(4 * np.pi * state.phase) * np.clip(state.speed, 0, 1)
+    height = height * stand + gait.sit_m * state.sit + gait.lie_m * state.lie + bob
     hop = np.clip(state.speed / 0.4, 0, 1)
     height += gait.hop_m * hop * (0.5 - 0.5 * np.cos(2 * np.pi * state.phase))
     height += 0.0015 * np.sin(2 * np.pi * 0.45 * timestamp_s)
-    pitch = gait.sit_pitch * state.sit + 0.03 * np.sin(4 * np.pi * state.phase + 1.0) * np.clip(
-        state.speed - 0.6, 0, 1
-    )
+    run = np.clip(state.speed - 0.6, 0, 1)
+    pitch = gait.sit_pitch * state.sit + 0.03 * np.sin(4 * np.pi * state.phase + 1.0) * run
     pitch = pitch - gait.hop_pitch * hop * np.sin(2 * np.pi * (state.phase - 0.1))
     roll = np.clip(0.05 * state.turn * state.speed, -0.12, 0.12)
     climb = np.gradient(state.position[:, 1], timestamp_s) if len(timestamp_s) > 1 else np.zeros(1)
     pitch = pitch - np.clip(0.35 * climb, -0.6, 0.6) * state.air
     rotation = _turn(1, state.yaw) @ _turn(0, pitch) @ _turn(2, -roll)
-    return rigid.make(
-        rotation, state.position + np.stack([np.zeros_like(height), height, np.zeros_like(height)], axis=-1)
-    )
+    return rigid.make(rotation, state.position + height[:, None] * [0, 1, 0])
 
 
 def _posed_feet(
@@ -265,12 +242,8 @@ def _posed_feet(
             level[:, foot] = np.stack([np.full_like(ground, x), ground, np.full_like(ground, z)], axis=-1)
         return np.einsum("fji,fkj->fki", level_from_agent, level)
 
-    sitting = on_ground(anatomy.gait.sitting)
-    lying = on_ground(anatomy.gait.lying)
-    flying = np.broadcast_to(
-        _neutral(anatomy) + np.array([[0, 0.05, 0.07], [0, 0.05, 0.07], [0, 0.03, -0.09], [0, 0.03, -0.09]]),
-        feet_agent.shape,
-    )
+    sitting, lying = on_ground(anatomy.gait.sitting), on_ground(anatomy.gait.lying)
+    flying = _neutral(anatomy) + np.repeat([[0, 0.05, 0.07], [0, 0.03, -0.09]], 2, axis=0)
     sit, lie, air = (part[:, None, None] for part in (state.sit, state.lie, state.air))
     return (feet_agent * (1 - sit - lie) + sitting * sit + lying * lie) * (1 - air) + flying * air
 
@@ -293,9 +266,8 @@ def _bend_spine(rig: Rig, state: _State) -> None:
 
 def _turn_head(rig: Rig, world_from_agent: np.ndarray, state: _State) -> None:
     """Point the head at the gaze, shared with the neck and limited to what a neck can do."""
-    toward = rigid.apply(rigid.inverse(world_from_agent), state.gaze[:, None])[:, 0] - np.array(
-        rig.anatomy.gait.eye
-    )
+    gaze_agent = rigid.apply(rigid.inverse(world_from_agent), state.gaze[:, None])[:, 0]
+    toward = gaze_agent - np.array(rig.anatomy.gait.eye)
     yaw = np.clip(np.arctan2(toward[:, 0], toward[:, 2]), -1.25, 1.25)
     pitch = np.clip(-np.arctan2(toward[:, 1], np.hypot(toward[:, 0], toward[:, 2])), -0.6, 0.75)
     neck_pitch = 0.35 * state.crouch - 0.1 * state.sit + 0.25 * np.clip((state.speed - 0.8) / 1.2, 0, 1)
@@ -311,11 +283,8 @@ def _swing_tail(rig: Rig, state: _State, timestamp_s: np.ndarray) -> None:
     base, much = rig.bones[:, INDEX["pelvis"], :3, :3], rig.anatomy.gait.tail_sway
     lift = (0.35 + 0.75 * state.tail) * (1 - rest) - 0.3 * rest + 0.45 * state.sit
     for index in range(5):
-        sway = (
-            0.16
-            * np.sin(2 * np.pi * (0.55 + 0.25 * np.abs(state.tail)) * timestamp_s - 0.7 * index)
-            * (1 + 0.5 * index)
-        )
+        wave = np.sin(2 * np.pi * (0.55 + 0.25 * np.abs(state.tail)) * timestamp_s - 0.7 * index)
+        sway = 0.16 * wave * (1 + 0.5 * index)
         curl = 0.38 * rest * (index > 0)
         bend = (0.75 if index == 0 else 0.22) * lift
         base = base @ _turn(1, much * (sway * (1 - 0.7 * rest) + curl)) @ _turn(0, much * bend)

@@ -46,38 +46,29 @@ def upright(x: float, z: float, yaw: float = 0.0, y: float = 0.0) -> Float[np.nd
     return rigid.make(rigid.rotation_from_vector(np.array([0.0, yaw, 0.0])), np.array([x, y, z]))
 
 
-def flat(corner, right, down, paint: Paint, *, glow: float = 0.0, cells: tuple[int, int] = (1, 1)) -> Sheet:
+def flat(corner, right, down, paint: Paint, *, glow: float = 0.0) -> Sheet:
     """Make a rectangle from its top left corner and its two edges as seen from the front."""
     corner, right, down = (np.asarray(part, float) for part in (corner, right, down))
-    v, u = np.meshgrid(np.linspace(0, 1, cells[0] + 1), np.linspace(0, 1, cells[1] + 1), indexing="ij")
+    v, u = np.meshgrid((0.0, 1.0), (0.0, 1.0), indexing="ij")
     points = corner + v[..., None] * down + u[..., None] * right
     picture = paint(float(np.linalg.norm(right)), float(np.linalg.norm(down)))
     return Sheet(points.astype(np.float32), picture, glow)
 
 
 def box(center, size, paint: Paint | dict[str, Paint], *, skip: str = "") -> list[Sheet]:
-    """Make an upright box; ``paint`` may name faces (``+x`` ... ``-z``) apart ("" = the rest); ``skip`` omits
-    faces."""
+    """Make an upright box; ``paint`` may be by face (``+x``, "" = the rest), ``skip`` omits faces."""
     center, half = np.asarray(center, float), np.asarray(size, float) / 2
     sheets = []
-    for name, normal in (
-        ("+x", (1, 0, 0)),
-        ("-x", (-1, 0, 0)),
-        ("+y", (0, 1, 0)),
-        ("-y", (0, -1, 0)),
-        ("+z", (0, 0, 1)),
-        ("-z", (0, 0, -1)),
-    ):
+    for name in ("+x", "-x", "+y", "-y", "+z", "-z"):
         if name in skip.split():
             continue
-        normal = np.array(normal, float)
+        normal = float(f"{name[0]}1") * np.eye(3)["xyz".index(name[1])]
         up = np.array([0.0, 1.0, 0.0]) if normal[1] == 0 else np.array([0.0, 0.0, -normal[1]])
         right = np.cross(up, normal)
-        corner = (
-            center + half * normal + np.abs(half @ np.abs(up)) * up - np.abs(half @ np.abs(right)) * right
-        )
+        high, wide = half @ np.abs(up), half @ np.abs(right)
+        corner = center + half * normal + high * up - wide * right
         chosen = paint.get(name, paint[""]) if isinstance(paint, dict) else paint
-        sheets.append(flat(corner, 2 * (half @ np.abs(right)) * right, -2 * (half @ np.abs(up)) * up, chosen))
+        sheets.append(flat(corner, 2 * wide * right, -2 * high * up, chosen))
     return sheets
 
 
@@ -103,17 +94,14 @@ def cylinder(
     ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
     half = np.array([0, height / 2, 0])
     low, high = np.asarray(center, float) - half, np.asarray(center, float) + half
-    wall = Sheet(
-        np.stack([high + ring * radius * flare, low + ring * radius]).astype(np.float32),
-        side(2 * np.pi * radius, height),
-    )
-    disc = np.stack([np.broadcast_to(high, ring.shape), high + ring * radius * flare]).astype(np.float32)
-    return [wall, Sheet(disc, top(2 * np.pi * radius, radius))]
+    rim, around = high + ring * radius * flare, 2 * np.pi * radius
+    wall = np.stack([rim, low + ring * radius]).astype(np.float32)
+    disc = np.stack([np.broadcast_to(high, ring.shape), rim]).astype(np.float32)
+    return [Sheet(wall, side(around, height)), Sheet(disc, top(around, radius))]
 
 
 def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: int) -> Sheet:
-    """Make a hanging cloth from its top left corner along ``right``, in ``folds`` waves of ``depth``
-    metres."""
+    """Make a hanging cloth from its top left corner along ``right``, in waves of ``depth`` metres."""
     corner, right = np.asarray(corner, float), np.asarray(right, float)
     u = np.linspace(0, 1, folds * 4 + 1)
     out = np.cross(right, [0, 1.0, 0]) / np.linalg.norm(right)
@@ -122,18 +110,13 @@ def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: 
     return Sheet(points.astype(np.float32), paint(float(np.linalg.norm(right)), height))
 
 
-def ball(center, radius: float, paint: Paint, *, squash: float = 1.0, rings: int = 7) -> Sheet:
-    """Make a ball, its height scaled by ``squash``."""
-    polar, angle = np.meshgrid(
-        np.linspace(0.02, np.pi - 0.02, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij"
-    )
-    unit = np.stack(
-        [np.sin(polar) * np.sin(angle), squash * np.cos(polar), np.sin(polar) * np.cos(angle)], axis=-1
-    )
-    return Sheet(
-        (np.asarray(center, float) + radius * unit).astype(np.float32),
-        paint(2 * np.pi * radius, np.pi * radius),
-    )
+def ball(center, radius: float, paint: Paint) -> Sheet:
+    """Make a ball."""
+    latitude, longitude = np.linspace(0.02, np.pi - 0.02, 8), np.linspace(0, 2 * np.pi, 15)
+    polar, angle = np.meshgrid(latitude, longitude, indexing="ij")
+    unit = [np.sin(polar) * np.sin(angle), np.cos(polar), np.sin(polar) * np.cos(angle)]
+    points = np.asarray(center, float) + radius * np.stack(unit, axis=-1)
+    return Sheet(points.astype(np.float32), paint(2 * np.pi * radius, np.pi * radius))
 
 
 def triangles(
@@ -160,11 +143,9 @@ def triangles(
         vertices.append(sheet.points.reshape(-1, 3))
         owner.append(np.full(len(faces[-1]), index))
         start += rows * columns
-    joined = (np.concatenate(part) for part in (vertices, faces, coordinates, owner))
-    vertices, faces, coordinates, owner = joined
     return (
-        vertices.astype(np.float32),
-        faces.astype(np.int32),
-        coordinates.astype(np.float32),
-        owner.astype(np.int32),
+        np.concatenate(vertices).astype(np.float32),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate(coordinates).astype(np.float32),
+        np.concatenate(owner).astype(np.int32),
     )

@@ -17,8 +17,7 @@ HEIGHT_M = 1.6
 CHANNELS = 16
 KINDS = (
     "floor", "wall", "window", "rug", "sofa", "shelf", "media", "cat tree", "coffee table", "dining table",
-    "plant", "lamp",
-    "bowls", "loose",
+    "plant", "lamp", "bowls", "loose",
 )  # fmt: skip
 CODES = np.linalg.qr(np.random.default_rng(5).standard_normal((CHANNELS, CHANNELS)))[0][: len(KINDS)]
 """One orthonormal vector per kind."""
@@ -29,23 +28,20 @@ HEADROOM_M = 0.5
 def volume_of(home: Room) -> FeatureVolume:
     """Voxelise floor, walls, surfaces and what they enclose."""
     origin = np.array([-WIDTH_M / 2 - MARGIN_M, -MARGIN_M, -DEPTH_M / 2 - MARGIN_M])
-    shape = tuple(
-        np.ceil((np.array([WIDTH_M, HEIGHT_M, DEPTH_M]) + 2 * MARGIN_M) / VOXEL_M - 1e-9).astype(int)
-    )
+    extent = np.array([WIDTH_M, HEIGHT_M, DEPTH_M]) + 2 * MARGIN_M
+    shape = tuple(np.ceil(extent / VOXEL_M - 1e-9).astype(int))
     centres = origin + (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) + 0.5) * VOXEL_M
     kind = np.full(shape, -1)
-    kind[(np.abs(centres[..., 0]) > WIDTH_M / 2) | (np.abs(centres[..., 2]) > DEPTH_M / 2)] = KINDS.index(
-        "wall"
-    )
+    outside = (np.abs(centres[..., 0]) > WIDTH_M / 2) | (np.abs(centres[..., 2]) > DEPTH_M / 2)
+    kind[outside] = KINDS.index("wall")
     kind[centres[..., 1] < 0] = KINDS.index("floor")
     for thing in (*home.standing, *home.loose):
         kind[_taken(thing, centres, origin)] = KINDS.index(thing.name)
     for place in home.places:
-        if place.position[1] > 0.1:
-            near = np.hypot(centres[..., 0] - place.position[0], centres[..., 2] - place.position[2]) < 0.3
-            level = (centres[..., 1] > place.position[1] + 0.05) & (
-                centres[..., 1] < place.position[1] + HEADROOM_M
-            )
+        x, height, z = place.position
+        if height > 0.1:
+            near = np.hypot(centres[..., 0] - x, centres[..., 2] - z) < 0.3
+            level = (centres[..., 1] > height + 0.05) & (centres[..., 1] < height + HEADROOM_M)
             kind[near & level] = -1
     codes = np.concatenate([CODES, np.zeros((1, CHANNELS))])
     features = np.moveaxis(codes[kind], -1, 0).astype(np.float16)

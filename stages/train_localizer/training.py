@@ -20,6 +20,8 @@ from stages.train_localizer import describing, networks, views
 from stages.train_localizer.config import AgentConfig, Config, SceneConfig
 from stages.train_localizer.views import RenderedView
 
+SEEDS = 2**31
+"""Seeds are drawn below this."""
 MOST_DRAWS = 200
 """Random views of the scene of which one at least must be such as people take."""
 AXES = 64
@@ -128,10 +130,10 @@ def train(
         case "bank":
             model = described.bank()
         case "coordinates":
-            model = networks.train_coordinates(described, config.network, int(rng.integers(2**31)))
+            model = networks.train_coordinates(described, config.network, int(rng.integers(SEEDS)))
         case "regression":
             draw = _fresh_patches(shown, describe) if config.network.fresh_views else None
-            seed = int(rng.integers(2**31))
+            seed = int(rng.integers(SEEDS))
             model = networks.train_regressor(described, shown.target, config.network, seed, draw)
         case _:
             assert_never(config.kind)

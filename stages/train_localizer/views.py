@@ -119,8 +119,7 @@ def augment(
 
 
 def plausible(view: RenderedView, caster: RayCaster) -> bool:
-    """Return whether a person could have taken this scene view: mostly surface, from its front, nothing too
-    near."""
+    """Return whether a person could have taken it: mostly surface, from its front, nothing too near."""
     if view.seen.mean() < LEAST_SEEN or np.quantile(view.depth[view.seen], NEAREST_QUANTILE) < NEAREST_M:
         return False
     grid = view.depth.shape[0] // FRONT_RAYS
