@@ -61,9 +61,16 @@ MODEL = TrainingConfig(
 )
 """The behaviour model without a map; two orders more data than of one animal need no augmentation of the past
 and one network. Chosen on the validation parts of the scenes to learn from."""
-SAMPLING = PlanSamplingConfig(goal_steps=20, sequence_steps=2, avoid_solid=False, max_path_draws=1)
-"""Two steps of a path: more of them add sway that no goal asks for (ADE 0.231 m with 2, 0.242 m with 5 on the
-validation parts)."""
+SAMPLING = PlanSamplingConfig(
+    method="ddpm_large",
+    goal_steps=20,
+    sequence_steps=1,
+    path_noise_std=0.0,
+    avoid_solid=False,
+    max_path_draws=1,
+)
+"""Goals keep the spread that the posterior's variance loses; a path is the mean of those that lead to its goal,
+for noise adds sway that no goal asks for. See `docs/real_benchmark.md`."""
 WINDOWS_AT_ONCE = 512
 MOST_WINDOWS = 2000
 """Windows that are judged of a scene at most, evenly chosen."""

@@ -26,13 +26,16 @@ AblatedInput = Literal["nothing", "scene", "observer", "past"]
 """The part of perception that an ablation replaces by its learned null."""
 NoiseCourse = Literal["linear", "rectified"]
 """Variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023)."""
+SamplingMethod = Literal["ddpm", "ddpm_large", "ddim"]
+"""DDPM adds noise of the posterior's variance at each step, or of the larger one of the forward step (both of
+Ho et al. 2020, Sec. 3.2), which keeps the spread that few steps of the former lose; DDIM adds none."""
 
 
 @dataclass(frozen=True)
 class PlanSamplingConfig:
     """How plans are drawn."""
 
-    method: Literal["ddpm", "ddim"] | None = None
+    method: SamplingMethod | None = None
     """Sampler of goals (none: as the schedule asks for). DDPM adds fresh noise at every step, which corrects
     earlier errors; DDIM is a function of the first noise alone, as paths and bodies are."""
     goal_steps: int = 50
@@ -60,6 +63,9 @@ class PlanSamplingConfig:
     """Standard deviation of the noise that bodies are drawn from. At 1 a body trembles three times as much as
     the animal does; at 0.3 its bones rotate from frame to frame as far as recorded ones (session kept from
     training)."""
+    path_noise_std: float = 1.0
+    """Standard deviation of the noise that paths are drawn from. At 0, in one step, a path is the mean of all
+    that lead to its goal."""
     max_path_draws: int = 3
     """Paths drawn at most until one reaches its goal. Of paths drawn once, more stay than animals do: 67 % of
     the time against 64 % with up to three draws and 63 % in truth (four homes kept from training)."""

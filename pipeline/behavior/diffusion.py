@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.behavior.config import NoiseCourse
+from pipeline.behavior.config import NoiseCourse, SamplingMethod
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
@@ -93,7 +93,7 @@ def sample(
     noise: Array,
     schedule: Schedule,
     *,
-    method: Literal["ddpm", "ddim"],
+    method: SamplingMethod,
     count: int,
     draw: Callable[[], Array] | None = None,
     correct: Callable[[Array], Array] | None = None,
@@ -102,8 +102,9 @@ def sample(
 
     ``denoise(x, t)`` predicts the noise. DDIM is deterministic; DDPM adds fresh noise from ``draw`` at each
     step but the last, with the posterior variance of the steps visited (exact ancestral sampling when all
-    are). ``correct`` is applied to the clean estimates of the steps at which most of the variance is clean,
-    the last one among them.
+    are) or, as `ddpm_large`, with that of the forward steps, which is exact for data of N(0, 1).
+    ``correct`` is applied to the clean estimates of the steps at which most of the variance is clean, the
+    last one among them.
     """
     x, steps, alpha_bar = noise, schedule.visited(count), schedule.alpha_bar
     for position, t in enumerate(steps):
@@ -115,9 +116,19 @@ def sample(
         if position == len(steps) - 1:
             return clean
         later = float(alpha_bar[steps[position + 1]])
-        variance = (1 - later) / (1 - now) * (1 - now / later) if method == "ddpm" else 0.0
-        x = later**0.5 * clean + max(1 - later - variance, 0.0) ** 0.5 * epsilon
-        if method == "ddpm":
+        beta = 1 - now / later
+        posterior = (1 - later) / (1 - now) * beta
+        match method:
+            case "ddpm":
+                replaced, fresh = posterior, posterior
+            case "ddpm_large":
+                replaced, fresh = posterior, beta
+            case "ddim":
+                replaced, fresh = 0.0, 0.0
+            case _:
+                assert_never(method)
+        x = later**0.5 * clean + max(1 - later - replaced, 0.0) ** 0.5 * epsilon
+        if fresh:
             assert draw is not None, "DDPM draws fresh noise"
-            x = x + variance**0.5 * draw()
+            x = x + fresh**0.5 * draw()
     return x

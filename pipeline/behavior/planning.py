@@ -293,9 +293,14 @@ class Sampler:
 
         towards = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.less)]
         shape = len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]
-        drawn = replace(sampling, method="ddim")
         path = self._drawn(
-            towards, shape, drawn, sampling.sequence_steps, rng, lambda x: self.paths_out_of_solid(codes, x)
+            towards,
+            shape,
+            replace(sampling, method="ddim"),
+            sampling.sequence_steps,
+            rng,
+            lambda x: self.paths_out_of_solid(codes, x),
+            sampling.path_noise_std,
         )
         return self.finished_paths(codes, path, goal, sampling)
 

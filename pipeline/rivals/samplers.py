@@ -80,7 +80,7 @@ class GaussianSampler(Sampler):
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path towards each goal, metres, ego frame."""
-        scaled = self._drawn_from(self._path(codes, goal, sampling), rng)
+        scaled = self._drawn_from(self._path(codes, goal, sampling), rng, sampling.path_noise_std)
         return self.finished_paths(codes, scaled, goal, sampling)
 
     def bodies(
@@ -169,7 +169,8 @@ class OneStageSampler(Sampler):
 
         body = len(self.scaling.body_mean)
         shape, steps = (len(codes.full), PATH_CHANNELS + body, frames), sampling.sequence_steps
-        spread = np.array([1.0] * PATH_CHANNELS + [sampling.body_noise_std] * body)[:, None]
+        stds = sampling.path_noise_std, sampling.body_noise_std
+        spread = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
         denoisers = [denoise(code) for code in (codes.full, *codes.less)]
         return self._drawn(denoisers, shape, sampling, steps, rng, correct, spread)
 

@@ -37,6 +37,23 @@ def test_samplers_reproduce_a_gaussian(method, count, tolerance):
     assert abs(x.std() - 0.5) < tolerance
 
 
+def test_the_forward_variance_keeps_the_spread_of_unit_data_in_few_steps():
+    rng = np.random.default_rng(0)
+    spread = {}
+    for method in ("ddpm", "ddpm_large"):
+        x = sample(
+            perfect(0.0, 1.0),
+            rng.standard_normal(40000),
+            SCHEDULE,
+            method=method,
+            count=20,
+            draw=lambda: rng.standard_normal(40000),
+        )
+        spread[method] = x.std()
+    assert spread["ddpm_large"] == pytest.approx(1.0, abs=0.02)  # the standard error is 0.004
+    assert spread["ddpm"] < 0.95
+
+
 def test_noising_keeps_unit_variance():
     rng = np.random.default_rng(0)
     clean, noise = rng.standard_normal((2, 100000))

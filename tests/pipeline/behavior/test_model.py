@@ -118,6 +118,21 @@ def test_bodies_spread_as_far_as_they_are_told(ats, data):
     assert spread[0] < 1e-6 < spread[1] < spread[2]
 
 
+def test_paths_without_noise_are_a_function_of_their_goal(ats, data):
+    context, _ = data.windows(np.array([0]))
+    codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), ats.sampling, 40)
+    goal = np.tile([[0.3, 0.0, 0.7]], (40, 1))
+    spread = [
+        ats.sampler.draw_paths(
+            codes, goal, replace(ats.sampling, path_noise_std=told), np.random.default_rng(0)
+        )
+        .std(0)
+        .mean()
+        for told in (0.0, 1.0)
+    ]
+    assert spread[0] < 1e-6 < 1e-3 < spread[1]
+
+
 def test_predictors_share_one_call(ats, data):
     train = data.windows(data.indices(TRAIN))
     context, _ = data.windows(data.indices(TEST)[::20])
