@@ -7,7 +7,8 @@ share one form. A relative pose factor is what odometry measured between two fra
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -24,6 +25,10 @@ SHORTEST_S = 1e-3
 """Least time between frames, seconds."""
 DAMPING = 1e-6
 """Damping of a step, share of each diagonal element and of their mean: what nothing measures stays still."""
+CHI_DAMPING = 1e-3
+"""The same in `chi_squares`: what one flat wall does not measure does not count."""
+MEDIAN_CHI_SQUARE = 5.348
+"""Median of the chi-square distribution of six degrees of freedom."""
 PRIOR_PRECISION = 1e-9
 """Added to the information so that frames that nothing holds have a finite covariance."""
 
@@ -45,6 +50,10 @@ class Correspondences:
         names = [field.name for field in fields(Correspondences)]
         return Correspondences(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
+    def inflated(self, factor: float) -> "Correspondences":
+        """Multiply the deviations."""
+        return replace(self, sigma_m=factor * self.sigma_m)
+
 
 @dataclass(frozen=True)
 class RelativePoseFactors:
@@ -56,6 +65,14 @@ class RelativePoseFactors:
     sigma_rad: Float[np.ndarray, "edge"]
     sigma_m: Float[np.ndarray, "edge"]
 
+    def inflated(self, factor: float) -> "RelativePoseFactors":
+        """Multiply the deviations."""
+        return replace(self, sigma_rad=factor * self.sigma_rad, sigma_m=factor * self.sigma_m)
+
+    def chi_squares(self, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "edge"]:
+        """Return each factor's squared error, in its deviations."""
+        return (_edge_rows(world_from_camera, self)[1].reshape(-1, 6) ** 2).sum(1)
+
 
 @dataclass(frozen=True)
 class OptimizedPoses:
@@ -64,6 +81,16 @@ class OptimizedPoses:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     correspondences: Correspondences
     residual_m: Float[np.ndarray, "match"]
+
+
+class PoseTerm(Protocol):
+    """A further term of the cost, with unknowns of its own."""
+
+    def normal_equations(
+        self, world_from_camera: Float[np.ndarray, "frame 4 4"]
+    ) -> tuple[sparse.csc_array, Float[np.ndarray, "parameter"]]:
+        """Return matrix and gradient for the cameras' right-hand twists, its own unknowns eliminated."""
+        ...
 
 
 def odometry_factors(
@@ -88,17 +115,21 @@ def optimize_poses(
     *,
     reach_m: tuple[float, ...],
     fixed: Bool[np.ndarray, "frame"] | None = None,
+    term: PoseTerm | None = None,
 ) -> OptimizedPoses:
     """Minimise sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses; rho: Geman-McClure of ``reach_m``.
 
     Each round finds the correspondences anew within its reach (metres) and takes one Gauss-Newton step on the
-    right-hand twist of each camera. ``fixed`` frames stay where they are.
+    right-hand twist of each camera. ``fixed`` frames stay where they are; ``term`` is added to the cost.
     """
     poses = np.array(world_from_camera, float)
     free = np.ones(len(poses), bool) if fixed is None else ~fixed
     for reach in reach_m:
         correspondences = find_correspondences(poses, reach)
         normal, gradient = _normal_equations(poses, correspondences, relative_poses, reach)
+        if term is not None:
+            other_normal, other_gradient = term.normal_equations(poses)
+            normal, gradient = normal + other_normal, gradient + other_gradient
         poses = poses @ rigid.exp(_solve(normal, gradient, free))
     correspondences = find_correspondences(poses, reach_m[-1])
     return OptimizedPoses(poses, correspondences, residuals(poses, correspondences))
@@ -129,6 +160,34 @@ def marginal_covariance(
         back = len(own) - 1 - frame
         future[back] -= next_to[back] @ np.linalg.solve(future[back + 1], next_to[back].T)
     return np.linalg.inv(past + future - own)
+
+
+def chi_squares(
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    correspondences: Correspondences,
+    group: Int[np.ndarray, "match"],
+    reach_m: float,
+) -> Float[np.ndarray, "group"]:
+    """Return how far each group of correspondences wants its first camera elsewhere: g^T H^-1 g of its own.
+
+    Chi-square distributed with six degrees of freedom where the deviations are true and errors independent.
+    """
+    residual = residuals(world_from_camera, correspondences)
+    weight = (reach_m**2 / (reach_m**2 + residual**2)) ** 2 / correspondences.sigma_m**2
+    rotation = world_from_camera[correspondences.first, :3, :3]
+    direction = np.einsum("cij,ci->cj", rotation, correspondences.direction_world)
+    rows = np.concatenate([np.cross(correspondences.points_first, direction), direction], axis=1)
+    normal, gradient = np.zeros((group.max() + 1, 6, 6)), np.zeros((group.max() + 1, 6))
+    np.add.at(normal, group, np.einsum("c,ci,cj->cij", weight, rows, rows))
+    np.add.at(gradient, group, rows * (weight * residual)[:, None])
+    damping = CHI_DAMPING * np.trace(normal, axis1=1, axis2=2) / 6 + np.finfo(float).tiny
+    step = np.linalg.solve(normal + damping[:, None, None] * np.eye(6), gradient[..., None])[..., 0]
+    return (step * gradient).sum(1)
+
+
+def variance_factor(chi_squares: Float[np.ndarray, "group"]) -> float:
+    """Return by what factor variances are larger than assumed, from errors of six degrees of freedom."""
+    return float(np.median(chi_squares)) / MEDIAN_CHI_SQUARE
 
 
 def residuals(

@@ -29,6 +29,7 @@ ALIGN_REACH_M = (0.1, 0.04)
 """Width of the robust weight in the first and last round of the alignment to the surface, metres."""
 ALIGN_POINTS, ALIGN_LEAST_POINTS = 400_000, 40
 """Depth points that take part, so that memory stays bounded, and least number per frame."""
+NO_KEYFRAMES = np.zeros(0, int)
 NEAREST_M, SEEN_WITHIN_M = 0.2, 0.06
 """A frame sees a vertex beyond the first distance where measured depth agrees within the second, metres."""
 
@@ -63,9 +64,16 @@ def fuse(
 
 
 def align_frames(
-    clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], config: FusionConfig
+    clip: Clip,
+    mesh: Mesh,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    config: FusionConfig,
+    keyframes: Int[np.ndarray, "key"] = NO_KEYFRAMES,
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
-    """Optimize every frame against surface and odometry; also return each frame's median gap, metres."""
+    """Optimize every frame against surface and odometry; also return each frame's median gap, metres.
+
+    Depth counts by how far it contradicts the keyframes; they stay if that is more than its noise explains.
+    """
     surface, frames = depth_scans.SurfaceMap(mesh), np.arange(len(clip))
     most = max(ALIGN_POINTS // len(clip), ALIGN_LEAST_POINTS)
     scans = [
@@ -80,10 +88,18 @@ def align_frames(
     ]
 
     def find(poses, reach_m):
-        return surface.correspondences(frames, scans, poses, reach_m, DEPTH_INFLATION)
+        return surface.correspondences(frames, scans, poses, reach_m, inflation)
 
-    reach, odometry = tuple(np.geomspace(*ALIGN_REACH_M, config.align_rounds)), odometry_factors(clip, frames)
-    optimized = pose_optimization.optimize_poses(world_from_camera, find, odometry, reach_m=reach)
+    inflation, fixed = DEPTH_INFLATION, np.zeros(len(clip), bool)
+    if len(keyframes):
+        found = find(world_from_camera, ALIGN_REACH_M[0])
+        squares = pose_optimization.chi_squares(world_from_camera, found, found.first, ALIGN_REACH_M[0])
+        variance = pose_optimization.variance_factor(squares[np.isin(np.arange(len(squares)), keyframes)])
+        inflation *= np.sqrt(max(1.0, variance))
+        fixed[keyframes] = variance > 1
+    reach = tuple(np.geomspace(*ALIGN_REACH_M, config.align_rounds))
+    motion = odometry_factors(clip, frames, otherwise=world_from_camera)
+    optimized = pose_optimization.optimize_poses(world_from_camera, find, motion, reach_m=reach, fixed=fixed)
     gap = np.full(len(clip), np.nan)
     for frame in np.unique(optimized.correspondences.first):
         gap[frame] = np.median(np.abs(optimized.residual_m[optimized.correspondences.first == frame]))

@@ -1,7 +1,8 @@
-"""Refine the walk-through's keyframes against each other.
+"""Refine the walk-through's keyframes against each other by what they share.
 
-They are tied by what they share: SfM tracks (sideways, by pixel noise) and overlapping depth (along surface
-normals), with odometry between neighbours: correspondences of `pipeline.mapping.pose_optimization`.
+Matched points (`pipeline.mapping.bundle_adjustment`), overlapping depth (along surface normals) and odometry
+between neighbours count by measured variances: points by their reprojection errors, depth and odometry by how
+far they contradict cameras from points.
 """
 
 from dataclasses import dataclass
@@ -12,14 +13,11 @@ from jaxtyping import Float, Int
 from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping import depth_scans, pose_optimization
-from pipeline.mapping.colmap import SparseModel
+from pipeline.mapping.bundle_adjustment import PointTerm, TrackedPoints
 from stages.build_scene_template.config import RefinementConfig
-from stages.build_scene_template.sfm import points_under
 
 DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.5), 0.02
 """Drift of the odometry that the graph allows, several times that of phones: depth decides."""
-PIXEL_SIGMA_PX = 1.5
-"""Standard deviation of a SIFT feature's position, colour pixels."""
 DEPTH_INFLATION = 4.0
 """Depth noise is multiplied by this, since neighbouring pixels err together."""
 STRIDE_PX = 10
@@ -30,8 +28,14 @@ CANDIDATE_REACH = 1.5
 """Point pairs up to so many reaches apart are candidates."""
 NEAREST_M = 0.1
 """Depth below this is none, metres."""
-TRACK_HOPS = (1, 3)
-"""Observations of a track are paired with the next one and the third after it."""
+LEAST_COSINE = 0.7
+"""Normals of a pair, both known, agree within 45 degrees: rims and backs of thin walls are other surfaces."""
+FIRST_ROUNDS, FIRST_INFLATION = 6, 3.0
+"""Steps that place keyframes by points and odometry, and factor on the deviation of depth in them."""
+SHARED_POINTS, LEAST_PAIRS = 30, 10
+"""Depth of pairs that share so many points is judged by them; fewer pairs judge nothing."""
+LEAST_VARIANCE = 0.25
+"""Least factor on the assumed variance of depth: neighbouring pixels err together more than pairs show."""
 OVERLAP_STEP, LEAST_OVERLAP = 7, 0.3
 """One point in so many measures the overlap of two keyframes; the least share that makes them neighbours."""
 
@@ -74,57 +78,13 @@ def _pair_correspondences(keyframes, first, second, world_from_camera, reach_m):
     met = cameras.unproject(pixel[inside], target.intrinsics) * target.depth[row, column, None]
     normal = target.normals[row, column]
     gap = np.abs(np.einsum("ci,ci->c", moved[inside] - met, normal))
-    good = (np.abs(normal).sum(1) > 0) & (gap < CANDIDATE_REACH * reach_m)
+    own = keyframes[first].normals.reshape(-1, 3)[source.pixel_index[inside]] @ second_from_first[:3, :3].T
+    good = (np.einsum("ci,ci->c", own, normal) > LEAST_COSINE) & (gap < CANDIDATE_REACH * reach_m)
     inside, met = inside[good], met[good]
     sigma = DEPTH_INFLATION * np.hypot(source.sigma_m[inside], depth_scans.depth_noise(met[:, 2]))
     direction = normal[good] @ world_from_camera[second, :3, :3].T
     a, b = (np.full(len(inside), key) for key in (first, second))
     return pose_optimization.Correspondences(a, b, source.points_camera[inside], met, direction, sigma)
-
-
-@dataclass(frozen=True)
-class TrackMatches:
-    """Depth points under the same SfM track in two keyframes, camera axes, and their sideways noise."""
-
-    first: Int[np.ndarray, "tie"]
-    second: Int[np.ndarray, "tie"]
-    points_first: Float[np.ndarray, "tie 3"]
-    points_second: Float[np.ndarray, "tie 3"]
-    sigma_m: Float[np.ndarray, "tie"]
-
-    def correspondences(
-        self, world_from_camera: Float[np.ndarray, "key 4 4"]
-    ) -> pose_optimization.Correspondences:
-        """Constrain the points across the second camera's ray; along it depth is more accurate."""
-        ray = self.points_second / np.linalg.norm(self.points_second, axis=1, keepdims=True)
-        sides = []
-        for axis in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
-            side = axis - (ray @ axis)[:, None] * ray
-            side /= np.linalg.norm(side, axis=1, keepdims=True)
-            direction = np.einsum("cij,cj->ci", world_from_camera[self.second, :3, :3], side)
-            sides.append(
-                pose_optimization.Correspondences(
-                    self.first, self.second, self.points_first, self.points_second, direction, self.sigma_m
-                )
-            )
-        return pose_optimization.Correspondences.join(*sides)
-
-
-def match_tracks(sparse: SparseModel, clip: Clip, key_of_view: Int[np.ndarray, "view"]) -> TrackMatches:
-    """Pair each observation of a track that has depth with the track's next one and the third after it."""
-    points = np.full((len(sparse.observed_key), 3), np.nan)
-    for view, frame in enumerate(sparse.frame):
-        row = np.flatnonzero(sparse.observed_key == view)
-        points[row] = points_under(clip, int(frame), sparse.observed_pixel[row])
-    order = np.lexsort((sparse.observed_key, sparse.observed_point))
-    order = order[np.isfinite(points[order, 0])]
-    track = sparse.observed_point[order]
-    hops = [np.stack([order[:-hop], order[hop:]], 1)[track[:-hop] == track[hop:]] for hop in TRACK_HOPS]
-    first, second = np.concatenate(hops).T
-    focal = clip.intrinsics[sparse.frame[sparse.observed_key[second]], 0, 0]
-    sigma = PIXEL_SIGMA_PX * points[second, 2] / focal
-    first_key, second_key = (key_of_view[sparse.observed_key[each]] for each in (first, second))
-    return TrackMatches(first_key, second_key, points[first], points[second], sigma)
 
 
 def overlapping(
@@ -153,31 +113,61 @@ def refine_keyframes(
     frames: Int[np.ndarray, "key"],
     keyframes: list[Keyframe],
     world_from_camera: Float[np.ndarray, "key 4 4"],
-    sparse: SparseModel | None,
+    tracked: TrackedPoints,
     config: RefinementConfig,
 ) -> Float[np.ndarray, "key 4 4"]:
-    """Optimize the keyframes against each other by depth, SfM tracks and odometry; the first one is fixed."""
-    pairs = overlapping(world_from_camera, keyframes, config.neighbours)
-    tracks = None if sparse is None else match_tracks(sparse, clip, np.searchsorted(frames, sparse.frame))
+    """Optimize the keyframes against each other by points, depth and odometry; the first one is fixed."""
+    fixed, odometry = np.arange(len(frames)) == 0, odometry_factors(clip, frames)
+    poses, term, inflation = world_from_camera, None, 1.0
+    pairs = overlapping(poses, keyframes, config.neighbours)
 
     def find(poses, reach_m):
-        correspondences = depth_correspondences(keyframes, pairs, poses, reach_m)
-        if tracks is None:
-            return correspondences
-        return pose_optimization.Correspondences.join(correspondences, tracks.correspondences(poses))
+        return depth_correspondences(keyframes, pairs, poses, reach_m).inflated(inflation)
 
-    fixed, odometry = np.arange(len(frames)) == 0, odometry_factors(clip, frames)
+    if len(tracked.camera):
+        term, inflation, reach = PointTerm(tracked, poses), FIRST_INFLATION, (REACH_M[0],) * FIRST_ROUNDS
+        first = pose_optimization.optimize_poses(
+            poses, find, odometry, reach_m=reach, fixed=fixed, term=term
+        )  # fmt: skip
+        poses = first.world_from_camera
+        pairs = overlapping(poses, keyframes, config.neighbours)
+        inflation = np.sqrt(depth_variance(keyframes, pairs, poses, tracked))
+        if odometry is not None:
+            variance = pose_optimization.variance_factor(odometry.chi_squares(poses))
+            odometry = odometry.inflated(np.sqrt(max(1.0, variance)))
     reach = tuple(np.geomspace(*REACH_M, config.rounds))
-    found = pose_optimization.optimize_poses(world_from_camera, find, odometry, reach_m=reach, fixed=fixed)
+    found = pose_optimization.optimize_poses(poses, find, odometry, reach_m=reach, fixed=fixed, term=term)
     return found.world_from_camera
 
 
+def depth_variance(
+    keyframes: list[Keyframe],
+    pairs: Int[np.ndarray, "pair 2"],
+    world_from_camera: Float[np.ndarray, "key 4 4"],
+    tracked: TrackedPoints,
+) -> float:
+    """Return the variance of overlapping depth over the assumed one, judged by cameras that share points.
+
+    It is 1 where too few pairs do.
+    """
+    shared = tracked.shared(len(keyframes))
+    judged = [(int(a), int(b)) for a, b in pairs if shared[a, b] >= SHARED_POINTS]
+    parts = [_pair_correspondences(keyframes, a, b, world_from_camera, REACH_M[0]) for a, b in judged]
+    parts = [part for part in parts if len(part.first) >= SHARED_POINTS]
+    if len(parts) < LEAST_PAIRS:
+        return 1.0
+    group = np.repeat(np.arange(len(parts)), [len(part.first) for part in parts])
+    joined = pose_optimization.Correspondences.join(*parts)
+    squares = pose_optimization.chi_squares(world_from_camera, joined, group, REACH_M[0])
+    return max(LEAST_VARIANCE, pose_optimization.variance_factor(squares))
+
+
 def odometry_factors(
-    clip: Clip, frames: Int[np.ndarray, "key"]
+    clip: Clip, frames: Int[np.ndarray, "key"], otherwise: Float[np.ndarray, "key 4 4"] | None = None
 ) -> pose_optimization.RelativePoseFactors | None:
-    """Return the odometry between neighbouring frames of a selection, None where there is none."""
-    odometry, time_s = clip.odometry_from_camera, clip.timestamp_s[frames]
+    """Return the odometry between neighbouring frames of a selection; without it, that of ``otherwise``."""
+    odometry = otherwise if clip.odometry_from_camera is None else clip.odometry_from_camera[frames]
     if odometry is None:
         return None
     drift = dict(drift_rad_s=DRIFT_RAD_S, drift_m_s=DRIFT_M_S)
-    return pose_optimization.odometry_factors(time_s, odometry[frames], **drift)
+    return pose_optimization.odometry_factors(clip.timestamp_s[frames], odometry, **drift)

@@ -59,9 +59,9 @@ def build(
         raise InputError("MAP-001", what, str(clip.folder), "record a slower walk-through in better light")
     why = f": {start.reason}" if start.reason else ""
     log(f"start from {start.source}{why}; {len(start.registered)} of {len(frames)} keyframes in the model")
+    tracked = sfm.tracked_points(clip, workspace / sfm.DATABASE, frames)
     keys = start.world_from_camera[frames]
-    trusted = sparse if start.source == "colmap" else None
-    keys = refine.refine_keyframes(clip, frames, keyframes, keys, trusted, config.refinement)
+    keys = refine.refine_keyframes(clip, frames, keyframes, keys, tracked, config.refinement)
     poses = anchor.propagate(clip, frames, keys)
     points, normals = _measured(keyframes, keys)
     if len(points) < LEAST_POINTS:
@@ -70,7 +70,7 @@ def build(
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, config.fusion)
     if len(mesh.faces) < LEAST_POINTS:
         raise _no_surface(clip)
-    poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion)
+    poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, frames)
     mesh = fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion)
     mesh = fuse.clean(mesh, workspace, config.fusion.island_faces)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")

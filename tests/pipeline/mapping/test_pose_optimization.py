@@ -1,6 +1,9 @@
 """Relaxing poses: contacts pull displaced cameras back, odometry bridges what contacts leave open."""
 
+import dataclasses
+
 import numpy as np
+import pytest
 
 from pipeline.geometry import rigid
 from pipeline.mapping import pose_optimization
@@ -112,3 +115,19 @@ def test_spread_is_the_diagonal_of_the_inverse_and_grows_away_from_contacts():
     assert np.abs(found - dense).max() < 1e-6 * np.abs(dense).max()
     size = np.sqrt(found[:, range(3, 6), range(3, 6)].sum(1))
     assert (np.diff(size[2:]) > 0).all(), "metres: what odometry alone carries drifts"
+
+
+def test_contradictions_are_measured_in_deviations():
+    rng = np.random.default_rng(6)
+    _, truth, points, normals = corridor(rng)
+    exact = plane_correspondences(truth, points, normals, np.arange(FRAMES))
+    squares = []
+    for _ in range(20):
+        error = rng.normal(0, 0.01, (len(exact.first), 3))
+        noisy = dataclasses.replace(exact, points_first=exact.points_first + error)
+        squares.append(pose_optimization.chi_squares(truth, noisy, exact.first, 1.0))
+    factor = pose_optimization.variance_factor(np.concatenate(squares))
+    assert 0.85 < factor < 1.15, "deviations are those assumed"
+    assert pose_optimization.variance_factor(
+        pose_optimization.chi_squares(truth, noisy.inflated(2.0), exact.first, 1.0)
+    ) == pytest.approx(np.median(squares[-1]) / 4 / pose_optimization.MEDIAN_CHI_SQUARE, rel=1e-3)
