@@ -30,14 +30,14 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, float]:
     torch.set_num_threads(1)
     clip = Clip.open(build / "frames" / video)
     start = time.process_time()
-    masks, _ = segment(
+    masks = segment(
         There(clip, forth_and_back(len(clip), frames)),
         build / "flow" / video,
         "session",
         None,
         Config(),
         np.random.default_rng(0),
-    )
+    ).masks
     seen = np.mean([mask.visible for mask in masks])
     return time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, float(seen)
 

@@ -9,7 +9,7 @@ from benchmarks import codebase_counts
 BARS = {
     "lines": 58_000,
     "lines over 110 columns": 0,
-    "recipe keys": 325,
+    "recipe keys": 326,
     "packages over 16 modules": 0,
     "private words in identifiers": 39,
     "tell, told": 5,

@@ -40,6 +40,9 @@ MAPPED = "mapped"
 """`Clip.scale` of a recording without depth: its cameras and the room's depth come from the map, its animal's
 depth is inferred, or confirmed by several views"""
 MASKS = FileSchema.of("masks/masks.npz", "visible [frame] bool", "confidence [frame] f4", "area [frame] f4")
+PEOPLE = FileSchema.of(
+    "masks/people.npz", "timestamp_s [frame] f8", "feet_camera [frame person 3] f4", "height_m [person] f4"
+)
 CLIP_KEYS = (
     "timestamp_s", "intrinsics", "depth_intrinsics", "odometry_from_camera",
     "gravity_known", "scale", "quality",

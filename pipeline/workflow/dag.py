@@ -243,6 +243,7 @@ FLOW: tuple[Node, ...] = (
             Need("reconstruction", flow="recordings"),
             Need("trajectories", flow="trajectories"),
             Need("reconstruction", flow="recordings", option="companions", others=True),
+            Need("masks", ("session",), flow="recordings"),
         ),
         role_dependencies=("session",),
         flows=BOTH,

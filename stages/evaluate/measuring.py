@@ -10,7 +10,7 @@ from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import devices, progress
 from pipeline.core.videos import Video
 from pipeline.data import flow, plots
-from pipeline.data.clips import Masks
+from pipeline.data.clips import PEOPLE, Masks
 from pipeline.data.poses import RegisteredPoses
 from pipeline.data.templates import SceneCameras
 from pipeline.localization import localizer as localizers
@@ -191,6 +191,11 @@ def _perception(
             pairs += perception.flow_pairs(forward, true, each.truth.masks)
     metrics = perception.mask_metrics([seen[each.video.id] for each in sessions], seen[turnaround.video.id])
     metrics.add(perception.flow_metrics(pairs))
+    tracks = [(each.truth, folders.masks[each.video.id] / "people.npz") for each in sessions]
+    found = [
+        (truth, PEOPLE.load(path, "feet_camera")["feet_camera"]) for truth, path in tracks if path.exists()
+    ]
+    metrics.add(perception.people_metrics(found))
     return metrics
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.data.clips import Masks
+from pipeline.geometry import rigid
 from pipeline.metrics.metrics import Metrics
 from stages.evaluate.reliability import reliability_metrics
 from stages.evaluate.truth import RecordingTruth, TrueFlow
@@ -65,6 +66,38 @@ def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> M
     confidence = np.concatenate([each.confidence for each in sessions]) if sessions else np.zeros(0)
     metrics.add(reliability_metrics("masks", confidence, iou >= RIGHT_IOU))
     metrics.put("masks/iou_turnaround", _mean(turnaround.iou) if turnaround else np.nan, "no turnaround")
+    return metrics
+
+
+PERSON_SEEN = 0.01
+"""share of the picture that must show a person for a frame to count"""
+
+
+def people_metrics(sessions: Sequence[tuple[RecordingTruth, Float[np.ndarray, "frame person 3"]]]) -> Metrics:
+    """Compare where people stand (camera frame, metres) with the true visitor, over the floor and the phone.
+
+    The nearest of the tracks counts; `people/unseen` is the share of tracked frames that show nobody.
+    """
+    metrics, errors, unseen, tracked_frames = Metrics(), [], 0, 0
+    for truth, feet_camera in sessions:
+        if truth.world_from_visitor is None or truth.visitor_seen is None:
+            continue
+        feet_world = truth.world_from_visitor[:, :3, 3] * [1, 0, 1]
+        true = rigid.apply(rigid.inverse(truth.world_from_camera), feet_world[:, None])
+        off = np.linalg.norm(feet_camera - true, axis=-1)
+        error = np.where(np.isfinite(off), off, np.inf).min(1, initial=np.inf)
+        errors.append(error[truth.visitor_seen > PERSON_SEEN])
+        tracked_frames += int(np.isfinite(error).sum())
+        unseen += int((np.isfinite(error) & (truth.visitor_seen == 0)).sum())
+    if errors:
+        error = np.concatenate(errors)
+        found = np.isfinite(error)
+        metrics.put("people/found", _mean(found), "nobody is ever in view")
+        median = float(np.median(error[found])) if found.any() else float("nan")
+        metrics.put("people/position_median_m", median, "nobody was found")
+        metrics.put(
+            "people/unseen", unseen / tracked_frames if tracked_frames else np.nan, "nobody was found"
+        )
     return metrics
 
 

@@ -8,10 +8,11 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.data import npz
 
-FILED_AS = {
-    name: name for name in ("world_from_camera", "intrinsics", "agent_visible", "moving", "world_from_agent")
-} | {"vertices": "agent_vertices_world"}
-"""Names in the file of the fields below; the last two only where there is an agent."""
+AGENT_FIELDS = ("world_from_camera", "intrinsics", "agent_visible", "moving", "world_from_agent")
+FILED_AS = {name: name for name in (*AGENT_FIELDS, "world_from_visitor", "visitor_seen")} | {
+    "vertices": "agent_vertices_world"
+}
+"""Names in the file of the fields below; those of agent and visitor only where there is one."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,11 @@ class RecordingTruth:
     """world positions less the agent's"""
     masks: Bool[np.ndarray, "frame height width"]
     others: Bool[np.ndarray, "frame height width"] | None = None
-    """masks of the home's other animals; None where there are none"""
+    """masks of the home's other animals and of visitors; None where there are none"""
+    world_from_visitor: Float[np.ndarray, "frame 4 4"] | None = None
+    """pose of another person's body; None where there is none"""
+    visitor_seen: Float[np.ndarray, "frame"] | None = None
+    """share of the picture that shows the visitor"""
 
     @classmethod
     def open(cls, folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> "RecordingTruth":

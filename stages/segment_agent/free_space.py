@@ -63,6 +63,9 @@ class References:
     color: UInt8[np.ndarray, "reference height width 3"]
     frame: Int[np.ndarray, "reference"]
     noise: DepthNoise
+    ignored: Callable[[int, Float[np.ndarray, "*shape 3"]], Bool[np.ndarray, "*shape"]] | None = None
+    """which points (world, metres) of a frame are people's, whose motion is no animal's: none sees through
+    them"""
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,8 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], fr
     votes = [np.zeros(known.shape + values.shape[1:], values.dtype) for values in judged]
     for whole, values in zip(votes, judged, strict=True):
         whole[known] = values
+    if references.ignored is not None:
+        votes[0][references.ignored(frame, points_world)] = 0
     return Votes(*votes)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import subsampling
-from stages.segment_agent import free_space, movers
+from stages.segment_agent import free_space, movers, people
 from stages.segment_agent import prompt as prompts
 from stages.segment_agent.appearance import Appearance, Example, learn
 from stages.segment_agent.config import Config
@@ -22,6 +22,7 @@ from stages.segment_agent.free_space import References
 from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.movers import Hint
 from stages.segment_agent.painting import Mask, Painter, learn_palette
+from stages.segment_agent.people import People
 from stages.segment_agent.prompt import Prompt
 from stages.segment_agent.refine import Palette
 from stages.segment_agent.resting import find_resting, rests
@@ -43,6 +44,20 @@ RIM = np.ones((5, 5), np.uint8)
 """what may still be animal around what looks like it or moves, pixels or samples"""
 
 
+@dataclass(frozen=True)
+class Segmentation:
+    """What is found in a recording."""
+
+    masks: Iterator[Mask]
+    """One per frame, made as they are asked for."""
+    path: Trajectory | None = None
+    """Camera poses; None without depth."""
+    walkers: People | None = None
+    """People in a session with depth."""
+    strangers: float | None = None
+    """Share of frames in which something moves about that is none of several animals."""
+
+
 def segment(
     clip: Clip,
     flow: Path,
@@ -50,8 +65,8 @@ def segment(
     hint: Prompt | None,
     config: Config,
     rng: np.random.Generator,
-) -> tuple[Iterator[Mask], Trajectory | None]:
-    """Return one mask per frame, made as they are asked for, and the poses they rest on.
+) -> Segmentation:
+    """Return one mask per frame, made as they are asked for, the poses they rest on, and people.
 
     ``flow`` is the recording's flow folder. A recording without any depth is followed from its hint, with no
     poses.
@@ -64,18 +79,20 @@ def segment(
             what = "there is no depth, so motion alone does not separate the animal from the room"
             remedy = "give a hint: one box around the animal in one frame (<recording>.prompt.toml)"
             raise InputError("MSK-004", what, str(clip.folder), remedy)
-        return follow(Footage(clip, flow, config.height_px), hint, config.learning, rng), None
+        return Segmentation(follow(Footage(clip, flow, config.height_px), hint, config.learning, rng))
     path = steady(clip, flow, rng)
     poses = path.world_from_camera
     mark = None if hint is None else prompts.place(hint, clip, poses)
     match role:
         case "turnaround":
-            painter = _standing(clip, poses, mark, config)
+            return Segmentation(_standing(clip, poses, mark, config).masks(range(len(clip))), path)
         case "session":
-            painter = _moving(clip, poses, mark, config, rng)
+            references, walkers = people.set_apart(clip, poses, config.references)
+            painter = _moving(clip, poses, references, mark, config, rng)
+            masks = people.hide(painter.masks(range(len(clip))), walkers, clip, poses)
+            return Segmentation(masks, path, walkers)
         case _:
             assert_never(role)
-    return painter.masks(range(len(clip))), path
 
 
 def painter_of_turnaround(clip: Clip, flow: Path, config: Config, rng: np.random.Generator) -> Painter:
@@ -96,12 +113,12 @@ def _standing(
 def _moving(
     clip: Clip,
     poses: Float[np.ndarray, "frame 4 4"],
+    references: References,
     mark: Hint | None,
     config: Config,
     rng: np.random.Generator,
 ) -> Painter:
     """Prepare the masks of a session: motion first, then the appearance that it teaches, then both."""
-    references = free_space.gather(clip, poses, config.references)
     balls = find_mover(clip, poses, references, config.animal, mark)
     judge, resting = judge_motion(references), None
     held = any(ball is not None and not ball.presumed for ball in balls)

@@ -150,12 +150,12 @@ def connected(
     nearest = chosen[int(seen[wait_s.argmin()])] if len(seen) else None
     if nearest is None or wait_s.min() > ABSENT_S or not _meant(nearest, hint):
         return surely
-    piece = _pieces(chosen, seen, timestamp_s, animal)
+    piece = pieces(chosen, seen, timestamp_s, animal)
     surely[seen[piece == piece[wait_s.argmin()]]] = True
     return surely
 
 
-def _pieces(
+def pieces(
     chosen: Sequence[Candidate | None],
     seen: Int[np.ndarray, "seen"],
     timestamp_s: Float[np.ndarray, "frame"],
@@ -179,7 +179,7 @@ def self_moving(
     surely = np.zeros(len(chosen), bool)
     if not len(seen):
         return surely
-    piece = _pieces(chosen, seen, timestamp_s, animal)
+    piece = pieces(chosen, seen, timestamp_s, animal)
     for number in range(piece[-1] + 1):
         own = seen[piece == number]
         if timestamp_s[own[-1]] - timestamp_s[own[0]] < ABSENT_S:

@@ -5,7 +5,7 @@ animal goes the way of a single one (`masks`): its track, its appearance in this
 of the others are unknown in the mask of the one that is followed: neither it nor the room.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,16 +17,17 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
 from pipeline.geometry import subsampling
-from stages.segment_agent import free_space, masks
+from stages.segment_agent import free_space, masks, people
 from stages.segment_agent.appearance import Appearance, Example
 from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import ROOM, Evidence, Judge, judge_motion
 from stages.segment_agent.free_space import References
 from stages.segment_agent.identity import LIMIT, MOVES, Identities, Portrait, margin, of_one, stranger
 from stages.segment_agent.locate import AppearanceOf, find_mover
+from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.painting import Mask, Painter, learn_palette
 from stages.segment_agent.refine import Palette
-from stages.segment_agent.trajectory import Trajectory, steady
+from stages.segment_agent.trajectory import steady
 from stages.segment_agent.windows import Sphere, Window, working_picture
 
 STEPS = 127 / LIMIT
@@ -80,22 +81,23 @@ class Margins:
 
 def segment(
     clip: Clip, flow: Path, followed: str, network: Identities, portraits: Sequence[Portrait], config: Config
-) -> tuple[Iterator[Mask], Trajectory, float]:
-    """Return one mask per frame of the animal that is followed, the poses they rest on, and the share of
-    frames in which something moves about that is none of the animals.
+) -> Segmentation:
+    """Return one mask per frame of the animal that is followed, the poses they rest on, people, and the share
+    of frames in which something moves about that is none of them.
 
     Raises InputError MSK-007 where that is most of them.
     """
     path = steady(clip, flow, np.random.default_rng(config.seed))
     poses, margins = path.world_from_camera, Margins(clip, network, config.height_px)
-    references = free_space.gather(clip, poses, config.references)
+    references, walkers = people.set_apart(clip, poses, config.references)
     strangers = _strangers(clip, poses, references, config, margins)
     painters = find_all(clip, poses, references, config, margins, portraits)
     for name, painter in zip(network.names, painters, strict=True):
         seen = sum(ball is not None and not ball.presumed for ball in painter.balls)
         log(f"{name}: tracked in {seen} of {len(clip)} frames" if seen else f"{name} is not here")
     own = network.names.index(followed)
-    return (joined(painters, margins, own, frame) for frame in range(len(clip))), path, strangers
+    found = (joined(painters, margins, own, frame) for frame in range(len(clip)))
+    return Segmentation(people.hide(found, walkers, clip, poses), path, walkers, strangers)
 
 
 def find_all(

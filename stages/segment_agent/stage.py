@@ -58,10 +58,12 @@ def run(
             if clip.odometry_from_camera is None:
                 log("no usable odometry: the motion comes from depth and flow, which drifts more")
             rng = np.random.default_rng(config.seed)
-            masks, path = segment(clip, inputs.flow, _role(config, video), hint, config, rng)
-            if path is not None:
-                residual_m = path.residual_m
-                log(f"poses: {path.alignments} depth alignments agree within {MM * residual_m:.0f} mm")
+            found = segment(clip, inputs.flow, _role(config, video), hint, config, rng)
+            masks = found.masks
+            if found.path is not None:
+                residual_m = found.path.residual_m
+                log(f"poses: {found.path.alignments} depth alignments agree within {MM * residual_m:.0f} mm")
+            writing.write_people(out, clip, found)
         case "foundation":
             from stages.segment_agent.backends import foundation
 
@@ -90,9 +92,11 @@ def _run_of_several(
     clip, followed = Clip.open(inputs.frames), next(video.animal for video in videos if video.animal)
     assert followed is not None, "the planner lists one animal's turnaround"
     network, portraits = Identities.load(identities), load_portraits(identities)
-    masks, path, strangers = several.segment(clip, inputs.flow, followed, network, portraits, config)
-    summary = writing.write(out, track(masks, "masks", len(clip)), len(clip))
-    pictures.report_quality(out, clip, summary, path.residual_m, strangers)
+    found = several.segment(clip, inputs.flow, followed, network, portraits, config)
+    summary = writing.write(out, track(found.masks, "masks", len(clip)), len(clip))
+    writing.write_people(out, clip, found)
+    assert found.path is not None, "several animals are told apart where there is depth"
+    pictures.report_quality(out, clip, summary, found.path.residual_m, found.strangers)
     return summary
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.data import images, npz
+from pipeline.data.clips import PEOPLE, Clip
+from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.painting import Mask
 
 
@@ -40,3 +42,15 @@ def write(folder: Path, masks: Iterable[Mask], count: int, pictures: int = 12) -
         area=np.array(summary.area, np.float32),
     )
     return summary
+
+
+def write_people(folder: Path, clip: Clip, found: Segmentation) -> None:
+    """Write ``people.npz`` of a session with depth."""
+    if found.walkers is not None and found.path is not None:
+        feet_camera = found.walkers.feet_in_camera(found.path.world_from_camera)
+        PEOPLE.save(
+            folder / "people.npz",
+            timestamp_s=clip.timestamp_s,
+            feet_camera=feet_camera,
+            height_m=found.walkers.height_m,
+        )

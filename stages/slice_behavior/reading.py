@@ -3,16 +3,22 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.trajectories import KINDS
 from pipeline.core.errors import InputError
 from pipeline.data import npz
+from pipeline.data.clips import PEOPLE
 from pipeline.data.templates import bones_at_rest
+from pipeline.geometry import rigid
 from stages.slice_behavior.gridding import ReconstructedMotion
+
+PHONE_M = 1.4
+"""how high above the floor people hold a phone: they are perceived where one who films is"""
 
 
 @dataclass(frozen=True)
@@ -28,16 +34,22 @@ class BehaviorSource:
 
 
 def read_reconstruction(
-    folder: Path, sessions: Sequence[str], others: Mapping[str, Path], min_confidence: float
+    folder: Path,
+    sessions: Sequence[str],
+    others: Mapping[str, Path],
+    min_confidence: float,
+    masks: Mapping[str, Path] = MappingProxyType({}),
 ) -> BehaviorSource:
-    """Read the sessions that were reconstructed, all in one scene, with the home's other animals as
-    companions. Raises InputError ART-010 when damaged.
+    """Read the sessions that were reconstructed, all in one scene, with the home's other animals and people
+    who walk through as companions. Raises InputError ART-010 when damaged.
     """
     motions = {id: read_motion(folder / id) for id in sessions if (folder / id).is_dir()}
     for id, motion in motions.items():
         present = [read_motion(other / id) for other in others.values() if (other / id).is_dir()]
-        if present:
-            tracks = [companion_of(each, motion.timestamp_s, min_confidence) for each in present]
+        tracks = [companion_of(each, motion.timestamp_s, min_confidence) for each in present]
+        if id in masks and (masks[id] / "people.npz").exists():
+            tracks += people_of(PEOPLE.load(masks[id] / "people.npz"), motion)
+        if tracks:
             motions[id] = replace(motion, companions=np.stack(tracks, axis=1))
     return BehaviorSource(
         motions, _rest(folder), (FeatureVolume.load(folder / "feature_volume.npz"),), str(folder)
@@ -56,6 +68,23 @@ def companion_of(
     assert len(same) or not trusted.any(), "both come from the same frames"
     found[mine, :3] = motion.world_from_agent[trusted][its, :3, 3]
     found[mine, 3] = KINDS.index("animal")
+    return found
+
+
+def people_of(
+    people: dict[str, Shaped[np.ndarray, "..."]], motion: ReconstructedMotion
+) -> list[Float[np.ndarray, "frame 4"]]:
+    """Return where each person's phone would be at the times of a motion in the same recording, and that it
+    is a person; NaN where nobody is seen or the camera is not known.
+    """
+    _, mine, its = np.intersect1d(motion.timestamp_s, people["timestamp_s"], return_indices=True)
+    found = []
+    for feet_camera in people["feet_camera"].transpose(1, 0, 2):
+        track = np.full((len(motion.timestamp_s), 4), np.nan)
+        track[mine, :3] = rigid.apply(motion.world_from_camera[mine], feet_camera[its, None])[:, 0]
+        track[:, 1] += PHONE_M
+        track[np.isfinite(track[:, 0]), 3] = KINDS.index("person")
+        found.append(track)
     return found
 
 

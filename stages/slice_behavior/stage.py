@@ -28,6 +28,8 @@ class Inputs:
     """Tables of motion, a folder per recording."""
     companions: Mapping[str, Path] | None = None
     """The artifact `reconstruction` of each other animal of the home, by its name."""
+    masks: Mapping[str, Path] | None = None
+    """Masks of the sessions, with the tracks of people who walk through them."""
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> None:
@@ -40,7 +42,11 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         source = reading.read_tables(inputs.trajectories)
     elif inputs.reconstruction is not None:
         source = reading.read_reconstruction(
-            inputs.reconstruction, list(sessions), inputs.companions or {}, config.min_confidence
+            inputs.reconstruction,
+            list(sessions),
+            inputs.companions or {},
+            config.min_confidence,
+            inputs.masks or {},
         )
     else:
         raise InputError("ART-003", "no motion was given", "slice_behavior", "give --reconstruction")

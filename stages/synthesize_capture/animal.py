@@ -42,7 +42,11 @@ class Animal:
 
 def grow(rng: np.random.Generator, *, cell_m: float = 0.013, species: Species = "cat") -> Animal:
     """Make an animal; the generator chooses its coat."""
-    anatomy = BODIES[species]
+    return embody(BODIES[species], rng, cell_m)
+
+
+def embody(anatomy: Anatomy, rng: np.random.Generator, cell_m: float) -> Animal:
+    """Make the surface of a body; ``cell_m`` is the grid's spacing at the size of its bones."""
     axes = [np.arange(low, high, cell_m) for low, high in anatomy.box]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     distance = _body_distance(anatomy, points.reshape(-1, 3)).reshape(points.shape[:3])

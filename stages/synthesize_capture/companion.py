@@ -3,6 +3,7 @@
 `live` moves one or two animals on, `focus` is what the person films.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -86,16 +87,19 @@ class Companion(Policy):
         self.walker.go(goal)
 
 
-def live(seconds: float, animals: list[Policy], past: list[SeenWalker]) -> None:
-    """Move the animals on by one step, given the person and the animals as they notice them now."""
-    person, *others = past
+def live(
+    seconds: float, animals: list[Policy], people: Sequence[SeenWalker], others: Sequence[SeenWalker]
+) -> None:
+    """Move the animals on by one step, given people and animals as they notice them now: of people, they mind
+    the nearest.
+    """
     match animals:
         case [animal]:
-            animal.step(seconds, person)
+            animal.step(seconds, _nearest(animal, people))
         case [cat, Companion() as dog]:
-            cat.step(seconds, _minded(cat, person, others[1]))
+            cat.step(seconds, _minded(cat, _nearest(cat, people), others[1]))
             dog.other = others[0]
-            dog.step(seconds, person)
+            dog.step(seconds, _nearest(dog, people))
             _keep_apart(seconds, cat, dog)
 
 
@@ -104,6 +108,10 @@ def seen(animal: Policy) -> SeenWalker:
     walker = animal.walker
     velocity = walker.speed * np.array([np.sin(walker.yaw), np.cos(walker.yaw)])
     return SeenWalker(walker.position.copy(), velocity)
+
+
+def _nearest(animal: Policy, people: Sequence[SeenWalker]) -> SeenWalker:
+    return min(people, key=lambda each: float(np.linalg.norm(each.position - animal.walker.position)))
 
 
 def _minded(cat: Policy, person: SeenWalker, dog: SeenWalker) -> SeenWalker:

@@ -38,3 +38,5 @@ class Config:
     """A second animal of another species: it follows the first, plays with it and avoids it."""
     alone_session: int = 0
     """Session (from 1) in which the second animal is not at home; 0 = none."""
+    visitor_sessions: tuple[int, ...] = ()
+    """Sessions (from 1) in which another person walks about the room."""

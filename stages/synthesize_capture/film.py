@@ -10,6 +10,10 @@ from pipeline.geometry import cameras, rigid
 from stages.synthesize_capture import animal, light, raster, sensor, shade
 from stages.synthesize_capture.animal import INDEX, Animal
 from stages.synthesize_capture.script import Script
+from stages.synthesize_capture.visitor import PERSON
+
+VISITOR_CELL_M = 0.006
+"""Spacing of the grid of which the visitor's surface is made, before it is scaled."""
 
 
 @dataclass(frozen=True)
@@ -20,33 +24,35 @@ class Frame:
     depth: Float[np.ndarray, "rows columns"]
     confidence: UInt8[np.ndarray, "rows columns"]
     true_depth: Float[np.ndarray, "rows columns"]
-    masks: Bool[np.ndarray, "animal height width"]
-    """Of the animal and of the companion."""
+    masks: Bool[np.ndarray, "body height width"]
+    """Of the animal, of the companion and of a visitor."""
     vertices_world: Sequence[Float[np.ndarray, "vertex 3"] | None]
 
 
 @dataclass(frozen=True)
 class Body:
-    """One animal in one frame."""
+    """One animal, or the visitor, in one frame."""
 
     creature: Animal
     world_from_bone: Float[np.ndarray, "bone 4 4"]
     vertices_world: Float[np.ndarray, "vertex 3"]
     number: int
-    """0, or 1 of the companion."""
+    """0 of the animal, 1 of the companion, 2 of the visitor."""
 
 
 class Stage:
     """The lit set of one script: the room's mesh with its pictures, and the animals."""
 
     def __init__(self, script: Script, creature: Animal, companion: Animal | None = None):
-        self.script, self.creatures = script, (creature, companion)
+        dressing, visited = np.random.default_rng([script.seed, 8]), script.motions[2] is not None
+        visitor = animal.embody(PERSON, dressing, VISITOR_CELL_M) if visited else None
+        self.script, self.creatures = script, (creature, companion, visitor)
         self._rng = np.random.default_rng([script.seed, 7])
         lit = light.lit_sheets(script.room, script.light, self._rng)
         self.room = shade.backdrop(script.room.sheets(), lit)
 
     def bodies(self, index: int) -> list[Body]:
-        """Return the animals that are there in a frame, the companion last."""
+        """Return the bodies that are there in a frame, in the order of their numbers."""
         found = []
         for number, (creature, motion) in enumerate(zip(self.creatures, self.script.motions, strict=True)):
             if creature is not None and motion is not None:
@@ -86,8 +92,8 @@ class Stage:
             view.face, view.inverse_depth, view.inverse_corners, smaller, rows, columns
         )
         depth, confidence = sensor.lidar(true_depth, self._rng)
-        masks, start = np.zeros((2, height, width), bool), len(self.room.faces)
-        shown: list[np.ndarray | None] = [None, None]
+        masks, start = np.zeros((3, height, width), bool), len(self.room.faces)
+        shown: list[np.ndarray | None] = [None] * 3
         for body in bodies:
             stop = start + len(body.creature.faces)
             masks[body.number] = _four_sums((view.face >= start) & (view.face < stop)) >= 2

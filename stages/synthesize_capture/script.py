@@ -19,6 +19,7 @@ from stages.synthesize_capture.light import Hour, Light
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.sensor import Exposure
 from stages.synthesize_capture.session import AnimalCourse, SessionTrajectories
+from stages.synthesize_capture.visitor import PERSON
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,8 @@ class Script:
     """fx, fy, cx, cy in stored colour pixels."""
     odometry_from_camera: Float[np.ndarray, "frame 4 4"]
     gain: Float[np.ndarray, "frame"]
-    motions: tuple[AnimalMotion | None, AnimalMotion | None]
-    """Of the animal and of the companion, where they are there."""
+    motions: tuple[AnimalMotion | None, AnimalMotion | None, AnimalMotion | None]
+    """Of the animal, of the companion and of a visitor, where they are there."""
     moving: tuple[Bool[np.ndarray, "frame"], Bool[np.ndarray, "frame"]]
     quarter_turns: int
     """Clockwise turns that make the stored picture upright."""
@@ -101,9 +102,12 @@ def _sessions(
         arranged = room.arranged(rng)
         lit = light.light_of_session(rng, hour)
         together = config.companion != "none" and number != config.alone_session
-        lived = session.simulate_session(arranged, rng, seconds, with_dog=together)
+        visited = number in config.visitor_sessions
+        visitors = np.random.default_rng([config.seed, 5, number]) if visited else None
+        lived = session.simulate_session(arranged, rng, seconds, with_dog=together, visitors=visitors)
         path, turns = camera_motion.filming(lived, rng), int(number == config.sideways_session)
-        seen = {"course": lived.animal, "companion": lived.companion, "hour": hour, "species": config.species}
+        seen = {"course": lived.animal, "companion": lived.companion, "visitor": lived.visitor}
+        seen |= {"hour": hour, "species": config.species}
         yield _script(phone, rng, name, arranged, lit, path, seconds, lived=lived, turns=turns, **seen)
         rng = next(streams)
         if number == config.heldout_of:
@@ -134,6 +138,7 @@ def _script(
     species: Species = "cat",
     course: AnimalCourse | None = None,
     companion: AnimalCourse | None = None,
+    visitor: AnimalCourse | None = None,
     lived: SessionTrajectories | None = None,
     hour: Hour = "day",
     turns: int = 0,
@@ -156,6 +161,7 @@ def _script(
         motions=(
             None if course is None else gait.poses(course, timestamp_s, BODIES[species]),
             None if companion is None else gait.poses(companion, timestamp_s, DOG),
+            None if visitor is None else gait.poses(visitor, timestamp_s, PERSON),
         ),
         moving=(_moving(course, timestamp_s), _moving(companion, timestamp_s)),
         quarter_turns=turns,

@@ -18,6 +18,7 @@ from stages.synthesize_capture.navigation import ANIMAL_M, PERSON_M, Floor, Grou
 from stages.synthesize_capture.observer import FILMING, Observer, ObserverStyle
 from stages.synthesize_capture.policy import DELAY_S, REASONS, STEP_S, Policy, SeenWalker
 from stages.synthesize_capture.room import Room
+from stages.synthesize_capture.visitor import Visitor
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class SessionTrajectories:
     """Index into `policy.REASONS`."""
     companion: AnimalCourse | None = None
     """The course of a second animal."""
+    visitor: AnimalCourse | None = None
+    """The course of another person."""
 
 
 def simulate_session(
@@ -61,10 +64,12 @@ def simulate_session(
     style: ObserverStyle = FILMING,
     *,
     with_dog: bool = False,
+    visitors: np.random.Generator | None = None,
 ) -> SessionTrajectories:
-    """Simulate one session in a room; the same generator state gives the same session.
+    """Simulate one session in a room; the same generator states give the same session.
 
-    Where a dog lives too, the person films whom it looks at, one or both.
+    Where a dog lives too, the person films whom it looks at, one or both. ``visitors`` decides about another
+    person, where one walks about.
     """
     obstacles = room.obstacles()
     animal_floor, person_floor = floor_for(obstacles, ANIMAL_M), floor_for(obstacles, PERSON_M)
@@ -76,20 +81,26 @@ def simulate_session(
         animals.append(Companion(dog_floor, room.places, begin, rng))
     observer = Observer(person_floor, start, rng, style)
     phase = rng.uniform(0, 2 * np.pi) if with_dog else 0.0
-    past: deque[list[SeenWalker]] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
-    rows, person, reason = [], [], []
+    visitor = None if visitors is None else Visitor(person_floor, visitors)
+    past: deque[tuple[list[SeenWalker], list[SeenWalker]]] = deque(maxlen=max(1, round(DELAY_S / STEP_S)))
+    rows, person, reason, guest = [], [], [], []
     for index in range(steps(duration_s)):
         observer.step(STEP_S, companion.focus(animals, index * STEP_S, phase))
         walker = observer.walker
-        seen_person = SeenWalker(walker.position.copy(), observer.velocity.copy())
-        past.append([seen_person, *(companion.seen(animal) for animal in animals)])
-        companion.live(STEP_S, animals, past[0])
+        people = [SeenWalker(walker.position.copy(), observer.velocity.copy())]
+        if visitor is not None:
+            visitor.step(STEP_S, walker.position)
+            people.append(SeenWalker(visitor.walker.position.copy(), visitor.velocity.copy()))
+            guest.append(visitor_row(visitor))
+        past.append((people, [companion.seen(animal) for animal in animals]))
+        companion.live(STEP_S, animals, *past[0])
         rows.append([course_row(animal) for animal in animals])
         person.append((walker.position.copy(), observer.looks_at.copy()))
         reason.append(REASONS.index(animals[0].reason))
     position, looks_at = (np.array(column) for column in zip(*person, strict=True))
     first, *others = (course_from_rows(course) for course in zip(*rows, strict=True))
-    return SessionTrajectories(first, position, looks_at, np.array(reason), others[0] if others else None)
+    second, walked = others[0] if others else None, course_from_rows(guest) if guest else None
+    return SessionTrajectories(first, position, looks_at, np.array(reason), second, walked)
 
 
 def steps(duration_s: float) -> int:
@@ -111,6 +122,13 @@ def course_row(animal: Policy) -> CourseRow:
     mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason]
     tail, airborne = mood * (1.0 - 0.6 * animal.posture[:2].sum()), float(animal.leap is not None)
     return animal.position, animal.walker.yaw, animal.posture.copy(), airborne, animal.gaze.copy(), tail
+
+
+def visitor_row(visitor: Visitor) -> CourseRow:
+    """Return where a visitor is now, who looks ahead, for `course_from_rows`."""
+    (x, z), yaw = visitor.walker.position, visitor.walker.yaw
+    gaze = np.array([x + 3 * np.sin(yaw), PERSON_M[1], z + 3 * np.cos(yaw)])
+    return np.array([x, 0.0, z]), yaw, np.zeros(3), 0.0, gaze, 0.0
 
 
 def course_from_rows(rows: Sequence[CourseRow]) -> AnimalCourse:

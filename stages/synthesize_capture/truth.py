@@ -30,6 +30,7 @@ class TruthWriter:
     """1: the companion is the agent, and the first animal the other."""
     masks: list[np.ndarray] = field(default_factory=list)
     others: list[np.ndarray] = field(default_factory=list)
+    visitor_seen: list[float] = field(default_factory=list)
     depth: list[np.ndarray] = field(default_factory=list)
     vertices: list[np.ndarray] = field(default_factory=list)
 
@@ -37,8 +38,10 @@ class TruthWriter:
         """Take over one frame."""
         turns, motion = self.script.quarter_turns, self.script.motions[self.number]
         self.masks.append(cameras.turn_image(frame.masks[self.number], turns))
-        if self.script.motions[1] is not None:
-            self.others.append(cameras.turn_image(frame.masks[1 - self.number], turns))
+        if any(other is not None for other in self.script.motions[1:]):
+            others = np.delete(frame.masks, self.number, axis=0)
+            self.others.append(cameras.turn_image(np.any(others, axis=0), turns))
+        self.visitor_seen.append(float(frame.masks[2].mean()))
         if self.keep_depth:
             self.depth.append(cameras.turn_image(frame.true_depth, turns).astype(np.float16))
         vertices_world = frame.vertices_world[self.number]
@@ -68,6 +71,9 @@ class TruthWriter:
             _save_masks(path.with_suffix(".masks.npz"), self.masks)
         if self.others:
             _save_masks(path.with_suffix(".others.npz"), self.others)
+        if script.motions[2] is not None:
+            contents["world_from_visitor"] = script.motions[2].world_from_agent
+            contents["visitor_seen"] = np.array(self.visitor_seen, np.float32)
         npz.save(path.with_suffix(".npz"), compress=False, **contents)
         if self.keep_depth:
             lens = cameras.scale_intrinsics(stored, size, depth_size)

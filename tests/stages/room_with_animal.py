@@ -51,6 +51,14 @@ def animal() -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
+def person() -> trimesh.Trimesh:
+    """Two legs, a body and a head, 1.7 m tall; the middle of the feet at the origin."""
+    legs = [box((0.15, 0.8, 0.18), (x, 0.4, 0)) for x in (-0.1, 0.1)]
+    return trimesh.util.concatenate(
+        [*legs, box((0.44, 0.6, 0.25), (0, 1.1, 0)), box((0.2, 0.3, 0.2), (0, 1.55, 0))]
+    )
+
+
 @dataclass(frozen=True)
 class Recording:
     """What was rendered."""
@@ -69,12 +77,13 @@ def record(
     odometry: np.ndarray | None,
     seed: int = 0,
     world_from_other: np.ndarray | None = None,
+    other_body: trimesh.Trimesh | None = None,
 ) -> Recording:
     """Render a frames artifact into ``folder``; a pose of NaN leaves the animal out, or the other one, which
-    is green.
+    is green and another animal unless it has a body of its own.
     """
     rng = np.random.default_rng(seed)
-    still, body = room(), animal()
+    still, bodies = room(), (animal(), other_body or animal())
     others = np.full_like(world_from_agent, np.nan) if world_from_other is None else world_from_other
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir(parents=True)
@@ -83,9 +92,10 @@ def record(
         zip(world_from_camera, world_from_agent, others, strict=True)
     ):
         movers = [(pose, kind) for pose, kind in ((agent, 1), (other, 2)) if not np.isnan(pose).any()]
-        mesh = trimesh.util.concatenate([still, *(body.copy().apply_transform(pose) for pose, _ in movers)])
+        moved = [bodies[kind - 1].copy().apply_transform(pose) for pose, kind in movers]
+        mesh = trimesh.util.concatenate([still, *moved])
         kinds = np.repeat(
-            [0, *(kind for _, kind in movers), 0], [len(still.faces), *[len(body.faces)] * len(movers), 1]
+            [0, *(kind for _, kind in movers), 0], [len(still.faces), *(len(each.faces) for each in moved), 1]
         )
         directions = cameras.ray_directions(INTRINSICS, *COLOR_SIZE).reshape(-1, 3) @ camera[:3, :3].T
         hits = RayCaster(Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces))).cast(

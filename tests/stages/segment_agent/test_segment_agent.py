@@ -31,7 +31,7 @@ def iou(found, truth) -> float:
 def make(folder, role, poses, agent, odometry, flow=Path("none"), hint=None):
     """Record, segment, and return the masks with the truth."""
     truth = scenery.record(folder, poses, agent, odometry)
-    found, _ = masks.segment(Clip.open(folder), flow, role, hint, OPTIONS, np.random.default_rng(0))
+    found = masks.segment(Clip.open(folder), flow, role, hint, OPTIONS, np.random.default_rng(0)).masks
     return list(found), truth
 
 
@@ -166,7 +166,7 @@ def test_an_animal_that_never_moves_is_found_by_a_hint(tmp_path):
     truth = scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
     clip, scores = Clip.open(tmp_path / "frames"), {}
     for hint in (None, click(truth.masks[20], 20)):
-        found, _ = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0))
+        found = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0)).masks
         scores[hint] = [iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]
     assert np.max(scores.pop(None)) == 0, "nothing moves"
     assert np.mean(*scores.values()) > 0.7
@@ -187,7 +187,7 @@ def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
     agent[16:] = np.nan
     truth = scenery.record(tmp_path / "frames", poses, agent, poses, world_from_other=other)
     clip, hint = Clip.open(tmp_path / "frames"), click(truth.masks[8], 8)
-    found, _ = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0))
+    found = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0)).masks
     found = list(found)
     assert (
         np.mean(

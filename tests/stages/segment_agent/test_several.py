@@ -144,10 +144,8 @@ def together(tmp_path_factory):
 def test_two_that_pass_each_other_keep_their_masks(network, portraits, together):
     folder, truth = together
     for name, own, others in (("orange", truth.masks, truth.others), ("green", truth.others, truth.masks)):
-        found, _, strangers = several.segment(
-            Clip.open(folder), Path("none"), name, network, portraits, OPTIONS
-        )
-        labels = np.stack([mask.labels for mask in found])
+        found = several.segment(Clip.open(folder), Path("none"), name, network, portraits, OPTIONS)
+        labels = np.stack([mask.labels for mask in found.masks])
         shown = own.mean((1, 2)) > 0.002
         score = [
             ((mask == 255) & true).sum() / ((mask == 255) | true).sum()
@@ -156,17 +154,17 @@ def test_two_that_pass_each_other_keep_their_masks(network, portraits, together)
         assert np.mean(score) > 0.7, "share; the pictures are 90 pixels wide"
         assert (labels[others] == 255).mean() < 0.03, "of the other's pixels"
         assert (labels[others] == 128).mean() > 0.6, "they are neither the animal nor the room"
-        assert strangers < 0.1
+        assert found.strangers < 0.1
 
 
 @pytest.mark.slow
 def test_one_that_is_not_here_has_no_mask(network, portraits, tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
-    found, _, _ = several.segment(
+    found = several.segment(
         Clip.open(tmp_path / "frames"), Path("none"), "green", network, portraits, OPTIONS
     )
-    assert not any((mask.labels == 255).any() for mask in found)
+    assert not any((mask.labels == 255).any() for mask in found.masks)
 
 
 def test_a_hint_that_names_no_animal_is_refused(network, together, tmp_path):

@@ -1,0 +1,227 @@
+"""People who walk about in a recording: upright movers, larger than an animal. None of them is the animal.
+
+`find_people` tracks them through the whole recording; `People.beside` says which points are theirs, so that
+neither the animal's track nor its appearance is learned from somebody's legs.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.core.progress import log
+from pipeline.data.clips import Clip
+from pipeline.geometry import cameras, rigid
+from stages.segment_agent import free_space, movers
+from stages.segment_agent.config import AnimalConfig
+from stages.segment_agent.free_space import References
+from stages.segment_agent.movers import Candidate
+from stages.segment_agent.painting import Mask
+
+COARSE_PX = 111
+"""side of the square that has as many pixels as people are looked for among"""
+UPRIGHT_M = 0.9
+"""vertical extent that no animal of a home has and that a person who is not cut off has"""
+LEAST_M = 0.4
+"""vertical extent from which on a mover may be the legs of somebody who was seen whole before or after"""
+SLENDER = 1.2
+"""how much higher than wide somebody upright is at least"""
+LEAST_UPRIGHT_FRAMES = 4
+"""frames in which a track must be as high as a person"""
+MOST_PEOPLE = 3
+BODY_RADIUS_M = 0.125
+"""how far the body's axis lies behind what is seen of it: half the depth of a chest"""
+REACH_M = 0.45
+"""horizontal distance from a person's axis within which points are his or hers"""
+FLOOR_QUANTILE, ABOVE_FLOOR_M = 0.05, 0.06
+"""quantile of the heights of all depth that is taken for the floor, and how far above it people begin"""
+RIM = np.ones((5, 5), np.uint8)
+"""what may still be a person around what is, pixels of depth"""
+WALK_M_S = 1.5
+"""how fast people walk in a room"""
+WALKER = AnimalConfig(largest_m=4.0, speed_m_s=2.5)
+"""size and speed of people, for the track"""
+
+
+@dataclass(frozen=True)
+class People:
+    """Tracks of people in a recording's own world, metres, +y up."""
+
+    axis_world: Float[np.ndarray, "person frame 2"]
+    """x and z of the body's middle; NaN where a person is not seen"""
+    height_m: Float[np.ndarray, "person"]
+    """above the floor; NaN where the head is never in the picture"""
+    floor_m: float
+    """height of the floor in the recording's world"""
+
+    def beside(self, frame: int, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
+        """Return which points belong to a person or touch one."""
+        axes = self.axis_world[:, frame]
+        axes = axes[np.isfinite(axes[:, 0])]
+        off = np.linalg.norm(points_world[..., None, ::2] - axes, axis=-1)
+        near = (off < REACH_M).any(-1)
+        return near & (points_world[..., 1] > self.floor_m + ABOVE_FLOOR_M)
+
+    def feet_in_camera(
+        self, world_from_camera: Float[np.ndarray, "frame 4 4"]
+    ) -> Float[np.ndarray, "frame person 3"]:
+        """Return the places on the floor where people stand, camera frame, metres; NaN where not seen."""
+        x, z = self.axis_world[..., 0].T, self.axis_world[..., 1].T
+        feet = np.stack([x, np.full_like(x, self.floor_m), z], axis=-1)
+        return rigid.apply(rigid.inverse(world_from_camera)[:, None], feet[..., None, :])[..., 0, :]
+
+
+def find_people(
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], references: References
+) -> People:
+    """Track all people of a session through its frames."""
+    scanned = [_upright(clip, frame, world_from_camera[frame], references) for frame in range(len(clip))]
+    lowest = np.concatenate([low for _, low in scanned])
+    floor_m = float(np.median(lowest)) if len(lowest) else 0.0
+    found = [list(group) for group, _ in scanned]
+    axes, heights = [], []
+    for _ in range(MOST_PEOPLE):
+        chosen = _track([[each.candidate for each in group] for group in found], clip.timestamp_s)
+        picked = [group[index] if index >= 0 else None for group, index in zip(found, chosen, strict=True)]
+        person = _persistent(picked, clip.timestamp_s)
+        if not person.any():
+            break
+        axis, tops = np.full((len(clip), 2), np.nan), []
+        for frame in np.flatnonzero(person):
+            mover = picked[frame]
+            assert mover is not None, "a person's frames have a mover"
+            axis[frame] = mover.candidate.centre_world[[0, 2]]
+            tops += [mover.top_m] if mover.whole else []
+            found[frame].remove(mover)
+        axes.append(_bridged(axis, clip.timestamp_s))
+        heights.append(
+            float(np.quantile(tops, 0.9)) - floor_m if len(tops) >= LEAST_UPRIGHT_FRAMES else np.nan
+        )
+    return People(np.array(axes).reshape(-1, len(clip), 2), np.array(heights, float), floor_m)
+
+
+def set_apart(
+    clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int
+) -> tuple[References, People]:
+    """Gather ``count`` references by which people are found, and which then ignore their motion."""
+    references = free_space.gather(clip, world_from_camera, count)
+    walkers = find_people(clip, world_from_camera, references)
+    for axis, height_m in zip(walkers.axis_world, walkers.height_m, strict=True):
+        tall = "" if np.isnan(height_m) else f", {height_m:.2f} m tall"
+        log(f"somebody walks here, seen in {np.isfinite(axis[:, 0]).sum()} of {len(clip)} frames{tall}")
+    return replace(references, ignored=walkers.beside if len(walkers.axis_world) else None), walkers
+
+
+@dataclass(frozen=True, eq=False)
+class UprightMover:
+    """A group of moving points that is higher than wide."""
+
+    candidate: Candidate
+    extent_m: float
+    """vertical"""
+    top_m: float
+    """height of its highest points in the recording's world"""
+    whole: bool
+    """whether its top is within the picture"""
+
+
+def _upright(
+    clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], references: References
+) -> tuple[list[UprightMover], Float[np.ndarray, "height"]]:
+    """Group the moving points of a frame, and keep what is upright; and return the height of low surfaces."""
+    stride = max(1, round(np.sqrt(np.prod(clip.depth_size)) / COARSE_PX))
+    chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    depth = free_space.inner_depth(clip, frame)[chosen]
+    rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)[chosen]
+    points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
+    points[depth == 0] = np.nan
+    heights = points[depth > 0, 1]
+    low = np.quantile(heights, [FLOOR_QUANTILE]) if len(heights) else np.zeros(0)
+    moving = movers.moving(free_space.vote(references, points, frame))
+    area = (depth * stride) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
+    joined = cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8))
+    count, label = cv2.connectedComponents(joined, connectivity=8)
+    found = []
+    for number in range(1, count):
+        own = (label == number) & moving
+        if own.sum() < movers.LEAST_PIXELS:
+            continue
+        group = points[own]
+        bottom, top = np.quantile(group[:, 1], [0.02, 0.98])
+        width = np.ptp(np.quantile(group[:, [0, 2]], [0.1, 0.9], axis=0), axis=0).max()
+        if top - bottom < max(LEAST_M, SLENDER * width):
+            continue
+        centre = np.median(group, axis=0)
+        away = (centre - world_from_camera[:3, 3]) * [1, 0, 1]
+        centre += BODY_RADIUS_M * away / max(float(np.linalg.norm(away)), BODY_RADIUS_M)
+        radius = float(np.quantile(np.linalg.norm(group - centre, axis=1), 0.95))
+        whole = bool(np.nonzero(own)[0].min() > 1)
+        candidate = Candidate(centre, float(area[own].sum()), radius)
+        found.append(UprightMover(candidate, float(top - bottom), float(top), whole))
+    return found, low
+
+
+def _track(
+    found: Sequence[Sequence[Candidate]], timestamp_s: Float[np.ndarray, "frame"]
+) -> Int[np.ndarray, "frame"]:
+    return movers.track(found, timestamp_s, WALKER)
+
+
+def _persistent(
+    picked: Sequence[UprightMover | None], timestamp_s: Float[np.ndarray, "frame"]
+) -> Bool[np.ndarray, "frame"]:
+    """Return in which frames a track surely has a person: in pieces that are as high as one often enough, and
+    in those soon before or after them that the same person can have walked to.
+    """
+    seen = np.array([frame for frame, mover in enumerate(picked) if mover is not None], int)
+    person = np.zeros(len(picked), bool)
+    if not len(seen):
+        return person
+    piece = movers.pieces([mover and mover.candidate for mover in picked], seen, timestamp_s, WALKER)
+    own = [seen[piece == number] for number in range(piece[-1] + 1)]
+    tall = np.array([mover is not None and mover.extent_m > UPRIGHT_M for mover in picked])
+    is_person = [int(tall[frames].sum()) >= LEAST_UPRIGHT_FRAMES for frames in own]
+    place = np.array([[np.nan] * 3 if mover is None else mover.candidate.centre_world for mover in picked])
+    for step in (1, -1):
+        for number, following in pairwise(range(len(own))[::step]):
+            ends = [own[number][-1 if step > 0 else 0], own[following][0 if step > 0 else -1]]
+            is_person[following] |= is_person[number] and _reachable(place[ends], timestamp_s[ends])
+    for frames, yes in zip(own, is_person, strict=True):
+        person[frames] = yes
+    return person
+
+
+def _reachable(place_world: Float[np.ndarray, "2 3"], timestamp_s: Float[np.ndarray, "2"]) -> bool:
+    """Return whether a person can have walked from one place to another, and had no time to leave between."""
+    gap_s = abs(float(timestamp_s[1] - timestamp_s[0]))
+    off_m = float(np.linalg.norm((place_world[1] - place_world[0])[[0, 2]]))
+    return gap_s < movers.PRESUMED_S and off_m < movers.FREE_M + REACH_M + WALK_M_S * gap_s
+
+
+def _bridged(
+    axis: Float[np.ndarray, "frame 2"], timestamp_s: Float[np.ndarray, "frame"]
+) -> Float[np.ndarray, "frame 2"]:
+    """Cross short gaps of a track, in which a person stood still or in front of nothing that was seen."""
+    seen = np.flatnonzero(np.isfinite(axis[:, 0]))
+    filled = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis[seen, k]) for k in range(2)], axis=-1)
+    after = np.clip(np.searchsorted(seen, np.arange(len(axis))), 1, len(seen) - 1)
+    gap_s = timestamp_s[seen[after]] - timestamp_s[seen[after - 1]]
+    inside = (np.arange(len(axis)) >= seen[0]) & (np.arange(len(axis)) <= seen[-1])
+    return np.where((inside & (gap_s <= movers.ABSENT_S))[:, None], filled, axis)
+
+
+def hide(
+    masks: Iterable[Mask], people: People, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]
+) -> Iterator[Mask]:
+    """Mark people as unknown in the masks of all frames: neither the animal nor the room."""
+    for frame, mask in enumerate(masks):
+        depth = clip.depth(frame)
+        rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)
+        points = rigid.apply(world_from_camera[frame], (rays * depth[..., None]).reshape(-1, 3))
+        theirs = people.beside(frame, points.reshape(*depth.shape, 3)) & (depth > 0)
+        theirs = cv2.dilate(theirs.astype(np.uint8), RIM)
+        theirs = cv2.resize(theirs, mask.labels.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        yield replace(mask, labels=np.where(theirs & (mask.labels == 0), np.uint8(128), mask.labels))

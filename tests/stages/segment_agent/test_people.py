@@ -1,0 +1,74 @@
+"""People who walk through a session: found, and never taken for the animal."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.data.clips import PEOPLE, Clip
+from pipeline.geometry import rigid
+from stages.segment_agent import masks, people, writing
+from stages.segment_agent.config import Config, LearningConfig
+
+_spec = importlib.util.spec_from_file_location(
+    "room_with_animal", Path(__file__).parent.parent / "room_with_animal.py"
+)
+scenery = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(scenery)
+
+OPTIONS = Config(learning=LearningConfig(examples=30, steps=60, batch=4, crop_px=96))
+
+
+@pytest.fixture(scope="module")
+def visited(tmp_path_factory):
+    """A session through which a person walks, behind the animal: its folder, truth and the person's poses."""
+    poses, agent = scenery.session()
+    along = np.linspace(-1.2, 1.2, len(poses))
+    person = np.repeat(np.eye(4)[None], len(poses), axis=0)
+    middle = np.nanmean(agent[:, :3, 3], axis=0)
+    ahead = middle - poses[:, :3, 3].mean(0)
+    ahead = ahead[[0, 2]] / np.linalg.norm(ahead[[0, 2]])
+    person[:, 0, 3] = middle[0] + 0.6 * ahead[0] + along * ahead[1]
+    person[:, 2, 3] = middle[2] + 0.6 * ahead[1] - along * ahead[0]
+    folder = tmp_path_factory.mktemp("visited") / "frames"
+    return (
+        folder,
+        scenery.record(
+            folder, poses, agent, scenery.drifted(poses), world_from_other=person, other_body=scenery.person()
+        ),
+        person,
+    )
+
+
+@pytest.mark.slow
+def test_a_person_is_found_and_is_not_the_animal(visited, tmp_path):
+    folder, truth, person = visited
+    clip = Clip.open(folder)
+    found = masks.segment(clip, Path("none"), "session", None, OPTIONS, np.random.default_rng(0))
+    labels = np.stack([mask.labels for mask in found.masks])
+    seen = truth.others.mean((1, 2)) > 0.03
+    assert (labels[truth.others] == 255).mean() < 0.03, "of the person's pixels"
+    assert (labels[truth.others] == 128).mean() > 0.6, "they are neither the animal nor the room"
+    shown = truth.masks.mean((1, 2)) > 0.002
+    score = [
+        ((mask == 255) & true).sum() / ((mask == 255) | true).sum()
+        for mask, true in zip(labels[shown], truth.masks[shown], strict=True)
+    ]
+    assert np.mean(score) > 0.6, "share; the pictures are 90 pixels wide"
+    writing.write_people(tmp_path, clip, found)
+    stored = PEOPLE.load(tmp_path / "people.npz")
+    assert stored["feet_camera"].shape == (len(clip), 1, 3)
+    true = rigid.apply(rigid.inverse(truth.world_from_camera), person[:, None, :3, 3])[:, 0]
+    off = np.linalg.norm(stored["feet_camera"][:, 0] - true, axis=-1)
+    assert np.isfinite(off[seen]).mean() > 0.7, "share of the frames that show the person"
+    assert np.nanmedian(off) < 0.1, "metres"
+
+
+def test_an_animal_alone_is_nobody(tmp_path):
+    poses, agent = scenery.session()
+    scenery.record(tmp_path / "frames", poses, agent, poses)
+    references, walkers = people.set_apart(Clip.open(tmp_path / "frames"), poses, 40)
+    assert walkers.axis_world.shape == (0, len(poses), 2)
+    assert references.ignored is None
+    assert not walkers.beside(0, np.zeros((3, 3))).any()
