@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
-from pipeline.geometry import cameras, rigid
+from pipeline.geometry import rigid
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References
@@ -134,10 +134,8 @@ def _upright(
     """Group the moving points of a frame, and keep what is upright; and return the height of low surfaces."""
     stride = max(1, round(np.sqrt(np.prod(clip.depth_size)) / COARSE_PX))
     chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    depth = free_space.inner_depth(clip, frame)[chosen]
-    rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)[chosen]
-    points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
-    points[depth == 0] = np.nan
+    whole = free_space.inner_depth(clip, frame)
+    points, depth = free_space.points_of(clip, frame, world_from_camera, whole, stride), whole[chosen]
     heights = points[depth > 0, 1]
     low = np.quantile(heights, [FLOOR_QUANTILE]) if len(heights) else np.zeros(0)
     moving = movers.moving(free_space.vote(references, points, frame))
@@ -218,10 +216,8 @@ def hide(
 ) -> Iterator[Mask]:
     """Mark people as unknown in the masks of all frames: neither the animal nor the room."""
     for frame, mask in enumerate(masks):
-        depth = clip.depth(frame)
-        rays = cameras.ray_directions(clip.depth_intrinsics[frame], *clip.depth_size)
-        points = rigid.apply(world_from_camera[frame], (rays * depth[..., None]).reshape(-1, 3))
-        theirs = people.beside(frame, points.reshape(*depth.shape, 3)) & (depth > 0)
+        points = free_space.points_of(clip, frame, world_from_camera[frame], clip.depth(frame), 1)
+        theirs = people.beside(frame, points)
         theirs = cv2.dilate(theirs.astype(np.uint8), RIM)
         theirs = cv2.resize(theirs, mask.labels.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
         yield replace(mask, labels=np.where(theirs & (mask.labels == 0), np.uint8(128), mask.labels))
