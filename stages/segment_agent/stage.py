@@ -95,7 +95,7 @@ def _run_of_several(
     found = several.segment(clip, inputs.flow, followed, network, portraits, config)
     summary = writing.write(out, track(found.masks, "masks", len(clip)), len(clip))
     writing.write_people(out, clip, found)
-    assert found.path is not None, "several animals are told apart where there is depth"
+    assert found.path is not None, "sessions of several animals have depth"
     pictures.report_quality(out, clip, summary, found.path.residual_m, found.strangers)
     return summary
 
