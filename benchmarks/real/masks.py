@@ -17,7 +17,10 @@ from stages.segment_agent.config import Config
 AGENT = 255
 BAR_MEAN, BAR_WORST = 0.75, 0.60
 """mean and lowest IoU of the sequences that nothing was designed on"""
-DESIGNED_ON = frozenset({"blackswan", "dog"})
+DESIGNED_ON = frozenset(
+    "bear blackswan dog dog-agility elephant flamingo horsejump-low mallard-fly mallard-water rhino".split()
+)
+"""sequences that the method was designed on"""
 
 
 def segmented(sequence: DavisSequence, folder: Path) -> float:
@@ -61,7 +64,7 @@ def row(data: Path, out: Path) -> Row:
         f"{mean}; {listed}",
         {},
         {},
-        f"mean >= {BAR_MEAN:.2f} without {' and '.join(sorted(DESIGNED_ON))}, none below {BAR_WORST:.2f}",
+        f"mean >= {BAR_MEAN:.2f} over the others, which nothing was designed on, none below {BAR_WORST:.2f}",
         bool(met),
         {"iou": each},
     )

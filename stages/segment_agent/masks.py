@@ -17,7 +17,8 @@ from stages.segment_agent import prompt as prompts
 from stages.segment_agent.appearance import Appearance, Example, learn
 from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import either, judge_motion
-from stages.segment_agent.follow import Footage, follow
+from stages.segment_agent.follow import follow
+from stages.segment_agent.footage import Footage
 from stages.segment_agent.free_space import References
 from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.movers import Hint

@@ -13,7 +13,8 @@ from pipeline.data.clips import Clip
 from stages.estimate_flow.config import Config as FlowConfig
 from stages.estimate_flow.estimation import STRIDE_PX, Estimator, flows
 from stages.segment_agent.config import Config
-from stages.segment_agent.follow import Footage, follow
+from stages.segment_agent.follow import follow
+from stages.segment_agent.footage import Footage
 from stages.segment_agent.prompt import Prompt
 
 DOG = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata")) / "davis_dog"

@@ -1,19 +1,54 @@
-"""Masks from one box without depth, on a drawn scene."""
+"""Masks from one box without depth, on drawn scenes."""
+
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
-from stages.segment_agent.follow import MOTION_GAP, Footage, cut_out, trimmed
+from pipeline.data.flow import GAPS
+from stages.segment_agent.config import LearningConfig
+from stages.segment_agent.follow import cut_out, follow
+from stages.segment_agent.footage import MOTION_GAPS, Footage
 from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.propagation import SURE, Labels, connected, message
 
 SIZE = (120, 160)
-FRAMES = MOTION_GAP + 1
-SHIFT_PX = 6
+CELLS = (30, 40)
+SHIFT_PX = 4
+
+
+def _footage(folder: Path, pictures: list[np.ndarray], steps: list[np.ndarray]) -> Footage:
+    """Write a recording in which the pixels of frame i move by ``steps[i]`` to the next frame."""
+    for name in ("color", "depth"):
+        (folder / name).mkdir()
+    for frame, picture in enumerate(pictures):
+        images.write_color(folder / "color" / f"{frame:06d}.jpg", picture)
+    images.write_depth(folder / "depth" / "000000.exr", np.zeros((12, 16)))
+    count, eye = len(pictures), np.tile(np.eye(3), (len(pictures), 1, 1))
+    npz.save(
+        folder / "frames.npz",
+        timestamp_s=np.arange(count) / 10,
+        intrinsics=eye,
+        depth_intrinsics=eye,
+        quality=np.ones(count, np.float32),
+        gravity_known=np.array(False),
+    )
+    for gap in GAPS:
+        for way, sign in (("fw", 1), ("bw", -1)):
+            pairs = range(max(count - gap, 0))
+            flow = [sign * gap * steps[first if way == "fw" else first + gap][2::4, 2::4] for first in pairs]
+            npz.save(
+                folder / f"flow_{gap}_{way}.npz",
+                flow=np.array(flow, np.float16).reshape(len(flow), *CELLS, 2),
+                confidence=np.full((len(flow), *CELLS), 255, np.uint8),
+            )
+    return Footage(Clip.open(folder), folder, SIZE[0])
 
 
 def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
-    """A wall of a colour that is hardly seen outside the box stands in half of it; only the animal moves."""
+    """A wall of a color that is hardly seen outside the box stands in half of it; only the animal moves."""
     rng = np.random.default_rng(0)
     picture = np.full((*SIZE, 3), (40, 110, 40), np.uint8)
     picture[30:60, 40:120] = 190, 190, 180
@@ -21,37 +56,52 @@ def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
     animal[60:90, 40:120] = animal[30:60, 95:120] = True
     picture[animal] = 60, 40, 30
     noisy = np.clip(picture + rng.normal(0, 12, picture.shape), 0, 255).astype(np.uint8)
-    for name in ("color", "depth"):
-        (tmp_path / name).mkdir()
-    for frame in range(FRAMES):
-        images.write_color(tmp_path / "color" / f"{frame:06d}.jpg", noisy)
-    images.write_depth(tmp_path / "depth" / "000000.exr", np.zeros((12, 16)))
-    eye = np.tile(np.eye(3), (FRAMES, 1, 1))
-    npz.save(
-        tmp_path / "frames.npz",
-        timestamp_s=np.arange(FRAMES) / 10,
-        intrinsics=eye,
-        depth_intrinsics=eye,
-        quality=np.ones(FRAMES, np.float32),
-        gravity_known=np.array(False),
-    )
-    flow = np.zeros((1, *SIZE, 2), np.float16)
-    flow[0, animal, 0] = SHIFT_PX
-    for way in ("fw", "bw"):
-        sign = 1 if way == "fw" else -1
-        npz.save(tmp_path / f"flow_{MOTION_GAP}_{way}.npz", flow=(sign * flow).astype(np.float16))
-    footage = Footage(Clip.open(tmp_path), tmp_path, SIZE[0])
-    found = cut_out(footage, Prompt(0, (40, 30, 120, 90)), np.random.default_rng(0))
+    frames = MOTION_GAPS[0] + 1
+    step = 1.5 * animal[..., None] * np.array([1, 0])
+    footage = _footage(tmp_path, frames * [noisy], frames * [step])
+    found = cut_out(footage, Prompt(0, (40, 30, 120, 90)), rng)
     assert (found & animal).sum() > 0.95 * (found | animal).sum()
 
 
-def test_a_rim_of_background_is_trimmed():
-    """A mask 8 px too wide all around falls back to the animal; nothing is left as nothing."""
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory) -> tuple[Footage, list[np.ndarray]]:
+    """An animal walks to the right before a wall; something of its color stands at the wall."""
     rng = np.random.default_rng(0)
-    animal, wide = np.zeros(SIZE, bool), np.zeros(SIZE, bool)
-    animal[40:80, 50:110] = wide[32:88, 42:118] = True
-    color = np.where(animal[..., None], (60, 40, 30), (40, 110, 40)) + rng.normal(0, 12, (*SIZE, 3))
-    picture = np.clip(color, 0, 255).astype(np.uint8)
-    found = trimmed(picture, wide, rng)
-    assert (found & animal).sum() > 0.95 * (found | animal).sum()
-    assert not trimmed(picture, np.zeros(SIZE, bool), rng).any()
+    wall = np.clip(rng.normal((40, 110, 40), 12, (*SIZE, 3)), 0, 255).astype(np.uint8)
+    coat = np.clip(rng.normal((150, 90, 50), 12, (*SIZE, 3)), 0, 255).astype(np.uint8)
+    wall[8:24, 20:90] = coat[8:24, 20:90]
+    pictures, masks, steps = [], [], []
+    for frame in range(12):
+        animal = np.zeros(SIZE, bool)
+        animal[40:80, 20 + SHIFT_PX * frame : 70 + SHIFT_PX * frame] = True
+        pictures.append(np.where(animal[..., None], np.roll(coat, SHIFT_PX * frame, axis=1), wall))
+        masks.append(animal)
+        steps.append(SHIFT_PX * animal[..., None] * np.array([1, 0]))
+    return _footage(tmp_path_factory.mktemp("walk"), pictures, steps), masks
+
+
+@pytest.mark.parametrize("hinted", [0, 5])
+def test_an_animal_is_followed_both_ways(walk, hinted):
+    footage, masks = walk
+    left = 20.0 + SHIFT_PX * hinted
+    hint = Prompt(hinted, (left, 40, left + 50, 80))
+    found = list(follow(footage, hint, LearningConfig(), np.random.default_rng(0)))
+    assert len(found) == len(masks)
+    for mask, true in zip(found, masks, strict=True):
+        assert ((mask.labels == 255) & true).sum() > 0.9 * ((mask.labels == 255) | true).sum()
+
+
+def test_labels_come_along_the_flow(walk):
+    footage, masks = walk
+    found: Labels = [None for _ in masks]
+    found[0] = np.where(masks[0], SURE, -SURE).astype(np.float16)
+    there = message(footage, 8, found)
+    assert (there > 0)[masks[8]].mean() > 0.9 and (there < 0)[~masks[0] & ~masks[8]].mean() > 0.9
+    assert not message(footage, 3, found).any(), "no flow is stored over three frames"
+
+
+def test_parts_apart_from_the_animal_are_left_out():
+    inside = np.zeros(SIZE, bool)
+    inside[10:30, 10:30] = inside[10:30, 50:70] = True
+    carried = inside & (np.arange(SIZE[1]) < 20)
+    assert (connected(inside, carried) == (inside & (np.arange(SIZE[1]) < 40))).all()

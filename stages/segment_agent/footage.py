@@ -1,0 +1,84 @@
+"""Pictures, flow and motion against the background of a recording without depth, at working size."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.data.clips import Clip
+from pipeline.data.flow import open_confidence, open_flow
+from stages.segment_agent.windows import working_picture, working_size
+
+MOTION_GAPS = (4, 8)
+"""frames over which motion against the background is measured"""
+SPARSE_PX, INLIER_PX = 8, 2.0
+"""distance of the pixels that the background's homography is fitted to, and how far they may miss it"""
+LEAST_TYPICAL_PX = 0.5
+"""typical residual that counts as noise of the flow"""
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Working pictures and flow at their size."""
+
+    clip: Clip
+    flow: Path
+    height_px: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of working pictures."""
+        return working_size(self.clip, self.height_px)
+
+    def color(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+        """Read a working picture."""
+        return working_picture(self.clip, frame, self.height_px)
+
+    def to(self, frame: int, other: int) -> Float[np.ndarray, "height width 2"] | None:
+        """Read the flow from a frame to another, working pixels; None where none is stored."""
+        first, gap = min(frame, other), abs(other - frame)
+        table = open_flow(self.flow, gap, backward=other < frame)
+        if not 0 <= first < len(table):
+            return None
+        scale = self.size[0] / self.clip.color_size[0]
+        return scale * self._resized(table[first].astype(np.float32))
+
+    def confidence(self, frame: int, other: int) -> Float[np.ndarray, "height width"]:
+        """Read how far both directions of a stored flow agree, 0..1."""
+        table = open_confidence(self.flow, abs(other - frame), backward=other < frame)
+        return self._resized(table[min(frame, other)]).astype(np.float32) / 255
+
+    def residual(self, frame: int) -> Float[np.ndarray, "height width"]:
+        """Return how far a point moves against the background, in typical residuals; mean over
+        `MOTION_GAPS` in both directions of time.
+
+        The background moves as most of the picture does, by a homography.
+        """
+        pixel, parts = pixels(self.size), []
+        for other in (frame + way * gap for gap in MOTION_GAPS for way in (-1, 1)):
+            moved = self.to(frame, other)
+            if moved is None:
+                continue
+            sparse, apart = (part[::SPARSE_PX, ::SPARSE_PX].reshape(-1, 2) for part in (pixel, moved))
+            matrix, _ = cv2.findHomography(sparse, sparse + apart, cv2.RHO, INLIER_PX)
+            if matrix is not None:
+                expected = cv2.perspectiveTransform(pixel.reshape(1, -1, 2), matrix).reshape(pixel.shape)
+                error = np.linalg.norm(expected - pixel - moved, axis=-1)
+                parts.append(error / max(float(np.median(error)), LEAST_TYPICAL_PX))
+        return np.mean(parts, axis=0) if parts else np.zeros(self.size, np.float32)
+
+    def _resized(self, image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image, self.size[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def pixels(size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
+    """Return the index (x, y) of each pixel of a picture of (height, width)."""
+    return np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size[::-1])), -1)
+
+
+def grown(mask: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
+    """Dilate a mask by a disc."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
+    return cv2.dilate(mask.astype(np.uint8), disc) > 0
