@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
+from pipeline.data.flow import GAPS
 from stages.estimate_flow.config import Config as FlowConfig
 from stages.estimate_flow.estimation import STRIDE_PX, Estimator, flows
 from stages.segment_agent.config import Config
@@ -23,7 +24,7 @@ FRAMES = 60
 
 @pytest.fixture(scope="module")
 def dog(tmp_path_factory):
-    """The frames as an artifact without depth, true masks, and our flow of gaps 1 and 4."""
+    """The frames as an artifact without depth, true masks, and our flow of all gaps."""
     if not DOG.exists():
         pytest.skip(f"no real recordings at {DOG.parent} (set ATS_REALDATA)")
     cv2.setNumThreads(1)  # the search divides its work, and its result, by threads
@@ -44,8 +45,8 @@ def dog(tmp_path_factory):
     clip = Clip.open(folder)
     estimator = Estimator(clip.color_size, FlowConfig().working_side_px)
     gray = [estimator.reduce(clip.color(frame)) for frame in range(FRAMES)]
-    found = {(gap, way): [] for gap in (1, 2, 4) for way in ("fw", "bw")}
-    for gap, *both in flows(gray.__getitem__, FRAMES, (1, 2, 4), estimator):
+    found = {(gap, way): [] for gap in GAPS for way in ("fw", "bw")}
+    for gap, *both in flows(gray.__getitem__, FRAMES, GAPS, estimator):
         for way, part in zip(("fw", "bw"), both, strict=True):
             found[gap, way].append(part)
     for (gap, way), parts in found.items():
