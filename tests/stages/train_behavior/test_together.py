@@ -14,6 +14,7 @@ from pipeline.core import distributed
 from pipeline.core.training import generator_for
 from stages.train_behavior import objective, rival_losses, training
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig
+from stages.train_behavior.homes import TrainingHomes
 from tests import two_processes
 from tests.pipeline.behavior.wandering import ARCHITECTURE, room, wandering
 
@@ -24,8 +25,7 @@ def trained(family: str, batch: int, folder: Path | None = None) -> training.Tra
     """Train for six steps, half of them goals; a quarter of the windows are mirrored and have no bones."""
     pace = BehaviorOptimizerConfig(steps=6, goal_steps=3, batch=batch, goal_batch=batch, rate=1e-3)
     return training.train(
-        wandering(),
-        Scenes.of(room()),
+        TrainingHomes.of_one(wandering(), Scenes.of(room())),
         replace(ARCHITECTURE, family=family),
         Schedule(),
         BehaviorTrainingConfig(pace),
