@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, ground, rigid
+from pipeline.mapping.bundle_adjustment import MAD_TO_SIGMA
 from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.refine import Keyframe
 from stages.build_scene_template.sfm import points_under
@@ -23,8 +24,6 @@ MOST_GAP_M, MOST_GAP_RATIO = 0.06, 1.5
 """Gap between depth images that refutes the model, metres, if so many times the gap under the odometry."""
 LEAST_RATIOS = 20
 """Tracks with depth below which there is no scale."""
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 HOPS = (1, 3, 8)
 """Keyframes that many apart have their depth images compared."""
 GAP_QUANTILE, LEAST_OVERLAP = 0.75, 50

@@ -4,7 +4,7 @@
 programming over size, evidence and speed, looking at the whole recording at once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -89,6 +89,16 @@ def motion(votes: Votes) -> Float[np.ndarray, "*shape"]:
     return np.where(moving(votes), np.where(clearly_moving(votes), CLEAR_MOTION, MOTION), 0.0)
 
 
+def groups(is_moving: Bool[np.ndarray, "height width"]) -> Iterator[Bool[np.ndarray, "height width"]]:
+    """Return the groups of moving pixels that nearly touch, larger than what chance brings together."""
+    closed = cv2.dilate(is_moving.astype(np.uint8), np.ones((3, 3), np.uint8))
+    count, label = cv2.connectedComponents(closed, connectivity=8)
+    for index in range(1, count):
+        own = (label == index) & is_moving
+        if own.sum() >= LEAST_PIXELS:
+            yield own
+
+
 def candidates(
     is_moving: Bool[np.ndarray, "height width"],
     probability: Float[np.ndarray, "height width"],
@@ -97,13 +107,10 @@ def candidates(
     animal: AnimalConfig,
 ) -> list[Candidate]:
     """Group moving pixels that touch, largest area first; ``area_m2`` is what each covers at its distance."""
-    closed = cv2.dilate(is_moving.astype(np.uint8), np.ones((3, 3), np.uint8))
-    count, label = cv2.connectedComponents(closed, connectivity=8)
     found = []
-    for index in range(1, count):
-        own = (label == index) & is_moving
+    for own in groups(is_moving):
         area = float(area_m2[own].sum())
-        if area < LEAST_AREA_M2 or own.sum() < LEAST_PIXELS:
+        if area < LEAST_AREA_M2:
             continue
         points = points_world[own]
         centre = np.median(points, axis=0)

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
@@ -18,11 +18,10 @@ from pipeline.geometry import rigid
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References
+from stages.segment_agent.locate import COARSE_PX
 from stages.segment_agent.movers import Candidate
 from stages.segment_agent.painting import Mask
 
-COARSE_PX = 111
-"""side of the square that has as many pixels as people are looked for among"""
 UPRIGHT_M = 0.9
 """vertical extent that no animal of a home has and that a person who is not cut off has"""
 LEAST_M = 0.4
@@ -84,7 +83,8 @@ def find_people(
     found = [list(group) for group, _ in scanned]
     axes, heights = [], []
     for _ in range(MOST_PEOPLE):
-        chosen = _track([[each.candidate for each in group] for group in found], clip.timestamp_s)
+        candidates = [[each.candidate for each in group] for group in found]
+        chosen = movers.track(candidates, clip.timestamp_s, WALKER)
         picked = [group[index] if index >= 0 else None for group, index in zip(found, chosen, strict=True)]
         person = _persistent(picked, clip.timestamp_s)
         if not person.any():
@@ -140,13 +140,8 @@ def _upright(
     low = np.quantile(heights, [FLOOR_QUANTILE]) if len(heights) else np.zeros(0)
     moving = movers.moving(free_space.vote(references, points, frame))
     area = (depth * stride) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
-    joined = cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8))
-    count, label = cv2.connectedComponents(joined, connectivity=8)
     found = []
-    for number in range(1, count):
-        own = (label == number) & moving
-        if own.sum() < movers.LEAST_PIXELS:
-            continue
+    for own in movers.groups(moving):
         group = points[own]
         bottom, top = np.quantile(group[:, 1], [0.02, 0.98])
         width = np.ptp(np.quantile(group[:, [0, 2]], [0.1, 0.9], axis=0), axis=0).max()
@@ -160,12 +155,6 @@ def _upright(
         candidate = Candidate(centre, float(area[own].sum()), radius)
         found.append(UprightMover(candidate, float(top - bottom), float(top), whole))
     return found, low
-
-
-def _track(
-    found: Sequence[Sequence[Candidate]], timestamp_s: Float[np.ndarray, "frame"]
-) -> Int[np.ndarray, "frame"]:
-    return movers.track(found, timestamp_s, WALKER)
 
 
 def _persistent(

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.data.flow import GAPS
+from pipeline.geometry import subsampling
 from stages.segment_agent.appearance import Example, learn
 from stages.segment_agent.config import LearningConfig
 from stages.segment_agent.footage import Footage, grown, pixels
@@ -64,7 +65,7 @@ def propagate(
 
 def examples(footage: Footage, found: Labels, hinted: int, count: int) -> list[Example]:
     """Label so many frames, evenly chosen, as far as they are sure; the hinted one is repeated."""
-    chosen = np.unique(np.linspace(0, len(found) - 1, count).round().astype(int)).tolist()
+    chosen = subsampling.evenly(len(found), count, rounded=True).tolist()
     shown = []
     for frame in (hinted, *(each for each in chosen if each != hinted)):
         log_odds = found[frame]
