@@ -165,7 +165,7 @@ class Surface:
         return np.stack([at[:, 0], self.heights_m[self.free], at[:, 1]], axis=1)
 
     def connects(self, a: np.ndarray, b: np.ndarray) -> bool:
-        """Tell whether the straight way between two points is free."""
+        """Return whether the straight way between two points is free."""
         way = a + np.linspace(0, 1, max(2, int(np.linalg.norm(b - a) / (CELL_M / 2))))[:, None] * (b - a)
         at = np.floor((way[:, [0, 2]] - self.origin) / CELL_M).astype(int)
         return bool(self.free[at[:, 0], at[:, 1]].all())

@@ -262,7 +262,7 @@ class Disturbance:
 
 
 def _alive(group: int) -> bool:
-    """Tell whether a process of the group still runs."""
+    """Return whether a process of the group still runs."""
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             state, _, of_group = stat.read_text().rpartition(")")[2].split()[:3]

@@ -7,14 +7,14 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 57_600,
+    "lines": 57_560,
     "lines over 110 columns": 0,
     "recipe keys": 326,
     "packages over 16 modules": 0,
-    "private words in identifiers": 39,
-    "tell, told": 5,
-    "class names used twice": 3,
-    "unnamed numbers": 121,
+    "private words in identifiers": 0,
+    "tell, told": 0,
+    "class names used twice": 0,
+    "unnamed numbers": 118,
     "unshaped public functions": 0,
     "modules in import cycles": 0,
 }

@@ -93,7 +93,7 @@ def held_out(clip: str, clips: dict[str, Path], folder: Path, config: TrainingCo
 
 
 def predicts(samples: Samples, score: str) -> bool:
-    """Tell whether a method predicts what a score judges."""
+    """Return whether a method predicts what a score judges."""
     needed = {"path_minade_m": samples.path, "orientation_minade_rad": samples.rotation}
     return score not in needed or needed[score] is not None
 

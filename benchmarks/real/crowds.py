@@ -58,7 +58,7 @@ class Crowd:
         return [Walk(int(person), int(start)) for person, start in zip(*np.nonzero(whole.T), strict=True)]
 
     def accompanied(self, walks: list[Walk]) -> Bool[np.ndarray, "walk"]:
-        """Tell through which windows others walk as well."""
+        """Return through which windows others walk as well."""
         start = np.array([walk.start for walk in walks], int)
         return np.bincount(start, minlength=1)[start] >= LEAST_PEOPLE
 

@@ -40,7 +40,7 @@ def carried(
 
 
 def hits(step: Step, sequence: DavisSequence) -> Bool[np.ndarray, "joint"]:
-    """Tell which joints that both frames of a pair show are carried to where they are."""
+    """Return which joints that both frames of a pair show are carried to where they are."""
     joints, found = sequence.joints_by_frame(), []
     known = sorted(joints)
     for first, last in pairwise(known):

@@ -90,6 +90,6 @@ def judge(
 def collisions(
     path: Float[np.ndarray, "sample frame 3"], others: Float[np.ndarray, "frame other 2"]
 ) -> Bool[np.ndarray, "sample"]:
-    """Tell which paths come nearer than `COLLISION_M` to somebody."""
+    """Return which paths come nearer than `COLLISION_M` to somebody."""
     square = ((path[:, :, None, ::2] - others) ** 2).sum(-1)
     return (square < COLLISION_M**2).any((1, 2))

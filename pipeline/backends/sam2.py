@@ -84,9 +84,9 @@ class Sam2:
         reach = max(self._model.config.num_maskmem, self._model.config.max_object_pointers_in_encoder)
         session.processed_frames.pop(frame, None)
         for outputs in session.output_dict_per_obj.values():
-            kept = outputs["non_cond_frame_outputs"]
-            kept.pop(frame - step * reach, None)
-            for output in kept.values():
+            memory = outputs["non_cond_frame_outputs"]
+            memory.pop(frame - step * reach, None)
+            for output in memory.values():
                 output.pop("high_res_masks", None)
         for tracked in session.frames_tracked_per_obj.values():
             tracked.pop(frame - step * reach, None)

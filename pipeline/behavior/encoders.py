@@ -76,7 +76,7 @@ class OthersEncoder(SetEncoder):
     """Encode the past positions of others through features that vanish towards ``radius_m``.
 
     Distance and approach speed are encoded frame by frame in metres and m/s, well inside the radius undamped:
-    whether the animal minds hangs on them, and to learn them from positions takes thousands of steps. Beyond
+    they decide whether the animal reacts, and to learn them from positions takes thousands of steps. Beyond
     the radius all features are zero, so that a far being and none at all are the same to the agent: the
     code of zero features is also the learned null.
     """

@@ -1,8 +1,8 @@
 """Goals and paths as the numbers that are diffused: ways by a power of their length, paths by their strides.
 
-An animal rests most of the time. Told as places, rest is as uncertain as a walk, and what sampling leaves of
-noise makes a path tremble. Told as strides it is zero, the root sets it apart from the slowest walk, and a
-number of its own states whether the animal moves or stays.
+An animal rests most of the time. In positions, rest is as uncertain as a walk, and the noise that sampling
+leaves makes a path tremble. In strides rest is zero, the root separates it from the slowest walk, and a
+channel of its own states whether the animal moves.
 """
 
 from typing import overload

@@ -12,7 +12,7 @@ HOST = "127.0.0.1"
 
 
 def is_own(port: int, hosts: Sequence[str], origins: Sequence[str]) -> bool:
-    """Tell whether a request is one of a server's own page, or of a program on this machine.
+    """Return whether a request is one of a server's own page, or of a program on this machine.
 
     `hosts` and `origins` are all values of the headers `Host` and `Origin`; a program sends no `Origin`.
     """

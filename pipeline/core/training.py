@@ -172,7 +172,7 @@ class _Loop:
         return dict(zip(terms, values.tolist(), strict=True))
 
     def anywhere(self, here: bool) -> bool:
-        """Tell whether something is so in any of the processes."""
+        """Return whether something is so in any of the processes."""
         return bool(distributed.total(torch.tensor(float(here)))) if self.shared else here
 
     def _fall_back(self, values: Mapping[str, float], norm: float) -> None:

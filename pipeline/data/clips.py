@@ -77,7 +77,7 @@ class Clip:
 
     @property
     def mapped(self) -> bool:
-        """Tell whether its cameras lie in the map's world, and its depth is no measurement of its own."""
+        """Return whether its cameras lie in the map's world, and its depth is no measurement of its own."""
         return self.scale == MAPPED
 
     @classmethod

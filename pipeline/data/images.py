@@ -100,7 +100,7 @@ def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
 
 
 def _is_complete(path: Path) -> bool:
-    """Tell whether a ZIP-compressed scan-line EXR reaches to the end of its last block."""
+    """Return whether a ZIP-compressed scan-line EXR reaches to the end of its last block."""
     with open(path, "rb") as file:
         try:
             attributes, table = _exr_attributes(file.read(MAX_EXR_HEADER_BYTES))

@@ -1,4 +1,4 @@
-"""Tell depth of thin things from flying pixels, where the sensor itself doubts both."""
+"""Separate depth of thin things from flying pixels, where the sensor itself doubts both."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,7 +11,7 @@ what lies behind has two"""
 def supported(
     depth: Float[np.ndarray, "height width"], tolerance_m: float = 0.03
 ) -> Bool[np.ndarray, "height width"]:
-    """Tell which pixels have three of eight neighbours at nearly their own depth (metres, 0 = unknown)."""
+    """Return which pixels have three of eight neighbours at nearly their own depth (metres, 0 = unknown)."""
     height, width = depth.shape
     around = np.pad(depth, 1)
     count = np.zeros(depth.shape, np.uint8)

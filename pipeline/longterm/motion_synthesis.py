@@ -234,7 +234,7 @@ def measure_motion_prior(
 
     Half a turn within a second counts as possible for any body, also for one that was only seen to rest.
     """
-    clearance, above, pace, travels, turn = [], [], [], [], []
+    clearance, above, travelled, travels, turn = [], [], [], [], []
     for stretch, scene in zip(stretches, scenes, strict=True):
         root = stretch.world_from_agent[:, :3, 3]
         way = np.linalg.norm((root[STEPS:] - root[:-STEPS])[:, [0, 2]], axis=1)
@@ -243,13 +243,13 @@ def measure_motion_prior(
         up = (stretch.world_from_agent[middle, 1:2, :3] @ bones)[:, 0]
         clearance.append(scene.distance.at(torch.from_numpy(root[middle]).float()).numpy())
         above.append(up.max(1))
-        pace.append(way)
+        travelled.append(way)
         travels.append(way > moving_m)
         rotation = stretch.world_from_agent[:, :3, :3]
         turn.append(rigid.rotation_angle(rotation[:-1], rotation[1:]))
     chosen = np.concatenate(travels)
     chosen = chosen if chosen.any() else ~chosen
-    found = (float(np.median(np.concatenate(each)[chosen])) for each in (clearance, pace, above))
+    found = (float(np.median(np.concatenate(each)[chosen])) for each in (clearance, travelled, above))
     clearance_m, pace_m, above_m = found
     turn_rad = max(float(np.percentile(np.concatenate(turn), TURN_PERCENTILE)), np.pi / RATE_HZ)
     return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)

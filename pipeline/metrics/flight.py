@@ -15,7 +15,7 @@ def flees(
     person_world: Float[np.ndarray, "*batch 3"],
     rate_hz: float = RATE_HZ,
 ) -> Bool[np.ndarray, "*batch"]:
-    """Tell whether within 3 s the root gets 0.8 m further from where the person is now, over the floor."""
+    """Return whether within 3 s the root gets 0.8 m further from where the person is now, over the floor."""
 
     def away(points: Float[np.ndarray, "*batch frame 3"]) -> Float[np.ndarray, "*batch frame"]:
         return np.linalg.norm((points - person_world[..., None, :])[..., [0, 2]], axis=-1)

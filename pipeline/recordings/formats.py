@@ -117,6 +117,6 @@ def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[V
 
 
 def has_depth(path: Path) -> bool:
-    """Tell, by its names alone, whether a recording has depth."""
+    """Return, by its names alone, whether a recording has depth."""
     found = format_of(path)
     return found is not None and found.has_depth

@@ -38,7 +38,7 @@ OLDEST = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 @dataclass(frozen=True)
-class Odometry:
+class OdometryTable:
     """The rows of `odometry.csv`."""
 
     frame: Int[np.ndarray, "row"]
@@ -82,7 +82,7 @@ def open_recording(path: Path) -> Recording:
     )
 
 
-def read_odometry(text: str, where: str) -> Odometry:
+def read_odometry(text: str, where: str) -> OdometryTable:
     """Read the table by its column names: 7 (oldest, no header), 9 or 15 columns, blanks where unknown."""
     lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
     lines = [row for row in lines if any(row)]
@@ -109,11 +109,11 @@ def read_odometry(text: str, where: str) -> Odometry:
     if set(COEFFICIENTS) <= set(column):
         coefficients = np.stack([column[name] for name in COEFFICIENTS], axis=1)
         coefficients = coefficients if np.isfinite(coefficients).all() else None
-    return Odometry(frame.astype(int), timestamp_s, pose, coefficients)
+    return OdometryTable(frame.astype(int), timestamp_s, pose, coefficients)
 
 
 def _intrinsics(
-    container: FolderContainer, rows: Odometry, valid: np.ndarray, size: tuple[int, int]
+    container: FolderContainer, rows: OdometryTable, valid: np.ndarray, size: tuple[int, int]
 ) -> Float[np.ndarray, "frame 3 3"]:
     """Return intrinsics in the video's pixels: per frame, else the last frame's of `camera_matrix.csv`."""
     if rows.coefficients is not None:

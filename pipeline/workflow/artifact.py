@@ -60,7 +60,7 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def _is_sound(manifest: Manifest) -> bool:
-    """Tell whether every field holds what it should."""
+    """Return whether every field holds what it should."""
     texts, tables = (manifest.stage, manifest.content), (manifest.inputs, manifest.versions, manifest.files)
     return (
         all(isinstance(text, str) for text in texts)

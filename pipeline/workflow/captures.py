@@ -161,7 +161,7 @@ def assign(
 
 
 def is_mapped(folder: Path, video: Video) -> bool:
-    """Tell whether a recording in `folder` gets cameras and depth from the map: it has no depth itself."""
+    """Return whether a recording in `folder` gets cameras and depth from the map: it has no depth itself."""
     return video.role in ("turnaround", "session") and not has_depth(folder / video.file)
 
 

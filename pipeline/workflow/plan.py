@@ -85,7 +85,7 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     _write(base / "videos.json", _json([asdict(video) for video in plan.videos]))
     for video in plan.videos:
         _write(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
-    for name, file in _beside_recordings(plan):
+    for name, file in _further_files(plan):
         digested = file / artifact.MANIFEST if file.is_dir() else file
         digest = cache.get(digested, artifact.digest_of_file)
         _write(base / "keys" / name, _json({"sha256": digest}))
@@ -108,7 +108,7 @@ def write(plan: Plan, cache: sources.Cache) -> None:
     stamps.remove_outdated(all_jobs)
 
 
-def _beside_recordings(plan: Plan) -> Iterator[tuple[str, Path]]:
+def _further_files(plan: Plan) -> Iterator[tuple[str, Path]]:
     """Yield the user's further files that decide something, each with the name of its key file."""
     agent = plan.home.agent
     for node in dag.FLOW:

@@ -158,7 +158,7 @@ def _key(job: dict[str, Any]) -> str:
 
 
 def _other_key(resume: Path, key: str) -> bool:
-    """Tell whether checkpoints, if any, belong to another key; they must never be gone on from."""
+    """Return whether checkpoints, if any, belong to another key; they must never be gone on from."""
     try:
         return (resume / "key").read_text() != key
     except FileNotFoundError:

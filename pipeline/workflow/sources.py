@@ -63,7 +63,7 @@ class Cache:
 
 
 def fits(known: Any) -> bool:
-    """Tell whether this is what a `Cache` kept."""
+    """Return whether this is what a `Cache` kept."""
     entries = known.values() if isinstance(known, dict) else [None]
     values = [
         entry["value"] if isinstance(entry, dict) and entry.keys() == {"mark", "value"} else None
@@ -173,5 +173,5 @@ def _imported(node: ast.AST) -> list[str]:
 def _drop_docstrings(node: ast.AST) -> None:
     body = getattr(node, "body", None)
     if isinstance(body, list):
-        kept = [n for n in body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
-        body[:] = kept or [ast.Pass()]
+        statements = [n for n in body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
+        body[:] = statements or [ast.Pass()]

@@ -20,7 +20,7 @@ def drift_m(shots: Sequence[SampledFrame]) -> float:
         (first, second)
         for i, first in enumerate(shots)
         for second in shots[i + 1 :]
-        if second.timestamp_s - first.timestamp_s >= LATER_S and _looks_alike(first, second)
+        if second.timestamp_s - first.timestamp_s >= LATER_S and _similar_views(first, second)
     ]
     found = []
     for first, second in pairs[:: max(1, len(pairs) // MOST_PAIRS)]:
@@ -32,7 +32,7 @@ def drift_m(shots: Sequence[SampledFrame]) -> float:
     return float(np.median(found)) if found else np.nan
 
 
-def _looks_alike(first: SampledFrame, second: SampledFrame) -> bool:
-    """Tell whether two cameras look into about the same direction from about the same place."""
+def _similar_views(first: SampledFrame, second: SampledFrame) -> bool:
+    """Return whether two cameras look into about the same direction from about the same place."""
     relative = first.camera_from_odometry @ second.odometry_from_camera
     return relative[2, 2] > 0.8 and float(np.linalg.norm(relative[:3, 3])) < 1.5

@@ -31,7 +31,7 @@ class CaptureVerdict:
 
     @property
     def usable(self) -> bool:
-        """Tell whether a build goes on with it: the held-out phone must have depth."""
+        """Return whether a build goes on with it: the held-out phone must have depth."""
         return self.seen is not None and (self.seen.sample.plan is not None or self.role != "heldout")
 
 

@@ -60,7 +60,7 @@ class Lens:
 
     @property
     def bends(self) -> bool:
-        """Tell whether pictures must be undistorted."""
+        """Return whether pictures must be undistorted."""
         corner = np.hypot(*self.size) / 2 / self.focal_px
         return abs(self.radial) * corner**3 * self.focal_px > LEAST_BEND_PX
 
@@ -86,7 +86,7 @@ class Located:
 
     @property
     def sure(self) -> bool:
-        """Tell whether enough matches agree to believe it without neighbours."""
+        """Return whether enough matches agree to believe it without neighbours."""
         return len(self.matches.pixel) >= LEAST_INLIERS and self.share >= LEAST_SHARE
 
 

@@ -26,7 +26,7 @@ WALK_VIEWS = 2
 NEIGHBOURS = (1, 3)
 """Frames after a frame that it is compared with."""
 PROBES = 60
-"""Pixels of a frame that tell which pictures of the walk-through see the same."""
+"""Pixels of a frame by which pictures of the walk-through that see the same are found."""
 TRACKED_SHARE, ENOUGH_SHARE = 0.35, 0.7
 """Share of the flow between frames that must agree on a camera for it to be placed, and with which no other
 explanation is searched."""

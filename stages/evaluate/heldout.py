@@ -151,7 +151,7 @@ def _gray(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height
 
 
 def depth_is_right(view: HeldoutView) -> Bool[np.ndarray, "height width"]:
-    """Tell which pixels are within 0.1 m of truth; holes are wrong."""
+    """Return which pixels are within 0.1 m of truth; holes are wrong."""
     return (view.depth > 0) & (np.abs(view.depth - view.true.depth) <= TOLERANCE_M)
 
 

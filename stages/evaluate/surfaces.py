@@ -69,7 +69,7 @@ def seen_by(
     intrinsics: Float[np.ndarray, "camera 3 3"],
     size: tuple[int, int],
 ) -> Bool[np.ndarray, "point"]:
-    """Tell which surface points some camera sees within 5 m: in its picture and not behind anything."""
+    """Return which surface points some camera sees within 5 m: in its picture and not behind anything."""
     seen = np.zeros(len(points_world), bool)
     for camera, lens in zip(world_from_camera, intrinsics, strict=True):
         points_camera = rigid.apply(rigid.inverse(camera), points_world)

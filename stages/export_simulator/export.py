@@ -47,8 +47,8 @@ def simulator(
     body: CanonicalAgent, scene: Mesh, gaussians: SplatClouds, motions: list[SessionClip], config: Config
 ) -> SimulatorParts:
     """Thin the surfaces, fit the weights, resample the motion."""
-    agent, kept = decimate(body.mesh, config.agent_faces)
-    thinned = CanonicalAgent(agent, body.weights[kept], body.agent_from_bone_rest)
+    agent, source_vertex = decimate(body.mesh, config.agent_faces)
+    thinned = CanonicalAgent(agent, body.weights[source_vertex], body.agent_from_bone_rest)
     (four, residual_m), (eight, eight_residual_m) = fit_weights(thinned, motions)
     names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
     room, _ = decimate(scene, config.scene_faces)

@@ -54,8 +54,8 @@ def light_page(*, contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> t
     """Return a page that loads its assets from beside it, and these files by name; it wants a static host."""
     files = compressed(contract, assets)
     tags = [_tag(name, assets, f' data-file="assets/{name}.gz"') for name in files]
-    beside = {f"assets/{name}.gz": file for name, file in files.items()}
-    return _assembled(contract, tags, connect="'self'"), beside
+    loaded = {f"assets/{name}.gz": file for name, file in files.items()}
+    return _assembled(contract, tags, connect="'self'"), loaded
 
 
 def compressed(contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> dict[str, bytes]:

@@ -27,13 +27,13 @@ SHEET_HEIGHT_PX = 200
 class WrittenFrames:
     """What came out of a recording."""
 
-    kept: Bool[np.ndarray, "frame"]
+    usable: Bool[np.ndarray, "frame"]
     """of the plan's frames, those with enough depth"""
     lost: float
     """share (0..1) of the plan's frames at which the file is damaged"""
-    sharpness: Float[np.ndarray, "kept"]
-    brightness: Float[np.ndarray, "kept"]
-    depth_valid: Float[np.ndarray, "kept"]
+    sharpness: Float[np.ndarray, "usable_frame"]
+    brightness: Float[np.ndarray, "usable_frame"]
+    depth_valid: Float[np.ndarray, "usable_frame"]
     color_strip: UInt8[np.ndarray, "height width 3"]
     depth_strip: UInt8[np.ndarray, "height width 3"]
 
@@ -47,7 +47,7 @@ def write_frames(
     """
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir()
-    kept, lost, statistics, strip = np.zeros(total, bool), 0, [], []
+    usable, lost, statistics, strip = np.zeros(total, bool), 0, [], []
     shown = set(np.linspace(0, total - 1, SHEET_FRAMES).astype(int).tolist())
     for number, frame in enumerate(frames):
         if frame is None:
@@ -62,7 +62,7 @@ def write_frames(
         images.write_depth(folder / "depth" / f"{name}.exr", frame.depth)
         images.write_gray(folder / "confidence" / f"{name}.png", frame.confidence)
         statistics.append((frame.sharpness, frame.brightness, frame.depth_valid))
-        kept[number] = True
+        usable[number] = True
     if lost > MOST_LOST * total:
         raise damaged(where, f"{lost} of {total} pictures cannot be decoded")
     if len(statistics) < LEAST_FRAMES:
@@ -72,22 +72,22 @@ def write_frames(
         raise InputError("CAP-007", what, where, remedy)
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))
     sharpness, brightness, depth_valid = np.array(statistics).T
-    return WrittenFrames(kept, lost / total, sharpness, brightness, depth_valid, color_strip, depth_strip)
+    return WrittenFrames(usable, lost / total, sharpness, brightness, depth_valid, color_strip, depth_strip)
 
 
 def write_table(folder: Path, recording: Recording, plan: ExtractionPlan, written: WrittenFrames) -> None:
-    """Write ``frames.npz`` for the kept frames."""
-    kept = written.kept
-    odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[kept]
+    """Write ``frames.npz`` for the usable frames."""
+    usable = written.usable
+    odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[usable]
     FRAMES.save(
         folder / "frames.npz",
-        timestamp_s=plan.timestamp_s[kept],
-        intrinsics=plan.intrinsics[kept],
-        depth_intrinsics=plan.depth_intrinsics[kept],
+        timestamp_s=plan.timestamp_s[usable],
+        intrinsics=plan.intrinsics[usable],
+        depth_intrinsics=plan.depth_intrinsics[usable],
         odometry_from_camera=odometry,
         gravity_known=np.array(plan.gravity_known),
         scale=np.array(plan.scale),
-        source_index=recording.index[plan.chosen][kept],
+        source_index=recording.index[plan.chosen][usable],
         quarter_turns=np.array(plan.quarter_turns),
         sharpness=written.sharpness,
         brightness=written.brightness,
@@ -104,10 +104,10 @@ def write_mesh(folder: Path, recording: Recording, plan: ExtractionPlan) -> None
 
 def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *, rate_hz: float) -> None:
     """Write the stage's own judgement: what was understood, how much of it is usable, a contact sheet."""
-    timestamp_s = plan.timestamp_s[written.kept]
+    timestamp_s = plan.timestamp_s[written.usable]
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
     blurred = written.sharpness < 0.4 * max(float(np.median(written.sharpness)), 1e-6)
-    dropped = float((~written.kept).mean()) - written.lost
+    dropped = float((~written.usable).mean()) - written.lost
     with_poses = float(plan.odometry_from_camera is not None)
     missing = 1 - len(timestamp_s) / max(round(duration_s * rate_hz) + 1, 1)
     checks = [

@@ -27,7 +27,7 @@ from stages.segment_agent.people import People
 from stages.segment_agent.prompt import Prompt
 from stages.segment_agent.refine import Palette
 from stages.segment_agent.resting import find_resting, rests
-from stages.segment_agent.trajectory import Trajectory, steady
+from stages.segment_agent.trajectory import CameraPath, steady
 from stages.segment_agent.turnaround import EDGES, find_standing, meeting_point
 from stages.segment_agent.windows import Sphere, rectangle, working_picture, working_size
 
@@ -51,7 +51,7 @@ class Segmentation:
 
     masks: Iterator[Mask]
     """One per frame, made as they are asked for."""
-    path: Trajectory | None = None
+    path: CameraPath | None = None
     """Camera poses; None without depth."""
     walkers: People | None = None
     """People in a session with depth."""

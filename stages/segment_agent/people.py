@@ -1,6 +1,6 @@
 """People who walk about in a recording: upright movers, larger than an animal. None of them is the animal.
 
-`find_people` tracks them through the whole recording; `People.beside` says which points are theirs, so that
+`find_people` tracks them through the whole recording; `People.near` says which points are theirs, so that
 neither the animal's track nor its appearance is learned from somebody's legs.
 """
 
@@ -56,13 +56,12 @@ class People:
     floor_m: float
     """height of the floor in the recording's world"""
 
-    def beside(self, frame: int, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
+    def near(self, frame: int, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
         """Return which points belong to a person or touch one."""
         axes = self.axis_world[:, frame]
         axes = axes[np.isfinite(axes[:, 0])]
         off = np.linalg.norm(points_world[..., None, ::2] - axes, axis=-1)
-        near = (off < REACH_M).any(-1)
-        return near & (points_world[..., 1] > self.floor_m + ABOVE_FLOOR_M)
+        return (off < REACH_M).any(-1) & (points_world[..., 1] > self.floor_m + ABOVE_FLOOR_M)
 
     def feet_in_camera(
         self, world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -112,7 +111,7 @@ def set_apart(
     for axis, height_m in zip(walkers.axis_world, walkers.height_m, strict=True):
         tall = "" if np.isnan(height_m) else f", {height_m:.2f} m tall"
         log(f"somebody walks here, seen in {np.isfinite(axis[:, 0]).sum()} of {len(clip)} frames{tall}")
-    return replace(references, ignored=walkers.beside if len(walkers.axis_world) else None), walkers
+    return replace(references, ignored=walkers.near if len(walkers.axis_world) else None), walkers
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +205,7 @@ def hide(
     """Mark people as unknown in the masks of all frames: neither the animal nor the room."""
     for frame, mask in enumerate(masks):
         points = free_space.points_of(clip, frame, world_from_camera[frame], clip.depth(frame), 1)
-        theirs = people.beside(frame, points)
+        theirs = people.near(frame, points)
         theirs = cv2.dilate(theirs.astype(np.uint8), RIM)
         theirs = cv2.resize(theirs, mask.labels.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
         yield replace(mask, labels=np.where(theirs & (mask.labels == 0), np.uint8(128), mask.labels))

@@ -18,7 +18,7 @@ DEPTH_STRIDE = 3
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class CameraPath:
     """Camera poses in a world of the recording's own, +y up."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -26,7 +26,7 @@ class Trajectory:
     residual_m: float
 
 
-def steady(clip: Clip, flow: Path, rng: np.random.Generator) -> Trajectory:
+def steady(clip: Clip, flow: Path, rng: np.random.Generator) -> CameraPath:
     """Return poses without drift; a recording without odometry is chained from picture to picture first."""
 
     def view(frame: int) -> DepthImage:
@@ -42,7 +42,7 @@ def steady(clip: Clip, flow: Path, rng: np.random.Generator) -> Trajectory:
     found = correct_drift(view, clip.timestamp_s, poses)
     level_known = clip.odometry_from_camera is not None and clip.gravity_known
     poses = found.world_from_camera if level_known else align_gravity(view, found.world_from_camera)
-    return Trajectory(poses, found.edges, found.residual_m)
+    return CameraPath(poses, found.edges, found.residual_m)
 
 
 def motion_from_flow(

@@ -29,7 +29,7 @@ class Floor:
         return min(max(i, 0), self.free.shape[0] - 1), min(max(k, 0), self.free.shape[1] - 1)
 
     def is_free(self, point: Ground) -> bool:
-        """Tell whether a walker may stand there."""
+        """Return whether a walker may stand there."""
         return bool(self.free[self.cell(point)])
 
     def centers(self) -> Float[np.ndarray, "cell 2"]:
@@ -93,7 +93,7 @@ class Walker:
         self.way = np.zeros((0, 2))
 
     def arrived(self) -> bool:
-        """Tell whether nothing of the way is left."""
+        """Return whether nothing of the way is left."""
         return len(self.way) == 0
 
     def step(self, seconds: float, desired_speed: float, *, face: float | None = None) -> None:

@@ -50,7 +50,7 @@ def walk(tmp_path_factory) -> Walk:
         out, mapped.frames, total=len(mapped.plan.chosen), min_depth_valid=0.2, where="walk"
     )
     writing.write_table(out, recording, mapped.plan, written)
-    clip, kept = Clip.open(out), mapped.plan.chosen[written.kept]
+    clip, kept = Clip.open(out), mapped.plan.chosen[written.usable]
     centres, true = clip.odometry_from_camera[:, :3, 3], truth.world_from_camera[kept][:, :3, 3]
     fitted = pycolmap.estimate_sim3d(centres, true)
     moved = fitted.scale * centres @ fitted.rotation.matrix().T + fitted.translation

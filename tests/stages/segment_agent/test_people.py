@@ -71,4 +71,4 @@ def test_an_animal_alone_is_nobody(tmp_path):
     references, walkers = people.set_apart(Clip.open(tmp_path / "frames"), poses, 40)
     assert walkers.axis_world.shape == (0, len(poses), 2)
     assert references.ignored is None
-    assert not walkers.beside(0, np.zeros((3, 3))).any()
+    assert not walkers.near(0, np.zeros((3, 3))).any()
