@@ -8,7 +8,7 @@ from pipeline.core import progress
 from pipeline.geometry import rigid
 from pipeline.longterm.clip_channels import Clips
 from pipeline.longterm.examples import ClipSelection, MotionDataset, encode_selection, select_clips
-from pipeline.longterm.short_motions import STEPS
+from pipeline.longterm.short_motions import RATE_HZ, STEPS
 from pipeline.metrics.intervals import episodes
 from stages.tabulate_longterm import methods, scores, tables
 from stages.tabulate_longterm.config import Config
@@ -18,6 +18,9 @@ CLIP_STRIDE = 10
 """Frames (30 fps) between the starts of held-out clips."""
 EPISODE_FRAMES = 300
 """Clips that begin within the same ten seconds count as one episode."""
+LENGTHS_S, LENGTH_RUNS = (2, 4, 6), 8
+"""Seconds of the longer motions that are compared, the true bodies given every two seconds (Sec. 4.2 of the
+paper), and how many motions there are."""
 BLOCKED_M = 0.06
 """A straight line from start to end that comes nearer than this to anything is not the animal's way."""
 
@@ -28,7 +31,8 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
     if dataset is None:
         return {}
     rng = np.random.default_rng(config.seed)
-    cuts = select_pairs(select_clips(dataset, rng, stride=CLIP_STRIDE, resting=0.0), config.clips)
+    travelled = select_clips(dataset, rng, stride=CLIP_STRIDE, resting=0.0)
+    cuts = select_runs(travelled, 2, config.clips)
     if not len(cuts.start):
         return {}
     clips = encode_selection(dataset, cuts, model.poses, model.sizes.points, rng)
@@ -44,9 +48,10 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
         for name, than in methods.COMPARED_WITH.items()
         if {name, than} <= set(plain)
     }
-    some = even_pairs(len(clips), config.optimized_clips)
+    some = even_runs(len(clips), 2, config.optimized_clips)
     done = {}
-    for name in methods.OPTIMIZED if source.data is None else ("ours",):
+    optimized = methods.OPTIMIZED if source.data is None else ("ours",)
+    for name in optimized:
         true = [known[index] for index in some]
         done[f"{name}_opt"] = scores.scores(made[name][some], clips[some], true, model, config.optimization)
         done[f"{name}_same"] = plain[name][some]
@@ -58,26 +63,54 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
         if chosen.any():
             rows = {name: values[chosen] for name, values in plain.items()}
             found |= tables.figures(rows, episode[chosen], prefix + ending, seed=config.seed)
-    return found | tables.figures(done, episode[some], prefix, seed=config.seed)
+    found |= tables.figures(done, episode[some], prefix, seed=config.seed)
+    return found | _figures_of_lengths(prefix, source, travelled, optimized, config)
 
 
-def select_pairs(cuts: ClipSelection, most: int) -> ClipSelection:
-    """Take short motions two by two that follow each other, evenly until there are enough."""
-    known = set(zip(cuts.stretch.tolist(), cuts.start.tolist(), strict=True))
-    first = np.array(
-        [(stretch, start) in known for stretch, start in zip(cuts.stretch, cuts.start + STEPS, strict=True)],
-        bool,
+def _figures_of_lengths(
+    prefix: str, source: MotionSource, cuts: ClipSelection, optimized: tuple[str, ...], config: Config
+) -> dict[str, float | None]:
+    """Measure optimised motions of several lengths, each as a whole, on the same places."""
+    dataset, model = source.split.held_out, source.models.ours
+    assert dataset is not None
+    run = max(LENGTHS_S) * RATE_HZ // STEPS
+    cuts = select_runs(cuts, run, run * LENGTH_RUNS)
+    if not len(cuts.start):
+        return {}
+    clips = encode_selection(
+        dataset, cuts, model.poses, model.sizes.points, np.random.default_rng(config.seed)
     )
-    stretch, start = (np.repeat(each[first], 2) for each in (cuts.stretch, cuts.start))
-    start[1::2] += STEPS
-    some = even_pairs(len(start), most)
+    known = scores.references(cuts.parts(dataset), clips.scene, dataset, model)
+    every = methods.methods(source.models, dataset, config.seed)
+    made = {name: scores.decoded(every[name](clips), clips, known, model) for name in optimized}
+    episode, found = episodes(cuts.start, cuts.stretch, EPISODE_FRAMES)[::run], {}
+    for seconds in LENGTHS_S:
+        parts = seconds * RATE_HZ // STEPS
+        rows = {"truth": scores.scored_whole([each.truth for each in known], known, model, run, parts)}
+        for name, motions in made.items():
+            rows[f"{name}_opt"] = scores.scored_whole(motions, known, model, run, parts, config.optimization)
+        found |= tables.figures(rows, episode, f"{prefix}_{seconds}s", seed=config.seed)
+        progress.log(f"{prefix}: {len(episode)} motions of {seconds} s, optimised")
+    return found
+
+
+def select_runs(cuts: ClipSelection, run: int, most: int) -> ClipSelection:
+    """Take short motions that follow each other ``run`` by ``run``, evenly, ``most`` at most."""
+    known = set(zip(cuts.stretch.tolist(), cuts.start.tolist(), strict=True))
+    begins = [
+        all((stretch, start + number * STEPS) in known for number in range(run))
+        for stretch, start in zip(cuts.stretch.tolist(), cuts.start.tolist(), strict=True)
+    ]
+    stretch, start = (np.repeat(each[np.array(begins, bool)], run) for each in (cuts.stretch, cuts.start))
+    start += np.arange(len(start)) % run * STEPS
+    some = even_runs(len(start), run, most)
     return ClipSelection(stretch[some], start[some])
 
 
-def even_pairs(count: int, most: int) -> Int[np.ndarray, "some"]:
-    """Return the numbers of at most ``most`` of ``count`` things that come two by two, evenly chosen."""
-    first = 2 * np.unique(np.linspace(0, max(count // 2 - 1, 0), min(most, count) // 2).astype(int))
-    return np.stack([first, first + 1], axis=1).reshape(-1)
+def even_runs(count: int, run: int, most: int) -> Int[np.ndarray, "some"]:
+    """Return the numbers of at most ``most`` of ``count`` things, whole runs of ``run``, evenly chosen."""
+    first = run * np.unique(np.linspace(0, max(count // run - 1, 0), min(most, count) // run).astype(int))
+    return (first[:, None] + np.arange(run)).reshape(-1)
 
 
 def blocked(clips: Clips, dataset: MotionDataset) -> Bool[np.ndarray, "clip"]:

@@ -53,9 +53,9 @@ class Reference:
 
 
 def score(
-    made: BodyMotion, reference: Reference, poses: PoseSpace, seam_m: Float[np.ndarray, "vertex"]
+    made: BodyMotion, reference: Reference, poses: PoseSpace, seam_m: Float[np.ndarray, "*seam vertex"]
 ) -> Float[np.ndarray, "metric"]:
-    """Measure one short motion; the feet that stand are those of the made motion itself."""
+    """Measure one motion; the feet that stand are those of the made motion itself."""
     body, truth = reference.judge.body, reference.truth
     stance = reference.judge.stance(made)
     worth = reference.judge.plausibility(made, stance)
@@ -103,11 +103,17 @@ def scores(
     Where ``settings`` are given both are optimised as one motion, all but the given bodies at its ends and in
     its middle.
     """
-    made = [
+    return scored(decoded(channels, clips, references, model), references, model, settings)
+
+
+def decoded(
+    channels: Float[Tensor, "clip frame channel"], clips: Clips, references: list[Reference], model: LongTerm
+) -> list[BodyMotion]:
+    """Turn the channels of a method into motions in the world; their ends are the true bodies."""
+    return [
         decode_clip(each, frame, model.poses, reference.truth[ENDS].agent_from_bone)
         for each, frame, reference in zip(channels, clips.world_from_clip, references, strict=True)
     ]
-    return scored(made, references, model, settings)
 
 
 def scored(
@@ -119,10 +125,8 @@ def scored(
     """Measure motions that follow each other two by two."""
     rows = []
     for start in range(0, len(motions), 2):
-        both, judge = concatenate_motions(motions[start : start + 2]), references[start].judge
-        if settings is not None:
-            held = np.arange(len(both)) % STEPS == 0
-            both = optimize_motion(both, model.contact_body(judge.body), judge.scene, settings, held=held)
+        judge = references[start].judge
+        both = _joined(motions[start : start + 2], judge, model, settings)
         seam = seams(judge.body, both, STEPS, vertices=None)[0]
         halves = both[: STEPS + 1], both[STEPS:]
         rows += [
@@ -130,6 +134,40 @@ def scored(
             for half, known in zip(halves, references[start : start + 2], strict=True)
         ]
     return np.array(rows).reshape(-1, len(METRICS))
+
+
+def scored_whole(
+    motions: list[BodyMotion],
+    references: list[Reference],
+    model: LongTerm,
+    run: int,
+    parts: int,
+    settings: MotionOptimizationConfig | None = None,
+) -> Float[np.ndarray, "run metric"]:
+    """Measure the first ``parts`` of every ``run`` motions that follow each other as one motion."""
+    rows = []
+    for start in range(0, len(motions), run):
+        some, judge = slice(start, start + parts), references[start].judge
+        made = _joined(motions[some], judge, model, settings)
+        truth = concatenate_motions([each.truth for each in references[some]])
+        seam_m = seams(judge.body, made, STEPS, vertices=None)
+        nowhere = np.full((1, 1), np.nan)
+        rows.append(score(made, Reference(truth, judge), model.poses, seam_m if len(seam_m) else nowhere))
+    return np.array(rows).reshape(-1, len(METRICS))
+
+
+def _joined(
+    motions: list[BodyMotion],
+    judge: PlausibilityMeter,
+    model: LongTerm,
+    settings: MotionOptimizationConfig | None,
+) -> BodyMotion:
+    """Join motions; where ``settings`` are given all but the bodies at their ends is optimised as one."""
+    joined = concatenate_motions(motions)
+    if settings is None:
+        return joined
+    held = np.arange(len(joined)) % STEPS == 0
+    return optimize_motion(joined, model.contact_body(judge.body), judge.scene, settings, held=held)
 
 
 def references(

@@ -1,5 +1,6 @@
 """Figures with intervals, and the tables as people read them."""
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,6 +11,7 @@ from stages.tabulate_longterm.scores import MEDIANS, METRICS
 
 TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
 TABLE_2 = ("non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "least_slide_m_s")
+LENGTHS = ("mpvpe_mm", "non_collision", "contact", "slide_m_s", "seam_worst_mm")
 TABLE_4 = ("end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share", "seam_share", "seam_worst_mm")
 
 
@@ -48,17 +50,23 @@ def text(found: Mapping[str, float | None]) -> str:
         ("longterm_recorded", "reconstructed motion, test recording"),
         ("longterm_recorded_blocked", "reconstructed motion, something in the way"),
     ):
-        methods = dict.fromkeys(
-            name.split("/")[1] for name in found if name.startswith(f"{prefix}/") and name.count("/") == 2
-        )
         for number, columns in ((1, TABLE_1), (2, TABLE_2), (4, TABLE_4)):
-            if methods:
-                parts.append(_table(f"Table {number}: {title}", prefix, list(methods), columns, found))
+            if methods := _methods(prefix, found):
+                parts.append(_table(f"Table {number}: {title}", prefix, methods, columns, found))
+        for prefix_s in dict.fromkeys(name.split("/")[0] for name in found):
+            if (length := re.fullmatch(rf"{prefix}_(\d+)s", prefix_s)) is not None:
+                named = f"{length[1]} s, the body given every 2 s: {title}"
+                parts.append(_table(named, prefix_s, _methods(prefix_s, found), LENGTHS, found))
     others = [name for name in found if name.split("/")[0] in ("longterm_minutes", "longterm_samples")]
     if others:
         rows = [(name, formatted_interval(found, name)) for name in others]
         parts.append(aligned("Minutes of motion, and samples of the behaviour model", rows))
     return "\n\n".join(parts)
+
+
+def _methods(prefix: str, found: Mapping[str, float | None]) -> list[str]:
+    names = (name.split("/") for name in found if name.startswith(f"{prefix}/") and name.count("/") == 2)
+    return list(dict.fromkeys(name[1] for name in names))
 
 
 def _table(

@@ -109,18 +109,31 @@ def test_tables_hold_every_method_with_intervals(source):
             "given ends are kept, by the networks and by the optimisation"
         )
     assert found["longterm/ours_opt/seam_share"] < 0.05
+    for seconds in (2, 4, 6):
+        assert (
+            found[f"longterm_{seconds}s/truth/mpvpe_mm"]
+            == 0
+            < found[f"longterm_{seconds}s/ours_opt/mpvpe_mm"]
+        )
+        assert found[f"longterm_{seconds}s/ours_opt/end_v2v_share"] < 1e-4
+        assert (found[f"longterm_{seconds}s/base_opt/seam_worst_mm"] is None) == (seconds == 2)
     assert "longterm_unseen/ours/mpvpe_mm" in found and "longterm_unseen/ours_opt/mpvpe_mm" not in found
     text = tables.text(found)
-    assert text.count("Table 1") == text.count("Table 4") == len({name.split("/")[0] for name in found})
+    sources = {name.split("/")[0] for name in found}
+    assert text.count("Table 1") == text.count("Table 4") == len(sources) - 3
+    assert text.count("the body given every 2 s") == 3
     assert len(bars.checks(found)) > 10
 
 
 def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
     dataset, model = source.split.held_out, source.models.ours
-    cuts = comparison.select_pairs(select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0), 6)
+    travelled = select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0)
+    cuts = comparison.select_runs(travelled, 2, 6)
     assert len(cuts.start) == 6 and set(cuts.start[1::2] - cuts.start[::2]) == {60}
     assert (cuts.stretch[1::2] == cuts.stretch[::2]).all()
-    assert comparison.even_pairs(7, 4).tolist() == [0, 1, 4, 5] and not len(comparison.even_pairs(0, 4))
+    assert comparison.even_runs(7, 2, 4).tolist() == [0, 1, 4, 5] and not len(comparison.even_runs(0, 2, 4))
+    threes = comparison.select_runs(travelled, 3, 6).start
+    assert len(threes) == 6 and set(np.diff(threes.reshape(-1, 3)).reshape(-1)) == {60}
     parts = cuts.parts(dataset)
     known = scores.references(parts, np.zeros(6, int), dataset, model)
     seam = scores.METRICS.index("seam_share")
