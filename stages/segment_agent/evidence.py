@@ -56,7 +56,8 @@ def judge_motion(references: References) -> Judge:
     def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
         known = np.isfinite(window.points_world[..., 0])
         near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
-        votes = free_space.vote(references, np.where(near[..., None], window.points_world, np.nan), frame)
+        points = np.where(near[..., None], window.points_world, np.nan)
+        votes = free_space.vote(references, points, frame, surfaces=True)
         animal = movers.moving(votes)
         settled = known & ~animal & (votes.occupied > 0)
         step = np.clip((votes.gap_m - STEP_M) / STEP_SPREAD_M, -ROOM, 1)

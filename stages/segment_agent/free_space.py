@@ -102,7 +102,8 @@ def points_of(
 ) -> Float[np.ndarray, "row column 3"]:
     """Return every ``stride``-th pixel of a depth picture in the world, metres; NaN where it is 0."""
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    rays, depth = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape)[every], depth[every]
+    pixel, depth = cameras.pixel_grid(*depth.shape)[every], depth[every]
+    rays = cameras.unproject(pixel, clip.depth_intrinsics[frame])
     points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
     points[depth == 0] = np.nan
     return points
@@ -177,8 +178,11 @@ def soft_color(
     return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), 1.2)
 
 
-def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], frame: int) -> Votes:
-    """Let all references but the frame itself judge points (world, metres; NaN gets no vote)."""
+def vote(
+    references: References, points_world: Float[np.ndarray, "*shape 3"], frame: int, surfaces: bool = False
+) -> Votes:
+    """Let all references but the frame itself judge points (world, metres; NaN gets no vote); colors are 0
+    without ``surfaces``."""
     known = np.isfinite(points_world[..., 0])
     points = np.ascontiguousarray(points_world[known], np.float32)
     other = np.flatnonzero((references.frame != frame) & _looking_at(references, points))
@@ -186,7 +190,7 @@ def vote(references: References, points_world: Float[np.ndarray, "*shape 3"], fr
     poses, noise = references.camera_from_world.astype(np.float32), references.noise
     margin = np.float32(MARGIN_M + SIGNIFICANT * noise.constant_m), np.float32(SIGNIFICANT * noise.quadratic)
     pictures = references.depth, references.nearest, references.color
-    judged = _vote(points, other, poses, pinhole, *pictures, *margin)
+    judged = _vote(points, other, poses, pinhole, *pictures, *margin, surfaces)
     votes = [np.zeros(known.shape + values.shape[1:], values.dtype) for values in judged]
     for whole, values in zip(votes, judged, strict=True):
         whole[known] = values
@@ -227,7 +231,7 @@ def _nearest(
 
 
 @numba.njit(cache=True, fastmath=True)
-def _vote(points, voters, camera_from_world, pinhole, depth, nearest, color, margin_m, margin_quadratic):
+def _vote(points, voters, camera_from_world, pinhole, depth, nearest, color, margin_m, quadratic, surfaces):
     count, (height, width) = len(points), depth.shape[1:]
     free, occupied, gap = np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros(count, np.float32)
     mean = np.zeros((count, 3), np.float32)
@@ -242,14 +246,14 @@ def _vote(points, voters, camera_from_world, pinhole, depth, nearest, color, mar
             v = int(np.floor((m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth_here * k[1] + k[3]))
             if u < 0 or v < 0 or u >= width or v >= height or depth[r, v, u] == 0:
                 continue
-            margin = margin_m + margin_quadratic * depth_here * depth_here
+            margin = margin_m + quadratic * depth_here * depth_here
             difference = depth[r, v, u] - depth_here
             if nearest[r, v, u] - depth_here > margin:
                 free[i] += 1
             elif abs(difference) < margin:
                 occupied[i] += 1
                 gap[i] += difference
-                for channel in range(3):
+                for channel in range(3 * surfaces):
                     mean[i, channel] += color[r, v, u, channel]
     for i in range(count):
         if occupied[i] > 0:

@@ -149,8 +149,7 @@ def connected(
     hint: Hint,
 ) -> Bool[np.ndarray, "frame"]:
     """Return in which frames a track surely has what a hint points at: nowhere on the way there it is absent
-    or faster than an animal. Nowhere if it is elsewhere at the time of the hint.
-    """
+    or faster than an animal. Nowhere if it is elsewhere at the time of the hint."""
     seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
     surely = np.zeros(len(chosen), bool)
     wait_s = np.abs(timestamp_s[seen] - timestamp_s[hint.frame])

@@ -131,8 +131,7 @@ class Painter:
         presumed: bool,
     ) -> float:
         """Return the log-odds that a mask shows the animal at all: by what it looks like, by what moved, by
-        the track.
-        """
+        the track."""
         similarity = float(np.clip(like[inside], -PRESENCE_LIMIT, PRESENCE_LIMIT).mean())
         moved = float(evidence.clear[inside].mean())
         return (

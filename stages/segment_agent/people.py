@@ -160,8 +160,7 @@ def _persistent(
     picked: Sequence[UprightMover | None], timestamp_s: Float[np.ndarray, "frame"]
 ) -> Bool[np.ndarray, "frame"]:
     """Return in which frames a track surely has a person: in pieces that are as high as one often enough, and
-    in those soon before or after them that the same person can have walked to.
-    """
+    in those soon before or after them that the same person can have walked to."""
     seen = np.array([frame for frame, mover in enumerate(picked) if mover is not None], int)
     person = np.zeros(len(picked), bool)
     if not len(seen):
@@ -204,6 +203,9 @@ def hide(
 ) -> Iterator[Mask]:
     """Mark people as unknown in the masks of all frames: neither the animal nor the room."""
     for frame, mask in enumerate(masks):
+        if not np.isfinite(people.axis_world[:, frame]).any():
+            yield mask
+            continue
         points = free_space.points_of(clip, frame, world_from_camera[frame], clip.depth(frame), 1)
         theirs = people.near(frame, points)
         theirs = cv2.dilate(theirs.astype(np.uint8), RIM)

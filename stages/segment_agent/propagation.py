@@ -77,8 +77,7 @@ def examples(footage: Footage, found: Labels, hinted: int, count: int) -> list[E
 
 def updated(footage: Footage, frame: int, judged: LogOdds, found: Labels) -> LogOdds:
     """Update one frame from what the network makes of it and from messages; only what is connected with the
-    carried mask stays.
-    """
+    carried mask stays."""
     carried = message(footage, frame, found)
     log_odds = np.clip(judged, -SURE, SURE).astype(np.float32) + MESSAGE * carried
     seen = bool((carried > 0).any())

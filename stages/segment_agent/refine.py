@@ -41,8 +41,7 @@ class Palette:
         self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
         """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks pixels that surely
-        show the room.
-        """
+        show the room."""
         if self._counts.sum() < 50 or room.sum() < 50:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)
@@ -88,8 +87,7 @@ def without_strays(
     labels: UInt8[np.ndarray, "height width"], like: Float[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
     """Take away parts, but for the largest, that look rather like the room: rims of furniture that drift
-    makes seem to move.
-    """
+    makes seem to move."""
     parts, area = _parts((labels > 0).astype(np.uint8), 8)
     if len(area) < 3:
         return labels

@@ -70,8 +70,7 @@ def rectangle(
     rim_px: int = 8,
 ) -> tuple[slice, slice]:
     """Return the rows and columns of a working picture of (height, width) that show a ball; empty where it is
-    out of view.
-    """
+    out of view."""
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     centre = rigid.apply(rigid.inverse(world_from_camera), ball.centre_world[None])[0]
     pixel, depth = cameras.project(centre, intrinsics)
@@ -109,8 +108,7 @@ def cut(
 
 def supported_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     """Read depth without blur at steps, thin things kept that the sensor doubts but neighbours agree on (0 =
-    unknown).
-    """
+    unknown)."""
     depth = unblurred(clip.depth(frame))
     return np.where(supported(depth), depth, 0)
 
