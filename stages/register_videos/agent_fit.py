@@ -19,6 +19,8 @@ from pipeline.geometry.meshes import Mesh, RayCaster
 UP = np.array([0.0, 1.0, 0.0])
 POINTS, MODEL_POINTS = 220, 700
 """Depth points per frame and vertices of the template that are used; more fit no better."""
+LEAF_POINTS = 32
+"""Vertices in a leaf of the search tree; nearest ones are found fastest so."""
 COARSE_ROUNDS, FIRST_REACH_M, REACH_M = 5, 0.18, 0.07
 """Gauss-Newton steps from every initial pose, and width of the robust weight at first and at the end, metres:
 legs and tail move, the trunk decides."""
@@ -104,7 +106,7 @@ def make_model(mesh: Mesh, rng: np.random.Generator) -> AgentModel:
     color = np.full((len(chosen), 3), 0.5) if mesh.color is None else mesh.color[chosen] / 255.0
     extent = np.ptp(points[:, [0, 2]], axis=0)
     stand_m, normals = float(-np.quantile(points[:, 1], 0.01)), mesh.vertex_normals()[chosen]
-    return AgentModel(points, normals, color, KDTree(points), float(extent.max()), stand_m)
+    return AgentModel(points, normals, color, KDTree(points, LEAF_POINTS), float(extent.max()), stand_m)
 
 
 def observe(
@@ -289,17 +291,19 @@ def _fit(observation, model, world_from_agent, reaches, prior, *, stands=True, n
 
 
 def _normal_equations(local, target, normal, weight):
-    """Sum plane and point terms; the twist moves the body, so it moves points the other way."""
-    gap = local - target
-    curvature, gradient = np.zeros((6, 6)), np.zeros(6)
-    axes = [(np.broadcast_to(axis, gap.shape), POINT_SHARE) for axis in np.eye(3)]
-    for direction, share in [(normal, 1.0), *axes]:
-        jacobian = -np.concatenate([np.cross(local, direction), direction], axis=-1)
-        residual = (gap * direction).sum(-1)
-        scaled = jacobian * (share * weight)[..., None]
-        curvature = curvature + np.swapaxes(scaled, -1, -2) @ jacobian
-        gradient = gradient + (scaled * residual[..., None]).sum(-2)
-    return gradient, curvature
+    """Sum plane and point terms; the twist moves the body, so it moves points the other way.
+
+    Point terms are plane terms along the three axes, whose sums have closed forms.
+    """
+    gap, share, eye = local - target, POINT_SHARE * weight[..., None], np.eye(3)
+    jacobian = np.concatenate([np.cross(local, normal), normal], axis=-1)
+    scaled, heavy = (np.swapaxes(each, 1, 2) for each in (jacobian * weight[..., None], local * share))
+    curvature, gradient = scaled @ jacobian, -(scaled @ (gap * normal).sum(-1, keepdims=True))[..., 0]
+    squared, pull, lever = heavy @ local, heavy @ gap, np.cross(heavy.sum(-1)[:, None], eye)
+    diagonal = np.trace(squared, axis1=1, axis2=2)[:, None, None] * eye - squared, share.sum(1)[:, None] * eye
+    curvature += np.block([[diagonal[0], np.swapaxes(lever, 1, 2)], [lever, diagonal[1]]])
+    turn = [pull[:, k - 2, k - 1] - pull[:, k - 1, k - 2] for k in range(3)]
+    return gradient - np.stack([*turn, *(share * gap).sum(1).T], axis=-1), curvature
 
 
 def _keep_upright(placed, curvature, gradient, prior_rad):
