@@ -24,7 +24,6 @@ from pipeline.fields import fused_depth as fused
 from pipeline.fields import skinning
 from pipeline.fields.encodings import DenseGrid, PositionalMLP
 from pipeline.fields.fused_depth import FusedGeometry
-from pipeline.geometry import rigid_torch
 
 FEATURE_CHANNELS = 16
 FUSED_CHANNELS = fused.CHANNELS
@@ -301,7 +300,7 @@ class ArticulatedBody(nn.Module):
 
     def _back(self, points_posed: Tensor, agent_from_bone: Tensor, weights: Tensor) -> Tensor:
         posed_from_rest = skinning.blend(weights, agent_from_bone, self.agent_from_bone_rest)
-        return skinning.move(rigid_torch.inverse(posed_from_rest), points_posed)
+        return skinning.move(posed_from_rest, points_posed, back=True)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from torch.nn import functional
 
 from pipeline.data import gaussian_ply, npz
 from pipeline.fields import rasterize, skinning
-from pipeline.fields.skinning import blend
 from pipeline.geometry import rigid_torch
 from pipeline.geometry.meshes import Mesh
 
@@ -177,8 +176,7 @@ class Splats(nn.Module):
         stands: Bool[Tensor, "row point"] | None = None,
     ):
         """``stands``: which Gaussians of the room each video shows and, last, which all share; None: all of
-        them.
-        """
+        them."""
         super().__init__()
         self.scene, self.agent = scene, agent
         self.register_buffer("agent_weights", agent_weights)
@@ -191,8 +189,7 @@ class Splats(nn.Module):
 
     def place_scene(self, video: int | None, which: Int[Tensor, "chosen"] | None = None) -> Cloud:
         """Return the room, or some Gaussians of it, as it stood and was lit in one video (None: as all share
-        it).
-        """
+        it)."""
         here = self.stands[-1 if video is None else video]
         which = torch.nonzero(here)[:, 0] if which is None else which[here[which]]
         return self._exposed(self.scene.cloud(which), video)
@@ -205,14 +202,13 @@ class Splats(nn.Module):
     ) -> Cloud:
         """Return the animal in one pose, in the light of one video."""
         agent = self.agent.cloud()
-        world_from_rest = world_from_agent @ blend(
-            self.agent_weights, agent_from_bone, self.agent_from_bone_rest
-        )
-        turn = rigid_torch.quaternion_from_rotation(world_from_rest[:, :3, :3])
+        agent_from_rest = skinning.blend(self.agent_weights, agent_from_bone, self.agent_from_bone_rest)
+        heading = rigid_torch.quaternion_from_rotation(world_from_agent[:3, :3])
+        turn = skinning.multiply(heading, agent_from_rest[:4].T)
         rotation = skinning.multiply(turn, functional.normalize(agent.rotation, dim=-1))
         posed = replace(
             agent,
-            means=skinning.move(world_from_rest, agent.means),
+            means=rigid_torch.apply(world_from_agent, skinning.move(agent_from_rest, agent.means)),
             rotation=rotation,
             agent=torch.ones_like(agent.opacity),
         )

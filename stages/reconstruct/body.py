@@ -190,7 +190,8 @@ def silhouette_residual_m(
     depth = points_camera[..., 2:].clamp_min(NEAREST_M)
     image_point = points_camera[..., :2] / depth
     with torch.no_grad():
-        near = torch.cdist(target, image_point).argmin(-1, keepdim=True)
+        squared = image_point.square().sum(-1)[:, None]  # without |target|^2, which is the same for all
+        near = torch.baddbmm(squared, target, image_point.mT, alpha=-2).argmin(-1, keepdim=True)
     gap = image_point.gather(1, near.expand(-1, -1, 2)) - target
     gap_m = gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach()
     return functional.relu(gap_m - COVER_M).clamp_max(2 * DECIMETRE)
