@@ -65,8 +65,7 @@ class FusedGeometry(nn.Module):
 
     def own_blocks(self, video: int) -> tuple[Float[Tensor, "block 3"], Float[Tensor, "block 9 9 9"]]:
         """Return the lowest corners of a video's own blocks, and signed distances at their nodes in units of
-        the truncation.
-        """
+        the truncation."""
         place = torch.nonzero(self.table[video] != self.table[-1])
         block = self.table[video][tuple(place.T)].long()
         return self.low + place * (CELLS * self.sizes[0]), self.blocks[block][..., 0].float()

@@ -83,8 +83,7 @@ def extract_moved(field: Field, code: int) -> Mesh:
 @torch.no_grad()
 def on_surface(field: Field, points: Float[np.ndarray, "point 3"], code: int) -> Bool[np.ndarray, "point"]:
     """Return which points lie on a surface of one video's scene (-1: the shared one), within half of the
-    truncation.
-    """
+    truncation."""
     assert field.fused is not None, "only fused scenes have a truncation of their own"
     at = torch.from_numpy(np.asarray(points, np.float32)).to(field.log_beta.device)
     distance_m = field.distance_at(at, torch.full((len(at),), code, device=at.device))

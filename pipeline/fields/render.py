@@ -6,7 +6,7 @@ and features mix by density; `importance_depths` places samples where a first pa
 extracted surfaces (scene with one video's code, posed agent) and the fields give the color there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Generator, Tensor
 
 from pipeline.fields import marching_cubes
-from pipeline.fields.fields import Reconstruction
+from pipeline.fields.fields import Field, Reconstruction, Values
 from pipeline.geometry import cameras, rigid_torch
 from pipeline.geometry.meshes import Mesh, RayCaster
 
@@ -38,6 +38,22 @@ class Layer:
     """per metre"""
     color: Float[Tensor, "ray sample 3"]
     feature: Float[Tensor, "ray sample 16"]
+
+    @classmethod
+    def of(cls, field: Field, values: Values, shape: tuple[int, ...], least_beta_m: float = 0.0) -> "Layer":
+        """Lay out what a field holds at samples; `Field.density` explains ``least_beta_m``."""
+        density = field.density(values.signed_distance, least_beta_m).view(shape)
+        return cls(density, values.color.view(*shape, 3), values.feature.view(*shape, -1))
+
+    @classmethod
+    def of_agent(
+        cls, field: Field, rest: Float[Tensor, "*batch 3"], shape: tuple[int, ...], least_beta_m: float = 0.0
+    ) -> "Layer":
+        """Evaluate the agent's field at samples in the rest shape; it is empty outside its box."""
+        low, high = (rest.new_tensor(corner) for corner in (field.shape.low_m, field.shape.high_m))
+        inside = ((rest > low) & (rest < high)).all(-1).view(shape)
+        layer = cls.of(field, field(rest.reshape(-1, 3)), shape, least_beta_m)
+        return replace(layer, density=layer.density * inside)
 
 
 @dataclass(frozen=True)
@@ -202,25 +218,12 @@ class _PosedRays:
         points_camera = (self.direction[:, None] * depth[..., None]).reshape(-1, 3)
         world = rigid_torch.apply(self.world_from_camera, points_camera)
         values = scene(world, torch.full((len(world),), self.code, device=world.device))
-        shape = depth.shape
-        scene_layer = Layer(
-            scene.density(values.signed_distance, least_beta_m).view(shape),
-            values.color.view(*shape, 3),
-            values.feature.view(*shape, -1),
-        )
+        scene_layer = Layer.of(scene, values, depth.shape, least_beta_m)
         if self.agent_pose is None:
             return scene_layer, None
         agent_from_camera, bones = self.agent_pose
         rest = body.unpose(rigid_torch.apply(agent_from_camera, points_camera)[None], bones[None])[0]
-        low, high = (rest.new_tensor(corner) for corner in (agent.shape.low_m, agent.shape.high_m))
-        inside = ((rest > low) & (rest < high)).all(-1)
-        values = agent(rest)
-        agent_layer = Layer(
-            (agent.density(values.signed_distance, least_beta_m) * inside).view(shape),
-            values.color.view(*shape, 3),
-            values.feature.view(*shape, -1),
-        )
-        return scene_layer, agent_layer
+        return scene_layer, Layer.of_agent(agent, rest, depth.shape, least_beta_m)
 
 
 @dataclass(frozen=True)
@@ -241,8 +244,7 @@ class Renderer:
         self, reconstruction: Reconstruction, video: str | None = None, agent_step_m: float = 0.0075
     ):
         """``video`` chooses the scene's code (None: the shared scene); the step is the resolution of the
-        agent's mesh.
-        """
+        agent's mesh."""
         self.reconstruction = reconstruction
         self.code = reconstruction.video_code(video)
         self.device = reconstruction.scene.log_beta.device

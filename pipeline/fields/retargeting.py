@@ -79,8 +79,7 @@ def corresponding(
     source: SkinnedShape, target: SkinnedShape, points: Float[np.ndarray, "point 3"]
 ) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, "point source_bone"]]:
     """Return where points of the target lie in the source once its extents are those of the target, and the
-    skinning weights of the source there.
-    """
+    skinning weights of the source there."""
     place = _scaled(target, source, points)
     distance, nearest = KDTree(source.vertices).query(place, k=NEIGHBOURS)
     share = 1 / np.maximum(distance, 1e-6)
@@ -90,8 +89,7 @@ def corresponding(
 
 def shape_distance_m(source: SkinnedShape, target: SkinnedShape) -> float:
     """Return the mean distance of the target's vertices from the source's once its extents are the target's:
-    how far the plans of both bodies differ, metres.
-    """
+    how far the plans of both bodies differ, metres."""
     scaled = _scaled(source, target, source.vertices.astype(float))
     return float(KDTree(scaled).query(target.vertices)[0].mean())
 
@@ -161,8 +159,7 @@ def carried_root(
     source: SkinnedShape, target: SkinnedShape, world_from_agent: Float[np.ndarray, "frame 4 4"]
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Return the root of the target: steps as much longer as its root is higher above its feet, from where
-    the source begins, and as much higher above what carries it.
-    """
+    the source begins, and as much higher above what carries it."""
     legs, own_legs = -source.extent[0, 1], -target.extent[0, 1]
     root = world_from_agent.copy()
     place, begin = root[:, :3, 3], root[0, :3, 3].copy()

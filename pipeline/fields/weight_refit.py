@@ -40,8 +40,7 @@ def different_poses(
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"], count: int
 ) -> Int[np.ndarray, " chosen"]:
     """Choose poses far from each other, beginning with the one furthest from the mean, so that the extremes
-    are among them.
-    """
+    are among them."""
     flat = agent_from_bone[:, :, :3].reshape(len(agent_from_bone), -1)
     distance = ((flat - flat.mean(0)) ** 2).sum(1)
     chosen = [int(distance.argmax())]
@@ -59,8 +58,7 @@ def blend_dual_quaternions(
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
 ) -> Float[np.ndarray, "frame vertex 3"]:
     """Pose the surface as the reconstruction does: dual-quaternion blending with all weights; metres, agent
-    frame.
-    """
+    frame."""
     points, weight, rest = (
         torch.from_numpy(np.ascontiguousarray(values, np.float32))
         for values in (vertices, weights, agent_from_bone_rest)
@@ -76,8 +74,7 @@ def refit_weights(
     vertices: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"], poses: Poses
 ) -> tuple[Influences, Influences]:
     """Return the four and the eight bones, with convex weights, whose linear blend is nearest, in squares, to
-    the posed surface.
-    """
+    the posed surface."""
     candidates = np.argsort(-weights, axis=1, kind="stable")[:, : min(EIGHT, weights.shape[1])]
     gram = _gram(vertices, candidates, poses)
     start = np.take_along_axis(weights, candidates, 1)

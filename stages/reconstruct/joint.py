@@ -48,8 +48,7 @@ class JointLoss:
         self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
     ):
         """``rendered``: rays are sampled evenly and by importance, not around measured depth (paper 001,
-        A.1).
-        """
+        A.1)."""
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
         self.scene_loss = SceneLoss(problem, weights, batches, steps, rendered)
         self.run_frames = RUN_FRAMES if len(problem.runs(RUN_FRAMES)) else 1
@@ -73,8 +72,7 @@ class JointLoss:
 
     def _rendered(self, pose: Pose, number: int, probability: float, generator: Generator) -> Terms:
         """Render ``number`` rays per frame on and around the agent through both fields and compare all
-        observations.
-        """
+        observations."""
         problem, samples = self.problem, self.batches.rendered_samples
         rays = problem.store.agent.at(problem.agent_rays.pick(pose.frame, number, generator).flatten())
         has_scene = problem.has_scene[rays.frame]
@@ -111,8 +109,7 @@ def sample_points(
     pose: Pose, rays: Rays, depth: Float[Tensor, "ray sample"]
 ) -> tuple[Float[Tensor, "ray sample 3"], Float[Tensor, "frame point 3"]]:
     """Return samples of rays ``[frame * ray]`` in the world, and per frame relative to the agent's root,
-    metres.
-    """
+    metres."""
     points_camera = (rays.direction[:, None] * depth[..., None]).view(len(pose.frame), -1, 3)
     world = rigid_torch.apply(pose.world_from_camera, points_camera).view(*depth.shape, 3)
     return world, rigid_torch.apply(pose.agent_from_camera, points_camera)
@@ -126,21 +123,9 @@ def agent_layer(
     least_beta_m: float = 0.0,
 ) -> tuple[Layer, Float[Tensor, "frame point 3"]]:
     """Evaluate the agent's field along rays (`Field.density` explains ``least_beta_m``); also return the
-    samples in the rest shape. It is empty outside its box.
-    """
-    field = problem.agent
+    samples in the rest shape. It is empty outside its box."""
     rest = problem.body.unpose(points_agent, pose.agent_from_bone)
-    low, high = (
-        torch.tensor(corner, device=problem.device) for corner in (field.shape.low_m, field.shape.high_m)
-    )
-    inside = ((rest > low) & (rest < high)).all(-1).view(shape)
-    values = field(rest.reshape(-1, 3))
-    layer = Layer(
-        field.density(values.signed_distance, least_beta_m).view(shape) * inside,
-        values.color.view(*shape, 3),
-        values.feature.view(*shape, -1),
-    )
-    return layer, rest
+    return Layer.of_agent(problem.agent, rest, shape, least_beta_m), rest
 
 
 def compare(

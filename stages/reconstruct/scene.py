@@ -65,8 +65,7 @@ def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"],
 
 def sample_depths(rays: Rays, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
     """Return the measured depth, `NEAR` samples from ``reach_m`` before it to just behind, and `FREE` before
-    those; metres.
-    """
+    those; metres."""
     depth = rays.depth[:, None]
     place = torch.rand(len(rays), NEAR, generator=generator).to(depth.device)
     around = place * (reach_m / rays.slope[:, None].clamp_min(LEAST_SLOPE) + BEHIND_M) - BEHIND_M
@@ -129,8 +128,7 @@ def rendered_terms(
     depth: Float[Tensor, "ray sample"],
 ) -> Terms:
     """Fit the scene by volume rendering at samples ``depth``, metres: any rays, with or without measured
-    depth.
-    """
+    depth."""
     origin, direction = world_rays(problem.motion, rays)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     scene = scene_layer(problem, points, problem.video[rays.frame], code_of)
@@ -154,11 +152,7 @@ def scene_layer(
     values = field(
         points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
     )
-    return Layer(
-        field.density(values.signed_distance).view(rays, samples),
-        values.color.view(rays, samples, 3),
-        values.feature.view(rays, samples, -1),
-    )
+    return Layer.of(field, values, (rays, samples))
 
 
 def scene_density(
